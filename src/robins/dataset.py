@@ -1,0 +1,89 @@
+"""What a run starts from: tables of IMU samples, GNSS fixes and, where known, the truth.
+
+Readers of real logs and simulators both produce a `Dataset`; nothing downstream knows which. The
+tables are NumPy, float64, time in integer nanoseconds, SI and radians, and each states its frames.
+They are plain records: the *doctor* (`robins.logs.doctor`) judges them, the systems use them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+NavFrame = Literal["NED", "ENU"]
+BodyFrame = Literal["FRD", "RFU"]
+
+
+@dataclass(frozen=True)
+class ImuTable:
+    """Inertial samples.
+
+    kind "increment": row k is the integral over (time[k-1], time[k]]; gyro [rad], accel [m/s].
+    kind "rate": row k is the value at time[k]; gyro [rad/s], accel (specific force) [m/s^2].
+    """
+
+    time_ns: np.ndarray  # (N,) int64
+    gyro: np.ndarray  # (N, 3) body axes
+    accel: np.ndarray  # (N, 3) body axes
+    kind: Literal["rate", "increment"]
+    body: BodyFrame = "FRD"
+    source: str = ""  # file or scenario the rows came from
+    rows: np.ndarray | None = None  # (N,) line number of each row in its source, for messages
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True)
+class GnssTable:
+    """Position and velocity fixes of a GNSS antenna; NaN where a component is missing.
+
+    Velocities and sigmas are given along ``nav``; for ENU the components are east, north, up.
+    """
+
+    time_ns: np.ndarray  # (M,) int64
+    lat_rad: np.ndarray  # (M,)
+    lon_rad: np.ndarray  # (M,)
+    alt_m: np.ndarray  # (M,) above the WGS-84 ellipsoid
+    sigma_m: np.ndarray  # (M, 3) one-sigma position along nav axes
+    v_n: np.ndarray | None = None  # (M, 3) m/s
+    sigma_v: np.ndarray | None = None  # (M, 3) m/s
+    quality: np.ndarray | None = None  # (M,) int; RTKLIB: 1 fix, 2 float, 5 single
+    nav: NavFrame = "NED"
+    source: str = ""
+    rows: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A path: position, velocity and attitude over time (truth or a solution)."""
+
+    time_ns: np.ndarray  # (K,) int64
+    lat_rad: np.ndarray
+    lon_rad: np.ndarray
+    alt_m: np.ndarray
+    v_n: np.ndarray  # (K, 3) m/s
+    q_nb: np.ndarray  # (K, 4) scalar first, body to nav
+    nav: NavFrame = "NED"
+    body: BodyFrame = "FRD"
+    source: str = ""
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Everything a run starts from."""
+
+    name: str
+    imu: ImuTable
+    gnss: GnssTable | None = None
+    truth: Trajectory | None = None
+    counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
+    meta: dict[str, Any] = field(default_factory=dict)

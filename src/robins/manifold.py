@@ -1,0 +1,101 @@
+"""States that are not vectors: `retract` moves a state along a tangent vector, `local` measures it.
+
+A state is any pytree. Its leaves are arrays, which add, and *elements*: objects with ``dim``,
+``retract(delta)`` and ``local(other)``, such as `robins.rotation.Rotation` or `Angle`. The tangent
+vector of a state stacks those of its leaves in pytree order. With no elements this room costs
+nothing: `retract` is addition and `local` subtraction.
+
+    retract(x, local(x, y)) == y        local(x, retract(x, d)) == d
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+
+State = Any  # a pytree of arrays and elements
+
+
+def wrap(angle_rad):
+    """Fold an angle into [-pi, pi)."""
+    return jnp.mod(angle_rad + jnp.pi, 2.0 * jnp.pi) - jnp.pi
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Angle:
+    """A plane angle [rad] whose differences wrap to [-pi, pi)."""
+
+    rad: Float[Array, "*b"]
+
+    dim = 1
+
+    def retract(self, delta: Float[Array, "*b 1"]) -> Angle:
+        """Add, wrapped."""
+        return Angle(wrap(self.rad + delta[..., 0]))
+
+    def local(self, other: Angle) -> Float[Array, "*b 1"]:
+        """Signed shortest way from self to other."""
+        return wrap(other.rad - self.rad)[..., None]
+
+
+def is_element(leaf) -> bool:
+    """Whether a leaf brings its own `retract` and `local`."""
+    return hasattr(leaf, "retract") and hasattr(leaf, "local")
+
+
+def _leaves(x: State):
+    return jax.tree_util.tree_flatten(x, is_leaf=is_element)
+
+
+def dim(x: State) -> int:
+    """Tangent dimension of a single (not batched) state."""
+    leaves, _ = _leaves(x)
+    return sum(leaf.dim if is_element(leaf) else jnp.size(leaf) for leaf in leaves)
+
+
+def retract(x: State, delta: Float[Array, "n"]) -> State:
+    """Move x along the tangent vector delta.
+
+    Raises:
+        ValueError: delta does not have one component per tangent dimension of x.
+    """
+    leaves, tree = _leaves(x)
+    if delta.shape != (dim(x),):
+        raise ValueError(f"tangent vector has shape {delta.shape}, the state needs ({dim(x)},)")
+    out, at = [], 0
+    for leaf in leaves:
+        if is_element(leaf):
+            out.append(leaf.retract(delta[at : at + leaf.dim]))
+            at += leaf.dim
+        else:
+            size = jnp.size(leaf)
+            out.append(leaf + delta[at : at + size].reshape(jnp.shape(leaf)))
+            at += size
+    return jax.tree_util.tree_unflatten(tree, out)
+
+
+def local(x: State, y: State) -> Float[Array, "n"]:
+    """The tangent vector that leads from x to y."""
+    xs, tree = _leaves(x)
+    ys, other = _leaves(y)
+    if tree != other:
+        raise ValueError(f"states of different structure: {tree} and {other}")
+    parts = [
+        a.local(b).reshape(-1) if is_element(a) else jnp.reshape(jnp.asarray(b) - a, -1)
+        for a, b in zip(xs, ys, strict=True)
+    ]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+
+def mean_about(x: State, points: Sequence[State], weights: Float[Array, "p"]) -> State:
+    """One Gauss-Newton step of the weighted mean of points, begun at x."""
+    deltas = jnp.stack([local(x, p) for p in points])
+    return retract(x, weights @ deltas)

@@ -1,0 +1,233 @@
+"""Rotations: unit quaternions, rotation vectors, direction cosine matrices, Euler angles.
+
+Quaternions are scalar first (w, x, y, z), Hamilton product; ``q_nb`` maps body coordinates to
+navigation coordinates, ``v_n = rotate(q_nb, v_b)``. All functions work on one or many alike: the
+last axis holds the components, leading axes broadcast. Euler angles are roll, pitch, heading of
+the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame.
+
+Small-angle series live here and nowhere else; they are exact to rounding on both sides of their
+switch and have finite derivatives at zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+
+_SMALL = 1e-3  # rad^2; below it the series, whose first dropped term is 1e-3^4 / 9! < 1e-17
+
+
+def _sinc_cos(angle_sq):
+    """Return ``sin(a)/a`` and ``cos(a)`` for a = sqrt(angle_sq), smooth at zero."""
+    # Double `where`: the square root is taken of a safe number on the branch that is not used,
+    # else its infinite derivative at zero would reach the gradient as 0 * inf = NaN.
+    small = angle_sq < _SMALL
+    safe = jnp.where(small, 1.0, angle_sq)
+    angle = jnp.sqrt(safe)
+    x = jnp.where(small, angle_sq, 0.0)
+    sinc_series = 1.0 - x / 6.0 * (1.0 - x / 20.0 * (1.0 - x / 42.0))
+    cos_series = 1.0 - x / 2.0 * (1.0 - x / 12.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0)))
+    sinc = jnp.where(small, sinc_series, jnp.sin(angle) / angle)
+    return sinc, jnp.where(small, cos_series, jnp.cos(angle))
+
+
+def skew(v: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Cross-product matrix: ``skew(a) @ b == cross(a, b)``."""
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    o = jnp.zeros_like(x)
+    rows = [jnp.stack(r, -1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))]
+    return jnp.stack(rows, -2)
+
+
+def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
+    """Hamilton product p q: rotate by q first, then by p."""
+    pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return jnp.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        -1,
+    )
+
+
+def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+    """Inverse of a unit quaternion."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0])
+
+
+def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+    """Scale to unit length."""
+    return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def rotate(q: Float[Array, "*#b 4"], v: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
+    """Apply the rotation: ``v_n = rotate(q_nb, v_b)``."""
+    w, u = q[..., :1], q[..., 1:]
+    t = 2.0 * jnp.cross(u, v)
+    return v + w * t + jnp.cross(u, t)
+
+
+def from_rotvec(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
+    """Quaternion exp(phi/2) of a rotation vector [rad]."""
+    sinc, cos = _sinc_cos(jnp.sum(phi * phi, -1, keepdims=True) / 4.0)
+    return jnp.concatenate([cos, 0.5 * sinc * phi], -1)
+
+
+def to_rotvec(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+    """Rotation vector [rad] of length at most pi; q and -q give the same."""
+    q = jnp.where(q[..., :1] < 0.0, -q, q)
+    w, u = q[..., :1], q[..., 1:]
+    s_sq = jnp.sum(u * u, -1, keepdims=True)
+    small = s_sq < _SMALL
+    safe = jnp.where(small, 1.0, s_sq)
+    s = jnp.sqrt(safe)
+    x = jnp.where(small, s_sq / jnp.where(small, w * w, 1.0), 0.0)
+    # 2 atan2(s, w)/s; the series is that of 2 atan(t)/t with t = s/w, over w
+    series = 2.0 * (1.0 - x * (1 / 3 - x * (1 / 5 - x * (1 / 7 - x * (1 / 9 - x / 11)))))
+    series = series / jnp.where(small, w, 1.0)
+    return jnp.where(small, series, 2.0 * jnp.arctan2(s, jnp.where(small, 1.0, w)) / s) * u
+
+
+def to_dcm(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
+    """Direction cosine matrix: ``v_n = C_nb @ v_b``."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
+
+
+def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
+    """Quaternion of a direction cosine matrix, scalar part not negative (Shepperd 1978).
+
+    Shepperd's method divides by the largest of the four components, so no case is ill-conditioned.
+    """
+    c = [[C[..., i, j] for j in range(3)] for i in range(3)]
+    trace = c[0][0] + c[1][1] + c[2][2]
+    d = jnp.stack([trace, c[0][0], c[1][1], c[2][2]], -1)
+    cand = (
+        (1 + trace, c[2][1] - c[1][2], c[0][2] - c[2][0], c[1][0] - c[0][1]),
+        (c[2][1] - c[1][2], 1 + 2 * c[0][0] - trace, c[0][1] + c[1][0], c[0][2] + c[2][0]),
+        (c[0][2] - c[2][0], c[0][1] + c[1][0], 1 + 2 * c[1][1] - trace, c[1][2] + c[2][1]),
+        (c[1][0] - c[0][1], c[0][2] + c[2][0], c[1][2] + c[2][1], 1 + 2 * c[2][2] - trace),
+    )
+    table = jnp.stack([jnp.stack(k, -1) for k in cand], -2)
+    best = jnp.argmax(d, -1)
+    q = jnp.take_along_axis(table, best[..., None, None], -2)[..., 0, :]
+    q = normalise(q)
+    return jnp.where(q[..., :1] < 0.0, -q, q)
+
+
+def from_euler(roll_rad, pitch_rad, heading_rad) -> Float[Array, "*b 4"]:
+    """Quaternion q_nb (NED from FRD): C_nb = Rz(heading) Ry(pitch) Rx(roll)."""
+    args = (jnp.asarray(a) for a in (roll_rad, pitch_rad, heading_rad))
+    roll, pitch, heading = jnp.broadcast_arrays(*args)
+    cr, sr = jnp.cos(roll / 2), jnp.sin(roll / 2)
+    cp, sp = jnp.cos(pitch / 2), jnp.sin(pitch / 2)
+    ch, sh = jnp.cos(heading / 2), jnp.sin(heading / 2)
+    return jnp.stack(
+        [
+            cr * cp * ch + sr * sp * sh,
+            sr * cp * ch - cr * sp * sh,
+            cr * sp * ch + sr * cp * sh,
+            cr * cp * sh - sr * sp * ch,
+        ],
+        -1,
+    )
+
+
+def to_euler(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
+    """Roll, pitch, heading [rad] of q_nb (NED from FRD).
+
+    At pitch = +-90 deg roll and heading are not distinct: roll is then set to zero and the heading
+    takes the whole turn, so the three angles still describe the rotation.
+    """
+    C = to_dcm(q)
+    sin_pitch = jnp.clip(-C[..., 2, 0], -1.0, 1.0)
+    cos_pitch = jnp.hypot(C[..., 2, 1], C[..., 2, 2])
+    pitch = jnp.arctan2(sin_pitch, cos_pitch)
+    lock = cos_pitch < 1e-12
+    roll = jnp.where(lock, 0.0, jnp.arctan2(C[..., 2, 1], C[..., 2, 2]))
+    heading = jnp.where(
+        lock,
+        jnp.arctan2(-C[..., 0, 1], C[..., 1, 1]),
+        jnp.arctan2(C[..., 1, 0], C[..., 0, 0]),
+    )
+    return roll, pitch, heading
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Rotation:
+    """A rotation as an element of a state: one or many, ``wxyz`` of shape (..., 4).
+
+    `retract` perturbs on the left, ``exp(delta x) C``: delta is seen in the frame the rotation maps
+    *to*. For ``q_nb`` this is the platform misalignment phi of inertial navigation.
+    """
+
+    wxyz: Float[Array, "*b 4"]
+
+    dim = 3
+
+    @classmethod
+    def identity(cls) -> Rotation:
+        """No rotation."""
+        return cls(jnp.array([1.0, 0.0, 0.0, 0.0]))
+
+    @classmethod
+    def from_rotvec(cls, phi) -> Rotation:
+        """From a rotation vector [rad]."""
+        return cls(from_rotvec(jnp.asarray(phi)))
+
+    @classmethod
+    def from_dcm(cls, C) -> Rotation:
+        """From a direction cosine matrix."""
+        return cls(from_dcm(jnp.asarray(C)))
+
+    @classmethod
+    def from_euler(cls, roll_rad, pitch_rad, heading_rad) -> Rotation:
+        """From roll, pitch, heading [rad] (NED from FRD)."""
+        return cls(from_euler(roll_rad, pitch_rad, heading_rad))
+
+    def as_rotvec(self) -> Float[Array, "*b 3"]:
+        """Rotation vector [rad]."""
+        return to_rotvec(self.wxyz)
+
+    def as_dcm(self) -> Float[Array, "*b 3 3"]:
+        """Direction cosine matrix."""
+        return to_dcm(self.wxyz)
+
+    def as_euler(self) -> tuple[Array, Array, Array]:
+        """Roll, pitch, heading [rad] (NED from FRD)."""
+        return to_euler(self.wxyz)
+
+    def __matmul__(self, other: Rotation) -> Rotation:
+        """Compose: ``(C_ab @ C_bc)`` maps c to a."""
+        return Rotation(multiply(self.wxyz, other.wxyz))
+
+    def inverse(self) -> Rotation:
+        """The opposite rotation."""
+        return Rotation(conjugate(self.wxyz))
+
+    def apply(self, v) -> Float[Array, "*b 3"]:
+        """Rotate vectors."""
+        return rotate(self.wxyz, jnp.asarray(v))
+
+    def retract(self, delta: Float[Array, "*b 3"]) -> Rotation:
+        """``exp(delta x) C``, renormalised so that rounding cannot accumulate."""
+        return Rotation(normalise(multiply(from_rotvec(delta), self.wxyz)))
+
+    def local(self, other: Rotation) -> Float[Array, "*b 3"]:
+        """The delta for which ``self.retract(delta) == other``."""
+        return to_rotvec(multiply(other.wxyz, conjugate(self.wxyz)))
