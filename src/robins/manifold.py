@@ -33,7 +33,7 @@ def wrap(angle_rad):
 class Angle:
     """A plane angle [rad] whose differences wrap to [-pi, pi)."""
 
-    rad: Float[Array, "*b"]
+    rad: Any  # (...) array
 
     dim = 1
 

@@ -12,6 +12,7 @@ switch and have finite derivatives at zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -176,7 +177,7 @@ class Rotation:
     *to*. For ``q_nb`` this is the platform misalignment phi of inertial navigation.
     """
 
-    wxyz: Float[Array, "*b 4"]
+    wxyz: Any  # (..., 4) array; unannotated, for JAX rebuilds the class with stand-ins
 
     dim = 3
 
