@@ -1,0 +1,65 @@
+"""What every test stands on: checked shapes, strict JAX, one float width, where the data lies.
+
+Loaded by each worker of a parallel run before any test module, so before `robins` is imported.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import hypothesis
+import jax
+import jaxtyping
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Set in the environment, not by calls, so that processes started by tests inherit it. A run on an
+# accelerator is asked for by JAX_PLATFORMS; figures never need a screen.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["MPLBACKEND"] = "Agg"
+
+# Every annotation in robins is checked at each call: shapes by jaxtyping, types by beartype.
+if "robins" in sys.modules:
+    raise pytest.UsageError("robins was imported before its annotations could be checked")
+jaxtyping.install_import_hook("robins", "beartype.beartype")
+
+# An accidental outer product or a silent change of width is an error here, not a slow surprise.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# The first example pays for a compilation, so neither time nor slowness means anything.
+hypothesis.settings.register_profile(
+    "repeatable",
+    derandomize=True,
+    deadline=None,
+    print_blob=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+# For hunting: `pytest --hypothesis-profile=explore`.
+hypothesis.settings.register_profile(
+    "explore", hypothesis.settings.get_profile("repeatable"), derandomize=False, max_examples=2000
+)
+hypothesis.settings.load_profile("repeatable")
+
+
+def outside(variable: str, folder: str) -> Path:
+    """The folder a variable names, else ``../shared/<folder>``; skip the test if it is absent."""
+    named = os.environ.get(variable)
+    path = Path(named).resolve() if named else ROOT.parent / "shared" / folder
+    if not path.is_dir():
+        where = f"{variable}={named}" if named else f"{variable} is not set and ../shared/{folder}"
+        pytest.skip(f"needs files that are not part of robins: {where} is not a folder")
+    return path
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Real logs: ROBINS_DATA, else ../shared/data beside the repository."""
+    return outside("ROBINS_DATA", "data")
+
+
+@pytest.fixture(scope="session")
+def cases_dir() -> Path:
+    """Reference numbers for filters: ROBINS_CASES, else ../shared/cases beside the repository."""
+    return outside("ROBINS_CASES", "cases")
