@@ -1,0 +1,45 @@
+"""The Earth: ellipsoid, normal gravity, rates of the local frame, positions as states.
+
+- `wgs84`: constants and functions of the WGS-84 ellipsoid.
+- `geodetic`: `Geodetic`, latitude, longitude and height with `retract` and `local` in metres.
+"""
+
+from robins.earth.geodetic import Geodetic
+from robins.earth.wgs84 import (
+    A_M,
+    B_M,
+    E2,
+    GAMMA_E,
+    GAMMA_P,
+    GM,
+    OMEGA_E,
+    F,
+    curvature_radii,
+    dcm_en,
+    earth_rate_n,
+    ecef_from_geodetic,
+    geodetic_from_ecef,
+    gravity,
+    gravity_n,
+    transport_rate_n,
+)
+
+__all__ = [
+    "A_M",
+    "B_M",
+    "E2",
+    "GAMMA_E",
+    "GAMMA_P",
+    "GM",
+    "OMEGA_E",
+    "F",
+    "Geodetic",
+    "curvature_radii",
+    "dcm_en",
+    "earth_rate_n",
+    "ecef_from_geodetic",
+    "geodetic_from_ecef",
+    "gravity",
+    "gravity_n",
+    "transport_rate_n",
+]
