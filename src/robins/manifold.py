@@ -24,8 +24,11 @@ State = Any  # a pytree of arrays and elements
 
 
 def wrap(angle_rad):
-    """Fold an angle into [-pi, pi)."""
-    return jnp.mod(angle_rad + jnp.pi, 2.0 * jnp.pi) - jnp.pi
+    """Fold an angle into [-pi, pi); one that is there already comes back bit for bit."""
+    turn = 2.0 * jnp.pi
+    folded = angle_rad - turn * jnp.floor((angle_rad + jnp.pi) / turn)
+    # The sum can round up to a whole turn just below pi; the fold then lands just below -pi.
+    return jnp.where(folded < -jnp.pi, folded + turn, folded)
 
 
 @jax.tree_util.register_dataclass
@@ -55,10 +58,14 @@ def _leaves(x: State):
     return jax.tree_util.tree_flatten(x, is_leaf=is_element)
 
 
+def leaves(x: State) -> list[Any]:
+    """The arrays and elements of a state, in tangent order."""
+    return _leaves(x)[0]
+
+
 def dim(x: State) -> int:
     """Tangent dimension of a single (not batched) state."""
-    leaves, _ = _leaves(x)
-    return sum(leaf.dim if is_element(leaf) else jnp.size(leaf) for leaf in leaves)
+    return sum(leaf.dim if is_element(leaf) else jnp.size(leaf) for leaf in leaves(x))
 
 
 def retract(x: State, delta: Float[Array, "n"]) -> State:
