@@ -1,0 +1,101 @@
+"""Random streams that depend on their name, not on who draws when.
+
+A stream is named by three numbers: the seed of the campaign, the run, and the component that
+draws. Both generators below are counter-based (Threefry and Philox; Salmon et al., "Parallel
+random numbers: as easy as 1, 2, 3", SC 2011), so the stream of run 137 is the same alone, in a
+batch, on any number of workers and in any order, and a sensor that is added draws from a stream
+of its own and leaves the noise of the others as it was.
+
+The numbers of `Component` are part of the file format: a result folder that states its seed can
+be computed again only while they stay. Add at the end, never renumber, never reuse.
+"""
+
+from __future__ import annotations
+
+import operator
+from enum import IntEnum
+from typing import Any, SupportsIndex
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from robins import _float64  # noqa: F401
+
+UNITS_OF_A_KIND = 256  # stride between the streams of two sensors of one kind
+
+
+class Component(IntEnum):
+    """Who draws. A second or third sensor of a kind is named by `unit(component, index)`."""
+
+    INITIAL_STATE = 0  # true initial state and the errors of the initial estimate
+    IMU = 1  # errors of an inertial measurement unit
+    GNSS = 2  # errors, outliers and losses of a GNSS receiver
+    TRAJECTORY = 3  # random motion of the vehicle
+    WIND = 4  # gusts and turbulence
+    FLEXURE = 5  # wing or structure between two IMUs
+    BAROMETER = 6
+    MAGNETOMETER = 7
+    AIR_DATA = 8
+    STAR_SENSOR = 9
+    SAR = 10
+    ODOMETER = 11
+    FAULT = 12  # when and how a fault strikes
+    LINK = 13  # losses and delays on the way from a sensor to the computer
+    FILTER = 14  # draws of a filter itself, e.g. of a particle filter
+
+
+def unit(component: Component, index: SupportsIndex) -> int:
+    """Component number of the sensor ``index`` of a kind; index 0 is the component itself.
+
+    Raises:
+        ValueError: index is not in 0 .. 2^24 - 1.
+    """
+    return int(component) + UNITS_OF_A_KIND * _bounded("index", index, 2**24)
+
+
+def stream(seed: SupportsIndex, run: Any, component: SupportsIndex) -> Array:
+    """JAX key of one component in one run, ``fold_in(fold_in(key(seed), run), component)``.
+
+    The generator is named (Threefry 2x32), not left to JAX's settings. ``run`` may be traced:
+    ``vmap(lambda run: stream(seed, run, Component.IMU))(runs)`` gives the keys of a batch.
+
+    Args:
+        seed: of the campaign, 0 .. 2^63 - 1.
+        run: number of the run, 0 .. 2^32 - 1.
+        component: a `Component`, or a number from `unit`.
+
+    Raises:
+        ValueError: a number known at call time is not an integer or out of its range.
+    """
+    key = jax.random.key(_bounded("seed", seed, 2**63), impl="threefry2x32")
+    if not isinstance(run, jax.Array):
+        run = _bounded("run", run, 2**32)
+    return jax.random.fold_in(jax.random.fold_in(key, run), _bounded("component", component, 2**32))
+
+
+def generator(
+    seed: SupportsIndex, run: SupportsIndex, component: SupportsIndex
+) -> np.random.Generator:
+    """NumPy generator of one component in one run, for work outside compiled code.
+
+    It has the independence of `stream`, not its numbers: the two use different generators. NumPy
+    keeps Philox's bits across versions but not the way normals are made from them.
+
+    Raises:
+        ValueError: as in `stream`.
+    """
+    name = (_bounded("run", run, 2**32), _bounded("component", component, 2**32))
+    seeds = np.random.SeedSequence(_bounded("seed", seed, 2**63), spawn_key=name)
+    return np.random.Generator(np.random.Philox(seeds))
+
+
+def _bounded(name: str, value: Any, limit: int) -> int:
+    wrong = f"{name} must be an integer from 0 to {limit - 1}, got {value!r}"
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise ValueError(wrong) from None
+    if isinstance(value, bool) or not 0 <= number < limit:
+        raise ValueError(wrong)
+    return number

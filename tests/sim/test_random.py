@@ -1,0 +1,112 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from robins.sim.random import Component, generator, stream, unit
+
+SEED = 20250101
+
+
+def draws(run, component=Component.IMU, shape=(7, 3)):
+    return jax.random.normal(stream(SEED, run, component), shape)
+
+
+def test_a_run_has_the_same_noise_alone_in_a_batch_and_in_any_order():
+    runs = jnp.array([4, 137, 0, 9, 1])
+    batch = jax.jit(jax.vmap(draws))(runs)
+    for row, run in zip(np.asarray(batch), [4, 137, 0, 9, 1], strict=True):
+        np.testing.assert_array_equal(row, draws(run))
+
+
+def test_stream_is_the_documented_fold():
+    key = jax.random.key(SEED, impl="threefry2x32")
+    wanted = jax.random.fold_in(jax.random.fold_in(key, 5), 2)
+    got = stream(SEED, 5, Component.GNSS)
+    np.testing.assert_array_equal(jax.random.key_data(got), jax.random.key_data(wanted))
+
+
+def test_streams_do_not_depend_on_the_default_generator_of_jax():
+    before = jax.random.key_data(stream(SEED, 3, Component.IMU))
+    with jax.default_prng_impl("rbg"):
+        after = jax.random.key_data(stream(SEED, 3, Component.IMU))
+    np.testing.assert_array_equal(before, after)
+
+
+def test_component_numbers_are_the_file_format():
+    # Renumbering changes every result that was ever stored: this table may only grow.
+    assert {c.name: int(c) for c in Component} == {
+        "INITIAL_STATE": 0,
+        "IMU": 1,
+        "GNSS": 2,
+        "TRAJECTORY": 3,
+        "WIND": 4,
+        "FLEXURE": 5,
+        "BAROMETER": 6,
+        "MAGNETOMETER": 7,
+        "AIR_DATA": 8,
+        "STAR_SENSOR": 9,
+        "SAR": 10,
+        "ODOMETER": 11,
+        "FAULT": 12,
+        "LINK": 13,
+        "FILTER": 14,
+    }
+
+
+def test_units_of_a_kind_have_streams_of_their_own():
+    numbers = [unit(c, i) for c in Component for i in range(4)]
+    assert len(set(numbers)) == len(numbers)
+    assert unit(Component.IMU, 0) == Component.IMU
+    keys = {bytes(np.asarray(jax.random.key_data(stream(1, 0, n)))) for n in numbers}
+    assert len(keys) == len(numbers)
+
+
+def test_streams_of_neighbouring_names_are_uncorrelated():
+    n = 4000
+    rows = [draws(r, c, (n,)) for r in range(3) for c in (Component.IMU, Component.GNSS)]
+    rows += [generator(SEED, r, c).standard_normal(n) for r in range(3) for c in (1, 2)]
+    correlation = np.corrcoef(np.stack([np.asarray(r) for r in rows]))
+    off = correlation[~np.eye(len(rows), dtype=bool)]
+    assert np.abs(off).max() < 5.0 / np.sqrt(n)  # five sigma of a sample correlation
+
+
+def test_generator_repeats_by_name_and_differs_between_names():
+    a = generator(SEED, 12, Component.WIND).standard_normal(9)
+    np.testing.assert_array_equal(a, generator(SEED, 12, Component.WIND).standard_normal(9))
+    for other in [(SEED + 1, 12, 4), (SEED, 13, 4), (SEED, 12, 5), (SEED, 4, 12)]:
+        assert not np.any(generator(*other).standard_normal(9) == a)
+
+
+@pytest.mark.parametrize("make", [stream, generator])
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ((-1, 0, 1), "seed"),
+        ((2**63, 0, 1), "seed"),
+        ((True, 0, 1), "seed"),
+        ((1, -1, 1), "run"),
+        ((1, 2**32, 1), "run"),
+        ((1, 0, -1), "component"),
+    ],
+)
+def test_bad_names_are_refused(make, arguments, name):
+    with pytest.raises(ValueError, match=f"^{name} must be an integer"):
+        make(*arguments)
+
+
+def test_the_largest_names_work():
+    keys = [stream(2**63 - 1, 2**32 - 1, 2**32 - 1), stream(2**63 - 1, 2**32 - 2, 2**32 - 1)]
+    a, b = (np.asarray(jax.random.key_data(k)) for k in keys)
+    assert np.any(a != b)
+    generator(2**63 - 1, 2**32 - 1, 2**32 - 1)
+
+
+def test_a_run_that_is_not_whole_is_refused():
+    with pytest.raises(ValueError, match=r"^run must be an integer from 0 to \d+, got 0\.5"):
+        stream(1, 0.5, Component.IMU)
+
+
+def test_numpy_integers_name_the_same_stream():
+    a, b = stream(np.int64(7), np.int32(3), np.uint8(1)), stream(7, 3, 1)
+    np.testing.assert_array_equal(jax.random.key_data(a), jax.random.key_data(b))
