@@ -49,8 +49,9 @@ def _alternating(x, coefficients):
     return total
 
 
+_Q0 = _q(_EP2)
 _M = OMEGA_E**2 * A_M**2 * B_M / GM
-_EP_QP_OVER_Q = 3.0 * _q_prime(_EP2) / _q(_EP2)  # e' q0'/q0, dimensionless
+_EP_QP_OVER_Q = 3.0 * _q_prime(_EP2) / _Q0  # e' q0'/q0, dimensionless
 GAMMA_E = GM / (A_M * B_M) * (1.0 - _M - _M * _EP_QP_OVER_Q / 6.0)  # m/s^2, at the equator
 GAMMA_P = GM / A_M**2 * (1.0 + _M * _EP_QP_OVER_Q / 3.0)  # m/s^2, at the poles
 
@@ -134,27 +135,30 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Array, "*b 3"]:
     p = (transverse + alt) * cos_lat
     z = ((1.0 - E2) * transverse + alt) * sin_lat
 
-    # Semi-minor axis u of the confocal ellipsoid through the point, reduced latitude beta on it.
+    # Semi-minor axis u of the confocal ellipsoid through the point, v its semi-major axis; the
+    # reduced latitude on it has the sine z/u and the cosine p/v.
     half = 0.5 * (p * p + z * z - _FOCAL_SQ)
     u_sq = half + jnp.sqrt(half * half + _FOCAL_SQ * z * z)
+    u = jnp.sqrt(u_sq)
+    per_u = 1.0 / u
+    sin_sq = (z * per_u) ** 2
     v_sq = u_sq + _FOCAL_SQ
-    u, v = jnp.sqrt(u_sq), jnp.sqrt(v_sq)
-    sin_beta, cos_beta = z / u, p / v
-    w = jnp.sqrt((u_sq + _FOCAL_SQ * sin_beta**2) / v_sq)
+    per_v_sq = 1.0 / v_sq
+    spread = u_sq + _FOCAL_SQ * sin_sq
 
-    t_sq = _FOCAL_SQ / u_sq
-    b_over_u = B_M / u
-    q_ratio = b_over_u**3 * _q(t_sq) / _q(_EP2)  # q/q0
-    focal_q_prime = 3.0 * B_M * b_over_u**2 * _q_prime(t_sq) / _q(_EP2)  # E q'/q0
-    spin = OMEGA_E**2
-    along_u = (
-        GM + spin * A_M**2 * focal_q_prime * (0.5 * sin_beta**2 - 1.0 / 6.0)
-    ) / v_sq - spin * u * cos_beta**2
-    along_beta = spin * (A_M**2 * q_ratio / v - v) * sin_beta * cos_beta
+    b_over_u = B_M * per_u
+    t_sq = _EP2 * b_over_u**2
+    q_ratio = b_over_u**3 * _q(t_sq) / _Q0  # q/q0
+    focal_q_prime = 3.0 * B_M * b_over_u**2 * _q_prime(t_sq) / _Q0  # E q'/q0
+    spin_sq = OMEGA_E**2
+    bulge = spin_sq * A_M**2 * focal_q_prime * (0.5 * sin_sq - 1.0 / 6.0)
+    inward = (GM + bulge - spin_sq * u * p * p) * per_v_sq
+    poleward = spin_sq * (A_M**2 * q_ratio * per_v_sq - 1.0)
 
-    # Both are divided by w; then from the confocal axes to the axis and the equator plane.
-    across = (-along_u * u / v * cos_beta - along_beta * sin_beta) / w**2
-    axial = (-along_u * sin_beta + along_beta * u / v * cos_beta) / w**2
+    # The two components along the confocal axes, turned to the axis and the equator plane; written
+    # without the square root of v_sq and with few divisions, for this runs at every IMU sample.
+    across = -p * (inward * u + poleward * sin_sq * v_sq) / spread
+    axial = -z * (inward * v_sq * per_u - poleward * p * p) / spread
     north = axial * cos_lat - across * sin_lat
     down = -axial * sin_lat - across * cos_lat
     return jnp.stack([north, jnp.zeros_like(north), down], -1)
