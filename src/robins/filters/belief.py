@@ -1,0 +1,90 @@
+"""What a filter believes, what it says about a step, and the outcomes it can have."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from robins import linalg, manifold
+from robins.manifold import State
+
+
+class Belief(NamedTuple):
+    """What is believed about the state at one instant.
+
+    The true state is ``retract(mean, e)`` with e ~ N(0, factor factor').
+    """
+
+    mean: State  # pytree on a manifold, tangent dimension n
+    factor: Array  # (n, n) lower triangular
+
+    @classmethod
+    def of(cls, mean: State, covariance: ArrayLike) -> Belief:
+        """From a mean and a covariance (positive semidefinite; looked at, so not inside `jit`).
+
+        Raises:
+            ValueError: the covariance is not one, or its size is not the state's.
+        """
+        factor = linalg.factor(covariance, "initial covariance")
+        n = manifold.dim(mean)
+        if factor.shape != (n, n):
+            raise ValueError(f"initial covariance is {factor.shape}, the state needs ({n}, {n})")
+        return cls(mean, factor)
+
+    @property
+    def covariance(self) -> Array:
+        """(..., n, n)."""
+        return self.factor @ jnp.swapaxes(self.factor, -1, -2)
+
+    @property
+    def sigma(self) -> Array:
+        """(..., n) standard deviation of each tangent component."""
+        return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))
+
+
+class Code(IntEnum):
+    """How a step went; `SENTENCES` says what that means and what to do."""
+
+    DONE = 0
+    MISSING = 1
+    PARTLY_MISSING = 2
+    REFUSED = 3
+    INDEFINITE = 4
+    NOT_FINITE = 5
+
+
+SENTENCES: dict[Code, str] = {
+    Code.DONE: "the measurement was used",
+    Code.MISSING: "no component of the measurement was there, so the belief stands",
+    Code.PARTLY_MISSING: "components that were missing were left out, the others used",
+    Code.REFUSED: "a rule of the filter refused the measurement, so the belief stands",
+    Code.INDEFINITE: (
+        "the step would have made a covariance indefinite and was not taken: use form='sqrt', or "
+        "sigma points with beta >= alpha^2"
+    ),
+    Code.NOT_FINITE: (
+        "the step would have made the state infinite or NaN and was not taken: look at the model, "
+        "the units and the size of the measurement"
+    ),
+}
+
+
+class StepInfo(NamedTuple):
+    """What an update saw, and what it made of it. m is the measurement's tangent dimension."""
+
+    innovation: Array  # (m,) y minus its prediction; NaN where missing
+    factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where missing
+    gain: Array  # (n, m); zero columns where missing
+    nis: Float[Array, ""]  # normalised innovation squared, chi-square of `dof`
+    dof: Array  # number of components used
+    log_likelihood: Float[Array, ""]
+    code: Array  # a `Code`
+    notes: dict[str, Any]  # what the rules add, by their names
+
+    @property
+    def sigma(self) -> Array:
+        """(..., m) standard deviation of each innovation component."""
+        return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))

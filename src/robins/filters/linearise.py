@@ -1,0 +1,238 @@
+r"""Ways to linearise: first-order Taylor, unscented, cubature.
+
+All of them answer with the same thing, a statistical linear regression
+y ~ F x + c + e, e ~ N(0, Omega) (Särkkä 2013, sec. 5.3; Arasaratnam & Haykin 2007), so one
+Kalman update serves them all. What the update needs is not F but F S, the *spread*: for
+sigma points it falls out without inverting S, which may then be singular.
+
+Symmetric points m +- c s_i (s_i column i of S, c^2 = alpha^2 (n + kappa)) split each
+function value into an odd part o_i, which makes the spread, o_i / c, and an even part a_i =
+(y_i+ + y_i-)/2 - y_0, which makes the mean shift b = 2 w sum a_i and the residual covariance
+
+    Omega = 2 w sum a_i a_i' + (beta - alpha^2) b b',        w = 1 / (2 c^2).
+
+The textbook form sums squares about the mean with weights Wc_0 of either sign and size 1/alpha^2;
+here the cancellation has been done on paper. So no subtraction is left whenever beta >= alpha^2, at
+any alpha; and for beta < alpha^2 a shift of the a_i by s b removes it as long as
+1 + 2 n w (beta - alpha^2) >= 0. Beyond that Omega can be truly indefinite: the update then downdates,
+and says `Code.INDEFINITE` where no covariance is left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief
+from robins.filters.model import Motion, Sensor
+from robins.manifold import State
+
+
+class Transition(NamedTuple):
+    """A motion seen from a belief, linearised."""
+
+    mean: State  # predicted
+    spread: Array  # (n, n) F S; cross-covariance with the state before is S @ spread.T
+    excess: Array  # (n, k) factor of what the linearisation leaves over; k = 0 for Taylor
+    noise: Array  # (n, q) factor of the process noise
+    deficit: Array | None = None  # (n,) vector to take away again, for indefinite weights
+
+
+class Observation(NamedTuple):
+    """A measurement seen from a belief, linearised. Not a JAX type: `sensor` is a string."""
+
+    sensor: str
+    residual: Array  # (m,) y minus its prediction; 0 where missing
+    present: Array  # (m,) bool, the component was measured
+    accepted: Array  # (m,) bool, the component is used; rules may refuse what is present
+    spread: Array  # (m, n) H S
+    excess: Array  # (m, k)
+    noise: Array  # (m, m) measurement noise factor
+    deficit: Array | None = None  # (m,)
+
+
+class Linearisation(NamedTuple):
+    """A way to linearise, as two functions."""
+
+    transition: Callable[[Belief, Motion, Any], Transition]
+    observation: Callable[[Belief, Sensor, Any, Any], Observation]
+
+
+def innovation(z: Any, y: Any) -> tuple[Array, Array]:
+    """Tangent vector from a predicted to a real measurement, and which components are present.
+
+    A component is missing where it is NaN or infinite. Missing numbers are replaced before any
+    arithmetic, so that gradients stay finite.
+    """
+    raw = jax.lax.stop_gradient(manifold.local(z, y))
+    present = jnp.isfinite(raw)
+    filled = jax.tree_util.tree_map(lambda a, b: jnp.where(jnp.isfinite(b), b, a), z, y)
+    return jnp.where(present, manifold.local(z, filled), 0.0), present
+
+
+def _jacobian(g, x):
+    """``g(x)`` and the Jacobian of g between the tangent spaces at x and at g(x)."""
+    value = g(x)
+    origin = jnp.zeros(manifold.dim(x))
+    slope = jax.jacfwd(lambda d: manifold.local(value, g(manifold.retract(x, d))))(origin)
+    return value, slope
+
+
+def taylor() -> Linearisation:
+    """First-order Taylor expansion at the mean: the extended Kalman filter.
+
+    Uses a model's ``linear`` where it has one, else forward-mode automatic differentiation on the
+    manifold.
+    """
+
+    def transition(belief: Belief, motion: Motion, u) -> Transition:
+        if motion.linear is not None:
+            mean, F, noise = motion.linear(belief.mean, u)
+        else:
+            mean, F = _jacobian(lambda x: motion.step(x, u), belief.mean)
+            noise = motion.noise_factor(belief.mean, u)
+        return Transition(mean, F @ belief.factor, linalg.zeros(F.shape[0], 0), noise)
+
+    def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
+        if sensor.linear is not None:
+            z, H = sensor.linear(prior.mean, aux)
+        else:
+            z, H = _jacobian(lambda x: sensor.read(x, aux), prior.mean)
+        residual, present = innovation(z, y)
+        return Observation(
+            sensor.name,
+            residual,
+            present,
+            present,
+            H @ prior.factor,
+            linalg.zeros(sensor.dim, 0),
+            sensor.noise_factor(prior.mean, aux),
+        )
+
+    return Linearisation(transition, observation)
+
+
+class Weights(NamedTuple):
+    """Weights of 2n + 1 symmetric sigma points, centre first (Wan & van der Merwe 2000)."""
+
+    mean: Array  # (2n+1,)
+    covariance: Array  # (2n+1,)
+    reach: float  # c: points lie at m +- c s_i
+
+
+def sigma_weights(n: int, alpha: float, beta: float, kappa: float) -> Weights:
+    """The one place where sigma weights are made.
+
+    Raises:
+        ValueError: n + kappa or alpha is not positive, so that no points exist.
+    """
+    if not (alpha > 0.0 and n + kappa > 0.0):
+        raise ValueError(
+            f"sigma points need alpha > 0 and n + kappa > 0, got alpha = {alpha}, "
+            f"n = {n}, kappa = {kappa}"
+        )
+    c_sq = alpha**2 * (n + kappa)
+    w = 1.0 / (2.0 * c_sq)
+    wm0 = 1.0 - n / c_sq
+    ring = jnp.full(2 * n, w)
+    mean = jnp.concatenate([jnp.array([wm0]), ring])
+    cov = jnp.concatenate([jnp.array([wm0 + 1.0 - alpha**2 + beta]), ring])
+    return Weights(mean, cov, math.sqrt(c_sq))
+
+
+def sigma_points(belief: Belief, reach: float) -> State:
+    """States at the mean, then at +reach and at -reach times each column of the factor.
+
+    Returns:
+        The state's pytree with a leading axis of 2n + 1.
+    """
+    n = belief.factor.shape[0]
+    ring = reach * belief.factor.T
+    offsets = jnp.concatenate([jnp.zeros((1, n)), ring, -ring])
+    return jax.vmap(lambda d: manifold.retract(belief.mean, d))(offsets)
+
+
+def _regress(values: Any, n: int, alpha: float, beta: float, kappa: float):
+    """Mean, spread, excess, deficit of function values at the sigma points (module docstring)."""
+    w = sigma_weights(n, alpha, beta, kappa)
+    ring = 1.0 / (2.0 * w.reach**2)
+    centre = jax.tree_util.tree_map(lambda v: v[0], values)
+
+    def split(origin):
+        d = jax.vmap(lambda v: manifold.local(origin, v))(values)
+        plus, minus = d[1 : n + 1], d[n + 1 :]
+        even = 0.5 * (plus + minus) - d[:1]
+        return d[0], even, (plus - minus) / (2.0 * w.reach)
+
+    offset, even, spread = split(centre)
+    mean = manifold.retract(centre, offset + 2.0 * ring * jnp.sum(even, axis=0))
+    if any(manifold.is_element(x) for x in manifold.leaves(centre)):
+        # On a curved space the deviations are read off about the mean, not about the centre point.
+        _, even, spread = split(mean)
+    b = 2.0 * ring * jnp.sum(even, axis=0)
+
+    lack = beta - alpha**2
+    nu = 2.0 * n * ring
+    root = math.sqrt(2.0 * ring)
+    if lack >= 0.0:
+        columns = [root * even.T] + ([math.sqrt(lack) * b[:, None]] if lack > 0.0 else [])
+        return mean, spread.T, jnp.concatenate(columns, axis=1), None
+    if 1.0 + nu * lack >= 0.0:
+        shift = (1.0 - math.sqrt(1.0 + nu * lack)) / nu  # s of s^2 nu - 2 s = beta - alpha^2
+        return mean, spread.T, root * (even - shift * b[None, :]).T, None
+    return mean, spread.T, root * even.T, math.sqrt(-lack) * b
+
+
+def unscented(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> Linearisation:
+    """Sigma points (Julier & Uhlmann 2004), drawn anew before every prediction and update.
+
+    The defaults use points at +- sqrt(n) standard deviations. ``alpha``, ``beta`` and ``kappa`` are
+    plain numbers without unit; beta >= alpha^2 keeps every covariance a sum of squares. On linear
+    models all of them give the Kalman filter.
+    """
+
+    def transition(belief: Belief, motion: Motion, u) -> Transition:
+        n = belief.factor.shape[0]
+        points = sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach)
+        values = jax.vmap(lambda x: motion.step(x, u))(points)
+        mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
+        return Transition(mean, spread, excess, motion.noise_factor(belief.mean, u), deficit)
+
+    def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
+        n = prior.factor.shape[0]
+        points = sigma_points(prior, sigma_weights(n, alpha, beta, kappa).reach)
+        values = jax.vmap(lambda x: sensor.read(x, aux))(points)
+        z, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
+        residual, present = innovation(z, y)
+        noise = sensor.noise_factor(prior.mean, aux)
+        return Observation(
+            sensor.name, residual, present, present, spread, excess, noise, deficit
+        )
+
+    return Linearisation(transition, observation)
+
+
+def cubature() -> Linearisation:
+    """Third-degree spherical-radial cubature (Arasaratnam & Haykin 2009): 2n equal weights."""
+    return unscented(alpha=1.0, beta=0.0, kappa=0.0)
+
+
+def unscented_transform(
+    belief: Belief,
+    g: Callable[[State], Any],
+    alpha: float = 1.0,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+) -> Belief:
+    """Push a belief through a function, with no noise added: its mean and factor by sigma points."""
+    n = belief.factor.shape[0]
+    values = jax.vmap(g)(sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach))
+    mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
+    factor = linalg.tria(spread, excess)
+    return Belief(mean, factor if deficit is None else linalg.downdate(factor, deficit))

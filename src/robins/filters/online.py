@@ -1,0 +1,77 @@
+"""The same filter, one sample at a time, for benches and programs that live."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+from typing import Any
+
+import jax
+
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.model import Model
+
+
+@partial(jax.jit, static_argnames=("filter_",))
+def _predict(filter_, motion, state, u):
+    return filter_.predict(state, motion, u)
+
+
+@partial(jax.jit, static_argnames=("filter_",))
+def _update(filter_, sensor, state, y, aux):
+    return filter_.update(state, sensor, y, aux)
+
+
+class OnlineFilter:
+    """A filter with a current state; `predict` and `update` are those of a run, compiled.
+
+    Gives the numbers of `robins.filters.run` to rounding.
+
+    Attributes:
+        state: the filter's state; assign to restore a saved one.
+        counts: outcomes of updates so far, by `Code` name.
+    """
+
+    def __init__(self, filter_: Filter, model: Model, start: Belief | FilterState):
+        """Begin at a belief, or go on from a state.
+
+        Args:
+            filter_: from `kalman` and its kin.
+            model: the motion and the sensors.
+            start: initial belief or saved state.
+        """
+        self._filter, self._model = filter_, model
+        self.state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
+        self.counts: Counter[str] = Counter()
+
+    @property
+    def belief(self) -> Belief:
+        """What is believed now."""
+        return self.state.belief
+
+    def predict(self, u: Any = None) -> Prediction:
+        """Move on by one step with input u."""
+        self.state, prediction = _predict(self._filter, self._model.motion, self.state, u)
+        return prediction
+
+    def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
+        """Use a measurement; NaN is missing, per component.
+
+        Args:
+            y: the measurement.
+            sensor: its sensor's name; may be left out where the model has one sensor.
+            aux: what the sensor needs besides the state.
+
+        Raises:
+            KeyError: the model has no sensor of this name.
+            ValueError: no name was given and the model has several sensors.
+        """
+        if sensor is None:
+            if len(self._model.sensors) != 1:
+                raise ValueError(f"name one of the sensors {sorted(self._model.dims)}")
+            sensor = self._model.sensors[0].name
+        chosen = self._model.sensor(sensor)
+        self.state, info = _update(self._filter, chosen, self.state, y, aux)
+        self.counts[Code(int(info.code)).name] += 1
+        return info

@@ -1,0 +1,60 @@
+"""A rule: one published adaptation of the Kalman filter, as four pure hooks.
+
+Rules know nothing of how the model was linearised, and keep what they remember in the filter's
+state, so that a run stays one scan, a batch one `vmap`, and streaming use the same code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.linearise import Observation, Transition
+
+Memory = Any  # a pytree of arrays; its shapes may not change from step to step
+
+
+def _no_memory(belief: Belief, dims: Mapping[str, int]) -> Memory:
+    return ()
+
+
+def _keep_transition(memory: Memory, transition: Transition) -> tuple[Memory, Transition]:
+    return memory, transition
+
+
+def _keep_prior(
+    memory: Memory, prior: Belief, observation: Observation
+) -> tuple[Memory, Belief, Observation]:
+    return memory, prior, observation
+
+
+def _keep_posterior(
+    memory: Memory, posterior: Belief, info: StepInfo
+) -> tuple[Memory, Belief, StepInfo]:
+    return memory, posterior, info
+
+
+class Rule(NamedTuple):
+    """One adaptation; every hook is pure and defaults to identity.
+
+    Attributes:
+        init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension.
+        process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
+            and before the covariance is formed: adapt ``noise``, remember ``spread``.
+        before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
+            reweight or refuse components (``present``), scale ``noise``. A rule that hands back
+            *another* prior has the measurement linearised about it again, keeping the noise and the
+            refusals; one that does not touch the prior must hand back the same object.
+        after: ``(memory, posterior, info) -> (memory, posterior, info)``: inflate, project, learn
+            from the innovation; may add to ``info.notes``.
+        name: prefix of its notes.
+    """
+
+    init: Callable[[Belief, Mapping[str, int]], Memory] = _no_memory
+    process: Callable[[Memory, Transition], tuple[Memory, Transition]] = _keep_transition
+    before: Callable[[Memory, Belief, Observation], tuple[Memory, Belief, Observation]] = (
+        _keep_prior
+    )
+    after: Callable[[Memory, Belief, StepInfo], tuple[Memory, Belief, StepInfo]] = _keep_posterior
+    name: str = "rule"

@@ -1,0 +1,139 @@
+"""The one driver: a whole run is one scan, a batch of runs one `vmap` of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.model import Model
+
+
+class Step(NamedTuple):
+    """One step of a run: predict, then every sensor in the model's order."""
+
+    prediction: Prediction
+    posterior: Belief
+    info: dict[str, StepInfo]  # by sensor
+
+
+class Solution(NamedTuple):
+    """A run: every field has a leading axis of T steps."""
+
+    steps: Any  # what `keep` chose of each Step; by default the Step itself
+    final: FilterState  # after the last step, to go on from
+    log_likelihood: Float[Array, ""]
+
+    @property
+    def mean(self):
+        """Filtered means."""
+        return self.steps.posterior.mean
+
+    @property
+    def covariance(self) -> Array:
+        """(T, n, n) filtered covariances."""
+        return self.steps.posterior.covariance
+
+    @property
+    def sigma(self) -> Array:
+        """(T, n) filtered standard deviations."""
+        return self.steps.posterior.sigma
+
+
+def _everything(step: Step) -> Step:
+    return step
+
+
+def _one_sensor(model: Model, data: Any) -> dict[str, Any]:
+    """Measurements by sensor name; a bare array means the only sensor there is."""
+    if isinstance(data, Mapping):
+        unknown = set(data) - set(model.dims)
+        if unknown:
+            raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
+        return dict(data)
+    if data is None:
+        return {}
+    if len(model.sensors) != 1:
+        raise ValueError(
+            f"this model has {sorted(model.dims)}: give measurements as a dict by sensor name"
+        )
+    return {model.sensors[0].name: data}
+
+
+def _length(y: dict[str, Any], u: Any, aux: dict[str, Any]) -> int:
+    lengths = {int(jnp.shape(leaf)[0]) for leaf in jax.tree_util.tree_leaves((y, u, aux))}
+    if len(lengths) != 1:
+        raise ValueError(f"measurements and inputs must have one length in time, got {lengths}")
+    return lengths.pop()
+
+
+def filter_step(
+    filter_: Filter, model: Model, state: FilterState, u: Any, y: Mapping[str, Any], aux: Any
+) -> tuple[FilterState, Step]:
+    """Predict over one step, then update with each sensor that has a measurement in y."""
+    state, prediction = filter_.predict(state, model.motion, u)
+    info = {}
+    for sensor in model.sensors:
+        if sensor.name in y:
+            extra = aux.get(sensor.name)
+            state, info[sensor.name] = filter_.update(state, sensor, y[sensor.name], extra)
+    return state, Step(prediction, state.belief, info)
+
+
+@partial(jax.jit, static_argnames=("filter_", "keep"))
+def _scan(filter_, model, state, u, y, aux, keep):
+    def body(carry, row):
+        state, total = carry
+        state, step = filter_step(filter_, model, state, *row)
+        gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
+        return (state, total + gained), keep(step)
+
+    (state, total), steps = jax.lax.scan(body, (state, jnp.zeros(())), (u, y, aux))
+    return Solution(steps, state, total)
+
+
+def run(
+    filter_: Filter,
+    model: Model,
+    start: Belief | FilterState,
+    y: Any,
+    u: Any = None,
+    aux: Mapping[str, Any] | None = None,
+    keep: Callable[[Step], Any] = _everything,
+) -> Solution:
+    """Run a filter over measurements: for each step predict, then update with row k of y.
+
+    One compiled scan: batch with `jax.vmap` over any of the data, differentiate with `jax.grad`.
+    A filter, model functions and `keep` that are the same objects, with data of the same shapes,
+    are compiled once.
+
+    Args:
+        filter_: from `kalman` and its kin.
+        model: the motion and the sensors.
+        start: belief before the first prediction, or the state a run ended with, to go on.
+        y: measurements, (T, m) for a model of one sensor, else a dict by sensor name; NaN is
+            missing, per component.
+        u: input of the motion at each step, a pytree of arrays with leading axis T.
+        aux: what sensors need besides the state, by sensor name, leading axis T.
+        keep: what to keep of each `Step`; long campaigns keep little.
+
+    Raises:
+        ValueError: lengths differ, or a measurement names no sensor of the model.
+    """
+    measurements = _one_sensor(model, y)
+    extra = dict(aux or {})
+    length = _length(measurements, u, extra)
+    if u is None and not measurements:
+        raise ValueError(f"nothing to run over: no measurement and no input in {length} steps")
+    as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
+    state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
+    return _scan(
+        filter_, model, as_arrays(state), as_arrays(u), as_arrays(measurements), as_arrays(extra),
+        keep,
+    )

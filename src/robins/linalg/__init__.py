@@ -1,0 +1,47 @@
+"""Small-matrix algebra on square-root factors.
+
+A *factor* of a covariance P is any matrix S with ``S @ S.T == P``. Filters are written against the
+names of this room plus the operators ``@ + - * .T``, and never call ``jnp.linalg`` themselves, so
+that another matrix layout can take the place of `robins.linalg.dense` without touching a filter.
+"""
+
+from robins.linalg.dense import (
+    as_factor,
+    block_factor,
+    cholesky,
+    downdate,
+    eigenvalue_bounds,
+    factor,
+    guard,
+    identity,
+    log_diagonal,
+    solve_lower,
+    solve_lower_transposed,
+    solve_spd,
+    symmetric_root,
+    tria,
+    where,
+    zeros,
+)
+from robins.linalg.systems import steady_state, van_loan
+
+__all__ = [
+    "as_factor",
+    "block_factor",
+    "cholesky",
+    "downdate",
+    "eigenvalue_bounds",
+    "factor",
+    "guard",
+    "identity",
+    "log_diagonal",
+    "solve_lower",
+    "solve_lower_transposed",
+    "solve_spd",
+    "steady_state",
+    "symmetric_root",
+    "tria",
+    "van_loan",
+    "where",
+    "zeros",
+]
