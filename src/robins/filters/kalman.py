@@ -110,7 +110,9 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     used = o.accepted & independent
     dof = jnp.sum(used)
     nis = jnp.sum(whitened**2)
-    log_likelihood = -0.5 * (nis + dof.astype(float) * math.log(2.0 * math.pi)) - linalg.log_diagonal(S_y, used)
+    log_likelihood = -0.5 * (
+        nis + dof.astype(float) * math.log(2.0 * math.pi)
+    ) - linalg.log_diagonal(S_y, used)
     mean = manifold.retract(prior.mean, gain @ residual)
     info = StepInfo(
         innovation=jnp.where(o.present, o.residual, jnp.nan),

@@ -14,8 +14,8 @@ function value into an odd part o_i, which makes the spread, o_i / c, and an eve
 The textbook form sums squares about the mean with weights Wc_0 of either sign and size 1/alpha^2;
 here the cancellation has been done on paper. So no subtraction is left whenever beta >= alpha^2, at
 any alpha; and for beta < alpha^2 a shift of the a_i by s b removes it as long as
-1 + 2 n w (beta - alpha^2) >= 0. Beyond that Omega can be truly indefinite: the update then downdates,
-and says `Code.INDEFINITE` where no covariance is left.
+1 + 2 n w (beta - alpha^2) >= 0. Beyond that Omega can be truly indefinite: the update then takes
+the rest away again, and says `Code.INDEFINITE` where no covariance is left.
 """
 
 from __future__ import annotations
@@ -211,9 +211,7 @@ def unscented(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> Line
         z, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
         residual, present = innovation(z, y)
         noise = sensor.noise_factor(prior.mean, aux)
-        return Observation(
-            sensor.name, residual, present, present, spread, excess, noise, deficit
-        )
+        return Observation(sensor.name, residual, present, present, spread, excess, noise, deficit)
 
     return Linearisation(transition, observation)
 
@@ -230,7 +228,7 @@ def unscented_transform(
     beta: float = 2.0,
     kappa: float = 0.0,
 ) -> Belief:
-    """Push a belief through a function, with no noise added: its mean and factor by sigma points."""
+    """Push a belief through a function, with no noise added, by sigma points."""
     n = belief.factor.shape[0]
     values = jax.vmap(g)(sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach))
     mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)

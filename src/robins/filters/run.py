@@ -134,6 +134,11 @@ def run(
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     return _scan(
-        filter_, model, as_arrays(state), as_arrays(u), as_arrays(measurements), as_arrays(extra),
+        filter_,
+        model,
+        as_arrays(state),
+        as_arrays(u),
+        as_arrays(measurements),
+        as_arrays(extra),
         keep,
     )
