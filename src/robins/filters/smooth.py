@@ -19,7 +19,8 @@ def rts_smoother(solution: Solution) -> Belief:
 
     written as one triangularisation of a sum of squares, so nothing is subtracted. It undoes
     process and measurement noise as the run used them; covariance a rule added in an update
-    (fading, inflation) is not undone, and a run with such rules is smoothed as if it were process noise.
+    (fading, inflation) is not undone: a run with such rules is smoothed as if it were process
+    noise.
 
     Returns:
         Beliefs with leading axis T; the last one is the filter's.
