@@ -190,7 +190,7 @@ def kalman(
         # With nothing to use the belief stands bit for bit, as if there had been no update.
         posterior = _select(jnp.any(seen.accepted), posterior, prior)
         for i, rule in enumerate(rules):
-            memory[i], posterior, info = rule.after(memory[i], posterior, info)
+            memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
         new = FilterState(posterior, tuple(memory))
         ok = _finite(new)
         inputs = (prior, seen.residual, seen.spread, seen.noise)

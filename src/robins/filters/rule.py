@@ -30,7 +30,7 @@ def _keep_prior(
 
 
 def _keep_posterior(
-    memory: Memory, posterior: Belief, info: StepInfo
+    memory: Memory, posterior: Belief, info: StepInfo, observation: Observation
 ) -> tuple[Memory, Belief, StepInfo]:
     return memory, posterior, info
 
@@ -46,8 +46,9 @@ class Rule(NamedTuple):
             reweight or refuse components (``present``), scale ``noise``. A rule that hands back
             *another* prior has the measurement linearised about it again, keeping the noise and the
             refusals; one that does not touch the prior must hand back the same object.
-        after: ``(memory, posterior, info) -> (memory, posterior, info)``: inflate, project, learn
-            from the innovation; may add to ``info.notes``.
+        after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
+            project, learn from the innovation; may add to ``info.notes``. The observation is the
+            one the update used.
         name: prefix of its notes.
     """
 
@@ -56,5 +57,7 @@ class Rule(NamedTuple):
     before: Callable[[Memory, Belief, Observation], tuple[Memory, Belief, Observation]] = (
         _keep_prior
     )
-    after: Callable[[Memory, Belief, StepInfo], tuple[Memory, Belief, StepInfo]] = _keep_posterior
+    after: Callable[[Memory, Belief, StepInfo, Observation], tuple[Memory, Belief, StepInfo]] = (
+        _keep_posterior
+    )
     name: str = "rule"

@@ -1,0 +1,125 @@
+"""Cut a stream of IMU increments into blocks, one per filter epoch.
+
+The IMU runs at hundreds of hertz, the covariance and the aids at a few. A block holds the
+increments between two epochs, padded with increments of zero length, so that a whole log has one
+shape and a run is one scan over blocks with one scan inside. An increment that an epoch falls into
+is split there, so that every measurement meets the state at its own time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation as SciRotation
+
+from robins.ins.increments import Increments
+
+
+class Blocks(NamedTuple):
+    """Increments grouped by epoch."""
+
+    increments: Increments  # dt (E, K), theta (E, K, 3), dv (E, K, 3); padded with zeros
+    epoch_s: np.ndarray  # (E,) time at the end of each block
+    duration_s: np.ndarray  # (E,) length of each block
+    parent: np.ndarray  # (E, K) index of the increment each piece is of; -1 where padded
+
+
+def epochs_between(
+    start_s: float, end_s: float, wanted_s: np.ndarray, longest_s: float
+) -> np.ndarray:
+    """Epochs at all wanted times in (start, end], and between them so that none is too long.
+
+    Args:
+        start_s: where the first block begins.
+        end_s: where the last block ends.
+        wanted_s: times that need an epoch of their own (measurements).
+        longest_s: longest block allowed.
+
+    Returns:
+        (E,) strictly increasing; the last one is end_s.
+    """
+    wanted = np.unique(np.asarray(wanted_s, dtype=float))
+    wanted = wanted[(wanted > start_s) & (wanted <= end_s)]
+    edges = np.unique(np.concatenate([[start_s], wanted, [end_s]]))
+    out = []
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        # a block is split evenly; a hair of tolerance keeps 1.0000001 s from becoming two
+        pieces = max(1, int(np.ceil((b - a) / longest_s - 1e-6)))
+        out.append(a + (b - a) * np.arange(1, pieces + 1) / pieces)
+        out[-1][-1] = b
+    return np.concatenate(out) if out else np.zeros(0)
+
+
+def cut(
+    increments: Increments,
+    time_s: np.ndarray,
+    start_s: float,
+    epoch_s: np.ndarray,
+    width: int | None = None,
+) -> Blocks:
+    """Group increments by epoch, splitting those that an epoch falls into.
+
+    A split increment is shared in proportion to time, at a constant rate within it; the second
+    part's velocity increment is turned into the body axes at its own start.
+
+    Args:
+        increments: N increments; dt (N,), theta (N, 3), dv (N, 3).
+        time_s: (N,) end of each increment; it begins at ``time_s - dt``.
+        start_s: beginning of the first block.
+        epoch_s: (E,) end of each block, increasing.
+        width: pad every block to this many pieces; by default to the longest block, rounded up
+            to a multiple of 8 so that logs of like rate share a compilation.
+
+    Raises:
+        ValueError: the increments do not cover (start_s, last epoch], or width is too small.
+    """
+    dt, theta, dv = (np.asarray(a, dtype=float) for a in increments)
+    time_s, epoch_s = np.asarray(time_s, dtype=float), np.asarray(epoch_s, dtype=float)
+    begin_s = time_s - dt
+    slack = 1e-9
+    if len(dt) == 0 or begin_s[0] > start_s + slack or time_s[-1] < epoch_s[-1] - slack:
+        have = "none" if len(dt) == 0 else f"{begin_s[0]:.6f} to {time_s[-1]:.6f} s"
+        raise ValueError(
+            f"the IMU does not cover the blocks from {start_s:.6f} to {epoch_s[-1]:.6f} s: "
+            f"its increments reach from {have}"
+        )
+    inside = (time_s > start_s) & (begin_s < epoch_s[-1])
+    edges = np.concatenate([[start_s], epoch_s, time_s[inside]])
+    edges = np.unique(edges[(edges >= start_s) & (edges <= epoch_s[-1])])
+    ends, starts = edges[1:], edges[:-1]
+    middle = 0.5 * (starts + ends)
+    parent = np.minimum(np.searchsorted(time_s, middle), len(dt) - 1)
+    # edges that differ only by the rounding of a time stamp are one edge
+    real = (ends - starts) > slack
+    starts, ends, parent = starts[real], ends[real], parent[real]
+
+    share = np.clip((ends - starts) / dt[parent], 0.0, 1.0)
+    before = np.clip((starts - begin_s[parent]) / dt[parent], 0.0, 1.0)
+    whole = share > 1.0 - 1e-6
+    share, before = np.where(whole, 1.0, share), np.where(whole, 0.0, before)
+    piece_theta = share[:, None] * theta[parent]
+    piece_dv = share[:, None] * dv[parent]
+    late = before > 0.0
+    if np.any(late):
+        turn = SciRotation.from_rotvec(-before[late, None] * theta[parent[late]])
+        piece_dv[late] = turn.apply(piece_dv[late])
+
+    block = np.searchsorted(epoch_s, ends - slack)
+    count = np.bincount(block, minlength=len(epoch_s))
+    needed = int(count.max(initial=1))
+    if width is None:
+        width = -(-needed // 8) * 8
+    elif needed > width:
+        raise ValueError(f"a block holds {needed} IMU increments, more than the width {width}")
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    column = np.arange(len(block)) - first[block]
+    shape = (len(epoch_s), width)
+    out_dt, out_theta, out_dv = np.zeros(shape), np.zeros((*shape, 3)), np.zeros((*shape, 3))
+    out_parent = np.full(shape, -1)
+    out_dt[block, column] = share * dt[parent]
+    out_theta[block, column] = piece_theta
+    out_dv[block, column] = piece_dv
+    out_parent[block, column] = parent
+    duration = np.diff(np.concatenate([[start_s], epoch_s]))
+    return Blocks(Increments(out_dt, out_theta, out_dv), epoch_s, duration, out_parent)
