@@ -1,0 +1,147 @@
+"""The documents are true: their examples run, and their docstrings show what was typed."""
+
+import doctest
+import importlib
+import json
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+from plain_docstrings import plain
+
+from robins.results.summary import checked
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "robins"
+BUILT = {"_build", "_generated"}
+FENCE = re.compile(r"^(?P<indent> *)(?P<mark>`{3,}|~{3,})(?P<language>.*)$")
+
+
+def pages() -> list[Path]:
+    inside = (ROOT / "docs").rglob("*.md")
+    kept = [p for p in inside if not BUILT & set(p.relative_to(ROOT).parts)]
+    return sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *kept])
+
+
+def blocks(text: str) -> list[tuple[int, str, str]]:
+    """Fenced blocks of a page: first line number, language, code."""
+    found, opened, code, at = [], None, [], 0
+    for number, line in enumerate(text.splitlines(), 1):
+        fence = FENCE.match(line)
+        if opened is None:
+            if fence:
+                opened, code, at = fence, [], number + 1
+        elif fence and fence["mark"].startswith(opened["mark"]) and not fence["language"].strip():
+            found.append((at, opened["language"].strip(), "\n".join(code)))
+            opened = None
+        else:
+            code.append(line.removeprefix(opened["indent"]))
+    if opened is not None:
+        raise ValueError(f"line {at - 1}: block without an end")
+    return found
+
+
+def execute(page: Path) -> int:
+    """Run a page's ```python blocks in order in one namespace; return how many there are.
+
+    A block that is not to be run says so by its language: `text`, `console`.
+    """
+    namespace = {"__name__": "__main__"}
+    ran = 0
+    for line, language, code in blocks(page.read_text("utf-8")):
+        if language == "python":
+            # Blank lines before it make tracebacks name the line of the page.
+            exec(compile("\n" * (line - 1) + code, page, "exec", dont_inherit=True), namespace)
+            ran += 1
+    return ran
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda p: str(p.relative_to(ROOT)))
+def test_examples_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    try:
+        execute(page)
+    finally:
+        plt.close("all")
+
+
+WITH_RESULTS = [
+    ".".join(("robins", *path.relative_to(SOURCE).with_suffix("").parts))
+    for path in sorted(SOURCE.rglob("*.py"))
+    if ">>> " in path.read_text("utf-8")
+]
+
+
+@pytest.mark.parametrize("name", WITH_RESULTS)
+def test_examples_in_docstrings_give_their_results(name):
+    done = doctest.testmod(importlib.import_module(name))
+    assert done.attempted
+    assert not done.failed
+
+
+def test_the_readme_shows_the_library():
+    languages = [language for _, language, _ in blocks((ROOT / "README.md").read_text("utf-8"))]
+    assert "python" in languages
+
+
+def test_no_example_escapes_by_its_spelling():
+    known = re.compile(r"python|text|console|toml|json|csv|\{(?!code)[\w-]+\}.*")
+    found = {language for p in pages() for _, language, _ in blocks(p.read_text("utf-8"))}
+    assert not {language for language in found if not known.fullmatch(language)}
+
+
+def test_the_documented_summary_is_one():
+    contract = ROOT / "docs" / "contract.md"
+    (shown,) = (
+        json.loads(code) for _, language, code in blocks(contract.read_text()) if language == "json"
+    )
+    made = checked({key: value for key, value in shown.items() if key != "files"})
+    assert list(made) == list(shown)
+    assert made | {"files": shown["files"]} == shown
+
+
+def test_a_failing_example_is_found_at_its_line(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Page\n```python\nx = 1\n```\n```text\nnot code\n```\n1. item\n\n"
+        "   ```python\n   y = x + 1\n   assert y == 3, 'planted'\n   ```\n"
+    )
+    with pytest.raises(AssertionError, match="planted") as caught:
+        execute(page)
+    assert (caught.traceback[-1].path, caught.traceback[-1].lineno + 1) == (page, 12)
+    page.write_text(page.read_text().replace("== 3", "== 2"))
+    assert execute(page) == 2
+
+
+def test_links_between_pages_lead_somewhere():
+    broken = [
+        f"{page.relative_to(ROOT)}: {target}"
+        for page in pages()
+        for target in re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
+        if not (page.parent / target).exists()
+    ]
+    assert not broken
+
+
+@pytest.mark.parametrize(
+    ("typed", "shown"),
+    [
+        ("K* x of |f|, lambda_ and a**2 b**2", r"K\* x of \|f\|, lambda\_ and a\*\*2 b\*\*2"),
+        ("the *doctor*, **never**, `K*`, ``|f|``", "the *doctor*, **never**, `K*`, ``|f|``"),
+        ("`x`s, ``(x, u) -> ``, snake_case_name", r"`x`\ s, ``(x, u) ->``, snake_case_name"),
+        ("* item *x", r"* item \*x"),
+        ("text\n\n    P |x|\n    Q\n\nmore*", "text\n\n::\n\n    P |x|\n    Q\n\nmore\\*"),
+        ("text::\n\n    P*", "text::\n\n    P*"),
+        ("a\n\n    P*\n\n    Q*\n\nb", "a\n\n::\n\n    P*\n\n    Q*\n\nb"),
+        (">>> 2 * 3\n6", ">>> 2 * 3\n6"),
+        ("==  ==\na|  b*\n==  ==", "==  ==\na|  b*\n==  =="),
+        ("- item\n\n  more*", "- item\n\n  more\\*"),
+        (
+            "Args:\n    x: K* y\n        z*\n    w: v",
+            "Args:\n    x: K\\* y\n        z\\*\n    w: v",
+        ),
+    ],
+)
+def test_docstrings_show_what_was_typed(typed, shown):
+    assert "\n".join(plain(typed.split("\n"))) == shown
