@@ -1,0 +1,11 @@
+"""Campaigns: many runs of a problem, in chunks, with statistics that say how sure they are."""
+
+from robins.campaign.monte_carlo import CHUNK, chunks
+from robins.campaign.statistics import (
+    Statistics,
+    collect,
+    mean_with_bounds,
+    rms_with_bounds,
+)
+
+__all__ = ["CHUNK", "Statistics", "chunks", "collect", "mean_with_bounds", "rms_with_bounds"]

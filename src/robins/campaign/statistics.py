@@ -1,0 +1,156 @@
+"""What many runs say together, with the confidence they allow.
+
+Sums are taken chunk by chunk, so a campaign of any size needs the memory of one chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+from scipy import stats
+
+from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
+from robins.systems.system import StateBlock
+
+
+@dataclass
+class Statistics:
+    """Running sums over the runs of one filter; `add` a chunk at a time.
+
+    Attributes:
+        runs: added so far.
+        diverged: runs whose error or covariance stopped being finite; they stay in the count, and
+            every statistic that they touch is infinite rather than flattered.
+        run_rms: (runs, n) root mean square of the error of each run over the epochs counted.
+        example: the record of the first run, for figures.
+    """
+
+    blocks: Sequence[StateBlock]
+    count_from: int = 0  # first epoch that counts for per-run figures
+    runs: int = 0
+    diverged: int = 0
+    example: dict[str, Any] | None = None
+    _square: Any = 0.0
+    _variance: Any = 0.0
+    _nees: Any = 0.0
+    _block_nees: dict[str, Any] = field(default_factory=dict)
+    _nis: dict[str, Any] = field(default_factory=dict)
+    _dof: dict[str, Any] = field(default_factory=dict)
+    _codes: dict[str, dict[int, int]] = field(default_factory=dict)
+    _run_rms: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Take in a chunk as `robins.campaign.chunks` yields it."""
+        error, sigma = record["error"], record["sigma"]
+        if self.example is None:
+            self.example = jax.tree_util.tree_map(lambda x: x[0], record)
+        bad = ~np.all(np.isfinite(error) & np.isfinite(sigma), axis=(1, 2))
+        error = np.where(bad[:, None, None], np.inf, error)
+        self.runs += len(error)
+        self.diverged += int(np.sum(bad))
+        self._square = self._square + np.sum(error**2, axis=0)
+        self._variance = self._variance + np.sum(sigma**2, axis=0)
+        self._nees = self._nees + np.sum(np.where(bad[:, None], np.inf, record["nees"]), axis=0)
+        for name, value in record["block_nees"].items():
+            total = np.sum(np.where(bad[:, None], np.inf, value), axis=0)
+            self._block_nees[name] = self._block_nees.get(name, 0.0) + total
+        for name, value in record["nis"].items():
+            self._nis[name] = self._nis.get(name, 0.0) + np.sum(value, axis=0)
+            self._dof[name] = self._dof.get(name, 0) + np.sum(record["dof"][name], axis=0)
+            kinds, numbers = np.unique(record["code"][name], return_counts=True)
+            tally = self._codes.setdefault(name, {})
+            for kind, number in zip(kinds.tolist(), numbers.tolist(), strict=True):
+                tally[kind] = tally.get(kind, 0) + number
+        self._run_rms.append(np.sqrt(np.mean(error[:, self.count_from :] ** 2, axis=1)))
+
+    @property
+    def rms(self) -> np.ndarray:
+        """(E, n) root mean square error over the runs."""
+        return np.sqrt(self._square / self.runs)
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(E, n) root of the mean variance that the filter states."""
+        return np.sqrt(self._variance / self.runs)
+
+    @property
+    def run_rms(self) -> np.ndarray:
+        """(runs, n)."""
+        return np.concatenate(self._run_rms)
+
+    @property
+    def n(self) -> int:
+        """Tangent dimension."""
+        return self.rms.shape[1]
+
+    @property
+    def codes(self) -> dict[str, dict[int, int]]:
+        """Number of updates by sensor and `robins.filters.Code`."""
+        return self._codes
+
+    def overall_ratio(self) -> np.ndarray:
+        """(n,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
+        start = self.count_from
+        return np.sqrt(np.sum(self._square[start:], 0) / np.sum(self._variance[start:], 0))
+
+    def anees(self) -> np.ndarray:
+        """(E,) average NEES over n."""
+        return self._nees / (self.runs * self.n)
+
+    def block_anees(self) -> dict[str, np.ndarray]:
+        """(E,) average NEES of each block over its size."""
+        size = {b.name: len(b.axes) for b in self.blocks}
+        return {k: v / (self.runs * size[k]) for k, v in self._block_nees.items()}
+
+    def anees_band(self, level: float = 0.95) -> np.ndarray:
+        """(2,) band of `anees`."""
+        return chi2_band(self.n, self.runs, level) / self.n
+
+    def anees_share_inside(self, level: float = 0.95) -> float:
+        """Share of the epochs counted whose ANEES is inside its band."""
+        low, high = self.anees_band(level)
+        value = self.anees()[self.count_from :]
+        return float(np.mean((value >= low) & (value <= high)))
+
+    def nis(self, sensor: str, level: float = 0.95) -> Verdict:
+        """Grand mean NIS of a sensor per degree of freedom, all runs and epochs, and its band."""
+        return grand_mean_nis(self._nis[sensor], self._dof[sensor], level)
+
+    @property
+    def sensors(self) -> list[str]:
+        """Sensors that were used at all."""
+        return [k for k, v in self._dof.items() if np.sum(v) > 0]
+
+
+def collect(
+    records: Iterable[dict[str, Any]], blocks: Sequence[StateBlock], count_from: int = 0
+) -> Statistics:
+    """Statistics of all chunks."""
+    out = Statistics(blocks, count_from)
+    for record in records:
+        out.add(record)
+    return out
+
+
+def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[float, float, float]:
+    """Mean of independent numbers with its Student-t confidence bounds."""
+    values = np.asarray(values, dtype=float)
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return mean, float("nan"), float("nan")
+    half = stats.t.ppf(0.5 + level / 2.0, len(values) - 1) * np.std(values, ddof=1)
+    half = float(half / np.sqrt(len(values)))
+    return mean, mean - half, mean + half
+
+
+def rms_with_bounds(square_means: np.ndarray, level: float = 0.95) -> tuple[float, float, float]:
+    """Root of the mean of per-run mean squares, with bounds from the spread between runs.
+
+    Epochs of one run are correlated, runs are not, so the spread between runs is what counts.
+    """
+    mean, low, high = mean_with_bounds(square_means, level)
+    return float(np.sqrt(mean)), float(np.sqrt(max(low, 0.0))), float(np.sqrt(high))

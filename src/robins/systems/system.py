@@ -1,0 +1,88 @@
+"""What a system offers: scenarios to simulate, logs to replay, filters to compare, claims to check.
+
+The campaign runs any `Problem`, the workbench writes any `Outcome`; neither knows which system it
+came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from robins.filters import Belief, Filter, Model
+from robins.manifold import State
+from robins.scenario import Parameters
+
+Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
+
+
+class StateBlock(NamedTuple):
+    """Some components of the tangent space, under a name."""
+
+    name: str
+    where: slice
+    units: str  # SI
+    display_unit: str  # of figures and metrics
+    frame: str
+    axes: tuple[str, ...]
+
+
+class Case(NamedTuple):
+    """One simulated run: what a filter is given, and what it should find."""
+
+    start: Belief
+    u: Any  # input of the motion, leading axis E epochs
+    y: Mapping[str, Any]
+    aux: Mapping[str, Any]
+    truth: State  # leading axis E
+
+
+class Contender(NamedTuple):
+    """A filter with the model it believes in."""
+
+    filter: Filter
+    model: Model
+
+
+class Problem(NamedTuple):
+    """A simulated scenario, ready to be run any number of times."""
+
+    simulate: Callable[[Array], Case]  # run number (traced) -> case; pure, so it batches
+    contenders: Mapping[str, Contender]
+    epoch_s: np.ndarray  # (E,)
+    blocks: Sequence[StateBlock]
+    context: xr.Dataset  # truth, fixes, outages: what figures show beside the filters
+    metrics: Callable[[Any], dict[str, Any]]  # campaign statistics of a filter -> metrics
+    claims: Callable[[Mapping[str, dict[str, Any]]], list[dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run, a campaign or a replay found."""
+
+    solution: xr.Dataset
+    metrics: dict[str, dict[str, Any]]  # by filter
+    claims: list[dict[str, Any]] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)  # more to put into the result folder
+    notes: list[str] = field(default_factory=list)  # sentences for the reader of the report
+
+
+class System(NamedTuple):
+    """One entry of the registry."""
+
+    name: str
+    summary: str
+    filters: tuple[str, ...]
+    scenarios: Mapping[str, Path]  # packaged scenario files by name
+    claims: tuple[Mapping[str, str], ...]  # {"id", "text"} of what scenarios check
+    parameters: type[Parameters]  # of a simulated scenario
+    problem: Callable[..., Problem]  # (parameters, filters, seed) -> problem
+    replay_parameters: type[Parameters] | None = None
+    replay: Callable[..., Outcome] | None = None  # (paths, parameters, filters, progress)
