@@ -1,0 +1,39 @@
+r"""Scenarios: TOML text with units in strings, read into a checked parameter class.
+
+A system states its parameters as a class; a quantity says its kind, and the text its unit:
+
+    Axes = tuple[float, float, float]
+
+    class Imu(Parameters):
+        rate: Annotated[float, Quantity("frequency", above="0 Hz")]
+        gyro_bias: Annotated[Axes, Quantity("angle rate")] = default("0 deg/h")
+
+    class Drive(Parameters):
+        imu: Imu
+
+    drive = parse(Drive, '[imu]\nrate = "100 Hz"', settings=["imu.gyro_bias=2 deg/h"])
+    drive.imu.gyro_bias  # three times 9.7e-6 rad/s: one text serves all axes
+
+In a scenario a number without its unit is refused; in Python code a number is SI. Whatever is wrong
+with a scenario is one `ScenarioError` with one line a fault: path, value, what is allowed.
+"""
+
+from robins.scenario.errors import ScenarioError
+from robins.scenario.parameters import Parameters, Quantity, default
+from robins.scenario.reading import load, parse, validate
+from robins.scenario.text import hash_of, mapping_of, override, read_text, text_of
+
+__all__ = [
+    "Parameters",
+    "Quantity",
+    "ScenarioError",
+    "default",
+    "hash_of",
+    "load",
+    "mapping_of",
+    "override",
+    "parse",
+    "read_text",
+    "text_of",
+    "validate",
+]
