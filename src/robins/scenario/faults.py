@@ -44,8 +44,7 @@ def _locate(mapping: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], 
         try:
             value = value[step]
         except (KeyError, IndexError, TypeError):
-            absent = i == len(loc) - 1 and isinstance(value, Mapping | list)
-            if not absent:
+            if i < len(loc) - 1 or type(value) not in (dict, list):
                 continue
         path.append(step)
     return path, value
