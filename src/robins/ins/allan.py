@@ -1,0 +1,347 @@
+"""Overlapping Allan deviation of inertial sensor data, with bounds, and the noises in it.
+
+`deviation` estimates, `fit` reads the model off the curve (IEEE Std 952-1997, Annex C): angle or
+velocity random walk N, bias instability B, rate random walk K and, where asked for, quantisation Q
+and rate ramp R. Everything is NumPy and per axis; SI units go through, so for gyros in rad/s
+the coefficients come in rad, rad/sqrt(s), rad/s, rad/s/sqrt(s), rad/s^2.
+
+Bounds and weights rest on one thing, the covariance of the estimates under the noises found in the
+data (`robins.ins.allan_noise`), not on a rule of thumb for white noise.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+from scipy.stats import chi2 as chi_square
+from scipy.stats import norm
+
+from robins.ins.allan_noise import TERMS, Moments, moments
+from robins.units import from_si
+
+_FEWEST_CLUSTERS = 9  # in the longest averages; gives them about ten degrees of freedom
+_PER_DECADE = 10
+_WHITE = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
+_FIELD_UNITS = {  # name -> term, unit; of a ramp, what the sensor drifts in an hour
+    "gyro": {
+        "angle_random_walk": ("N", "deg/sqrt(h)"),
+        "noise_density": ("N", "deg/s/sqrt(Hz)"),
+        "bias_instability": ("B", "deg/h"),
+        "rate_random_walk": ("K", "deg/h/sqrt(h)"),
+        "rate_ramp": ("R", "deg/h"),
+        "quantisation": ("Q", "arcsec"),
+    },
+    "accel": {
+        "velocity_random_walk": ("N", "m/s/sqrt(h)"),
+        "noise_density": ("N", "ug/sqrt(Hz)"),
+        "bias_instability": ("B", "ug"),
+        "acceleration_random_walk": ("K", "ug/sqrt(h)"),
+        "ramp": ("R", "ug"),
+        "quantisation": ("Q", "m/s"),
+    },
+}
+
+
+class Allan(NamedTuple):
+    """Overlapping Allan deviation; T cluster times, A axes."""
+
+    tau_s: np.ndarray  # (T,) cluster times [s]
+    deviation: np.ndarray  # (T, A), unit of the rate
+    lower: np.ndarray  # (T, A) bounds of the two-sided interval of the stated confidence
+    upper: np.ndarray  # (T, A)
+    edf: np.ndarray  # (T, A) equivalent degrees of freedom
+    clusters: np.ndarray  # (T,) cluster sizes in samples
+    n_samples: int
+    dt_s: float
+    confidence: float
+
+
+class Coefficients(NamedTuple):
+    """Coefficients of the noise terms, each (A,), in SI units of the sensor."""
+
+    Q: np.ndarray  # quantisation [rad | m/s]
+    N: np.ndarray  # angle or velocity random walk [rad/sqrt(s) | m/s/sqrt(s)]
+    B: np.ndarray  # bias instability [rad/s | m/s^2]; the flat part of the curve is 0.664 B
+    K: np.ndarray  # rate random walk [rad/s/sqrt(s) | m/s^2/sqrt(s)]
+    R: np.ndarray  # rate ramp [rad/s^2 | m/s^3]
+
+
+class AllanFit(NamedTuple):
+    """Noise terms read off an Allan curve. Terms not asked for are zero with zero interval."""
+
+    value: Coefficients
+    lower: Coefficients  # interval of the confidence asked for; 0 where a term is not resolved
+    upper: Coefficients
+    chi2: np.ndarray  # (A,) weighted squared residual; far above dof: the terms do not explain it
+    dof: int
+    terms: str
+    confidence: float
+
+
+def deviation(
+    rate: ArrayLike,
+    *,
+    dt_s: float | None = None,
+    time_ns: ArrayLike | None = None,
+    clusters: ArrayLike | None = None,
+    confidence: float = 0.95,
+) -> Allan:
+    """Overlapping Allan deviation of evenly sampled rates.
+
+    The interval is ``sigma sqrt(edf / chi2_q(edf))`` at ``q = (1 +- confidence) / 2``, with
+    ``edf = 2 E[V]^2 / var V`` of the variance estimate V under the noises fitted to this very curve
+    (Greenhall and Riley 2003; see `robins.ins.allan_noise`).
+
+    Args:
+        rate: (N,) or (N, A) rates or specific forces; divide increments by their interval.
+        dt_s: sampling interval [s]; or
+        time_ns: (N,) sampling times, from which the interval is taken and gaps are found.
+        clusters: cluster sizes in samples; ten per decade up to a ninth of the record if not given.
+        confidence: of the interval, between 0 and 1.
+
+    Raises:
+        ValueError: neither or both of dt_s and time_ns; a gap, a step back or a repeated time; NaN
+            or infinite data; constant data or a mere drift; too few samples; clusters out of range.
+    """
+    x = np.asarray(rate, float)
+    x = x[:, None] if x.ndim == 1 else x
+    if x.ndim != 2:
+        raise ValueError(f"rate must have shape (N,) or (N, axes), got {np.shape(rate)}")
+    n = len(x)
+    if n < 2 * _FEWEST_CLUSTERS:
+        raise ValueError(
+            f"an Allan deviation needs at least {2 * _FEWEST_CLUSTERS} samples, got {n}"
+        )
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    _refuse_bad_values(x)
+    interval = _interval(dt_s, time_ns, n)
+    sizes = _cluster_sizes(clusters, n)
+
+    variance = np.stack([_variances(axis, sizes) for axis in x.T], axis=-1)
+    # Cluster by cluster: the covariance between clusters is not needed here.
+    single = [moments(m[None], n, interval) for m in sizes]
+    mean = np.concatenate([s.mean for s in single])
+    white = np.concatenate([s.degrees_of_freedom(_WHITE) for s in single])
+    mixes = np.stack([_rough_mix(v, mean, white, np.arange(5)) for v in variance.T])
+    edf = np.concatenate([s.degrees_of_freedom(mixes) for s in single], axis=-1).T
+
+    low, high = (chi_square.ppf((1.0 + s * confidence) / 2.0, edf) for s in (1.0, -1.0))
+    sigma = np.sqrt(variance)
+    lower, upper = sigma * np.sqrt(edf / low), sigma * np.sqrt(edf / high)
+    return Allan(sizes * interval, sigma, lower, upper, edf, sizes, n, interval, confidence)
+
+
+def _variances(rate: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    # Without its mean the running sum stays small; second differences do not see the mean.
+    angle = np.concatenate([[0.0], np.cumsum(rate - rate.mean())])
+    out = np.empty(len(sizes))
+    for i, m in enumerate(sizes):
+        z = angle[2 * m :] - 2.0 * angle[m:-m] + angle[: -2 * m]
+        out[i] = z @ z / (2.0 * m * m * len(z))
+    return out
+
+
+def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
+    """Noise terms of an Allan curve by generalised least squares.
+
+    The Allan variance is linear in the squared coefficients, which are found not negative and
+    with the inverse covariance of the estimates as weight; that covariance, which grows with the
+    variance itself and so makes the fit one of relative (logarithmic) errors, is taken under the
+    terms found, until nothing changes. Neighbouring points of the curve share their data: the
+    covariance knows it, so the intervals are not too short. They hold if the terms explain the
+    curve: look at ``chi2`` against ``dof``.
+
+    Args:
+        allan: from `deviation`.
+        terms: any of Q, N, B, K, R.
+        confidence: of the intervals of the coefficients.
+
+    Raises:
+        ValueError: unknown or repeated terms; a curve too short to tell the terms apart; a curve
+            that fits no noise at all.
+        ArithmeticError: a curve so unlike the terms that the fit does not settle.
+    """
+    if len(set(terms)) != len(terms) or not set(terms) <= set(TERMS) or set(terms) <= {"R"}:
+        raise ValueError(
+            f"terms must be different letters out of {TERMS}, not R alone, got {terms!r}"
+        )
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    _refuse_short_curve(allan, terms)
+    # Sizes closer than this carry next to no news and make the covariance nearly singular.
+    keep = [0]
+    for i, m in enumerate(allan.clusters):
+        if m >= 1.5 * allan.clusters[keep[-1]]:
+            keep.append(i)
+    expected = moments(allan.clusters[keep], allan.n_samples, allan.dt_s)
+    index = np.array(sorted(TERMS.index(t) for t in terms))
+    columns = [_fit_axis(v, expected, index) for v in (allan.deviation[keep] ** 2).T]
+
+    squares, sigmas = (np.stack([c[k] for c in columns], axis=-1) for k in (0, 1))  # (5, A)
+    reach = norm.ppf((1.0 + confidence) / 2.0) * sigmas
+    value, lower, upper = (
+        Coefficients(*np.sqrt(np.maximum(squares + side * reach, 0.0))) for side in (0.0, -1.0, 1.0)
+    )
+    chi2 = np.array([c[2] for c in columns])
+    return AllanFit(value, lower, upper, chi2, len(keep) - len(terms), terms, confidence)
+
+
+class Interval(NamedTuple):
+    """A coefficient of each axis (A,) in a unit of the field, and the bounds of its interval."""
+
+    unit: str
+    value: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def in_field_units(fitted: AllanFit, sensor: Literal["gyro", "accel"]) -> dict[str, Interval]:
+    """The terms of a fit as data sheets tell them.
+
+    White noise is told twice, as random walk and as density: the density here is that of the
+    two-sided spectrum (IEEE Std 952), so 1 deg/sqrt(h) is 1/60 deg/s/sqrt(Hz); a data sheet that
+    means the one-sided spectrum prints sqrt(2) more.
+    """
+    out = {}
+    for name, (term, unit) in _FIELD_UNITS[sensor].items():
+        if term in fitted.terms:
+            per_hour, factor = ("/h", 3600.0) if term == "R" else ("", 1.0)
+            values = (getattr(c, term) for c in (fitted.value, fitted.lower, fitted.upper))
+            out[name] = Interval(unit + per_hour, *(from_si(v, unit) * factor for v in values))
+    return out
+
+
+def _fit_axis(
+    variance: np.ndarray, expected: Moments, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Squared coefficients (5,), their sigmas (5,) and the weighted squared residual."""
+    white = expected.degrees_of_freedom(_WHITE)
+    p = _rough_mix(variance, expected.mean, white, index)
+    for _ in range(100):
+        before = expected.mean @ p
+        p, sigma, chi2 = _weighted_fit(variance, expected, index, p)
+        _refuse_no_noise(p)
+        # Far below what the data can tell, and reached in ten to thirty passes.
+        if np.all(np.abs(expected.mean @ p - before) <= 1e-6 * before):
+            return p, sigma, chi2
+    raise ArithmeticError(
+        f"the fit of terms {[TERMS[i] for i in index]} does not settle: the curve is none of "
+        "theirs; look at it, and ask for other terms"
+    )
+
+
+def _weighted_fit(
+    variance: np.ndarray, expected: Moments, index: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """One pass of `_fit_axis`, weighted by the covariance under the mix p."""
+    root = np.linalg.cholesky(expected.covariance(p))
+    system = np.column_stack([expected.mean[:, index], variance])
+    whitened = solve_triangular(root, system, lower=True)
+    size = np.linalg.norm(whitened[:, :-1], axis=0)
+    design = whitened[:, :-1] / size
+    solution, residual = nnls(design, whitened[:, -1])
+    squares, sigma = np.zeros(5), np.zeros(5)
+    squares[index] = solution / size
+    sigma[index] = np.sqrt(np.diag(np.linalg.inv(design.T @ design))) / size
+    return squares, sigma, residual**2
+
+
+def _rough_mix(
+    variance: np.ndarray, mean: np.ndarray, edf: np.ndarray, index: np.ndarray
+) -> np.ndarray:
+    """Squared coefficients (5,), not negative, that fit with relative weights by edf alone."""
+    design = mean[:, index] * (np.sqrt(edf) / variance)[:, None]
+    size = np.linalg.norm(design, axis=0)
+    p = np.zeros(5)
+    p[index] = nnls(design / size, np.sqrt(edf))[0] / size
+    _refuse_no_noise(p)
+    return p
+
+
+def _refuse_no_noise(p: np.ndarray) -> None:
+    if not p[:4].any():
+        raise ValueError(
+            "there is no noise in the terms that fit best, only a ramp: the data are a drift, or "
+            "the terms asked for are not the ones in the data"
+        )
+
+
+def _cluster_sizes(clusters: ArrayLike | None, n: int) -> np.ndarray:
+    if clusters is None:
+        longest = n // _FEWEST_CLUSTERS
+        count = 1 + int(np.ceil(_PER_DECADE * np.log10(longest))) if longest > 1 else 1
+        return np.unique(np.rint(np.geomspace(1, longest, count)).astype(np.int64))
+    sizes = np.unique(np.asarray(clusters))
+    whole = np.issubdtype(sizes.dtype, np.integer)
+    if sizes.size == 0 or not whole or sizes[0] < 1 or sizes[-1] > n // 2:
+        raise ValueError(
+            f"clusters must be whole numbers of samples from 1 to {n // 2}, half of the {n} "
+            f"samples, got {np.asarray(clusters)}"
+        )
+    return sizes.astype(np.int64)
+
+
+def _interval(dt_s: float | None, time_ns: ArrayLike | None, n: int) -> float:
+    if (dt_s is None) == (time_ns is None):
+        raise ValueError("give either dt_s, the sampling interval, or time_ns, the sampling times")
+    if dt_s is not None:
+        if not (np.isfinite(dt_s) and dt_s > 0.0):
+            raise ValueError(f"dt_s must be a positive number of seconds, got {dt_s}")
+        return float(dt_s)
+    time = np.asarray(time_ns)
+    if time.shape != (n,) or not np.issubdtype(time.dtype, np.integer):
+        raise ValueError(f"time_ns must be {n} integers, got {time.dtype} of shape {time.shape}")
+    step = np.diff(time)
+    nominal = np.median(step)
+    back = np.flatnonzero(step <= 0)
+    if back.size:
+        row = int(back[0]) + 1
+        raise ValueError(
+            f"time does not go forward at row {row} (step {step[row - 1] * 1e-9:g} s): remove "
+            "repeated and misplaced rows before the Allan analysis"
+        )
+    gap = np.flatnonzero(step > 1.5 * nominal)
+    if gap.size:
+        row = int(gap[0]) + 1
+        raise ValueError(
+            f"{gap.size} gap(s) in the data, the first of {step[row - 1] * 1e-9:g} s before row "
+            f"{row} where {nominal * 1e-9:g} s is usual: an Allan deviation needs even sampling; "
+            "use the longest part without gaps"
+        )
+    return float((int(time[-1]) - int(time[0])) * 1e-9 / (n - 1))
+
+
+def _refuse_bad_values(x: np.ndarray) -> None:
+    bad = np.argwhere(~np.isfinite(x))
+    if bad.size:
+        row, axis = bad[0]
+        raise ValueError(
+            f"{len(bad)} value(s) are not finite, the first at row {row}, axis {axis} "
+            f"({x[row, axis]}): an Allan deviation needs whole data; use a part without them"
+        )
+    still = np.flatnonzero(np.ptp(x, axis=0) == 0.0)
+    if still.size:
+        raise ValueError(
+            f"axis {still[0]} is constant at {x[0, still[0]]:g}: there is no noise to analyse; is "
+            "the sensor stuck or the noise below its resolution?"
+        )
+
+
+def _refuse_short_curve(allan: Allan, terms: str) -> None:
+    # Terms are told apart by the slope of the curve: a decade for each but the first.
+    needed = 10 ** (len(terms) - 1)
+    have = allan.clusters[-1] / allan.clusters[0]
+    if have < needed or len(allan.clusters) < len(terms) + 2:
+        record = _FEWEST_CLUSTERS * needed * allan.clusters[0] * allan.dt_s
+        raise ValueError(
+            f"too short for the {len(terms)} terms {terms}: the cluster times span a factor of "
+            f"{have:g} with {len(allan.clusters)} points, and the fit needs a factor of {needed} "
+            f"and {len(terms) + 2} points, that is at least {record:g} s of data at this rate "
+            f"(this record has {allan.n_samples * allan.dt_s:g} s); record longer or ask for fewer "
+            "terms"
+        )
