@@ -16,11 +16,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from robins import _float64  # noqa: F401
 
-_SMALL = 1e-3  # rad^2; below it the series, whose first dropped term is 1e-3^4 / 9! < 1e-17
+_SMALL = 1e-3  # rad^2; below it the series, of which no dropped term exceeds 1e-18
+
+
+_LOCK = 1e-14  # rad from the vertical, about; a unit quaternion is rounded to 3e-16
+
+
+def _same_rank(*arrays):
+    """Leading axes of length one where an array has fewer, for then the rest broadcasts itself."""
+    most = max(a.ndim for a in arrays)
+    return [a.reshape((1,) * (most - a.ndim) + a.shape) for a in arrays]
 
 
 def _sinc_cos(angle_sq):
@@ -47,6 +56,7 @@ def skew(v: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
 
 def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
     """Hamilton product p q: rotate by q first, then by p."""
+    p, q = _same_rank(p, q)
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     return jnp.stack(
@@ -62,7 +72,7 @@ def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array,
 
 def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     """Inverse of a unit quaternion."""
-    return q * jnp.array([1.0, -1.0, -1.0, -1.0])
+    return jnp.concatenate([q[..., :1], -q[..., 1:]], -1)
 
 
 def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -71,7 +81,8 @@ def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
 
 
 def rotate(q: Float[Array, "*#b 4"], v: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
-    """Apply the rotation: ``v_n = rotate(q_nb, v_b)``."""
+    """Turn vectors; with q_nb, body components become navigation components."""
+    q, v = _same_rank(q, v)
     w, u = q[..., :1], q[..., 1:]
     t = 2.0 * jnp.cross(u, v)
     return v + w * t + jnp.cross(u, t)
@@ -132,7 +143,7 @@ def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
 
 def from_euler(roll_rad, pitch_rad, heading_rad) -> Float[Array, "*b 4"]:
     """Quaternion q_nb (NED from FRD): C_nb = Rz(heading) Ry(pitch) Rx(roll)."""
-    args = (jnp.asarray(a) for a in (roll_rad, pitch_rad, heading_rad))
+    args = (jnp.asarray(a, float) for a in (roll_rad, pitch_rad, heading_rad))
     roll, pitch, heading = jnp.broadcast_arrays(*args)
     cr, sr = jnp.cos(roll / 2), jnp.sin(roll / 2)
     cp, sp = jnp.cos(pitch / 2), jnp.sin(pitch / 2)
@@ -149,23 +160,43 @@ def from_euler(roll_rad, pitch_rad, heading_rad) -> Float[Array, "*b 4"]:
 
 
 def to_euler(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
-    """Roll, pitch, heading [rad] of q_nb (NED from FRD).
+    """Roll, pitch, heading [rad] of q_nb (NED from FRD): in [-pi, pi], [-pi/2, pi/2], [-pi, pi].
 
     At pitch = +-90 deg roll and heading are not distinct: roll is then set to zero and the heading
-    takes the whole turn, so the three angles still describe the rotation.
+    takes the whole turn. The angles are found by way of the half sum and the half difference of
+    roll and heading (Bernardes & Viollet 2022), of which only one is lost near the vertical: so
+    they describe the rotation to rounding at every pitch.
     """
-    C = to_dcm(q)
-    sin_pitch = jnp.clip(-C[..., 2, 0], -1.0, 1.0)
-    cos_pitch = jnp.hypot(C[..., 2, 1], C[..., 2, 2])
-    pitch = jnp.arctan2(sin_pitch, cos_pitch)
-    lock = cos_pitch < 1e-12
-    roll = jnp.where(lock, 0.0, jnp.arctan2(C[..., 2, 1], C[..., 2, 2]))
-    heading = jnp.where(
-        lock,
-        jnp.arctan2(-C[..., 0, 1], C[..., 1, 1]),
-        jnp.arctan2(C[..., 1, 0], C[..., 0, 0]),
-    )
-    return roll, pitch, heading
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    # Cosine and sine of (roll - heading)/2 and of (roll + heading)/2, each pair times sqrt(2) and
+    # times the sine of half the angle between the pitch and -90 or +90 deg.
+    nose_up, nose_down = (w + y, x - z), (w - y, x + z)
+    up, difference, at_bottom = _polar(*nose_up)
+    down, total, at_top = _polar(*nose_down)
+    pitch = jnp.arctan2(2.0 * (w * y - x * z), up * down)
+    total = jnp.where(at_top, -difference, total)
+    difference = jnp.where(at_bottom, -total, difference)
+    return _within_half_turn(total + difference), pitch, _within_half_turn(total - difference)
+
+
+def gimbal_lock(q: Float[Array, "*b 4"]) -> Bool[Array, "*b"]:
+    """Whether the pitch is so near +-90 deg that `to_euler` has set the roll to zero."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return _polar(w + y, x - z)[2] | _polar(w - y, x + z)[2]
+
+
+def _polar(c, s):
+    """Length and angle of (c, s) and whether it is too short to have an angle (then both zero)."""
+    length_sq = c * c + s * s
+    short = length_sq < _LOCK**2
+    # Double `where`, as above: the derivatives at the origin are infinite.
+    length = jnp.sqrt(jnp.where(short, 1.0, length_sq))
+    angle = jnp.arctan2(jnp.where(short, 0.0, s), jnp.where(short, 1.0, c))
+    return jnp.where(short, 0.0, length), angle, short
+
+
+def _within_half_turn(angle):
+    return angle - 2.0 * jnp.pi * jnp.round(angle / (2.0 * jnp.pi))
 
 
 @jax.tree_util.register_dataclass
@@ -189,12 +220,12 @@ class Rotation:
     @classmethod
     def from_rotvec(cls, phi) -> Rotation:
         """From a rotation vector [rad]."""
-        return cls(from_rotvec(jnp.asarray(phi)))
+        return cls(from_rotvec(jnp.asarray(phi, float)))
 
     @classmethod
     def from_dcm(cls, C) -> Rotation:
         """From a direction cosine matrix."""
-        return cls(from_dcm(jnp.asarray(C)))
+        return cls(from_dcm(jnp.asarray(C, float)))
 
     @classmethod
     def from_euler(cls, roll_rad, pitch_rad, heading_rad) -> Rotation:
@@ -223,7 +254,7 @@ class Rotation:
 
     def apply(self, v) -> Float[Array, "*b 3"]:
         """Rotate vectors."""
-        return rotate(self.wxyz, jnp.asarray(v))
+        return rotate(self.wxyz, jnp.asarray(v, float))
 
     def retract(self, delta: Float[Array, "*b 3"]) -> Rotation:
         """``exp(delta x) C``, renormalised so that rounding cannot accumulate."""
