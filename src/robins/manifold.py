@@ -2,7 +2,8 @@
 
 A state is any pytree. Its leaves are arrays, which add, and *elements*: objects with ``dim``,
 ``retract(delta)`` and ``local(other)``, such as `robins.rotation.Rotation` or `Angle`. The tangent
-vector of a state stacks those of its leaves in pytree order. With no elements this room costs
+vector of a state stacks those of its leaves in pytree order. An element in a state is one, not
+many; many states are one state under `vmap`. With no elements this room costs
 nothing: `retract` is addition and `local` subtraction.
 
     retract(x, local(x, y)) == y        local(x, retract(x, d)) == d
@@ -63,6 +64,11 @@ def leaves(x: State) -> list[Any]:
     return _leaves(x)[0]
 
 
+def _form(leaf):
+    """What two leaves must share: the class of an element, the shape of an array."""
+    return type(leaf).__name__ if is_element(leaf) else jnp.shape(leaf)
+
+
 def dim(x: State) -> int:
     """Tangent dimension of a single (not batched) state."""
     return sum(leaf.dim if is_element(leaf) else jnp.size(leaf) for leaf in leaves(x))
@@ -90,11 +96,18 @@ def retract(x: State, delta: Float[Array, "n"]) -> State:
 
 
 def local(x: State, y: State) -> Float[Array, "n"]:
-    """The tangent vector that leads from x to y."""
+    """The tangent vector that leads from x to y.
+
+    Raises:
+        ValueError: the states differ in structure, in a kind of element or in the shape of a leaf.
+    """
     xs, tree = _leaves(x)
     ys, other = _leaves(y)
     if tree != other:
         raise ValueError(f"states of different structure: {tree} and {other}")
+    for a, b in zip(xs, ys, strict=True):
+        if _form(a) != _form(b):
+            raise ValueError(f"states of different leaves: {_form(a)} and {_form(b)}")
     parts = [
         a.local(b).reshape(-1) if is_element(a) else jnp.reshape(jnp.asarray(b) - a, -1)
         for a, b in zip(xs, ys, strict=True)
