@@ -1,0 +1,44 @@
+"""Why a result could not be written or read."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+_MENDS = {
+    errno.ENOSPC: "free some space or write elsewhere",
+    errno.EDQUOT: "free some of your quota or write elsewhere",
+    errno.EFBIG: "raise the file size limit (`ulimit -f`) or write elsewhere",
+    errno.EACCES: "choose a folder you may write to",
+    errno.EPERM: "choose a folder you may write to",
+    errno.EROFS: "choose a folder you may write to",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOTDIR: "choose a path whose parents are folders",
+    errno.EEXIST: "choose a path whose parents are folders",
+}
+
+
+class ResultError(Exception):
+    """A result folder was refused, or could not be written.
+
+    Attributes:
+        path: the folder.
+        reason: what is wrong.
+        mend: what to do about it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], reason: str, mend: str):
+        super().__init__(path, reason, mend)
+        self.path, self.reason, self.mend = Path(path), reason, mend
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.reason}; {self.mend}"
+
+
+def cannot(path: str | os.PathLike[str], doing: str, error: Exception) -> ResultError:
+    """The `ResultError` for a failure of the file system or of a library that writes files."""
+    code = error.errno if isinstance(error, OSError) else None
+    why = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    mend = _MENDS.get(code, "check the disk and the permissions") if code else "check the disk"
+    return ResultError(path, f"cannot {doing}: {why or type(error).__name__}", mend)

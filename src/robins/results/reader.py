@@ -1,0 +1,56 @@
+"""Reading a result: whole and unchanged, or refused with the reason."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xarray as xr
+
+from robins.results import folder, manifest, solution, summary
+from robins.results.errors import ResultError, cannot
+
+
+class Result(NamedTuple):
+    """A result read back."""
+
+    path: Path
+    manifest: dict[str, Any]
+    summary: dict[str, Any]
+    solution: xr.Dataset | None  # None for a result without time series
+
+    @property
+    def figures(self) -> dict[str, Path]:
+        """Pictures by name."""
+        return {Path(name).stem: self.path / name for name in self.summary["files"]["figures"]}
+
+    @property
+    def report(self) -> Path | None:
+        """The page, if there is one."""
+        name = self.summary["files"].get("report")
+        return self.path / name if name else None
+
+
+def read(path: str | os.PathLike[str]) -> Result:
+    """Read a result folder and verify every file in it.
+
+    Files in the folder that the manifest does not list are left alone and not looked at.
+
+    Raises:
+        ResultError: there is none, it is incomplete or damaged, or of an unknown version.
+    """
+    where = folder.locate(path)
+    if not where.exists():
+        raise ResultError(path, "does not exist", "name a folder robins wrote")
+    if not where.is_dir():
+        raise ResultError(path, "is not a folder", "name a folder robins wrote")
+    made = manifest.load(where, path)
+    manifest.verify(where, made, path)
+    try:
+        text = (where / "summary.json").read_bytes()
+        dataset = solution.read(where / "solution.nc") if "solution.nc" in made["files"] else None
+    except OSError as error:
+        raise cannot(path, "read the result", error) from error
+    shown = Path(path) if where == folder.resolve(path) else where
+    return Result(shown, made, summary.loads(text), dataset)

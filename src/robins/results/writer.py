@@ -1,0 +1,273 @@
+"""Writing a result: filled in a hidden folder, which takes its place when it is whole."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
+from time import monotonic
+from types import TracebackType
+from typing import Any
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from robins.results import folder, manifest, solution, summary
+from robins.results.errors import ResultError, cannot
+from robins.results.reader import Result
+
+SOLUTION, SUMMARY, REPORT, FIGURES = "solution.nc", "summary.json", "report.html", "figures"
+_OF_THE_DESKTOP = {".DS_Store", "Thumbs.db", "desktop.ini"}  # not put there by a person
+
+
+class ResultWriter:
+    """A result being written; use it as a context manager.
+
+    Leaving the context normally makes the result appear under its name, in place of an earlier one;
+    leaving it by an exception, Ctrl-C included, leaves the earlier one and nothing else.
+
+        with ResultWriter("results/walk", scenario_text=text) as writer:
+            writer.save_solution(dataset)
+            writer.save_summary(summary)
+
+    Args:
+        path: the folder; missing parents are made. A folder there that robins did not write is
+            refused at once, before anything is computed.
+        scenario_text: the scenario as it was read, with what the command line changed.
+        device: what computed it, e.g. "cpu" or the name of an accelerator.
+        command: the command line or call that makes the result again.
+
+    Raises:
+        ResultError: the path cannot or must not be written to; also from every method.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        scenario_text: str = "",
+        device: str = "cpu",
+        command: str = "",
+    ):
+        self.path = Path(path)
+        self.scenario_text, self.device, self.command = scenario_text, device, command
+        self.summary: dict[str, Any] | None = None
+        self.solution: xr.Dataset | None = None
+        self._began = monotonic()
+        _check_replaceable(self.path)
+        try:
+            self._stage = folder.stage(self.path)
+        except OSError as error:
+            raise cannot(self.path, "make the result folder", error) from error
+
+    def save_solution(self, dataset: xr.Dataset) -> None:
+        """Store the time series as `solution.nc`; `robins.results` lists what it holds.
+
+        Raises:
+            ValueError: an array lacks its units, name or frame.
+        """
+        solution.check(dataset)
+        self._write(SOLUTION, solution.pack(dataset))
+        self.solution = dataset
+
+    def save_summary(self, values: Mapping[str, Any]) -> None:
+        """Set what goes into `summary.json`; `files` is filled in, `seconds` if it is not given.
+
+        Raises:
+            TypeError, ValueError: a documented key is missing or wrong, or there are others.
+        """
+        self.summary = summary.checked({"seconds": self.seconds} | dict(values))
+
+    @property
+    def seconds(self) -> float:
+        """Time since the writer was made."""
+        return round(monotonic() - self._began, 3)
+
+    def figure(self, name: str, figure: Figure, dpi: int = 150) -> None:
+        """Store a figure as `figures/NAME.png`."""
+        picture = io.BytesIO()
+        # No software and date tags: the same figure is then the same file.
+        figure.savefig(picture, format="png", dpi=dpi, metadata={"Software": None})
+        self.save_file(f"{FIGURES}/{name}.png", picture.getvalue())
+
+    def save_report(self, html: str) -> None:
+        """Store the page as `report.html`."""
+        self.save_file(REPORT, html.encode())
+
+    def save_file(self, name: str, content: bytes) -> None:
+        """Store anything else, e.g. the trajectory in another program's format.
+
+        Raises:
+            ValueError: the name leads out of the folder or is one of robins' own.
+        """
+        parts = PurePosixPath(name).parts
+        if not parts or PurePosixPath(name).is_absolute() or ".." in parts:
+            raise ValueError(f"{name!r} does not lie inside a result folder")
+        if name in (SOLUTION, SUMMARY, manifest.NAME):
+            raise ValueError(f"{name} is written by robins itself")
+        self._write(name, content)
+
+    def _write(self, name: str, content: bytes) -> None:
+        path = self._stage.path / name
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.unlink(missing_ok=True)  # it may be a link into the earlier result
+            path.write_bytes(content)
+        except OSError as error:
+            raise cannot(self.path, f"write {name}", error) from error
+
+    def commit(self) -> Path:
+        """Make the result appear; the last call.
+
+        Raises:
+            ResultError: no summary was saved, or the disk refused; the earlier result is in place.
+        """
+        if self.summary is None:
+            raise ResultError(self.path, "has no summary", "call save_summary before the commit")
+        self.summary["files"] = self._files()
+        self._write(SUMMARY, summary.dumps(self.summary).encode())
+        made = manifest.make(
+            self._stage.path,
+            scenario=self.summary["scenario"],
+            scenario_text=self.scenario_text,
+            seed=self.summary["seed"],
+            device=self.device,
+            command=self.command,
+        )
+        self._write(manifest.NAME, summary.dumps(made).encode())
+        _check_replaceable(self.path)
+        try:
+            folder.commit(self._stage)
+        except OSError as error:
+            raise cannot(self.path, "put the result in its place", error) from error
+        return self.path
+
+    def _files(self) -> dict[str, Any]:
+        """What the folder holds, by kind, as paths inside it."""
+        here = self._stage.path
+        names = sorted(p.relative_to(here).as_posix() for p in here.rglob("*") if p.is_file())
+        own = {"solution": SOLUTION, "report": REPORT}
+        files: dict[str, Any] = {"summary": SUMMARY, "manifest": manifest.NAME}
+        files |= {kind: name for kind, name in own.items() if name in names}
+        files["figures"] = [name for name in names if name.startswith(f"{FIGURES}/")]
+        known = {SUMMARY, manifest.NAME, *own.values(), *files["figures"]}
+        files["other"] = [name for name in names if name not in known]
+        return files
+
+    def discard(self) -> None:
+        """Remove what was written so far; the earlier result stays as it was."""
+        folder.discard(self._stage)
+
+    def __enter__(self) -> ResultWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if error is None:
+                self.commit()
+        finally:
+            self.discard()  # nothing is left to remove after a commit
+
+
+def write(
+    path: str | os.PathLike[str],
+    values: Mapping[str, Any],
+    dataset: xr.Dataset | None = None,
+    *,
+    figures: Mapping[str, Figure] | None = None,
+    report: str | None = None,
+    scenario_text: str = "",
+    device: str = "cpu",
+    command: str = "",
+) -> Path:
+    """Write a whole result at once: summary, solution, figures by name, page; see `ResultWriter`.
+
+    Raises:
+        ResultError: the path cannot or must not be written to.
+        TypeError, ValueError: the summary or the solution is not as documented.
+    """
+    with ResultWriter(path, scenario_text=scenario_text, device=device, command=command) as writer:
+        writer.save_summary(values)
+        if dataset is not None:
+            writer.save_solution(dataset)
+        for name, figure in (figures or {}).items():
+            writer.figure(name, figure)
+        if report is not None:
+            writer.save_report(report)
+    return Path(path)
+
+
+def extend(result: Result) -> ResultWriter:
+    """A writer that begins with a result's content and will take its place.
+
+    Files are linked, not copied, where the file system can; writing one again replaces the link.
+
+    Raises:
+        ResultError: as for `ResultWriter`.
+    """
+    made = result.manifest
+    writer = ResultWriter(
+        result.path,
+        scenario_text=made["scenario"]["text"],
+        device=made["device"],
+        command=made["command"],
+    )
+    try:
+        for name in made["files"]:
+            _link(result.path / name, writer._stage.path / name)
+    except BaseException as error:
+        writer.discard()
+        if isinstance(error, OSError):
+            raise cannot(result.path, "take the result over", error) from error
+        raise
+    writer.summary, writer.solution = dict(result.summary), result.solution
+    return writer
+
+
+def _link(source: Path, copy: Path) -> None:
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, copy)
+    except OSError:
+        shutil.copyfile(source, copy)
+
+
+def _check_replaceable(path: Path) -> None:
+    """Refuse to put a result where something lies that robins did not write."""
+    target = folder.resolve(path)
+    elsewhere = "choose a new folder"
+    with suppress(FileNotFoundError):
+        if Path.cwd().is_relative_to(target):
+            raise ResultError(path, "is the folder you are in", "choose a folder inside it")
+    if not os.path.lexists(target):
+        return
+    if not target.is_dir():
+        raise ResultError(path, "is a file, not a folder", elsewhere)
+    if os.path.ismount(target):
+        raise ResultError(path, "is a mount point", "choose a folder inside it")
+    try:
+        held = {p.relative_to(target).as_posix() for p in target.rglob("*") if not p.is_dir()}
+        if not any(target.iterdir()):
+            return
+    except OSError as error:
+        raise cannot(path, "look into the folder", error) from error
+    if manifest.NAME not in held:
+        raise ResultError(path, "holds files that are not a result of robins", elsewhere)
+    listed = manifest.listed(target)
+    if listed is None:
+        raise ResultError(path, f"its {manifest.NAME} is not one of robins", elsewhere)
+    foreign = {name for name in held if PurePosixPath(name).name not in _OF_THE_DESKTOP}
+    if foreign := sorted(foreign - listed):
+        raise ResultError(
+            path,
+            f"holds {foreign[0]!r}, which robins did not write, and replacing would delete it",
+            "move that file away or choose a new folder",
+        )
