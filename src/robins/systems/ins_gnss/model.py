@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array
+from robins.ins.increments import Increments
+from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 from robins.earth import earth_rate_n
 from robins.filters import Model, Motion, Sensor
-from robins.ins.increments import Increments
-from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "gnss_position",

@@ -1,0 +1,117 @@
+"""Parameters of INS/GNSS, of a replayed log and of a simulated drive, with units."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, default
+
+Three = tuple[float, float, float]
+
+
+class Imu(Parameters):
+    """The inertial sensors as the filter models them, and how they are mounted.
+
+    The biases are random walks that begin with the stated spread, or first-order Gauss-Markov
+    where a correlation time is given.
+    """
+
+    gyro_noise: Annotated[Three, Quantity("angle random walk", above="0 deg/sqrt(h)")]
+    accel_noise: Annotated[Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")]
+    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")]
+    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
+    gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")]
+    accel_bias_walk: Annotated[Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")]
+    gyro_bias_time: Annotated[float, Quantity("time", above="0 s")] | None = None
+    accel_bias_time: Annotated[float, Quantity("time", above="0 s")] | None = None
+    scale_states: bool = False
+    gyro_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
+    accel_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
+    orientation: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of mount
+
+
+class Gnss(Parameters):
+    """The receiver, its antenna and how far its stated sigmas are believed."""
+
+    lever_arm: Annotated[Three, Quantity("length")] = default("0 m")  # IMU to antenna, body
+    latency: Annotated[float, Quantity("time")] = default("0 s")
+    use_velocity: bool = True
+    # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
+    sigma_factor: dict[str, float] = pydantic.Field(default_factory=dict)
+    least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
+    least_velocity_sigma: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")
+
+
+class Start(Parameters):
+    """How well the start is known, and how the heading is found."""
+
+    tilt: Annotated[float, Quantity("angle", above="0 deg")] = default("2 deg")
+    heading: Annotated[float, Quantity("angle", above="0 deg")] = default("20 deg")
+    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.2 m/s")
+    position: Annotated[float, Quantity("length", above="0 m")] = default("0.1 m")
+    # heading of the body at the start; without it, the course once above the speed
+    known_heading: Annotated[float, Quantity("angle")] | None = None
+    course_speed: Annotated[float, Quantity("speed", above="0 m/s")] = default("1 m/s")
+
+
+class Aids(Parameters):
+    """Knowledge about the motion, used as measurements."""
+
+    zero_velocity: bool = True
+    standstill_velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.01 m/s")
+    standstill_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default(
+        "0.05 deg/s"
+    )
+    # at rest: spread of the samples over the window stays below these
+    window: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.15 m/s^2")
+    quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.5 deg/s")
+    non_holonomic: bool = False
+    axle: Annotated[Three, Quantity("length")] = default("0 m")  # IMU to rear axle, body
+    road_velocity: Annotated[tuple[float, float], Quantity("speed", above="0 m/s")] = default(
+        "0.1 m/s"
+    )
+
+
+class Outages(Parameters):
+    """Times at which the GNSS is withheld, to see how long the inertial solution holds."""
+
+    length: Annotated[float, Quantity("time", above="0 s")]
+    first: Annotated[float, Quantity("time", least="0 s")]  # after the first fix
+    gap: Annotated[float, Quantity("time", above="0 s")]  # between two outages
+    last: Annotated[float, Quantity("time", least="0 s")]  # before the last fix none begins
+
+
+class Update(Parameters):
+    """How the filter steps."""
+
+    longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
+    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
+    # an IMU gap longer than this is declared instead of bridged
+    longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0)] = 30.0  # process noise factor across one
+
+
+class Replay(Parameters):
+    """A recorded log: what cannot be read from the files themselves."""
+
+    title: str = "INS/GNSS replay"
+    imu: Imu
+    gnss: Gnss = pydantic.Field(default_factory=Gnss)
+    start: Start = pydantic.Field(default_factory=Start)
+    aids: Aids = pydantic.Field(default_factory=Aids)
+    update: Update = pydantic.Field(default_factory=Update)
+    outages: Outages | None = None
+    filters: tuple[str, ...] = ("ekf",)
+
+
+class Leg(Parameters):
+    """One command of a drive."""
+
+    do: Literal["stop", "straight", "turn", "accelerate", "climb"]
+    seconds: Annotated[float, Quantity("time", above="0 s")]
+
+
+__all__ = ["Aids", "Gnss", "Imu", "Leg", "Outages", "Replay", "Start", "Update"]

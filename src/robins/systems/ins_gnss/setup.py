@@ -1,0 +1,112 @@
+"""From parameters to what the filter takes: noise, mount, filters, initial belief."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from robins.ins.state import InsNoise, InsState
+
+from robins.earth import Geodetic
+from robins.filters import Belief, Filter, Model, cubature, kalman, taylor, unscented
+from robins.filters.rules import gate
+from robins.rotation import Rotation
+from robins.systems.ins_gnss.model import Mount, ins_gnss_model
+from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start, Update
+from robins.systems.system import StateBlock
+
+FILTERS = {
+    "ekf": lambda rules: kalman(taylor(), rules),
+    "ekf-joseph": lambda rules: kalman(taylor(), rules, form="joseph"),
+    "ukf": lambda rules: kalman(unscented(), rules),
+    "ckf": lambda rules: kalman(cubature(), rules),
+}
+SMOOTHED = "+rts"  # a filter's name with this ending is its smoother
+
+
+def make_filter(name: str, update: Update) -> Filter:
+    """The filter of a name, with the gate where one is asked for.
+
+    Raises:
+        ValueError: there is no filter of this name.
+    """
+    base = name.removesuffix(SMOOTHED)
+    if base not in FILTERS:
+        raise ValueError(
+            f"no filter '{name}'; there are {', '.join(FILTERS)}, each also with {SMOOTHED}"
+        )
+    return FILTERS[base]((gate(update.gate),) if update.gate > 0.0 else ())
+
+
+def noise_of(imu: Imu) -> InsNoise:
+    """Noise of the inertial sensors, SI."""
+    never = jnp.inf
+    return InsNoise(
+        gyro_arw=jnp.asarray(imu.gyro_noise),
+        accel_vrw=jnp.asarray(imu.accel_noise),
+        gyro_bias_rw=jnp.asarray(imu.gyro_bias_walk),
+        accel_bias_rw=jnp.asarray(imu.accel_bias_walk),
+        gyro_bias_tau=jnp.full(3, never if imu.gyro_bias_time is None else imu.gyro_bias_time),
+        accel_bias_tau=jnp.full(3, never if imu.accel_bias_time is None else imu.accel_bias_time),
+    )
+
+
+def model_of(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
+    """The model a filter believes in."""
+    mount = Mount(jnp.asarray(gnss.lever_arm), jnp.asarray(gnss.latency), jnp.asarray(aids.axle))
+    return ins_gnss_model(
+        noise_of(imu),
+        mount,
+        standstill_sigma=jnp.full(3, aids.standstill_velocity),
+        still_rate_sigma=jnp.full(3, aids.standstill_rate),
+        road_sigma=jnp.asarray(aids.road_velocity),
+    )
+
+
+def sigma_of(imu: Imu, start: Start, tilt: float, heading: float) -> np.ndarray:
+    """(n,) standard deviations of the initial state's tangent components."""
+    parts = [
+        [tilt, tilt, heading],
+        [start.velocity] * 3,
+        [start.position] * 3,
+        imu.gyro_bias,
+        imu.accel_bias,
+    ]
+    if imu.scale_states:
+        parts += [imu.gyro_scale, imu.accel_scale]
+    return np.concatenate([np.asarray(p, dtype=float) for p in parts])
+
+
+def belief_at(q_nb, v_n, position: Geodetic, sigma: np.ndarray, imu: Imu, gyro_bias=None) -> Belief:
+    """Initial belief, uncorrelated."""
+    scale = jnp.zeros(3) if imu.scale_states else None
+    mean = InsState(
+        Rotation(jnp.asarray(q_nb)),
+        jnp.asarray(v_n),
+        position,
+        jnp.zeros(3) if gyro_bias is None else jnp.asarray(gyro_bias),
+        jnp.zeros(3),
+        scale,
+        scale,
+    )
+    return Belief(mean, jnp.diag(jnp.asarray(sigma)))
+
+
+NED = ("north", "east", "down")
+XYZ = ("forward", "right", "down")
+
+
+def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:
+    """The tangent components of `InsState` under their names."""
+    blocks = [
+        StateBlock("attitude", slice(0, 3), "rad", "deg", "NED", NED),
+        StateBlock("velocity", slice(3, 6), "m/s", "m/s", "NED", NED),
+        StateBlock("position", slice(6, 9), "m", "m", "NED", NED),
+        StateBlock("gyro_bias", slice(9, 12), "rad/s", "deg/h", "FRD", XYZ),
+        StateBlock("accel_bias", slice(12, 15), "m/s^2", "mg", "FRD", XYZ),
+    ]
+    if scale_states:
+        blocks += [
+            StateBlock("gyro_scale", slice(15, 18), "1", "ppm", "FRD", XYZ),
+            StateBlock("accel_scale", slice(18, 21), "1", "ppm", "FRD", XYZ),
+        ]
+    return tuple(blocks)
