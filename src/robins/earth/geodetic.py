@@ -53,7 +53,7 @@ class Geodetic:
     @classmethod
     def from_ecef(cls, r_e) -> Geodetic:
         """From an Earth-fixed position [m]."""
-        lat, lon, alt = geodetic_from_ecef(r_e)
+        lat, lon, alt = geodetic_from_ecef(jnp.asarray(r_e, float))
         return cls(lat, wrap(lon), alt)
 
     def as_ecef(self) -> Float[Array, "*b 3"]:
