@@ -33,6 +33,14 @@ class StateBlock(NamedTuple):
     axes: tuple[str, ...]
 
 
+class SensorAxes(NamedTuple):
+    """What the components of a sensor's innovation are."""
+
+    units: str
+    frame: str
+    axes: tuple[str, ...]
+
+
 class Case(NamedTuple):
     """One simulated run: what a filter is given, and what it should find."""
 
@@ -57,9 +65,11 @@ class Problem(NamedTuple):
     contenders: Mapping[str, Contender]
     epoch_s: np.ndarray  # (E,)
     blocks: Sequence[StateBlock]
+    sensors: Mapping[str, SensorAxes]
     context: xr.Dataset  # truth, fixes, outages: what figures show beside the filters
     metrics: Callable[[Any], dict[str, Any]]  # campaign statistics of a filter -> metrics
     claims: Callable[[Mapping[str, dict[str, Any]]], list[dict[str, Any]]]
+    count_from: int = 0  # first epoch that counts for figures pooled over time
 
 
 @dataclass(frozen=True)

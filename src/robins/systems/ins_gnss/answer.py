@@ -15,14 +15,12 @@ from robins.filters import Code
 from robins.filters.consistency import grand_mean_nis
 from robins.manifold import leaves
 from robins.results import variable
-from robins.systems.ins_gnss import model as names
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.replay import Navigated, Prepared, navigate, prepare
-from robins.systems.ins_gnss.setup import NED, SMOOTHED, state_blocks
+from robins.systems.ins_gnss.setup import SENSORS, SMOOTHED, state_blocks
 from robins.systems.system import Outcome, Progress
+from robins.systems.tables import Seen, innovation_tables
 
-AXES = {names.ROAD: ("right", "down"), names.STILL_RATE: ("forward", "right", "down")}
-UNITS = {names.POSITION: "m", names.STILL_RATE: "rad/s"}
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
@@ -117,10 +115,8 @@ def replay_solution(
         )
     data |= _fixes(prepared)
     coords["gnss_time"] = variable("gnss_time", prepared.gnss_s, "s", "time of the fixes")
-    causal = {k: a for k, a in answers.items() if not k.endswith(SMOOTHED)}
-    if causal:
-        _innovations(data, coords, causal, list(answers))
-    return xr.Dataset(data, coords)
+    more, places = innovation_tables(_seen(answers), SENSORS, prepared.blocks.epoch_s)
+    return xr.Dataset(data | more, coords | places)
 
 
 def _estimate(answer: Navigated, block: str) -> np.ndarray:
@@ -151,49 +147,30 @@ def _fixes(prepared: Prepared) -> dict[str, Any]:
     return out
 
 
-def _innovations(data, coords, causal: dict[str, Navigated], everyone: list[str]) -> None:
-    """Innovations at the epochs a sensor spoke; a smoother has none and gets NaN."""
-    first = next(iter(causal.values())).solution.steps.info
-    for sensor in first:
-        spoke = np.any(np.isfinite(np.asarray(first[sensor].innovation)), axis=1)
-        if not np.any(spoke):
-            continue
-        time, axis = f"{sensor}_time", f"axis_{sensor}"
-        epoch = np.asarray(coords["time"].values)[spoke]
-        coords[time] = variable(time, epoch, "s", f"time of {sensor.replace('_', ' ')}")
-        labels = AXES.get(sensor, NED)
-        coords[axis] = list(labels)
-        unit = UNITS.get(sensor, "m/s")
+def _seen(answers: dict[str, Navigated]) -> dict[str, Seen]:
+    """Innovations by sensor; a smoother has none, so its rows are NaN."""
+    causal = [name for name in answers if not name.endswith(SMOOTHED)]
+    if not causal:
+        return {}
 
-        def rows(pick, width=None, s=sensor, on=spoke):
-            shape = (int(np.sum(on)),) if width is None else (int(np.sum(on)), width)
-            blank = np.full(shape, np.nan)
-            return np.stack(
-                [
-                    np.asarray(pick(causal[k].solution.steps.info[s]), float)[on]
-                    if k in causal
-                    else blank
-                    for k in everyone
-                ]
-            )
+    def of(pick: Any, sensor: str) -> np.ndarray:
+        rows = {
+            name: np.asarray(pick(answers[name].solution.steps.info[sensor]), dtype=float)
+            for name in causal
+        }
+        blank = np.full_like(rows[causal[0]], np.nan)
+        return np.stack([rows.get(name, blank) for name in answers])
 
-        dims = ("filter", time)
-        frame = "FRD" if sensor in AXES else "NED"
-        name = sensor.replace("_", " ")
-        wide = len(labels)
-        data[f"innovation_{sensor}"] = variable(
-            (*dims, axis), rows(lambda i: i.innovation, wide), unit, f"innovation of {name}", frame
+    return {
+        k: Seen(
+            of(lambda i: i.innovation, k),
+            of(lambda i: i.sigma, k),
+            of(lambda i: i.nis, k),
+            of(lambda i: i.dof, k),
+            of(lambda i: i.code == int(Code.REFUSED), k),
         )
-        data[f"innovation_sigma_{sensor}"] = variable(
-            (*dims, axis), rows(lambda i: i.sigma, wide), unit, f"innovation bound of {name}", frame
-        )
-        data[f"nis_{sensor}"] = variable(dims, rows(lambda i: i.nis), "1", f"NIS of {name}")
-        data[f"nis_dof_{sensor}"] = variable(
-            dims, rows(lambda i: i.dof), "1", f"degrees of freedom of {name}"
-        )
-        data[f"refused_{sensor}"] = variable(
-            dims, rows(lambda i: i.code == int(Code.REFUSED)), "1", f"{name} refused by the gate"
-        )
+        for k in answers[causal[0]].solution.steps.info
+    }
 
 
 def replay(

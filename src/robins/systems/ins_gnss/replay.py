@@ -6,6 +6,7 @@ simulated outage withholds, and all others of the best quality, are the referenc
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -55,8 +56,6 @@ def rotated(imu: ImuTable, orientation_rad: tuple[float, float, float]) -> ImuTa
     if not any(orientation_rad):
         return imu
     C = np.asarray(Rotation.from_euler(*orientation_rad).as_dcm())
-    from dataclasses import replace
-
     return replace(imu, gyro=imu.gyro @ C.T, accel=imu.accel @ C.T)
 
 
@@ -70,7 +69,7 @@ def outage_mask(time_s: np.ndarray, first_s: float, last_s: float, outages: Outa
 
 
 def fix_sigmas(gnss: GnssTable, parameters: Replay) -> tuple[np.ndarray, np.ndarray | None]:
-    """Sigmas the filter believes: those stated, times the factor of their quality, not too small."""
+    """Sigmas the filter believes: those stated, times the factor of their quality."""
     g = parameters.gnss
     factor = np.ones(len(gnss))
     if gnss.quality is not None:

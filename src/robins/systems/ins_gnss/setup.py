@@ -10,9 +10,17 @@ from robins.earth import Geodetic
 from robins.filters import Belief, Filter, Model, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
 from robins.rotation import Rotation
-from robins.systems.ins_gnss.model import Mount, ins_gnss_model
+from robins.systems.ins_gnss.model import (
+    POSITION,
+    ROAD,
+    STANDSTILL,
+    STILL_RATE,
+    VELOCITY,
+    Mount,
+    ins_gnss_model,
+)
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start, Update
-from robins.systems.system import StateBlock
+from robins.systems.system import SensorAxes, StateBlock
 
 FILTERS = {
     "ekf": lambda rules: kalman(taylor(), rules),
@@ -93,6 +101,13 @@ def belief_at(q_nb, v_n, position: Geodetic, sigma: np.ndarray, imu: Imu, gyro_b
 
 NED = ("north", "east", "down")
 XYZ = ("forward", "right", "down")
+SENSORS = {
+    POSITION: SensorAxes("m", "NED", NED),
+    VELOCITY: SensorAxes("m/s", "NED", NED),
+    STANDSTILL: SensorAxes("m/s", "NED", NED),
+    STILL_RATE: SensorAxes("rad/s", "FRD", XYZ),
+    ROAD: SensorAxes("m/s", "FRD", XYZ[1:]),
+}
 
 
 def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:

@@ -1,0 +1,54 @@
+"""Labelled time series that replays and campaigns share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins.results import variable
+from robins.systems.system import SensorAxes
+
+
+class Seen(NamedTuple):
+    """What the filters saw of one sensor; leading axes are filter and epoch, NaN where nothing."""
+
+    innovation: np.ndarray  # (F, E, m)
+    sigma: np.ndarray  # (F, E, m)
+    nis: np.ndarray  # (F, E)
+    dof: np.ndarray  # (F, E)
+    refused: np.ndarray  # (F, E)
+
+
+def innovation_tables(
+    seen: Mapping[str, Seen], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Variables and coordinates of a solution, at the epochs where each sensor spoke.
+
+    Args:
+        seen: by sensor.
+        axes: by sensor, units and names of the innovation's components.
+        epoch_s: (E,) time of each epoch.
+    """
+    data: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    for sensor, s in seen.items():
+        spoke = np.any(np.isfinite(s.innovation), axis=(0, 2))
+        if not np.any(spoke):
+            continue
+        time, axis, words = f"{sensor}_time", f"axis_{sensor}", sensor.replace("_", " ")
+        units, frame, labels = axes[sensor]
+        coords[time] = variable(time, epoch_s[spoke], "s", f"time of {words}")
+        coords[axis] = list(labels)
+        ft, fta = ("filter", time), ("filter", time, axis)
+        rows = {
+            f"innovation_{sensor}": (fta, s.innovation, units, f"innovation of {words}", frame),
+            f"innovation_sigma_{sensor}": (fta, s.sigma, units, f"expected {words}", frame),
+            f"nis_{sensor}": (ft, s.nis, "1", f"NIS of {words}"),
+            f"nis_dof_{sensor}": (ft, s.dof, "1", f"degrees of freedom of {words}"),
+            f"refused_{sensor}": (ft, s.refused, "1", f"{words} refused by a rule"),
+        }
+        for name, (dims, values, *words_) in rows.items():
+            data[name] = variable(dims, values[:, spoke], *words_)
+    return data, coords
