@@ -207,10 +207,15 @@ def _nearest(symbol: str, among: Iterable[str]) -> str | None:
 
 def _likely(symbol: str, among: tuple[str, ...]) -> str:
     """The unit of a kind that was probably meant by one of another kind."""
-    # deg/h for deg/sqrt(h) is near in spelling; ug for ug/sqrt(Hz), deg/s for deg by its beginning.
-    begun = [s for s in among if s.startswith(f"{symbol}/")]
-    begun += [s for s in among if symbol.startswith(f"{s}/")]
-    return _nearest(symbol, among) or (begun or list(among))[0]
+
+    def rootless(s: str) -> str:
+        return re.sub(r"sqrt\((\w+)\)", r"\1", s)
+
+    # deg/h for deg/sqrt(h); then what is near in spelling; then ug for ug/sqrt(Hz), deg for deg/s.
+    root = [s for s in among if rootless(s) == rootless(symbol)]
+    near = _nearest(symbol, root or among)
+    begun = [s for s in among if s.startswith(f"{symbol}/") or symbol.startswith(f"{s}/")]
+    return near or (begun or list(among))[0]
 
 
 def unit(symbol: str, kind: str | None = None) -> Unit:
