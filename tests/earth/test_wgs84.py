@@ -9,10 +9,11 @@ import pytest
 from robins.earth import wgs84
 
 # One unit in the last place of an Earth-fixed coordinate is 0.93e-9 m. Sines, products and a
-# square root cost a few of these, here as in PROJ: so the error is below 1e-9 m root mean square,
-# and its worst case is held to four units.
+# square root cost a few of these: so the error is below 1e-9 m root mean square, and its worst case
+# is held to four units. PROJ has as many of its own.
 RMS_M = 1e-9
 WORST_M = 4 * np.spacing(wgs84.A_M)
+ORACLES = {"exact": WORST_M, "proj": 2 * WORST_M}
 
 to_ecef = jax.jit(wgs84.ecef_from_geodetic)
 to_geodetic = jax.jit(wgs84.geodetic_from_ecef)
@@ -63,7 +64,7 @@ def test_ecef_is_that_of_proj_and_of_extended_precision():
     ):
         error = np.abs(got - expected).astype(float)
         assert rms(error) < RMS_M, name
-        assert error.max() <= WORST_M, name
+        assert error.max() <= ORACLES[name], name
 
 
 def test_geodetic_coordinates_lead_back_to_the_place():
@@ -77,7 +78,7 @@ def test_geodetic_coordinates_lead_back_to_the_place():
     ):
         error = np.abs(back - r).astype(float)
         assert rms(error) < RMS_M, name
-        assert error.max() <= WORST_M, name
+        assert error.max() <= ORACLES[name], name
     np.testing.assert_allclose(alt, ALT, atol=WORST_M, rtol=0)
     # Latitude is known to the rounding of r and of itself, which is coarser above 1 rad.
     np.testing.assert_allclose(lat, LAT, atol=WORST_M / wgs84.A_M, rtol=0)
