@@ -65,7 +65,7 @@ class Quantity:
         if Ellipsis in items:
             return each
 
-        def on_each_axis(value: Any, info: core_schema.ValidationInfo) -> Any:
+        def on_each_axis(value, info):
             if isinstance(value, str | int | float):
                 self.read(value, unit_needed=info.mode == "json")  # one slip, one message
                 return (value,) * len(items)
