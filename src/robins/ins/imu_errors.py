@@ -1,0 +1,304 @@
+"""Error models of inertial sensors: what is wrong with a triad of gyros or accelerometers.
+
+Each sample of a triad is taken to be (Groves 2013, section 4.4; Titterton & Weston 2004, chapters 4
+and 6)::
+
+    measured = (I + S + M) true + bias + G f + noise,        then clipped, then quantised
+
+with scale factor errors S, misalignments M, and for gyros a sensitivity G to the specific force f.
+The bias is the sum of a constant that changes from one switching on to the next, a first-order
+Gauss-Markov process, a random walk and a ramp; the noise is white. This module describes, from SI
+numbers, data sheets, an Allan fit or by grade, and says in closed form what to expect;
+`robins.sim.imu_sensor` draws.
+
+Units are SI, per axis: [y] stands for rad/s of a gyro and m/s^2 of an accelerometer.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robins import _float64  # noqa: F401
+from robins.ins.allan import AllanFit
+from robins.units import UnitError, parse
+
+MARKOV_PEAK = 0.6173642831
+"""Largest Allan deviation of a Gauss-Markov process over its sigma, at 1.893 correlation times."""
+
+FLICKER_FLAT = float(np.sqrt(2.0 * np.log(2.0) / np.pi))
+"""Allan deviation of flicker noise over its coefficient B, 0.664 (IEEE Std 952)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TriadErrors:
+    """Errors of three gyros or three accelerometers; None: the sensor has no such error.
+
+    Sigmas are one sigma of what is drawn anew in each run. A number stands for all three axes, of a
+    matrix for all elements that can differ from zero (of a given ``g_sensitivity``: the diagonal).
+    A model is a pytree: which errors there are is its structure, how large they are its leaves, so
+    models of one structure can be stacked, mapped over and traced. Values that are known are
+    checked when a model is written, not inside compiled code.
+
+    Raises:
+        ValueError: a wrong shape, a value not finite, a negative sigma, a size not positive, a
+            misalignment with a diagonal, a Markov process without sigma or correlation time.
+    """
+
+    bias: Any = None  # (3,) [y], the same in every run
+    bias_sigma: Any = None  # (3,) [y], from one switching on to the next
+    markov_sigma: Any = None  # (3,) [y], stationary sigma of the Gauss-Markov bias
+    markov_tau_s: Any = None  # (3,) s, its correlation time
+    walk: Any = None  # (3,) [y]/sqrt(s), random walk of the bias, K
+    ramp: Any = None  # (3,) [y]/s, steady drift of the bias
+    white: Any = None  # (3,) [y] sqrt(s), angle or velocity random walk, N
+    scale: Any = None  # (3,) relative, the same in every run
+    scale_sigma: Any = None  # (3,) relative
+    misalignment: Any = None  # (3, 3) rad, zero diagonal: axis i sees M[i, j] of axis j
+    misalignment_sigma: Any = None  # (3, 3) rad, zero diagonal
+    g_sensitivity: Any = None  # (3, 3) [y]/(m/s^2), of gyros
+    g_sensitivity_sigma: Any = None  # (3, 3) [y]/(m/s^2), of gyros
+    full_scale: Any = None  # (3,) [y], larger magnitudes are clipped
+    quantum: Any = None  # (3,) [y] s, one count of the increments; the rest is carried over
+
+    def __post_init__(self):
+        for name in _FIELDS:
+            object.__setattr__(self, name, _checked(name, getattr(self, name)))
+        if (self.markov_sigma is None) != (self.markov_tau_s is None):
+            raise ValueError("markov_sigma and markov_tau_s belong together: give both or neither")
+
+    @classmethod
+    def from_allan(cls, fit: AllanFit, correlation_time_s: float | None = None) -> TriadErrors:
+        """White noise, random walk, ramp, quantisation and Markov bias of an Allan fit of 3 axes.
+
+        Terms whose interval reaches zero are not resolved by the data and left out. Flicker noise
+        has no finite model: the bias instability becomes a Gauss-Markov process whose Allan
+        deviation peaks at the flat part of the fit, where a correlation time is given.
+
+        Raises:
+            ValueError: a fit of another number of axes; a correlation time that is not positive.
+        """
+        if np.shape(fit.value.N) != (3,):
+            raise ValueError(f"a triad has three axes, the fit has {np.shape(fit.value.N)}")
+
+        def resolved(term: str, factor: float) -> np.ndarray | None:
+            seen = getattr(fit.lower, term) > 0.0
+            return np.where(seen, getattr(fit.value, term) * factor, 0.0) if seen.any() else None
+
+        flicker = None
+        if correlation_time_s is not None:
+            flicker = resolved("B", FLICKER_FLAT / MARKOV_PEAK)
+        return cls(
+            white=resolved("N", 1.0),
+            walk=resolved("K", 1.0),
+            ramp=resolved("R", 1.0),
+            quantum=resolved("Q", np.sqrt(12.0)),
+            markov_sigma=flicker,
+            markov_tau_s=None if flicker is None else correlation_time_s,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ImuErrorModel:
+    """Errors of an inertial measurement unit: those of its gyros and of its accelerometers.
+
+    Raises:
+        ValueError: accelerometers with a g-sensitivity (theirs is the scale factor).
+    """
+
+    gyro: TriadErrors = field(default_factory=TriadErrors)
+    accel: TriadErrors = field(default_factory=TriadErrors)
+
+    def __post_init__(self):
+        if self.accel.g_sensitivity is not None or self.accel.g_sensitivity_sigma is not None:
+            raise ValueError("g_sensitivity is an error of gyros; for accelerometers give a scale")
+
+    @classmethod
+    def from_datasheet(
+        cls, gyro: Mapping[str, Any] | None = None, accel: Mapping[str, Any] | None = None
+    ) -> ImuErrorModel:
+        """Model from the figures of a data sheet, numbers with units.
+
+        >>> model = ImuErrorModel.from_datasheet(
+        ...     gyro={"noise": "0.1 deg/sqrt(h)", "bias": "10 deg/h"},
+        ...     accel={"noise": "50 ug/sqrt(Hz)", "scale_factor": "300 ppm"},
+        ... )
+
+        Each figure is a text, or three of them for the three axes:
+
+        - ``bias``: one sigma from one switching on to the next (repeatability);
+        - ``bias_instability``, the lowest point of the Allan deviation, with ``correlation_time``:
+          a Gauss-Markov process whose Allan deviation peaks at that figure;
+        - ``noise``: angle or velocity random walk, or the density (``arw`` and ``vrw`` also do);
+        - ``rate_random_walk``, ``drift_per_hour`` (of the bias), ``scale_factor``,
+          ``misalignment``, ``g_sensitivity`` (gyros), ``quantisation`` (of increments),
+          ``full_scale``.
+
+        Raises:
+            ValueError: an unknown or repeated figure; an instability without correlation time.
+            robins.units.UnitError: a figure without unit or with that of something else.
+        """
+        return cls(_from_figures("gyro", gyro or {}), _from_figures("accel", accel or {}))
+
+
+_FIELDS = tuple(f.name for f in dataclasses.fields(TriadErrors))
+_MATRICES = ("misalignment", "misalignment_sigma", "g_sensitivity", "g_sensitivity_sigma")
+_SIGNED = ("bias", "ramp", "scale", "misalignment", "g_sensitivity")
+_POSITIVE = ("markov_tau_s", "full_scale")
+
+
+def _register(cls: type) -> None:
+    # Not `register_dataclass`, which would run the checks on JAX's stand-ins and on tracers.
+    names = tuple(f.name for f in dataclasses.fields(cls))
+
+    def flatten(model: Any) -> tuple[tuple[Any, ...], None]:
+        keys = (jax.tree_util.GetAttrKey(name) for name in names)
+        return tuple((key, getattr(model, key.name)) for key in keys), None
+
+    def unflatten(_: None, values: Iterable[Any]) -> Any:
+        model = object.__new__(cls)
+        for name, value in zip(names, values, strict=True):
+            object.__setattr__(model, name, value)
+        return model
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+
+
+_register(TriadErrors)
+_register(ImuErrorModel)
+
+
+def _checked(name: str, value: Any) -> Any:
+    if value is None:
+        return None
+    traced = isinstance(value, jax.Array)
+    x = (jnp if traced else np).asarray(value, float)
+    shape = (3, 3) if name in _MATRICES else (3,)
+    if x.shape not in ((), shape):
+        raise ValueError(f"{name} must be a number or of shape {shape}, got shape {x.shape}")
+    if x.shape == ():
+        x = (jnp if traced else np).broadcast_to(x, shape) * _pattern(name)
+    if traced:
+        return x
+    if not np.all(np.isfinite(x)):
+        raise ValueError(f"{name} must be finite, got {value}; None stands for no such error")
+    if name not in _SIGNED and np.any(x < 0.0):
+        raise ValueError(f"{name} must not be negative, got {value}")
+    if name in _POSITIVE and np.any(x == 0.0):
+        raise ValueError(f"{name} must be positive, got {value}; None stands for no such error")
+    if name.startswith("misalignment") and np.any(np.diag(x) != 0.0):
+        raise ValueError(f"{name} has a diagonal, {np.diag(x)}: that part is a scale factor error")
+    return x
+
+
+def _pattern(name: str) -> Any:
+    """Elements a single number stands for."""
+    if name.startswith("misalignment"):
+        return np.ones((3, 3)) - np.eye(3)
+    return np.eye(3) if name == "g_sensitivity" else 1.0
+
+
+_FIGURES = {  # figure -> (field, kind for gyros, kind for accelerometers, factor into SI)
+    "bias": ("bias_sigma", "angle rate", "specific force", 1.0),
+    "bias_instability": ("markov_sigma", "angle rate", "specific force", 1.0 / MARKOV_PEAK),
+    "correlation_time": ("markov_tau_s", "time", "time", 1.0),
+    "noise": ("white", "angle random walk", "velocity random walk", 1.0),
+    "arw": ("white", "angle random walk", None, 1.0),
+    "vrw": ("white", None, "velocity random walk", 1.0),
+    "rate_random_walk": ("walk", "rate random walk", "acceleration random walk", 1.0),
+    "drift_per_hour": ("ramp", "angle rate", "specific force", 1.0 / 3600.0),
+    "scale_factor": ("scale_sigma", "scale factor", "scale factor", 1.0),
+    "misalignment": ("misalignment_sigma", "angle", "angle", 1.0),
+    "g_sensitivity": ("g_sensitivity_sigma", "g-sensitivity", None, 1.0),
+    "quantisation": ("quantum", "angle", "speed", 1.0),
+    "full_scale": ("full_scale", "angle rate", "specific force", 1.0),
+}
+
+
+def _from_figures(sensor: str, figures: Mapping[str, Any]) -> TriadErrors:
+    known = {
+        figure: (name, kind, factor)
+        for figure, (name, of_gyro, of_accel, factor) in _FIGURES.items()
+        if (kind := of_gyro if sensor == "gyro" else of_accel) is not None
+    }
+    values: dict[str, Any] = {}
+    for figure, text in figures.items():
+        if figure not in known:
+            near = difflib.get_close_matches(figure, known, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise ValueError(f"{sensor}: no figure {figure!r}{hint} (known: {', '.join(known)})")
+        name, kind, factor = known[figure]
+        if name in values:
+            raise ValueError(f"{sensor}.{figure}: {name} is given twice, by two figures")
+        try:
+            if isinstance(text, list | tuple):
+                values[name] = factor * np.array([parse(t, kind) for t in text])
+            else:
+                values[name] = factor * parse(text, kind)
+        except UnitError as error:
+            raise UnitError(f"{sensor}.{figure}: {error}") from None
+    if ("bias_instability" in figures) != ("correlation_time" in figures):
+        raise ValueError(f"{sensor}: bias_instability and correlation_time belong together")
+    try:
+        return TriadErrors(**values)
+    except ValueError as error:
+        raise ValueError(f"{sensor}: {error}") from None
+
+
+def allan_deviation(errors: TriadErrors, tau_s: ArrayLike | float) -> np.ndarray:
+    """Allan deviation (T, 3) that the model predicts for a sensor at rest, without clipping.
+
+    The Markov term is IEEE Std 952-1997, Annex C; the others are the terms of
+    `robins.ins.allan_noise`.
+    """
+    tau = np.asarray(tau_s, float)[..., None]
+    variance = np.zeros(np.broadcast_shapes(tau.shape, (3,)))
+    if errors.quantum is not None:
+        variance = variance + errors.quantum**2 / (4.0 * tau**2)
+    if errors.white is not None:
+        variance = variance + errors.white**2 / tau
+    if errors.markov_sigma is not None:
+        x = tau / errors.markov_tau_s
+        closed = (x + 2.0 * np.expm1(-x) - 0.5 * np.expm1(-2.0 * x)) / x**2
+        series = x / 3.0 - x**2 / 4.0 + 7.0 * x**3 / 60.0  # the closed form cancels at small x
+        variance = variance + 2.0 * errors.markov_sigma**2 * np.where(x < 1e-4, series, closed)
+    if errors.walk is not None:
+        variance = variance + errors.walk**2 * tau / 3.0
+    if errors.ramp is not None:
+        variance = variance + errors.ramp**2 * tau**2 / 2.0
+    return np.sqrt(variance)
+
+
+def mean_sigma(errors: TriadErrors, duration_s: float) -> np.ndarray:
+    """One sigma (3,) of the bias of a mean over a stated time, from all runs.
+
+    What is left in the mean of a sensor at rest: the constant bias, the Gauss-Markov bias averaged,
+    the random walk (from zero at the start of the mean), the white noise averaged and one
+    quantisation step at either end; a given ``bias`` and ``ramp`` are no chance and not counted.
+
+    Raises:
+        ValueError: a duration that is not positive.
+    """
+    if not (np.isfinite(duration_s) and duration_s > 0.0):
+        raise ValueError(f"duration_s must be a positive number of seconds, got {duration_s}")
+    variance = np.zeros(3)
+    if errors.bias_sigma is not None:
+        variance = variance + errors.bias_sigma**2
+    if errors.markov_sigma is not None:
+        x = duration_s / errors.markov_tau_s
+        variance = variance + 2.0 * (errors.markov_sigma / x) ** 2 * (x + np.expm1(-x))
+    if errors.walk is not None:
+        variance = variance + errors.walk**2 * duration_s / 3.0
+    if errors.white is not None:
+        variance = variance + errors.white**2 / duration_s
+    if errors.quantum is not None:
+        variance = variance + errors.quantum**2 / 6.0 / duration_s**2
+    return np.sqrt(variance)
