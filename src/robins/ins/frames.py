@@ -1,0 +1,102 @@
+"""The two frame conventions of the house, and the way between them.
+
+Native are north-east-down for navigation and forward-right-down for the body (NED/FRD). East-north-
+up and right-forward-up (ENU/RFU) is the same thing relabelled: with T the half turn about (1, 1, 0)
+
+    v_ENU = T v_NED       v_RFU = T v_FRD       C_ENU_RFU = T C_NED_FRD T'
+
+T exchanges the first two components and turns the sign of the third, so nothing is rounded, and T
+is its own inverse, so one function serves both ways. Roll, pitch and heading are those of the
+vehicle and the same in both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins.dataset import BodyFrame, GnssTable, ImuTable, NavFrame, Trajectory
+from robins.manifold import wrap
+from robins.rotation import multiply, to_euler
+
+Table = TypeVar("Table", ImuTable, GnssTable, Trajectory)
+
+_ORDER = np.array([1, 0, 2])
+_ORDER_Q = np.array([0, 2, 1, 3])
+_HALF_TURN = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])  # T as a quaternion
+
+
+def swap(v):
+    """A vector (..., 3) in the other convention, NED <-> ENU or FRD <-> RFU; exact."""
+    return _turn_last(v[..., _ORDER])
+
+
+def swap_q(q):
+    """A quaternion (..., 4) q_nb in the other convention, NED/FRD <-> ENU/RFU; exact."""
+    return _turn_last(q[..., _ORDER_Q])
+
+
+def _turn_last(v):
+    sign = np.ones(v.shape[-1:])
+    sign[-1] = -1.0
+    return v * sign.reshape((1,) * (v.ndim - 1) + sign.shape)
+
+
+def to_ned_frd(table: Table) -> Table:
+    """The same table in NED/FRD; see `to_enu_rfu`."""
+    return _to(table, "NED", "FRD")
+
+
+def to_enu_rfu(table: Table) -> Table:
+    """The same table in ENU/RFU.
+
+    Exact, and there and back gives the same bits. Only a trajectory that mixes the conventions
+    (NED with RFU, say) rounds: turning one side of a quaternion takes a square root of two.
+    """
+    return _to(table, "ENU", "RFU")
+
+
+def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
+    if isinstance(table, ImuTable):
+        if table.body == body:
+            return table
+        return replace(table, gyro=swap(table.gyro), accel=swap(table.accel), body=body)
+    if isinstance(table, GnssTable):
+        if table.nav == nav:
+            return table
+        return replace(
+            table,
+            sigma_m=table.sigma_m[..., _ORDER],
+            v_n=None if table.v_n is None else swap(table.v_n),
+            sigma_v=None if table.sigma_v is None else table.sigma_v[..., _ORDER],
+            nav=nav,
+        )
+    turn_nav, turn_body = table.nav != nav, table.body != body
+    q = table.q_nb
+    if turn_nav and turn_body:
+        q = swap_q(q)
+    elif turn_nav:
+        q = np.asarray(multiply(jnp.asarray(_HALF_TURN), jnp.asarray(q)))
+    elif turn_body:
+        q = np.asarray(multiply(jnp.asarray(q), jnp.asarray(-_HALF_TURN)))
+    return replace(
+        table, v_n=swap(table.v_n) if turn_nav else table.v_n, q_nb=q, nav=nav, body=body
+    )
+
+
+def euler_enu_rfu(q_nb) -> tuple[Array, Array, Array]:
+    """Roll, pitch, heading [rad] of an ENU/RFU attitude (..., 4).
+
+    Right wing down, nose up, clockwise from north: the angles `robins.rotation.to_euler` gives for
+    the same vehicle in NED/FRD.
+    """
+    return to_euler(swap_q(jnp.asarray(q_nb)))
+
+
+def yaw_from_heading(heading_rad) -> Array:
+    """Yaw [rad] counter-clockwise from north in [-pi, pi), as in PSINS; and back again."""
+    return wrap(-jnp.asarray(heading_rad))
