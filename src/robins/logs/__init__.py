@@ -1,0 +1,58 @@
+"""Logs: read and write them, have them examined, make them safe.
+
+- `open_log`, `load_dataset`: any known format, recognised by content, into the tables of
+  `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.
+- `Mounting`: how the IMU sits in the vehicle.
+- `examine`: the doctor; findings in sentences about units, axes, time, sigmas.
+- `clean`: refuses bad samples and counts them, so that a run never sees a NaN or a step back.
+- `write_kfgins_imu`, `write_pyins`, `write_tum`, ...: for other tools.
+"""
+
+from robins.logs.clean import clean
+from robins.logs.doctor import examine
+from robins.logs.euroc import read_euroc_imu, read_euroc_truth, write_euroc_imu
+from robins.logs.findings import Finding, LogError, LogWarning
+from robins.logs.gnss_imu import read_gnss_imu
+from robins.logs.kfgins import (
+    read_kfgins_gnss,
+    read_kfgins_imu,
+    read_kfgins_nav,
+    write_kfgins_gnss,
+    write_kfgins_imu,
+    write_kfgins_nav,
+)
+from robins.logs.loading import load_dataset
+from robins.logs.local import Origin
+from robins.logs.mounting import Mounting
+from robins.logs.pyins_csv import read_pyins, write_pyins
+from robins.logs.registry import FORMATS, Format, open_log
+from robins.logs.rtklib import read_rtklib
+from robins.logs.tum import write_tum
+
+__all__ = [
+    "FORMATS",
+    "Finding",
+    "Format",
+    "LogError",
+    "LogWarning",
+    "Mounting",
+    "Origin",
+    "clean",
+    "examine",
+    "load_dataset",
+    "open_log",
+    "read_euroc_imu",
+    "read_euroc_truth",
+    "read_gnss_imu",
+    "read_kfgins_gnss",
+    "read_kfgins_imu",
+    "read_kfgins_nav",
+    "read_pyins",
+    "read_rtklib",
+    "write_euroc_imu",
+    "write_kfgins_gnss",
+    "write_kfgins_imu",
+    "write_kfgins_nav",
+    "write_pyins",
+    "write_tum",
+]

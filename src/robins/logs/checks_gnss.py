@@ -1,0 +1,192 @@
+"""The doctor on GNSS fixes: place, height, sigmas, quality, decimals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from robins.dataset import GnssTable
+from robins.logs.findings import Finding
+from robins.logs.quiet import finding
+
+_AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
+
+
+def check_gnss(gnss: GnssTable) -> Iterator[Finding]:
+    """All findings about a GNSS table by itself."""
+    if not len(gnss):
+        return
+    yield from _missing(gnss)
+    yield from _place(gnss)
+    yield from _height(gnss)
+    yield from _sigmas(gnss)
+    yield from _quality(gnss)
+    yield from _resolution(gnss)
+
+
+def _missing(gnss: GnssTable) -> Iterator[Finding]:
+    columns = {"latitude": gnss.lat_rad, "longitude": gnss.lon_rad, "height": gnss.alt_m}
+    if gnss.v_n is not None:
+        columns |= {f"velocity {a}": gnss.v_n[:, k] for k, a in enumerate(_AXES[gnss.nav])}
+    for name, column in columns.items():
+        bad = ~np.isfinite(column)
+        if bad.any():
+            yield finding(
+                gnss,
+                "error" if bad.all() and name in ("latitude", "longitude") else "warning",
+                "gnss_missing",
+                int(bad.sum()),
+                f"{name} is missing in {bad.sum()} of {len(gnss)} fixes, here first. The receiver "
+                "had none; the other components of those fixes are used.",
+                int(np.argmax(bad)),
+            )
+
+
+def _place(gnss: GnssTable) -> Iterator[Finding]:
+    lat, lon = gnss.lat_rad, gnss.lon_rad
+    known = np.isfinite(lat) & np.isfinite(lon)
+    if not known.any():
+        return
+    with np.errstate(invalid="ignore"):
+        beyond = known & ((np.abs(lat) > np.pi / 2) | (np.abs(lon) > 2 * np.pi))
+    if beyond.any():
+        k = int(np.argmax(beyond))
+        lat_deg, lon_deg = np.rad2deg(lat[k]), np.rad2deg(lon[k])
+        if abs(lat_deg) <= 360.0 and abs(lon_deg) <= 90.0:
+            cause = "Latitude and longitude are exchanged; name the columns the other way round"
+        elif abs(lat[k]) <= 90.0 and abs(lon[k]) <= 360.0:
+            cause = "They are degrees where radians are needed; convert them (numpy.deg2rad)"
+        else:
+            cause = "The columns are not latitude and longitude, or scaled (1e-7 deg?); check them"
+        yield finding(
+            gnss,
+            "error",
+            "position_unit",
+            float(lat_deg),
+            f"latitude {lat_deg:.6g} deg, longitude {lon_deg:.6g} deg is no place on Earth "
+            f"({beyond.sum()} of {len(gnss)} fixes). {cause}.",
+            k,
+        )
+        return
+    zero = known & (lat == 0.0) & (lon == 0.0)
+    if zero.any():
+        yield finding(
+            gnss,
+            "error",
+            "no_fix_as_zero",
+            int(zero.sum()),
+            f"latitude and longitude are both exactly 0 in {zero.sum()} of {len(gnss)} fixes. The "
+            "receiver had no fix and wrote zeros; delete those lines, or write nan.",
+            int(np.argmax(zero)),
+        )
+    elif np.all(np.abs(np.rad2deg(lat[known])) <= np.pi / 2) and np.all(
+        np.abs(np.rad2deg(lon[known])) <= np.pi
+    ):
+        yield finding(
+            gnss,
+            "warning",
+            "position_in_radians",
+            float(np.rad2deg(lat[known][0])),
+            f"all places lie within latitude {np.rad2deg(lat[known][0]):.5f} deg, longitude "
+            f"{np.rad2deg(lon[known][0]):.5f} deg or so, in the Gulf of Guinea. The file probably "
+            "holds radians where degrees are expected; convert them, unless you were there.",
+        )
+
+
+def _height(gnss: GnssTable) -> Iterator[Finding]:
+    if not np.isfinite(gnss.alt_m).any():
+        return
+    alt = float(np.nanmedian(gnss.alt_m))
+    if alt < -500.0 or alt > 12_000.0:
+        hidden = alt < -12_000.0 or alt > 2_000_000.0
+        yield finding(
+            gnss,
+            "error" if hidden else "warning",
+            "height",
+            alt,
+            f"the median height is {alt:.6g} m, where nobody drives, sails or flies by air. The "
+            "column is in mm or feet, or is another one; if this is a rocket, all is well.",
+        )
+
+
+def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
+    groups = [
+        ("position", "m", gnss.sigma_m, np.stack([gnss.lat_rad, gnss.lon_rad, gnss.alt_m], -1))
+    ]
+    if gnss.sigma_v is not None and gnss.v_n is not None:
+        groups.append(("velocity", "m/s", gnss.sigma_v, gnss.v_n))
+    for what, unit, sigma, values in groups:
+        with np.errstate(invalid="ignore"):
+            bad = (np.isfinite(values) & (sigma <= 0.0)).any(axis=1)
+        if bad.any():
+            k = int(np.argmax(bad))
+            shown = ", ".join(f"{s:g}" for s in sigma[k])
+            yield finding(
+                gnss,
+                "error",
+                "sigma_not_positive",
+                int(bad.sum()),
+                f"the {what} sigmas are ({shown}) {unit} here, and not all positive in {bad.sum()} "
+                f"of {len(gnss)} fixes. Zero means unknown, but a filter takes it for exact and "
+                "ends in NaN; write real sigmas (RTK 0.02 m, code 2 m; velocity 0.05 m/s).",
+                k,
+            )
+        good = sigma[np.isfinite(sigma) & (sigma > 0.0)]
+        if not len(good):
+            continue
+        typical = float(np.median(good))
+        if typical < 1e-3 or typical > 1e3:
+            yield finding(
+                gnss,
+                "warning",
+                "sigma_absurd",
+                typical,
+                f"the {what} sigmas are {typical:.3g} {unit} (median), which no receiver has. "
+                f"They may be variances or in another unit; a filter would "
+                f"{'trust them blindly' if typical < 1 else 'ignore the fixes'}.",
+            )
+
+
+def _quality(gnss: GnssTable) -> Iterator[Finding]:
+    if gnss.quality is None:
+        return
+    size = np.linalg.norm(gnss.sigma_m[:, :2], axis=-1)
+    fixed, other = gnss.quality == 1, gnss.quality > 1
+    if not (fixed.any() and other.any()):
+        return
+    with np.errstate(invalid="ignore"):
+        ratio = float(np.nanmedian(size[other]) / np.nanmedian(size[fixed]))
+    k = int(np.argmax(other))
+    if ratio < 1.5:
+        yield finding(
+            gnss,
+            "warning",
+            "float_sigma",
+            ratio,
+            f"{other.sum()} of {len(gnss)} fixes are float or worse (Q > 1, from here on in part) "
+            f"but state {ratio:.2g} times the sigma of fixed ones ({np.nanmedian(size[other]):.3g} "
+            "m). The receiver is too sure of them; scale their sigmas, by 2 for float and 5 for "
+            "single.",
+            k,
+        )
+
+
+def _resolution(gnss: GnssTable) -> Iterator[Finding]:
+    """Decimals of the written position against its sigma."""
+    lat_deg = np.unique(np.rad2deg(gnss.lat_rad[np.isfinite(gnss.lat_rad)]))
+    if len(lat_deg) < 10:
+        return
+    step_m = float(np.min(np.diff(lat_deg))) * 111_000.0
+    with np.errstate(invalid="ignore"):
+        sigma = float(np.nanmedian(gnss.sigma_m[:, 0]))
+    if step_m > sigma > 0.0:
+        yield finding(
+            gnss,
+            "note",
+            "position_resolution",
+            step_m,
+            f"latitude is written in steps of {step_m * 1e3:.1f} mm, its sigma is "
+            f"{sigma * 1e3:.1f} mm. The file has too few decimals for such good fixes; that adds "
+            f"{step_m / np.sqrt(12.0) * 1e3:.1f} mm of noise. Write nine decimals.",
+        )

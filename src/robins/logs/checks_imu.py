@@ -1,0 +1,226 @@
+"""The doctor on the IMU alone: units by gravity, rates against increments, which way is up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from robins.dataset import ImuTable
+from robins.logs.findings import Finding
+from robins.logs.quiet import Signal, Windows, finding, signal_of, windows_of
+
+G = 9.80665
+EARTH_RATE = 7.292115e-5  # rad/s
+_GRAVITY = (9.7, 9.9)  # m/s^2, every place where people live
+_BIASED = 0.05  # share of gravity that a bad sensor may be off
+_REST_RATE = 0.2  # rad/s (11 deg/s): more than the bias of almost any gyro
+_FASTEST = 75.0  # rad/s (4300 deg/s): beyond the range of gyros for vehicles
+
+_UNITS = {
+    1.0: ("g", "multiply by 9.80665"),
+    1e3: ("milli-g", "multiply by 0.00980665"),
+    100.0 * G: ("cm/s^2", "divide by 100"),
+    1e3 * G: ("mm/s^2", "divide by 1000"),
+    G / 0.3048: ("ft/s^2", "multiply by 0.3048"),
+}
+
+
+def check_imu(imu: ImuTable) -> Iterator[Finding]:
+    """All findings about the IMU's units and axes that need no other sensor."""
+    signal = signal_of(imu)
+    if signal is None:
+        yield finding(
+            imu,
+            "error",
+            "no_samples",
+            len(imu),
+            "fewer than ten samples have all six numbers; units and axes cannot be judged.",
+        )
+        return
+    windows = windows_of(signal)
+    of_force = list(_gravity(imu, signal, windows))
+    yield from of_force
+    yield from _up(imu, windows)
+    if not any(f.code in ("rates_as_increments", "increments_as_rates") for f in of_force):
+        yield from _rates(imu, signal, windows)
+
+
+def _quiet(windows: Windows) -> np.ndarray:
+    """Windows at rest, or all if there are none."""
+    return windows.at_rest if windows.at_rest.any() else np.ones_like(windows.at_rest)
+
+
+def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]:
+    quiet = _quiet(windows)
+    size = np.linalg.norm(windows.accel[quiet], axis=-1)
+    measured = float(np.median(size))
+    row = int(signal.rows[windows.first[np.flatnonzero(quiet)[0]]])
+    where = "at rest" if windows.at_rest.any() else "on average (it never rests)"
+    if _GRAVITY[0] <= measured <= _GRAVITY[1]:
+        return
+    if abs(measured / G - 1.0) < _BIASED:
+        yield finding(
+            imu,
+            "note",
+            "gravity_bias",
+            measured,
+            f"{where} the specific force is {measured:.3f} m/s^2, gravity is 9.76 to 9.83. The "
+            f"unit is right; the accelerometers are off by {measured - 9.8:+.2f} m/s^2 "
+            f"({(measured - 9.8) / G * 1e3:+.0f} mg), usual for cheap sensors. Begin the filter "
+            "with a bias sigma of at least that.",
+            row,
+        )
+        return
+    causes = [*_kind_causes(imu, signal.step_s, measured), *_unit_causes(measured)]
+    shown = f"{where} the specific force is {measured:.4g} m/s^2 where gravity is 9.8"
+    if causes:
+        yield finding(
+            imu,
+            "error",
+            causes[0][0],
+            measured,
+            f"{shown}. {' Or '.join(f'{cause}.' for _, cause in causes)}",
+            row,
+        )
+    elif windows.at_rest.any():
+        yield finding(
+            imu,
+            "error",
+            "gravity_unknown",
+            measured,
+            f"{shown}, and no usual unit makes it that. A scale factor is missing (counts of the "
+            "converter?), the columns are in another order, or gravity was taken off already.",
+            row,
+        )
+    else:
+        yield finding(
+            imu,
+            "warning",
+            "gravity_not_seen",
+            measured,
+            f"{shown}, and the log has no second at rest. Unless the vehicle really accelerated "
+            "like that all the time, a unit or a column is wrong.",
+            row,
+        )
+
+
+def _kind_causes(imu: ImuTable, step_s: float, measured: float) -> list[tuple[str, str]]:
+    """Rates taken for increments, and the reverse, in m/s^2 or g."""
+    out = []
+    for scale, unit, summed in ((G, "m/s^2", "m/s"), (1.0, "g", "g s")):
+        if imu.kind == "increment" and _near(measured, scale / step_s):
+            out.append(
+                (
+                    "rates_as_increments",
+                    f"The rows are rates in {unit}, not increments over {step_s * 1e3:.4g} ms: "
+                    f"multiply accelerations{_g_word(unit)} and angular rates by that time, or "
+                    "name a format of rates",
+                )
+            )
+        if imu.kind == "rate" and _near(measured, scale * step_s):
+            out.append(
+                (
+                    "increments_as_rates",
+                    f"The rows are increments over {step_s * 1e3:.4g} ms in {summed}, not rates: "
+                    f"divide both sensors by that time{_g_word(unit)}, or name a format of "
+                    "increments",
+                )
+            )
+    return out
+
+
+def _g_word(unit: str) -> str:
+    return " (and the accelerations by 9.80665)" if unit == "g" else ""
+
+
+def _unit_causes(measured: float) -> list[tuple[str, str]]:
+    return [
+        ("gravity_unit", f"The unit is probably {unit}: {mend}")
+        for value, (unit, mend) in _UNITS.items()
+        if _near(measured, value)
+    ]
+
+
+def _near(measured: float, expected: float) -> bool:
+    return abs(measured / expected - 1.0) < _BIASED
+
+
+def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
+    """The sign of gravity along z: specific force at rest points up."""
+    force = windows.accel[_quiet(windows)]
+    direction = np.median(force / np.linalg.norm(force, axis=-1, keepdims=True), axis=0)
+    down = direction[2] if imu.body == "FRD" else -direction[2]
+    axes = "forward-right-down" if imu.body == "FRD" else "right-forward-up"
+    sign = "-" if imu.body == "FRD" else "+"
+    if down > 0.7:
+        yield finding(
+            imu,
+            "error",
+            "z_axis_reversed",
+            float(direction[2]),
+            f"gravity shows as {direction[2] * 9.8:+.1f} m/s^2 on accel_z, in {axes} axes a level "
+            f"vehicle at rest shows {sign}9.8. The sensor's z points the other way, or the log "
+            "holds gravity instead of specific force; turn the axes with a mounting (roll 180 deg "
+            "if z points up and x forward).",
+        )
+    elif down > -0.7:
+        k = int(np.argmax(np.abs(direction)))
+        yield finding(
+            imu,
+            "warning",
+            "not_level",
+            float(direction[k]),
+            f"gravity lies along ({direction[0]:+.2f}, {direction[1]:+.2f}, {direction[2]:+.2f}) "
+            f"of x, y, z. The sensor is mounted on its side or the vehicle stands steep; if it is "
+            f"the mounting, give its angles, for speed along the body is taken along x ({axes}).",
+        )
+
+
+def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]:
+    """Angular rates that no vehicle has, and the Earth's rate in another unit."""
+    fastest = np.linalg.norm(signal.gyro, axis=-1)
+    k = int(np.argmax(fastest))
+    calm = windows.at_rest & (windows.restless <= np.percentile(windows.restless, 25))
+    rest = windows.gyro[calm] if calm.any() else windows.gyro[:0]
+    mean = rest.mean(axis=0) if len(rest) else np.zeros(3)
+    size = float(np.linalg.norm(mean))
+    if len(rest) >= 30 and (unit := _earth_rate_in(rest, size)):
+        yield finding(
+            imu,
+            "error" if size > _REST_RATE else "warning",
+            "gyro_unit",
+            size,
+            f"at rest the mean rate is {size:.4g} rad/s, just the Earth's 15.04 deg/h in {unit}. "
+            f"The gyro column is in {unit}; convert it to rad/s.",
+        )
+    elif size > _REST_RATE or fastest[k] > _FASTEST:
+        row = int(signal.rows[windows.first[np.flatnonzero(calm)[0]] if calm.any() else k])
+        most = max(size, float(fastest[k]))
+        shown = (
+            f"at rest the gyros show {size:.3g} rad/s ({np.rad2deg(size):.0f} deg/s)"
+            if size > _REST_RATE
+            else f"the gyros reach {most:.4g} rad/s ({np.rad2deg(most):.0f} deg/s)"
+        )
+        # More than 4500 deg/s is beyond the range of gyros as well, so then it is deg/h.
+        unit, mend = ("deg/s", "pi/180") if most < 4500.0 else ("deg/h", "pi/180/3600")
+        yield finding(
+            imu,
+            "error",
+            "gyro_unit",
+            most,
+            f"{shown}, more than any gyro of a vehicle. The columns are probably in {unit}: "
+            f"multiply by {mend}.",
+            row,
+        )
+
+
+def _earth_rate_in(rest: np.ndarray, size: float) -> str:
+    """The unit in which a steady mean rate at rest is the Earth's; empty if in none."""
+    scatter = rest.std(axis=0) / np.sqrt(len(rest))
+    if np.linalg.norm(scatter) > 0.01 * size:
+        return ""
+    for unit, factor in (("deg/s", 180.0 / np.pi), ("deg/h", 180.0 / np.pi * 3600.0)):
+        if abs(size / (EARTH_RATE * factor) - 1.0) < 0.02:
+            return unit
+    return ""

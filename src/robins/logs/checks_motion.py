@@ -1,0 +1,258 @@
+"""The doctor on IMU and GNSS together: gyro unit, axes, handedness, forward, time offset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from robins.dataset import GnssTable, ImuTable
+from robins.logs.findings import Finding
+from robins.logs.gnss_motion import Track, lateness, lowest, track_of, velocity_of
+from robins.logs.motion import (
+    GRAVITY,
+    Fit,
+    Pair,
+    pair_of,
+    signed_permutations,
+    travel_in_body,
+    unexplained,
+)
+from robins.logs.quiet import Signal, finding, name_of, signal_of, windows_of
+
+_GOOD = 0.5  # share left unexplained by data that fit
+_BETTER = 0.4  # a hypothesis must leave this share of what the data as they are leave
+_OFFSET_S = 0.05
+_SCALES = {
+    np.pi / 180: ("deg/s", "multiply by pi/180"),
+    np.pi / 180 / 3600: ("deg/h", "multiply by pi/180/3600"),
+    180 / np.pi: ("rad/s converted to radians once more", "take the conversion out"),
+}
+
+
+def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
+    """Findings about IMU and GNSS as views of one motion; none if there is too little of it."""
+    signal, track = signal_of(imu), track_of(gnss)
+    if signal is None or track is None:
+        return
+    pair = _pair(imu, gnss, signal, track)
+    if pair is None:
+        yield finding(
+            imu,
+            "note",
+            "motion_not_checked",
+            0,
+            "gyro unit, axes and time offset could not be checked against GNSS: there are no "
+            "30 s of common data with enough acceleration for these fixes. Drive a figure of eight "
+            "to have them checked.",
+        )
+        return
+    as_is = float(np.nanmean(unexplained(pair, np.eye(3)[None]).proper))
+    if as_is < _GOOD:
+        yield from _small_offset(imu, gnss, pair)
+        yield from _forward(imu, gnss, pair)
+        return
+    yield _diagnosis(imu, gnss, signal, pair, as_is)
+
+
+def _pair(imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track) -> Pair | None:
+    """Both on one time, specific force scaled to gravity, velocities without their delay."""
+    windows = windows_of(signal)
+    quiet = windows.at_rest if windows.at_rest.any() else np.ones_like(windows.at_rest)
+    size = float(np.median(np.linalg.norm(windows.accel[quiet], axis=-1)))
+    if not size > 0.0:
+        return None
+    scaled = signal._replace(accel=signal.accel * (GRAVITY / size))
+    v_n, noise = velocity_of(track)
+    start = int(imu.time_ns[signal.rows[0]]) - int(gnss.time_ns[0])
+    when = track.time_s - start * 1e-9 - (lateness(track) or 0.0)
+    return pair_of(scaled, when, v_n, noise)
+
+
+def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
+    lags = np.arange(-20, 21) * 0.05
+    fit = unexplained(pair, np.eye(3)[None], lags).proper
+    each = [lowest(lags, left) for left in fit if np.isfinite(left).all()]
+    clear = np.array([lag for lag in each if lag is not None])
+    if len(clear) < max(1, len(each) // 2):
+        return
+    lag = float(np.median(clear))
+    if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())):
+        yield finding(
+            gnss,
+            "warning",
+            "time_offset",
+            lag,
+            f"the motion fits {name_of(imu)} best if {lag:+.2f} s is added to the stamps of this "
+            f"file (from {len(clear)} stretches of 30 s). A buffer or a filter delays one of them; "
+            "give the run that time offset.",
+        )
+
+
+def _forward(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
+    """Whether the vehicle travels along its forward axis."""
+    v_b = travel_in_body(pair)
+    x, y = v_b[:, :2].T
+    mean = np.mean((x + 1j * y) / np.hypot(x, y)) if len(v_b) > 20 else 0.0
+    forward = 0.0 if imu.body == "FRD" else 90.0
+    angle = float(np.rad2deg(np.angle(mean)))
+    off = (angle - forward + 180.0) % 360.0 - 180.0
+    if np.abs(mean) > 0.85 and abs(off) > 30.0:
+        yield finding(
+            imu,
+            "warning",
+            "forward_axis",
+            off,
+            f"by the velocities of {name_of(gnss)} the vehicle travels {angle:+.0f} deg from x "
+            f"towards y of the IMU, not along {'x' if imu.body == 'FRD' else 'y'}. The sensor is "
+            f"turned in the vehicle: give its mounting, {abs(off):.0f} deg more about the "
+            "vertical, else a heading begun from the velocity is wrong by as much.",
+        )
+
+
+def _diagnosis(imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is: float) -> Finding:
+    """The hypothesis that explains the motion best, or that none does."""
+    scales = [*_SCALES, signal.step_s, 1.0 / signal.step_s]
+    lags = np.arange(-120, 121) * 0.25
+    tried = {
+        "scale": unexplained(pair, np.array(scales)[:, None, None] * np.eye(3)),
+        "axes": unexplained(pair, signed_permutations()),
+        "lag": unexplained(pair, np.eye(3)[None], lags),
+    }
+    left = {name: float(np.nanmin(_mean(fit))) for name, fit in tried.items()}
+    left["lag"] = float(np.nanmin(_mean(tried["lag"])[0]))  # a reflection has no delay
+    left["scale"] = float(np.nanmin(_mean(tried["scale"])[0]))
+    best = min(left, key=lambda name: left[name])
+    if left[best] > min(_GOOD, _BETTER * as_is):
+        return finding(
+            imu,
+            "warning",
+            "motion_disagrees",
+            as_is,
+            f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(as_is)} of their "
+            "change is left), and neither another gyro unit, exchanged or reversed axes, nor a "
+            "shift of up to 30 s mends it. Are the files of one recording, and is the IMU fixed to "
+            "the vehicle?",
+        )
+    share = (
+        f"(then {left[best]:.0%} of the change of velocity is left unexplained, now {_all(as_is)})"
+    )
+    if best == "lag":
+        return _late(imu, gnss, lags, tried["lag"], share)
+    if best == "scale":
+        return _unit(imu, scales[int(np.nanargmin(_mean(tried["scale"])[0]))], signal.step_s, share)
+    return _axes(imu, tried["axes"], share)
+
+
+def _all(share: float) -> str:
+    return "all" if share > 0.95 else f"{share:.0%}"
+
+
+def _mean(fit: Fit) -> np.ndarray:
+    """(2, hypotheses): by rotation and by reflection, over all stretches that were recorded.
+
+    A hypothesis judged by less than half of them is left out (NaN).
+    """
+    few = np.mean(np.isfinite(fit.proper), axis=0) < 0.5
+    both = np.stack([fit.proper, fit.mirrored])
+    total, count = np.nansum(both, axis=1), np.sum(np.isfinite(both), axis=1)
+    return np.where(few, np.nan, total / np.maximum(count, 1))
+
+
+def _late(imu: ImuTable, gnss: GnssTable, lags: np.ndarray, fit: Fit, share: str) -> Finding:
+    left = _mean(fit)[0]
+    k = int(np.nanargmin(left))
+    near = slice(max(k - 1, 0), k + 2)
+    lag = lowest(lags[near], left[near]) or float(lags[k])
+    leap = abs(abs(lag) - 18.0) < 0.5
+    cause = (
+        "That is the leap seconds between UTC and GPS time"
+        if leap
+        else "The clocks were never set together"
+    )
+    return finding(
+        gnss,
+        "error",
+        "leap_seconds" if leap else "time_offset",
+        lag,
+        f"the motion fits {name_of(imu)} only if {lag:+.2f} s is added to the stamps of this file "
+        f"{share}. {cause}; shift one of the files.",
+    )
+
+
+def _unit(imu: ImuTable, scale: float, step_s: float, share: str) -> Finding:
+    if scale in _SCALES:
+        unit, mend = _SCALES[scale]
+    elif scale == step_s:
+        unit, mend = "rates where increments are expected", f"multiply by {step_s:g} s"
+    else:
+        unit, mend = "increments where rates are expected", f"divide by {step_s:g} s"
+    return finding(
+        imu,
+        "error",
+        "gyro_unit",
+        scale,
+        f"turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
+        f"{scale:.4g} {share}. The gyro columns are probably {unit}: {mend}.",
+    )
+
+
+def _axes(imu: ImuTable, fit: Fit, share: str) -> Finding:
+    """What it means that the gyro needs the map S, or the specific force a reflection as well."""
+    left = _mean(fit)
+    mirrored, k = np.unravel_index(int(np.nanargmin(left)), left.shape)
+    S = signed_permutations()[k]
+    if mirrored and np.array_equal(S, -np.eye(3)):
+        code, cause = (
+            "left_handed",
+            (
+                "Both triads are left-handed: two axes are exchanged or one is reversed, alike in "
+                "gyros and accelerometers. Check the axes against the data sheet's picture"
+            ),
+        )
+    elif mirrored and np.array_equal(S, np.eye(3)):
+        code, cause = (
+            "accel_reversed",
+            (
+                "The accelerometers have the opposite sign: the log holds gravity, or minus the "
+                "specific force. Turn the signs of all three"
+            ),
+        )
+    elif mirrored:
+        code, cause = (
+            "accel_axes",
+            (
+                f"The accelerometer axes do not belong to those of the gyros: take them as "
+                f"{_words(-S.T, 'accel')}. Columns were exchanged or a sign lost"
+            ),
+        )
+    elif np.array_equal(S, -np.eye(3)):
+        code, cause = (
+            "gyro_reversed",
+            ("The gyros have the opposite sense of rotation: turn the signs of all three"),
+        )
+    else:
+        code, cause = (
+            "gyro_axes",
+            (
+                f"The gyro axes do not belong to those of the accelerometers: take them as "
+                f"{_words(S, 'gyro')}. Columns were exchanged or a sign lost"
+            ),
+        )
+    return finding(
+        imu,
+        "error",
+        code,
+        float(np.nanmin(left)),
+        f"gyros and accelerometers together do not explain the GNSS velocities, with other axes "
+        f"they do {share}. {cause}.",
+    )
+
+
+def _words(S: np.ndarray, sensor: str) -> str:
+    """The map as columns: "gyro_y, -gyro_x, gyro_z"."""
+    parts = []
+    for row in S:
+        j = int(np.argmax(np.abs(row)))
+        parts.append(f"{'-' if row[j] < 0 else ''}{sensor}_{'xyz'[j]}")
+    return f"({', '.join(parts)})"

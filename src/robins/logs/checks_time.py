@@ -1,0 +1,217 @@
+"""The doctor on time stamps: unit, order, duplicates, jumps, gaps, jitter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.logs.findings import Finding
+from robins.logs.ordering import increasing
+from robins.logs.quiet import finding, place, usual_step_s
+
+Table = ImuTable | GnssTable | Trajectory
+
+# Steps a clock makes, in seconds, and what makes them.
+_WRAPS = {
+    2.0**32 * 1e-6: "a 32-bit counter of microseconds that ran over",
+    2.0**32 * 1e-3: "a 32-bit counter of milliseconds that ran over",
+    2.0**16 * 1e-3: "a 16-bit counter of milliseconds that ran over",
+    604_800.0: "the second of the GPS week, which begins again on Sunday",
+    1024 * 604_800.0: "the GPS week, which begins again after 1024 weeks",
+    86_400.0: "the second of the day, which begins again at midnight",
+}
+_STEPS = {
+    1.0: "a leap second",
+    18.0: "the 18 leap seconds between UTC and GPS time",
+    3600.0: "a change of time zone or of daylight saving",
+}
+_GAP = 2.5  # usual steps
+_BLIP = 3  # refused samples that count as a slip, not as a clock set anew
+
+
+def check_time(table: Table) -> Iterator[Finding]:
+    """All findings about the stamps of one table."""
+    if len(table) < 2:
+        yield finding(table, "error", "too_short", len(table), _SHORT.format(n=len(table)))
+        return
+    usual = usual_step_s(table.time_ns)
+    if not np.isfinite(usual):
+        yield finding(table, "error", "time_stands", 0.0, _STANDS)
+        return
+    yield from _unit(table, usual)
+    keep = increasing(table.time_ns)
+    yield from _duplicates(table)
+    yield from _order(table, keep, usual)
+    yield from _gaps(table, keep, usual)
+    yield from _jitter(table, keep, usual)
+
+
+_SHORT = "only {n} sample(s). Nothing can be run on that; is it the right file?"
+_STANDS = "time never goes forward. The time column is constant or another one; name the format."
+
+
+def _unit(table: Table, usual: float) -> Iterator[Finding]:
+    """A rate no such sensor has tells the unit of time."""
+    slowest, fastest = (0.25, 2e-5) if isinstance(table, ImuTable) else (45.0, 5e-3)
+    for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+        if usual > slowest and fastest < usual * factor < slowest:
+            yield finding(
+                table,
+                "error",
+                "time_unit",
+                usual,
+                f"samples are {usual:g} s apart, one every {usual * factor:g} s if the time column "
+                f"is in {unit}. It probably is; convert it to seconds.",
+            )
+            return
+    if usual > slowest or usual < fastest:
+        yield finding(
+            table,
+            "error",
+            "time_unit",
+            usual,
+            f"samples are {usual:g} s apart, which no such sensor does. The time column is in "
+            "another unit than seconds, or is another column; check it.",
+        )
+
+
+def _duplicates(table: Table) -> Iterator[Finding]:
+    again = np.flatnonzero(np.diff(table.time_ns) == 0) + 1
+    if len(again):
+        share = len(again) / len(table)
+        cause = (
+            "The logger writes faster than the sensor measures, or time is rounded too coarsely"
+            if share > 0.05
+            else "A line was written twice, or time is rounded too coarsely"
+        )
+        yield finding(
+            table,
+            "warning",
+            "time_duplicate",
+            len(again),
+            f"{len(again)} samples ({share:.1%}) repeat the time of the sample before, this one "
+            f"first. {cause}; `clean` refuses the second of each.",
+            int(again[0]),
+        )
+
+
+def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
+    """Time that goes back: slips of single samples together, clocks set back one by one."""
+    step = np.diff(table.time_ns) * 1e-9
+    slips = []
+    for k in np.flatnonzero(step < 0):
+        lost = _refused_around(keep, int(k))
+        if lost <= _BLIP:
+            slips.append(int(k))
+            continue
+        size = -step[k] + usual
+        cause = _named(size, usual, _WRAPS | _STEPS) or "The clock was set, or the logger restarted"
+        yield finding(
+            table,
+            "error",
+            "clock_set_back",
+            float(step[k]),
+            f"time goes back by {-step[k]:.6g} s and goes on from there. {cause}. `clean` refuses "
+            f"{lost} samples so that time increases, and what follows them is joined wrongly: "
+            "split the file here, or add the step to all later stamps.",
+            int(k) + 1,
+        )
+    if slips:
+        sizes = -step[slips]
+        yield finding(
+            table,
+            "warning",
+            "time_backward",
+            len(slips),
+            f"time goes back by {sizes.max():.6g} s for a sample or so ({len(slips)} such places, "
+            "this one first). Lines were swapped or a stamp is damaged; `clean` refuses those "
+            "samples and goes on.",
+            slips[0] + 1,
+        )
+
+
+def _refused_around(keep: np.ndarray, k: int) -> int:
+    """Number of refused rows in the stretch that touches the step from row k to k + 1."""
+    low = high = k + 1 if not keep[k + 1] else k
+    while low > 0 and not keep[low - 1]:
+        low -= 1
+    while high < len(keep) - 1 and not keep[high + 1]:
+        high += 1
+    return int(np.sum(~keep[low : high + 1]))
+
+
+def _named(size: float, usual: float, names: dict[float, str]) -> str:
+    """The cause of a step of this size, as the beginning of a sentence; empty if unknown."""
+    for known, cause in names.items():
+        multiple = max(round(size / known), 1)
+        if (known in (1.0, 18.0) and multiple != 1) or multiple > 24:
+            continue
+        if abs(size - multiple * known) < 1.6 * usual + 1e-6 * known:
+            return f"This is {cause}"
+    return ""
+
+
+def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
+    rows = np.flatnonzero(keep)
+    step = np.diff(table.time_ns[rows]) * 1e-9
+    long = np.flatnonzero(step > _GAP * usual)
+    jumps = [k for k in long if _jump(step[k] - usual, usual)]
+    for k in jumps:
+        size = step[k] - usual
+        yield finding(
+            table,
+            "error" if size > 1.5 else "warning",
+            "time_jump",
+            float(size),
+            f"time jumps ahead by {size:.6g} s. {_jump(size, usual)}, unless exactly that much was "
+            "lost. If the motion goes on without a break, take the step off all later stamps.",
+            int(rows[k + 1]),
+        )
+    gaps = [k for k in long if k not in jumps]
+    if not gaps:
+        return
+    worst = max(gaps, key=lambda k: step[k])
+    total = sum(step[k] for k in gaps)
+    gnss = isinstance(table, GnssTable)
+    cause = (
+        "The receiver had no solution there; the run goes on by inertia alone"
+        if gnss
+        else "The logger lost data (buffer, card or cable too slow); a run must bridge it blindly, "
+        "and after about a second its heading and position are no longer worth much"
+    )
+    yield finding(
+        table,
+        "note" if gnss or total < 0.05 else "warning",
+        "gap_long" if step[worst] >= 1.0 else "gap_short",
+        float(step[worst]),
+        f"no sample for {step[worst]:.6g} s before this one, where {usual:.6g} s is usual "
+        f"({len(gaps)} gaps, {total:.6g} s in all, the first at {place(table, rows[gaps[0]])}). "
+        f"{cause}.",
+        int(rows[worst + 1]),
+    )
+
+
+def _jump(size: float, usual: float) -> str:
+    return _named(size, usual, _WRAPS | _STEPS) if size > 0.9 else ""
+
+
+def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
+    step = np.diff(table.time_ns[keep]) * 1e-9
+    step = step[step < _GAP * usual]
+    if len(step) < 10 or isinstance(table, GnssTable):
+        return
+    scatter = float(step.std()) / usual
+    if scatter > 0.1:
+        low, high = np.percentile(step, [0.5, 99.5])
+        yield finding(
+            table,
+            "warning" if scatter > 0.5 else "note",
+            "time_jitter",
+            scatter,
+            f"steps of time scatter from {low * 1e3:.3g} to {high * 1e3:.3g} ms (mean "
+            f"{step.mean() * 1e3:.4g} ms, {1 / step.mean():.4g} Hz). The stamps were taken on "
+            "arrival or rounded, not by the sensor's clock; harmless for slow motion, but use the "
+            "sensor's own counter if it was logged.",
+        )

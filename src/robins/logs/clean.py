@@ -1,0 +1,190 @@
+"""The boundary behind which a run is safe: bad samples are refused, counted, and then absent.
+
+What is refused here leaves the tables exactly as if its rows had never been recorded; nothing is
+repaired, interpolated or smoothed. Time is put in order by refusing the fewest samples, see
+`robins.logs.ordering`. Gaps are declared, not filled: the system decides whether to bridge them.
+Denormal numbers and huge but possible ones pass; outliers are the business of filters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
+from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
+from robins.logs.findings import LogError
+from robins.logs.ordering import increasing, reasons
+
+# Far beyond any vehicle, so that only nonsense is caught: 1e4 rad/s are 95 000 turns a minute.
+GYRO_LIMIT = 1e4  # rad/s, or rad for increments
+ACCEL_LIMIT = 1e6  # m/s^2, or m/s for increments
+ALT_LIMIT_M = 1e9
+SPEED_LIMIT = 1e5  # m/s
+
+_PLACEHOLDER_SIGMA = 1.0
+_COMPONENTS = ("north", "east", "vertical")
+
+
+def clean(dataset: Dataset) -> Dataset:
+    """Refuse what cannot be used and count it by reason.
+
+    Counts, in samples, begin with the table's name: ``imu_nan``, ``imu_inf``, ``imu_absurd`` (a
+    magnitude no vehicle has), ``imu_duplicate``, ``imu_backward`` and ``imu_ahead`` (time stamps
+    out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``.
+    Counts already in the dataset are added to.
+
+    A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if that was
+    not a positive number, a 1 that nobody uses. A fix with no component left is refused whole.
+
+    ``meta["imu_gaps"]`` lists (start_ns, end_ns) between which IMU samples are missing.
+
+    Raises:
+        LogError: arrays that are no tables (F04), fewer than two IMU samples left, or a GNSS
+            component whose sigma is never positive.
+    """
+    imu, counts, gaps = clean_imu(dataset.imu)
+    gnss = truth = None
+    if dataset.gnss is not None:
+        gnss, more = clean_gnss(dataset.gnss)
+        counts |= more
+    if dataset.truth is not None:
+        truth, more = clean_truth(dataset.truth)
+        counts |= more
+    total = {k: dataset.counts.get(k, 0) + counts.get(k, 0) for k in dataset.counts | counts}
+    meta = {**dataset.meta, "imu_gaps": gaps}
+    return dataclasses.replace(dataset, imu=imu, gnss=gnss, truth=truth, counts=total, meta=meta)
+
+
+def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, int]]]:
+    """Clean one IMU table: the table, counts by reason, gaps (start_ns, end_ns). See `clean`."""
+    imu = checked_imu(imu)
+    values = np.hstack([imu.gyro, imu.accel])
+    limit = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
+    keep, counts = _whole_rows(imu.time_ns, values, limit)
+    if np.count_nonzero(keep) < 2:
+        refused = ", ".join(f"{n} {reason}" for reason, n in counts.items() if n) or "none"
+        raise LogError(
+            imu.source or "ImuTable",
+            f"fewer than two of {len(imu)} samples can be used (refused: {refused})",
+            "the doctor tells what is wrong with them",
+        )
+    gaps = _gaps(imu, keep)
+    return _rows(imu, keep), {f"imu_{k}": n for k, n in counts.items()}, gaps
+
+
+def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
+    """Clean a trajectory: whole rows only."""
+    truth = checked_truth(truth)
+    position = np.stack([truth.lat_rad, truth.lon_rad, truth.alt_m], -1)
+    values = np.hstack([position, truth.v_n, truth.q_nb])
+    limit = np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M, *[SPEED_LIMIT] * 3, *[1.001] * 4])
+    keep, counts = _whole_rows(truth.time_ns, values, limit)
+    return _rows(truth, keep), {f"truth_{k}": n for k, n in counts.items()}
+
+
+def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
+    """Clean one GNSS table: the table and counts by reason. See `clean`."""
+    gnss = checked_gnss(gnss)
+    position = np.stack([gnss.lat_rad, gnss.lon_rad, gnss.alt_m], -1)
+    limit = np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M])
+    values, sigma, refused = _components(gnss, "position", position, gnss.sigma_m, limit)
+    v_n = sigma_v = None
+    if gnss.v_n is not None and gnss.sigma_v is not None:
+        limit = np.full(3, SPEED_LIMIT)
+        v_n, sigma_v, more = _components(gnss, "velocity", gnss.v_n, gnss.sigma_v, limit)
+        refused = {reason: refused[reason] | more[reason] for reason in refused}
+    have = np.isfinite(values).any(axis=1)
+    if v_n is not None:
+        have |= np.isfinite(v_n).any(axis=1)
+    in_order = np.zeros(len(gnss), bool)
+    in_order[have] = increasing(gnss.time_ns[have])
+    counts = {reason: int(rows.sum()) for reason, rows in refused.items()}
+    counts |= reasons(gnss.time_ns[have], in_order[have])
+    table = dataclasses.replace(
+        gnss,
+        lat_rad=values[:, 0],
+        lon_rad=values[:, 1],
+        alt_m=values[:, 2],
+        sigma_m=sigma,
+        v_n=v_n,
+        sigma_v=sigma_v,
+    )
+    return _rows(table, in_order), {f"gnss_{k}": n for k, n in counts.items()}
+
+
+def _whole_rows(
+    time_ns: np.ndarray, values: np.ndarray, limit: np.ndarray
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Rows to keep, and counts, where one bad number spoils its row."""
+    nan = np.isnan(values).any(axis=1)
+    inf = np.isinf(values).any(axis=1) & ~nan
+    with np.errstate(invalid="ignore"):
+        absurd = (np.abs(values) > limit).any(axis=1) & ~nan & ~inf
+    good = ~(nan | inf | absurd)
+    keep = np.zeros(len(time_ns), bool)
+    keep[good] = increasing(time_ns[good])
+    counts = {"nan": int(nan.sum()), "inf": int(inf.sum()), "absurd": int(absurd.sum())}
+    return keep, counts | reasons(time_ns[good], keep[good])
+
+
+def _components(
+    gnss: GnssTable, what: str, values: np.ndarray, sigma: np.ndarray, limit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Values with NaN where a component is missing, sigmas, rows touched by each reason."""
+    with np.errstate(invalid="ignore"):
+        absurd = np.abs(values) > limit
+        unsure = sigma <= 0.0
+    for k, name in enumerate(_COMPONENTS):
+        stated = np.isfinite(values[:, k]) & np.isfinite(sigma[:, k])
+        if stated.any() and unsure[stated, k].all():
+            raise LogError(
+                gnss.source or "GnssTable",
+                f"the {name} {what} has {np.count_nonzero(stated)} fixes and no positive sigma",
+                "zero means unknown, not exact: give real sigmas"
+                + (", or leave the velocities out" if what == "velocity" else ""),
+                field=f"sigma of {name} {what}",
+                value=float(sigma[stated, k][0]),
+            )
+    nan = np.isnan(values) | np.isnan(sigma)
+    inf = (np.isinf(values) | np.isinf(sigma)) & ~nan
+    absurd &= ~nan & ~inf
+    unsure &= ~nan & ~inf
+    refused = {"nan": nan, "inf": inf, "absurd": absurd, "sigma": unsure}
+    missing = nan | inf | absurd | unsure
+    usable = np.isfinite(sigma) & (sigma > 0.0)
+    return (
+        np.where(missing, np.nan, values),
+        np.where(usable, sigma, _PLACEHOLDER_SIGMA),
+        {reason: np.asarray(mask.any(axis=1)) for reason, mask in refused.items()},
+    )
+
+
+def _rows(table: Any, keep: np.ndarray) -> Any:
+    """The table with only some of its rows."""
+    n = len(table.time_ns)
+    arrays = {
+        f.name: getattr(table, f.name)[keep]
+        for f in dataclasses.fields(table)
+        if isinstance(getattr(table, f.name), np.ndarray) and len(getattr(table, f.name)) == n
+    }
+    return dataclasses.replace(table, **arrays)
+
+
+def _gaps(imu: ImuTable, keep: np.ndarray) -> list[tuple[int, int]]:
+    """Where samples are missing between two kept ones.
+
+    A step longer than usual: for increments 1.5 times, for each one lost takes its motion with it;
+    for rates 2.5 times, since one lost sample is bridged by its neighbours. Also where more than
+    two samples in a row were refused as backward: a clock set back hides time that has passed.
+    """
+    kept, refused = np.flatnonzero(keep), np.flatnonzero(~keep)
+    time_ns = imu.time_ns[kept]
+    step = np.diff(time_ns)
+    long = step > (1.5 if imu.kind == "increment" else 2.5) * np.median(step)
+    after = np.searchsorted(kept, refused) - 1  # the last sample kept before each refused one
+    backward = (after >= 0) & (imu.time_ns[refused] < time_ns[np.maximum(after, 0)])
+    long |= np.bincount(after[backward], minlength=len(kept))[:-1] > 2
+    return [(int(time_ns[k]), int(time_ns[k + 1])) for k in np.flatnonzero(long)]

@@ -1,0 +1,150 @@
+"""What a GNSS table says about its own motion: positions in metres against velocities."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.dataset import GnssTable
+from robins.earth import curvature_radii
+from robins.logs.ordering import increasing
+
+_BASE_S = 1.0
+_SPEED = 0.3  # m/s; below it a receiver at rest
+
+
+class Track(NamedTuple):
+    """The complete fixes of a table, in the order of time."""
+
+    rows: np.ndarray  # (m,) index into the table
+    time_s: np.ndarray  # (m,) since the table's first row
+    r_n: np.ndarray  # (m, 3) m north, east, down of the first fix
+    v_n: np.ndarray | None  # (m, 3) m/s north, east, down
+    sigma_m: float  # horizontal position noise, median
+    sigma_v: float  # velocity noise, median over all axes
+
+
+def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
+    """Fixes with all components; None if there are fewer than ten.
+
+    Args:
+        gnss: the table.
+        swap: exchange latitude and longitude, to see whether they were exchanged.
+    """
+    lat, lon = (gnss.lon_rad, gnss.lat_rad) if swap else (gnss.lat_rad, gnss.lon_rad)
+    place = np.stack([lat, lon, gnss.alt_m], axis=-1)
+    good = np.isfinite(place).all(axis=1) & (np.abs(lat) < np.deg2rad(89.9))
+    v = gnss.v_n
+    if v is not None:
+        good &= np.isfinite(v).all(axis=1)
+    rows = np.flatnonzero(good)
+    rows = rows[increasing(gnss.time_ns[rows])]
+    if len(rows) < 10:
+        return None
+    if v is not None:
+        v = v[rows] if gnss.nav == "NED" else v[rows][:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    lat, lon, alt = place[rows].T
+    meridian, transverse = (np.asarray(r) for r in curvature_radii(lat))
+    east = np.unwrap(lon) - lon[0]
+    r_n = np.stack(
+        [
+            (lat - lat[0]) * (meridian + alt),
+            east * (transverse + alt) * np.cos(lat),
+            alt[0] - alt,
+        ],
+        axis=-1,
+    )
+    with np.errstate(invalid="ignore"):
+        sigma_v = np.inf if gnss.sigma_v is None else float(np.median(gnss.sigma_v[rows]))
+        sigma_m = float(np.median(gnss.sigma_m[rows][:, :2]))
+    time_s = (gnss.time_ns[rows] - gnss.time_ns[0]) * 1e-9
+    return Track(rows, time_s, r_n, v, sigma_m, sigma_v)
+
+
+def velocity_of(track: Track) -> tuple[np.ndarray, float]:
+    """Velocities, and the noise [m/s] of their change over a second.
+
+    From the positions half a second to either side where the receiver gave no velocities.
+    """
+    if track.v_n is not None:
+        return track.v_n, float(np.sqrt(6.0)) * track.sigma_v
+    time_s = track.time_s
+
+    def at(when: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(when, time_s, c) for c in track.r_n.T], axis=-1)
+
+    v_n = (at(time_s + 0.5 * _BASE_S) - at(time_s - 0.5 * _BASE_S)) / _BASE_S
+    return v_n, float(np.sqrt(12.0)) * track.sigma_m / _BASE_S
+
+
+class Steps(NamedTuple):
+    """Change of position over about a second, seen by positions and by velocities [m]."""
+
+    of_position: np.ndarray  # (k, 3)
+    of_velocity: np.ndarray  # (k, 3)
+
+
+def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
+    """Steps of a moving receiver; None without velocities, or if it moves too little to judge.
+
+    Args:
+        track: the fixes.
+        late_s: velocities are taken to be this much older than their stamps say.
+    """
+    if track.v_n is None:
+        return None
+    time_s = track.time_s
+    stride = max(1, round(_BASE_S / float(np.median(np.diff(time_s)))))
+    first = np.arange(0, len(time_s) - stride, max(1, stride // 2))
+    last = first + stride
+    near = time_s[last] - time_s[first] < 1.5 * np.median(time_s[last] - time_s[first])
+    first, last = first[near], last[near]
+    path = np.concatenate(
+        [
+            np.zeros((1, 3)),
+            np.cumsum(0.5 * (track.v_n[1:] + track.v_n[:-1]) * np.diff(time_s)[:, None], axis=0),
+        ]
+    )
+
+    def at(when: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(when, time_s, c) for c in path.T], axis=-1)
+
+    by_position = track.r_n[last] - track.r_n[first]
+    by_velocity = at(time_s[last] + late_s) - at(time_s[first] + late_s)
+    duration = time_s[last] - time_s[first]
+    # By either view, so that positions in a wrong unit do not pass for rest.
+    by_both = np.maximum(*(np.linalg.norm(x[:, :2], axis=-1) for x in (by_position, by_velocity)))
+    moving = by_both > np.maximum(_SPEED * duration, 5.0 * track.sigma_m)
+    if np.count_nonzero(moving) < 10:
+        return None
+    return Steps(by_position[moving], by_velocity[moving])
+
+
+def lateness(track: Track) -> float | None:
+    """How much older velocities are than their stamps [s], by the positions; None if unclear.
+
+    Many receivers give the mean velocity of the last epoch, half an epoch late.
+    """
+    if track.v_n is None or np.median(np.diff(track.time_s)) > 1.1:
+        return None
+    lags = np.arange(-10, 11) * 0.05
+    left = []
+    for lag in lags:
+        steps = steps_of(track, float(lag))
+        if steps is None:
+            return None
+        left.append(np.mean((steps.of_position - steps.of_velocity)[:, :2] ** 2))
+    late = lowest(lags, np.array(left))
+    clear = late is not None and min(left) < 0.5 * left[len(lags) // 2]
+    return late if clear else None
+
+
+def lowest(x: np.ndarray, y: np.ndarray) -> float | None:
+    """Where a sampled curve is lowest, by the parabola through three points; None at an end."""
+    k = int(np.argmin(y))
+    if k in (0, len(x) - 1):
+        return None
+    below, here, above = y[k - 1 : k + 2]
+    bend = below - 2.0 * here + above
+    return float(x[k] + 0.5 * (x[1] - x[0]) * (below - above) / bend) if bend > 0 else None

@@ -1,0 +1,189 @@
+"""One motion, seen by the IMU and by GNSS: how well do they fit under a hypothesis about the axes?
+
+Over a short stretch the gyros tell how the body turns, so the specific force can be added up in
+axes that do not turn. Up to one constant rotation R these sums must be what GNSS saw,
+
+    R sum(C f dt) = change of v - g dt,
+
+whatever the attitude and the mounting. R is found in closed form (Kabsch 1976), as a rotation or as
+a reflection; the share of the GNSS accelerations left unexplained judges the hypothesis. Wrong
+units, exchanged or reversed axes and late clocks all leave about everything unexplained.
+
+The sums are taken on a grid of 20 Hz, so vibration does not matter and an hour costs little.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.logs.quiet import Signal
+
+GRAVITY = 9.8
+_RATE_HZ = 20
+STRETCH_S = 30  # long enough to turn, short enough for the drift of cheap gyros
+_STRETCHES = 4
+_NO_LAG = np.zeros(1)
+
+
+def signed_permutations() -> np.ndarray:
+    """(48, 3, 3): all ways to exchange and reverse three axes, the identity first."""
+    out = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            out.append(np.diag(signs)[:, order])
+    return np.array(out)
+
+
+class Pair(NamedTuple):
+    """IMU sums on the fine grid and GNSS velocity, both from one zero of time."""
+
+    turn: np.ndarray  # (n + 1, 3) integral of the rate up to each grid time [rad]
+    push: np.ndarray  # (n + 1, 3) integral of the specific force [m/s]
+    gnss_s: np.ndarray  # (m,) times of the velocities
+    v_n: np.ndarray  # (m, 3) m/s, NED
+    starts: np.ndarray  # first second of each stretch that is judged
+
+
+class Fit(NamedTuple):
+    """Results per stretch and hypothesis; NaN where the IMU was not recorded."""
+
+    proper: np.ndarray  # (stretches, hypotheses) share left unexplained by the best rotation
+    mirrored: np.ndarray  # (stretches, hypotheses) by the best reflection
+    R_nb: np.ndarray  # (stretches, hypotheses, 3, 3) that rotation, body at the start to NED
+
+
+def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -> Pair | None:
+    """Put both on one time; None if no stretch has enough motion for a judgement.
+
+    Args:
+        signal: the IMU, whose specific force is scaled to gravity at rest.
+        gnss_s: (m,) times of the velocities, from the zero of the signal.
+        v_n: (m, 3) finite velocities, north-east-down [m/s].
+        noise: standard deviation of a velocity's change over a second [m/s].
+    """
+    grid = np.arange(0.0, signal.time_s[-1], 1.0 / _RATE_HZ)
+    turn, push = (_at(grid, signal.time_s, _integral(signal.time_s, x)) for x in signal[2:4])
+    first, last = max(0.0, gnss_s[0]), min(grid[-1], gnss_s[-1])
+    starts = np.arange(np.ceil(first), last - STRETCH_S, STRETCH_S)
+    lively = []
+    for start in starts:
+        if _has_gap(gnss_s, start) or _has_gap(signal.time_s, start):
+            continue
+        change = np.diff(_at(start + np.arange(STRETCH_S + 1), gnss_s, v_n), axis=0)
+        power = float(np.mean(np.sum((change - change.mean(axis=0)) ** 2, axis=1)))
+        if power > max(0.2**2, (3.0 * noise) ** 2):
+            lively.append((power, start))
+    if not lively:
+        return None
+    best = sorted(start for _, start in sorted(lively)[-_STRETCHES:])
+    return Pair(turn, push, gnss_s, v_n, np.array(best))
+
+
+def _has_gap(time_s: np.ndarray, start: float) -> bool:
+    inside = time_s[(time_s >= start) & (time_s <= start + STRETCH_S)]
+    return len(inside) < 2 or bool(np.max(np.diff(inside)) > 1.5)
+
+
+def unexplained(pair: Pair, gyro_maps: np.ndarray, lags_s: np.ndarray = _NO_LAG) -> Fit:
+    """Judge hypotheses.
+
+    Args:
+        pair: the two views.
+        gyro_maps: (h, 3, 3) applied to the angular rate: units, exchanges, reversals.
+        lags_s: (h) or (1,) what is added to the GNSS times to find the IMU samples that belong.
+    """
+    out = [_judge(pair, start, gyro_maps, lags_s) for start in pair.starts]
+    return Fit(*(np.stack(part) for part in zip(*out, strict=True)))
+
+
+def travel_in_body(pair: Pair) -> np.ndarray:
+    """(k, 3) velocities in body axes, where the pair fits as it is and moves: which way is forward.
+
+    Only seconds faster than 0.5 m/s; at most `STRETCH_S` of each stretch.
+    """
+    out = []
+    for start in pair.starts:
+        _, _, R = _judge(pair, start, np.eye(3)[None], _NO_LAG)
+        fine = (np.arange(STRETCH_S * _RATE_HZ + 1) + start * _RATE_HZ)[None]
+        turn, push = (np.diff(_between(fine, x), axis=1) for x in (pair.turn, pair.push))
+        _, C = _sum_unturned(turn, push)
+        v_n = _at(start + np.arange(STRETCH_S), pair.gnss_s, pair.v_n)
+        v_b = np.einsum("kji,lj,kl->ki", C[0], R[0], v_n)  # C^T R^T v
+        out.append(v_b[np.linalg.norm(v_n, axis=-1) > 0.5])
+    return np.concatenate(out)
+
+
+def _judge(
+    pair: Pair, start: float, gyro_maps: np.ndarray, lags_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    seconds = start + np.arange(STRETCH_S + 1)
+    wanted = np.diff(_at(seconds, pair.gnss_s, pair.v_n), axis=0) - [0.0, 0.0, GRAVITY]
+    power = np.sum((wanted - wanted.mean(axis=0)) ** 2)
+    fine = np.arange(STRETCH_S * _RATE_HZ + 1) / _RATE_HZ + start
+    index = (fine + lags_s[:, None]) * _RATE_HZ  # (h or 1, fine)
+    turn, push = (np.diff(_between(index, x), axis=1) for x in (pair.turn, pair.push))
+    count = max(len(gyro_maps), len(lags_s))
+    turn, push = (np.broadcast_to(x, (count, *x.shape[1:])) for x in (turn, push))
+    turn = np.einsum("hij,hkj->hki", np.broadcast_to(gyro_maps, (count, 3, 3)), turn)
+    sums, _ = _sum_unturned(turn, push)
+    R, left, mirrored = _kabsch(sums, wanted)
+    seen = (index[:, 0] >= 0.0) & (index[:, -1] <= len(pair.turn) - 1)
+    left, mirrored = (np.where(seen, x / power, np.nan) for x in (left, mirrored))
+    return left, mirrored, R
+
+
+def _integral(time_s: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time_s)[:, None]
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _at(when: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(when, time_s, column) for column in values.T], axis=-1)
+
+
+def _between(index: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Linear interpolation of rows at real indices, held at the ends."""
+    index = np.clip(index, 0, len(values) - 1)
+    low = np.minimum(index.astype(np.int64), len(values) - 2)
+    share = (index - low)[..., None]
+    return (1.0 - share) * values[low] + share * values[low + 1]
+
+
+def _sum_unturned(turn: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity increments (h, seconds, 3) in the axes of the first moment, and C (h, seconds, 3, 3)
+    from the axes at the start of each second to those.
+    """
+    whole, half = _rotations(turn), _rotations(0.5 * turn)
+    C = np.broadcast_to(np.eye(3), (len(turn), 3, 3))
+    out = np.zeros((len(turn), STRETCH_S, 3))
+    attitudes = []
+    for k in range(turn.shape[1]):
+        if k % _RATE_HZ == 0:
+            attitudes.append(C)
+        out[:, k // _RATE_HZ] += np.einsum("hij,hjk,hk->hi", C, half[:, k], push[:, k])
+        C = C @ whole[:, k]
+    return out, np.stack(attitudes, axis=1)
+
+
+def _rotations(phi: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula for many rotation vectors."""
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(phi, -1, 0)
+    o = np.zeros_like(x)
+    K = np.stack([np.stack(r, -1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+    half_sinc = np.sinc(0.5 * angle / np.pi)
+    return np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half_sinc**2 * K @ K
+
+
+def _kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Best rotation R of u (h, k, 3) onto v (k, 3), squares left by it and by a reflection."""
+    U, s, Vt = np.linalg.svd(np.einsum("hki,kj->hij", u, v))
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    total = np.sum(u * u, axis=(1, 2)) + np.sum(v * v)
+    corrected = np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)
+    R = np.einsum("hji,hj,hkj->hik", Vt, corrected, U)
+    both = s[:, 0] + s[:, 1]
+    return R, total - 2.0 * (both + sign * s[:, 2]), total - 2.0 * (both - sign * s[:, 2])

@@ -1,0 +1,55 @@
+"""How the IMU sits in the vehicle: sensor axes into forward-right-down, and the antenna's place."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from robins import rotation
+from robins.dataset import ImuTable
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Orientation of the sensor and lever arm of the GNSS antenna.
+
+    The angles are roll, pitch, yaw (Z-Y-X) of the vehicle's forward-right-down axes as seen from
+    the sensor's axes. GNSS_IMU calls them `imu_misalign`; for its walk they are 180, 0, -90 deg: a
+    sensor whose x points left, y backward and z up.
+    """
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    lever_arm_b_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the IMU to the antenna, forward, right, down."""
+
+    def dcm_bs(self) -> np.ndarray:
+        """(3, 3) C_bs: maps sensor axes to body axes; exact where the angles are right angles.
+
+        Raises:
+            ValueError: an angle is not finite.
+        """
+        angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
+        if not np.all(np.isfinite(angles)):
+            raise ValueError(f"the angles of {self} must be finite")
+        C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*angles))).T
+        # Turns by right angles only exchange axes, so a rounding of 1e-16 must not mix them.
+        whole = np.round(C_bs)
+        return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
+
+    def turn(self, imu: ImuTable) -> ImuTable:
+        """The same samples along body axes, forward-right-down."""
+        C_bs = self.dcm_bs()
+        gyro, accel = (_turned(C_bs, v) for v in (imu.gyro, imu.accel))
+        return dataclasses.replace(imu, gyro=gyro, accel=accel, body="FRD")
+
+
+def _turned(C_bs: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """C_bs @ v by rows. A zero entry takes no part, so NaN on one axis does not reach another."""
+    out = np.zeros_like(vectors)
+    for i, j in zip(*np.nonzero(C_bs), strict=True):
+        out[:, i] += C_bs[i, j] * vectors[:, j]
+    return out

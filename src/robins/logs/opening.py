@@ -1,0 +1,109 @@
+"""Opening a log that may be compressed: decompressed blocks, in bounded memory, from any cut.
+
+A compressed file that merely ends early gives every byte before the cut. One that is damaged is
+refused whole: its checksum comes after the data, so nothing before it can be trusted.
+"""
+
+from __future__ import annotations
+
+import lzma
+import os
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from robins.logs.findings import LogError
+
+_BLOCK = 1 << 20
+_XZ, _GZIP = b"\xfd7zXZ\x00", b"\x1f\x8b"
+_FOREIGN = {
+    b"PK\x03\x04": ("a zip archive", "unpack it first"),
+    b"BZh": ("a bzip2 file", "unpack it first"),
+    b"\x28\xb5\x2f\xfd": ("a zstd file", "unpack it first"),
+    b"ULog": ("a PX4 ULog", "export the IMU and GNSS topics to CSV"),
+    b"#ROSBAG": ("a ROS bag", "export the IMU and GNSS topics to CSV"),
+    b"SQLite": ("an SQLite file (a ROS 2 bag?)", "export the IMU and GNSS topics to CSV"),
+    b"\x89MCAP": ("an MCAP file", "export the IMU and GNSS topics to CSV"),
+    b"\x89HDF": ("an HDF5 or MATLAB v7.3 file", "export the columns to CSV"),
+    b"MATLAB": ("a MATLAB file", "export the columns to CSV"),
+}
+
+
+class _Gunzip:
+    """zlib's decompressor with the interface of `lzma.LZMADecompressor`."""
+
+    def __init__(self):
+        self._inner = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+
+    def decompress(self, data: bytes, max_length: int) -> bytes:
+        return self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
+
+    @property
+    def eof(self) -> bool:
+        return self._inner.eof
+
+    @property
+    def needs_input(self) -> bool:
+        return not self._inner.unconsumed_tail
+
+    @property
+    def unused_data(self) -> bytes:
+        return self._inner.unused_data
+
+
+class Source:
+    """The bytes of a file, decompressed if it is .xz or .gz by content, in blocks.
+
+    Iterate once. Afterwards `cut` tells whether a compressed stream ended before its end mark.
+
+    Raises:
+        LogError: the file cannot be opened or read, is damaged, or is another kind of file.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = Path(path)
+        self.cut = False
+
+    def __iter__(self) -> Iterator[bytes]:
+        try:
+            with self.path.open("rb") as file:
+                head = file.read(8)
+                file.seek(0)
+                for magic, (what, mend) in _FOREIGN.items():
+                    if head.startswith(magic):
+                        raise LogError(str(self.path), f"is {what}, not a text log", mend)
+                if head.startswith((_XZ, _GZIP)):
+                    yield from self._expand(file, head.startswith(_XZ))
+                else:
+                    while block := file.read(_BLOCK):
+                        yield block
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise LogError(
+                str(self.path), f"cannot be read: {why}", "check path and permissions"
+            ) from error
+        except (lzma.LZMAError, zlib.error) as error:
+            raise LogError(
+                str(self.path),
+                f"is damaged: the compressed stream does not decode ({error})",
+                "fetch it again; nothing of it was used, for no number in it can be trusted",
+            ) from error
+
+    def _expand(self, file, xz: bool) -> Iterator[bytes]:
+        new = lzma.LZMADecompressor if xz else _Gunzip
+        decoder = new()
+        between = False  # after one stream's end mark, before another stream
+        while raw := file.read(_BLOCK):
+            while raw:
+                if between and not (raw := raw.lstrip(b"\0")):  # padding
+                    break
+                between = False
+                out = decoder.decompress(raw, _BLOCK)
+                if out:
+                    yield out
+                while not (decoder.eof or decoder.needs_input):
+                    yield decoder.decompress(b"", _BLOCK)
+                raw = decoder.unused_data if decoder.eof else b""
+                if decoder.eof:
+                    decoder, between = new(), True
+        self.cut = not between

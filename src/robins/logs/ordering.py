@@ -1,0 +1,67 @@
+"""Which samples to refuse so that time strictly increases: as few as possible.
+
+One principle covers every way a clock goes wrong. A duplicate or a step back by a sample costs that
+sample; a lone stamp an hour ahead costs itself, not the hour after it; a clock set back by a second
+costs a second; a recorder that restarts its clock costs the shorter of the two recordings, never
+"everything for ever". Where two choices refuse equally many, the earlier rows are kept.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+
+import numpy as np
+
+
+def increasing(time_ns: np.ndarray) -> np.ndarray:
+    """(n,) bool: the longest strictly increasing choice of rows, the earlier rows on a tie."""
+    keep = np.ones(len(time_ns), bool)
+    if np.all(np.diff(time_ns) > 0):
+        return keep
+    # Where all stamps before are earlier than all after, the two sides do not concern each other.
+    latest = np.maximum.accumulate(time_ns)[:-1]
+    earliest = np.minimum.accumulate(time_ns[::-1])[::-1][1:]
+    bounds = np.concatenate([[0], np.flatnonzero(latest < earliest) + 1, [len(time_ns)]])
+    for i in np.flatnonzero(np.diff(bounds) > 1):
+        span = slice(bounds[i], bounds[i + 1])
+        keep[span] = _longest(time_ns[span].tolist())
+    return keep
+
+
+def _longest(times: list[int]) -> list[bool]:
+    """Patience sorting (Fredman 1975), O(n log n).
+
+    The level of a row is the length of the longest choice that ends with it. At one level the times
+    never grow with the row, so of those that may come before the row chosen next, the first in the
+    order of recording is found by bisection.
+    """
+    tops: list[int] = []
+    levels: list[list[int]] = []
+    for row, t in enumerate(times):
+        level = bisect_left(tops, t)
+        tops[level : level + 1] = [t]
+        if level == len(levels):
+            levels.append([])
+        levels[level].append(row)
+    keep = [False] * len(times)
+    row, t = len(times), max(times) + 1
+    for rows in reversed(levels):
+        before = bisect_left(rows, row)
+        row = rows[bisect_left(rows, 1 - t, hi=before, key=lambda r: -times[r])]
+        t = times[row]
+        keep[row] = True
+    return keep
+
+
+def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
+    """How many rows were refused as duplicate, as backward and as ahead of what follows."""
+    refused = np.flatnonzero(~keep)
+    kept = np.flatnonzero(keep)
+    at = np.searchsorted(kept, refused) - 1  # the last row kept before each; -1: none
+    before = time_ns[kept[np.maximum(at, 0)]]
+    times = time_ns[refused]
+    return {
+        "duplicate": int(np.sum((at >= 0) & (times == before))),
+        "backward": int(np.sum((at >= 0) & (times < before))),
+        "ahead": int(np.sum((at < 0) | (times > before))),
+    }

@@ -1,0 +1,106 @@
+"""What the doctor looks at: a table without its bad rows, its usual step, its quiet stretches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.logs.findings import Finding, Severity
+from robins.logs.ordering import increasing
+
+_WINDOW_S = 1.0
+_REST = 0.01  # relative scatter of |specific force| in a window at rest
+
+
+def name_of(table: ImuTable | GnssTable | Trajectory) -> str:
+    """How sentences call a table: its file without the folder, or its type."""
+    return Path(table.source).name if table.source else type(table).__name__
+
+
+def place(table: ImuTable | GnssTable | Trajectory, row: int) -> str:
+    """Where a row is: its line in the file if known, else its time since the first row."""
+    rows = getattr(table, "rows", None)
+    if rows is not None:
+        return f"line {rows[row]}"
+    since = (int(table.time_ns[row]) - int(table.time_ns[0])) * 1e-9
+    return f"{since:.3f} s after the start"
+
+
+def finding(
+    table: ImuTable | GnssTable | Trajectory,
+    severity: Severity,
+    code: str,
+    value: float | int | str,
+    sentence: str,
+    row: int | None = None,
+) -> Finding:
+    """A finding about a table; the sentence is put behind the file's name and the place."""
+    where = "" if row is None else place(table, row)
+    begin = f"{name_of(table)} {where}".rstrip()
+    return Finding(severity, code, table.source, where, value, f"{begin}: {sentence}")
+
+
+def usual_step_s(time_ns: np.ndarray) -> float:
+    """Median step of time among those that go forward [s]; NaN if there is none."""
+    step = np.diff(time_ns)
+    step = step[step > 0]
+    return float(np.median(step)) * 1e-9 if len(step) else np.nan
+
+
+class Signal(NamedTuple):
+    """An IMU table as rates, good rows only, in the order of time."""
+
+    rows: np.ndarray  # (n,) index into the table
+    time_s: np.ndarray  # (n,) since the first of them
+    gyro: np.ndarray  # (n, 3) rad/s if the units are what the table claims
+    accel: np.ndarray  # (n, 3) m/s^2, likewise
+    step_s: float  # mean step, gaps left out
+
+
+def signal_of(imu: ImuTable) -> Signal | None:
+    """The usable samples of a table; None if there are fewer than ten."""
+    good = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
+    rows = np.flatnonzero(good)
+    rows = rows[increasing(imu.time_ns[rows])]
+    if len(rows) < 10:
+        return None
+    time_s = (imu.time_ns[rows] - imu.time_ns[rows[0]]) * 1e-9
+    steps = np.diff(time_s)
+    step_s = float(np.mean(steps[steps < 2.5 * np.median(steps)]))
+    per = np.ones((len(rows), 1))
+    if imu.kind == "increment":
+        per[:, 0] = np.concatenate([[step_s], steps])
+    return Signal(rows, time_s, imu.gyro[rows] / per, imu.accel[rows] / per, step_s)
+
+
+class Windows(NamedTuple):
+    """Stretches of about one second."""
+
+    first: np.ndarray  # (w,) index of the first sample of each in the signal
+    gyro: np.ndarray  # (w, 3) mean
+    accel: np.ndarray  # (w, 3) mean
+    restless: np.ndarray  # (w,) scatter of |gyro - mean|
+    at_rest: np.ndarray  # (w,) bool: the specific force hardly varies; needs no unit
+
+
+def windows_of(signal: Signal) -> Windows:
+    """Cut a signal into windows of one second, or of ten samples if that is longer."""
+    n = min(max(round(_WINDOW_S / signal.step_s), 10), len(signal.rows))
+    count = len(signal.rows) // n
+
+    def cut(values: np.ndarray) -> np.ndarray:
+        return values[: count * n].reshape(count, n, *values.shape[1:])
+
+    gyro, accel = cut(signal.gyro), cut(signal.accel)
+    size = np.linalg.norm(accel, axis=-1)
+    mean = size.mean(axis=1)
+    return Windows(
+        np.arange(count) * n,
+        gyro.mean(axis=1),
+        accel.mean(axis=1),
+        np.linalg.norm(gyro.std(axis=1), axis=-1),
+        size.std(axis=1) < _REST * mean,
+    )

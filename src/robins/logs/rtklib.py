@@ -1,0 +1,169 @@
+"""RTKLIB solutions (.pos): positions and velocities of a GNSS antenna.
+
+The header names the columns and the time system; both are believed, not assumed. RTKLIB's third
+axis is up: ``vu`` becomes ``v_D = -vu`` and ``sdu`` the sigma along D. Correlations (sdne, ...) are
+not kept.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from robins.dataset import GnssTable
+from robins.logs.findings import Finding, LogError, report
+from robins.logs.text import Head, Layout, peek, read_columns
+from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns
+
+# What RTKLIB writes, with velocities or without; used where the header was stripped.
+_POSITION: list[str] = ["latitude", "longitude", "height", "Q", "ns"]
+_POSITION += ["sdn", "sde", "sdu", "sdne", "sdeu", "sdun", "age", "ratio"]
+_WITH_VELOCITY: list[str] = [
+    *_POSITION,
+    "vn",
+    "ve",
+    "vu",
+    "sdvn",
+    "sdve",
+    "sdvu",
+    "sdvne",
+    "sdveu",
+    "sdvun",
+]
+_VELOCITY = ("vn", "ve", "vu", "sdvn", "sdve", "sdvu")
+_NEEDED = ("latitude", "longitude", "height", "Q", "sdn", "sde", "sdu")
+_UNSUPPORTED = {
+    "x-ecef": ("positions are Earth-fixed X, Y, Z", "out-solformat = llh"),
+    "e-baseline": ("positions are baselines east, north, up", "out-solformat = llh"),
+    "d'\"": ("latitudes are in degrees, minutes, seconds", "out-degform = deg"),
+    "JST": ("times are Japan standard time", "out-timesys = gpst"),
+}
+
+
+def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:
+    """Read a .pos file of RTKLIB, latitude/longitude/height in degrees, GPST or UTC.
+
+    Calendar stamps and week/time of week both become nanoseconds since 1970 in GPS time.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: the file is not such a solution, or in one of RTKLIB's other forms.
+    """
+    file, head = str(path), peek(path)
+    data = head.data(1)
+    if not data:
+        raise LogError(file, "holds no solution: header only", "was any epoch solved?")
+    comma = "," in data[0][1]
+    calendar = "/" in data[0][1].replace(",", " ").split()[0]
+    names, utc = _header(head)
+    # With commas, date and clock share a field; week and time of week never do.
+    texts = 1 if comma and calendar else 2
+    width = len(data[0][1].split("," if comma else None)) - texts
+    names = names or (_WITH_VELOCITY if width >= len(_WITH_VELOCITY) else _POSITION)
+    time_names = ("date", "time")[-texts:] if calendar else ("week", "time of week")
+    layout = Layout((*time_names, *names), "," if comma else None, texts)
+    columns = read_columns(path, layout, findings)
+    if missing := [n for n in _NEEDED if n not in names]:
+        raise LogError(
+            file,
+            f"has no column {', '.join(missing)}",
+            "write latitude, longitude, height, Q and the standard deviations",
+            where="header",
+        )
+
+    def column(name: str) -> np.ndarray:
+        return columns.values[:, names.index(name)]
+
+    def vectors(n: str, e: str, u: str, sign: float) -> np.ndarray:
+        return np.stack([column(n), column(e), sign * column(u) + 0.0], axis=-1)
+
+    v_n = sigma_v = None
+    if all(name in names for name in _VELOCITY):
+        v_n, sigma_v = vectors("vn", "ve", "vu", -1.0), vectors("sdvn", "sdve", "sdvu", 1.0)
+        if not (v_n.any() or sigma_v.any()):
+            v_n = sigma_v = None
+            report(findings, _no_velocity(file))
+    if any("/geodetic" in line for line in head.lines if line.startswith("%")):
+        report(findings, _above_geoid(file))
+    quality = column("Q")
+    return GnssTable(
+        time_ns=_times(file, columns.texts, columns.rows, calendar, utc),
+        lat_rad=np.deg2rad(column("latitude")),
+        lon_rad=np.deg2rad(column("longitude")),
+        alt_m=column("height").copy(),
+        sigma_m=vectors("sdn", "sde", "sdu", 1.0),
+        v_n=v_n,
+        sigma_v=sigma_v,
+        quality=np.where(np.isfinite(quality), quality, 0.0).astype(np.int64),
+        source=file,
+        rows=columns.rows,
+    )
+
+
+def _header(head: Head) -> tuple[list[str], bool]:
+    """Names of the number columns, if the header gives them, and whether times are UTC."""
+    for number, line in enumerate(head.lines, start=1):
+        if line.startswith("%"):
+            fields = line[1:].replace(",", " ").split()
+            for mark, (what, mend) in _UNSUPPORTED.items():
+                if any(mark in field for field in fields) and "ns" in fields:
+                    raise LogError(
+                        head.file,
+                        what,
+                        f"set {mend} in RTKLIB and solve again",
+                        where=f"line {number}",
+                    )
+            if fields[:1] in (["GPST"], ["UTC"]):
+                names = [field.split("(")[0] for field in fields[1:]]
+                return names, fields[0] == "UTC"
+    return [], False
+
+
+def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: bool) -> np.ndarray:
+    if not calendar:
+        weeks = stamps_to_ns(file, "week", texts[:, 0], rows, exponent=0)
+        return week_to_ns(weeks, stamps_to_ns(file, "time of week", texts[:, 1], rows))
+    out = np.zeros(len(texts), np.int64)
+    for i, text in enumerate(texts):
+        stamp = b" ".join(text).decode("utf-8", "replace")
+        try:
+            out[i] = calendar_to_ns(*stamp.split(), utc=utc)
+        except (ValueError, TypeError, ArithmeticError) as error:
+            raise LogError(
+                file,
+                "is not a time stamp year/month/day hour:minute:second",
+                "repair or delete the line",
+                where=f"line {rows[i]}",
+                field="time",
+                value=stamp,
+            ) from error
+    return out
+
+
+def _no_velocity(file: str) -> Finding:
+    return Finding(
+        "note",
+        "no_velocity",
+        file,
+        "",
+        0.0,
+        f"{file}: all velocities and their sigmas are zero, so RTKLIB did not solve for them; they "
+        "are left out. Heading will be found from the positions alone; set out-outvel = on.",
+    )
+
+
+def _above_geoid(file: str) -> Finding:
+    return Finding(
+        "warning",
+        "height_above_geoid",
+        file,
+        "header",
+        "geodetic",
+        f"{file} header: heights are above the geoid, and robins takes them as above the WGS-84 "
+        "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. Set "
+        "out-height = ellipsoidal in RTKLIB.",
+    )

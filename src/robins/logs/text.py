@@ -1,0 +1,322 @@
+"""Columns of numbers out of a text log: fast, strict, in bounded memory.
+
+Blocks of whole lines go through NumPy's C reader, which takes a number exactly or not at all. What
+it refuses is read again line by line, to allow comments and empty fields or to name line, field
+and value. A number is never completed, shortened or guessed:
+
+- a last line without its line end may have lost digits, so it is left out and reported;
+- a first line shorter than the next (a recording that began mid-line) likewise;
+- an empty field, ``nan`` and ``inf`` are kept as NaN and infinities, for `clean` to count;
+- anything else that is not a number is a `LogError`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.logs.findings import Finding, LogError, report
+from robins.logs.opening import Source
+
+_PARSE_BYTES = 1 << 22
+_LONGEST_LINE = 1 << 16
+_TEXT_BYTES = 40
+_BOM, _LF = b"\xef\xbb\xbf", b"\n"
+_NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.I)
+COMMENTS = ("#", "%")
+
+
+class Layout(NamedTuple):
+    """How to read the lines of a file.
+
+    The first `texts` columns, at least one, are kept as text (time stamps are read from their
+    digits); the others are numbers. Further columns than those named may follow; all lines must
+    have as many as the first ones have.
+    """
+
+    names: tuple[str, ...]
+    delimiter: str | None  # None: blanks
+    texts: int = 1
+    skip: int = 0  # header lines
+
+
+class Columns(NamedTuple):
+    """What was read: n rows of text columns and number columns, and their line numbers."""
+
+    texts: np.ndarray  # (n, texts) bytes
+    values: np.ndarray  # (n, width - texts) float64
+    rows: np.ndarray  # (n,) line numbers, from 1
+
+
+class Head(NamedTuple):
+    """The first whole lines of a file, to recognise its format by."""
+
+    file: str
+    lines: list[str]
+
+    def data(self, count: int = 50) -> list[tuple[int, str]]:
+        """Line numbers and text of the first lines that are neither blank nor comments."""
+        lines = enumerate(self.lines, start=1)
+        found = [(k, t) for k, t in lines if t.strip() and not t.lstrip().startswith(COMMENTS)]
+        return found[:count]
+
+
+def peek(path: str | os.PathLike[str]) -> Head:
+    """The first lines of a file, at most 64 KiB of it.
+
+    Raises:
+        LogError: the file is empty, cannot be opened, or is not text.
+    """
+    start = b""
+    for block in Source(path):
+        start += block[:_LONGEST_LINE]
+        if len(start) >= _LONGEST_LINE:
+            break
+    file = str(path)
+    if not start:
+        raise LogError(file, "is empty (0 bytes)", "record or copy it again")
+    _refuse_nul(file, start[:_LONGEST_LINE], 1)
+    start = start[:_LONGEST_LINE].removeprefix(_BOM)
+    if b"\r" in start and _LF not in start:
+        raise LogError(
+            file, "its lines end in CR alone", "save it with line ends LF or CR LF", where="line 1"
+        )
+    try:
+        text = start[: start.rfind(_LF) + 1 or None].decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = start[: error.start].count(_LF) + 1
+        raise LogError(
+            file, "is not text in UTF-8", "is this the log itself?", where=f"line {line}"
+        ) from error
+    return Head(file, [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")])
+
+
+def read_columns(
+    path: str | os.PathLike[str], layout: Layout, findings: list[Finding] | None = None
+) -> Columns:
+    """Read all lines of a file.
+
+    Args:
+        path: the file; .xz and .gz are recognised by content.
+        layout: names, delimiter and header of its columns.
+        findings: receives what was left out; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: no samples, a field that is not a number, a line of another length, no text file.
+    """
+    file = str(path)
+    width, cut_first = _width(peek(path), layout)
+    reader = _Reader(file, layout, width)
+    source = Source(path)
+    parts, line, ends_early = [], 1, ""
+    for block, whole in _blocks_of_lines(file, source):
+        if not whole:
+            ends_early = block.decode("utf-8", "replace")
+            break
+        count = block.count(_LF)
+        skip = min(max(layout.skip - line + 1, 0), count)
+        body = block.split(_LF, skip)[-1] if skip else block
+        parts.append(reader.read(body, line + skip, cut_first))
+        line += count
+    table = Columns(*(np.concatenate(p) for p in zip(*parts, strict=True))) if parts else None
+    if cut_first is not None:
+        report(findings, _begins_midway(file, *cut_first))
+    if table is None or not len(table.rows):
+        raise LogError(file, "holds no whole line of samples", "record or copy it again")
+    if ends_early or source.cut:
+        report(findings, _ends_early(file, line, ends_early, source.cut))
+    return table
+
+
+def _refuse_nul(file: str, data: bytes, line: int) -> None:
+    """Raise if the bytes, whose first line has this number, cannot be text."""
+    if b"\0" in data:
+        utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+        raise LogError(
+            file,
+            "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole",
+            "save it as UTF-8" if utf16 else "copy it again, or cut it before this line",
+            where=f"line {line + data[: data.index(bytes(1))].count(_LF)}",
+        )
+
+
+def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
+    """Blocks of whole lines, True; then what follows the last line end, if anything, False."""
+    line, rest = 1, b""  # rest begins on this line
+    pending: list[bytes] = []
+    for block in source:
+        _refuse_nul(file, block, line + sum(p.count(_LF) for p in pending))
+        pending.append(block)
+        if sum(map(len, pending)) < _PARSE_BYTES:
+            continue
+        lines, rest = _split(b"".join(pending), line)
+        line += lines.count(_LF)
+        if len(rest) > _LONGEST_LINE:
+            raise LogError(
+                file,
+                f"is longer than {_LONGEST_LINE} bytes",
+                "is this a text log with one sample a line?",
+                where=f"line {line}",
+            )
+        yield lines, True
+        pending = [rest]
+    lines, rest = _split(b"".join(pending), line)
+    if lines:
+        yield lines, True
+    if rest.strip():
+        yield rest, False
+
+
+def _split(data: bytes, line: int) -> tuple[bytes, bytes]:
+    """Whole lines, and what follows the last line end."""
+    if line == 1:
+        data = data.removeprefix(_BOM)
+    at = data.rfind(_LF) + 1
+    return data[:at], data[at:]
+
+
+def _width(head: Head, layout: Layout) -> tuple[int, tuple[int, str] | None]:
+    """Fields a line, and the first line if it is shorter than the second."""
+    data = [d for d in head.data(layout.skip + 3) if d[0] > layout.skip]
+    if not data:
+        raise LogError(head.file, "holds no sample: header only", "record it again")
+    widths = [len(_fields(text.encode(), layout.delimiter)) for _, text in data[:2]]
+    cut = len(widths) == 2 and widths[0] < widths[1]
+    width = max(widths)
+    if width < len(layout.names):
+        raise LogError(
+            head.file,
+            f"{width} fields where {len(layout.names)} are needed: {', '.join(layout.names)}",
+            "is it of another format, or separated by other characters?",
+            where=f"line {data[-1][0] if cut else data[0][0]}",
+        )
+    return width, (data[0] if cut else None)
+
+
+def _fields(line: bytes, delimiter: str | None) -> list[bytes]:
+    return line.split(delimiter.encode() if delimiter else None)
+
+
+class _Reader:
+    """Turns blocks of whole lines into arrays."""
+
+    def __init__(self, file: str, layout: Layout, width: int):
+        self.file, self.layout, self.width = file, layout, width
+        self.numbers = width - layout.texts
+        self.dtype = np.dtype(
+            [
+                ("texts", f"S{_TEXT_BYTES}", (layout.texts,)),
+                ("values", np.float64, (self.numbers,)),
+            ]
+        )
+
+    def read(self, block: bytes, line: int, cut_first: tuple[int, str] | None) -> Columns:
+        """Columns of a block whose first line has this number."""
+        try:
+            table = np.loadtxt(
+                io.BytesIO(block),
+                dtype=self.dtype,
+                delimiter=self.layout.delimiter,
+                comments=None,
+                ndmin=1,
+                encoding="latin1",
+            ) if block.strip() else np.zeros(0, self.dtype)  # fmt: skip
+        except ValueError:
+            table = None
+        if table is None or len(table) != block.count(_LF):
+            return self._line_by_line(block, line, cut_first)
+        texts = np.ascontiguousarray(table["texts"])
+        if np.any(texts.view(np.uint8)[:, _TEXT_BYTES - 1 :: _TEXT_BYTES]):
+            return self._line_by_line(block, line, cut_first)
+        rows = np.arange(line, line + len(table))
+        return Columns(texts, np.ascontiguousarray(table["values"]), rows)
+
+    def _line_by_line(self, block: bytes, line: int, cut_first: tuple[int, str] | None) -> Columns:
+        comments = tuple(c.encode() for c in COMMENTS)
+        texts, values, rows = [], [], []
+        for number, raw in enumerate(block.removesuffix(_LF).split(_LF), start=line):
+            text = raw.strip()
+            if not text or text.startswith(comments):
+                continue
+            if cut_first is not None and number == cut_first[0]:
+                continue
+            fields = _fields(text, self.layout.delimiter)
+            if len(fields) != self.width:
+                raise self._wrong_width(number, fields)
+            texts.append(fields[: self.layout.texts])
+            values.append(
+                [self._number(number, k, f) for k, f in enumerate(fields)][-self.numbers :]
+            )
+            rows.append(number)
+        return Columns(
+            np.array(texts, f"S{_TEXT_BYTES}").reshape(-1, self.layout.texts),
+            np.array(values, np.float64).reshape(-1, self.numbers),
+            np.array(rows, np.int64),
+        )
+
+    def _number(self, line: int, k: int, field: bytes) -> float:
+        field = field.strip()
+        if k < self.layout.texts:
+            if len(field) >= _TEXT_BYTES:
+                raise self._no_number(line, k, field, "is too long for a time stamp")
+            return 0.0
+        if not field:
+            return np.nan
+        if not _NUMBER.fullmatch(field):
+            cause = "is not a number"
+            if b"," in field:
+                cause += " (a decimal comma?)"
+            raise self._no_number(line, k, field, cause)
+        return float(field)
+
+    def _no_number(self, line: int, k: int, field: bytes, cause: str) -> LogError:
+        names = self.layout.names
+        return LogError(
+            self.file,
+            cause,
+            "write numbers with a decimal point, nan where one is missing; or delete the line",
+            where=f"line {line}",
+            field=names[k] if k < len(names) else f"column {k + 1}",
+            value=field[:_TEXT_BYTES].decode("utf-8", "replace"),
+        )
+
+    def _wrong_width(self, line: int, fields: list[bytes]) -> LogError:
+        return LogError(
+            self.file,
+            f"{len(fields)} fields where the first lines have {self.width}",
+            "bytes are missing, or numbers have decimal commas; delete or repair the line",
+            where=f"line {line}",
+        )
+
+
+def _ends_early(file: str, line: int, rest: str, cut: bool) -> Finding:
+    where = f"line {line}"
+    shown = rest.strip()[:60]
+    what = "the compressed stream has no end mark" if cut else "the last line has no line end"
+    lost = f"; line {line} ({shown!r}) may have lost digits and is left out" if rest else ""
+    return Finding(
+        "warning",
+        "ends_early",
+        file,
+        where,
+        shown,
+        f"{file} ends early at line {line}: {what}{lost}. The recording or the copy was "
+        "interrupted; all lines before it were read. Copy it again if the original is longer.",
+    )
+
+
+def _begins_midway(file: str, line: int, text: str) -> Finding:
+    return Finding(
+        "warning",
+        "begins_midway",
+        file,
+        f"line {line}",
+        text[:60],
+        f"{file} line {line} ({text[:60]!r}) has fewer fields than the next: the recording began "
+        "in the middle of a line. It is left out; nothing else is affected.",
+    )

@@ -1,0 +1,147 @@
+"""Time stamps of logs as integer nanoseconds, exact from their decimal text.
+
+A double holds seconds of today's Unix time only to 2.4e-7 s, so the digits are read as integers.
+Absolute stamps count from 1970-01-01 *in GPS time*: no leap seconds, as in RTKLIB's GPST and in the
+GNSS_IMU logs. Stamps of other epochs (seconds of the GPS week, since power-up) are kept as they
+are; the doctor says so when two files do not fit together.
+"""
+
+from __future__ import annotations
+
+import datetime
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+
+from robins.logs.findings import LogError
+
+GPS_EPOCH_S = 315_964_800  # 1980-01-06 on a count from 1970-01-01 without leap seconds
+WEEK_S = 604_800
+_NS = 1_000_000_000
+_EPOCH_DAY = datetime.date(1970, 1, 1).toordinal()
+
+# UTC dates from which GPS time - UTC has grown by one more second (IERS Bulletin C).
+_LEAPS = [
+    datetime.date(*day)
+    for day in [
+        (1981, 7, 1), (1982, 7, 1), (1983, 7, 1), (1985, 7, 1), (1988, 1, 1), (1990, 1, 1),
+        (1991, 1, 1), (1992, 7, 1), (1993, 7, 1), (1994, 7, 1), (1996, 1, 1), (1997, 7, 1),
+        (1999, 1, 1), (2006, 1, 1), (2009, 1, 1), (2012, 7, 1), (2015, 7, 1), (2017, 1, 1),
+    ]
+]  # fmt: skip
+
+
+def decimals_to_ns(text: np.ndarray, exponent: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers written in decimal, times 10**exponent, rounded (half up) to integers.
+
+    Args:
+        text: (n,) bytes, such as b"1756402240.9610000"; blanks around the number are ignored.
+        exponent: 9 where the text counts seconds, 0 where it counts nanoseconds.
+
+    Returns:
+        (n,) int64, and (n,) bool: False where the text is no number or beyond int64.
+    """
+    n, width = len(text), text.dtype.itemsize
+    value, plain = np.zeros(n, np.int64), np.zeros(n, bool)
+    if n:
+        columns = np.ascontiguousarray(text).view(np.uint8).reshape(n, width)
+        columns = np.ascontiguousarray(columns[:, columns.any(axis=0)].T)  # (characters, n)
+        length = np.count_nonzero(columns, axis=0)
+        is_point = columns == ord(".")
+        points = np.count_nonzero(is_point, axis=0)
+        at = np.where(points == 1, is_point.argmax(axis=0), length)
+        after = np.maximum(length - at - 1, 0)
+        plain = np.count_nonzero(columns - np.uint8(48) < 10, axis=0) == length - points
+        plain &= (points < 2) & (length > points) & (after <= exponent)
+        # int64 holds all numbers of 18 digits, and those of 19 that begin with less than a 9.
+        plain &= at + exponent <= 18 + (columns[0] < ord("9"))
+        shape = np.where(plain, at * width + length, -1)
+        # Stamps of one length with the point at one place are read together, digit by digit.
+        for k in np.unique(shape[plain]):
+            same = np.flatnonzero(shape == k)
+            value[same] = _digits(columns[:, same], int(k) // width, int(k) % width, exponent)
+    for i in np.flatnonzero(~plain):  # signs, exponents, blanks, more digits than ns, nonsense
+        exact = _exactly(text[i], exponent)
+        value[i], plain[i] = exact or 0, exact is not None
+    return value, plain
+
+
+def _digits(columns: np.ndarray, at: int, length: int, exponent: int) -> np.ndarray:
+    """Value of (characters, n) digits with the point, if any, in row `at`."""
+    value = np.zeros(columns.shape[1], np.int64)
+    for row in (r for r in range(length) if r != at):
+        value = value * 10 + (columns[row] - np.uint8(48))
+    return value * 10 ** (exponent - max(length - at - 1, 0))
+
+
+def _exactly(text: bytes, exponent: int) -> int | None:
+    try:
+        number = Decimal(text.decode("ascii").strip()).scaleb(exponent)
+        if number.adjusted() > 18:  # do not write out 1e999999999
+            return None
+        whole = int((number + Decimal("0.5")).to_integral_value("ROUND_FLOOR"))
+    except (InvalidOperation, UnicodeDecodeError, ValueError, OverflowError):
+        return None
+    return whole if -(2**63) <= whole < 2**63 else None
+
+
+def stamps_to_ns(
+    file: str, field: str, text: np.ndarray, rows: np.ndarray, exponent: int = 9
+) -> np.ndarray:
+    """`decimals_to_ns` for a column of a file.
+
+    Raises:
+        LogError: a stamp is no number, or too large for the unit it is read in.
+    """
+    time_ns, good = decimals_to_ns(text, exponent)
+    if not good.all():
+        bad = int(np.argmin(good))
+        shown = text[bad].decode("utf-8", "replace").strip()
+        large = _exactly(text[bad], 0) is not None
+        raise LogError(
+            file,
+            "does not fit: the time may be in ns, us or ms" if large else "is not a time stamp",
+            "convert the time column to seconds" if large else "repair or delete the line",
+            where=f"line {rows[bad]}",
+            field=field,
+            value=shown,
+        )
+    return time_ns
+
+
+def ns_to_decimal(time_ns: int) -> str:
+    """Seconds as exact decimal text: at least three decimals, no more than needed."""
+    sign = "-" if time_ns < 0 else ""
+    whole, part = divmod(abs(int(time_ns)), _NS)
+    decimals = f"{part:09d}".rstrip("0").ljust(3, "0")
+    return f"{sign}{whole}.{decimals}"
+
+
+def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
+    """``2025/08/28`` and ``17:30:39.749`` as nanoseconds since 1970 in GPS time.
+
+    Args:
+        date: year/month/day.
+        clock: hour:minute:second with any decimals.
+        utc: the stamp is UTC; the leap seconds since 1980 are added.
+
+    Raises:
+        ValueError: no date or time of that form.
+    """
+    year, month, day = (int(part) for part in date.split("/"))
+    hour, minute, second = clock.split(":")
+    today = datetime.date(year, month, day)
+    seconds = Decimal(second)
+    # RTKLIB writes 60.000 where rounding carries; a leap second is 60.x as well.
+    if not (0 <= int(hour) < 24 and 0 <= int(minute) < 60 and 0 <= seconds < 61):
+        raise ValueError(f"{clock} is no time of day")
+    days = today.toordinal() - _EPOCH_DAY
+    whole = (days * 24 + int(hour)) * 3600 + int(minute) * 60
+    if utc:
+        whole += sum(today >= leap for leap in _LEAPS)
+    return whole * _NS + int((seconds * _NS).to_integral_value())
+
+
+def week_to_ns(week: np.ndarray, tow_ns: np.ndarray) -> np.ndarray:
+    """GPS week (counted from 1980, not folded at 1024) and time of week, since 1970 in GPS time."""
+    return (GPS_EPOCH_S + week * WEEK_S) * _NS + tow_ns
