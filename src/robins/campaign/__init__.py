@@ -1,6 +1,7 @@
 """Campaigns: many runs of a problem, in chunks, with statistics that say how sure they are."""
 
 from robins.campaign.monte_carlo import CHUNK, chunks
+from robins.campaign.outcome import campaign_solution, simulate
 from robins.campaign.statistics import (
     Statistics,
     collect,
@@ -8,4 +9,13 @@ from robins.campaign.statistics import (
     rms_with_bounds,
 )
 
-__all__ = ["CHUNK", "Statistics", "chunks", "collect", "mean_with_bounds", "rms_with_bounds"]
+__all__ = [
+    "CHUNK",
+    "Statistics",
+    "campaign_solution",
+    "chunks",
+    "collect",
+    "mean_with_bounds",
+    "rms_with_bounds",
+    "simulate",
+]

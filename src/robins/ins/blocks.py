@@ -64,7 +64,8 @@ def cut(
     part's velocity increment is turned into the body axes at its own start.
 
     Args:
-        increments: N increments; dt (N,), theta (N, 3), dv (N, 3).
+        increments: N increments; dt (N,), theta (N, 3), dv (N, 3). Displacements are not used: a
+            piece moves as under a constant force, which is exact to the order of the rest.
         time_s: (N,) end of each increment; it begins at ``time_s - dt``.
         start_s: beginning of the first block.
         epoch_s: (E,) end of each block, increasing.
@@ -74,7 +75,7 @@ def cut(
     Raises:
         ValueError: the increments do not cover (start_s, last epoch], or width is too small.
     """
-    dt, theta, dv = (np.asarray(a, dtype=float) for a in increments)
+    dt, theta, dv = (np.asarray(a, dtype=float) for a in increments[:3])
     time_s, epoch_s = np.asarray(time_s, dtype=float), np.asarray(epoch_s, dtype=float)
     begin_s = time_s - dt
     slack = 1e-9

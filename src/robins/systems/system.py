@@ -95,4 +95,7 @@ class System(NamedTuple):
     parameters: type[Parameters]  # of a simulated scenario
     problem: Callable[..., Problem]  # (parameters, filters, seed) -> problem
     replay_parameters: type[Parameters] | None = None
-    replay: Callable[..., Outcome] | None = None  # (paths, parameters, filters, progress)
+    replay_default: Path | None = None  # configuration of a log that comes without one
+    replay: Callable[..., Outcome] | None = None  # (dataset, parameters, filters, progress)
+    # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
+    orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.tree_util import Partial
-from jaxtyping import Array
-from robins.ins.increments import Increments
+from jaxtyping import Array, ArrayLike
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 from robins.earth import earth_rate_n
 from robins.filters import Model, Motion, Sensor
+from robins.ins.increments import Increments
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "gnss_position",
@@ -31,14 +31,14 @@ class Block(NamedTuple):
     """Input of one step of the motion."""
 
     increments: Increments  # (K,), (K, 3), (K, 3)
-    noise_scale: Array  # () multiplies the process noise factor: 1, more across an IMU gap
+    noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
 
 
 class Fix(NamedTuple):
     """What GNSS sensors need besides the state."""
 
-    sigma: Array  # (3,) m or m/s, north east down
-    omega_b: Array  # (3,) rad/s mean raw gyro rate about the fix
+    sigma: ArrayLike  # (3,) m or m/s, north east down
+    omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
 
 
 class Mount(NamedTuple):

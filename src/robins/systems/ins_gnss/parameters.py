@@ -97,6 +97,7 @@ class Update(Parameters):
 class Replay(Parameters):
     """A recorded log: what cannot be read from the files themselves."""
 
+    system: Literal["ins-gnss"] = "ins-gnss"
     title: str = "INS/GNSS replay"
     imu: Imu
     gnss: Gnss = pydantic.Field(default_factory=Gnss)

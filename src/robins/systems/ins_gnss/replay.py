@@ -6,20 +6,19 @@ simulated outage withholds, and all others of the best quality, are the referenc
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
 from robins.ins.state import InsState
 
-from robins.dataset import Dataset, GnssTable, ImuTable
+from robins.dataset import Dataset, GnssTable
 from robins.earth import Geodetic
 from robins.filters import Belief, Solution, rts_smoother, run
 from robins.ins.blocks import Blocks, cut, epochs_between
+from robins.ins.frames import to_ned_frd
+from robins.ins.increments import Increments, from_imu
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import model as names
 from robins.systems.ins_gnss.model import Block, Fix, Mount, antenna_velocity
@@ -51,14 +50,6 @@ class Prepared(NamedTuple):
     withheld_epoch: np.ndarray  # (E,) bool
 
 
-def rotated(imu: ImuTable, orientation_rad: tuple[float, float, float]) -> ImuTable:
-    """Turn sensor axes into body axes, ``v_b = C(roll, pitch, yaw) v_sensor``."""
-    if not any(orientation_rad):
-        return imu
-    C = np.asarray(Rotation.from_euler(*orientation_rad).as_dcm())
-    return replace(imu, gyro=imu.gyro @ C.T, accel=imu.accel @ C.T)
-
-
 def outage_mask(time_s: np.ndarray, first_s: float, last_s: float, outages: Outages) -> np.ndarray:
     """Which times lie in an outage; outages repeat until none may begin any more."""
     period = outages.length + outages.gap
@@ -83,7 +74,7 @@ def fix_sigmas(gnss: GnssTable, parameters: Replay) -> tuple[np.ndarray, np.ndar
 
 def _mean_rate(increments: Increments, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
     """Gyro rate about a time: mean of the increments that end within 20 ms around it."""
-    dt, theta, _ = increments
+    dt, theta = increments.dt, increments.theta
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(theta, axis=0)])
     length = np.concatenate([[0.0], np.cumsum(dt)])
     half = max(0.01, 1.5 * float(np.median(dt)))
@@ -108,10 +99,11 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     """
     if dataset.gnss is None or len(dataset.gnss) == 0:
         raise ValueError("a replay of INS/GNSS needs GNSS fixes; this log has none")
-    imu = rotated(to_ned_frd(dataset.imu), parameters.imu.orientation)
+    imu = to_ned_frd(dataset.imu)
     gnss = to_ned_frd(dataset.gnss)
     increments, time_ns = from_imu(imu)
-    increments = Increments(*(np.asarray(a, dtype=float) for a in increments))
+    increments = Increments(*(np.asarray(a, dtype=float) for a in increments[:3]))
+    samples = increments[:3]
     origin = int(time_ns[0] - round(1e9 * float(increments.dt[0])))
     time_s = (time_ns - origin) * 1e-9
     gnss_s = (gnss.time_ns - origin) * 1e-9
@@ -126,7 +118,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     any_fix = np.flatnonzero(inside)[0]
     lat, alt = float(gnss.lat_rad[any_fix]), float(gnss.alt_m[any_fix])
     start = find_start(
-        time_s, *increments, gnss_s, gnss.v_n, lat, alt, parameters.start, parameters.aids
+        time_s, *samples, gnss_s, gnss.v_n, lat, alt, parameters.start, parameters.aids
     )
     # the first fix at or after the start places the filter
     begin = np.flatnonzero(inside & (gnss_s >= start.time_s - 1e-6))
@@ -180,7 +172,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     if velocity is not None and sigma_v is not None:
         y[names.VELOCITY] = _at_epochs(velocity[given], at, count, np.nan)
         aux[names.VELOCITY] = Fix(_at_epochs(sigma_v[given], at, count, 1.0), rate)
-    still, still_rate = standstill(*increments, parameters.aids)
+    still, still_rate = standstill(*samples, parameters.aids)
     last = np.minimum(np.searchsorted(time_s, epochs - 1e-9), len(time_s) - 1)
     at_rest = (still[last] & parameters.aids.zero_velocity)[:, None]
     if parameters.aids.zero_velocity:
@@ -232,7 +224,7 @@ def navigate(
         base = name.removesuffix(SMOOTHED)
         if base not in solutions:
             solutions[base] = run(
-                make_filter(base, parameters.update),
+                make_filter(base, parameters.update.gate),
                 model,
                 prepared.belief,
                 prepared.y,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import jax.numpy as jnp
 import numpy as np
 from robins.ins.state import InsNoise, InsState
@@ -19,7 +21,7 @@ from robins.systems.ins_gnss.model import (
     Mount,
     ins_gnss_model,
 )
-from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start, Update
+from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
 from robins.systems.system import SensorAxes, StateBlock
 
 FILTERS = {
@@ -31,8 +33,11 @@ FILTERS = {
 SMOOTHED = "+rts"  # a filter's name with this ending is its smoother
 
 
-def make_filter(name: str, update: Update) -> Filter:
-    """The filter of a name, with the gate where one is asked for.
+@cache
+def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
+    """The filter of a name, gated where the probability is not zero.
+
+    Equal arguments give the same object, so that what was compiled for it serves again.
 
     Raises:
         ValueError: there is no filter of this name.
@@ -42,7 +47,7 @@ def make_filter(name: str, update: Update) -> Filter:
         raise ValueError(
             f"no filter '{name}'; there are {', '.join(FILTERS)}, each also with {SMOOTHED}"
         )
-    return FILTERS[base]((gate(update.gate),) if update.gate > 0.0 else ())
+    return FILTERS[base]((gate(gate_probability),) if gate_probability > 0.0 else ())
 
 
 def noise_of(imu: Imu) -> InsNoise:

@@ -1,0 +1,255 @@
+"""What the commands do: from a scenario or a log to a result folder with figures and a page.
+
+Everything below knows one thing; here they meet: scenario text, system, campaign, result, report.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from robins import _float64, logs, report, results, scenario
+from robins.campaign import simulate
+from robins.logs import Finding
+from robins.systems import SYSTEMS, Outcome, System
+
+Progress = Callable[[float, str], None]
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used; the message names it, says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished command: where its result is and what its summary says."""
+
+    path: Path
+    summary: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+
+def _hint(word: str, among: Iterable[str]) -> str:
+    near = difflib.get_close_matches(word, list(among), 1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def find_scenario(name: str) -> tuple[System, str, str]:
+    """System, name and text of a packaged scenario "system/name", or of a TOML file.
+
+    A file says its system in the key ``system``.
+
+    Raises:
+        InputError: there is no such scenario or file, or the file names no system.
+    """
+    packaged = {
+        f"{s.name}/{k}": (s, path) for s in SYSTEMS.values() for k, path in s.scenarios.items()
+    }
+    if name in packaged:
+        system, path = packaged[name]
+        return system, name, path.read_text()
+    if not name.endswith(".toml"):
+        raise InputError(
+            f"no scenario '{name}'{_hint(name, packaged)}. `robins list` names those there are; "
+            "a path must end in .toml"
+        )
+    text = scenario.read_text(name)
+    chosen = scenario.mapping_of(text).get("system")
+    if chosen not in SYSTEMS:
+        raise InputError(
+            f'{name}: write system = "..." into its first lines, one of {", ".join(SYSTEMS)}; '
+            f"it says {chosen!r}"
+        )
+    return SYSTEMS[chosen], Path(name).stem, text
+
+
+def _check_filters(system: System, wanted: Sequence[str]) -> tuple[str, ...]:
+    for name in wanted:
+        if name not in system.filters:
+            raise InputError(
+                f"no filter '{name}' in {system.name}{_hint(name, system.filters)}. It has "
+                f"{', '.join(system.filters)}"
+            )
+    return tuple(dict.fromkeys(wanted))
+
+
+def _write(
+    outcome: Outcome,
+    out: str | os.PathLike[str],
+    *,
+    name: str,
+    text: str,
+    seed: int,
+    runs: int,
+    command: str,
+    tell: Progress,
+    writer: results.ResultWriter,
+) -> Done:
+    writer.save_summary(
+        {
+            "scenario": name,
+            "seed": seed,
+            "runs": runs,
+            "filters": outcome.metrics,
+            "claims": outcome.claims,
+            "counts": outcome.counts,
+        }
+    )
+    writer.save_solution(outcome.solution)
+    for file, content in outcome.files.items():
+        writer.save_file(file, content)
+
+    def drawing(done: float, total: float, what: str) -> None:
+        tell(0.85 + 0.15 * done / max(total, 1.0), what)
+
+    report.add(writer, drawing)
+    return Done(Path(out), {}, tuple(outcome.notes))
+
+
+def run_scenario(
+    name: str,
+    *,
+    out: str | os.PathLike[str],
+    runs: int | None = None,
+    seed: int = 0,
+    filters: Sequence[str] = (),
+    settings: Iterable[str] = (),
+    command: str = "",
+    progress: Progress | None = None,
+) -> Done:
+    """Simulate a scenario with several filters on the same random numbers.
+
+    Args:
+        name: "system/name" or the path of a TOML file.
+        out: the result folder.
+        runs: how many; by default what the scenario says.
+        seed: of the random streams.
+        filters: names; by default those of the scenario.
+        settings: "path=value" texts that change the scenario.
+        command: how to make the result again, for its report.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+        robins.results.ResultError: the folder cannot be written.
+    """
+    _float64.require()
+    tell = progress or (lambda share, what: None)
+    system, label, text = find_scenario(name)
+    settings = tuple(settings)
+    parameters = scenario.parse(system.parameters, text, settings, source=name)
+    chosen = _check_filters(system, filters) or tuple(parameters.filters)
+    count = parameters.runs if runs is None else runs
+    with _writer(out, text, settings, command) as writer:
+        problem = system.problem(parameters, chosen, seed)
+        outcome = simulate(problem, count, progress=lambda s, w: tell(0.85 * s, w))
+        done = _write(
+            outcome,
+            out,
+            name=label,
+            text=text,
+            seed=seed,
+            runs=count,
+            command=command,
+            tell=tell,
+            writer=writer,
+        )
+    return _finished(done)
+
+
+def replay_log(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    out: str | os.PathLike[str],
+    system: str = "ins-gnss",
+    filters: Sequence[str] = (),
+    settings: Iterable[str] = (),
+    seed: int = 0,
+    command: str = "",
+    progress: Progress | None = None,
+    findings: Callable[[Sequence[Finding]], None] | None = None,
+) -> Done:
+    """Navigate a recorded log: doctor, clean, align, filter, smooth, measure.
+
+    Args:
+        paths: the log's files; one that ends in .toml is the configuration.
+        out: the result folder.
+        system: which system navigates it.
+        filters: names; by default those of the configuration.
+        settings: "path=value" texts that change the configuration.
+        seed: recorded in the result; a replay draws nothing.
+        command: how to make the result again.
+        progress: called with the share done and what is being done.
+        findings: called with what the doctor says.
+
+    Raises:
+        InputError: the log or what was asked of it cannot be used.
+        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
+        robins.results.ResultError: the folder cannot be written.
+    """
+    _float64.require()
+    tell = progress or (lambda share, what: None)
+    if system not in SYSTEMS:
+        raise InputError(f"no system '{system}'; there are {', '.join(SYSTEMS)}")
+    chosen_system = SYSTEMS[system]
+    if chosen_system.replay is None or chosen_system.replay_parameters is None:
+        raise InputError(f"{system} does not replay logs")
+    configurations = [os.fspath(p) for p in paths if os.fspath(p).endswith(".toml")]
+    files = [p for p in paths if not os.fspath(p).endswith(".toml")]
+    if len(configurations) > 1:
+        raise InputError(f"one configuration is wanted, got {', '.join(configurations)}")
+    chosen_path = configurations[0] if configurations else chosen_system.replay_default
+    text = scenario.read_text(chosen_path)
+    settings = tuple(settings)
+    source = configurations[0] if configurations else "the default configuration"
+    parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
+    chosen = _check_filters(chosen_system, filters)
+    with _writer(out, text, settings, command) as writer:
+        tell(0.0, "reading")
+        angles = np.degrees(chosen_system.orientation(parameters))
+        dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles))
+        found = logs.examine(dataset)
+        if findings is not None:
+            findings(found)
+        errors = [f for f in found if f.severity == "error"]
+        if errors:
+            raise InputError("\n".join(f.sentence for f in errors))
+        dataset = logs.clean(dataset)
+        try:
+            outcome = chosen_system.replay(
+                dataset, parameters, chosen, lambda s, w: tell(0.1 + 0.75 * s, w)
+            )
+        except ValueError as error:
+            raise InputError(f"{dataset.name}: {error}") from error
+        done = _write(
+            outcome,
+            out,
+            name=f"{system}/{dataset.name}",
+            text=text,
+            seed=seed,
+            runs=1,
+            command=command,
+            tell=tell,
+            writer=writer,
+        )
+    return _finished(done)
+
+
+def _writer(out, text: str, settings: Sequence[str], command: str) -> results.ResultWriter:
+    """The result is refused before anything is computed where it could not be written."""
+    effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
+    device = jax.devices()[0].device_kind
+    return results.ResultWriter(
+        out, scenario_text=effective if settings else text, device=device, command=command
+    )
+
+
+def _finished(done: Done) -> Done:
+    return Done(done.path, results.read(done.path).summary, done.notes)

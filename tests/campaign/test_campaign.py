@@ -1,0 +1,152 @@
+"""Campaigns against plain loops and closed forms, on a problem small enough to know by heart."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from robins.campaign import chunks, collect, rms_with_bounds, simulate
+from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
+from robins.sim.random import Component, stream
+from robins.systems.system import Case, Contender, Problem, SensorAxes, StateBlock
+
+STEPS = 60
+F = jnp.array([[1.0, 0.5], [0.0, 1.0]])
+Q_FACTOR = jnp.array([[0.02, 0.0], [0.05, 0.03]])
+
+
+def _model(sigma, factor=Q_FACTOR):
+    return Model(
+        Motion(lambda x, u: F @ x, factor), (Sensor(lambda x, a: x[:1], jnp.array([sigma]), 1),)
+    )
+
+
+def _simulate(index):
+    key = stream(7, index, Component.TRAJECTORY)
+    k0, k1, k2 = jax.random.split(key, 3)
+    x0 = jax.random.normal(k0, (2,))
+
+    def step(x, w):
+        x = F @ x + Q_FACTOR @ w
+        return x, x
+
+    _, truth = jax.lax.scan(step, x0, jax.random.normal(k1, (STEPS, 2)))
+    y = truth[:, :1] + 0.4 * jax.random.normal(k2, (STEPS, 1))
+    start = Belief(jnp.zeros(2), jnp.eye(2))
+    return Case(start, None, {"y": y}, {}, truth)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(
+        simulate=_simulate,
+        contenders={
+            "right": Contender(kalman(taylor()), _model(0.4)),
+            "sure": Contender(kalman(taylor()), _model(0.2)),
+            "wrong R": Contender(kalman(taylor()), _model(0.4 * np.sqrt(1.2))),
+        },
+        epoch_s=np.arange(1, STEPS + 1) * 0.5,
+        blocks=(StateBlock("line", slice(0, 2), "m", "m", "E", ("x", "v")),),
+        sensors={"y": SensorAxes("m", "E", ("x",))},
+        context=xr.Dataset(),
+        metrics=lambda s: {"rms_m": float(np.sqrt(np.mean(s.rms[:, 0] ** 2)))},
+        claims=lambda m: [],
+    )
+
+
+@pytest.fixture(scope="module")
+def right(problem):
+    return collect(chunks(problem, "right", 300, chunk=64), problem.blocks)
+
+
+def test_chunks_do_not_change_a_run(problem):
+    whole = np.concatenate([r["error"] for r in chunks(problem, "right", 10, chunk=10)])
+    parts = np.concatenate([r["error"] for r in chunks(problem, "right", 10, chunk=4)])
+    np.testing.assert_allclose(parts, whole, rtol=0, atol=1e-13)
+    alone = np.concatenate([r["error"] for r in chunks(problem, "right", 1, first=7)])
+    np.testing.assert_allclose(alone[0], whole[7], rtol=0, atol=1e-13)
+
+
+def test_a_run_in_a_campaign_is_the_run_alone(problem):
+    record = next(chunks(problem, "right", 3, chunk=3))
+    case = _simulate(jnp.asarray(2))
+    c = problem.contenders["right"]
+    solution = run(c.filter, c.model, case.start, case.y)
+    np.testing.assert_allclose(record["error"][2], case.truth - solution.mean, atol=1e-13)
+    np.testing.assert_allclose(record["sigma"][2], solution.sigma, atol=1e-13)
+
+
+def test_statistics_are_those_of_a_plain_loop(problem):
+    records = list(chunks(problem, "right", 10, chunk=4))
+    s = collect(records, problem.blocks)
+    error = np.concatenate([r["error"] for r in records])
+    np.testing.assert_allclose(s.rms, np.sqrt(np.mean(error**2, axis=0)), rtol=1e-13)
+    P = [run_covariance(problem, i) for i in range(10)]
+    nees = np.mean(
+        [
+            [e @ np.linalg.solve(p, e) for e, p in zip(err, cov, strict=True)]
+            for err, cov in zip(error, P, strict=True)
+        ],
+        axis=0,
+    )
+    np.testing.assert_allclose(s.anees() * 2, nees, rtol=1e-9)
+    np.testing.assert_allclose(s.block_anees()["line"], s.anees(), rtol=1e-9)
+    assert s.runs == 10
+    assert s.run_rms.shape == (10, 2)
+    assert s.sensors == ["y"]
+
+
+def run_covariance(problem, i):
+    c = problem.contenders["right"]
+    case = _simulate(jnp.asarray(i))
+    return np.asarray(run(c.filter, c.model, case.start, case.y).covariance)
+
+
+def test_a_matched_filter_is_consistent_and_wrong_ones_are_caught(problem, right):
+    assert right.anees_share_inside() >= 0.9
+    assert right.nis("y", 0.999).inside
+    np.testing.assert_allclose(right.overall_ratio(), 1.0, atol=0.05)
+    sure = collect(chunks(problem, "sure", 300), problem.blocks)
+    assert not sure.nis("y", 0.999).inside
+    assert sure.anees_share_inside() < 0.5
+    wrong = collect(chunks(problem, "wrong R", 300), problem.blocks)
+    assert not wrong.nis("y", 0.999).inside, "R wrong by 1.2 must be seen in the grand mean NIS"
+
+
+def test_a_diverged_run_is_counted_not_dropped(problem):
+    record = next(chunks(problem, "right", 4, chunk=4))
+    record["error"] = record["error"].copy()
+    record["error"][1, 5] = np.nan
+    s = collect([record], problem.blocks)
+    assert s.diverged == 1
+    assert s.runs == 4
+    assert np.all(np.isinf(s.rms[5]))
+
+
+def test_all_filters_see_the_same_numbers(problem):
+    outcome = simulate(problem, 5, chunk=5)
+    assert list(outcome.metrics) == ["right", "sure", "wrong R"]
+    y = outcome.solution["innovation_y"].values[:, 0, 0]
+    # the first innovation is y - F m0 whatever R is believed
+    np.testing.assert_allclose(y, y[0], atol=1e-14)
+    assert outcome.solution["rms_line"].attrs["runs"] == 5
+
+
+def test_bounds_cover(problem):
+    rng = np.random.default_rng(3)
+    hits = 0
+    for _ in range(400):
+        squares = stats.chi2.rvs(20, size=30, random_state=rng) / 20
+        _, low, high = rms_with_bounds(squares)
+        hits += low <= 1.0 <= high
+    # 95 % bounds: 400 trials, four sigma of the binomial
+    assert abs(hits - 380) < 4 * np.sqrt(400 * 0.95 * 0.05)
+
+
+def test_refuses_nonsense(problem):
+    with pytest.raises(ValueError, match="at least 1"):
+        next(chunks(problem, "right", 0))
+    with pytest.raises(ValueError, match="no filter 'ghost'"):
+        next(chunks(problem, "ghost", 1))

@@ -1,0 +1,91 @@
+"""Standstill and the start of a replay, on motion that is known."""
+
+import numpy as np
+import pytest
+
+from robins import rotation
+from robins.systems.ins_gnss.parameters import Aids, Start
+from robins.systems.ins_gnss.still import (
+    find_start,
+    level,
+    moving_statistics,
+    standstill,
+    with_heading,
+)
+
+G = 9.80
+DT = 0.01
+
+
+def test_moving_statistics_are_those_of_the_windows():
+    x = np.random.default_rng(1).normal(1e3, 1.0, (200, 2))
+    mean, spread = moving_statistics(x, 25)
+    for k in (0, 3, 24, 25, 199):
+        window = x[max(0, k - 24) : k + 1]
+        np.testing.assert_allclose(mean[k], window.mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(spread[k], window.std(axis=0), atol=1e-9)
+
+
+def test_levelling_returns_the_tilt_of_every_attitude():
+    rng = np.random.default_rng(2)
+    for roll, pitch, heading in rng.uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (30, 3)):
+        C_nb = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading)))
+        q = level(C_nb.T @ [0.0, 0.0, -G], heading)
+        np.testing.assert_allclose(np.asarray(rotation.to_dcm(q)), C_nb, atol=1e-12)
+        turned = with_heading(q, heading + 1.0)
+        expected = rotation.from_euler(roll, pitch, heading + 1.0)
+        np.testing.assert_allclose(
+            np.asarray(rotation.to_dcm(turned)), np.asarray(rotation.to_dcm(expected)), atol=1e-12
+        )
+
+
+def _walk(rest_s, go_s, roll, pitch, heading_rest, course):
+    """Rest at one heading, then turn to the course at a constant rate and move off along it."""
+    rng = np.random.default_rng(5)
+    n0, n1 = round(rest_s / DT), round(go_s / DT)
+    rate = (course - heading_rest) / go_s
+    theta = rng.normal(0, 1e-5, (n0 + n1, 3))
+    C_rest = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading_rest)))
+    # a turn about the vertical, seen in the body
+    theta[n0:] += C_rest.T @ [0.0, 0.0, rate * DT]
+    dv = np.tile(C_rest.T @ [0.0, 0.0, -G] * DT, (n0 + n1, 1)) + rng.normal(
+        0, 1e-4, (n0 + n1, 3)
+    )
+    shake = np.zeros_like(dv)
+    shake[n0:] = 0.02 * rng.normal(size=(n1, 3))
+    dt = np.full(n0 + n1, DT)
+    time = np.cumsum(dt)
+    gnss_s = np.arange(0.25, time[-1], 0.25)
+    speed = np.where(gnss_s > rest_s + go_s - 0.5, 1.5, 0.0)
+    v_n = np.c_[speed * np.cos(course), speed * np.sin(course), 0 * speed]
+    return time, dt, theta, dv + shake, gnss_s, v_n
+
+
+def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
+    roll, pitch, course = 0.2, -0.1, 2.0
+    log = _walk(8.0, 4.0, roll, pitch, 0.5, course)
+    still, _ = standstill(*log[1:4], Aids())
+    assert np.all(still[100:790])
+    assert not np.any(still[900:])
+    found = find_start(*log, 0.7, 100.0, Start(), Aids())
+    assert found.time_s == pytest.approx(11.75, abs=0.3)
+    _, _, heading = (float(a) for a in rotation.to_euler(found.q_nb))
+    assert heading == pytest.approx(course, abs=1e-9)
+    # turning about the vertical keeps roll and pitch
+    roll_found, pitch_found, _ = (float(a) for a in rotation.to_euler(found.q_nb))
+    assert roll_found == pytest.approx(roll, abs=2e-3)
+    assert pitch_found == pytest.approx(pitch, abs=2e-3)
+    assert "at rest" in found.sentence
+
+
+def test_start_says_why_it_cannot():
+    time, dt, theta, dv, gnss_s, v_n = _walk(4.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    with pytest.raises(ValueError, match=r"fastest fix moves at 0\.00 m/s.*start\.known_heading"):
+        find_start(time, dt, theta, dv, gnss_s, 0 * v_n, 0.7, 0.0, Start(), Aids())
+    with pytest.raises(ValueError, match="no GNSS velocity"):
+        find_start(time, dt, theta, dv, gnss_s, None, 0.7, 0.0, Start(), Aids())
+    with pytest.raises(ValueError, match="cannot level"):
+        find_start(time, dt, theta, 0.01 * dv, gnss_s, v_n, 0.7, 0.0, Start(), Aids())
+    given = Start(known_heading=1.25)
+    found = find_start(time, dt, theta, dv, gnss_s, None, 0.7, 0.0, given, Aids())
+    assert float(rotation.to_euler(found.q_nb)[2]) == pytest.approx(1.25, abs=1e-12)
