@@ -26,6 +26,34 @@ def test_stream_is_the_documented_fold():
     np.testing.assert_array_equal(jax.random.key_data(got), jax.random.key_data(wanted))
 
 
+def threefry(key, x):
+    """Threefry-2x32 with 20 rounds (Salmon et al. 2011), in plain arithmetic."""
+    mask = 0xFFFFFFFF
+    keys = [*key, key[0] ^ key[1] ^ 0x1BD11BDA]
+    x = [(x[0] + keys[0]) & mask, (x[1] + keys[1]) & mask]
+    for group in range(5):
+        for turn in ((13, 15, 26, 6), (17, 29, 16, 24))[group % 2]:
+            x[0] = (x[0] + x[1]) & mask
+            x[1] = ((x[1] << turn) | (x[1] >> (32 - turn))) & mask
+            x[1] ^= x[0]
+        x[0] = (x[0] + keys[(group + 1) % 3]) & mask
+        x[1] = (x[1] + keys[(group + 2) % 3] + group + 1) & mask
+    return x
+
+
+def test_streams_are_threefry_and_number_their_bits_in_order():
+    # That rows drawn from one key do not depend on how many follow is what sensors rely on.
+    seed, run, component = 2**40 + 5, 137, 2
+    key = [seed >> 32, seed & 0xFFFFFFFF]
+    for word in (run, component):
+        key = threefry(key, [0, word])
+    got = stream(seed, run, component)
+    np.testing.assert_array_equal(jax.random.key_data(got), key)
+    bits = np.ravel(jax.random.bits(got, (3, 2), dtype=jnp.uint64)).tolist()
+    words = [threefry(key, [0, i]) for i in range(6)]
+    assert bits == [(high << 32) | low for high, low in words]
+
+
 def test_streams_do_not_depend_on_the_default_generator_of_jax():
     before = jax.random.key_data(stream(SEED, 3, Component.IMU))
     with jax.default_prng_impl("rbg"):
