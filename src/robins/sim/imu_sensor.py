@@ -1,0 +1,331 @@
+"""An inertial measurement unit: what its gyros and accelerometers report of a true motion.
+
+In go the ideal increments, the angle and the change of velocity of each sampling interval; out come
+those of a unit with the errors of an `ImuErrorModel`. Every process is discretised exactly, for the
+sampling interval of each sample: the bias at the end of a sample and its integral over the sample
+have their true covariance, so a sum of increments has the same statistics at 10 Hz as at 1 kHz, and
+intervals may vary.
+
+Normal numbers are drawn by sample number, and by error within a sample. So an error switched on or
+off leaves the numbers of the others as they were, and a piece of a run, a longer run and one sample
+at a time (`begin`, `sample`) get the noise that the whole run gets from `corrupt`.
+
+All is pure JAX: map over ``key`` for a batch of runs, and over a stacked model for a sweep.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.ins.imu_errors import ImuErrorModel, TriadErrors
+
+# What follows is part of the file format, as `robins.sim.random.Component` is: a table of normal
+# numbers (rows, 2, 3) is drawn once and one more at each sample; gyros are the first of the two.
+# A counter-based generator fills the rows in order, so none depends on how many follow it.
+_ONCE, _SAMPLES = 0, 1  # streams folded into the key of the unit
+
+
+class _Once(IntEnum):
+    """First row of what is drawn when the unit is switched on."""
+
+    MARKOV_START = 0
+    BIAS = 1
+    SCALE = 2
+    MISALIGNMENT = 3  # three rows
+    G_SENSITIVITY = 6  # three rows
+
+
+class _Row(IntEnum):
+    """Row of what is drawn at a sample."""
+
+    WHITE = 0  # white noise, and what the ends of the processes leave open about their integrals
+    MARKOV = 1
+    WALK = 2
+
+
+class TriadTruth(NamedTuple):
+    """True errors of a triad. From `corrupt` the first two have a row for each sample."""
+
+    bias: Any  # (3,) or (n, 3) rad/s or m/s^2 at the end of the sample, all parts of the bias
+    clipped: Any  # (3,) or (n, 3) bool: the axis was beyond its full scale
+    matrix: Any  # (3, 3) S + M: scale factor errors and misalignments
+    g_sensitivity: Any  # (3, 3) rad/s per m/s^2
+
+
+class ImuTruth(NamedTuple):
+    """True errors of a unit."""
+
+    gyro: TriadTruth
+    accel: TriadTruth
+
+
+class _Constants(NamedTuple):
+    bias: Any  # (3,); None, here as below, where there is none
+    matrix: Any  # (3, 3) S + M
+    g_sensitivity: Any  # (3, 3)
+
+
+class _Triad(NamedTuple):
+    errors: TriadErrors
+    constants: _Constants
+
+
+class Imu(NamedTuple):
+    """A unit that was switched on: its model and what stays the same until it is switched off."""
+
+    gyro: _Triad
+    accel: _Triad
+    key: Array  # of what is drawn at each sample
+
+
+class _TriadState(NamedTuple):
+    markov: Any = None  # (3,) Gauss-Markov bias
+    walk: Any = None  # (3,) random walk of the bias
+    residue: Any = None  # (3,) part of the increments not yet reported by the quantiser
+
+
+class ImuState(NamedTuple):
+    """What a unit carries from sample to sample."""
+
+    number: Any  # () int, number of the next sample
+    elapsed_s: Any  # () s since it was switched on
+    gyro: _TriadState
+    accel: _TriadState
+
+
+def begin(model: ImuErrorModel, key: Array) -> tuple[Imu, ImuState]:
+    """Switch a unit on: draw what is constant and where its processes start.
+
+    The Gauss-Markov bias starts in its steady state, the random walk and the ramp at zero.
+
+    Args:
+        model: of its errors.
+        key: of the run and the unit, from `robins.sim.random.stream`.
+    """
+    numbers = jax.random.normal(jax.random.fold_in(key, _ONCE), (9, 2, 3))
+    gyro, markov_of_gyro = _switch_on(model.gyro, numbers[:, 0])
+    accel, markov_of_accel = _switch_on(model.accel, numbers[:, 1])
+    state = ImuState(
+        jnp.asarray(0),
+        jnp.asarray(0.0),
+        _start(model.gyro, markov_of_gyro),
+        _start(model.accel, markov_of_accel),
+    )
+    return Imu(gyro, accel, jax.random.fold_in(key, _SAMPLES)), state
+
+
+def sample(
+    imu: Imu,
+    state: ImuState,
+    dt_s: Float[Array, ""],
+    theta: Float[Array, "3"],
+    dv: Float[Array, "3"],
+) -> tuple[ImuState, tuple[Array, Array, ImuTruth]]:
+    """Report one sample; the increments and `ImuTruth` are as in `corrupt`."""
+    after, (turned, pushed, seen) = _sample(
+        imu, state, _normals(imu, state.number), dt_s, theta, dv
+    )
+    return after, (turned, pushed, _truth(imu, seen))
+
+
+def corrupt(
+    dt_s: ArrayLike, theta: ArrayLike, dv: ArrayLike, model: ImuErrorModel, key: Array
+) -> tuple[Array, Array, ImuTruth]:
+    """What a unit reports of n ideal samples in a row, and its true errors.
+
+    An error the model has not (None) costs nothing and changes nothing: with none at all the
+    increments come back bit for bit. Memory grows with n; a long campaign takes `begin` and
+    `sample` in a scan of its own.
+
+    Args:
+        dt_s: (n,) sampling intervals [s].
+        theta: (n, 3) ideal angle increments [rad], integrals of omega_ib_b.
+        dv: (n, 3) ideal velocity increments [m/s], integrals of the specific force f_ib_b.
+        model: of the errors.
+        key: of the run and the unit, from `robins.sim.random.stream`.
+
+    Returns:
+        theta and dv as reported, and the `ImuTruth`.
+
+    Raises:
+        ValueError: shapes that do not fit together.
+    """
+    dt, turned, pushed = (jnp.asarray(x, float) for x in (dt_s, theta, dv))
+    if dt.ndim != 1 or turned.shape != (*dt.shape, 3) or pushed.shape != turned.shape:
+        raise ValueError(
+            "dt_s, theta, dv must have shapes (n,), (n, 3), (n, 3), got "
+            f"{dt.shape}, {turned.shape}, {pushed.shape}"
+        )
+    imu, state = begin(model, key)
+    # All noise at once, then the recursions: many times faster than drawing inside the scan.
+    normals = jax.vmap(lambda number: _normals(imu, number))(jnp.arange(len(dt)))
+    _, (reported_theta, reported_dv, seen) = jax.lax.scan(
+        lambda carry, x: _sample(imu, carry, *x), state, (normals, dt, turned, pushed)
+    )
+    return reported_theta, reported_dv, _truth(imu, seen)
+
+
+def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Any]:
+    """A triad and the start of its Gauss-Markov bias, from normal numbers (9, 3)."""
+
+    def drawn(row: _Once, given: Any, sigma: Any) -> Any:
+        if sigma is None:
+            return given
+        normal = numbers[row] if jnp.ndim(sigma) == 1 else numbers[row : row + 3]
+        return _sum(given, sigma * normal)
+
+    bias = drawn(_Once.BIAS, errors.bias, errors.bias_sigma)
+    scale = drawn(_Once.SCALE, errors.scale, errors.scale_sigma)
+    sheared = drawn(_Once.MISALIGNMENT, errors.misalignment, errors.misalignment_sigma)
+    bent = drawn(_Once.G_SENSITIVITY, errors.g_sensitivity, errors.g_sensitivity_sigma)
+    matrix = _sum(None if scale is None else jnp.diag(scale), sheared)
+    constants = _Constants(bias, matrix, bent)
+    return _Triad(errors, constants), drawn(_Once.MARKOV_START, None, errors.markov_sigma)
+
+
+def _start(errors: TriadErrors, markov: Any) -> _TriadState:
+    walk = None if errors.walk is None else jnp.zeros(3)
+    residue = None if errors.quantum is None else jnp.zeros(3)
+    return _TriadState(markov, walk, residue)
+
+
+def _normals(imu: Imu, number: Array) -> Array:
+    """Standard normal numbers (rows, 2, 3) of one sample, as many rows as the errors need."""
+    rows = 0
+    for errors in (imu.gyro.errors, imu.accel.errors):
+        if errors.walk is not None:
+            rows = max(rows, _Row.WALK + 1)
+        if errors.markov_sigma is not None:
+            rows = max(rows, _Row.MARKOV + 1)
+        if errors.white is not None:
+            rows = max(rows, _Row.WHITE + 1)
+    if rows == 0:
+        return jnp.zeros((0, 2, 3))
+    return jax.random.normal(jax.random.fold_in(imu.key, number), (rows, 2, 3))
+
+
+def _sample(imu: Imu, state: ImuState, normals, dt, theta, dv):
+    time = (state.elapsed_s, dt)
+    gyro, turned, of_gyro = _report(imu.gyro, state.gyro, normals[:, 0], *time, theta, dv)
+    accel, pushed, of_accel = _report(imu.accel, state.accel, normals[:, 1], *time, dv, dv)
+    after = ImuState(state.number + 1, state.elapsed_s + dt, gyro, accel)
+    return after, (turned, pushed, (of_gyro, of_accel))
+
+
+def _report(triad: _Triad, state: _TriadState, normals, elapsed_s, dt, true, dv):
+    """One sample of one triad: state, increment, (bias, clipped); dv is the true one."""
+    errors, constants = triad.errors, triad.constants
+    now = constants.bias  # at the end of the sample
+    added = None if now is None else now * dt  # to the increment
+    markov, walk, residue = state
+    spread_sq = None if errors.white is None else errors.white**2 * dt
+    if markov is not None:
+        markov, integral, rest = markov_step(
+            markov, errors.markov_sigma, errors.markov_tau_s, dt, normals[_Row.MARKOV]
+        )
+        now, added, spread_sq = _sum(now, markov), _sum(added, integral), _sum(spread_sq, rest)
+    if walk is not None:
+        walk, integral, rest = walk_step(walk, errors.walk, dt, normals[_Row.WALK])
+        now, added, spread_sq = _sum(now, walk), _sum(added, integral), _sum(spread_sq, rest)
+    if spread_sq is not None:
+        added = _sum(added, jnp.sqrt(spread_sq) * normals[_Row.WHITE])
+    if errors.ramp is not None:
+        now = _sum(now, errors.ramp * (elapsed_s + dt))
+        added = _sum(added, errors.ramp * (dt * (elapsed_s + 0.5 * dt)))
+    if constants.matrix is not None:
+        added = _sum(added, constants.matrix @ true)
+    if constants.g_sensitivity is not None:
+        added = _sum(added, constants.g_sensitivity @ dv)
+
+    out = true if added is None else true + added
+    clipped = jnp.zeros(3, bool)
+    if errors.full_scale is not None:
+        limit = errors.full_scale * dt
+        clipped = jnp.abs(out) > limit
+        out = jnp.clip(out, -limit, limit)
+    if residue is not None:
+        due = out + residue
+        quantum = jnp.where(errors.quantum > 0.0, errors.quantum, 1.0)
+        out = jnp.where(errors.quantum > 0.0, jnp.round(due / quantum) * quantum, due)
+        residue = due - out
+    bias = jnp.zeros(3) if now is None else now
+    return _TriadState(markov, walk, residue), out, (bias, clipped)
+
+
+def _truth(imu: Imu, seen) -> ImuTruth:
+    none = jnp.zeros((3, 3))
+
+    def of(triad: _Triad, bias: Array, clipped: Array) -> TriadTruth:
+        matrix, bent = (none if m is None else m for m in triad.constants[1:])
+        return TriadTruth(bias, clipped, matrix, bent)
+
+    return ImuTruth(of(imu.gyro, *seen[0]), of(imu.accel, *seen[1]))
+
+
+def markov_step(
+    bias: Float[Array, "*b"],
+    sigma: ArrayLike,
+    tau_s: ArrayLike,
+    dt_s: ArrayLike,
+    normal: Float[Array, "*b"],
+) -> tuple[Array, Array, Array]:
+    """A first-order Gauss-Markov process over dt: its end, and its integral in mean and variance.
+
+    With x = dt/tau the end is ``e^-x bias + w`` with ``var w = sigma^2 (1 - e^-2x)``. Given both
+    ends the integral has the mean ``tau tanh(x/2) (bias + end)`` and the variance
+    ``4 sigma^2 tau^2 (x/2 - tanh(x/2))``: the joint covariance of the integrated Gauss-Markov
+    model (Brown & Hwang 2012), conditioned.
+
+    Args:
+        bias: at the start of dt.
+        sigma: of the stationary process.
+        tau_s: correlation time [s].
+        dt_s: interval [s].
+        normal: standard normal numbers.
+    """
+    sigma, tau, dt = (jnp.asarray(x, float) for x in (sigma, tau_s, dt_s))
+    half = 0.5 * dt / tau
+    end = jnp.exp(-2.0 * half) * bias + sigma * jnp.sqrt(-jnp.expm1(-4.0 * half)) * normal
+    mean = tau * jnp.tanh(half) * (bias + end)
+    return end, mean, 4.0 * (sigma * tau) ** 2 * _less_tanh(half)
+
+
+def walk_step(
+    bias: Float[Array, "*b"], strength: ArrayLike, dt_s: ArrayLike, normal: Float[Array, "*b"]
+) -> tuple[Array, Array, Array]:
+    """A random walk over dt: its end, and its integral in mean and variance.
+
+    Given both ends the integral has the mean ``dt (bias + end) / 2`` and the variance of an
+    integrated Brownian bridge, ``strength^2 dt^3 / 12``.
+
+    Args:
+        bias: at the start of dt.
+        strength: K, root of the variance gained in a second.
+        dt_s: interval [s].
+        normal: standard normal numbers.
+    """
+    strength, dt = jnp.asarray(strength, float), jnp.asarray(dt_s, float)
+    end = bias + strength * jnp.sqrt(dt) * normal
+    return end, 0.5 * dt * (bias + end), strength**2 * dt**3 / 12.0
+
+
+def _less_tanh(u):
+    """``u - tanh(u)`` for u >= 0 without cancellation."""
+    small = u < 0.1
+    x = jnp.where(small, u, 0.0) ** 2
+    # Dropped: 21844/6081075 u^13, 1e-12 of the whole at the switch.
+    series = x * (1 / 3 - x * (2 / 15 - x * (17 / 315 - x * (62 / 2835 - x * 1382 / 155925))))
+    safe = jnp.where(small, 1.0, u)
+    return jnp.where(small, u * series, safe - jnp.tanh(safe))
+
+
+def _sum(a: Any, b: Any) -> Any:
+    """Sum of two arrays, either of which may be None, for zero."""
+    return b if a is None else a if b is None else a + b
