@@ -103,11 +103,12 @@ def allowed(drawn: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def violations(source: Path, may: dict[str, set[str]]) -> list[str]:
     """Imports that the table does not allow, one sentence each."""
-    return [
+    found = [
         f"{i.where}: {i.room or 'robins/__init__'} must not import {i.imported}"
         for i in imports(source)
         if i.imported not in may.get(i.room, {"_float64"})
     ]
+    return list(dict.fromkeys(found))
 
 
 @pytest.fixture(scope="module")
