@@ -108,11 +108,56 @@ class Replay(Parameters):
     filters: tuple[str, ...] = ("ekf",)
 
 
+class Place(Parameters):
+    """Where a drive begins."""
+
+    latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
+    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
+    height: Annotated[float, Quantity("length")] = default("0 m")
+    heading: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
 class Leg(Parameters):
-    """One command of a drive."""
+    """One command of a drive; which quantities it takes depends on what it does."""
 
-    do: Literal["stop", "straight", "turn", "accelerate", "climb"]
-    seconds: Annotated[float, Quantity("time", above="0 s")]
+    do: Literal["stop", "straight", "accelerate", "turn", "climb", "sine"]
+    seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
+    speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
+    angle: Annotated[float, Quantity("angle")] | None = None  # positive to the right, or upwards
+    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
 
 
-__all__ = ["Aids", "Gnss", "Imu", "Leg", "Outages", "Replay", "Start", "Update"]
+class Receiver(Gnss):
+    """A simulated receiver; its sigmas are true, and what it states."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    sigma: Annotated[Three, Quantity("length", above="0 m")]
+    velocity_sigma: Annotated[Three, Quantity("speed", above="0 m/s")]
+
+
+class Believed(Parameters):
+    """What the filters believe, over what is true; 1 is right, and anything else a test."""
+
+    q_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the process noise covariance
+    r_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the fixes' covariance
+
+
+class Drive(Parameters):
+    """A simulated drive; sensor errors are drawn from what the filter is told of them."""
+
+    system: Literal["ins-gnss"] = "ins-gnss"
+    title: str = "INS/GNSS drive"
+    runs: Annotated[int, pydantic.Field(ge=1)] = 50
+    imu_rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("100 Hz")
+    place: Place
+    legs: tuple[Leg, ...]
+    imu: Imu
+    gnss: Receiver
+    start: Start = pydantic.Field(default_factory=Start)
+    aids: Aids = pydantic.Field(default_factory=lambda: Aids(zero_velocity=False))
+    update: Update = pydantic.Field(default_factory=Update)
+    outages: Outages | None = None
+    believed: Believed = pydantic.Field(default_factory=Believed)
+    # figures pooled over time leave out what comes before, while heading errors are large
+    settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    filters: tuple[str, ...] = ("ekf",)

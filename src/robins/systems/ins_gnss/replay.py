@@ -22,7 +22,8 @@ from robins.ins.increments import Increments, from_imu
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import model as names
 from robins.systems.ins_gnss.model import Block, Fix, Mount, antenna_velocity
-from robins.systems.ins_gnss.parameters import Outages, Replay
+from robins.systems.ins_gnss.outages import outage_mask
+from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.setup import (
     SMOOTHED,
     belief_at,
@@ -48,15 +49,6 @@ class Prepared(NamedTuple):
     fix_epoch: np.ndarray  # (M,) epoch of each fix, -1 outside
     withheld: np.ndarray  # (M,) bool
     withheld_epoch: np.ndarray  # (E,) bool
-
-
-def outage_mask(time_s: np.ndarray, first_s: float, last_s: float, outages: Outages) -> np.ndarray:
-    """Which times lie in an outage; outages repeat until none may begin any more."""
-    period = outages.length + outages.gap
-    since = time_s - (first_s + outages.first)
-    begin = np.floor(since / period) * period
-    inside = (since >= 0.0) & (since - begin < outages.length)
-    return inside & (first_s + outages.first + begin < last_s - outages.last)
 
 
 def fix_sigmas(gnss: GnssTable, parameters: Replay) -> tuple[np.ndarray, np.ndarray | None]:

@@ -1,0 +1,27 @@
+"""Systems: one problem each, with its model, scenarios, filters and claims; here is the registry."""
+
+from robins.systems import ins_gnss
+from robins.systems.system import (
+    Case,
+    Contender,
+    Outcome,
+    Problem,
+    Progress,
+    SensorAxes,
+    StateBlock,
+    System,
+)
+
+SYSTEMS: dict[str, System] = {s.name: s for s in (ins_gnss.SYSTEM,)}
+
+__all__ = [
+    "SYSTEMS",
+    "Case",
+    "Contender",
+    "Outcome",
+    "Problem",
+    "Progress",
+    "SensorAxes",
+    "StateBlock",
+    "System",
+]

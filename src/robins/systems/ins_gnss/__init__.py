@@ -1,0 +1,29 @@
+"""INS/GNSS: loosely coupled, closed loop, two rates; a simulated drive and recorded logs."""
+
+from pathlib import Path
+
+from robins.systems.ins_gnss.answer import replay
+from robins.systems.ins_gnss.drive import drive_problem
+from robins.systems.ins_gnss.drive_claims import CLAIMS
+from robins.systems.ins_gnss.model import ins_gnss_model
+from robins.systems.ins_gnss.parameters import Drive, Replay
+from robins.systems.ins_gnss.setup import FILTERS, SMOOTHED
+from robins.systems.system import System
+
+_HERE = Path(__file__).parent / "scenarios"
+
+SYSTEM = System(
+    name="ins-gnss",
+    summary="loosely coupled INS/GNSS: a simulated drive with an outage, and recorded logs",
+    filters=(*FILTERS, *(name + SMOOTHED for name in FILTERS)),
+    scenarios={"drive": _HERE / "drive.toml"},
+    claims=CLAIMS,
+    parameters=Drive,
+    problem=drive_problem,
+    replay_parameters=Replay,
+    replay_default=_HERE / "replay.toml",
+    replay=replay,
+    orientation=lambda parameters: parameters.imu.orientation,
+)
+
+__all__ = ["SYSTEM", "Drive", "Replay", "drive_problem", "ins_gnss_model", "replay"]

@@ -1,0 +1,263 @@
+"""A simulated drive: one true motion, any number of runs with their own sensor errors.
+
+The truth of a run is drawn from what the filter is told: initial errors from its initial
+covariance, biases and noise from its IMU parameters, fixes from its GNSS sigmas. So a right filter
+is consistent, and `Believed` makes it wrong on purpose.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+from robins.ins.state import InsState
+from robins.systems.ins_gnss.legs import motion_of
+
+from robins.earth import Geodetic
+from robins.filters import Belief
+from robins.ins.blocks import Blocks, cut, epochs_between
+from robins.ins.imu_errors import ImuErrorModel, TriadErrors
+from robins.ins.increments import Increments, from_imu
+from robins.ins.mechanise import Nav, mechanise, nav_at
+from robins.manifold import retract
+from robins.results import variable
+from robins.sim.gnss_sensor import GnssErrorModel, fix_times, observe
+from robins.sim.ideal_imu import ideal_increments
+from robins.sim.imu_sensor import corrupt
+from robins.sim.random import Component, stream
+from robins.sim.trajectory import Motion
+from robins.systems.ins_gnss import model as names
+from robins.systems.ins_gnss.drive_claims import drive_claims, drive_metrics
+from robins.systems.ins_gnss.model import Block, Fix
+from robins.systems.ins_gnss.outages import outage_mask
+from robins.systems.ins_gnss.parameters import Drive, Imu
+from robins.systems.ins_gnss.setup import (
+    SENSORS,
+    make_filter,
+    model_of,
+    sigma_of,
+    state_blocks,
+)
+from robins.systems.system import Case, Contender, Problem
+
+
+class Course(NamedTuple):
+    """What all runs share."""
+
+    motion: Motion
+    ideal: Increments  # (N,), (N, 3), (N, 3) the samples of an ideal unit
+    compensated: Increments  # the same with coning and sculling in them
+    blocks: Blocks
+    start: Nav
+    truth: Nav  # at each epoch, leading axis E
+    index: np.ndarray  # (E,) sample that ends at each epoch
+    rate_b: np.ndarray  # (E, 3) rad/s true gyro rate at each epoch
+    fix: np.ndarray  # (E,) number of the fix at each epoch, -1 where there is none
+    outage: np.ndarray  # (E,) bool
+
+
+def error_model(imu: Imu) -> ImuErrorModel:
+    """The sensors whose errors the filter's parameters describe."""
+
+    def triad(bias, noise, walk, time, scale) -> TriadErrors:
+        given: dict[str, Any] = {"white": np.asarray(noise)}
+        if time is None:
+            given |= {"bias_sigma": np.asarray(bias), "walk": np.asarray(walk)}
+        else:
+            given |= {"markov_sigma": np.asarray(bias), "markov_tau_s": np.full(3, time)}
+        if imu.scale_states:
+            given["scale_sigma"] = np.asarray(scale)
+        return TriadErrors(**given)
+
+    i = imu
+    return ImuErrorModel(
+        triad(i.gyro_bias, i.gyro_noise, i.gyro_bias_walk, i.gyro_bias_time, i.gyro_scale),
+        triad(i.accel_bias, i.accel_noise, i.accel_bias_walk, i.accel_bias_time, i.accel_scale),
+    )
+
+
+def receiver_model(drive: Drive) -> GnssErrorModel:
+    """The receiver; outages are left to the epochs."""
+    g = drive.gnss
+    return GnssErrorModel(
+        sigma_m=np.asarray(g.sigma),
+        sigma_v=np.asarray(g.velocity_sigma),
+        lever_b_m=np.asarray(g.lever_arm) if any(g.lever_arm) else None,
+        rate_hz=g.rate,
+        time_offset_s=g.latency,
+    )
+
+
+def lay_out(drive: Drive) -> Course:
+    """Everything that does not depend on a run, in NumPy.
+
+    Raises:
+        ValueError: the legs are too short for two fixes.
+    """
+    motion = motion_of(drive.place, drive.legs)
+    time_ns = motion.times_ns(drive.imu_rate)
+    trajectory = motion.trajectory(time_ns)
+    table = ideal_increments(trajectory)
+    compensated, end_ns = from_imu(table)
+    time_s = end_ns * 1e-9
+    dt = np.diff(time_ns) * 1e-9
+    # A bias of the sensors passes through coning and sculling terms of 1e-3 of its size at most, so
+    # the errors of a run are added to the compensated increments.
+    stamps = fix_times(receiver_model(drive), 1.0 / drive.gnss.rate, float(time_s[-1])).stamp_s
+    if len(stamps) < 2:
+        raise ValueError(f"the legs last {time_s[-1]:.1f} s, too short for two fixes")
+    epochs = epochs_between(0.0, float(time_s[-1]), stamps, drive.update.longest_block)
+    blocks = cut(compensated, time_s, 0.0, epochs)
+    start = nav_at(trajectory, 0)
+    path = mechanise(start, jax.tree_util.tree_map(jnp.asarray, compensated))
+    index = np.searchsorted(time_s, epochs - 1e-9)
+    if np.max(np.abs(time_s[index] - epochs)) > 1e-6:
+        raise ValueError(
+            "imu_rate must be a multiple of gnss.rate and of the block rate, so that every epoch "
+            "falls on a sample"
+        )
+    fix = np.full(len(epochs), -1)
+    fix[np.searchsorted(epochs, stamps - 1e-9)] = np.arange(len(stamps))
+    outage = np.zeros(len(epochs), dtype=bool)
+    if drive.outages is not None:
+        outage = outage_mask(epochs, 0.0, float(epochs[-1]), drive.outages)
+    return Course(
+        motion=motion,
+        ideal=Increments(dt, table.gyro[1:], table.accel[1:]),
+        compensated=compensated,
+        blocks=blocks,
+        start=start,
+        truth=jax.tree_util.tree_map(lambda x: x[index], path),
+        index=index,
+        rate_b=motion.at(epochs).rates()[0],
+        fix=fix,
+        outage=outage,
+    )
+
+
+def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
+    """One run, from its number; pure."""
+    dt, theta, dv = (jnp.asarray(a) for a in course.ideal[:3])
+    key = partial(stream, seed, index)
+    turned, pushed, errors = corrupt(dt, theta, dv, error_model(drive.imu), key(Component.IMU))
+    # the part of each piece in its parent sample is the same for all runs
+    parent, padded = course.blocks.parent, course.blocks.parent < 0
+    share = course.blocks.increments.dt / np.asarray(course.ideal.dt)[parent]
+    share = jnp.asarray(np.where(padded, 0.0, share))[..., None]
+    pieces = course.blocks.increments
+    u = Block(
+        Increments(
+            jnp.asarray(pieces.dt),
+            jnp.asarray(pieces.theta) + share * (turned - theta)[parent],
+            jnp.asarray(pieces.dv) + share * (pushed - dv)[parent],
+        ),
+        jnp.ones(len(parent)),
+    )
+    at = course.index
+    scales: list[Any] = [None, None]
+    if drive.imu.scale_states:
+        count = len(at)
+        scales = [
+            jnp.broadcast_to(jnp.diagonal(e.matrix), (count, 3))
+            for e in (errors.gyro, errors.accel)
+        ]
+    truth = InsState(*course.truth, errors.gyro.bias[at], errors.accel.bias[at], *scales)
+
+    sigma = jnp.asarray(sigma_of(drive.imu, drive.start, drive.start.tilt, drive.start.heading))
+    zero = jnp.zeros(3)
+    none = zero if drive.imu.scale_states else None
+    known = InsState(*course.start, zero, zero, none, none)
+    # true = retract(mean, e), and biases are drawn about zero by the sensors themselves
+    e = sigma * jax.random.normal(key(Component.INITIAL_STATE), sigma.shape)
+    e = jnp.where(jnp.arange(len(sigma)) < 9, e, 0.0)
+    start = Belief(retract(known, -e), jnp.diag(sigma))
+
+    receiver = receiver_model(drive)
+    times = fix_times(receiver, 1.0 / drive.gnss.rate, float(course.blocks.epoch_s[-1]))
+    k = course.motion.at(times.valid_s)
+    fixes = observe(
+        receiver,
+        key(Component.GNSS),
+        times.valid_s,
+        k.lat,
+        k.lon,
+        k.alt,
+        k.v_n,
+        k.q_nb,
+        k.rates()[0],
+    )
+    here = jnp.asarray((course.fix >= 0) & ~course.outage)
+
+    def at_epochs(x):
+        mask = here.reshape(-1, *([1] * (x.ndim - 1)))
+        return jnp.where(mask, x[course.fix], jnp.nan)
+
+    shape = (len(course.fix), 3)
+    r = np.sqrt(drive.believed.r_factor)
+    rate = jnp.asarray(course.rate_b) + errors.gyro.bias[at]
+    y = {
+        names.POSITION: Geodetic(*(at_epochs(x) for x in fixes[:3])),
+        names.VELOCITY: at_epochs(fixes.v_n),
+    }
+    aux = {
+        names.POSITION: Fix(jnp.broadcast_to(r * jnp.asarray(drive.gnss.sigma), shape), rate),
+        names.VELOCITY: Fix(
+            jnp.broadcast_to(r * jnp.asarray(drive.gnss.velocity_sigma), shape), rate
+        ),
+    }
+    if not drive.gnss.use_velocity:
+        del y[names.VELOCITY], aux[names.VELOCITY]
+    return Case(start, u, y, aux, truth)
+
+
+def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:
+    """A drive as a problem for a campaign.
+
+    Raises:
+        ValueError: the drive cannot be laid out, or a filter is unknown or a smoother.
+    """
+    course = lay_out(drive)
+    believed = drive.imu
+    if drive.believed.q_factor != 1.0:
+        factor = float(np.sqrt(drive.believed.q_factor))
+        believed = believed.model_copy(
+            update={
+                name: tuple(factor * x for x in getattr(believed, name))
+                for name in ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")
+            }
+        )
+    model = model_of(believed, drive.gnss, drive.aids)
+    blocks = state_blocks(drive.imu.scale_states)
+    count_from = int(np.searchsorted(course.blocks.epoch_s, drive.settle))
+    return Problem(
+        simulate=partial(_simulate, drive, course, seed),
+        contenders={
+            name: Contender(make_filter(name, drive.update.gate), model) for name in filters
+        },
+        epoch_s=course.blocks.epoch_s,
+        blocks=blocks,
+        sensors=SENSORS,
+        context=_context(course),
+        metrics=partial(drive_metrics, course.outage, blocks),
+        claims=drive_claims,
+        count_from=count_from,
+    )
+
+
+def _context(course: Course) -> xr.Dataset:
+    """The true path and the outages, for figures."""
+    p, time = course.truth.position, course.blocks.epoch_s
+    return xr.Dataset(
+        {
+            "reference_lat_rad": variable("time", p.lat, "rad", "true latitude"),
+            "reference_lon_rad": variable("time", p.lon, "rad", "true longitude"),
+            "reference_alt_m": variable("time", p.alt, "m", "true height"),
+            "outage": variable("time", course.outage.astype(np.int8), "1", "GNSS withheld"),
+        },
+        {"time": variable("time", time, "s", "time since the start")},
+    )

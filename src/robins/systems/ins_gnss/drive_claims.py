@@ -1,0 +1,85 @@
+"""What a campaign of drives says: errors, their bounds, and whether the filter is consistent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from robins import units
+from robins.systems.system import StateBlock
+
+CLAIMS = (
+    {
+        "id": "sigma",
+        "text": "The filter's sigma is within 5 % of the Monte Carlo RMS error on every state",
+    },
+    {"id": "anees", "text": "ANEES is inside its 95 % band at 90 % of the epochs or more"},
+    {"id": "nis", "text": "The grand mean NIS of every sensor is inside its 99.9 % band"},
+)
+
+
+def drive_metrics(
+    outage: np.ndarray, blocks: Sequence[StateBlock], statistics: Any
+) -> dict[str, Any]:
+    """Metrics of one filter from its campaign statistics."""
+    start = statistics.count_from
+    rms = statistics.rms
+    aided = ~outage[start:]
+    of = {b.name: b.where for b in blocks}
+
+    def pooled(columns, epochs) -> float:
+        return float(np.sqrt(np.mean(np.sum(rms[start:][epochs][:, columns] ** 2, axis=1))))
+
+    position = of["position"].start
+    horizontal, vertical = [position, position + 1], [position + 2]
+    minute = units.parse("1 arcmin", "angle")
+    degree_per_hour = units.parse("1 deg/h", "angle rate")
+    milli_g = units.parse("1 mg", "acceleration")
+    out: dict[str, Any] = {
+        "horizontal_rms_m": pooled(horizontal, aided),
+        "vertical_rms_m": pooled(vertical, aided),
+        "velocity_rms_mps": pooled(of["velocity"], aided),
+        "tilt_rms_arcmin": pooled([0, 1], aided) / minute,
+        "heading_rms_arcmin": pooled([2], aided) / minute,
+        "gyro_bias_rms_deg_per_h": pooled(of["gyro_bias"], aided) / degree_per_hour,
+        "accel_bias_rms_mg": pooled(of["accel_bias"], aided) / milli_g,
+    }
+    if np.any(outage[start:]):
+        out["outage_horizontal_rms_m"] = pooled(horizontal, ~aided)
+        worst = np.sum(rms[start:][~aided][:, horizontal] ** 2, axis=1)
+        out["outage_horizontal_worst_rms_m"] = float(np.sqrt(np.max(worst)))
+    out["error_over_sigma"] = statistics.overall_ratio().tolist()
+    out["anees_share_inside"] = statistics.anees_share_inside()
+    out["anees_mean"] = float(np.mean(statistics.anees()[start:]))
+    for sensor in statistics.sensors:
+        verdict = statistics.nis(sensor, 0.999)
+        out[f"nis_{sensor}"] = verdict.value
+        out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+    out["diverged_runs"] = statistics.diverged
+    return out
+
+
+def drive_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Verdict per claim; with several filters, of the worst of them."""
+    off = max(
+        float(np.max(np.abs(np.asarray(m["error_over_sigma"]) - 1.0))) for m in metrics.values()
+    )
+    share = min(m["anees_share_inside"] for m in metrics.values())
+    inside, farthest = True, 1.0
+    for m in metrics.values():
+        for name, band in m.items():
+            if name.startswith("nis_") and name.endswith("_band"):
+                value = m[name.removesuffix("_band")]
+                inside &= band[0] <= value <= band[1]
+                farthest = max(farthest, value, key=lambda v: abs(v - 1.0))
+    verdicts = (
+        (off, [0.0, 0.05], "reproduced" if off <= 0.05 else "partly" if off <= 0.1 else "not"),
+        (share, [0.9, 1.0], "reproduced" if share >= 0.9 else "not"),
+        (farthest, None, "reproduced" if inside else "not"),
+    )
+    return [
+        {**claim, "verdict": verdict, "value": value, "band": band}
+        for claim, (value, band, verdict) in zip(CLAIMS, verdicts, strict=True)
+    ]
