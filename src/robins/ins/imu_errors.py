@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
 from robins.ins.allan import AllanFit
+from robins.ins.records import checked_pytree
 from robins.units import UnitError, parse
 
 MARKOV_PEAK = 0.6173642831
@@ -38,6 +39,7 @@ FLICKER_FLAT = float(np.sqrt(2.0 * np.log(2.0) / np.pi))
 """Allan deviation of flicker noise over its coefficient B, 0.664 (IEEE Std 952)."""
 
 
+@checked_pytree
 @dataclass(frozen=True, eq=False)
 class TriadErrors:
     """Errors of three gyros or three accelerometers; None: the sensor has no such error.
@@ -106,6 +108,7 @@ class TriadErrors:
         )
 
 
+@checked_pytree
 @dataclass(frozen=True, eq=False)
 class ImuErrorModel:
     """Errors of an inertial measurement unit: those of its gyros and of its accelerometers.
@@ -153,27 +156,6 @@ _FIELDS = tuple(f.name for f in dataclasses.fields(TriadErrors))
 _MATRICES = ("misalignment", "misalignment_sigma", "g_sensitivity", "g_sensitivity_sigma")
 _SIGNED = ("bias", "ramp", "scale", "misalignment", "g_sensitivity")
 _POSITIVE = ("markov_tau_s", "full_scale")
-
-
-def _register(cls: type) -> None:
-    # Not `register_dataclass`, which would run the checks on JAX's stand-ins and on tracers.
-    names = tuple(f.name for f in dataclasses.fields(cls))
-
-    def flatten(model: Any) -> tuple[tuple[Any, ...], None]:
-        keys = (jax.tree_util.GetAttrKey(name) for name in names)
-        return tuple((key, getattr(model, key.name)) for key in keys), None
-
-    def unflatten(_: None, values: Iterable[Any]) -> Any:
-        model = object.__new__(cls)
-        for name, value in zip(names, values, strict=True):
-            object.__setattr__(model, name, value)
-        return model
-
-    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
-
-
-_register(TriadErrors)
-_register(ImuErrorModel)
 
 
 def _checked(name: str, value: Any) -> Any:
