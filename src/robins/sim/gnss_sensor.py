@@ -1,0 +1,335 @@
+"""A GNSS receiver: fixes of position and velocity of its antenna along a true motion.
+
+`fix_times` says at which instants the truth is wanted, `observe` makes the fixes from it, in pure
+JAX (map over ``key`` for a batch of runs), `as_table` makes a `GnssTable` of one run.
+
+    times = fix_times(model, 0.0, 600.0)
+    fixes = observe(model, key, times.valid_s, lat, lon, alt, v_n, q_nb, omega_ib_b)
+
+where the truth is that of the instants ``valid_s``. North-east-down and forward-right-down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.dataset import GnssTable
+from robins.earth import (
+    OMEGA_E,
+    Geodetic,
+    dcm_en,
+    ecef_from_geodetic,
+    geodetic_from_ecef,
+)
+from robins.ins.records import checked_pytree
+from robins.rotation import rotate
+
+# What is drawn at a fix is part of the file format, as `robins.sim.random.Component` is.
+_NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
+
+
+class _Row(IntEnum):
+    """Rows of the normal numbers (5, 3) of one fix."""
+
+    POSITION = 0
+    VELOCITY = 1
+    MARKOV = 2
+    OUTLIER_POSITION = 3
+    OUTLIER_VELOCITY = 4
+
+
+class _Chance(IntEnum):
+    """Uniform numbers (2,) of one fix."""
+
+    DROPPED = 0
+    OUTLIER = 1
+
+
+@checked_pytree
+@dataclass(frozen=True, eq=False)
+class GnssErrorModel:
+    """Errors of a GNSS receiver; vectors are north, east, down, a number stands for all three.
+
+    Raises:
+        ValueError: a wrong shape, a value not finite, a negative sigma, a share beyond 0 to 1, a
+            Markov error without sigma or correlation time, an outage that ends before it begins.
+    """
+
+    sigma_m: Any  # (3,) m, white error of a position
+    sigma_v: Any = None  # (3,) m/s, white error of a velocity; None: the receiver gives none
+    markov_sigma_m: Any = None  # (3,) m, slowly changing error of position (first-order Markov)
+    markov_tau_s: Any = None  # (3,) s, its correlation time
+    stated_sigma_m: Any = None  # (3,) m, what the receiver says; None: the truth, both parts
+    stated_sigma_v: Any = None  # (3,) m/s, what it says of velocity; None: the truth
+    lever_b_m: Any = None  # (3,) m, from IMU to antenna in body axes; None: no lever arm
+    rate_hz: float = 1.0
+    time_offset_s: float = 0.0  # time stamp less the instant the fix is true for
+    latency_s: float = 0.0  # arrival of the fix less its time stamp
+    outages_s: Any = None  # (k, 2) s, from (included) and to (not) when there are no fixes
+    drop_share: Any = 0.0  # share of the fixes lost one by one
+    outlier_share: Any = 0.0  # share of the fixes in gross error
+    outlier_size: Any = 10.0  # length of a gross error in sigmas of the white error
+
+    def __post_init__(self):
+        for name in ("sigma_m", "sigma_v", "stated_sigma_m", "stated_sigma_v"):
+            self._vector(name, low=0.0)
+        self._vector("markov_sigma_m", low=0.0)
+        self._vector("markov_tau_s", low=0.0, open_end=True)
+        self._vector("lever_b_m")
+        if (self.markov_sigma_m is None) != (self.markov_tau_s is None):
+            raise ValueError(
+                "markov_sigma_m and markov_tau_s belong together: give both or neither"
+            )
+        if self.sigma_v is None and self.stated_sigma_v is not None:
+            raise ValueError("stated_sigma_v without sigma_v: the receiver gives no velocities")
+        for name, low, high in (
+            ("time_offset_s", -np.inf, np.inf),
+            ("latency_s", 0.0, np.inf),
+            ("drop_share", 0.0, 1.0),
+            ("outlier_share", 0.0, 1.0),
+            ("outlier_size", 0.0, np.inf),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, jax.Array) and not (
+                np.isfinite(value) and low <= value <= high
+            ):
+                raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {value}")
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0.0):
+            raise ValueError(f"rate_hz must be a positive number, got {self.rate_hz}")
+        if self.outages_s is not None and len(self.outages_s) == 0:
+            object.__setattr__(self, "outages_s", None)
+        elif self.outages_s is not None:
+            outages = np.asarray(self.outages_s, float)
+            if outages.ndim != 2 or outages.shape[1] != 2 or not np.all(np.isfinite(outages)):
+                raise ValueError(f"outages_s must be pairs of times [s], got {self.outages_s}")
+            for begin, end in outages:
+                if not begin < end:
+                    raise ValueError(f"an outage from {begin:g} s to {end:g} s ends too early")
+            object.__setattr__(self, "outages_s", outages)
+
+    def _vector(self, name: str, low: float = -np.inf, open_end: bool = False) -> None:
+        value = getattr(self, name)
+        if value is None or isinstance(value, jax.Array):
+            return
+        x = np.asarray(value, float)
+        if x.shape not in ((), (3,)):
+            raise ValueError(f"{name} must be a number or of shape (3,), got shape {x.shape}")
+        if not np.all(np.isfinite(x)):
+            raise ValueError(f"{name} must be finite, got {value}")
+        if np.any(x < low) or (open_end and np.any(x == low)):
+            raise ValueError(
+                f"{name} must {'be positive' if open_end else 'not be negative'}, got {value}"
+            )
+        object.__setattr__(self, name, np.broadcast_to(x, (3,)))
+
+
+class FixTimes(NamedTuple):
+    """Times of the fixes of a run [s], each (m,)."""
+
+    valid_s: np.ndarray  # the instants whose truth the fixes measure
+    stamp_s: np.ndarray  # what the receiver says
+    arrival_s: np.ndarray  # when the fix is there to be used
+
+
+class GnssFixes(NamedTuple):
+    """Fixes of one run; NaN in position and velocity where there is none."""
+
+    lat_rad: Any  # (m,) of the antenna, measured
+    lon_rad: Any  # (m,)
+    alt_m: Any  # (m,)
+    v_n: Any  # (m, 3) m/s of the antenna, measured; None: the receiver gives none
+    sigma_m: Any  # (m, 3) as stated, north, east, down
+    sigma_v: Any  # (m, 3) m/s as stated; None as above
+    missing: Any  # (m,) bool: outage or lost
+    outlier: Any  # (m,) bool: in gross error, if not missing
+    error_m: Any  # (m, 3) true error, north, east, down, also of fixes that are missing
+
+
+def fix_times(model: GnssErrorModel, start_s: float, end_s: float) -> FixTimes:
+    """Times of the fixes stamped from start to end, at whole multiples of the fix interval.
+
+    Raises:
+        ValueError: an end before the start.
+    """
+    if not end_s >= start_s:
+        raise ValueError(f"fixes from {start_s} s to {end_s} s: the end is before the start")
+    # A stamp that is a multiple but for rounding counts as one.
+    first = np.ceil(start_s * model.rate_hz - 1e-6)
+    last = np.floor(end_s * model.rate_hz + 1e-6)
+    stamp = np.arange(first, last + 1.0) / model.rate_hz
+    return FixTimes(stamp - model.time_offset_s, stamp, stamp + model.latency_s)
+
+
+def antenna(
+    lat_rad: Float[Array, "*b"],
+    lon_rad: Float[Array, "*b"],
+    alt_m: Float[Array, "*b"],
+    v_n: Float[Array, "*b 3"],
+    q_nb: Float[Array, "*b 4"],
+    omega_ib_b: Float[Array, "*b 3"],
+    lever_b_m: Float[Array, "3"],
+) -> tuple[Array, Array, Array, Array]:
+    """Latitude, longitude, height and velocity of an antenna rigidly on the vehicle.
+
+    Position ``r_e + C_eb l`` and velocity ``v + C_nb (omega_eb_b x l)`` (Groves 2013, section
+    14.3.3), without approximation: through Earth-fixed coordinates, the velocity along north, east
+    and down at the antenna.
+    """
+    C_en = dcm_en(lat_rad, lon_rad)
+    lever_b = jnp.broadcast_to(lever_b_m, omega_ib_b.shape)
+    # The part of the Earth's rotation is added in Earth-fixed axes, where it is constant.
+    lever_e = _turn(C_en, rotate(q_nb, lever_b))
+    spin = jnp.broadcast_to(jnp.array([0.0, 0.0, OMEGA_E]), lever_e.shape)
+    v_e = _turn(C_en, v_n + rotate(q_nb, jnp.cross(omega_ib_b, lever_b))) - jnp.cross(spin, lever_e)
+    lat, lon, alt = geodetic_from_ecef(ecef_from_geodetic(lat_rad, lon_rad, alt_m) + lever_e)
+    return lat, lon, alt, _turn(jnp.swapaxes(dcm_en(lat, lon), -1, -2), v_e)
+
+
+def _turn(C: Array, v: Array) -> Array:
+    return jnp.einsum("...ij,...j->...i", C, v)
+
+
+def observe(
+    model: GnssErrorModel,
+    key: Array,
+    valid_s: ArrayLike,
+    lat_rad: ArrayLike,
+    lon_rad: ArrayLike,
+    alt_m: ArrayLike,
+    v_n: ArrayLike,
+    q_nb: ArrayLike,
+    omega_ib_b: ArrayLike,
+) -> GnssFixes:
+    """Fixes of a receiver from the truth of its vehicle at the instants the fixes are true for.
+
+    What is drawn for a fix depends on its number alone, so outages and losses leave the errors of
+    the other fixes as they were. Gross errors are added along a random direction, their length
+    measured in sigmas of the white error; a fix in gross error states the sigmas of a good one.
+    With no lever arm and no error the truth comes back unchanged.
+
+    Args:
+        model: of the errors.
+        key: of the run and the receiver, from `robins.sim.random.stream`.
+        valid_s: (m,) instants of the fixes, ascending, from `fix_times`; outages are in this time.
+        lat_rad: (m,) true latitude of the IMU.
+        lon_rad: (m,) true longitude.
+        alt_m: (m,) true height above the ellipsoid.
+        v_n: (m, 3) true velocity, north, east, down [m/s].
+        q_nb: (m, 4) true attitude, scalar first.
+        omega_ib_b: (m, 3) true angular rate of the gyros [rad/s].
+
+    Raises:
+        ValueError: shapes that do not fit together.
+    """
+    names = ("valid_s", "lat_rad", "lon_rad", "alt_m", "v_n", "q_nb", "omega_ib_b")
+    given = (valid_s, lat_rad, lon_rad, alt_m, v_n, q_nb, omega_ib_b)
+    time, lat, lon, alt, v, q, omega = truth = tuple(jnp.asarray(x, float) for x in given)
+    for name, x, tail in zip(names, truth, ((), (), (), (), (3,), (4,), (3,)), strict=True):
+        if time.ndim != 1 or x.shape != (*time.shape, *tail):
+            wanted = ("m", *tail) if tail else "(m,)"
+            raise ValueError(f"{name} must have shape {wanted}, m as in valid_s, got {x.shape}")
+    if model.lever_b_m is not None:
+        lat, lon, alt, v = antenna(lat, lon, alt, v, q, omega, jnp.asarray(model.lever_b_m))
+
+    numbers = jnp.arange(len(time))
+    normal, chance = jax.vmap(lambda number: _drawn(key, number))(numbers)
+    missing = chance[:, _Chance.DROPPED] < model.drop_share
+    if model.outages_s is not None:
+        begin, end = model.outages_s[None, :, 0], model.outages_s[None, :, 1]
+        now = time[:, None]
+        missing = missing | jnp.any((begin <= now) & (now < end), axis=1)
+    outlier = chance[:, _Chance.OUTLIER] < model.outlier_share
+    gross = jnp.where(outlier, model.outlier_size, 0.0)[:, None]
+
+    def rows(sigma):
+        return jnp.broadcast_to(jnp.asarray(sigma), (len(time), 3))
+
+    def error(sigma, white, direction):
+        unit = direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
+        return rows(sigma) * (white + gross * unit)
+
+    error_m = error(model.sigma_m, normal[:, _Row.POSITION], normal[:, _Row.OUTLIER_POSITION])
+    sigma_m = rows(model.sigma_m)
+    if model.markov_sigma_m is not None:
+        slow = _markov(time, rows(model.markov_tau_s), normal[:, _Row.MARKOV])
+        error_m = error_m + rows(model.markov_sigma_m) * slow
+        sigma_m = jnp.sqrt(sigma_m**2 + rows(model.markov_sigma_m) ** 2)
+    if model.stated_sigma_m is not None:
+        sigma_m = rows(model.stated_sigma_m)
+    measured = Geodetic(lat, lon, alt).retract(error_m)
+    lat, lon, alt = (
+        jnp.where(missing, jnp.nan, x) for x in (measured.lat, measured.lon, measured.alt)
+    )
+    v_measured, sigma_v = None, None
+    if model.sigma_v is not None:
+        draws = normal[:, _Row.VELOCITY], normal[:, _Row.OUTLIER_VELOCITY]
+        v_measured = jnp.where(missing[:, None], jnp.nan, v + error(model.sigma_v, *draws))
+        sigma_v = rows(model.sigma_v if model.stated_sigma_v is None else model.stated_sigma_v)
+    return GnssFixes(lat, lon, alt, v_measured, sigma_m, sigma_v, missing, outlier, error_m)
+
+
+def _drawn(key: Array, number: Array) -> tuple[Array, Array]:
+    normals, chances = (
+        jax.random.fold_in(jax.random.fold_in(key, which), number) for which in (_NORMALS, _CHANCES)
+    )
+    return jax.random.normal(normals, (len(_Row), 3)), jax.random.uniform(chances, (len(_Chance),))
+
+
+def _markov(time: Array, tau: Array, normal: Array) -> Array:
+    """First-order Markov process of unit variance (m, 3), steady from the first fix on."""
+
+    def step(before, x):
+        fade, drive, number = x
+        now = fade * before + drive * number
+        return now, now
+
+    # The first fix has no past: nothing is left of the zeros it starts from.
+    gone, steady = jnp.zeros((1, 3))[: len(time)], jnp.ones((1, 3))[: len(time)]
+    x = jnp.diff(time)[:, None] / tau[1:]
+    fades = jnp.concatenate([gone, jnp.exp(-x)])
+    drives = jnp.concatenate([steady, jnp.sqrt(-jnp.expm1(-2.0 * x))])
+    return jax.lax.scan(step, jnp.zeros(3), (fades, drives, normal))[1]
+
+
+def as_table(fixes: GnssFixes, stamp_s: np.ndarray, start_ns: int = 0) -> GnssTable:
+    """The fixes of one run that there are, as a log has them.
+
+    Args:
+        fixes: of one run.
+        stamp_s: (m,) time stamps [s], from `fix_times`.
+        start_ns: time of the run's start, added to the stamps.
+
+    Raises:
+        ValueError: fixes of another number, or of many runs.
+    """
+    missing = np.asarray(fixes.missing)
+    if missing.shape != np.shape(stamp_s):
+        raise ValueError(
+            f"{np.shape(stamp_s)} time stamps for fixes of shape {missing.shape}: give those of "
+            "one run"
+        )
+    there = ~missing
+    time_ns = start_ns + np.rint(np.asarray(stamp_s) * 1e9).astype(np.int64)
+
+    def of(x: Any) -> np.ndarray:
+        return np.asarray(x)[there]
+
+    return GnssTable(
+        time_ns[there],
+        of(fixes.lat_rad),
+        of(fixes.lon_rad),
+        of(fixes.alt_m),
+        of(fixes.sigma_m),
+        v_n=None if fixes.v_n is None else of(fixes.v_n),
+        sigma_v=None if fixes.sigma_v is None else of(fixes.sigma_v),
+        source="simulated receiver",
+    )
