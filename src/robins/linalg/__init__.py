@@ -14,6 +14,7 @@ from robins.linalg.dense import (
     factor,
     guard,
     identity,
+    independent_rows,
     log_diagonal,
     solve_lower,
     solve_lower_transposed,
@@ -21,6 +22,7 @@ from robins.linalg.dense import (
     symmetric_root,
     tria,
     where,
+    without_rounding,
     zeros,
 )
 from robins.linalg.systems import steady_state, van_loan
@@ -34,6 +36,7 @@ __all__ = [
     "factor",
     "guard",
     "identity",
+    "independent_rows",
     "log_diagonal",
     "solve_lower",
     "solve_lower_transposed",
@@ -43,5 +46,6 @@ __all__ = [
     "tria",
     "van_loan",
     "where",
+    "without_rounding",
     "zeros",
 ]

@@ -8,13 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from robins import _float64  # noqa: F401
 
-# A pivot below this share of its row's length is rounding: the row depends on those above it.
-# QR errs by a few 1e-16 of the row's length; 1e-14 leaves room for sizes up to about 50.
+# What is below this share of a row's length is rounding: such a row depends on those above it.
+# Orthogonalising errs by a few 1e-16 of the length; 1e-14 leaves room for sizes up to about 50.
 DEPENDENT = 1e-14
+
+# Rows up to which a loop is written out: faster for a measurement, slow to compile for a state.
+UNROLLED = 4
 
 
 def identity(n: int) -> Float[Array, "n n"]:
@@ -37,14 +40,92 @@ def tria(*blocks: Float[Array, "n _"]) -> Float[Array, "n n"]:
 
     One QR of the transposed row of blocks: no product is formed, so a covariance keeps full
     relative accuracy down to factors 1e-16 apart (Bierman 1977, ch. 4; Kaminski et al. 1971).
+    Derivatives stay finite where the covariance is singular.
     """
     wide = blocks[0] if len(blocks) == 1 else jnp.concatenate(blocks, axis=1)
     n, k = wide.shape
     if k < n:
         wide = jnp.concatenate([wide, jnp.zeros((n, n - k))], axis=1)
+    return _triangle(wide)
+
+
+@jax.custom_jvp
+def _triangle(wide):
     upper = jnp.linalg.qr(wide.T, mode="r")
-    sign = jnp.where(jnp.diagonal(upper) < 0.0, -1.0, 1.0)
-    return upper.T * sign[None, :]
+    return upper.T * _signs(upper)[None, :]
+
+
+def _signs(upper):
+    return jnp.where(jnp.diagonal(upper) < 0.0, -1.0, 1.0)
+
+
+@_triangle.defjvp
+def _triangle_jvp(primals, tangents):
+    # With A = L Q' the change is dL = dA Q + L W, W = Q' dQ skew and such that dL is lower
+    # triangular. Pivots lost in rounding turn nothing, where JAX's own rule divides by them.
+    (wide,), (slope,) = primals, tangents
+    Q, upper = jnp.linalg.qr(wide.T)
+    sign = _signs(upper)[None, :]
+    L = upper.T * sign
+    slide = slope @ (Q * sign)
+    length = jnp.sqrt(jnp.sum(L * L, axis=1))
+    solid = jnp.abs(jnp.diagonal(L)) > DEPENDENT * length
+    pivot = jnp.where(solid, jnp.diagonal(L), jnp.inf)
+    ratio = solve_lower(_with_diagonal(L, pivot), slide)
+    turn = jnp.triu(ratio, 1)
+    return L, jnp.tril(slide + L @ (turn.T - turn))
+
+
+def _with_diagonal(L, diagonal):
+    return jnp.where(jnp.eye(L.shape[0], dtype=bool), diagonal[:, None], L)
+
+
+def independent_rows(rows: Float[Array, "m k"]) -> Bool[Array, "m"]:
+    """Which rows are independent of those above them, to rounding; a row of zeros is not.
+
+    A row that is not finite counts as independent, so that a fault is not taken for a repetition.
+    Gram-Schmidt, each row twice (Parlett 1998, sec. 6.9). QR without row exchange cannot tell: past
+    a lost pivot its later ones are arbitrary.
+    """
+    m = rows.shape[0]
+    rows = jax.lax.stop_gradient(rows)
+    size = jnp.max(jnp.abs(rows), axis=1, initial=0.0, keepdims=True)
+    rows = rows / jnp.where(size > 0.0, size, 1.0)
+
+    def orthogonalise(row, basis, weight):
+        rest = row
+        for _ in range(2):
+            rest = rest - (weight * (basis @ rest)) @ basis
+        left = rest @ rest
+        solid = ~(left <= DEPENDENT**2 * (row @ row))
+        return rest, jnp.where(solid, 1.0 / jnp.where(solid, left, 1.0), 0.0), solid
+
+    if m > UNROLLED:
+
+        def body(i, state):
+            found = orthogonalise(rows[i], *state[:2])
+            return tuple(x.at[i].set(f) for x, f in zip(state, found, strict=True))
+
+        state = jnp.zeros_like(rows), jnp.zeros(m), jnp.zeros(m, dtype=bool)
+        return jax.lax.fori_loop(0, m, body, state)[2]
+
+    basis, weight, independent = rows[:0], jnp.zeros(0), []
+    for row in rows:
+        rest, share, solid = orthogonalise(row, basis, weight)
+        basis = jnp.concatenate([basis, rest[None]])
+        weight = jnp.append(weight, share)
+        independent.append(solid)
+    return jnp.stack(independent)
+
+
+def without_rounding(rows: Float[Array, "m k"], size: Float[Array, "m"]) -> Float[Array, "m k"]:
+    """Rows that are lost in rounding against the size of what they were summed from become zero.
+
+    The spread of a number that is known exactly comes out as 1e-16 of its terms, in some direction:
+    to believe in it would correlate the number with everything.
+    """
+    length = jnp.max(jnp.abs(jax.lax.stop_gradient(rows)), axis=1, initial=0.0)
+    return jnp.where((length <= DEPENDENT * size)[:, None], 0.0, rows)
 
 
 def block_factor(
@@ -77,17 +158,20 @@ def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The symmetric positive semidefinite root of P; negative rounding becomes zero."""
     value, vector = jnp.linalg.eigh(P)
-    return (vector * jnp.sqrt(jnp.maximum(value, 0.0))) @ vector.T
+    return (vector * jnp.sqrt(jnp.maximum(value, 0.0))[None, :]) @ vector.T
 
 
 def downdate(L: Float[Array, "n n"], v: Float[Array, "n"]) -> Float[Array, "n n"]:
-    """Lower factor of ``L L' - v v'``; all NaN where that is not positive definite.
+    """Lower factor of ``L L' - v v'``; all NaN where no covariance is left.
 
-    Written as ``L chol(I - p p')`` with p = L^-1 v: the subtraction meets numbers of order one
-    however badly L is scaled.
+    Written as ``L chol(I - p p')`` with L p = v: the subtraction meets numbers of order one however
+    badly L is scaled, and L may be singular as long as v is in its range.
     """
-    p = solve_lower(L, v[:, None])
-    return L @ jnp.linalg.cholesky(jnp.eye(L.shape[0]) - p @ p.T)
+    solid, _ = guard(L)
+    p = solve_lower(solid, L).T @ solve_lower(solid, v[:, None])
+    beyond = jnp.abs(v - (L @ p)[:, 0]) > 1e-10 * jnp.sqrt(jnp.sum(L * L, axis=1))
+    lower = L @ jnp.linalg.cholesky(jnp.eye(L.shape[0]) - p @ p.T)
+    return jnp.where(jnp.any(beyond), jnp.nan, lower)
 
 
 def solve_lower(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -105,19 +189,18 @@ def solve_spd(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n
     return solve_lower_transposed(L, solve_lower(L, B))
 
 
-def guard(L: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Array]:
-    """Make a lower factor of a perhaps singular covariance safe to solve with.
+def guard(factor: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], Bool[Array, "n"]]:
+    """Lower factor of a perhaps singular covariance, safe to solve with.
 
-    A row that depends on those above it (pivot lost in rounding) carries no information of its own.
-    Its pivot becomes infinite, so that solving gives exactly zero there, which is the limit of a
+    A row that depends on those above it carries no information of its own. It is left out: its
+    pivot is infinite, so that solving gives exactly zero there, which is the limit of a
     pseudo-inverse; the second result says which rows are independent.
     """
-    pivot = jnp.abs(jnp.diagonal(L))
-    length = jnp.sqrt(jnp.sum(L * L, axis=1))
-    independent = pivot > DEPENDENT * length
-    safe = jnp.where(independent, jnp.diagonal(L), jnp.inf)
-    n = L.shape[0]
-    return jnp.where(jnp.eye(n, dtype=bool), safe[:, None], L), independent
+    independent = independent_rows(factor)
+    kept = jnp.where(independent[:, None], factor, 0.0)
+    # A column of its own for a row left out, so that it stays uncorrelated with the rest.
+    L = tria(kept, jnp.diag(jnp.where(independent, 0.0, 1.0)))
+    return _with_diagonal(L, jnp.where(independent, jnp.diagonal(L), jnp.inf)), independent
 
 
 def log_diagonal(L: Float[Array, "n n"], include: Array) -> Float[Array, ""]:
@@ -161,13 +244,17 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
     unit = P_ / np.outer(scale, scale)
     if np.max(np.abs(unit - unit.T), initial=0.0) > 1e-9:
         raise ValueError(f"{name} is not symmetric: mend it with (P + P.T) / 2 if this is rounding")
-    value, vector = np.linalg.eigh((unit + unit.T) / 2.0)
-    if value.size and value[0] < -1e-10 * max(1.0, value[-1]):
+    unit = (unit + unit.T) / 2.0
+    value, vector = np.linalg.eigh(unit)
+    greatest = np.max(value, initial=1.0)
+    if value.size and value[0] < -1e-10 * greatest:
         raise ValueError(
             f"{name} is not positive semidefinite: its least scaled eigenvalue is {value[0]:.3g}"
         )
-    try:
-        root = np.linalg.cholesky((unit + unit.T) / 2.0)
-    except np.linalg.LinAlgError:
-        root = vector * np.sqrt(np.maximum(value, 0.0))
+    # What rounding leaves of a zero eigenvalue would be a standard deviation of 1e-8: it is zero.
+    rounding = len(P_) * np.finfo(float).eps * greatest
+    if np.all(value > 10.0 * rounding):
+        root = np.linalg.cholesky(unit)
+    else:
+        root = vector * np.sqrt(np.where(value > rounding, value, 0.0))
     return tria(jax.device_put(scale[:, None] * root))
