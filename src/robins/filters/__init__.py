@@ -4,7 +4,6 @@ from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
 from robins.filters.linearise import (
     Linearisation,
-    Observation,
     Transition,
     cubature,
     sigma_points,
@@ -14,6 +13,7 @@ from robins.filters.linearise import (
     unscented_transform,
 )
 from robins.filters.model import Model, Motion, Sensor
+from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
 from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
@@ -28,6 +28,7 @@ __all__ = [
     "Linearisation",
     "Model",
     "Motion",
+    "Normalised",
     "Observation",
     "OnlineFilter",
     "Prediction",
@@ -40,6 +41,7 @@ __all__ = [
     "cubature",
     "filter_step",
     "kalman",
+    "normalised",
     "rts_smoother",
     "run",
     "sigma_points",

@@ -5,7 +5,9 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
@@ -26,8 +28,11 @@ class Belief(NamedTuple):
         """From a mean and a covariance (positive semidefinite; looked at, so not inside `jit`).
 
         Raises:
-            ValueError: the covariance is not one, or its size is not the state's.
+            TypeError: the mean holds something that is not a real number.
+            ValueError: the mean is not finite, the covariance is not one, or its size is not the
+                state's.
         """
+        mean = jax.tree_util.tree_map(_as_state, mean)
         factor = linalg.factor(covariance, "initial covariance")
         n = manifold.dim(mean)
         if factor.shape != (n, n):
@@ -45,6 +50,15 @@ class Belief(NamedTuple):
         return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))
 
 
+def _as_state(leaf):
+    array = np.asarray(leaf)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"initial mean holds {array.dtype}: real numbers are wanted")
+    if not np.all(np.isfinite(array)):
+        raise ValueError("initial mean has entries that are not finite numbers")
+    return jnp.asarray(array.astype(float))
+
+
 class Code(IntEnum):
     """How a step went; `SENTENCES` says what that means and what to do."""
 
@@ -59,11 +73,11 @@ class Code(IntEnum):
 SENTENCES: dict[Code, str] = {
     Code.DONE: "the measurement was used",
     Code.MISSING: "no component of the measurement was there, so the belief stands",
-    Code.PARTLY_MISSING: "components that were missing were left out, the others used",
+    Code.PARTLY_MISSING: "components that were missing or refused were left out, the others used",
     Code.REFUSED: "a rule of the filter refused the measurement, so the belief stands",
     Code.INDEFINITE: (
         "the step would have made a covariance indefinite and was not taken: use form='sqrt', or "
-        "sigma points with beta >= alpha^2"
+        "sigma points with kappa and beta not negative"
     ),
     Code.NOT_FINITE: (
         "the step would have made the state infinite or NaN and was not taken: look at the model, "
@@ -76,8 +90,9 @@ class StepInfo(NamedTuple):
     """What an update saw, and what it made of it. m is the measurement's tangent dimension."""
 
     innovation: Array  # (m,) y minus its prediction; NaN where missing
-    factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where missing
-    gain: Array  # (n, m); zero columns where missing
+    factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
+    gain: Array  # (n, m); zero columns where not used
+    used: Array  # (m,) bool: there, not refused, and independent of the components above
     nis: Float[Array, ""]  # normalised innovation squared, chi-square of `dof`
     dof: Array  # number of components used
     log_likelihood: Float[Array, ""]

@@ -21,7 +21,10 @@ from robins.manifold import State
 
 
 def nees(belief: Belief, truth: State) -> Float[Array, ""]:
-    """Normalised estimation error squared of one belief; batch with `jax.vmap`."""
+    """Normalised estimation error squared of one belief; batch with `jax.vmap`.
+
+    Directions in which nothing is uncertain (a known constant) do not count, whatever their error.
+    """
     error = manifold.local(belief.mean, truth)
     solid, _ = linalg.guard(belief.factor)
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
@@ -30,7 +33,7 @@ def nees(belief: Belief, truth: State) -> Float[Array, ""]:
 def block_nees(belief: Belief, truth: State, block: slice) -> Float[Array, ""]:
     """NEES of some components alone, from their marginal covariance."""
     error = manifold.local(belief.mean, truth)[block]
-    solid, _ = linalg.guard(linalg.tria(belief.factor[block]))
+    solid, _ = linalg.guard(belief.factor[block])
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
 
 
@@ -105,15 +108,14 @@ def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
         info: of one sensor over a run (leading axis T).
 
     Returns:
-        (T, m), NaN where missing.
+        (T, m), NaN where not used.
     """
 
-    def one(residual, factor):
-        filled = jnp.where(jnp.isfinite(residual), residual, 0.0)
-        white = linalg.solve_lower(linalg.guard(factor)[0], filled[:, None])[:, 0]
-        return jnp.where(jnp.isfinite(residual), white, jnp.nan)
+    def one(residual, factor, used):
+        white = linalg.solve_lower(factor, jnp.where(used, residual, 0.0)[:, None])[:, 0]
+        return jnp.where(used, white, jnp.nan)
 
-    return jax.vmap(one)(info.innovation, info.factor)
+    return jax.vmap(one)(info.innovation, info.factor, info.used)
 
 
 def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdict:
@@ -125,7 +127,7 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
         level: of the one-sided bound.
 
     Raises:
-        ValueError: fewer than three times as many samples as lags.
+        ValueError: fewer than three times as many samples as lags, or all of them the same.
     """
     x = np.asarray(series, dtype=float)
     here = np.isfinite(x)
@@ -134,6 +136,8 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
         raise ValueError(f"whiteness over {lags} lags wants {3 * lags} samples, got {count}")
     x = np.where(here, x - np.mean(x[here]), 0.0)
     power = np.sum(x**2) / count
+    if power == 0.0:
+        raise ValueError("whiteness of a series that never changes")
     total = 0.0
     for lag in range(1, lags + 1):
         pairs = int(np.sum(here[lag:] & here[:-lag]))

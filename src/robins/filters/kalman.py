@@ -18,8 +18,9 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.linearise import Linearisation, Observation, Transition, taylor
+from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
+from robins.filters.observation import Observation, left_out, whiten
 from robins.filters.rule import Memory, Rule
 
 Form = Literal["sqrt", "joseph"]
@@ -65,18 +66,6 @@ def predicted_factor(t: Transition, form: Form) -> Array:
     return linalg.cholesky(P)
 
 
-def _leave_out_missing(o: Observation) -> tuple[Array, Array, Array, Array | None]:
-    """Spread, excess, noise, deficit with unit noise and nothing else in each row left out."""
-    here = o.accepted[:, None]
-    spread = jnp.where(here, o.spread, 0.0)
-    excess = jnp.where(here, o.excess, 0.0)
-    # Columns of its own for a row left out, so that it stays uncorrelated with the rest.
-    unit = jnp.diag(jnp.where(o.accepted, 0.0, 1.0))
-    noise = jnp.concatenate([jnp.where(here, o.noise, 0.0), unit], axis=1)
-    deficit = None if o.deficit is None else jnp.where(o.accepted, o.deficit, 0.0)
-    return spread, excess, noise, deficit
-
-
 def _outcome(o: Observation) -> Array:
     some = jnp.where(jnp.any(o.accepted), int(Code.PARTLY_MISSING), int(Code.REFUSED))
     some = jnp.where(jnp.any(o.present), some, int(Code.MISSING))
@@ -86,58 +75,68 @@ def _outcome(o: Observation) -> Array:
 def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo]:
     """The Kalman update for a linearised observation.
 
-    With F S known as the spread, gain and covariance follow from S_y, the innovation's factor:
+    With H S known as the spread, gain and covariance follow from S_y, the innovation's factor:
     K = (S spread') (S_y S_y')^-1 and P = (S - K spread)(..)' + K (Omega + R) K'.
     """
-    spread, excess, noise, deficit = _leave_out_missing(o)
+    spread, excess, noise, deficit, used = left_out(o)
     S = prior.factor
     if form == "sqrt":
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
-        solid, independent = linalg.guard(S_y)
-        gain = linalg.solve_lower_transposed(solid, cross.T).T
+        gain = linalg.solve_lower_transposed(S_y, cross.T).T
     else:
         R = excess @ excess.T + noise @ noise.T
         if deficit is not None:
             R = R - deficit[:, None] @ deficit[None, :]
         S_y = linalg.cholesky(spread @ spread.T + R)
-        solid, independent = linalg.guard(S_y)
-        gain = linalg.solve_spd(solid, spread @ S.T).T
+        gain = linalg.solve_spd(S_y, spread @ S.T).T
         A = S - gain @ spread
         S_post = linalg.cholesky(A @ A.T + gain @ R @ gain.T)
 
-    residual = jnp.where(o.accepted, o.residual, 0.0)
-    whitened = linalg.solve_lower(solid, residual[:, None])[:, 0]
-    used = o.accepted & independent
-    dof = jnp.sum(used)
-    nis = jnp.sum(whitened**2)
-    log_likelihood = -0.5 * (
-        nis + dof.astype(float) * math.log(2.0 * math.pi)
-    ) - linalg.log_diagonal(S_y, used)
-    mean = manifold.retract(prior.mean, gain @ residual)
+    gain = jnp.where(used[None, :], gain, 0.0)
+    seen = whiten(S_y, used, o.residual)
+    mean = manifold.retract(prior.mean, gain @ jnp.where(used, o.residual, 0.0))
+    # With nothing to use the belief stands bit for bit, as if there had been no update.
+    posterior = _select(jnp.any(used), Belief(mean, S_post), prior)
     info = StepInfo(
         innovation=jnp.where(o.present, o.residual, jnp.nan),
         factor=S_y,
         gain=gain,
-        nis=nis,
-        dof=dof,
-        log_likelihood=log_likelihood,
+        used=used,
+        nis=seen.nis,
+        dof=seen.dof,
+        log_likelihood=-0.5 * (seen.nis + seen.dof.astype(float) * math.log(2.0 * math.pi))
+        - linalg.log_diagonal(S_y, used),
         code=_outcome(o),
         notes={},
     )
-    return Belief(mean, S_post), info
+    return posterior, info
 
 
 def _finite(tree: Any) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(tree)]))
+    leaves = [jnp.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
+    numbers = [x for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
 
 
 def _select(condition: Array, new: Any, old: Any) -> Any:
     return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _failure(inputs: Any) -> Array:
-    """Why a step failed: finite inputs mean that a factorisation did."""
-    return jnp.where(_finite(inputs), int(Code.INDEFINITE), int(Code.NOT_FINITE))
+def _failure(inputs: Any, factor: Array) -> Array:
+    """Why a step failed: from finite inputs a factor that is not finite was not a covariance's."""
+    indefinite = _finite(inputs) & ~_finite(factor)
+    return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))
+
+
+def _not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
+    """What an update that was not taken says of itself: nothing used, and utterly unlikely."""
+    return info._replace(
+        used=info.used & ok,
+        nis=jnp.where(ok, info.nis, 0.0),
+        dof=jnp.where(ok, info.dof, 0),
+        log_likelihood=jnp.where(ok, info.log_likelihood, -jnp.inf),
+        code=jnp.where(ok, info.code, why),
+    )
 
 
 def kalman(
@@ -145,8 +144,9 @@ def kalman(
 ) -> Filter:
     """A Kalman filter: a way to linearise, a chain of rules, a form.
 
-    A step that would leave a state or covariance that is not finite is not taken: the belief and
-    the rules' memories stay, and the step's code says so.
+    A step that would leave a state, covariance or memory that is not finite is not taken, nor is
+    one whose innovation is too large to be squared: the belief and the rules' memories stay, the
+    step's code says so, and its log-likelihood is -inf, so that no search is drawn there.
 
     Args:
         linearise: `taylor` (default), `unscented` or `cubature`.
@@ -173,7 +173,8 @@ def kalman(
         belief = Belief(transition.mean, predicted_factor(transition, form))
         new = FilterState(belief, tuple(memory))
         ok = _finite(new)
-        code = jnp.where(ok, int(Code.DONE), _failure(transition))
+        why = _failure(transition, belief.factor)
+        code = jnp.where(ok, int(Code.DONE), why)
         new = _select(ok, new, state)
         return new, Prediction(transition, new.belief, code)
 
@@ -186,15 +187,14 @@ def kalman(
                 prior = faded
                 again = way.observation(prior, sensor, y, aux)
                 seen = again._replace(noise=seen.noise, accepted=seen.accepted)
+        seen = seen._replace(accepted=seen.accepted & seen.present)
         posterior, info = updated(prior, seen, form)
-        # With nothing to use the belief stands bit for bit, as if there had been no update.
-        posterior = _select(jnp.any(seen.accepted), posterior, prior)
         for i, rule in enumerate(rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
         new = FilterState(posterior, tuple(memory))
-        ok = _finite(new)
-        inputs = (prior, seen.residual, seen.spread, seen.noise)
-        info = info._replace(code=jnp.where(ok, info.code, _failure(inputs)))
-        return _select(ok, new, state), info
+        ok = _finite((new, info.nis))
+        inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *left_out(seen)[:3])
+        why = _failure(inputs, posterior.factor)
+        return _select(ok, new, state), _not_taken(ok, info, why)
 
     return Filter(init, predict, update)

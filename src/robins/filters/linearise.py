@@ -14,8 +14,9 @@ function value into an odd part o_i, which makes the spread, o_i / c, and an eve
 The textbook form sums squares about the mean with weights Wc_0 of either sign and size 1/alpha^2;
 here the cancellation has been done on paper. So no subtraction is left whenever beta >= alpha^2, at
 any alpha; and for beta < alpha^2 a shift of the a_i by s b removes it as long as
-1 + 2 n w (beta - alpha^2) >= 0. Beyond that Omega can be truly indefinite: the update then takes
-the rest away again, and says `Code.INDEFINITE` where no covariance is left.
+1 + 2 n w (beta - alpha^2) >= 0, that is kappa alpha^2 + n beta >= 0. Beyond that Omega can be truly
+indefinite: the update then takes the rest away again, and says `Code.INDEFINITE` where no
+covariance is left.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.model import Motion, Sensor
+from robins.filters.model import Motion, Sensor, as_noise
+from robins.filters.observation import Observation, innovation
 from robins.manifold import State
 
 
@@ -44,19 +46,6 @@ class Transition(NamedTuple):
     deficit: Array | None = None  # (n,) vector to take away again, for indefinite weights
 
 
-class Observation(NamedTuple):
-    """A measurement seen from a belief, linearised. Not a JAX type: `sensor` is a string."""
-
-    sensor: str
-    residual: Array  # (m,) y minus its prediction; 0 where missing
-    present: Array  # (m,) bool, the component was measured
-    accepted: Array  # (m,) bool, the component is used; rules may refuse what is present
-    spread: Array  # (m, n) H S
-    excess: Array  # (m, k)
-    noise: Array  # (m, m) measurement noise factor
-    deficit: Array | None = None  # (m,)
-
-
 class Linearisation(NamedTuple):
     """A way to linearise, as two functions."""
 
@@ -64,16 +53,41 @@ class Linearisation(NamedTuple):
     observation: Callable[[Belief, Sensor, Any, Any], Observation]
 
 
-def innovation(z: Any, y: Any) -> tuple[Array, Array]:
-    """Tangent vector from a predicted to a real measurement, and which components are present.
+def _observe(
+    sensor: Sensor, prior: Belief, z: Any, y: Any, aux: Any, spread, excess, size, deficit=None
+) -> Observation:
+    """An observation from what a linearisation found; ``size`` is what the spread was summed from.
 
-    A component is missing where it is NaN or infinite. Missing numbers are replaced before any
-    arithmetic, so that gradients stay finite.
+    Raises:
+        ValueError: the sensor reads another number of components than it says, or its measurement
+            is of another form than its reading.
     """
-    raw = jax.lax.stop_gradient(manifold.local(z, y))
-    present = jnp.isfinite(raw)
-    filled = jax.tree_util.tree_map(lambda a, b: jnp.where(jnp.isfinite(b), b, a), z, y)
-    return jnp.where(present, manifold.local(z, filled), 0.0), present
+    shapes = [
+        jax.tree_util.tree_map(jnp.shape, x, is_leaf=lambda leaf: leaf is None) for x in (z, y)
+    ]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"sensor '{sensor.name}' reads shape {shapes[0]}, but was given {shapes[1]} to compare"
+        )
+    if manifold.dim(z) != sensor.dim:
+        raise ValueError(
+            f"sensor '{sensor.name}' says dim = {sensor.dim}, but reads {manifold.dim(z)} numbers"
+        )
+    residual, present = innovation(z, y)
+    noise = sensor.noise_factor(prior.mean, aux)
+    if deficit is not None:
+        deficit = linalg.without_rounding(deficit[:, None], size)[:, 0]
+    return Observation(
+        sensor=sensor.name,
+        prior=prior,
+        residual=residual,
+        present=present,
+        accepted=present,
+        spread=linalg.without_rounding(spread, size),
+        excess=linalg.without_rounding(excess, size),
+        noise=noise,
+        deficit=deficit,
+    )
 
 
 def _jacobian(g, x):
@@ -93,7 +107,8 @@ def taylor() -> Linearisation:
 
     def transition(belief: Belief, motion: Motion, u) -> Transition:
         if motion.linear is not None:
-            mean, F, noise = motion.linear(belief.mean, u)
+            mean, F, given = motion.linear(belief.mean, u)
+            noise = as_noise(given, F.shape[0], "the motion")
         else:
             mean, F = _jacobian(lambda x: motion.step(x, u), belief.mean)
             noise = motion.noise_factor(belief.mean, u)
@@ -104,16 +119,9 @@ def taylor() -> Linearisation:
             z, H = sensor.linear(prior.mean, aux)
         else:
             z, H = _jacobian(lambda x: sensor.read(x, aux), prior.mean)
-        residual, present = innovation(z, y)
-        return Observation(
-            sensor.name,
-            residual,
-            present,
-            present,
-            H @ prior.factor,
-            linalg.zeros(sensor.dim, 0),
-            sensor.noise_factor(prior.mean, aux),
-        )
+        size = jnp.abs(H) @ prior.sigma
+        nothing = linalg.zeros(sensor.dim, 0)
+        return _observe(sensor, prior, z, y, aux, H @ prior.factor, nothing, size)
 
     return Linearisation(transition, observation)
 
@@ -126,7 +134,7 @@ class Weights(NamedTuple):
     reach: float  # c: points lie at m +- c s_i
 
 
-def sigma_weights(n: int, alpha: float, beta: float, kappa: float) -> Weights:
+def sigma_weights(n: int, alpha: float | int, beta: float | int, kappa: float | int) -> Weights:
     """The one place where sigma weights are made.
 
     Raises:
@@ -146,7 +154,7 @@ def sigma_weights(n: int, alpha: float, beta: float, kappa: float) -> Weights:
     return Weights(mean, cov, math.sqrt(c_sq))
 
 
-def sigma_points(belief: Belief, reach: float) -> State:
+def sigma_points(belief: Belief, reach: float | int) -> State:
     """States at the mean, then at +reach and at -reach times each column of the factor.
 
     Returns:
@@ -178,23 +186,36 @@ def _regress(values: Any, n: int, alpha: float, beta: float, kappa: float):
     b = 2.0 * ring * jnp.sum(even, axis=0)
 
     lack = beta - alpha**2
-    nu = 2.0 * n * ring
     root = math.sqrt(2.0 * ring)
     if lack >= 0.0:
         columns = [root * even.T] + ([math.sqrt(lack) * b[:, None]] if lack > 0.0 else [])
         return mean, spread.T, jnp.concatenate(columns, axis=1), None
-    if 1.0 + nu * lack >= 0.0:
-        shift = (1.0 - math.sqrt(1.0 + nu * lack)) / nu  # s of s^2 nu - 2 s = beta - alpha^2
+    nu = n / (alpha**2 * (n + kappa))  # 2 n w
+    # 1 + nu (beta - alpha^2), written so that it is exactly zero for the cubature points
+    room = (kappa * alpha**2 + n * beta) / (alpha**2 * (n + kappa))
+    if room >= 0.0:
+        shift = (1.0 - math.sqrt(room)) / nu  # s of s^2 nu - 2 s = beta - alpha^2
         return mean, spread.T, root * (even - shift * b[None, :]).T, None
     return mean, spread.T, root * even.T, math.sqrt(-lack) * b
 
 
-def unscented(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> Linearisation:
+def _greatest(values: Any) -> Array:
+    """Greatest size of each component over the sigma points; zero for those of elements."""
+    parts = [
+        jnp.zeros(v.dim) if manifold.is_element(v) else jnp.max(jnp.abs(v), axis=0).reshape(-1)
+        for v in manifold.leaves(values)
+    ]
+    return jnp.concatenate(parts)
+
+
+def unscented(
+    alpha: float | int = 1.0, beta: float | int = 2.0, kappa: float | int = 0.0
+) -> Linearisation:
     """Sigma points (Julier & Uhlmann 2004), drawn anew before every prediction and update.
 
     The defaults use points at +- sqrt(n) standard deviations. ``alpha``, ``beta`` and ``kappa`` are
-    plain numbers without unit; beta >= alpha^2 keeps every covariance a sum of squares. On linear
-    models all of them give the Kalman filter.
+    plain numbers without unit; kappa alpha^2 + n beta >= 0 keeps every covariance a sum of squares.
+    On linear models all of them give the Kalman filter.
     """
 
     def transition(belief: Belief, motion: Motion, u) -> Transition:
@@ -206,12 +227,11 @@ def unscented(alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> Line
 
     def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
-        points = sigma_points(prior, sigma_weights(n, alpha, beta, kappa).reach)
-        values = jax.vmap(lambda x: sensor.read(x, aux))(points)
+        weights = sigma_weights(n, alpha, beta, kappa)
+        values = jax.vmap(lambda x: sensor.read(x, aux))(sigma_points(prior, weights.reach))
         z, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
-        residual, present = innovation(z, y)
-        noise = sensor.noise_factor(prior.mean, aux)
-        return Observation(sensor.name, residual, present, present, spread, excess, noise, deficit)
+        size = _greatest(values) / weights.reach
+        return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
 
     return Linearisation(transition, observation)
 
@@ -224,9 +244,9 @@ def cubature() -> Linearisation:
 def unscented_transform(
     belief: Belief,
     g: Callable[[State], Any],
-    alpha: float = 1.0,
-    beta: float = 2.0,
-    kappa: float = 0.0,
+    alpha: float | int = 1.0,
+    beta: float | int = 2.0,
+    kappa: float | int = 0.0,
 ) -> Belief:
     """Push a belief through a function, with no noise added, by sigma points."""
     n = belief.factor.shape[0]

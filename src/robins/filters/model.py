@@ -13,14 +13,31 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
-from robins import linalg
+from robins import linalg, manifold
+
+
+def as_noise(value: Any, n: int, whose: str) -> Array:
+    """Noise factor from standard deviations or a factor.
+
+    Raises:
+        ValueError: it is neither (n,) nor (n, k).
+    """
+    noise = jnp.asarray(value, float)
+    if noise.ndim not in (1, 2) or noise.shape[0] != n:
+        raise ValueError(
+            f"noise of {whose} has shape {noise.shape}: ({n},) standard deviations or an ({n}, k) "
+            "factor L of the covariance L L' are wanted"
+        )
+    return linalg.as_factor(noise)
 
 
 def _is_static(value: Any) -> bool:
     # `Partial` is callable but carries arrays; JAX looks inside it.
     plain = callable(value) and not isinstance(value, jax.tree_util.Partial)
-    return plain or isinstance(value, (str, int, type(None)))
+    return plain or isinstance(value, (str, int, np.integer, type(None)))
 
 
 def _shape_and_data(cls):
@@ -52,8 +69,8 @@ class Motion:
     Attributes:
         step: ``(x, u) -> x``; u is the input of this step (increments, a time step, nothing).
         noise: process noise of a step in the tangent space of the new state: (n,) standard
-            deviations, (n, k) factor with Q = L L', or ``(x, u) -> (n, k) factor``.
-        linear: optional ``(x, u) -> (new x, F, Q factor)`` where an analytic transition exists;
+            deviations, (n, k) factor with Q = L L', or ``(x, u) -> `` one of these.
+        linear: optional ``(x, u) -> (new x, F, noise)`` where an analytic transition exists;
             `taylor` then uses it in place of automatic differentiation.
     """
 
@@ -64,7 +81,7 @@ class Motion:
     def noise_factor(self, x, u):
         """Process noise factor at x."""
         value = self.noise(x, u) if callable(self.noise) else self.noise
-        return linalg.as_factor(jnp.asarray(value))
+        return as_noise(value, manifold.dim(x), "the motion")
 
 
 @_shape_and_data
@@ -75,7 +92,7 @@ class Sensor:
     Attributes:
         read: ``(x, aux) -> z``, an (m,) array or a pytree with elements such as `Angle`; aux is
             what the reading needs besides the state (star direction, antenna rate, ...), or None.
-        noise: (m,) standard deviations, (m, m) lower factor with R = L L', or
+        noise: (m,) standard deviations, (m, k) factor with R = L L', or
             ``(x, aux) -> `` one of these.
         dim: tangent dimension m of the measurement.
         name: key of its measurements in a run.
@@ -91,7 +108,7 @@ class Sensor:
     def noise_factor(self, x, aux):
         """Measurement noise factor at x."""
         value = self.noise(x, aux) if callable(self.noise) else self.noise
-        return linalg.as_factor(jnp.asarray(value))
+        return as_noise(value, self.dim, f"sensor '{self.name}'")
 
 
 @_shape_and_data

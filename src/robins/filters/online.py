@@ -11,6 +11,7 @@ import jax
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
+from robins.filters.observation import as_measurement
 
 
 @partial(jax.jit, static_argnames=("filter_",))
@@ -30,7 +31,7 @@ class OnlineFilter:
 
     Attributes:
         state: the filter's state; assign to restore a saved one.
-        counts: outcomes of updates so far, by `Code` name.
+        counts: outcomes so far, by `Code` name: of updates, and of predictions not taken.
     """
 
     def __init__(self, filter_: Filter, model: Model, start: Belief | FilterState):
@@ -53,6 +54,9 @@ class OnlineFilter:
     def predict(self, u: Any = None) -> Prediction:
         """Move on by one step with input u."""
         self.state, prediction = _predict(self._filter, self._model.motion, self.state, u)
+        code = Code(int(prediction.code))
+        if code is not Code.DONE:
+            self.counts[code.name] += 1
         return prediction
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
@@ -65,13 +69,16 @@ class OnlineFilter:
 
         Raises:
             KeyError: the model has no sensor of this name.
-            ValueError: no name was given and the model has several sensors.
+            TypeError: the measurement is not of real numbers.
+            ValueError: no name was given and the model has several sensors, or the measurement is
+                not of the shape that the sensor reads.
         """
         if sensor is None:
             if len(self._model.sensors) != 1:
                 raise ValueError(f"name one of the sensors {sorted(self._model.dims)}")
             sensor = self._model.sensors[0].name
         chosen = self._model.sensor(sensor)
-        self.state, info = _update(self._filter, chosen, self.state, y, aux)
+        numbers = as_measurement(sensor, y)
+        self.state, info = _update(self._filter, chosen, self.state, numbers, aux)
         self.counts[Code(int(info.code)).name] += 1
         return info

@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.linearise import Observation, Transition
+from robins.filters.linearise import Transition
+from robins.filters.observation import Observation
 
 Memory = Any  # a pytree of arrays; its shapes may not change from step to step
 
@@ -43,7 +44,7 @@ class Rule(NamedTuple):
         process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
             and before the covariance is formed: adapt ``noise``, remember ``spread``.
         before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
-            reweight or refuse components (``present``), scale ``noise``. A rule that hands back
+            refuse components (``accepted``), scale ``noise``. A rule that hands back
             *another* prior has the measurement linearised about it again, keeping the noise and the
             refusals; one that does not touch the prior must hand back the same object.
         after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,

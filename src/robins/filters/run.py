@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from robins.filters.belief import Belief, StepInfo
+from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
+from robins.filters.observation import as_measurement
 
 
 class Step(NamedTuple):
@@ -50,27 +51,40 @@ def _everything(step: Step) -> Step:
     return step
 
 
-def _one_sensor(model: Model, data: Any) -> dict[str, Any]:
+def _by_sensor(model: Model, data: Any) -> dict[str, Any]:
     """Measurements by sensor name; a bare array means the only sensor there is."""
-    if isinstance(data, Mapping):
-        unknown = set(data) - set(model.dims)
-        if unknown:
-            raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
-        return dict(data)
     if data is None:
         return {}
-    if len(model.sensors) != 1:
-        raise ValueError(
-            f"this model has {sorted(model.dims)}: give measurements as a dict by sensor name"
-        )
-    return {model.sensors[0].name: data}
+    if not isinstance(data, Mapping):
+        if len(model.sensors) != 1:
+            raise ValueError(
+                f"this model has {sorted(model.dims)}: give measurements as a dict by sensor name"
+            )
+        data = {model.sensors[0].name: data}
+    _check_names(model, data)
+    return {name: as_measurement(name, values) for name, values in data.items()}
 
 
-def _length(y: dict[str, Any], u: Any, aux: dict[str, Any]) -> int:
-    lengths = {int(jnp.shape(leaf)[0]) for leaf in jax.tree_util.tree_leaves((y, u, aux))}
-    if len(lengths) != 1:
-        raise ValueError(f"measurements and inputs must have one length in time, got {lengths}")
-    return lengths.pop()
+def _check_names(model: Model, data: Mapping[str, Any]) -> None:
+    unknown = set(data) - set(model.dims)
+    if unknown:
+        raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
+
+
+def _check_lengths(y: Mapping[str, Any], u: Any, aux: Mapping[str, Any]) -> None:
+    """All that runs along must have one length in time."""
+    named = {"u": u, **{f"y['{k}']": v for k, v in y.items()}}
+    named |= {f"aux['{k}']": v for k, v in aux.items()}
+    lengths: dict[str, int] = {}
+    for name, data in named.items():
+        for leaf in jax.tree_util.tree_leaves(data):
+            if jnp.ndim(leaf) == 0:
+                raise ValueError(f"{name} holds a single number: a leading axis of time is wanted")
+            lengths[name] = jnp.shape(leaf)[0]
+            if lengths[name] != next(iter(lengths.values())):
+                raise ValueError(f"measurements and inputs must have one length, got {lengths}")
+    if u is None and not y:
+        raise ValueError("nothing to run over: neither a measurement nor an input")
 
 
 def filter_step(
@@ -92,7 +106,8 @@ def _scan(filter_, model, state, u, y, aux, keep):
         state, total = carry
         state, step = filter_step(filter_, model, state, *row)
         gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
-        return (state, total + gained), keep(step)
+        moved = step.prediction.code == int(Code.DONE)
+        return (state, total + jnp.where(moved, gained, -jnp.inf)), keep(step)
 
     (state, total), steps = jax.lax.scan(body, (state, jnp.zeros(())), (u, y, aux))
     return Solution(steps, state, total)
@@ -118,19 +133,20 @@ def run(
         model: the motion and the sensors.
         start: belief before the first prediction, or the state a run ended with, to go on.
         y: measurements, (T, m) for a model of one sensor, else a dict by sensor name; NaN is
-            missing, per component.
+            missing, per component. The motion comes first: row 0 is measured one step after start.
         u: input of the motion at each step, a pytree of arrays with leading axis T.
         aux: what sensors need besides the state, by sensor name, leading axis T.
         keep: what to keep of each `Step`; long campaigns keep little.
 
     Raises:
-        ValueError: lengths differ, or a measurement names no sensor of the model.
+        TypeError: a measurement is not a real number.
+        ValueError: lengths differ, a measurement names no sensor of the model or is not of the
+            shape that its sensor reads.
     """
-    measurements = _one_sensor(model, y)
+    measurements = _by_sensor(model, y)
     extra = dict(aux or {})
-    length = _length(measurements, u, extra)
-    if u is None and not measurements:
-        raise ValueError(f"nothing to run over: no measurement and no input in {length} steps")
+    _check_names(model, extra)
+    _check_lengths(measurements, u, extra)
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     return _scan(
@@ -138,7 +154,7 @@ def run(
         model,
         as_arrays(state),
         as_arrays(u),
-        as_arrays(measurements),
+        measurements,
         as_arrays(extra),
         keep,
     )

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief
+from robins.filters.belief import Belief, Code
 from robins.filters.run import Solution
 
 
@@ -15,12 +15,14 @@ def rts_smoother(solution: Solution) -> Belief:
 
     Backwards from the last step, with the gain G = P F' (P-)^-1:
 
-        m_s = m + G (m_s' - m-),   P_s = (S - G F S)(..)' + G (Omega + Q) G' + G P_s' G'
+        m_s = m + G (m_s' - m-),   P_s = P - G P- G' + G P_s' G'
 
-    written as one triangularisation of a sum of squares, so nothing is subtracted. It undoes
-    process and measurement noise as the run used them; covariance a rule added in an update
-    (fading, inflation) is not undone: a run with such rules is smoothed as if it were process
-    noise.
+    The first two terms of P_s are what an update of P by the predicted state leaves, and come from
+    the same triangularisation, so nothing is subtracted (Park & Kailath 1995).
+
+    It undoes process and measurement noise as the run used them; covariance a rule added in an
+    update (fading, inflation) is not undone: a run with such rules is smoothed as if it were
+    process noise.
 
     Returns:
         Beliefs with leading axis T; the last one is the filter's.
@@ -36,16 +38,21 @@ def rts_smoother(solution: Solution) -> Belief:
 
     def back(later: Belief, row):
         now, prediction = row
-        t, predicted = prediction.transition, prediction.belief
-        solid, _ = linalg.guard(predicted.factor)
-        cross = t.spread @ now.factor.T  # (P F')'
-        G = linalg.solve_spd(solid, cross).T
-        mean = manifold.retract(now.mean, G @ manifold.local(predicted.mean, later.mean))
-        parts = [G @ later.factor, now.factor - G @ t.spread, G @ t.excess, G @ t.noise]
-        factor = linalg.tria(*parts)
-        if t.deficit is not None:
-            factor = linalg.downdate(factor, (G @ t.deficit[:, None])[:, 0])
-        smoothed = Belief(mean, factor)
+        t = prediction.transition
+        # As an update of `now` by the state that followed, whose prediction has the noise t.noise.
+        used = linalg.independent_rows(jnp.concatenate([t.spread, t.excess, t.noise], axis=1))
+        spread, excess, noise = (
+            jnp.where(used[:, None], b, 0.0) for b in (t.spread, t.excess, t.noise)
+        )
+        unit = jnp.diag(jnp.where(used, 0.0, 1.0))
+        deficit = None if t.deficit is None else jnp.where(used, t.deficit, 0.0)
+        S, cross, rest = linalg.block_factor(spread, (excess, noise, unit), now.factor, deficit)
+        G = jnp.where(used[None, :], linalg.solve_lower_transposed(S, cross.T).T, 0.0)
+        mean = manifold.retract(now.mean, G @ manifold.local(prediction.belief.mean, later.mean))
+        smoothed = Belief(mean, linalg.tria(rest, G @ later.factor))
+        # A prediction that was not taken left the state where it was: the two are one.
+        taken = prediction.code == int(Code.DONE)
+        smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(taken, a, b), smoothed, later)
         return smoothed, smoothed
 
     rows = (

@@ -5,9 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from scipy import stats
 
-from robins import linalg
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.linearise import Observation
+from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 
 
@@ -37,19 +36,13 @@ def gate(probability: float = 0.9999, patience: int = 10) -> Rule:
         return {name: (jnp.zeros((), int), jnp.zeros(())) for name in dims}
 
     def before(memory, prior: Belief, o: Observation):
-        here = o.accepted[:, None]
-        unit = jnp.diag(jnp.where(o.accepted, 0.0, 1.0))
-        blocks = [jnp.where(here, b, 0.0) for b in (o.spread, o.excess, o.noise)]
-        solid, _ = linalg.guard(linalg.tria(*blocks, unit))
-        residual = jnp.where(o.accepted, o.residual, 0.0)
-        nis = jnp.sum(linalg.solve_lower(solid, residual[:, None]) ** 2)
+        seen = normalised(o)
         # quantile by number of components used; none used passes
         table = [jnp.inf, *stats.chi2.ppf(probability, range(1, len(o.residual) + 1))]
-        used = jnp.sum(o.accepted)
-        ratio = nis / jnp.asarray(table)[used]
+        ratio = jnp.minimum(seen.nis / jnp.asarray(table)[seen.dof], jnp.finfo(float).max)
         refused, _ = memory[o.sensor]
         passed = (ratio <= 1.0) | (refused >= patience)
-        refused = jnp.where(used == 0, refused, jnp.where(passed, 0, refused + 1))
+        refused = jnp.where(seen.dof == 0, refused, jnp.where(passed, 0, refused + 1))
         memory = {**memory, o.sensor: (refused, ratio)}
         return memory, prior, o._replace(accepted=o.accepted & passed)
 

@@ -1,0 +1,113 @@
+"""A measurement as a belief sees it, and how surprising it is."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief
+
+
+class Observation(NamedTuple):
+    """A measurement seen from a belief, linearised. Not a JAX type: `sensor` is a string."""
+
+    sensor: str
+    prior: Belief  # the belief it is seen from
+    residual: Array  # (m,) y minus its prediction; 0 where missing
+    present: Array  # (m,) bool, the component was measured
+    accepted: Array  # (m,) bool, the component is used; rules may refuse what is present
+    spread: Array  # (m, n) H S
+    excess: Array  # (m, k) factor of what the linearisation leaves over; k = 0 for Taylor
+    noise: Array  # (m, q) measurement noise factor
+    deficit: Array | None = None  # (m,) vector to take away again, for indefinite weights
+
+
+class Normalised(NamedTuple):
+    """An innovation in units of what was expected of it."""
+
+    factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
+    used: Array  # (m,) bool, accepted and independent of the components above
+    white: Array  # (m,) uncorrelated, of variance one if the filter is right; 0 where not used
+    nis: Array  # () sum of squares of white, chi-square of dof
+    dof: Array  # () number of components used
+
+
+def as_measurement(sensor: str, data: Any) -> Any:
+    """Measurements as 64-bit floats, from arrays of any real kind or lists of numbers.
+
+    Raises:
+        TypeError: something is not a real number.
+        ValueError: rows of a list differ in length.
+    """
+
+    def as_numbers(leaf):
+        array = leaf if isinstance(leaf, jax.Array) else np.asarray(leaf)
+        if not jnp.issubdtype(array.dtype, np.floating) and array.dtype.kind not in "iu":
+            raise TypeError(
+                f"measurements of '{sensor}' hold {array.dtype}: "
+                "real numbers are wanted, NaN where one is missing"
+            )
+        return array.astype(float)
+
+    numbers = jax.tree_util.tree_map(as_numbers, data, is_leaf=lambda x: isinstance(x, list))
+    return jax.tree_util.tree_map(jnp.asarray, numbers)
+
+
+def innovation(z: Any, y: Any) -> tuple[Array, Array]:
+    """Tangent vector from a predicted to a real measurement, and which components are present.
+
+    A component is missing where the measurement itself is NaN or infinite; a prediction that is
+    not finite is a fault of the model and stays visible. Missing numbers are replaced before any
+    arithmetic, so that gradients stay finite.
+    """
+    present = jnp.concatenate([_present(a, b) for a, b in _pairs(z, y)])
+    filled = jax.tree_util.tree_map(lambda a, b: jnp.where(jnp.isfinite(b), b, a), z, y)
+    return jnp.where(present, manifold.local(z, filled), 0.0), present
+
+
+def _pairs(z, y):
+    return zip(manifold.leaves(z), manifold.leaves(y), strict=True)
+
+
+def _present(predicted, measured) -> Array:
+    if not manifold.is_element(predicted):
+        return jnp.isfinite(jnp.reshape(measured, -1))
+    # An element has fewer tangent components than numbers: ask which of them come out finite.
+    whole = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(measured)]))
+    return jnp.isfinite(jnp.reshape(predicted.local(measured), -1)) | whole
+
+
+def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
+    """Spread, excess, noise, deficit without the rows that are not used, and which ones are.
+
+    Not used is what was not accepted, and what repeats components above it without noise of its
+    own: a second reading of a number that is known exactly. Such a row becomes unit noise,
+    uncorrelated with the rest, so shapes stay and nothing else changes.
+    """
+    kept = [jnp.where(o.accepted[:, None], b, 0.0) for b in (o.spread, o.excess, o.noise)]
+    used = linalg.independent_rows(jnp.concatenate(kept, axis=1))
+    spread, excess, noise = (jnp.where(used[:, None], b, 0.0) for b in kept)
+    unit = jnp.diag(jnp.where(used, 0.0, 1.0))
+    deficit = None if o.deficit is None else jnp.where(used, o.deficit, 0.0)
+    return spread, excess, jnp.concatenate([noise, unit], axis=1), deficit, used
+
+
+def whiten(factor: Array, used: Array, residual: Array) -> Normalised:
+    """Normalise a residual by the factor of its covariance."""
+    rest = jnp.where(used, residual, 0.0)
+    white = linalg.solve_lower(factor, rest[:, None])[:, 0]
+    return Normalised(factor, used, white, jnp.sum(white**2), jnp.sum(used))
+
+
+def normalised(o: Observation) -> Normalised:
+    """The innovation normalised as the update would: what rules judge a measurement by."""
+    spread, excess, noise, deficit, used = left_out(o)
+    factor = linalg.tria(spread, excess, noise)
+    if deficit is not None:
+        factor = linalg.downdate(factor, deficit)
+    return whiten(factor, used, o.residual)
