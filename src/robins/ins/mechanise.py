@@ -1,0 +1,259 @@
+"""Strapdown mechanisation in the local level frame, north-east-down.
+
+One step takes the increments of one interval and moves attitude, velocity and position over it
+(Savage 1998, parts 1 and 2; Groves 2013, section 5.5). Rates, gravity and Coriolis acceleration are
+taken at the middle of the interval, which a half step with the values at its start finds, so the
+error of a step is of third order in its length and that of a path of second.
+
+The frame is not defined at the poles; `refuse_polar` says so before a run starts. ENU/RFU users
+convert their tables, see `robins.ins.frames`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from robins import _float64, rotation
+from robins.dataset import Trajectory
+from robins.earth import A_M, E2, OMEGA_E, Geodetic
+from robins.ins.frames import to_ned_frd
+from robins.ins.increments import Increments, displacement
+from robins.ins.kernel import one_kernel, pack
+from robins.ins.zonal_gravity import gravity_nd
+from robins.rotation import Rotation
+
+POLAR_LAT_RAD = math.radians(89.9)
+
+_SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(11)]
+_COS = [(-1) ** k / math.factorial(2 * k) for k in range(12)]
+
+
+class Nav(NamedTuple):
+    """Attitude, velocity and position: one, or many along leading axes."""
+
+    q_nb: Rotation  # body FRD to navigation NED
+    v_n: Array  # (..., 3) m/s over the Earth, NED
+    position: Geodetic
+
+
+def step(nav: Nav, inc: Increments) -> Nav:
+    """Move over one interval: ``inc.dt`` a scalar, theta, dv and dr of shape (3,).
+
+    An increment that is all zero returns `nav` bit for bit, so blocks may be padded with them.
+    """
+    return _nav(_advance(_vector(nav), _row(inc)))
+
+
+@jax.jit
+def mechanise(nav: Nav, increments: Increments) -> Nav:
+    """Navigate from `nav` over N increments; the N states at the ends of the intervals.
+
+    Compiled for each N anew; `mechanise_chunked` is not.
+    """
+
+    def body(x, row):
+        x = _advance(x, row)
+        return x, x
+
+    _, path = lax.scan(body, _vector(nav), _row(increments))
+    return _nav(path)
+
+
+def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> Nav:
+    """As `mechanise`, on the host: NumPy arrays in and out, `chunk` increments at a time.
+
+    The device holds one chunk whatever the length of the run, and one compilation serves all
+    lengths, the last chunk being padded.
+
+    Raises:
+        ValueError: the start is too near a pole, see `refuse_polar`.
+    """
+    _float64.require()
+    refuse_polar(nav.position.lat)
+    inc = Increments(*(None if a is None else np.asarray(a, float) for a in increments))
+    total = len(inc.dt)
+    size = min(chunk, total)
+    path = jax.tree.map(lambda leaf: np.empty((total, *jnp.shape(leaf))), nav)
+    for start in range(0, total, size):
+        stop = min(start + size, total)
+        block = jax.tree.map(lambda a, at=slice(start, stop): _padded(a[at], size), inc)
+        part = mechanise(nav, block)
+        nav = jax.tree.map(lambda leaf: leaf[-1], part)
+        for whole, piece in zip(jax.tree.leaves(path), jax.tree.leaves(part), strict=True):
+            whole[start:stop] = np.asarray(piece)[: stop - start]
+    return path
+
+
+def _padded(a: np.ndarray, size: int) -> np.ndarray:
+    return np.concatenate([a, np.zeros((size - len(a), *a.shape[1:]))]) if len(a) < size else a
+
+
+def refuse_polar(lat_rad) -> None:
+    """Refuse latitudes where north is ill-defined.
+
+    Raises:
+        ValueError: a latitude is beyond 89.9 deg.
+    """
+    lat = np.atleast_1d(np.asarray(lat_rad, float))
+    worst = float(lat[np.argmax(np.abs(lat))]) if lat.size else 0.0
+    if abs(worst) > POLAR_LAT_RAD:
+        raise ValueError(
+            f"latitude {math.degrees(worst):.6f} deg: this mechanisation works in the local level "
+            "frame, whose north turns ever faster towards a pole and is not defined there; it "
+            "starts at up to 89.9 deg"
+        )
+
+
+def nav_at(trajectory: Trajectory, index: int | slice | np.ndarray = 0) -> Nav:
+    """One or many states of a trajectory, in NED/FRD whatever its own frames."""
+    t = to_ned_frd(trajectory)
+    leaves = (t.q_nb, t.v_n, t.lat_rad, t.lon_rad, t.alt_m)
+    q, v, lat, lon, alt = (jnp.asarray(np.asarray(a, float)[index]) for a in leaves)
+    return Nav(Rotation(q), v, Geodetic(lat, lon, alt))
+
+
+def as_trajectory(time_ns: np.ndarray, nav: Nav, source: str = "") -> Trajectory:
+    """States along one leading axis as a table."""
+    p = nav.position
+    leaves = (p.lat, p.lon, p.alt, nav.v_n, nav.q_nb.wxyz)
+    lat, lon, alt, v_n, q_nb = (np.asarray(a) for a in leaves)
+    return Trajectory(np.asarray(time_ns), lat, lon, alt, v_n, q_nb, source=source)
+
+
+# ---------------------------------------------------------------------- the step on plain vectors
+
+
+def _vector(nav: Nav) -> Float[Array, "*b 10"]:
+    """State as the step carries it: q_nb, v_n, lat, lon, alt."""
+    p = nav.position
+    lla = jnp.stack([jnp.asarray(a, float) for a in (p.lat, p.lon, p.alt)], -1)
+    return jnp.concatenate([jnp.asarray(nav.q_nb.wxyz), jnp.asarray(nav.v_n), lla], -1)
+
+
+def _nav(x: Float[Array, "*b 10"]) -> Nav:
+    return Nav(Rotation(x[..., :4]), x[..., 4:7], Geodetic(x[..., 7], x[..., 8], x[..., 9]))
+
+
+def _row(inc: Increments) -> Float[Array, "*b 11"]:
+    """What a step needs of an increment and nothing else depends on: dt, exp(theta/2), dv, dr."""
+    inc = Increments(*(None if a is None else jnp.asarray(a, float) for a in inc))
+    q_bb = rotation.from_rotvec(inc.theta)
+    return jnp.concatenate([inc.dt[..., None], q_bb, inc.dv, displacement(inc)], -1)
+
+
+def _horner(coefficients, x):
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = c + x * total
+    return total
+
+
+def _sin_cos(x):
+    """Sine and cosine on [-pi/2, pi/2] to rounding.
+
+    A library call would keep the runs of a batch from being computed side by side.
+    """
+    sq = x * x
+    return x * _horner(_SIN, sq), _horner(_COS, sq)
+
+
+def _wrap(lon):
+    return jnp.where(
+        lon >= jnp.pi, lon - 2.0 * jnp.pi, jnp.where(lon < -jnp.pi, lon + 2.0 * jnp.pi, lon)
+    )
+
+
+def _cross(a, b):
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+def _product(p, q):
+    """Hamilton product of quaternions held as scalars."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+def _rotate(q, v):
+    t = tuple(2.0 * c for c in _cross(q[1:], v))
+    u = _cross(q[1:], t)
+    return tuple(v[i] + q[0] * t[i] + u[i] for i in range(3))
+
+
+@one_kernel
+def _advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"]:
+    """The step, on scalars: see `robins.ins.kernel` for why."""
+    w, qx, qy, qz, v_north, v_east, v_down, lat, lon, alt = x
+    dt, *rest = row
+    q, v, q_bb = (w, qx, qy, qz), (v_north, v_east, v_down), tuple(rest[:4])
+    half = 0.5 * dt
+    dv = _rotate(q, tuple(rest[4:7]))
+    dr = _rotate(q, tuple(rest[7:]))
+
+    # Latitude and height at the middle, and what depends on them. The shift in latitude is tiny
+    # (2e-7 rad at 300 m/s and 100 Hz), so two terms carry sine, cosine and the radii over.
+    s, c = _sin_cos(lat)
+    per_w_sq = 1.0 / (1.0 - E2 * s * s)
+    transverse = A_M * jnp.sqrt(per_w_sq)
+    meridian = transverse * (1.0 - E2) * per_w_sq
+    shift = v_north * half / (meridian + alt)
+    s_mid = s + shift * (c - 0.5 * shift * s)
+    c_mid = c - shift * (s + 0.5 * shift * c)
+    alt_mid = alt - v_down * half
+    growth = E2 * s * c * per_w_sq * shift
+    transverse = transverse * (1.0 + growth)
+    per_north = 1.0 / (meridian * (1.0 + 3.0 * growth) + alt_mid)
+    per_east = 1.0 / (transverse + alt_mid)
+    tan_mid = s_mid / c_mid
+    earth = (OMEGA_E * c_mid, 0.0, -OMEGA_E * s_mid)  # omega_ie_n
+    g_north, g_down = gravity_nd(s_mid, c_mid, transverse, alt_mid)
+
+    def over_earth(north, east):
+        """omega_en_n, or the turn of the frame over a displacement."""
+        about_north = east * per_east
+        return about_north, -north * per_north, -about_north * tan_mid
+
+    def acceleration(v):
+        """Gravity and Coriolis, and omega_in_n."""
+        turn = over_earth(v[0], v[1])
+        coriolis = _cross([2.0 * e + t for e, t in zip(earth, turn, strict=True)], v)
+        omega = [e + t for e, t in zip(earth, turn, strict=True)]
+        return (g_north - coriolis[0], -coriolis[1], g_down - coriolis[2]), omega
+
+    a_start, _ = acceleration(v)
+    v_mid = tuple(v[i] + 0.5 * (dv[i] + a_start[i] * dt) for i in range(3))
+    a_mid, omega_in = acceleration(v_mid)
+    # Specific force is felt in a frame that turns: by half of its turn on average over the
+    # interval, and by a third of that half in the double integral.
+    turned = _cross([half * o for o in omega_in], dv)
+    v_new = tuple(v[i] + dv[i] - turned[i] + a_mid[i] * dt for i in range(3))
+    r = tuple(v[i] * dt + dr[i] + dt * (half * a_mid[i] - turned[i] / 3.0) for i in range(3))
+
+    turn = over_earth(r[0], r[1])
+    lat_new = lat - turn[1]
+    lon_new = _wrap(lon + turn[0] / c_mid)
+
+    # exp(-zeta/2) for the turn zeta of the frame, to its fifth power
+    zeta = [-0.5 * (turn[i] + earth[i] * dt) for i in range(3)]
+    sq = zeta[0] * zeta[0] + zeta[1] * zeta[1] + zeta[2] * zeta[2]
+    sinc = 1.0 - sq * (1.0 / 6.0 - sq / 120.0)
+    q_frame = (1.0 - sq * (0.5 - sq / 24.0), sinc * zeta[0], sinc * zeta[1], sinc * zeta[2])
+    q = _product(q_frame, _product(q, q_bb))
+    # One Newton step to unit length; none for a zero step, which must not touch a bit.
+    excess = 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] - 1.0)
+    scale = 1.0 - jnp.where(dt == 0.0, 0.0, excess)
+    return pack([*(scale * component for component in q), *v_new, lat_new, lon_new, alt - r[2]])
