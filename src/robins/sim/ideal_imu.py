@@ -1,0 +1,112 @@
+"""What an IMU without errors would deliver, in two senses.
+
+`true_increments` integrates what the body of a smooth motion really feels, by quadrature. A
+mechanisation that works on them shows its discretisation error.
+
+`ideal_increments` is the exact inversion of the mechanisation: the samples from which it returns a
+given sampled trajectory, whatever its own discretisation. Errors added to these are the only errors
+there are.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from robins.dataset import ImuTable, Trajectory
+from robins.ins.frames import swap, to_ned_frd
+from robins.ins.increments import Increments, from_imu
+from robins.ins.mechanise import Nav, nav_at, refuse_polar, step
+from robins.sim.trajectory import Motion
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+
+
+def ideal_rates(motion: Motion, time_ns: np.ndarray) -> ImuTable:
+    """Angular rate omega_ib_b and specific force f_b at given times [ns], FRD."""
+    gyro, accel = motion.at(np.asarray(time_ns) * 1e-9).rates()
+    return ImuTable(np.asarray(time_ns, np.int64), gyro, accel, "rate")
+
+
+def true_increments(motion: Motion, time_ns: np.ndarray) -> ImuTable:
+    """Integrals of omega_ib_b and f_b over (time[k-1], time[k]], FRD.
+
+    Five Gauss-Legendre points an interval: far below rounding at the rates of an IMU. The interval
+    that ends at the first time is as long as the second one; the splines reach that far back.
+    """
+    t = np.asarray(time_ns) * 1e-9
+    dt = np.diff(t)
+    dt = np.append(dt[:1], dt)
+    nodes = (t - 0.5 * dt)[:, None] + 0.5 * dt[:, None] * _NODES
+    gyro, accel = (
+        0.5 * dt[:, None] * np.einsum("nkj,k->nj", x.reshape(*nodes.shape, 3), _WEIGHTS)
+        for x in motion.at(nodes.reshape(-1)).rates()
+    )
+    return ImuTable(np.asarray(time_ns, np.int64), gyro, accel, "increment")
+
+
+def ideal_increments(
+    trajectory: Trajectory, tolerance: float = 1e-12, iterations: int = 50
+) -> ImuTable:
+    """The increment table from which `from_imu` and `mechanise` return a trajectory.
+
+    Attitude and velocity at the samples of the trajectory are met to rounding. Position is what the
+    mechanisation makes of them; it differs from the given one by the discretisation of the position
+    alone. Every interval is stepped from its true start, the misses in attitude and velocity at its
+    end are taken to the body and put into its samples, until nothing changes. Body axes are those
+    of the trajectory. The row of the first time repeats the second.
+
+    Args:
+        trajectory: at the rate wanted, two rows at least.
+        tolerance: of the last correction but one [rad and m/s].
+        iterations: allowed.
+
+    Raises:
+        ValueError: too short, near a pole, time that does not increase, or a body that turns too
+            far within a sample.
+    """
+    if len(trajectory) < 2:
+        raise ValueError(f"{len(trajectory)} row(s): an increment needs two")
+    refuse_polar(trajectory.lat_rad)
+    path = nav_at(to_ned_frd(trajectory), slice(None))
+    before, after = (jax.tree.map(lambda a, k=k: a[k], path) for k in (slice(-1), slice(1, None)))
+    n = len(trajectory) - 1
+    gyro, accel, size = np.zeros((n, 3)), np.zeros((n, 3)), np.inf
+    for _ in range(iterations):
+        imu = ImuTable(
+            trajectory.time_ns, _doubled(gyro), _doubled(accel), "increment", source="trajectory"
+        )
+        miss = _miss(before, after, from_imu(imu)[0])
+        gyro, accel = gyro + np.asarray(miss[0]), accel + np.asarray(miss[1])
+        size = float(jnp.max(jnp.abs(jnp.stack(miss))))
+        if size < tolerance:
+            break
+    else:
+        raise ValueError(
+            f"the inversion has not settled after {iterations} rounds (last change {size:.1e}): "
+            "the body turns too far between two rows of the trajectory; sample it more densely"
+        )
+    gyro, accel = _doubled(gyro), _doubled(accel)
+    if trajectory.body == "RFU":
+        gyro, accel = swap(gyro), swap(accel)
+    return ImuTable(trajectory.time_ns, gyro, accel, "increment", trajectory.body)
+
+
+def _doubled(a: np.ndarray) -> np.ndarray:
+    return np.concatenate([a[:1], a])
+
+
+@jax.jit
+def _miss(
+    before: Nav, after: Nav, increments: Increments
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """Rotation [rad] and velocity [m/s], in body axes, that each step still lacks."""
+
+    def one(start: Nav, end: Nav, inc: Increments):
+        reached = step(start, inc)
+        turn = (reached.q_nb.inverse() @ end.q_nb).as_rotvec()
+        return turn, start.q_nb.inverse().apply(end.v_n - reached.v_n)
+
+    return jax.vmap(one)(before, after, increments)

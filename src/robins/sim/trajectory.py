@@ -1,0 +1,273 @@
+"""Smooth motion over the Earth, with velocity, acceleration and angular rate that belong to it.
+
+A `Motion` is two splines of fifth degree or more: latitude, longitude and height; and the attitude
+quaternion. All else is their derivatives, so it is consistent with the path to rounding, whatever
+the motion was made from, and what an ideal IMU feels runs without steps. Offline, NumPy,
+north-east-down and forward-right-down; time in seconds from the start of the motion.
+
+    motion = sine_velocity(start, amplitude_mps=60.0, period_s=30.0)
+    truth = motion.trajectory(motion.times_ns(rate_hz=10.0))
+
+`robins.sim.commands` makes motions from a list of manoeuvres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline, make_interp_spline
+
+from robins import earth, rotation
+from robins.dataset import Trajectory
+from robins.earth import A_M, E2, OMEGA_E, Geodetic
+from robins.ins.mechanise import refuse_polar
+
+Vehicle = Literal["ground", "aircraft"]
+
+_DEGREE = 5
+_SLOWEST = 0.1  # m/s; below it a course is not a heading
+
+gravity_n = jax.jit(earth.gravity_n)
+
+
+class Kinematics(NamedTuple):
+    """A motion at N instants; NumPy."""
+
+    lat: np.ndarray  # (N,) rad
+    lon: np.ndarray  # (N,) rad, not folded
+    alt: np.ndarray  # (N,) m
+    v_n: np.ndarray  # (N, 3) m/s over the Earth, NED
+    a_n: np.ndarray  # (N, 3) m/s^2, time derivative of the components v_n
+    q_nb: np.ndarray  # (N, 4)
+    omega_nb_b: np.ndarray  # (N, 3) rad/s, body relative to NED
+
+    def rates(self) -> tuple[np.ndarray, np.ndarray]:
+        """What an ideal IMU feels: omega_ib_b [rad/s] and specific force f_b [m/s^2]."""
+        omega_ie = np.zeros_like(self.v_n)
+        omega_ie[:, 0], omega_ie[:, 2] = OMEGA_E * np.cos(self.lat), -OMEGA_E * np.sin(self.lat)
+        meridian, transverse = _radii(self.lat)
+        omega_en = np.empty_like(self.v_n)
+        omega_en[:, 0] = self.v_n[:, 1] / (transverse + self.alt)
+        omega_en[:, 1] = -self.v_n[:, 0] / (meridian + self.alt)
+        omega_en[:, 2] = -omega_en[:, 0] * np.tan(self.lat)
+        f_n = self.a_n + np.cross(2.0 * omega_ie + omega_en, self.v_n)
+        f_n -= np.asarray(gravity_n(self.lat, self.alt))
+        to_body = np.swapaxes(dcm(self.q_nb), 1, 2)
+        return (
+            self.omega_nb_b + np.einsum("nij,nj->ni", to_body, omega_ie + omega_en),
+            np.einsum("nij,nj->ni", to_body, f_n),
+        )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A smooth path and attitude from time zero to `duration_s`."""
+
+    duration_s: float
+    start: Geodetic  # scalars
+    path: BSpline  # (3,): latitude and longitude less the start's [rad], height [m]
+    attitude: BSpline  # (4,): q_nb, not normalised
+
+    def at(self, time_s: np.ndarray) -> Kinematics:
+        """Everything at given times [s], which may lie a little outside the motion."""
+        t = np.asarray(time_s, float)
+        (dlat, dlon, alt) = self.path(t).T
+        lat_rate, lon_rate, climb = self.path(t, 1).T
+        lat_rate2, lon_rate2, climb_rate = self.path(t, 2).T
+        lat, lon = float(self.start.lat) + dlat, float(self.start.lon) + dlon
+        s, c = np.sin(lat), np.cos(lat)
+        meridian, transverse = _radii(lat)
+        bulge = 3.0 * meridian * E2 * s * c / (1.0 - E2 * s * s)  # d meridian / d latitude
+        north, east = meridian + alt, (transverse + alt) * c
+        v_n = np.stack([lat_rate * north, lon_rate * east, -climb], -1)
+        a_n = np.stack(
+            [
+                lat_rate2 * north + lat_rate * (bulge * lat_rate + climb),
+                lon_rate2 * east + lon_rate * (c * climb - north * s * lat_rate),
+                -climb_rate,
+            ],
+            -1,
+        )
+        raw, raw_rate = self.attitude(t), self.attitude(t, 1)
+        sq = np.sum(raw * raw, -1, keepdims=True)
+        omega = 2.0 * _vector_part(raw, raw_rate) / sq
+        return Kinematics(lat, lon, alt, v_n, a_n, raw / np.sqrt(sq), omega)
+
+    def times_ns(self, rate_hz: float) -> np.ndarray:
+        """Sampling times from start to end at a constant rate, rounded to nanoseconds."""
+        n = int(np.floor(self.duration_s * rate_hz * (1.0 + 1e-12)))
+        return np.round(np.arange(n + 1) * (1e9 / rate_hz)).astype(np.int64)
+
+    def trajectory(self, time_ns: np.ndarray, source: str = "") -> Trajectory:
+        """The truth at given times [ns], NED/FRD."""
+        k = self.at(np.asarray(time_ns) * 1e-9)
+        lon = (k.lon + np.pi) % (2.0 * np.pi) - np.pi
+        return Trajectory(
+            np.asarray(time_ns, np.int64), k.lat, lon, k.alt, k.v_n, k.q_nb, source=source
+        )
+
+
+def from_waypoints(
+    time_s: ArrayLike,
+    lat_rad: ArrayLike,
+    lon_rad: ArrayLike,
+    alt_m: ArrayLike,
+    q_nb: ArrayLike | None = None,
+    vehicle: Vehicle = "ground",
+) -> Motion:
+    """Through given points at given times.
+
+    Args:
+        time_s: (K,) increasing, at least four; taken from the first one on.
+        lat_rad: (K,).
+        lon_rad: (K,); may cross 180 deg.
+        alt_m: (K,) above the ellipsoid.
+        q_nb: (K, 4) attitude at the points, NED/FRD. Without it the vehicle points where it goes;
+            an aircraft banks so that its turns are coordinated.
+        vehicle: who moves, if `q_nb` is not given.
+
+    Raises:
+        ValueError: too few points, time that does not increase, shapes that do not match, values
+            that are not finite, a pole, or, without `q_nb`, a vehicle that stands still.
+    """
+    columns = {"time_s": time_s, "lat_rad": lat_rad, "lon_rad": lon_rad, "alt_m": alt_m}
+    t, lat, lon, alt = (_column(name, a, np.size(time_s)) for name, a in columns.items())
+    if len(t) < 4 or np.any(np.diff(t) <= 0):
+        raise ValueError(
+            f"time_s: {len(t)} waypoints, at least 4 at increasing times are needed for a smooth "
+            "path"
+        )
+    refuse_polar(lat)
+    t = t - t[0]
+    lon = np.unwrap(lon)
+    degree = _DEGREE if len(t) > _DEGREE else 3
+    knots = np.stack([lat - lat[0], lon - lon[0], alt], -1)
+    path = make_interp_spline(t, knots, k=degree)
+    start = Geodetic(lat[0], lon[0], alt[0])
+    if q_nb is not None:
+        q = np.asarray(q_nb, float)
+        if q.shape != (len(t), 4):
+            raise ValueError(f"q_nb has shape {q.shape}, the waypoints need ({len(t)}, 4)")
+        return Motion(t[-1], start, path, _attitude(t, q, degree))
+    fine = np.interp(np.arange(16 * len(t) - 15) / 16.0, np.arange(len(t)), t)
+    level = _attitude(t, np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)), degree)
+    k = Motion(t[-1], start, path, level).at(fine)
+    speed = np.hypot(k.v_n[:, 0], k.v_n[:, 1])
+    if speed.min() < _SLOWEST:
+        raise ValueError(
+            f"the vehicle (nearly) stands still at {fine[speed.argmin()]:.3f} s "
+            f"({speed.min():.3f} m/s): where it points does not follow from where it goes; pass "
+            "q_nb, or use robins.sim.commands"
+        )
+    heading = np.arctan2(k.v_n[:, 1], k.v_n[:, 0])
+    return Motion(t[-1], start, path, _attitude(fine, along(k, heading, vehicle)))
+
+
+def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray) -> Motion:
+    """From velocity (K, 3) NED [m/s] and attitude (K, 4) at dense, increasing times from zero [s].
+
+    Between the knots the path follows splines of sixth degree, whose rates are those of the
+    velocity at the knots.
+
+    Raises:
+        ValueError: the start is too near a pole.
+    """
+    refuse_polar(start.lat)
+    lat0, alt0 = float(start.lat), float(start.alt)
+    alt = alt0 + make_interp_spline(time_s, -v_n[:, 2], k=_DEGREE).antiderivative()(time_s)
+    lat_rate, lat = np.zeros_like(alt), np.full_like(alt, lat0)
+    # Latitude appears on both sides only through the radii: each pass gains three digits.
+    for _ in range(6):
+        lat_rate = v_n[:, 0] / (_radii(lat)[0] + alt)
+        lat = lat0 + make_interp_spline(time_s, lat_rate, k=_DEGREE).antiderivative()(time_s)
+    refuse_polar(lat)
+    lon_rate = v_n[:, 1] / ((_radii(lat)[1] + alt) * np.cos(lat))
+    rates = make_interp_spline(time_s, np.stack([lat_rate, lon_rate, -v_n[:, 2]], -1), k=_DEGREE)
+    path = rates.antiderivative()
+    path.c[:, 2] += alt0  # B-splines sum to one, so this shifts the height
+    origin = Geodetic(lat0, float(start.lon), alt0)
+    return Motion(float(time_s[-1]), origin, path, _attitude(time_s, q_nb))
+
+
+def sine_velocity(
+    start: Geodetic,
+    mean_mps: ArrayLike = 10.0,
+    amplitude_mps: ArrayLike = 60.0,
+    period_s: float = 30.0,
+    duration_s: float = 600.0,
+    phase_rad: ArrayLike = (0.0, np.pi / 2.0, 0.0),
+) -> Motion:
+    """Velocity ``mean + amplitude sin(2 pi t / period + phase)`` along north, east and down.
+
+    The body points along the velocity, with its wings level. The motion pyins (N. Mayorov) tests
+    its mechanisation with.
+    """
+    mean, amplitude, phase = (
+        np.broadcast_to(np.asarray(a, float), 3) for a in (mean_mps, amplitude_mps, phase_rad)
+    )
+    t = _knots(duration_s, period_s / 600.0)
+    v = mean + amplitude * np.sin(2.0 * np.pi * t[:, None] / period_s + phase)
+    heading = np.arctan2(v[:, 1], v[:, 0])
+    pitch = np.arctan2(-v[:, 2], np.hypot(v[:, 0], v[:, 1]))
+    return from_velocity(t, v, start, quaternion(0.0 * heading, pitch, heading))
+
+
+def along(k: Kinematics, heading_rad: np.ndarray, vehicle: Vehicle) -> np.ndarray:
+    """Attitude q_nb (N, 4) that points along the path; banked, for an aircraft.
+
+    The bank is the one with no specific force to the side, as in a coordinated turn.
+    """
+    pitch = np.arctan2(-k.v_n[:, 2], np.hypot(k.v_n[:, 0], k.v_n[:, 1]))
+    roll = np.zeros_like(pitch)
+    level = quaternion(roll, pitch, heading_rad)
+    if vehicle == "aircraft":
+        _, f = k._replace(q_nb=level).rates()
+        roll = np.arctan2(f[:, 1], -f[:, 2])
+    return quaternion(roll, pitch, heading_rad)
+
+
+def quaternion(roll_rad, pitch_rad, heading_rad) -> np.ndarray:
+    """q_nb (N, 4), NumPy; see `robins.rotation.from_euler`."""
+    return np.asarray(_from_euler(roll_rad, pitch_rad, heading_rad))
+
+
+def dcm(q: np.ndarray) -> np.ndarray:
+    """C_nb (N, 3, 3), NumPy; see `robins.rotation.to_dcm`."""
+    return np.asarray(_to_dcm(q))
+
+
+_from_euler, _to_dcm = jax.jit(rotation.from_euler), jax.jit(rotation.to_dcm)
+
+
+def _knots(duration_s: float, spacing_s: float) -> np.ndarray:
+    return np.linspace(0.0, duration_s, max(int(np.ceil(duration_s / spacing_s)), 8) + 1)
+
+
+def _attitude(t: np.ndarray, q: np.ndarray, degree: int = _DEGREE) -> BSpline:
+    """Spline through unit quaternions, their signs chosen so that neighbours are close."""
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
+    return make_interp_spline(t, q * np.cumprod(np.append(1.0, flips))[:, None], k=degree)
+
+
+def _vector_part(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Vector part of ``conjugate(p) q``."""
+    a, b = p[:, 1:], q[:, 1:]
+    return p[:, :1] * b - q[:, :1] * a - np.cross(a, b)
+
+
+def _radii(lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    w_sq = 1.0 - E2 * np.sin(lat) ** 2
+    transverse = A_M / np.sqrt(w_sq)
+    return transverse * (1.0 - E2) / w_sq, transverse
+
+
+def _column(name: str, values: ArrayLike, n: int) -> np.ndarray:
+    a = np.asarray(values, float)
+    if a.shape != (n,) or not np.isfinite(a).all():
+        raise ValueError(f"{name}: {n} finite numbers are needed, got shape {a.shape}: {values!r}")
+    return a
