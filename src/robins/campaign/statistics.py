@@ -97,6 +97,17 @@ class Statistics:
         start = self.count_from
         return np.sqrt(np.sum(self._square[start:], 0) / np.sum(self._variance[start:], 0))
 
+    def ratio_bounds(self, level: float = 0.99) -> np.ndarray:
+        """(n, 2) bounds of `overall_ratio` that hold for all states at once at this level.
+
+        Runs are independent, the epochs of one are not, so the spread between runs is what counts;
+        the level is shared out over the states (Bonferroni).
+        """
+        variance = np.mean(self._variance[self.count_from :] / self.runs, axis=0)
+        squares = self.run_rms**2 / variance
+        each = 1.0 - (1.0 - level) / squares.shape[1]
+        return np.array([rms_with_bounds(column, each)[1:] for column in squares.T])
+
     def anees(self) -> np.ndarray:
         """(E,) average NEES over n."""
         return self._nees / (self.runs * self.n)

@@ -57,6 +57,7 @@ class Course(NamedTuple):
     truth: Nav  # at each epoch, leading axis E
     index: np.ndarray  # (E,) sample that ends at each epoch
     rate_b: np.ndarray  # (E, 3) rad/s true gyro rate at each epoch
+    at_fix: tuple[np.ndarray, ...]  # the truth at each fix, as `observe` takes it
     fix: np.ndarray  # (E,) number of the fix at each epoch, -1 where there is none
     outage: np.ndarray  # (E,) bool
 
@@ -108,7 +109,8 @@ def lay_out(drive: Drive) -> Course:
     dt = np.diff(time_ns) * 1e-9
     # A bias of the sensors passes through coning and sculling terms of 1e-3 of its size at most, so
     # the errors of a run are added to the compensated increments.
-    stamps = fix_times(receiver_model(drive), 1.0 / drive.gnss.rate, float(time_s[-1])).stamp_s
+    times = fix_times(receiver_model(drive), 1.0 / drive.gnss.rate, float(time_s[-1]))
+    stamps, k = times.stamp_s, motion.at(times.valid_s)
     if len(stamps) < 2:
         raise ValueError(f"the legs last {time_s[-1]:.1f} s, too short for two fixes")
     epochs = epochs_between(0.0, float(time_s[-1]), stamps, drive.update.longest_block)
@@ -135,6 +137,7 @@ def lay_out(drive: Drive) -> Course:
         truth=jax.tree_util.tree_map(lambda x: x[index], path),
         index=index,
         rate_b=motion.at(epochs).rates()[0],
+        at_fix=(times.valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0]),
         fix=fix,
         outage=outage,
     )
@@ -178,19 +181,7 @@ def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     start = Belief(retract(known, -e), jnp.diag(sigma))
 
     receiver = receiver_model(drive)
-    times = fix_times(receiver, 1.0 / drive.gnss.rate, float(course.blocks.epoch_s[-1]))
-    k = course.motion.at(times.valid_s)
-    fixes = observe(
-        receiver,
-        key(Component.GNSS),
-        times.valid_s,
-        k.lat,
-        k.lon,
-        k.alt,
-        k.v_n,
-        k.q_nb,
-        k.rates()[0],
-    )
+    fixes = observe(receiver, key(Component.GNSS), *course.at_fix)
     here = jnp.asarray((course.fix >= 0) & ~course.outage)
 
     def at_epochs(x):

@@ -51,6 +51,7 @@ def drive_metrics(
         worst = np.sum(rms[start:][~aided][:, horizontal] ** 2, axis=1)
         out["outage_horizontal_worst_rms_m"] = float(np.sqrt(np.max(worst)))
     out["error_over_sigma"] = statistics.overall_ratio().tolist()
+    out["error_over_sigma_bounds"] = statistics.ratio_bounds().tolist()
     out["anees_share_inside"] = statistics.anees_share_inside()
     out["anees_mean"] = float(np.mean(statistics.anees()[start:]))
     for sensor in statistics.sensors:
@@ -62,20 +63,25 @@ def drive_metrics(
 
 
 def drive_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Verdict per claim; with several filters, of the worst of them."""
-    off = max(
-        float(np.max(np.abs(np.asarray(m["error_over_sigma"]) - 1.0))) for m in metrics.values()
-    )
-    share = min(m["anees_share_inside"] for m in metrics.values())
-    inside, farthest = True, 1.0
+    """Verdict per claim; with several filters, of the worst of them.
+
+    The first claim is "partly" where a state is off by more than 5 % in these runs, but by no more
+    than so few runs scatter.
+    """
+    off, explained = 0.0, True
+    share, inside, farthest = 1.0, True, 1.0
     for m in metrics.values():
+        off = max(off, float(np.max(np.abs(np.asarray(m["error_over_sigma"]) - 1.0))))
+        bounds = np.asarray(m["error_over_sigma_bounds"])
+        explained &= bool(np.all((bounds[:, 0] <= 1.05) & (bounds[:, 1] >= 0.95)))
+        share = min(share, m["anees_share_inside"])
         for name, band in m.items():
             if name.startswith("nis_") and name.endswith("_band"):
                 value = m[name.removesuffix("_band")]
                 inside &= band[0] <= value <= band[1]
                 farthest = max(farthest, value, key=lambda v: abs(v - 1.0))
     verdicts = (
-        (off, [0.0, 0.05], "reproduced" if off <= 0.05 else "partly" if off <= 0.1 else "not"),
+        (off, [0.0, 0.05], "reproduced" if off <= 0.05 else "partly" if explained else "not"),
         (share, [0.9, 1.0], "reproduced" if share >= 0.9 else "not"),
         (farthest, None, "reproduced" if inside else "not"),
     )
