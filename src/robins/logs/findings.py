@@ -60,7 +60,7 @@ class LogError(ValueError):
 
     def __str__(self) -> str:
         at = f"{self.file} {self.where}".strip()
-        what = f"{self.field} = {self.value!r}" if self.field else ""
+        what = self.field if self.value == "" else f"{self.field} = {self.value!r}"
         return f"{': '.join(part for part in (at, what, self.cause) if part)}; {self.mend}"
 
 

@@ -128,7 +128,7 @@ def write_kfgins_gnss(path: Path, gnss: GnssTable) -> None:
             str(path),
             "KF-GINS cannot read a missing component",
             "leave out the fixes that are not complete",
-            where=f"time {ns_to_decimal(gnss.time_ns[row])} s",
+            where=f"time {ns_to_decimal(int(gnss.time_ns[row]))} s",
         )
     write_lines(path, rows_of_numbers(gnss.time_ns, values, " "))
 

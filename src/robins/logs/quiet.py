@@ -13,6 +13,7 @@ from robins.logs.ordering import increasing
 
 _WINDOW_S = 1.0
 _REST = 0.01  # relative scatter of |specific force| in a window at rest
+_STEADY = 0.003  # relative change of the specific force from one window at rest to the next
 
 
 def name_of(table: ImuTable | GnssTable | Trajectory) -> str:
@@ -83,7 +84,7 @@ class Windows(NamedTuple):
     gyro: np.ndarray  # (w, 3) mean
     accel: np.ndarray  # (w, 3) mean
     restless: np.ndarray  # (w,) scatter of |gyro - mean|
-    at_rest: np.ndarray  # (w,) bool: the specific force hardly varies; needs no unit
+    at_rest: np.ndarray  # (w,) bool: the specific force hardly changes; needs no unit
 
 
 def windows_of(signal: Signal) -> Windows:
@@ -95,12 +96,15 @@ def windows_of(signal: Signal) -> Windows:
         return values[: count * n].reshape(count, n, *values.shape[1:])
 
     gyro, accel = cut(signal.gyro), cut(signal.accel)
-    size = np.linalg.norm(accel, axis=-1)
+    force, size = accel.mean(axis=1), np.linalg.norm(accel, axis=-1)
     mean = size.mean(axis=1)
+    # A smooth drive scatters as little as rest does, but its force changes with every turn.
+    change = np.linalg.norm(np.diff(force, axis=0), axis=-1) < _STEADY * mean[1:]
+    steady = np.concatenate([change, [False]]) | np.concatenate([[False], change])
     return Windows(
         np.arange(count) * n,
         gyro.mean(axis=1),
-        accel.mean(axis=1),
+        force,
         np.linalg.norm(gyro.std(axis=1), axis=-1),
-        size.std(axis=1) < _REST * mean,
+        steady & (size.std(axis=1) < _REST * mean),
     )

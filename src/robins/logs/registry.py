@@ -90,7 +90,11 @@ def _is_pyins(*tables: str) -> Callable[[Head], bool]:
 
 
 def _is_euroc(column: str) -> Callable[[Head], bool]:
-    return lambda head: head.lines[0].startswith("#timestamp") and column in head.lines[0]
+    def recognise(head: Head) -> bool:
+        first, *others = head.lines[0].split(",")
+        return first.startswith("#timestamp") and any(n.strip().startswith(column) for n in others)
+
+    return recognise
 
 
 FORMATS: tuple[Format, ...] = (

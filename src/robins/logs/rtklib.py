@@ -132,7 +132,7 @@ def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: 
         stamp = b" ".join(text).decode("utf-8", "replace")
         try:
             out[i] = calendar_to_ns(*stamp.split(), utc=utc)
-        except (ValueError, TypeError, ArithmeticError) as error:
+        except (ValueError, TypeError) as error:
             raise LogError(
                 file,
                 "is not a time stamp year/month/day hour:minute:second",

@@ -9,7 +9,8 @@ are; the doctor says so when two files do not fit together.
 from __future__ import annotations
 
 import datetime
-from decimal import Decimal, InvalidOperation
+import re
+from decimal import Decimal
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from robins.logs.findings import LogError
 GPS_EPOCH_S = 315_964_800  # 1980-01-06 on a count from 1970-01-01 without leap seconds
 WEEK_S = 604_800
 _NS = 1_000_000_000
+_DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})", re.ASCII)
+_CLOCK = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)", re.ASCII)
 _EPOCH_DAY = datetime.date(1970, 1, 1).toordinal()
 
 # UTC dates from which GPS time - UTC has grown by one more second (IERS Bulletin C).
@@ -75,12 +78,14 @@ def _digits(columns: np.ndarray, at: int, length: int, exponent: int) -> np.ndar
 
 
 def _exactly(text: bytes, exponent: int) -> int | None:
+    if b"_" in text:  # which Python would allow between digits
+        return None
     try:
         number = Decimal(text.decode("ascii").strip()).scaleb(exponent)
         if number.adjusted() > 18:  # do not write out 1e999999999
             return None
         whole = int((number + Decimal("0.5")).to_integral_value("ROUND_FLOOR"))
-    except (InvalidOperation, UnicodeDecodeError, ValueError, OverflowError):
+    except (ArithmeticError, ValueError):
         return None
     return whole if -(2**63) <= whole < 2**63 else None
 
@@ -112,7 +117,7 @@ def stamps_to_ns(
 def ns_to_decimal(time_ns: int) -> str:
     """Seconds as exact decimal text: at least three decimals, no more than needed."""
     sign = "-" if time_ns < 0 else ""
-    whole, part = divmod(abs(int(time_ns)), _NS)
+    whole, part = divmod(abs(time_ns), _NS)
     decimals = f"{part:09d}".rstrip("0").ljust(3, "0")
     return f"{sign}{whole}.{decimals}"
 
@@ -128,15 +133,16 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
     Raises:
         ValueError: no date or time of that form.
     """
-    year, month, day = (int(part) for part in date.split("/"))
-    hour, minute, second = clock.split(":")
-    today = datetime.date(year, month, day)
-    seconds = Decimal(second)
+    day, time = _DATE.fullmatch(date), _CLOCK.fullmatch(clock)
+    if not (day and time):
+        raise ValueError(f"{date} {clock} is not year/month/day hour:minute:second")
+    today = datetime.date(*(int(part) for part in day.groups()))
+    hour, minute, seconds = int(time[1]), int(time[2]), Decimal(time[3])
     # RTKLIB writes 60.000 where rounding carries; a leap second is 60.x as well.
-    if not (0 <= int(hour) < 24 and 0 <= int(minute) < 60 and 0 <= seconds < 61):
+    if not (hour < 24 and minute < 60 and seconds < 61):
         raise ValueError(f"{clock} is no time of day")
     days = today.toordinal() - _EPOCH_DAY
-    whole = (days * 24 + int(hour)) * 3600 + int(minute) * 60
+    whole = (days * 24 + hour) * 3600 + minute * 60
     if utc:
         whole += sum(today >= leap for leap in _LEAPS)
     return whole * _NS + int((seconds * _NS).to_integral_value())

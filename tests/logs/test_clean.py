@@ -1,0 +1,351 @@
+"""Bad samples anywhere (F01-F04, F06, F07, F10): refused, counted, then absent."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_logs import rows_of, with_gnss, with_imu
+
+from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
+from robins.logs import LogError, Mounting, clean, load_dataset
+
+N = 200
+IMU = ImuTable(
+    time_ns=10**18 + np.arange(N) * 5_000_000,
+    gyro=np.random.default_rng(1).normal(size=(N, 3)),
+    accel=np.random.default_rng(2).normal(size=(N, 3)),
+    kind="rate",
+    source="imu.csv",
+    rows=np.arange(1, N + 1),
+)
+M = 30
+GNSS = GnssTable(
+    time_ns=10**18 + np.arange(M) * 200_000_000,
+    lat_rad=0.8 + 1e-7 * np.arange(M),
+    lon_rad=0.1 + 1e-7 * np.arange(M),
+    alt_m=400.0 + 0.1 * np.arange(M),
+    sigma_m=np.full((M, 3), 0.02),
+    v_n=np.random.default_rng(3).normal(size=(M, 3)),
+    sigma_v=np.full((M, 3), 0.05),
+    quality=np.ones(M, int),
+    source="gnss.pos",
+    rows=np.arange(1, M + 1),
+)
+DATA = Dataset("made", IMU, GNSS)
+
+
+def assert_same(one, two):
+    """Bit by bit, line numbers left out: those of later rows move by the row put in."""
+    assert type(one) is type(two)
+    for f in dataclasses.fields(one):
+        a, b = getattr(one, f.name), getattr(two, f.name)
+        if isinstance(a, np.ndarray) and f.name != "rows":
+            assert a.dtype == b.dtype
+            assert a.tobytes() == b.tobytes(), f.name
+
+
+def refused(counts):
+    return {reason: n for reason, n in counts.items() if n}
+
+
+def put_in(table, at, time_ns, **values):
+    """The table with one more row in place `at`: a copy of the one before, with changes."""
+    arrays = {}
+    for f in dataclasses.fields(table):
+        column = getattr(table, f.name)
+        if isinstance(column, np.ndarray):
+            row = column[at - 1].copy() if f.name not in values else values[f.name]
+            arrays[f.name] = np.insert(column, at, time_ns if f.name == "time_ns" else row, axis=0)
+    return dataclasses.replace(table, **arrays)
+
+
+def spoil(kind, table, at, axis, pick):
+    """One bad row in place `at`, and the reason it should be counted under."""
+    before = int(table.time_ns[at - 1])
+    between = (before + int(table.time_ns[at])) // 2 if at < len(table) else before + 1
+    sensor = ("gyro", "accel")[axis // 3]
+    row = getattr(table, sensor)[at - 1].copy()
+    if kind in ("nan", "inf", "-inf", "1e308", "1e9"):
+        row[axis % 3] = float(kind)
+        return put_in(table, at, between, **{sensor: row}), (
+            kind if kind == "nan" else "inf" if "inf" in kind else "absurd"
+        )
+    if kind == "duplicate":
+        return put_in(table, at, before, gyro=row + 1.0), "duplicate"
+    back = {"sample": 5_000_000, "second": 10**9, "hour": 3600 * 10**9}[pick]
+    return put_in(table, at, before - back), "backward" if back else "duplicate"
+
+
+KINDS = ["nan", "inf", "-inf", "1e308", "1e9", "duplicate", "backward"]
+BACK = ["sample", "second", "hour"]
+
+
+@given(st.sampled_from(KINDS), st.integers(1, N), st.integers(0, 5), st.sampled_from(BACK))
+def test_one_bad_imu_sample_anywhere(kind, at, axis, pick):
+    imu, reason = spoil(kind, IMU, at, axis, pick)
+    if pick == "sample" and kind == "backward" and at == 1:
+        reason = "backward"
+    got = clean(dataclasses.replace(DATA, imu=imu))
+    assert_same(got.imu, clean(DATA).imu)
+    # A step back by one sample meets the stamp before the last: an earlier time all the same.
+    assert refused(got.counts) == {f"imu_{reason}": 1}
+    assert got.meta["imu_gaps"] == []
+
+
+@pytest.fixture(scope="module")
+def walk(walk_files):
+    return load_dataset(walk_files, mounting=Mounting(180.0, 0.0, -90.0))
+
+
+@given(data=st.data())
+def test_one_bad_sample_anywhere_in_the_walk(walk, data):
+    at = data.draw(st.integers(1, len(walk.imu)))
+    kind, pick = data.draw(st.sampled_from(KINDS)), data.draw(st.sampled_from(BACK))
+    imu, reason = spoil(kind, walk.imu, at, data.draw(st.integers(0, 5)), pick)
+    got = clean(dataclasses.replace(walk, imu=imu))
+    assert_same(got.imu, walk.imu)
+    assert_same(got.gnss, walk.gnss)
+    assert refused(got.counts) == {f"imu_{reason}": 1}
+
+
+def test_a_clean_log_passes_bit_by_bit_and_all_reasons_are_listed():
+    got = clean(DATA)
+    assert_same(got.imu, IMU)
+    assert_same(got.gnss, GNSS)
+    assert set(got.counts.values()) == {0}
+    assert sorted(got.counts) == [
+        *sorted(
+            f"gnss_{r}" for r in ("absurd", "ahead", "backward", "duplicate", "inf", "nan", "sigma")
+        ),
+        *sorted(f"imu_{r}" for r in ("absurd", "ahead", "backward", "duplicate", "inf", "nan")),
+    ]
+
+
+def test_cleaning_twice_changes_nothing_and_keeps_the_counts():
+    gyro = IMU.gyro.copy()
+    gyro[7, 1] = np.nan
+    once = clean(dataclasses.replace(with_imu(DATA, gyro=gyro), counts={"imu_nan": 2, "late": 5}))
+    twice = clean(once)
+    assert refused(once.counts) == {"imu_nan": 3, "late": 5}
+    assert twice.counts == once.counts
+    assert_same(twice.imu, once.imu)
+
+
+def test_many_bad_samples_of_every_kind_at_once():
+    rng = np.random.default_rng(8)
+    gyro, accel, time_ns = IMU.gyro.copy(), IMU.accel.copy(), IMU.time_ns.copy()
+    bad = rng.permutation(np.arange(1, N - 1))[:60].reshape(6, 10)
+    gyro[bad[0], 0] = np.nan
+    accel[bad[1], 1] = np.inf
+    gyro[bad[2], 2] = -1e20
+    accel[bad[0], 2] = np.inf  # a row is counted once, by its first reason
+    good = np.ones(N, bool)
+    good[bad[:3]] = False
+    got = clean(with_imu(DATA, gyro=gyro, accel=accel, time_ns=time_ns))
+    assert_same(got.imu, rows_of(IMU, good))
+    assert refused(got.counts) == {"imu_nan": 10, "imu_inf": 10, "imu_absurd": 10}
+
+
+def test_denormals_and_large_but_possible_numbers_pass():
+    gyro, accel = IMU.gyro.copy(), IMU.accel.copy()
+    gyro[3], accel[4] = [5e-324, -1e-310, 60.0], [5e5, -1e-308, 0.0]
+    got = clean(with_imu(DATA, gyro=gyro, accel=accel))
+    assert refused(got.counts) == {}
+    assert_same(got.imu, dataclasses.replace(IMU, gyro=gyro, accel=accel))
+
+
+def test_a_clock_set_back_is_refused_until_time_passes_and_declared_as_a_gap():
+    time_ns = IMU.time_ns.copy()
+    time_ns[120:] -= 20 * 5_000_000
+    got = clean(with_imu(DATA, time_ns=time_ns))
+    keep = np.r_[0:120, 140:N]
+    assert_same(got.imu, rows_of(dataclasses.replace(IMU, time_ns=time_ns), keep))
+    assert refused(got.counts) == {"imu_duplicate": 1, "imu_backward": 19}
+    assert got.meta["imu_gaps"] == [(time_ns[119], time_ns[140])]
+
+
+def test_a_restart_costs_the_shorter_part_never_everything_after_it():
+    time_ns = IMU.time_ns.copy()
+    time_ns[60:] -= 10**17
+    got = clean(with_imu(DATA, time_ns=time_ns))
+    assert_same(got.imu, rows_of(dataclasses.replace(IMU, time_ns=time_ns), slice(60, None)))
+    assert refused(got.counts) == {"imu_ahead": 60}
+
+
+def test_a_lone_stamp_in_the_future_costs_itself():
+    time_ns = IMU.time_ns.copy()
+    time_ns[50] += 3600 * 10**9
+    got = clean(with_imu(DATA, time_ns=time_ns))
+    assert_same(got.imu, rows_of(IMU, np.arange(N) != 50))
+    assert refused(got.counts) == {"imu_ahead": 1}
+
+
+@pytest.mark.parametrize(
+    ("kind", "lost", "declared"),
+    [("rate", 1, False), ("rate", 2, True), ("increment", 1, True), ("rate", 60, True)],
+)
+def test_gaps_are_declared(kind, lost, declared):
+    keep = np.ones(N, bool)
+    keep[100 : 100 + lost] = False
+    got = clean(dataclasses.replace(DATA, imu=rows_of(dataclasses.replace(IMU, kind=kind), keep)))
+    gap = (int(IMU.time_ns[99]), int(IMU.time_ns[100 + lost]))
+    assert got.meta["imu_gaps"] == ([gap] if declared else [])
+
+
+def test_ten_nan_in_a_row_are_one_gap():
+    gyro = IMU.gyro.copy()
+    gyro[40:50] = np.nan
+    got = clean(with_imu(DATA, gyro=gyro))
+    assert refused(got.counts) == {"imu_nan": 10}
+    assert got.meta["imu_gaps"] == [(IMU.time_ns[39], IMU.time_ns[50])]
+
+
+def test_nan_for_ever_is_refused_with_the_reason():
+    with pytest.raises(
+        LogError, match=r"imu.csv: fewer than two of 200 .*\(refused: 200 nan\); the"
+    ):
+        clean(with_imu(DATA, gyro=np.full((N, 3), np.nan)))
+
+
+# ------------------------------------------------------------------------------------- GNSS
+
+
+@given(st.integers(0, M - 1), st.integers(0, 5), st.sampled_from([np.nan, np.inf, -np.inf, 1e300]))
+def test_one_bad_gnss_component_leaves_the_others(at, axis, bad):
+    names = ["lat_rad", "lon_rad", "alt_m"]
+    if axis < 3:
+        column = getattr(GNSS, names[axis]).copy()
+        column[at] = bad
+        got = clean(with_gnss(DATA, **{names[axis]: column}))
+        expected = column.copy()
+        expected[at] = np.nan
+        np.testing.assert_array_equal(getattr(got.gnss, names[axis]), expected)
+    else:
+        v_n = GNSS.v_n.copy()
+        v_n[at, axis - 3] = bad
+        got = clean(with_gnss(DATA, v_n=v_n))
+        v_n[at, axis - 3] = np.nan
+        np.testing.assert_array_equal(got.gnss.v_n, v_n)
+    reason = "nan" if np.isnan(bad) else "inf" if np.isinf(bad) else "absurd"
+    assert refused(got.counts) == {f"gnss_{reason}": 1}
+    for name in (*names, "sigma_m", "sigma_v"):
+        if axis >= 3 or name != names[axis]:
+            np.testing.assert_array_equal(getattr(got.gnss, name), getattr(GNSS, name))
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"), [(0.0, "sigma"), (-1.0, "sigma"), (np.nan, "nan"), (np.inf, "inf")]
+)
+def test_a_component_without_a_usable_sigma_is_missing(bad, reason):
+    sigma = GNSS.sigma_m.copy()
+    sigma[4, 2] = bad
+    got = clean(with_gnss(DATA, sigma_m=sigma))
+    assert np.flatnonzero(np.isnan(got.gnss.alt_m)).tolist() == [4]
+    assert np.all(got.gnss.sigma_m > 0)
+    assert refused(got.counts) == {f"gnss_{reason}": 1}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"sigma_m": np.zeros((M, 3))},
+            r"gnss.pos: sigma of north position = 0.0: the north position has 30 fixes and no posi",
+        ),
+        (
+            {"sigma_v": -GNSS.sigma_v},
+            r"sigma of north velocity = -0.05: .*real sigmas, or leave the velocities out",
+        ),
+        (
+            {"sigma_m": GNSS.sigma_m * [1, 1, 0]},
+            r"sigma of vertical position = 0.0: .*; zero means unknown, not exact: give real",
+        ),
+    ],
+)
+def test_sigmas_that_are_never_positive_are_refused_in_a_sentence(change, message):
+    with pytest.raises(LogError, match=message):
+        clean(with_gnss(DATA, **change))
+
+
+@given(st.integers(1, M), st.sampled_from(["nan", "duplicate", "backward"]))
+def test_one_bad_fix_anywhere(at, kind):
+    before = int(GNSS.time_ns[at - 1])
+    if kind == "nan":
+        nan = np.nan
+        hole = {"lat_rad": nan, "lon_rad": nan, "alt_m": nan, "v_n": np.full(3, nan)}
+        table = put_in(GNSS, at, before + 1000, **hole)
+    else:
+        table = put_in(GNSS, at, before - (0 if kind == "duplicate" else 10**9 + 7))
+    got = clean(dataclasses.replace(DATA, gnss=table))
+    assert_same(got.gnss, GNSS)
+    assert refused(got.counts) == {f"gnss_{kind}": 1}
+
+
+def test_positions_without_velocities():
+    got = clean(with_gnss(DATA, v_n=None, sigma_v=None))
+    assert got.gnss.v_n is None
+    np.testing.assert_array_equal(got.gnss.alt_m, GNSS.alt_m)
+
+
+def test_an_imu_alone_and_a_truth():
+    q = np.tile([1.0, 0, 0, 0], (M, 1))
+    truth = Trajectory(GNSS.time_ns, GNSS.lat_rad, GNSS.lon_rad, GNSS.alt_m, GNSS.v_n, q)
+    q = q.copy()
+    q[3, 0] = np.nan
+    got = clean(Dataset("x", IMU, truth=dataclasses.replace(truth, q_nb=q)))
+    assert_same(got.truth, rows_of(truth, np.arange(M) != 3))
+    assert refused(got.counts) == {"truth_nan": 1}
+    assert got.gnss is None
+
+
+# ------------------------------------------------------------------------------ arrays (F04)
+
+
+@pytest.mark.parametrize("kind", ["float32", "big-endian", "strided", "integer", "fortran"])
+def test_other_arrays_of_numbers_give_the_same(kind):
+    change = {
+        "float32": lambda a: a.astype(np.float32),
+        "big-endian": lambda a: a.astype(">f8"),
+        "strided": lambda a: np.repeat(a, 2, axis=0)[::2],
+        "integer": lambda a: np.round(a * 10).astype(np.int32),
+        "fortran": np.asfortranarray,
+    }[kind]
+    gyro = change(IMU.gyro)
+    got = clean(with_imu(DATA, gyro=gyro, time_ns=IMU.time_ns.astype(">i8"))).imu
+    assert (got.gyro.dtype, got.time_ns.dtype) == (np.float64, np.int64)
+    assert got.gyro.flags.c_contiguous
+    np.testing.assert_array_equal(got.gyro, gyro.astype(np.float64))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"gyro": np.full((N, 3), None)},
+            r"imu.csv: gyro: holds object, not real numbers; give",
+        ),
+        ({"gyro": IMU.gyro.astype(str)}, r"gyro: holds <U32, not real numbers"),
+        ({"accel": IMU.accel.astype(complex)}, r"accel: holds complex128, not real"),
+        (
+            {"accel": IMU.accel[:-1]},
+            r"accel: has shape \(199, 3\) where \(200, 3\) is needed; one",
+        ),
+        ({"accel": IMU.accel[:, :2]}, r"shape \(200, 2\)"),
+        ({"time_ns": IMU.time_ns * 1e-9}, r"time_ns: is float64 of .*; give time as int64 nano"),
+        ({"rows": IMU.rows[:5]}, r"rows: has shape \(5,\)"),
+        ({"kind": "rates"}, r"kind = 'rates': is neither 'rate' nor 'increment'"),
+    ],
+)
+def test_arrays_that_are_no_table(change, message):
+    imu = object.__new__(ImuTable)  # as a user without checked annotations would have it
+    for f in dataclasses.fields(ImuTable):
+        object.__setattr__(imu, f.name, change.get(f.name, getattr(IMU, f.name)))
+    with pytest.raises(LogError, match=message):
+        clean(dataclasses.replace(DATA, imu=imu))
+
+
+def test_velocities_without_their_sigmas():
+    with pytest.raises(LogError, match="belong together; give sigma_v as well"):
+        clean(with_gnss(DATA, sigma_v=None))

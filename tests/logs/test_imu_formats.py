@@ -1,0 +1,358 @@
+import dataclasses
+import io
+
+import numpy as np
+import pandas as pd
+import pyins.sim
+import pyins.strapdown
+import pytest
+from pyins import transform
+
+from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.logs import (
+    LogError,
+    Mounting,
+    Origin,
+    open_log,
+    read_euroc_truth,
+    read_kfgins_imu,
+    read_pyins,
+    write_euroc_imu,
+    write_kfgins_gnss,
+    write_kfgins_imu,
+    write_kfgins_nav,
+    write_pyins,
+    write_tum,
+)
+
+RNG = np.random.default_rng(5)
+TIME_NS = 1_700_000_000_123_456_789 + np.arange(40) * 5_000_001
+RATES = ImuTable(TIME_NS, RNG.normal(size=(40, 3)), 9.8 + RNG.normal(size=(40, 3)), "rate")
+STEPS = ImuTable(TIME_NS, 5e-3 * RATES.gyro, 5e-3 * RATES.accel, "increment")
+
+
+def path_over_hills(n=50):
+    s = np.arange(n) / 10.0
+    angles = np.stack([0.1 * np.sin(s), 0.05 * np.cos(s), -3.0 + 0.3 * s], axis=-1)
+    q = [quaternion(*a) for a in angles]
+    lat, lon = np.deg2rad(47.0) + 1e-6 * s, np.deg2rad(8.0) + 2e-6 * s
+    v_n = np.stack([6.0 + 0 * s, 9.0 + s, 0.1 * s], axis=-1)
+    return Trajectory(
+        TIME_NS[0] + (s * 1e9).astype(np.int64), lat, lon, 400 - s, v_n, np.array(q)
+    ), angles
+
+
+def quaternion(roll, pitch, heading):
+    """Heading, pitch, roll in turn, as a product of half-angle quaternions."""
+
+    def product(p, q):
+        w, u, x, v = p[0], p[1:], q[0], q[1:]
+        return np.array([w * x - u @ v, *(w * v + x * u + np.cross(u, v))])
+
+    half = [np.array([np.cos(a / 2), 0, 0, 0]) for a in (roll, pitch, heading)]
+    for k, a in enumerate((roll, pitch, heading)):
+        half[k][1 + k] = np.sin(a / 2)
+    return product(product(half[2], half[1]), half[0])
+
+
+def same_rotation(q, p, tolerance=1e-12):
+    return np.all(np.abs(np.abs(np.sum(q * p, axis=-1)) - 1.0) < tolerance)
+
+
+# ---------------------------------------------------------------------------------- GNSS_IMU
+
+
+def test_gnss_imu_in_si(tmp_path):
+    path = tmp_path / "imu.csv"
+    path.write_text("1756402240.9610007,1,0,-0.5,0.1,0.2,0.3,0,0,0,0\n" * 2)
+    imu = open_log(path)
+    assert imu.time_ns.tolist() == [1756402240961000700] * 2
+    assert imu.accel[0].tolist() == [9.80665, 0.0, -4.903325]
+    assert imu.gyro[0].tolist() == [0.1, 0.2, 0.3]
+    assert (imu.kind, imu.source, imu.rows.tolist()) == ("rate", str(path), [1, 2])
+
+
+# ---------------------------------------------------------------------------------- mounting
+
+
+def test_the_mounting_of_the_walk_only_exchanges_axes():
+    C = Mounting(180.0, 0.0, -90.0).dcm_bs()
+    assert C.tolist() == [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+
+
+def test_the_mounting_is_the_attitude_of_the_body_seen_from_the_sensor():
+    mounting = Mounting(10.0, -20.0, 130.0)
+    C_sb = transform.mat_from_rph([10.0, -20.0, 130.0])
+    np.testing.assert_allclose(mounting.dcm_bs(), C_sb.T, atol=1e-15)
+    turned = mounting.turn(RATES)
+    np.testing.assert_allclose(turned.gyro, RATES.gyro @ C_sb, atol=1e-14)
+    np.testing.assert_allclose(turned.accel, RATES.accel @ C_sb, atol=1e-14)
+
+
+def test_turning_by_right_angles_keeps_every_bit_and_every_nan_on_its_axis():
+    gyro = RATES.gyro.copy()
+    gyro[3, 2] = np.nan
+    turned = Mounting(180.0, 0.0, -90.0).turn(dataclasses.replace(RATES, gyro=gyro))
+    np.testing.assert_array_equal(turned.gyro[:, 0], -gyro[:, 1])
+    np.testing.assert_array_equal(turned.gyro[:, 2], -gyro[:, 2])
+    assert np.isfinite(turned.gyro[3]).tolist() == [True, True, False]
+
+
+def test_a_mounting_that_is_no_angle():
+    with pytest.raises(ValueError, match="must be finite"):
+        Mounting(np.nan).dcm_bs()
+
+
+# ---------------------------------------------------------------------------------- KF-GINS
+
+
+def test_kfgins_imu_there_and_back_bit_by_bit(tmp_path):
+    path = tmp_path / "imu.txt"
+    write_kfgins_imu(path, STEPS)
+    back = open_log(path)
+    assert back.kind == "increment"
+    np.testing.assert_array_equal(back.time_ns, STEPS.time_ns)
+    np.testing.assert_array_equal(back.gyro, STEPS.gyro)
+    np.testing.assert_array_equal(back.accel, STEPS.accel)
+
+
+def test_kfgins_gnss_there_and_back(tmp_path):
+    truth, _ = path_over_hills()
+    sigma = np.full((50, 3), [0.01, 0.02, 0.03])
+    table = GnssTable(truth.time_ns, truth.lat_rad, truth.lon_rad, truth.alt_m, sigma)
+    path = tmp_path / "gnss.txt"
+    write_kfgins_gnss(path, table)
+    back = open_log(path)
+    for name in ("lat_rad", "lon_rad"):
+        np.testing.assert_allclose(getattr(back, name), getattr(table, name), rtol=3e-16)
+    np.testing.assert_array_equal(back.time_ns, table.time_ns)
+    np.testing.assert_array_equal(back.alt_m, table.alt_m)
+    np.testing.assert_array_equal(back.sigma_m, sigma)
+    assert path.read_text().split()[1] == f"{np.rad2deg(truth.lat_rad[0])!r}".split("(")[-1].rstrip(
+        ")"
+    )
+
+
+def test_kfgins_nav_there_and_back(tmp_path):
+    truth, angles = path_over_hills()
+    truth = dataclasses.replace(truth, time_ns=truth.time_ns - 1_700_000_000 * 10**9)
+    path = tmp_path / "truth.nav"
+    write_kfgins_nav(path, truth, week=2300)
+    first = np.array(path.read_text().split("\n")[0].split(), float)
+    assert first[0] == 2300
+    assert first[1] == pytest.approx(0.123456789, abs=1e-12)
+    assert first[2:4] == pytest.approx([47.0, 8.0])
+    expected = np.rad2deg(angles[0])
+    assert first[8:] == pytest.approx([expected[0], expected[1], expected[2] + 360.0])
+    back = open_log(path)
+    np.testing.assert_array_equal(back.v_n, truth.v_n)
+    np.testing.assert_array_equal(back.time_ns, truth.time_ns)
+    assert same_rotation(back.q_nb, truth.q_nb)
+
+
+def test_kfgins_wants_increments_frames_and_whole_fixes(tmp_path):
+    path = tmp_path / "out.txt"
+    with pytest.raises(LogError, match="wants increments, these are rates; integrate them first"):
+        write_kfgins_imu(path, RATES)
+    with pytest.raises(LogError, match="wants body frame FRD, this table is in RFU"):
+        write_kfgins_imu(path, dataclasses.replace(STEPS, body="RFU"))
+    holed = GnssTable(TIME_NS[:2], np.array([0.8, np.nan]), np.ones(2), np.ones(2), np.ones((2, 3)))
+    with pytest.raises(
+        LogError, match=r"time 1700000000.12845679 s: KF-GINS cannot read a missing"
+    ):
+        write_kfgins_gnss(path, holed)
+    assert not path.exists()
+
+
+# ------------------------------------------------------------------------------------ pyins
+
+
+def test_pyins_reads_what_we_write(tmp_path):
+    path = tmp_path / "imu.csv"
+    write_pyins(path, RATES)
+    frame = pd.read_csv(path, index_col="time")
+    increments = pyins.strapdown.compute_increments_from_imu(frame, "rate")
+    # One sample interval: the mean of its two rates, but for coning of second order in dt.
+    mean = 0.5 * (RATES.gyro[1:] + RATES.gyro[:-1]) * 5.000001e-3
+    theta = increments[["theta_x", "theta_y", "theta_z"]].to_numpy()
+    np.testing.assert_allclose(theta, mean, atol=1e-4)
+
+
+def test_we_read_what_pyins_makes(tmp_path):
+    trajectory, imu = pyins.sim.generate_sine_velocity_motion(
+        0.1, 3.0, [50.0, 60.0, 100.0], [1.0, -1.0, 0.5]
+    )
+    for name, frame in (("trajectory", trajectory), ("imu", imu)):
+        frame.to_csv(tmp_path / f"{name}.csv")
+    table = open_log(tmp_path / "imu.csv")
+    assert table.kind == "rate"
+    np.testing.assert_array_equal(np.hstack([table.gyro, table.accel]), imu.to_numpy())
+    np.testing.assert_array_equal(table.time_ns, np.round(imu.index.to_numpy() * 1e9))
+    path = open_log(tmp_path / "trajectory.csv")
+    np.testing.assert_allclose(np.rad2deg(path.lat_rad), trajectory.lat, rtol=1e-15)
+    np.testing.assert_array_equal(path.v_n, trajectory[["VN", "VE", "VD"]])
+    C = transform.mat_from_rph(trajectory[["roll", "pitch", "heading"]])
+    v_b = np.array([1.0, 2.0, 3.0])
+    w, u = path.q_nb[:, :1], path.q_nb[:, 1:]
+    rotated = v_b + 2 * np.cross(u, np.cross(u, v_b) + w * v_b)
+    np.testing.assert_allclose(rotated, C @ v_b, atol=1e-12)
+
+
+def test_pyins_tables_there_and_back(tmp_path):
+    truth, _ = path_over_hills()
+    for table in (RATES, STEPS, truth):
+        path = tmp_path / "table.csv"
+        write_pyins(path, table)
+        back = open_log(path)
+        np.testing.assert_array_equal(back.time_ns, table.time_ns)
+        if isinstance(table, ImuTable):
+            assert back.kind == table.kind
+            np.testing.assert_array_equal(back.gyro, table.gyro)
+            np.testing.assert_array_equal(back.accel, table.accel)
+        else:
+            np.testing.assert_allclose(back.lon_rad, table.lon_rad, rtol=3e-16)
+            assert same_rotation(back.q_nb, table.q_nb)
+
+
+def test_pyins_columns_in_any_order_with_a_nameless_index(tmp_path):
+    names = ("accel_z", "gyro_y", "temperature", "gyro_x", "accel_x", "accel_y", "gyro_z")
+    frame = pd.DataFrame({n: [float(k), k + 0.5] for k, n in enumerate(names)})
+    frame.to_csv(tmp_path / "imu.csv")
+    table = open_log(tmp_path / "imu.csv")
+    assert table.gyro[0].tolist() == [3.0, 1.0, 6.0]
+    assert table.accel[1].tolist() == [4.5, 5.5, 0.5]
+
+
+def test_increments_whose_dt_disagrees_with_time_are_told(tmp_path):
+    path = tmp_path / "imu.csv"
+    rows = "".join(f"{t},0.01,0,0,0,0,0,-0.098\n" for t in (1.0, 1.01, 1.03, 1.04))
+    path.write_text("time,dt,theta_x,theta_y,theta_z,dv_x,dv_y,dv_z\n" + rows)
+    findings = []
+    read_pyins(path, findings)
+    (f,) = findings
+    assert (f.severity, f.code, f.where, f.value) == ("warning", "dt_disagrees", "line 4", 0.01)
+
+
+def test_pyins_columns_that_lack(tmp_path):
+    path = tmp_path / "imu.csv"
+    path.write_text("time,gyro_x,gyro_y,gyro_z,accel_x,accel_y\n0,1,2,3,4,5\n")
+    with pytest.raises(LogError, match=r"line 1: the header has no full .*Imu lacks accel_z;"):
+        read_pyins(path)
+
+
+def test_pyins_wants_its_frames(tmp_path):
+    with pytest.raises(LogError, match="pyins wants frames NED and FRD"):
+        write_pyins(tmp_path / "x.csv", dataclasses.replace(RATES, body="RFU"))
+
+
+# ------------------------------------------------------------------------------------ EuRoC
+
+
+def test_euroc_imu_there_and_back_bit_by_bit(tmp_path):
+    path = tmp_path / "data.csv"
+    write_euroc_imu(path, RATES)
+    assert path.read_text().startswith(
+        "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+        "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n1700000000123456789,"
+    )
+    back = open_log(path)
+    np.testing.assert_array_equal(back.time_ns, RATES.time_ns)
+    np.testing.assert_array_equal(back.gyro, RATES.gyro)
+    np.testing.assert_array_equal(back.accel, RATES.accel)
+    with pytest.raises(LogError, match="EuRoC wants rates, these are increments"):
+        write_euroc_imu(path, STEPS)
+
+
+TRUTH = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
+    "q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]\n"
+)
+
+
+def test_euroc_truth_at_an_origin(tmp_path):
+    path = tmp_path / "data.csv"
+    path.write_text(
+        TRUTH
+        + "1403636579758555392,0,0,0,0.6,0.8,0,0,1,2,3,9\n"
+        + "1403636579763555584,30,40,-5,1,0,0,0,1,2,3,9\n"
+    )
+    findings = []
+    at_sea = open_log(path, findings=findings)
+    assert [(f.severity, f.code) for f in findings] == [("note", "no_place")]
+    assert at_sea.lat_rad[0] == pytest.approx(0.0, abs=1e-15)
+    truth = read_euroc_truth(path, origin=Origin(47.0, 8.0, 430.0))
+    assert truth.time_ns.tolist() == [1403636579758555392, 1403636579763555584]
+    assert (truth.nav, truth.q_nb[0].tolist()) == ("ENU", pytest.approx([0.6, 0.8, 0, 0]))
+    # 30 m east and 40 m north by the usual degrees per metre at 47 deg.
+    assert np.rad2deg(truth.lat_rad[1]) - 47.0 == pytest.approx(40.0 / 111_173.0, rel=1e-4)
+    assert np.rad2deg(truth.lon_rad[1]) - 8.0 == pytest.approx(30.0 / 76_056.0, rel=1e-3)
+    assert truth.alt_m[1] == pytest.approx(425.0, abs=1e-3)  # the Earth falls off by 0.2 mm
+    assert truth.v_n[1] == pytest.approx([1.0, 2.0, 3.0], abs=3e-5)  # other axes 50 m away
+
+
+def test_a_quaternion_in_another_order_is_refused(tmp_path):
+    path = tmp_path / "data.csv"
+    path.write_text(TRUTH + "1,0,0,0,0.6,0.7,0,0,1,2,3,9\n")
+    with pytest.raises(
+        LogError, match=r"line 2: norm of q_RS = 0.92.*: a quaternion is not of unit"
+    ):
+        read_euroc_truth(path, [])
+
+
+# -------------------------------------------------------------------------------------- TUM
+
+
+def test_tum_is_local_metres_with_the_scalar_last(tmp_path):
+    truth, angles = path_over_hills()
+    path = tmp_path / "truth.tum"
+    origin = write_tum(path, truth)
+    assert origin == Origin(*np.rad2deg([truth.lat_rad[0], truth.lon_rad[0]]), 400.0)
+    text = path.read_text()
+    assert text.startswith("# timestamp tx ty tz qx qy qz qw\n# s; m east, north, up of ")
+    table = np.loadtxt(io.StringIO(text))
+    np.testing.assert_allclose(table[:, 0], truth.time_ns * 1e-9, atol=3e-7)
+    metres = transform.lla_to_ned(
+        np.column_stack([np.rad2deg(truth.lat_rad), np.rad2deg(truth.lon_rad), truth.alt_m])
+    )
+    np.testing.assert_allclose(table[:, 1:4], metres[:, [1, 0, 2]] * [1, 1, -1], atol=1e-6)
+    x, y, z, w = table[:, 4:].T
+    forward = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
+    _, pitch, heading = angles.T
+    expected = np.stack(
+        [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)], -1
+    )
+    np.testing.assert_allclose(forward, expected, atol=2e-5)  # local axes turn by 1e-5 on the way
+
+
+def test_tum_and_euroc_are_inverse(tmp_path):
+    truth, _ = path_over_hills()
+    path = tmp_path / "truth.tum"
+    origin = write_tum(path, truth, Origin(46.9, 8.1, 350.0))
+    table = np.loadtxt(path)
+    v = np.zeros((50, 3))
+    rows = np.column_stack([table[:, 1:4], np.roll(table[:, 4:], 1, axis=1), v])
+    euroc = tmp_path / "data.csv"
+    euroc.write_text(TRUTH + "".join(f"{t},{','.join(map(repr, r))},0\n" for t, r in zip(
+        truth.time_ns.tolist(), rows.tolist(), strict=True)))  # fmt: skip
+    back = read_euroc_truth(euroc, origin=origin)
+    np.testing.assert_allclose(back.lat_rad, truth.lat_rad, atol=1e-14)
+    np.testing.assert_allclose(back.alt_m, truth.alt_m, atol=1e-8)
+    again = tmp_path / "again.tum"
+    write_tum(again, back, origin)
+    np.testing.assert_allclose(np.loadtxt(again), table, atol=1e-7)
+
+
+def test_tum_of_nothing(tmp_path):
+    truth, _ = path_over_hills()
+    empty = Trajectory(*(a[:0] for a in dataclasses.astuple(truth)[:6]))
+    with pytest.raises(LogError, match="has no points"):
+        write_tum(tmp_path / "x.tum", empty)
+
+
+def test_a_cut_log_says_so(tmp_path):
+    path = tmp_path / "imu.txt"
+    write_kfgins_imu(path, STEPS)
+    path.write_bytes(path.read_bytes()[:-5])
+    findings = []
+    assert len(read_kfgins_imu(path, findings)) == 39
+    assert [f.code for f in findings] == ["ends_early"]
