@@ -1,7 +1,7 @@
 """Error models of inertial measurement units by grade, for when there is no data sheet yet.
 
-The grades are those of the field (Groves 2013, section 4; Titterton & Weston 2004, chapters 4, 5
-and 7). Figures are round ones from the middle of what such units are sold with, in the words of a
+The grades are those of the field (Groves 2013, chapter 4; Titterton & Weston 2004, chapters 4
+to 7). Figures are round ones from the middle of what such units are sold with, in the words of a
 data sheet, so that a reader can compare them with one. Within a grade products differ by a factor
 of three either way: take the figures of your sensor where you have them.
 """

@@ -180,9 +180,9 @@ def antenna(
 ) -> tuple[Array, Array, Array, Array]:
     """Latitude, longitude, height and velocity of an antenna rigidly on the vehicle.
 
-    Position ``r_e + C_eb l`` and velocity ``v + C_nb (omega_eb_b x l)`` (Groves 2013, section
-    14.3.3), without approximation: through Earth-fixed coordinates, the velocity along north, east
-    and down at the antenna.
+    Position ``r_e + C_eb l`` and velocity ``v + C_nb (omega_eb_b x l)`` (Groves 2013, chapter
+    14), without approximation: through Earth-fixed coordinates, the velocity along north, east and
+    down at the antenna.
     """
     C_en = dcm_en(lat_rad, lon_rad)
     lever_b = jnp.broadcast_to(lever_b_m, omega_ib_b.shape)
