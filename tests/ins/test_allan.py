@@ -6,8 +6,16 @@ import pytest
 from scipy.signal import fftconvolve
 from scipy.stats import norm
 
-from robins.ins.allan import deviation, fit, in_field_units
+from robins.ins.allan import (
+    AllanFit,
+    Coefficients,
+    deviation,
+    fit,
+    in_field_units,
+    triad_errors,
+)
 from robins.ins.allan_noise import moments
+from robins.ins.imu_errors import FLICKER_FLAT, TriadErrors, allan_deviation
 from robins.units import parse
 
 DT = 0.5
@@ -305,3 +313,26 @@ def test_terms_that_make_no_sense_are_refused(terms):
 def test_a_fit_of_wrong_terms_says_so():
     with pytest.raises(ValueError, match="confidence must lie"):
         fit(deviation(GOOD, dt_s=1.0), "N", confidence=0.0)
+
+
+def some_fit(axes=3):
+    value = Coefficients(*(np.full(axes, x) for x in (0.1, 0.2, 0.3, 0.4, 0.0)))
+    lower = Coefficients(*(0.9 * x for x in value))
+    lower.K[1:2] = 0.0  # not resolved on this axis
+    lower.Q[:] = 0.0
+    return AllanFit(value, lower, value, np.zeros(axes), 5, "QNBK", 0.95)
+
+
+def test_a_model_from_an_allan_fit():
+    errors = triad_errors(some_fit(), correlation_time_s=50.0)
+    np.testing.assert_array_equal(errors.white, [0.2, 0.2, 0.2])
+    np.testing.assert_array_equal(errors.walk, [0.4, 0.0, 0.4])
+    assert errors.quantum is None
+    assert errors.ramp is None
+    # The peak of the Markov curve lies at the flat part of the fit.
+    alone = TriadErrors(markov_sigma=errors.markov_sigma, markov_tau_s=errors.markov_tau_s)
+    curve = allan_deviation(alone, np.linspace(50.0, 150.0, 400))
+    np.testing.assert_allclose(curve.max(0), 0.3 * FLICKER_FLAT, rtol=1e-5)
+    assert triad_errors(some_fit()).markov_sigma is None
+    with pytest.raises(ValueError, match="a triad has three axes"):
+        triad_errors(some_fit(axes=1))

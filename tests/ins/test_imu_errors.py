@@ -7,9 +7,7 @@ import pytest
 from scipy.integrate import dblquad, quad
 from scipy.optimize import minimize_scalar
 
-from robins.ins.allan import AllanFit, Coefficients
 from robins.ins.imu_errors import (
-    FLICKER_FLAT,
     MARKOV_PEAK,
     ImuErrorModel,
     TriadErrors,
@@ -249,29 +247,6 @@ def test_mean_sigma_from_autocovariances():
     np.testing.assert_allclose(mean_sigma(TriadErrors(quantum=6.0), 2.0), np.sqrt(6.0) / 2.0)
     with pytest.raises(ValueError, match="duration_s must be a positive number"):
         mean_sigma(walk, 0.0)
-
-
-def some_fit(axes=3):
-    value = Coefficients(*(np.full(axes, x) for x in (0.1, 0.2, 0.3, 0.4, 0.0)))
-    lower = Coefficients(*(0.9 * x for x in value))
-    lower.K[1:2] = 0.0  # not resolved on this axis
-    lower.Q[:] = 0.0
-    return AllanFit(value, lower, value, np.zeros(axes), 5, "QNBK", 0.95)
-
-
-def test_a_model_from_an_allan_fit():
-    errors = TriadErrors.from_allan(some_fit(), correlation_time_s=50.0)
-    np.testing.assert_array_equal(errors.white, [0.2, 0.2, 0.2])
-    np.testing.assert_array_equal(errors.walk, [0.4, 0.0, 0.4])
-    assert errors.quantum is None
-    assert errors.ramp is None
-    # The peak of the Markov curve lies at the flat part of the fit.
-    alone = TriadErrors(markov_sigma=errors.markov_sigma, markov_tau_s=errors.markov_tau_s)
-    curve = allan_deviation(alone, np.linspace(50.0, 150.0, 400))
-    np.testing.assert_allclose(curve.max(0), 0.3 * FLICKER_FLAT, rtol=1e-5)
-    assert TriadErrors.from_allan(some_fit()).markov_sigma is None
-    with pytest.raises(ValueError, match="a triad has three axes"):
-        TriadErrors.from_allan(some_fit(axes=1))
 
 
 def test_grades_get_worse_from_first_to_last():

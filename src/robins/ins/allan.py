@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
-from scipy.stats import chi2 as chi_square
-from scipy.stats import norm
+from scipy.special import chdtri, ndtri
 
 from robins.ins.allan_noise import TERMS, Moments, moments
+from robins.ins.imu_errors import FLICKER_FLAT, MARKOV_PEAK, TriadErrors
 from robins.units import from_si
 
 _FEWEST_CLUSTERS = 9  # in the longest averages; gives them about ten degrees of freedom
@@ -130,7 +130,7 @@ def deviation(
     mixes = np.stack([_rough_mix(v, mean, white, np.arange(5)) for v in variance.T])
     edf = np.concatenate([s.degrees_of_freedom(mixes) for s in single], axis=-1).T
 
-    low, high = (chi_square.ppf((1.0 + s * confidence) / 2.0, edf) for s in (1.0, -1.0))
+    low, high = (chdtri(edf, (1.0 - side * confidence) / 2.0) for side in (1.0, -1.0))
     sigma = np.sqrt(variance)
     lower, upper = sigma * np.sqrt(edf / low), sigma * np.sqrt(edf / high)
     return Allan(sizes * interval, sigma, lower, upper, edf, sizes, n, interval, confidence)
@@ -183,7 +183,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     columns = [_fit_axis(v, expected, index) for v in (allan.deviation[keep] ** 2).T]
 
     squares, sigmas = (np.stack([c[k] for c in columns], axis=-1) for k in (0, 1))  # (5, A)
-    reach = norm.ppf((1.0 + confidence) / 2.0) * sigmas
+    reach = ndtri((1.0 + confidence) / 2.0) * sigmas
     value, lower, upper = (
         Coefficients(*np.sqrt(np.maximum(squares + side * reach, 0.0))) for side in (0.0, -1.0, 1.0)
     )
@@ -214,6 +214,36 @@ def in_field_units(fitted: AllanFit, sensor: Literal["gyro", "accel"]) -> dict[s
             values = (getattr(c, term) for c in (fitted.value, fitted.lower, fitted.upper))
             out[name] = Interval(unit + per_hour, *(from_si(v, unit) * factor for v in values))
     return out
+
+
+def triad_errors(fitted: AllanFit, correlation_time_s: float | None = None) -> TriadErrors:
+    """White noise, random walk, ramp, quantisation and Markov bias of a triad from its Allan fit.
+
+    Terms whose interval reaches zero are not resolved by the data and left out. Flicker noise has
+    no finite model: the bias instability becomes a Gauss-Markov process whose Allan deviation peaks
+    at the flat part of the fit, where a correlation time is given.
+
+    Raises:
+        ValueError: a fit of another number of axes; a correlation time that is not positive.
+    """
+    if np.shape(fitted.value.N) != (3,):
+        raise ValueError(f"a triad has three axes, the fit has {np.size(fitted.value.N)}")
+
+    def resolved(term: str, factor: float) -> np.ndarray | None:
+        seen = getattr(fitted.lower, term) > 0.0
+        return np.where(seen, getattr(fitted.value, term) * factor, 0.0) if seen.any() else None
+
+    flicker = None
+    if correlation_time_s is not None:
+        flicker = resolved("B", FLICKER_FLAT / MARKOV_PEAK)
+    return TriadErrors(
+        white=resolved("N", 1.0),
+        walk=resolved("K", 1.0),
+        ramp=resolved("R", 1.0),
+        quantum=resolved("Q", np.sqrt(12.0)),  # roundings are uniform over a quantum
+        markov_sigma=flicker,
+        markov_tau_s=None if flicker is None else correlation_time_s,
+    )
 
 
 def _fit_axis(

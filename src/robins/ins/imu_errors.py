@@ -8,8 +8,9 @@ and 6)::
 with scale factor errors S, misalignments M, and for gyros a sensitivity G to the specific force f.
 The bias is the sum of a constant that changes from one switching on to the next, a first-order
 Gauss-Markov process, a random walk and a ramp; the noise is white. This module describes, from SI
-numbers, data sheets, an Allan fit or by grade, and says in closed form what to expect;
-`robins.sim.imu_sensor` draws.
+numbers or data sheets (by grade: `robins.ins.imu_grades`; from an Allan fit:
+`robins.ins.allan.triad_errors`), and says in closed form what to expect; `robins.sim.imu_sensor`
+draws.
 
 Units are SI, per axis: [y] stands for rad/s of a gyro and m/s^2 of an accelerometer.
 """
@@ -28,7 +29,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
-from robins.ins.allan import AllanFit
 from robins.ins.records import checked_pytree
 from robins.units import UnitError, parse
 
@@ -76,36 +76,6 @@ class TriadErrors:
             object.__setattr__(self, name, _checked(name, getattr(self, name)))
         if (self.markov_sigma is None) != (self.markov_tau_s is None):
             raise ValueError("markov_sigma and markov_tau_s belong together: give both or neither")
-
-    @classmethod
-    def from_allan(cls, fit: AllanFit, correlation_time_s: float | None = None) -> TriadErrors:
-        """White noise, random walk, ramp, quantisation and Markov bias of an Allan fit of 3 axes.
-
-        Terms whose interval reaches zero are not resolved by the data and left out. Flicker noise
-        has no finite model: the bias instability becomes a Gauss-Markov process whose Allan
-        deviation peaks at the flat part of the fit, where a correlation time is given.
-
-        Raises:
-            ValueError: a fit of another number of axes; a correlation time that is not positive.
-        """
-        if np.shape(fit.value.N) != (3,):
-            raise ValueError(f"a triad has three axes, the fit has {np.shape(fit.value.N)}")
-
-        def resolved(term: str, factor: float) -> np.ndarray | None:
-            seen = getattr(fit.lower, term) > 0.0
-            return np.where(seen, getattr(fit.value, term) * factor, 0.0) if seen.any() else None
-
-        flicker = None
-        if correlation_time_s is not None:
-            flicker = resolved("B", FLICKER_FLAT / MARKOV_PEAK)
-        return cls(
-            white=resolved("N", 1.0),
-            walk=resolved("K", 1.0),
-            ramp=resolved("R", 1.0),
-            quantum=resolved("Q", np.sqrt(12.0)),
-            markov_sigma=flicker,
-            markov_tau_s=None if flicker is None else correlation_time_s,
-        )
 
 
 @checked_pytree
