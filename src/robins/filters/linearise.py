@@ -35,6 +35,8 @@ from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.observation import Observation, innovation
 from robins.manifold import State
 
+Number = float | int  # where types are checked an int is no float
+
 
 class Transition(NamedTuple):
     """A motion seen from a belief, linearised."""
@@ -134,7 +136,7 @@ class Weights(NamedTuple):
     reach: float  # c: points lie at m +- c s_i
 
 
-def sigma_weights(n: int, alpha: float | int, beta: float | int, kappa: float | int) -> Weights:
+def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights:
     """The one place where sigma weights are made.
 
     Raises:
@@ -154,7 +156,7 @@ def sigma_weights(n: int, alpha: float | int, beta: float | int, kappa: float | 
     return Weights(mean, cov, math.sqrt(c_sq))
 
 
-def sigma_points(belief: Belief, reach: float | int) -> State:
+def sigma_points(belief: Belief, reach: Number) -> State:
     """States at the mean, then at +reach and at -reach times each column of the factor.
 
     Returns:
@@ -166,7 +168,7 @@ def sigma_points(belief: Belief, reach: float | int) -> State:
     return jax.vmap(lambda d: manifold.retract(belief.mean, d))(offsets)
 
 
-def _regress(values: Any, n: int, alpha: float, beta: float, kappa: float):
+def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
     """Mean, spread, excess, deficit of function values at the sigma points (module docstring)."""
     w = sigma_weights(n, alpha, beta, kappa)
     ring = 1.0 / (2.0 * w.reach**2)
@@ -208,9 +210,7 @@ def _greatest(values: Any) -> Array:
     return jnp.concatenate(parts)
 
 
-def unscented(
-    alpha: float | int = 1.0, beta: float | int = 2.0, kappa: float | int = 0.0
-) -> Linearisation:
+def unscented(alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0) -> Linearisation:
     """Sigma points (Julier & Uhlmann 2004), drawn anew before every prediction and update.
 
     The defaults use points at +- sqrt(n) standard deviations. ``alpha``, ``beta`` and ``kappa`` are
@@ -244,9 +244,9 @@ def cubature() -> Linearisation:
 def unscented_transform(
     belief: Belief,
     g: Callable[[State], Any],
-    alpha: float | int = 1.0,
-    beta: float | int = 2.0,
-    kappa: float | int = 0.0,
+    alpha: Number = 1.0,
+    beta: Number = 2.0,
+    kappa: Number = 0.0,
 ) -> Belief:
     """Push a belief through a function, with no noise added, by sigma points."""
     n = belief.factor.shape[0]
