@@ -68,7 +68,7 @@ figures follow from ``degrees_of_freedom`` and ``runs`` at ``probability`` (0.95
 """
 
 from robins.results.errors import ResultError
-from robins.results.manifest import SCHEMA_VERSION
+from robins.results.manifest import SCHEMA_VERSION, versions
 from robins.results.reader import Result, read
 from robins.results.solution import variable
 from robins.results.summary import VERDICTS
@@ -83,5 +83,6 @@ __all__ = [
     "extend",
     "read",
     "variable",
+    "versions",
     "write",
 ]

@@ -37,15 +37,19 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 @cache
-def packages() -> dict[str, str]:
-    """Versions of what the numbers depend on, as far as it is installed."""
-    found = {}
+def _versions() -> tuple[tuple[str, str], ...]:
+    found = [("robins", __version__), ("python", platform.python_version())]
     for name in _PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            found.append((name, metadata.version(name)))
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return tuple(found)
+
+
+def versions() -> dict[str, str]:
+    """Versions of robins, Python and the packages the numbers depend on, as far as installed."""
+    return dict(_versions())
 
 
 def make(
@@ -68,9 +72,7 @@ def make(
         "seed": seed,
         "command": plain(command),
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "robins": __version__,
-        "python": platform.python_version(),
-        "packages": dict(packages()),
+        "versions": versions(),
         "platform": platform.platform(),
         "device": plain(device),
         "files": files,
@@ -103,7 +105,7 @@ def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
         raise ResultError(
             shown,
             f"has schema version {manifest['schema']}, this robins reads {SCHEMA_VERSION}",
-            f"read it with the robins that wrote it ({manifest.get('robins', 'unknown')})",
+            "read it with the version of robins that wrote it",
         )
     # Compared as text too: a cut that takes the last line break only is still a cut.
     if manifest.get("sha256") != _seal(manifest) or text != dumps(manifest).encode():
@@ -114,7 +116,7 @@ def load(folder: Path, shown: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def listed(folder: Path) -> set[str] | None:
-    """Names of the files of a result, even of a damaged one; None for a folder of something else."""
+    """Names of the files of a result, even of a damaged one; None for something else's folder."""
     try:
         manifest = loads((folder / NAME).read_bytes())
     except (OSError, ValueError):

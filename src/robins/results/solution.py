@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from robins import units
+
 
 def variable(
     dims: str | Sequence[str],
     values: Any,
-    units: str,
+    unit: str,
     long_name: str,
     frame: str = "",
     **attrs: Any,
@@ -23,12 +25,12 @@ def variable(
     Args:
         dims: names of the axes of `values`.
         values: anything NumPy takes.
-        units: in the spelling of `robins.units`; "1" for a pure number.
+        unit: in the spelling of `robins.units`; "1" for a pure number.
         long_name: for axes and captions, without the unit.
         frame: axes along which the components are given, e.g. "NED"; needed where there are some.
         attrs: anything else a figure needs, e.g. ``display_unit="deg/h"``.
     """
-    named = {"units": units, "long_name": long_name} | ({"frame": frame} if frame else {}) | attrs
+    named = {"units": unit, "long_name": long_name} | ({"frame": frame} if frame else {}) | attrs
     return xr.Variable(dims, np.asarray(values), named)
 
 
@@ -37,7 +39,8 @@ def check(solution: xr.Dataset) -> None:
 
     Raises:
         ValueError: a numeric array has no units or no name, components along axes have no frame,
-            or an attribute is of a type that netCDF cannot hold. The message names the array.
+            a unit for figures is not of its kind, or an attribute is of a type that netCDF cannot
+            hold. The message names the array.
     """
     for name, array in solution.variables.items():
         if array.dtype.kind in "biuf":
@@ -48,6 +51,11 @@ def check(solution: xr.Dataset) -> None:
             raise ValueError(f"{name}: arrays of {array.dtype} are not stored")
         if _has_axes(array.dims) and "frame" not in array.attrs and name not in solution.dims:
             raise ValueError(f"{name}: has components along axes, but no attribute 'frame'")
+        if "display_unit" in array.attrs:
+            try:
+                units.convert(1.0, array.attrs["units"], array.attrs["display_unit"])
+            except units.UnitError as error:
+                raise ValueError(f"{name}: the attribute 'display_unit': {error}") from None
         for attr, value in array.attrs.items():
             if np.asarray(value).dtype.kind not in "iufU":
                 raise ValueError(

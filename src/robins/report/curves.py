@@ -1,0 +1,244 @@
+"""Curves over time: errors in their envelopes, estimates, campaign statistics, height."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from robins.report import series, style
+from robins.report.bands import quantile
+from robins.report.numbers import words
+from robins.report.series import Series
+from robins.report.style import Picture
+
+_START = 0.2  # of the time axis
+_STEEP = 3.0  # a start this much higher than all that follows is cut off, and said so
+
+
+def _rows(count: int) -> float:
+    """Height in inches of a figure of so many stacked axes."""
+    return 0.9 + 1.35 * count
+
+
+def _label(axes: Axes, text: str, unit: str) -> None:
+    axes.set_ylabel(f"{text} [{unit}]" if unit else text)
+
+
+def _frame_of(solution: xr.Dataset, name: str) -> str:
+    frame = solution[name].attrs.get("frame", "")
+    return f" Frame: {frame}." if frame else ""
+
+
+def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = True) -> bool:
+    """Scale to the time after the start if the start is far higher; True if that cuts it off.
+
+    Only a start is cut: what goes off later is what the figure is for.
+    """
+    if x.size == 0:
+        return False
+    values = np.abs(np.stack(lines))
+    values = np.where(np.isfinite(values), values, 0.0)
+    most, later = values.max(), values[:, x > x[0] + _START * (x[-1] - x[0])].max(initial=0.0)
+    if later == 0.0 or most < _STEEP * later:
+        return False
+    top = 1.25 * later
+    axes.set_ylim(-top if centred else -0.02 * top, top)
+    axes.annotate(
+        f"starts at {most:.3g}",
+        (0.006, 0.95),
+        xycoords="axes fraction",
+        va="top",
+        fontsize=8.0,
+        color=style.TRUTH,
+        bbox={"facecolor": "white", "edgecolor": style.GREY, "linewidth": 0.5, "pad": 2.0},
+        zorder=6,
+    )
+    return True
+
+
+def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, series.Clock]:
+    figure, grid = style.new(len(data.axes), 1, _rows(len(data.axes)), sharex=True)
+    clock = series.clock(data.x)
+    outage = series.outage(solution)
+    for axes, label in zip(grid[:, 0], data.axes, strict=True):
+        if outage is not None:
+            style.shade(axes, outage[0] / clock.seconds, outage[1])
+        _label(axes, label, data.unit)
+        axes.margins(x=0.0)
+    grid[-1, 0].set_xlabel(clock.label)
+    figure.align_ylabels()
+    return figure, grid[:, 0], clock
+
+
+def _keys(filters: list[str], solution: xr.Dataset, *more) -> list:
+    keys = [*style.filter_keys(filters), *more]
+    return [*keys, style.outage_key()] if series.outage(solution) else keys
+
+
+@style.styled
+def errors(solution: xr.Dataset, block: str) -> Picture:
+    """Estimation errors of a block of the state within the three sigma the filters state."""
+    error = series.get(solution, "error", block)
+    assert error is not None
+    sigma = series.get(solution, "sigma", block)
+    filters = series.filters(solution)
+    figure, stack, clock = _stacked(error, solution)
+    for k, axes in enumerate(stack):
+        lines = []
+        for i in range(len(filters)):
+            look = {"color": style.colour(i), "linestyle": style.line(i)}
+            axes.plot(*series.thin(error.x / clock.seconds, error.values[i, :, k]), **look)
+            lines.append(error.values[i, :, k])
+            if sigma is not None:
+                _envelope(axes, sigma, i, k, clock, len(filters))
+                lines.append(3.0 * sigma.values[i, :, k])
+        axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
+        _limit(axes, error.x, lines)
+    bounds = [style.key("±3σ stated", color=style.GREY, linewidth=0.8)] if sigma is not None else []
+    style.legend(figure, _keys(filters, solution, *bounds))
+    name = words(block)
+    caption = "True minus estimated."
+    if sigma is not None:
+        caption += (
+            " A filter that knows its own accuracy keeps 99.7\u00a0% of it between the thin lines."
+        )
+    caption += _frame_of(solution, f"error_{block}")
+    return Picture(f"error_{block}", f"Error of the {name}", caption, figure)
+
+
+def _envelope(
+    axes: Axes,
+    sigma: Series,
+    i: int,
+    k: int,
+    clock: series.Clock,
+    count: int,
+    centre: float | np.ndarray = 0.0,
+) -> None:
+    """Draw plus and minus three sigma about a centre."""
+    reach = 3.0 * sigma.values[i, :, k]
+    x, low, high = series.thin(sigma.x / clock.seconds, centre - reach, centre + reach)
+    for bound in (low, high):
+        axes.plot(x, bound, color=style.colour(i), linestyle=style.line(i), linewidth=0.6)
+    if count <= 2:  # more would hide each other
+        axes.fill_between(x, low, high, color=style.colour(i), alpha=0.10, linewidth=0)
+
+
+@style.styled
+def estimates(solution: xr.Dataset, block: str) -> Picture:
+    """Estimates of a block of the state, within three sigma: biases, or a path without truth."""
+    found = series.get(solution, "estimate", block)
+    assert found is not None
+    sigma = series.get(solution, "sigma", block)
+    filters = series.filters(solution)
+    figure, stack, clock = _stacked(found, solution)
+    turn = {"rad": 2.0 * np.pi, "deg": 360.0}.get(found.unit)
+    for k, axes in enumerate(stack):
+        for i in range(len(filters)):
+            y = _broken(found.values[i, :, k], turn)
+            x, thinned = series.thin(found.x / clock.seconds, y)
+            axes.plot(x, thinned, color=style.colour(i), linestyle=style.line(i))
+            # About an angle that turns, an envelope would be drawn across the wrap.
+            if sigma is not None and turn is None:
+                _envelope(axes, sigma, i, k, clock, len(filters), centre=y)
+        if turn is None and sigma is not None:
+            _window(axes, found.values[:, :, k], 3.0 * sigma.values[:, :, k])
+    thin_lines = sigma is not None and turn is None
+    bounds = [style.key("±3σ stated", color=style.GREY, linewidth=0.8)] if thin_lines else []
+    style.legend(figure, _keys(filters, solution, *bounds))
+    name = words(block)
+    caption = "Thin lines: three stated standard deviations to either side." if thin_lines else ""
+    caption += _frame_of(solution, f"estimate_{block}")
+    return Picture(f"estimate_{block}", f"Estimated {name}", caption, figure)
+
+
+def _broken(y: np.ndarray, turn: float | None) -> np.ndarray:
+    """The same with gaps where an angle wraps, so that no line is drawn across the figure."""
+    if turn is None:
+        return y
+    y = y.copy()
+    y[1:][np.abs(np.diff(y)) > 0.75 * turn] = np.nan
+    return y
+
+
+def _window(axes: Axes, values: np.ndarray, reach: np.ndarray) -> None:
+    """Limits that hold the estimates, and of the envelope what it usually needs."""
+    if not np.isfinite(values).any() or not np.isfinite(reach).any():
+        return
+    usual = np.nanpercentile(reach, 70.0)
+    low, high = np.nanmin(values), np.nanmax(values)
+    low, high = low - 1.3 * usual, high + 1.3 * usual
+    now = axes.get_ylim()
+    if high > low and (now[1] - now[0]) > 3.0 * (high - low):
+        axes.set_ylim(low, high)
+
+
+@style.styled
+def campaign(solution: xr.Dataset, block: str) -> Picture:
+    """Scatter of the runs of a campaign against the sigma the filters state."""
+    rms = series.get(solution, "rms", block)
+    assert rms is not None
+    stated = series.get(solution, "mean_sigma", block)
+    filters = series.filters(solution)
+    runs = int(solution[f"rms_{block}"].attrs.get("runs", 0))
+    figure, stack, clock = _stacked(rms, solution)
+    for k, axes in enumerate(stack):
+        lines = []
+        for i in range(len(filters)):
+            x, y = series.thin(rms.x / clock.seconds, rms.values[i, :, k])
+            axes.plot(x, y, color=style.colour(i), linestyle=style.line(i))
+            lines.append(rms.values[i, :, k])
+            if stated is not None:
+                x, y = series.thin(stated.x / clock.seconds, stated.values[i, :, k], points=600)
+                axes.plot(x, y, color=style.dark(i), linewidth=0.9, zorder=3)
+                if runs:
+                    # The mean square of N errors of variance sigma^2 is sigma^2 chi2(N)/N.
+                    low, high = (np.sqrt(quantile(p, runs) / runs) for p in (0.025, 0.975))
+                    band = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
+                    axes.fill_between(x, low * y, high * y, **band)
+                lines.append(stated.values[i, :, k])
+        if not _limit(axes, rms.x, lines, centred=False):
+            axes.set_ylim(bottom=0.0)
+    more = [style.key("σ stated", color=style.GREY, linewidth=0.8)] if stated is not None else []
+    style.legend(figure, _keys(filters, solution, *more))
+    name = words(block)
+    caption = f"Root mean square error of the {name} over {runs or 'all'} runs."
+    if stated is not None and runs:
+        caption += (
+            " If the stated sigma (thin) is true, the line stays in the tint 95\u00a0% of the time."
+        )
+    caption += _frame_of(solution, f"rms_{block}")
+    return Picture(f"rms_{block}", f"Scatter of the {name} over the runs", caption, figure)
+
+
+@style.styled
+def height(solution: xr.Dataset) -> Picture:
+    """Height over time, with the fixes and the reference."""
+    filters = series.filters(solution)
+    data = series.get(solution, "alt_m", "")
+    assert data is not None
+    figure, grid = style.new(1, 1, 2.7)
+    axes, clock = grid[0, 0], series.clock(data.x)
+    outage = series.outage(solution)
+    if outage is not None:
+        style.shade(axes, outage[0] / clock.seconds, outage[1])
+    more = []
+    if "gnss_alt_m" in solution:
+        fixes = solution["gnss_alt_m"]
+        look = {"linestyle": "", "marker": ".", "markersize": 3.0, "color": style.GREY}
+        axes.plot(series.x_of(fixes, 0) / clock.seconds, fixes.values, **look)
+        more.append(style.key("GNSS fixes", **look))
+    if "reference_alt_m" in solution:
+        truth = solution["reference_alt_m"]
+        x, y = series.thin(series.x_of(truth, 0) / clock.seconds, np.asarray(truth, float))
+        axes.plot(x, y, color=style.TRUTH, linewidth=2.4, alpha=0.35)
+        more.append(style.key("reference", color=style.TRUTH, linewidth=2.4, alpha=0.35))
+    for i in range(len(filters)):
+        x, y = series.thin(data.x / clock.seconds, data.values[i, :, 0])
+        axes.plot(x, y, color=style.colour(i), linestyle=style.line(i))
+    axes.margins(x=0.0)
+    axes.set(xlabel=clock.label, ylabel="height [m]")
+    style.legend(figure, _keys(filters, solution, *more))
+    return Picture("height", "Height profile", "Height above the WGS-84 ellipsoid.", figure)

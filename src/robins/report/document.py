@@ -1,0 +1,188 @@
+"""The report: one HTML file that needs nothing else, read on a screen, in the dark, on paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from robins.report import numbers
+from robins.report.embed import Drawn, Embedded, embed
+from robins.report.style import Picture
+
+LIMIT = 500_000  # bytes of the whole page
+
+_SIGNS = {"reproduced": "✓", "partly": "≈", "not": "✗"}
+_LOCKED = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_LONGEST_SCENARIO = 40_000  # characters shown; the manifest has all of it
+
+
+class Origin(NamedTuple):
+    """Where a result came from."""
+
+    command: str
+    scenario_text: str
+    device: str
+    versions: Mapping[str, str]
+    created_utc: str
+
+
+def page(
+    summary: Mapping[str, Any], drawn: Sequence[Drawn], origin: Origin, limit: int = LIMIT
+) -> str:
+    """The report as HTML of at most `limit` bytes; pictures give way where there are too many."""
+    text = _page(summary, _figures([]), origin)
+    room = limit - len(text.encode()) - sum(len(_frame(d.picture).encode()) for d in drawn)
+    return _page(summary, _figures(embed(drawn, max(room, 0))), origin)
+
+
+def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
+    title = escape(summary["scenario"])
+    runs = "1 run" if summary["runs"] == 1 else f"{summary['runs']} runs"
+    filters = len(summary["filters"])
+    meta = [
+        f"{filters} filter{'' if filters == 1 else 's'}",
+        runs,
+        f"seed {summary['seed']}",
+        f"{numbers.show(summary['seconds'])} s on {escape(origin.device)}",
+        f"robins {escape(origin.versions.get('robins', ''))}",
+        escape(origin.created_utc),
+    ]
+    css = (Path(__file__).with_name("page.css")).read_text("utf-8")
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{_LOCKED}">
+<title>{title} · robins</title>
+<style>
+{css}</style>
+</head>
+<body>
+<main>
+<header>
+<h1>{title}</h1>
+<p class="meta">{" · ".join(meta)}</p>
+{_verdict(summary["claims"])}
+</header>
+{_metrics(summary["filters"])}
+{_claims(summary["claims"])}
+{figures}
+{_counts(summary["counts"])}
+{_reproduce(summary, origin)}
+</main>
+</body>
+</html>
+"""
+
+
+def _verdict(claims: Sequence[Mapping[str, Any]]) -> str:
+    verdicts = {claim["verdict"] for claim in claims}
+    worst = next((v for v in ("not", "partly", "reproduced") if v in verdicts), "")
+    sign = f"{_SIGNS[worst]} " if worst else ""
+    return f'<p class="verdict {worst}">{sign}{escape(numbers.verdict(claims))}</p>'
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = "") -> str:
+    body = "\n".join(f"<tr>{''.join(row)}</tr>" for row in rows)
+    named = f' class="{kind}"' if kind else ""
+    return (
+        f'<div class="scroll"><table{named}>\n<thead><tr>{"".join(head)}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def _th(text: str, kind: str = "") -> str:
+    return f'<th scope="col" class="{kind}">{escape(text)}</th>'
+
+
+def _td(text: str, kind: str = "") -> str:
+    return f'<td class="{kind}">{escape(text)}</td>'
+
+
+def _metrics(filters: Mapping[str, Mapping[str, Any]]) -> str:
+    names = dict.fromkeys(name for values in filters.values() for name in values)
+    if not names:
+        return ""
+    head = [_th("Metric"), _th("Unit"), *(_th(name, "number") for name in filters)]
+    rows = []
+    for name in names:
+        text, unit = numbers.label(name)
+        cells = [_td(numbers.show(values.get(name)), "number") for values in filters.values()]
+        rows.append([f'<th scope="row" title="{escape(name)}">{escape(text)}</th>'])
+        rows[-1] += [_td(unit, "unit"), *cells]
+    return f"<section>\n<h2>Summary</h2>\n{_table(head, rows)}\n</section>"
+
+
+def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
+    if not claims:
+        return ""
+    head = [_th("Verdict"), _th("Claim"), _th("Found", "number"), _th("Band", "number")]
+    rows = [
+        [
+            _td(f"{_SIGNS[c['verdict']]} {c['verdict']}", f"tag {c['verdict']}"),
+            f"<td>{escape(c['text'])} <span class='meta'>({escape(c['id'])})</span></td>",
+            _td(numbers.show(c["value"]), "number"),
+            _td(numbers.band(c["band"]), "number"),
+        ]
+        for c in claims
+    ]
+    return f"<section>\n<h2>Claims</h2>\n{_table(head, rows)}\n</section>"
+
+
+def _frame(picture: Picture) -> str:
+    """Everything around a picture but its source."""
+    return _figure(Embedded(picture, "", 99999, 99999)) + "\n" + " " * 80
+
+
+def _figure(shown: Embedded) -> str:
+    picture = shown.picture
+    head = f"<h3>{escape(picture.title)}</h3>{escape(picture.caption)}"
+    if shown.source:
+        image = (
+            f'<img src="{shown.source}" width="{shown.width}" height="{shown.height}" '
+            f'alt="{escape(picture.title)}">'
+        )
+    else:
+        name = escape(f"figures/{picture.name}.png")
+        image = f'<p class="meta">Too large for this page: <a href="{name}">{name}</a></p>'
+    return f"<figure><figcaption>{head}</figcaption>\n{image}\n</figure>"
+
+
+def _figures(shown: Sequence[Embedded]) -> str:
+    if not shown:
+        return ""
+    return "<section>\n<h2>Figures</h2>\n" + "\n".join(map(_figure, shown)) + "\n</section>"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    if not any(counts.values()):
+        body = "<p>Every sample was used.</p>"
+    else:
+        rows = [
+            [
+                f'<th scope="row">{escape(numbers.words(reason))}</th>',
+                _td(numbers.show(n), "number"),
+            ]
+            for reason, n in counts.items()
+        ]
+        head = [_th("Reason"), _th("Samples", "number")]
+        body = _table(head, rows, "narrow")
+    return f"<section>\n<h2>Refused samples</h2>\n{body}\n</section>"
+
+
+def _reproduce(summary: Mapping[str, Any], origin: Origin) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in origin.versions.items())
+    command = origin.command or "(called from Python)"
+    text = origin.scenario_text
+    if len(text) > _LONGEST_SCENARIO:
+        text = text[:_LONGEST_SCENARIO] + "\n(the rest is in manifest.json)"
+    scenario = f"<details><summary>Scenario</summary><pre>{escape(text)}</pre></details>"
+    return (
+        "<section>\n<h2>How to reproduce</h2>\n"
+        f"<pre>{escape(command)}</pre>\n"
+        f"<p>Seed {summary['seed']}, device {escape(origin.device)}; {escape(versions)}.</p>\n"
+        f"{scenario if text else ''}\n</section>"
+    )

@@ -1,0 +1,136 @@
+"""Names and numbers as people read them: ``horizontal_rms_m`` is "Horizontal RMS" in "m"."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+# What a metric name may end in, and how the unit is printed.
+_UNITS = {
+    "_m_per_s": "m/s",
+    "_m_s": "m/s",
+    "_mm_per_s": "mm/s",
+    "_deg_per_h": "deg/h",
+    "_deg_h": "deg/h",
+    "_deg_per_s": "deg/s",
+    "_deg_per_sqrt_h": "deg/sqrt(h)",
+    "_m_per_s_per_sqrt_h": "m/s/sqrt(h)",
+    "_rad_per_s": "rad/s",
+    "_m_per_s2": "m/s²",
+    "_ug_per_sqrt_hz": "ug/sqrt(Hz)",
+    "_arcsec": "arcsec",
+    "_arcmin": "arcmin",
+    "_mrad": "mrad",
+    "_rad": "rad",
+    "_deg": "deg",
+    "_percent": "%",
+    "_mg": "mg",
+    "_ug": "µg",
+    "_km": "km",
+    "_mm": "mm",
+    "_cm": "cm",
+    "_m": "m",
+    "_hz": "Hz",
+    "_us": "µs",
+    "_ms": "ms",
+    "_s": "s",
+    "_h": "h",
+}
+_CAPITALS = {
+    *(
+        "rms",
+        "rmse",
+        "nis",
+        "nees",
+        "anees",
+        "gnss",
+        "imu",
+        "rts",
+        "ins",
+        "cep",
+        "kf",
+        "ekf",
+        "ukf",
+    ),
+    *("rtk", "2d", "3d", "nhc", "zupt", "lmi"),
+}
+
+
+class Label(NamedTuple):
+    """A metric's name in words, and its unit ("" for a pure number)."""
+
+    text: str
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.text} [{self.unit}]" if self.unit else self.text
+
+
+def label(metric: str) -> Label:
+    """Words and unit of a metric's name."""
+    ending = next((e for e in sorted(_UNITS, key=len, reverse=True) if metric.endswith(e)), "")
+    text = words(metric.removesuffix(ending)) or metric
+    return Label(text[:1].upper() + text[1:], _UNITS.get(ending, ""))
+
+
+def words(name: str) -> str:
+    """A name of a program as words: ``gnss_position`` is "GNSS position"."""
+    split = (word for word in name.split("_") if word)
+    return " ".join(word.upper() if word in _CAPITALS else word for word in split)
+
+
+def show(value: Any) -> str:
+    """A number to four significant digits; lists are joined; nothing is an en dash."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u2009") if abs(value) >= 10_000 else str(value)
+    if isinstance(value, float):
+        return _float(value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {show(item)}" for key, item in value.items())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(show(item) for item in value)
+    return str(value)
+
+
+def _float(value: float) -> str:
+    if not math.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        digits = max(0, 3 - math.floor(math.log10(abs(value))))
+        text = f"{value:.{min(digits, 6)}f}"
+        return text.rstrip("0").rstrip(".") if "." in text else text
+    mantissa, exponent = f"{value:.3e}".split("e")
+    return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
+
+
+def band(value: Any) -> str:
+    """The band of a claim: two numbers as a range, with an open end where one is missing."""
+    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2:
+        low, high = value
+        if low is None and high is None:
+            return "–"
+        if low is None:
+            return f"at most {show(high)}"
+        if high is None:
+            return f"at least {show(low)}"
+        return f"{show(low)} to {show(high)}"
+    return show(value)
+
+
+def verdict(claims: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence on the claims."""
+    if not claims:
+        return "No claims are attached to this scenario."
+    found = [claim["verdict"] for claim in claims]
+    held, partly, failed = (found.count(v) for v in ("reproduced", "partly", "not"))
+    rest = [f"{partly} partly"] if partly else []
+    rest += [f"{failed} not"] if failed else []
+    noun = "claim" if len(claims) == 1 else "claims"
+    return f"{held} of {len(claims)} {noun} reproduced" + "".join(f", {r}" for r in rest) + "."

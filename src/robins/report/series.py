@@ -1,0 +1,138 @@
+"""What a solution holds, by the names and dimensions that `robins.results` lists."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from robins import units
+
+_PREFIXES = (
+    *("estimate", "error", "mean_sigma", "sigma", "rms"),
+    *("innovation_sigma", "innovation", "nis_dof", "nis", "refused"),
+    *("allan_low", "allan_high", "allan_fit", "allan_slope", "allan"),
+)
+_POINTS = 1200  # of a line; more than a figure has pixels
+
+
+class Series(NamedTuple):
+    """An array over filters, time and perhaps axes, in the unit of figures."""
+
+    name: str  # block or sensor
+    label: str  # its long name
+    unit: str
+    values: np.ndarray  # (filter, time, axis)
+    x: np.ndarray  # (time,) s
+    axes: list[str]
+
+
+def find(solution: xr.Dataset, prefix: str) -> Iterator[str]:
+    """Names of the blocks or sensors that have an array of this prefix."""
+    for variable in solution.data_vars:
+        # The longest prefix counts: innovation_sigma_gnss is not the innovation of "sigma_gnss".
+        name = str(variable)
+        fits = [p for p in _PREFIXES if name.startswith(f"{p}_")]
+        if fits and max(fits, key=len) == prefix:
+            yield name.removeprefix(f"{prefix}_")
+
+
+def get(solution: xr.Dataset, prefix: str, name: str) -> Series | None:
+    """An array of the solution, or None."""
+    full = f"{prefix}_{name}" if name else prefix
+    if full not in solution:
+        return None
+    array = solution[full]
+    unit = array.attrs.get("units", "1")
+    shown = array.attrs.get("display_unit", unit)
+    values = np.asarray(array.values, float)
+    if shown != unit:
+        values = units.convert(values, unit, shown)
+    axes = coordinate(solution, array.dims[2]) if array.ndim > 2 else [""]
+    label = str(array.attrs.get("long_name", name.replace("_", " ")))
+    values = values if array.ndim > 2 else values[..., None]
+    return Series(name, label, "" if shown == "1" else shown, values, x_of(array, 1), axes)
+
+
+def x_of(array: xr.DataArray, place: int) -> np.ndarray:
+    """Coordinate along the dimension at that place; numbers from 0 where there is none."""
+    dim = array.dims[place]
+    found = array.coords.get(dim)
+    return np.arange(array.shape[place]) * 1.0 if found is None else np.asarray(found, float)
+
+
+def coordinate(solution: xr.Dataset, dim) -> list[str]:
+    """Labels along a dimension; numbers from 1 where it has none."""
+    if dim in solution.coords:
+        return [str(label) for label in solution[dim].values]
+    return [str(i + 1) for i in range(solution.sizes[dim])]
+
+
+def filters(solution: xr.Dataset) -> list[str]:
+    """Names of the filters."""
+    return coordinate(solution, "filter") if "filter" in solution.sizes else []
+
+
+class Clock(NamedTuple):
+    """A unit for a time axis."""
+
+    seconds: float
+    label: str
+
+
+def clock(*times: np.ndarray) -> Clock:
+    """The unit in which a time axis has short numbers."""
+    longest = max((np.nanmax(np.abs(t)) for t in times if np.isfinite(t).any()), default=0.0)
+    if longest > 3 * 3600:
+        return Clock(3600.0, "time since start [h]")
+    if longest > 1200:
+        return Clock(60.0, "time since start [min]")
+    return Clock(1.0, "time since start [s]")
+
+
+def outage(solution: xr.Dataset) -> tuple[np.ndarray, np.ndarray] | None:
+    """Times and mask of withheld aids; None where there are none."""
+    if "outage" not in solution or not np.any(solution["outage"].values):
+        return None
+    return x_of(solution["outage"], 0), np.asarray(solution["outage"].values) != 0
+
+
+def thin(x: np.ndarray, *ys: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, ...]:
+    """Fewer points of lines that share their x, without losing an extreme of any of them.
+
+    The line is cut into bins; of each bin the points stay where a line is lowest and highest.
+    """
+    n = len(x)
+    if n <= points:
+        return x, *ys
+    bins = max(points // (2 * len(ys)), 1)
+    size = -(-n // bins)
+    keep = {0, n - 1}
+    padded = bins * size - n
+    for y in ys:
+        whole = np.append(y, np.full(padded, np.nan)).reshape(bins, size)
+        start = np.arange(bins) * size
+        for fill, pick in ((np.inf, np.argmin), (-np.inf, np.argmax)):
+            at = start + pick(np.where(np.isnan(whole), fill, whole), axis=1)
+            keep.update(at[at < n].tolist())
+        # A gap must stay a gap: keep one of the missing points of each bin.
+        holes = np.isnan(whole)
+        at = (start + np.argmax(holes, axis=1))[holes.any(axis=1)]
+        keep.update(at[at < n].tolist())
+    index = np.array(sorted(keep))
+    return x[index], *(y[index] for y in ys)
+
+
+def sample(x: np.ndarray, y: np.ndarray, points: int = 4000) -> tuple[np.ndarray, np.ndarray]:
+    """Fewer points of a cloud: evenly many everywhere, and every one that lies far out."""
+    if len(x) <= points:
+        return x, y
+    keep = np.zeros(len(x), bool)
+    keep[:: -(-len(x) // points)] = True
+    finite = np.isfinite(y)
+    if finite.any():
+        low, high = np.percentile(y[finite], (0.5, 99.5))
+        keep |= finite & ((y < low) | (y > high))
+    return x[keep], y[keep]

@@ -1,0 +1,136 @@
+"""How figures look: one style, colours that the colour-blind can tell apart, nothing global."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of the page around it
+
+# Okabe and Ito (2008): distinct with every kind of colour vision. The line styles carry the same
+# distinction onto paper without colours.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINES = ("-", "--", "-.", (0, (1, 1)))
+TRUTH = "#222222"
+GREY = "#6B6B6B"
+OUTAGE = "#FBE9B0"
+BAND = "#DDE7EE"
+
+_SETTINGS = {
+    "font.size": 9.0,
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "sans-serif"],  # repeated by every text of an SVG
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.formatter.limits": (-4, 5),
+    "axes.formatter.use_mathtext": True,
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.6,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": TRUTH,
+    "ytick.labelcolor": TRUTH,
+    "lines.linewidth": 1.2,
+    "lines.solid_joinstyle": "round",
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 2.2,
+    "svg.fonttype": "none",  # text stays text: smaller, searchable, read out by screen readers
+    "svg.hashsalt": "robins",  # same figure, same file
+}
+
+
+class Picture(NamedTuple):
+    """A figure with what is printed around it."""
+
+    name: str  # of its file
+    title: str
+    caption: str  # what to look for in it
+    figure: Figure
+
+
+def styled(draw: Callable) -> Callable:
+    """Decorator: draw in the style of robins, whatever the user's settings, and restore those."""
+
+    @wraps(draw)
+    def drawn(*args: Any, **kwargs: Any) -> Any:
+        with style.context(["default", _SETTINGS]):
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
+def new(
+    rows: int = 1, columns: int = 1, height: float = 2.6, **kwargs: Any
+) -> tuple[Figure, np.ndarray]:
+    """A figure without pyplot, and its axes as an array of rows and columns; height in inches."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
+
+
+def colour(index: int) -> str:
+    """Colour of the filter or axis of that number."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def dark(index: int) -> tuple[float, float, float]:
+    """A dark shade of that colour, for lines on top of those in the colour itself."""
+    red, green, blue = to_rgb(colour(index))
+    return 0.45 * red, 0.45 * green, 0.45 * blue
+
+
+def line(index: int) -> Any:
+    """Line style of the filter or axis of that number."""
+    return LINES[index % len(LINES)]
+
+
+def key(label: str, **line_properties: Any) -> Line2D:
+    """An entry of a legend."""
+    return Line2D([], [], label=label, **line_properties)
+
+
+def filter_keys(filters: Sequence[str]) -> list[Line2D]:
+    """Entries for the filters, in their colours."""
+    return [key(name, color=colour(i), linestyle=line(i)) for i, name in enumerate(filters)]
+
+
+def outage_key() -> Patch:
+    """The entry for shaded outages."""
+    return Patch(color=OUTAGE, label="outage")
+
+
+def legend(figure: Figure, keys: Sequence[Any]) -> None:
+    """One legend above all axes, where no data are; it reads row by row."""
+    if not keys:
+        return
+    widest = max(len(key.get_label()) for key in keys) * 0.066 + 0.55  # inches
+    columns = max(1, min(len(keys), int((WIDTH - 0.3) / widest)))
+    columns = -(-len(keys) // -(-len(keys) // columns))  # no last row of one
+    ordered = [key for column in range(columns) for key in keys[column::columns]]
+    figure.legend(handles=ordered, loc="outside upper center", ncols=columns)
+
+
+def shade(axes: Axes, x: np.ndarray, mask: np.ndarray | None) -> None:
+    """Shade where the mask holds."""
+    if mask is None or not mask.any():
+        return
+    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
+    last = len(x) - 1
+    for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        axes.axvspan(x[begin], x[min(end, last)], color=OUTAGE, linewidth=0, zorder=0)

@@ -1,0 +1,171 @@
+"""Innovations in their three-sigma bounds, and consistency statistics in their bands."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+
+from robins.report import series, style
+from robins.report.bands import band, inside
+from robins.report.numbers import words
+from robins.report.style import Picture
+
+_STEEP = 15.0  # a statistic this far above its band is shown on a logarithmic axis
+
+
+@style.styled
+def innovations(solution: xr.Dataset, sensor: str) -> Picture:
+    """Innovations of a sensor and, below them, their normalised square."""
+    data = series.get(solution, "innovation", sensor)
+    assert data is not None
+    sigma = series.get(solution, "innovation_sigma", sensor)
+    has_nis = f"nis_{sensor}" in solution
+    filters = series.filters(solution)
+    rows = len(data.axes) + has_nis
+    figure, grid = style.new(rows, 1, 0.9 + 1.35 * rows, sharex=True)
+    stack, clock = grid[:, 0], series.clock(data.x)
+    x = data.x / clock.seconds
+    outage = series.outage(solution)
+    refused = series.get(solution, "refused", sensor)
+    for axes in stack:
+        if outage is not None:
+            style.shade(axes, outage[0] / clock.seconds, outage[1])
+        axes.margins(x=0.0)
+    for k, label in enumerate(data.axes):
+        axes = stack[k]
+        for i in range(len(filters)):
+            y = data.values[i, :, k]
+            _points(axes, x, y, i)
+            if refused is not None:
+                out = refused.values[i, :, 0] != 0.0
+                axes.plot(x[out], y[out], **_CROSS)
+            if sigma is not None:
+                reach = 3.0 * sigma.values[i, :, k]
+                for sign in (-1.0, 1.0):
+                    look = {"color": style.colour(i), "linestyle": style.line(i)}
+                    axes.plot(*series.thin(x, sign * reach), linewidth=0.8, **look)
+        axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
+        axes.set_ylabel(f"{label} [{data.unit}]" if data.unit else label)
+    keys: list[Any] = [_dot(name, i) for i, name in enumerate(filters)]
+    if sigma is not None:
+        keys.append(style.key("±3σ expected", color=style.GREY, linewidth=0.8))
+    if refused is not None and np.any(refused.values != 0.0):
+        keys.append(style.key("refused", **_CROSS))
+    if has_nis:
+        shares = _statistic(stack[-1], solution, f"nis_{sensor}", f"nis_dof_{sensor}", clock)
+        stack[-1].set_ylabel("NIS")
+        keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
+        stack[-1].set_title(shares, fontsize=8.5, color=style.GREY)
+    if outage is not None:
+        keys.append(style.outage_key())
+    stack[-1].set_xlabel(clock.label)
+    figure.align_ylabels()
+    style.legend(figure, keys)
+    name = words(sensor)
+    caption = (
+        "Measured minus predicted. They should look like white noise "
+        "between the lines; runs to one side tell of an error the filter does not model."
+    )
+    return Picture(f"innovation_{sensor}", f"Innovations of {name}", caption, figure)
+
+
+_CROSS = {
+    "linestyle": "",
+    "marker": "x",
+    "markersize": 4.5,
+    "color": style.TRUTH,
+    "markeredgewidth": 0.9,
+}
+
+
+def _dot(name: str, i: int):
+    return style.key(name, linestyle="", marker=_MARKERS[i % len(_MARKERS)], color=style.colour(i))
+
+
+_MARKERS = (".", "+", "1", "2", "3", "4")
+
+
+def _points(axes: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
+    x, y = series.sample(x, y)
+    size, alpha = (3.0, 0.8) if len(x) <= 1500 else (2.2, 0.5)
+    look: dict[str, Any] = {"markersize": size, "markeredgewidth": 0.6, "alpha": alpha}
+    mark = _MARKERS[i % len(_MARKERS)]
+    axes.plot(x, y, linestyle="", marker=mark, color=style.colour(i), **look)
+
+
+def _statistic(
+    axes: Axes, solution: xr.Dataset, name: str, degrees_from: str, clock: series.Clock
+) -> str:
+    """Draw a statistic of each filter over its band; return how much of it lies inside."""
+    data = series.get(solution, name, "")
+    assert data is not None
+    values, x = data.values[..., 0], data.x / clock.seconds
+    limits = band(solution, name, degrees_from)
+    filters = series.filters(solution)
+    joined = name == "anees"  # the mean of many runs is smooth; one run is a cloud
+    for i in range(len(filters)):
+        if joined:
+            look = {"color": style.colour(i), "linestyle": style.line(i), "linewidth": 0.9}
+            axes.plot(*series.thin(x, values[i]), **look)
+        else:
+            _points(axes, x, values[i], i)
+    if limits is None or not np.isfinite(limits.high).any():
+        return ""
+    finite = np.isfinite(limits.high[0])
+    axes.fill_between(
+        x[finite],
+        limits.low[0][finite],
+        limits.high[0][finite],
+        color=style.BAND,
+        linewidth=0,
+        zorder=0.5,
+        step=None if joined else "mid",
+    )
+    top = np.nanmax(values) if np.isfinite(values).any() else 0.0
+    if top > _STEEP * np.nanmax(limits.high):
+        axes.set_yscale("log")
+        floor = np.nanmin(limits.low)
+        axes.set_ylim(bottom=0.3 * (floor if floor > 0.0 else 1e-2))
+    elif not joined:
+        axes.set_ylim(bottom=0.0)
+    shares = inside(values, limits)
+    told = ", ".join(
+        f"{name} {100.0 * share:.1f}\u00a0%"
+        for name, share in zip(filters, shares, strict=True)
+        if np.isfinite(share)
+    )
+    return f"inside the {100.0 * limits.probability:.4g}\u00a0% band: {told}"
+
+
+@style.styled
+def consistency(solution: xr.Dataset, name: str) -> Picture:
+    """NEES of a run, or its average over the runs of a campaign, in its chi-square band."""
+    data = series.get(solution, name, "")
+    assert data is not None
+    figure, grid = style.new(1, 1, 2.8)
+    axes, clock = grid[0, 0], series.clock(data.x)
+    outage = series.outage(solution)
+    if outage is not None:
+        style.shade(axes, outage[0] / clock.seconds, outage[1])
+    shares = _statistic(axes, solution, name, "", clock)
+    limits = band(solution, name)
+    filters = series.filters(solution)
+    keys = [_dot(f, i) for i, f in enumerate(filters)]
+    if name == "anees":
+        keys = style.filter_keys(filters)
+    if limits is not None:
+        keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
+        if np.isfinite(limits.expected):
+            axes.axhline(limits.expected, color=style.GREY, linewidth=0.7, zorder=1)
+    axes.set_title(shares, fontsize=8.5, color=style.GREY)
+    axes.margins(x=0.0)
+    axes.set(xlabel=clock.label, ylabel=name.upper())
+    style.legend(figure, [*keys, style.outage_key()] if outage is not None else keys)
+    runs = solution[name].attrs.get("runs")
+    caption = "Squared estimation error, normalised by the stated covariance"
+    caption += f", mean of {int(runs)} runs." if runs else "."
+    caption += " Above the band the filter is too sure of itself, below it too modest."
+    return Picture(name, "Consistency", caption, figure)

@@ -1,0 +1,115 @@
+"""Numbers and names as people read them."""
+
+import math
+
+import pytest
+
+from robins import report
+from robins.report import numbers
+
+
+@pytest.mark.parametrize(
+    ("metric", "text", "unit"),
+    [
+        ("horizontal_rms_m", "Horizontal RMS", "m"),
+        ("attitude_rms_arcmin", "Attitude RMS", "arcmin"),
+        ("velocity_rms_m_per_s", "Velocity RMS", "m/s"),
+        ("gyro_bias_rms_deg_per_h", "Gyro bias RMS", "deg/h"),
+        ("nis_inside_percent", "NIS inside", "%"),
+        ("anees", "ANEES", ""),
+        ("step_us", "Step", "µs"),
+        ("updates", "Updates", ""),
+        ("m", "M", ""),
+    ],
+)
+def test_a_metric_is_told_in_words_and_unit(metric, text, unit):
+    assert numbers.label(metric) == (text, unit)
+    assert str(numbers.label(metric)) == (f"{text} [{unit}]" if unit else text)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0213, "0.0213"),
+        (0.021349, "0.02135"),
+        (1.0, "1"),
+        (100.0, "100"),
+        (12345.678, "12346"),
+        (99999.4, "99999"),
+        (123456.0, "1.235e5"),
+        (-0.0005, "-5e-4"),
+        (1.5e-12, "1.5e-12"),
+        (0.0, "0"),
+        (math.nan, "–"),
+        (math.inf, "–"),
+        (None, "–"),
+        (7, "7"),
+        (1234567, "1\u2009234\u2009567"),
+        (True, "yes"),
+        ([1.0, None, 0.25], "1, –, 0.25"),
+        ({"a": 0.5}, "a 0.5"),
+        ("text", "text"),
+    ],
+)
+def test_a_number_is_shown_to_four_digits(value, text):
+    assert numbers.show(value) == text
+
+
+@pytest.mark.parametrize("value", [3.14159, 0.0012345, 87654.3, 2.5e-7, -41.7, 1e22, 0.99996])
+def test_what_is_shown_is_the_number_to_its_last_digit(value):
+    assert float(numbers.show(value)) == pytest.approx(value, rel=5.1e-4)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ([0.95, 1.05], "0.95 to 1.05"),
+        ([None, 0.29], "at most 0.29"),
+        ([0.9, None], "at least 0.9"),
+        ([None, None], "–"),
+        (None, "–"),
+        (2.0, "2"),
+        ("see text", "see text"),
+    ],
+)
+def test_a_band_is_a_range(value, text):
+    assert numbers.band(value) == text
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "text"),
+    [
+        ([], "No claims are attached to this scenario."),
+        (["reproduced"], "1 of 1 claim reproduced."),
+        (["reproduced", "partly", "not", "not"], "1 of 4 claims reproduced, 1 partly, 2 not."),
+    ],
+)
+def test_the_verdict_counts_the_claims(verdicts, text):
+    assert report.verdict([{"verdict": v} for v in verdicts]) == text
+
+
+def test_the_table_of_a_terminal_holds_every_metric_claim_and_refusal(town):
+    text = report.plain(town)
+    for expected in (
+        "Horizontal RMS [m]",
+        "0.0213",
+        "kalman",
+        "robust",
+        "reproduced",
+        "Smoothed error in 15 s outages",
+        "at most 0.29",
+        "1 of 2 claims reproduced, 1 partly.",
+        "IMU duplicate time 2",
+        "GNSS not finite 14",
+    ):
+        assert expected in " ".join(text.split())
+
+
+def test_markup_in_names_is_printed_as_it_is(town):
+    text = report.plain(town | {"filters": {"[red]x": {"a[/]b_m": 1.0}}})
+    assert "[red]x" in text
+    assert "A[/]b [m]" in text
+
+
+def test_an_empty_summary_prints_nothing(town):
+    assert report.plain(town | {"filters": {}, "claims": [], "counts": {}}) == ""
