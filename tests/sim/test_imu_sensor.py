@@ -9,9 +9,18 @@ import pytest
 from scipy.linalg import expm
 from scipy.stats import chi2
 
+from robins.dataset import ImuTable
 from robins.ins.allan import deviation
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors, allan_deviation, mean_sigma
-from robins.sim.imu_sensor import _less_tanh, begin, corrupt, markov_step, sample, walk_step
+from robins.sim.imu_sensor import (
+    _less_tanh,
+    begin,
+    corrupt,
+    corrupt_table,
+    markov_step,
+    sample,
+    walk_step,
+)
 from robins.sim.random import Component, stream
 
 N = 40
@@ -372,6 +381,26 @@ def test_gradients_are_finite_and_right():
             for s in (1.0, -1.0)
         )
         np.testing.assert_allclose(np.sum(slope * step), (up - down) / 2.0, rtol=1e-5, atol=1e-12)
+
+
+def test_tables_of_rates_and_of_increments():
+    time_ns = np.rint(1e9 * np.cumsum(DT)).astype(np.int64)
+    dt = np.diff(time_ns, prepend=2 * time_ns[0] - time_ns[1]) * 1e-9
+    model = gyro(**(PLAIN | {"bias": 2.0, "scale": 0.1}))
+    table = ImuTable(time_ns, THETA, DV, "increment", body="RFU", source="here")
+    got, truth = corrupt_table(table, model, KEY)
+    np.testing.assert_allclose(got.gyro, 1.1 * THETA + 2.0 * dt[:, None], rtol=1e-12, atol=1e-17)
+    np.testing.assert_array_equal(bits(got.accel), bits(DV))
+    np.testing.assert_array_equal(truth.gyro.bias, np.full((N, 3), 2.0))
+    assert (got.kind, got.body, got.source) == ("increment", "RFU", "here")
+    rates = ImuTable(time_ns, THETA, DV, "rate")
+    got, _ = corrupt_table(rates, model, KEY)
+    np.testing.assert_allclose(got.gyro, 1.1 * THETA + 2.0, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(got.accel, DV, rtol=1e-15)
+    for bad in (time_ns[:1], time_ns[[0, 2, 1]], time_ns[[0, 0]]):
+        rows = slice(len(bad))
+        with pytest.raises(ValueError, match="two rows and time that increases"):
+            corrupt_table(ImuTable(bad, THETA[rows], DV[rows], "rate"), model, KEY)
 
 
 @pytest.mark.parametrize(

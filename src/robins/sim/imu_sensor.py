@@ -15,15 +15,18 @@ All is pure JAX: map over ``key`` for a batch of runs, and over a stacked model 
 
 from __future__ import annotations
 
+import dataclasses
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.dataset import ImuTable
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 
 # What follows is part of the file format, as `robins.sim.random.Component` is: a table of normal
@@ -170,6 +173,31 @@ def corrupt(
         lambda carry, x: _sample(imu, carry, *x), state, (normals, dt, turned, pushed)
     )
     return reported_theta, reported_dv, _truth(imu, seen)
+
+
+_compiled = jax.jit(corrupt)
+
+
+def corrupt_table(imu: ImuTable, model: ImuErrorModel, key: Array) -> tuple[ImuTable, ImuTruth]:
+    """`corrupt` for a table of ideal samples, rates or increments; the errors have its body axes.
+
+    A rate is taken for the mean over the interval that ends with it. The interval of the first row
+    is not in the table; it counts as long as that of the second.
+
+    Raises:
+        ValueError: fewer than two rows, or time that does not increase.
+    """
+    dt = np.diff(imu.time_ns) * 1e-9
+    if len(dt) == 0 or np.any(dt <= 0.0):
+        raise ValueError(
+            f"{imu.source or 'imu'}: {len(imu)} row(s) with sampling intervals from "
+            f"{np.min(dt, initial=np.inf):g} s: two rows and time that increases are needed"
+        )
+    dt = np.concatenate([dt[:1], dt])
+    per_row = dt[:, None] if imu.kind == "rate" else np.ones((len(dt), 1))
+    theta, dv, truth = _compiled(dt, imu.gyro * per_row, imu.accel * per_row, model, key)
+    gyro, accel = np.asarray(theta) / per_row, np.asarray(dv) / per_row
+    return dataclasses.replace(imu, gyro=gyro, accel=accel), truth
 
 
 def _switch_on(errors: TriadErrors, numbers: Array) -> tuple[_Triad, Any]:
