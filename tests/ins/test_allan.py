@@ -12,6 +12,7 @@ from robins.ins.allan import (
     deviation,
     fit,
     in_field_units,
+    term_curves,
     triad_errors,
 )
 from robins.ins.allan_noise import moments
@@ -248,6 +249,22 @@ def test_field_units():
     np.testing.assert_allclose(accel["velocity_random_walk"].value, 60.0 * got.value.N, rtol=1e-12)
     np.testing.assert_allclose(accel["noise_density"].value, got.value.N / 9.80665e-6, rtol=1e-12)
     assert accel["ramp"].unit == "ug/h"
+
+
+def test_term_curves_add_up_to_the_model():
+    tau = np.array([0.1, 3.0, 200.0])
+    terms = Coefficients(*(np.array([x, 2.0 * x]) for x in (0.1, 1.0, 0.3, 0.02, 1e-3)))
+    curves = term_curves(terms, tau)
+    assert curves.shape == (5, 3, 2)
+    for axis, factor in enumerate((1.0, 2.0)):
+        model = TriadErrors(
+            quantum=0.1 * np.sqrt(12.0) * factor,
+            white=factor,
+            walk=0.02 * factor,
+            ramp=1e-3 * factor,
+        )
+        rest = allan_deviation(model, tau)[:, 0] ** 2 + (FLICKER_FLAT * 0.3 * factor) ** 2
+        np.testing.assert_allclose(np.sum(curves[:, :, axis] ** 2, axis=0), rest, rtol=1e-12)
 
 
 GOOD = np.random.default_rng(7).standard_normal((100, 3))

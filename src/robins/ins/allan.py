@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.special import chdtri, ndtri
 
-from robins.ins.allan_noise import TERMS, Moments, moments
+from robins.ins.allan_noise import TERMS, Moments, mean_variances, moments
 from robins.ins.imu_errors import FLICKER_FLAT, MARKOV_PEAK, TriadErrors
 from robins.units import from_si
 
@@ -189,6 +189,16 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     )
     chi2 = np.array([c[2] for c in columns])
     return AllanFit(value, lower, upper, chi2, len(keep) - len(terms), terms, confidence)
+
+
+def term_curves(coefficients: Coefficients, tau_s: np.ndarray) -> np.ndarray:
+    """Allan deviation (5, T, A) of each term Q, N, B, K, R; the whole is the root of their squares.
+
+    Args:
+        coefficients: of a fit, or of a data sheet in SI.
+        tau_s: (T,) cluster times [s].
+    """
+    return np.sqrt(mean_variances(tau_s).T)[:, :, None] * np.stack(coefficients)[:, None, :]
 
 
 class Interval(NamedTuple):

@@ -54,6 +54,12 @@ class Moments(NamedTuple):
         return 2.0 * (p @ self.mean.T) ** 2 / variance
 
 
+def mean_variances(tau_s: np.ndarray) -> np.ndarray:
+    """Allan variance (T, 5) at cluster times (T,) of each term with coefficient one."""
+    flat = np.full(len(tau_s), 2.0 * np.log(2.0) / np.pi)
+    return np.stack([3.0 / tau_s**2, 1.0 / tau_s, flat, tau_s / 3.0, tau_s**2 / 2.0], axis=-1)
+
+
 def moments(clusters: np.ndarray, n_samples: int, dt_s: float) -> Moments:
     """Moments of the overlapping Allan variances of n rate samples at the cluster sizes given.
 
@@ -63,8 +69,7 @@ def moments(clusters: np.ndarray, n_samples: int, dt_s: float) -> Moments:
         dt_s: sampling interval [s].
     """
     tau = clusters * dt_s
-    flat = np.full(len(tau), 2.0 * np.log(2.0) / np.pi)
-    mean = np.stack([3.0 / tau**2, 1.0 / tau, flat, tau / 3.0, tau**2 / 2.0], axis=-1)
+    mean = mean_variances(tau)
     count = len(clusters)
     quadratic, ramp = np.zeros((count, count, 4, 4)), np.zeros((count, count, 4))
     unit = np.array([1.0, dt_s, dt_s**2, dt_s**3])
