@@ -114,7 +114,7 @@ def is_static(
     if abs(size_f - g) > largest_g_error:
         reasons.append(
             f"the mean specific force is {size_f:.4g} m/s^2, {g:.4g} m/s^2 within "
-            f"{largest_g_error:g} m/s^2 are expected"
+            f"{largest_g_error:g} m/s^2 are expected{_hint_of_g(size_f)}"
         )
     return StaticCheck(not reasons, tuple(reasons), mean_omega, mean_f, sigma_omega, sigma_f)
 
@@ -358,12 +358,16 @@ def _specific_force(f_b: ArrayLike) -> np.ndarray:
     _refuse_bad_vectors("f_b", f)
     size = np.linalg.norm(f, axis=-1)
     if np.any(size < 0.5 * 9.80665):
-        hint = "; are the values in g?" if np.all(np.abs(size - 1.0) < 0.1) else ""
         raise ValueError(
             f"the mean specific force is {size} m/s^2: without a reaction to gravity (free fall) "
-            f"there is no level{hint}"
+            f"there is no level{_hint_of_g(size)}"
         )
     return f
+
+
+def _hint_of_g(size: ArrayLike) -> str:
+    near_one = np.abs(np.asarray(size, float) - 1.0) < 0.1
+    return "; are the values in g?" if np.all(near_one) else ""
 
 
 def _refuse_bad_vectors(name: str, x: np.ndarray) -> None:
