@@ -3,17 +3,41 @@
 - `frames`: NED/FRD and ENU/RFU, the same thing relabelled.
 - `increments`: IMU samples to rotation vectors and velocity increments.
 - `mechanise`: attitude, velocity and position from increments (``step``, ``mechanise``).
+- `imu_errors`, `imu_grades`: what is wrong with gyros and accelerometers, from data sheets.
+- `allan`: Allan deviation with bounds, and the noises fitted to it (import it by its name).
+- `alignment`: attitude at rest, from gravity, Earth rate or velocity.
 """
 
+from robins.ins.alignment import (
+    Alignment,
+    StaticCheck,
+    align,
+    gyrocompass,
+    heading_from_velocity,
+    is_static,
+    level,
+)
 from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
+from robins.ins.imu_errors import ImuErrorModel, TriadErrors
+from robins.ins.imu_grades import grade
 from robins.ins.increments import Increments, from_imu, thin
 from robins.ins.mechanise import Nav, as_trajectory, nav_at, refuse_polar
 
 __all__ = [
+    "Alignment",
+    "ImuErrorModel",
     "Increments",
     "Nav",
+    "StaticCheck",
+    "TriadErrors",
+    "align",
     "as_trajectory",
     "from_imu",
+    "grade",
+    "gyrocompass",
+    "heading_from_velocity",
+    "is_static",
+    "level",
     "nav_at",
     "refuse_polar",
     "swap",

@@ -2,17 +2,33 @@
 
 - `trajectory`: smooth motions from waypoints, velocity or a sine.
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
+- `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
+- `random`: streams of random numbers by seed, run and component.
 """
 
+from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments, ideal_rates, true_increments
+from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
+from robins.sim.random import Component, generator, stream
 from robins.sim.trajectory import Motion, from_velocity, from_waypoints, sine_velocity
 
 __all__ = [
+    "Component",
+    "GnssErrorModel",
+    "GnssFixes",
+    "ImuTruth",
     "Motion",
+    "as_table",
+    "corrupt",
+    "corrupt_table",
+    "fix_times",
     "from_velocity",
     "from_waypoints",
+    "generator",
     "ideal_increments",
     "ideal_rates",
+    "observe",
     "sine_velocity",
+    "stream",
     "true_increments",
 ]
