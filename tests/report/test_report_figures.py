@@ -492,6 +492,11 @@ def test_odd_results_are_drawn_without_complaint(change, drive, town):
         picture.figure.canvas.draw()
 
 
+def test_the_scatter_of_one_run_is_not_drawn(town):
+    one = a_drive(1, runs=1, seconds=20.0)
+    assert [picture.name for picture in report.pictures(one, town)] == ["anees", "comparison"]
+
+
 def test_a_result_without_series_has_at_least_its_comparison(town):
     assert [picture.name for picture in report.pictures(None, town)] == ["comparison"]
     assert series.filters(an_allan_curve()) == []

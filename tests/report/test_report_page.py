@@ -21,6 +21,7 @@ ORIGIN = report.Origin(
     device="cpu",
     versions={"robins": "0.1.0", "numpy": "2.0"},
     created_utc="2030-01-01 00:00 UTC",
+    notes=("Nobody drove.",),
 )
 _EMPTY = {"meta", "img", "br", "hr", "link", "input"}
 
@@ -71,7 +72,7 @@ def test_the_page_holds_the_whole_summary(text, town):
     reader = Reader(text)
     words = reader.words
     for expected in (
-        *("ins_gnss/town", "2 filters", "1 run", "seed 7", "kalman", "robust"),
+        *("ins_gnss/town", "1 run", "Nobody drove.", "seed 7", "kalman", "robust"),
         *("Horizontal RMS m 0.0213 0.03621", "Attitude RMS arcmin 3.21 5.457"),
         *("Velocity RMS m/s 0.021, 0.019, 0.03", "Worst step µs – –"),
         "1 of 2 claims reproduced, 1 partly.",
@@ -116,7 +117,9 @@ def test_hostile_names_are_printed_and_not_obeyed(town):
             "counts": {hostile: 3},
         },
         [],
-        report.Origin(hostile, f"</pre>{hostile}", hostile, {hostile: hostile}, hostile),
+        report.Origin(
+            hostile, f"</pre>{hostile}", hostile, {hostile: hostile}, hostile, (hostile,)
+        ),
     )
     reader = Reader(page)
     assert "script" not in reader.tags

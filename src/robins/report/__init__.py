@@ -8,7 +8,7 @@ listed in `robins.results`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,9 @@ def _drawings(
     solution: xr.Dataset | None, summary: Mapping[str, Any]
 ) -> list[Callable[[], Picture | None]]:
     """What to draw, in the order of the page."""
-    last = [lambda: comparison(summary)]
+    # Columns of a summary without filters are something else, such as the axes of a sensor.
+    compared = solution is None or "filter" in solution.sizes
+    last: list[Callable[[], Picture | None]] = [lambda: comparison(summary)] if compared else []
     if solution is None:
         return last
     ds = solution
@@ -63,6 +65,8 @@ def _drawings(
     for block in series.find(ds, "error"):
         drawings.append(lambda block=block: errors(ds, block))
     for block in series.find(ds, "rms"):
+        if ds[f"rms_{block}"].attrs.get("runs", 2) == 1:
+            continue  # the error itself, without its sign
         drawings.append(lambda block=block: campaign(ds, block))
     for block in series.find(ds, "estimate"):
         # Beside its error an estimate tells something new only where it should settle on a value.
@@ -80,8 +84,15 @@ def _drawings(
     return drawings + last
 
 
-def add(writer: results.ResultWriter, progress: Progress | None = None) -> None:
+def add(
+    writer: results.ResultWriter, progress: Progress | None = None, notes: Sequence[str] = ()
+) -> None:
     """Draw the figures and the page of a result being written, after its solution and summary.
+
+    Args:
+        writer: of the result.
+        progress: called with done, total and a word on what is done.
+        notes: sentences for the reader, printed below the verdict.
 
     Raises:
         ResultError: the writer has no summary yet, or the disk refused.
@@ -98,7 +109,10 @@ def add(writer: results.ResultWriter, progress: Progress | None = None) -> None:
             drawn.append(draw(picture))
             writer.save_file(f"figures/{picture.name}.png", drawn[-1].png())
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    origin = Origin(writer.command, writer.scenario_text, writer.device, results.versions(), now)
+    versions = results.versions()
+    origin = Origin(
+        writer.command, writer.scenario_text, writer.device, versions, now, tuple(notes)
+    )
     writer.save_report(page(writer.summary, drawn, origin))
     if progress is not None:
         progress(len(drawings), len(drawings), "drawing figures")

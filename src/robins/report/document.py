@@ -26,6 +26,7 @@ class Origin(NamedTuple):
     device: str
     versions: Mapping[str, str]
     created_utc: str
+    notes: Sequence[str] = ()  # sentences for the reader
 
 
 def page(
@@ -40,9 +41,7 @@ def page(
 def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
     title = escape(summary["scenario"])
     runs = "1 run" if summary["runs"] == 1 else f"{summary['runs']} runs"
-    filters = len(summary["filters"])
     meta = [
-        f"{filters} filter{'' if filters == 1 else 's'}",
         runs,
         f"seed {summary['seed']}",
         f"{numbers.show(summary['seconds'])} s on {escape(origin.device)}",
@@ -66,6 +65,7 @@ def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
 <h1>{title}</h1>
 <p class="meta">{" · ".join(meta)}</p>
 {_verdict(summary["claims"])}
+{_notes(origin.notes)}
 </header>
 {_metrics(summary["filters"])}
 {_claims(summary["claims"])}
@@ -83,6 +83,10 @@ def _verdict(claims: Sequence[Mapping[str, Any]]) -> str:
     worst = next((v for v in ("not", "partly", "reproduced") if v in verdicts), "")
     sign = f"{_SIGNS[worst]} " if worst else ""
     return f'<p class="verdict {worst}">{sign}{escape(numbers.verdict(claims))}</p>'
+
+
+def _notes(notes: Sequence[str]) -> str:
+    return "\n".join(f'<p class="note">{escape(note)}</p>' for note in notes)
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = "") -> str:

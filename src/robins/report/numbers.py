@@ -3,40 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-# What a metric name may end in, and how the unit is printed.
-_UNITS = {
-    "_m_per_s": "m/s",
-    "_m_s": "m/s",
-    "_mm_per_s": "mm/s",
-    "_deg_per_h": "deg/h",
-    "_deg_h": "deg/h",
-    "_deg_per_s": "deg/s",
-    "_deg_per_sqrt_h": "deg/sqrt(h)",
-    "_m_per_s_per_sqrt_h": "m/s/sqrt(h)",
-    "_rad_per_s": "rad/s",
-    "_m_per_s2": "m/s²",
-    "_ug_per_sqrt_hz": "ug/sqrt(Hz)",
-    "_arcsec": "arcsec",
-    "_arcmin": "arcmin",
-    "_mrad": "mrad",
-    "_rad": "rad",
-    "_deg": "deg",
-    "_percent": "%",
-    "_mg": "mg",
-    "_ug": "µg",
-    "_km": "km",
-    "_mm": "mm",
-    "_cm": "cm",
-    "_m": "m",
-    "_hz": "Hz",
-    "_us": "µs",
-    "_ms": "ms",
-    "_s": "s",
-    "_h": "h",
+# What the unit at the end of a metric's name is made of, and how that is printed.
+_PARTS = {
+    **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
+    **{u: u for u in ("h", "mg")},
+    **{"ug": "µg", "us": "µs", "s2": "s²", "hz": "Hz", "percent": "%"},
+    **{"sqrt_h": "√h", "sqrt_s": "√s", "sqrt_hz": "√Hz"},
 }
+_PART = "|".join(sorted(_PARTS, key=len, reverse=True))
+_UNIT = re.compile(rf"_((?:{_PART})(?:_per_(?:{_PART}))*)$")
 _CAPITALS = {
     *(
         "rms",
@@ -69,9 +48,10 @@ class Label(NamedTuple):
 
 def label(metric: str) -> Label:
     """Words and unit of a metric's name."""
-    ending = next((e for e in sorted(_UNITS, key=len, reverse=True) if metric.endswith(e)), "")
-    text = words(metric.removesuffix(ending)) or metric
-    return Label(text[:1].upper() + text[1:], _UNITS.get(ending, ""))
+    unit = _UNIT.search(metric)
+    text = words(metric[: unit.start()] if unit else metric) or metric
+    told = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
+    return Label(text[:1].upper() + text[1:], told)
 
 
 def words(name: str) -> str:

@@ -96,6 +96,11 @@ def _points(axes: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
     axes.plot(x, y, linestyle="", marker=mark, color=style.colour(i), **look)
 
 
+def _is_smooth(solution: xr.Dataset, name: str) -> bool:
+    """The mean of many runs is a line; one run is a cloud."""
+    return solution[name].attrs.get("runs", 1) > 1
+
+
 def _statistic(
     axes: Axes, solution: xr.Dataset, name: str, degrees_from: str, clock: series.Clock
 ) -> str:
@@ -105,7 +110,7 @@ def _statistic(
     values, x = data.values[..., 0], data.x / clock.seconds
     limits = band(solution, name, degrees_from)
     filters = series.filters(solution)
-    joined = name == "anees"  # the mean of many runs is smooth; one run is a cloud
+    joined = _is_smooth(solution, name)
     for i in range(len(filters)):
         if joined:
             look = {"color": style.colour(i), "linestyle": style.line(i), "linewidth": 0.9}
@@ -154,7 +159,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
     limits = band(solution, name)
     filters = series.filters(solution)
     keys = [_dot(f, i) for i, f in enumerate(filters)]
-    if name == "anees":
+    if _is_smooth(solution, name):
         keys = style.filter_keys(filters)
     if limits is not None:
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
