@@ -1,4 +1,4 @@
-"""Systems: one problem each, with its model, scenarios, filters and claims; here is the registry."""
+"""Systems: one problem each, with model, scenarios, filters and claims; here is the registry."""
 
 from robins.systems import ins_gnss
 from robins.systems.system import (

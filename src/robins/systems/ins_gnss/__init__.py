@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from robins.systems.ins_gnss.answer import replay
 from robins.systems.ins_gnss.drive import drive_problem
 from robins.systems.ins_gnss.drive_claims import CLAIMS
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
+from robins.systems.ins_gnss.replay import replay
 from robins.systems.ins_gnss.setup import FILTERS, SMOOTHED
 from robins.systems.system import System
 

@@ -15,8 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Array
-from robins.ins.state import InsState
-from robins.systems.ins_gnss.legs import motion_of
 
 from robins.earth import Geodetic
 from robins.filters import Belief
@@ -24,6 +22,7 @@ from robins.ins.blocks import Blocks, cut, epochs_between
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise, nav_at
+from robins.ins.state import InsState
 from robins.manifold import retract
 from robins.results import variable
 from robins.sim.gnss_sensor import GnssErrorModel, fix_times, observe
@@ -33,7 +32,8 @@ from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion
 from robins.systems.ins_gnss import model as names
 from robins.systems.ins_gnss.drive_claims import drive_claims, drive_metrics
-from robins.systems.ins_gnss.model import Block, Fix
+from robins.systems.ins_gnss.legs import motion_of
+from robins.systems.ins_gnss.model import Block, Fix, Velocity
 from robins.systems.ins_gnss.outages import outage_mask
 from robins.systems.ins_gnss.parameters import Drive, Imu
 from robins.systems.ins_gnss.setup import (
@@ -197,8 +197,11 @@ def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     }
     aux = {
         names.POSITION: Fix(jnp.broadcast_to(r * jnp.asarray(drive.gnss.sigma), shape), rate),
-        names.VELOCITY: Fix(
-            jnp.broadcast_to(r * jnp.asarray(drive.gnss.velocity_sigma), shape), rate
+        names.VELOCITY: Velocity(
+            jnp.broadcast_to(r * jnp.asarray(drive.gnss.velocity_sigma), shape),
+            rate,
+            jnp.zeros(shape),
+            jnp.zeros(shape[0]),
         ),
     }
     if not drive.gnss.use_velocity:

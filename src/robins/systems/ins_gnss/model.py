@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
-from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
-from robins.earth import earth_rate_n
+from robins.earth import Geodetic, earth_rate_n, gravity_n
 from robins.filters import Model, Motion, Sensor
 from robins.ins.increments import Increments
+from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "gnss_position",
@@ -35,10 +35,23 @@ class Block(NamedTuple):
 
 
 class Fix(NamedTuple):
-    """What GNSS sensors need besides the state."""
+    """What a GNSS position needs besides the state."""
 
-    sigma: ArrayLike  # (3,) m or m/s, north east down
+    sigma: ArrayLike  # (3,) m, north east down
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
+
+
+class Velocity(NamedTuple):
+    """What a GNSS velocity needs besides the state.
+
+    A receiver that differences positions states the mean velocity over a window up to the fix. It
+    is older than the fix by what the vehicle gained since, on average over the window.
+    """
+
+    sigma: ArrayLike  # (3,) m/s, north east down
+    omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
+    gained_b: ArrayLike = (0.0, 0.0, 0.0)  # (3,) m/s, raw, in body axes at the fix
+    age_s: ArrayLike = 0.0  # s, mean age over the window: half its length
 
 
 class Mount(NamedTuple):
@@ -50,7 +63,7 @@ class Mount(NamedTuple):
 
 
 def _step(noise: InsNoise, x: InsState, block: Block) -> InsState:
-    return propagate(x, block.increments)
+    return propagate(x, block.increments, noise)
 
 
 def _step_linear(noise: InsNoise, x: InsState, block: Block):
@@ -72,16 +85,23 @@ def antenna_velocity(x: InsState, mount: Mount, omega_b: Array) -> Array:
     return x.v_n + x.q_nb.apply(jnp.cross(turn_rate_b(x, omega_b), mount.lever_b))
 
 
-def _read_position(mount: Mount, x: InsState, fix: Fix):
+def read_position(mount: Mount, x: InsState, omega_b: Array) -> Geodetic:
+    """Where the antenna was when the fix that comes now was true."""
     arm = x.q_nb.apply(mount.lever_b)
-    return x.position.retract(arm - antenna_velocity(x, mount, fix.omega_b) * mount.latency_s)
+    return x.position.retract(arm - antenna_velocity(x, mount, omega_b) * mount.latency_s)
 
 
-def _read_velocity(mount: Mount, x: InsState, fix: Fix):
-    return antenna_velocity(x, mount, fix.omega_b)
+def _read_position(mount: Mount, x: InsState, fix: Fix):
+    return read_position(mount, x, jnp.asarray(fix.omega_b))
 
 
-def _fix_sigma(x: InsState, fix: Fix):
+def _read_velocity(mount: Mount, x: InsState, fix: Velocity):
+    gained_b = jnp.asarray(fix.gained_b) - x.accel_bias * fix.age_s
+    gained = x.q_nb.apply(gained_b) + gravity_n(x.position.lat, x.position.alt) * fix.age_s
+    return antenna_velocity(x, mount, jnp.asarray(fix.omega_b)) - gained
+
+
+def _fix_sigma(x: InsState, fix: Fix | Velocity):
     return fix.sigma
 
 
@@ -116,7 +136,7 @@ def ins_gnss_model(
 
     Returns:
         A model with sensors, in order: "gnss_position" (a `Geodetic`, aux `Fix`),
-        "gnss_velocity" ((3,) NED, aux `Fix`), "zero_velocity" ((3,), zeros), "zero_rate" ((3,)
+        "gnss_velocity" ((3,) NED, aux `Velocity`), "zero_velocity" ((3,), zeros), "zero_rate" ((3,)
         mean gyro rate at rest) and "non_holonomic" ((2,) zeros; aux mean gyro rate). A sensor is
         silent at an epoch where its measurement is NaN, and left out of a run that does not name
         it.

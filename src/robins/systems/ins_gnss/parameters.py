@@ -38,6 +38,8 @@ class Gnss(Parameters):
     lever_arm: Annotated[Three, Quantity("length")] = default("0 m")  # IMU to antenna, body
     latency: Annotated[float, Quantity("time")] = default("0 s")
     use_velocity: bool = True
+    # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix
+    velocity_window: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
     # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
     sigma_factor: dict[str, float] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import jax.numpy as jnp
 import numpy as np
-from robins.ins.state import InsNoise, InsState
 
 from robins.earth import Geodetic
 from robins.filters import Belief, Filter, Model, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
+from robins.ins.state import InsNoise, InsState
 from robins.rotation import Rotation
 from robins.systems.ins_gnss.model import (
     POSITION,
@@ -51,24 +52,38 @@ def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
 
 
 def noise_of(imu: Imu) -> InsNoise:
-    """Noise of the inertial sensors, SI."""
-    never = jnp.inf
+    """Noise of the inertial sensors, SI.
+
+    A Gauss-Markov bias of spread s and time tau is driven by noise of density s sqrt(2 / tau).
+    """
+
+    def drive(walk, spread, time):
+        if time is None:
+            return jnp.asarray(walk), jnp.full(3, jnp.inf)
+        return jnp.asarray(spread) * math.sqrt(2.0 / time), jnp.full(3, time)
+
+    gyro_walk, gyro_time = drive(imu.gyro_bias_walk, imu.gyro_bias, imu.gyro_bias_time)
+    accel_walk, accel_time = drive(imu.accel_bias_walk, imu.accel_bias, imu.accel_bias_time)
     return InsNoise(
         gyro_arw=jnp.asarray(imu.gyro_noise),
         accel_vrw=jnp.asarray(imu.accel_noise),
-        gyro_bias_rw=jnp.asarray(imu.gyro_bias_walk),
-        accel_bias_rw=jnp.asarray(imu.accel_bias_walk),
-        gyro_bias_tau=jnp.full(3, never if imu.gyro_bias_time is None else imu.gyro_bias_time),
-        accel_bias_tau=jnp.full(3, never if imu.accel_bias_time is None else imu.accel_bias_time),
+        gyro_bias_rw=gyro_walk,
+        accel_bias_rw=accel_walk,
+        gyro_bias_tau=gyro_time,
+        accel_bias_tau=accel_time,
     )
+
+
+def mount_of(gnss: Gnss, aids: Aids) -> Mount:
+    """Lever arms and latency."""
+    return Mount(jnp.asarray(gnss.lever_arm), jnp.asarray(gnss.latency), jnp.asarray(aids.axle))
 
 
 def model_of(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
     """The model a filter believes in."""
-    mount = Mount(jnp.asarray(gnss.lever_arm), jnp.asarray(gnss.latency), jnp.asarray(aids.axle))
     return ins_gnss_model(
         noise_of(imu),
-        mount,
+        mount_of(gnss, aids),
         standstill_sigma=jnp.full(3, aids.standstill_velocity),
         still_rate_sigma=jnp.full(3, aids.standstill_rate),
         road_sigma=jnp.asarray(aids.road_velocity),
