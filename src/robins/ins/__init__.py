@@ -3,6 +3,8 @@
 - `frames`: NED/FRD and ENU/RFU, the same thing relabelled.
 - `increments`: IMU samples to rotation vectors and velocity increments.
 - `mechanise`: attitude, velocity and position from increments (``step``, ``mechanise``).
+- `state`: the state of an aided INS, moved over a block, alone or with how errors go through it.
+- `errors`: the error dynamics F and G.
 - `imu_errors`, `imu_grades`: what is wrong with gyros and accelerometers, from data sheets.
 - `allan`: Allan deviation with bounds, and the noises fitted to it (import it by its name).
 - `alignment`: attitude at rest, from gravity, Earth rate or velocity.
@@ -17,21 +19,26 @@ from robins.ins.alignment import (
     is_static,
     level,
 )
+from robins.ins.errors import error_dynamics
 from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.imu_grades import grade
 from robins.ins.increments import Increments, from_imu, thin
 from robins.ins.mechanise import Nav, as_trajectory, nav_at, refuse_polar
+from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 __all__ = [
     "Alignment",
     "ImuErrorModel",
     "Increments",
+    "InsNoise",
+    "InsState",
     "Nav",
     "StaticCheck",
     "TriadErrors",
     "align",
     "as_trajectory",
+    "error_dynamics",
     "from_imu",
     "grade",
     "gyrocompass",
@@ -39,6 +46,8 @@ __all__ = [
     "is_static",
     "level",
     "nav_at",
+    "propagate",
+    "propagate_linear",
     "refuse_polar",
     "swap",
     "swap_q",

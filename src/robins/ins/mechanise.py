@@ -48,7 +48,7 @@ def step(nav: Nav, inc: Increments) -> Nav:
 
     An increment that is all zero returns `nav` bit for bit, so blocks may be padded with them.
     """
-    return _nav(_advance(_vector(nav), _row(inc)))
+    return unpacked(advance(vector(nav), rows(inc)))
 
 
 @jax.jit
@@ -59,11 +59,11 @@ def mechanise(nav: Nav, increments: Increments) -> Nav:
     """
 
     def body(x, row):
-        x = _advance(x, row)
+        x = advance(x, row)
         return x, x
 
-    _, path = lax.scan(body, _vector(nav), _row(increments))
-    return _nav(path)
+    _, path = lax.scan(body, vector(nav), rows(increments))
+    return unpacked(path)
 
 
 def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> Nav:
@@ -130,18 +130,19 @@ def as_trajectory(time_ns: np.ndarray, nav: Nav, source: str = "") -> Trajectory
 # ---------------------------------------------------------------------- the step on plain vectors
 
 
-def _vector(nav: Nav) -> Float[Array, "*b 10"]:
+def vector(nav: Nav) -> Float[Array, "*b 10"]:
     """State as the step carries it: q_nb, v_n, lat, lon, alt."""
     p = nav.position
     lla = jnp.stack([jnp.asarray(a, float) for a in (p.lat, p.lon, p.alt)], -1)
     return jnp.concatenate([jnp.asarray(nav.q_nb.wxyz), jnp.asarray(nav.v_n), lla], -1)
 
 
-def _nav(x: Float[Array, "*b 10"]) -> Nav:
+def unpacked(x: Float[Array, "*b 10"]) -> Nav:
+    """The state in a `vector`."""
     return Nav(Rotation(x[..., :4]), x[..., 4:7], Geodetic(x[..., 7], x[..., 8], x[..., 9]))
 
 
-def _row(inc: Increments) -> Float[Array, "*b 11"]:
+def rows(inc: Increments) -> Float[Array, "*b 11"]:
     """What a step needs of an increment and nothing else depends on: dt, exp(theta/2), dv, dr."""
     inc = Increments(*(None if a is None else jnp.asarray(a, float) for a in inc))
     q_bb = rotation.from_rotvec(inc.theta)
@@ -195,7 +196,7 @@ def _rotate(q, v):
 
 
 @one_kernel
-def _advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"]:
+def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"]:
     """The step, on scalars: see `robins.ins.kernel` for why."""
     w, qx, qy, qz, v_north, v_east, v_down, lat, lon, alt = x
     dt, *rest = row

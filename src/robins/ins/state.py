@@ -1,0 +1,132 @@
+"""The state of an aided INS: attitude, velocity, position and what its sensors do wrong.
+
+A sensor reads ``raw = (1 + scale) true + bias``, component by component in body axes. `step` and
+`propagate` undo that and mechanise; `propagate_linear` also says how small errors go through a
+whole block of samples, so that a filter propagates its covariance once for the block.
+
+The state is a pytree on a manifold: `robins.manifold.retract` and `local` work on it, and its
+tangent vector is the error state of `robins.ins.errors`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.earth import Geodetic
+from robins.ins.errors import decay_rates, scale_of
+from robins.ins.increments import Increments, displacement
+from robins.ins.mechanise import Nav, advance, rows, unpacked, vector
+from robins.ins.transition import linearise
+from robins.rotation import Rotation
+
+Perturbation = Any  # a number or (3,) body axes
+
+
+class InsState(NamedTuple):
+    """One state. Scale factors are states only where given; else the pytree does not hold them."""
+
+    q_nb: Rotation  # body FRD to navigation NED
+    v_n: Array  # (3,) m/s
+    position: Geodetic
+    gyro_bias: Array  # (3,) rad/s
+    accel_bias: Array  # (3,) m/s^2
+    gyro_scale: Array | None = None  # (3,)
+    accel_scale: Array | None = None  # (3,)
+
+    @classmethod
+    def start(cls, nav: Nav, scales: bool = False) -> InsState:
+        """At `nav`, with sensors believed perfect."""
+        scale = jnp.zeros(3) if scales else None
+        return cls(*nav, jnp.zeros(3), jnp.zeros(3), scale, scale)
+
+    @property
+    def nav(self) -> Nav:
+        """Attitude, velocity and position alone."""
+        return Nav(self.q_nb, self.v_n, self.position)
+
+
+class InsNoise(NamedTuple):
+    """Noise of the sensors and of the drift of their errors: numbers, or (3,) by body axis."""
+
+    gyro_arw: Perturbation  # rad/sqrt(s), angle random walk
+    accel_vrw: Perturbation  # m/s/sqrt(s), velocity random walk
+    gyro_bias_rw: Perturbation = 0.0  # rad/s/sqrt(s)
+    accel_bias_rw: Perturbation = 0.0  # m/s^2/sqrt(s)
+    gyro_bias_tau: Perturbation = jnp.inf  # s, of a first-order Markov process; inf: random walk
+    accel_bias_tau: Perturbation = jnp.inf  # s
+    gyro_scale_rw: Perturbation = 0.0  # 1/sqrt(s)
+    accel_scale_rw: Perturbation = 0.0  # 1/sqrt(s)
+
+
+def step(x: InsState, inc: Increments, noise: InsNoise | None = None) -> InsState:
+    """Move over one raw increment (scalar dt). The biases decay with the time constants of `noise`.
+
+    An increment that is all zero returns x unchanged.
+    """
+    one = Increments(*(None if a is None else jnp.asarray(a, float)[None] for a in inc))
+    return propagate(x, one, noise)
+
+
+def propagate(x: InsState, block: Increments, noise: InsNoise | None = None) -> InsState:
+    """Move over a block of K raw increments (leading axis); zero ones change nothing."""
+    x, *_ = _moved(x, block, noise)
+    return x
+
+
+def propagate_linear(
+    x: InsState, block: Increments, noise: InsNoise, segments: int = 4
+) -> tuple[InsState, Float[Array, "n n"], Float[Array, "n n"]]:
+    """`propagate`, and how errors and noise go through the block.
+
+    See `robins.ins.transition` for the approximations. Zero increments may pad the block.
+
+    Args:
+        x: at the start of the block.
+        block: K raw increments, leading axis.
+        noise: of the sensors.
+        segments: parts of the block in which the navigation frame is taken to turn evenly and
+            noise is sampled; a quarter of a second each is plenty. At most K are used.
+
+    Returns:
+        The state at the end; Phi, with ``error(end) = Phi error(start)``; and a lower-triangular
+        factor L of the covariance Q = L L' that the noise adds to the error.
+    """
+    end, true, starts = _moved(x, block, noise)
+    Phi, L = linearise(x, true, starts, noise, segments)
+    return end, Phi, L
+
+
+def _moved(x: InsState, block: Increments, noise: InsNoise | None):
+    """The state at the end, the corrected increments, and the vectors each of them starts from."""
+    block = Increments(*(None if a is None else jnp.asarray(a, float) for a in block))
+    dt = block.dt[:, None]
+    until = jnp.cumsum(dt, 0)
+    rates = decay_rates(x, noise)
+    fading = jnp.exp(-(until - 0.5 * dt) * rates[None, :6])  # in the middle of each increment
+    gyro_bias = x.gyro_bias[None] * fading[:, :3]
+    accel_bias = x.accel_bias[None] * fading[:, 3:]
+    gyro_gain = 1.0 / (1.0 + scale_of(x, "gyro"))[None]
+    accel_gain = 1.0 / (1.0 + scale_of(x, "accel"))[None]
+    true = Increments(
+        block.dt,
+        (block.theta - gyro_bias * dt) * gyro_gain,
+        (block.dv - accel_bias * dt) * accel_gain,
+        (displacement(block) - 0.5 * accel_bias * dt**2) * accel_gain,
+    )
+
+    def body(at, row):
+        return advance(at, row), at
+
+    last, starts = lax.scan(body, vector(x.nav), rows(true))
+    faded = jnp.exp(-until[-1] * rates)
+    end = x._replace(
+        **unpacked(last)._asdict(),
+        gyro_bias=x.gyro_bias * faded[:3],
+        accel_bias=x.accel_bias * faded[3:6],
+    )
+    return end, true, starts
