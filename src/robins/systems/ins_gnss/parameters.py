@@ -122,7 +122,7 @@ class Place(Parameters):
 class Leg(Parameters):
     """One command of a drive; which quantities it takes depends on what it does."""
 
-    do: Literal["stop", "straight", "accelerate", "turn", "climb", "sine"]
+    do: Literal["stop", "straight", "accelerate", "turn", "climb"]
     seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
     speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
     angle: Annotated[float, Quantity("angle")] | None = None  # positive to the right, or upwards
