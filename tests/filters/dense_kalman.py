@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from robins.filters import Belief, Model, Motion, Sensor
 
@@ -30,13 +31,19 @@ class System(NamedTuple):
     def R(self):
         return self.W @ self.W.T
 
-    def model(self, name: str = "y") -> Model:
-        F, H = jnp.array(self.F), jnp.array(self.H)
-        sensor = Sensor(lambda x, aux: H @ x, jnp.array(self.W), len(self.H), name)
-        return Model(Motion(lambda x, u: F @ x, jnp.array(self.G)), (sensor,))
+    def model(self) -> Model:
+        # Matrices are data, so that systems of one size share one compilation.
+        F, G, H, W = (jnp.array(a) for a in self[:4])
+        sensor = Sensor(Partial(times, H), W, len(self.H))
+        return Model(Motion(Partial(times, F), G), (sensor,))
 
     def start(self) -> Belief:
         return Belief.of(jnp.array(self.m0), self.P0)
+
+
+def times(A, x, unused):
+    """A linear motion or reading."""
+    return A @ x
 
 
 def random_system(seed: int, n: int = 4, m: int = 3, q: int | None = None) -> System:

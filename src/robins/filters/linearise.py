@@ -55,6 +55,14 @@ class Linearisation(NamedTuple):
     observation: Callable[[Belief, Sensor, Any, Any], Observation]
 
 
+def _is_none(leaf):
+    return leaf is None
+
+
+def _shape(leaf):
+    return None if leaf is None else jnp.shape(leaf)
+
+
 def _observe(
     sensor: Sensor, prior: Belief, z: Any, y: Any, aux: Any, spread, excess, size, deficit=None
 ) -> Observation:
@@ -64,12 +72,10 @@ def _observe(
         ValueError: the sensor reads another number of components than it says, or its measurement
             is of another form than its reading.
     """
-    shapes = [
-        jax.tree_util.tree_map(jnp.shape, x, is_leaf=lambda leaf: leaf is None) for x in (z, y)
-    ]
-    if shapes[0] != shapes[1]:
+    reads, given = (jax.tree_util.tree_map(_shape, x, is_leaf=_is_none) for x in (z, y))
+    if reads != given:
         raise ValueError(
-            f"sensor '{sensor.name}' reads shape {shapes[0]}, but was given {shapes[1]} to compare"
+            f"sensor '{sensor.name}' reads shape {reads}, but was given {given} to compare"
         )
     if manifold.dim(z) != sensor.dim:
         raise ValueError(
