@@ -1,11 +1,13 @@
 """Simulation: motions over the Earth and what sensors make of them.
 
 - `trajectory`: smooth motions from waypoints, velocity or a sine.
+- `commands`: smooth motions from manoeuvres (import the manoeuvres by their module).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
 - `random`: streams of random numbers by seed, run and component.
 """
 
+from robins.sim.commands import from_commands
 from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments, ideal_rates, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
@@ -22,6 +24,7 @@ __all__ = [
     "corrupt",
     "corrupt_table",
     "fix_times",
+    "from_commands",
     "from_velocity",
     "from_waypoints",
     "generator",

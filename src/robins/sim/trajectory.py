@@ -163,8 +163,8 @@ def from_waypoints(
             f"({speed.min():.3f} m/s): where it points does not follow from where it goes; pass "
             "q_nb, or use robins.sim.commands"
         )
-    heading = np.arctan2(k.v_n[:, 1], k.v_n[:, 0])
-    return Motion(t[-1], start, path, _attitude(fine, along(k, heading, vehicle)))
+    heading, pitch = np.arctan2(k.v_n[:, 1], k.v_n[:, 0]), np.arctan2(-k.v_n[:, 2], speed)
+    return Motion(t[-1], start, path, _attitude(fine, along(k, heading, pitch, vehicle)))
 
 
 def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np.ndarray) -> Motion:
@@ -216,18 +216,18 @@ def sine_velocity(
     return from_velocity(t, v, start, quaternion(0.0 * heading, pitch, heading))
 
 
-def along(k: Kinematics, heading_rad: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """Attitude q_nb (N, 4) that points along the path; banked, for an aircraft.
+def along(
+    k: Kinematics, heading_rad: np.ndarray, pitch_rad: np.ndarray, vehicle: Vehicle
+) -> np.ndarray:
+    """Attitude q_nb (N, 4) of given heading and pitch, level; or, for an aircraft, banked.
 
     The bank is the one with no specific force to the side, as in a coordinated turn.
     """
-    pitch = np.arctan2(-k.v_n[:, 2], np.hypot(k.v_n[:, 0], k.v_n[:, 1]))
-    roll = np.zeros_like(pitch)
-    level = quaternion(roll, pitch, heading_rad)
-    if vehicle == "aircraft":
-        _, f = k._replace(q_nb=level).rates()
-        roll = np.arctan2(f[:, 1], -f[:, 2])
-    return quaternion(roll, pitch, heading_rad)
+    level = quaternion(np.zeros_like(pitch_rad), pitch_rad, heading_rad)
+    if vehicle == "ground":
+        return level
+    _, f = k._replace(q_nb=level).rates()
+    return quaternion(np.arctan2(f[:, 1], -f[:, 2]), pitch_rad, heading_rad)
 
 
 def quaternion(roll_rad, pitch_rad, heading_rad) -> np.ndarray:
