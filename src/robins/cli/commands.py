@@ -1,0 +1,237 @@
+"""The commands and their options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from robins import __version__
+from robins.cli.frame import BadInput, Status, only_json
+
+DEMO = "ins-gnss/drive"
+_LOGS = click.Path(path_type=Path)
+
+_EXAMPLES = """
+\b
+Examples:
+  robins demo                                    a first look; needs no data
+  robins list                                    what there is to run
+  robins run ins-gnss/drive --runs 20            simulate and compare filters
+  robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
+  robins doctor imu.csv gnss.pos                 is my log fit to navigate?
+  robins replay imu.csv gnss.pos --out walk      navigate it
+  robins allan still.csv                         noise parameters of my IMU
+
+Every command that computes writes a folder with a summary, the time series, figures and a page
+report.html to open in a browser. With --json a command prints one JSON object for scripts.
+
+\b
+Exit status: 0 done, 1 failed, 2 bad input, 3 interrupted (run it again).
+"""
+
+
+def _examples(*lines: str) -> str:
+    """The end of a help text; the control character keeps click from joining its lines."""
+    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
+
+
+class _Group(click.Group):
+    """Keeps the commands in the order in which one meets them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+
+@click.group(cls=_Group, epilog=_EXAMPLES, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="robins")
+@click.option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
+def app() -> None:
+    """Robust inertial navigation: simulate, navigate real logs, compare filters, show how good."""
+
+
+def _option(*names: str, **settings: Any) -> Callable[[Callable], Callable]:
+    return click.option(*names, **settings)
+
+
+def _debug(command: Callable) -> Callable:
+    return _option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")(command)
+
+
+def _json(command: Callable) -> Callable:
+    return _option(
+        "--json", "as_json", is_flag=True, help="Print one JSON object, nothing else, to stdout."
+    )(command)
+
+
+def _out(command: Callable) -> Callable:
+    return _option(
+        "--out", type=_LOGS, metavar="DIR", help="Result folder. [default: results/<name>]"
+    )(command)
+
+
+def _names(_context: click.Context, _option: click.Parameter, text: str | None) -> tuple[str, ...]:
+    if text is None:
+        return ()
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise click.BadParameter(f"{text!r} has an empty name; write it as a,b")
+    return names
+
+
+def _settings(
+    _context: click.Context, _option: click.Parameter, texts: tuple[str, ...]
+) -> tuple[str, ...]:
+    for text in texts:
+        key, equals, _ = text.partition("=")
+        if not equals or not key.strip():
+            raise click.BadParameter(f'{text!r} is not key=value, such as imu.gyro_bias="5 deg/h"')
+    return texts
+
+
+def _choices(command: Callable) -> Callable:
+    """Options that `run` and `replay` share."""
+    for option in (
+        _option("--filters", callback=_names, metavar="a,b", help="Which filters to compare."),
+        _option(
+            "--set",
+            "settings",
+            multiple=True,
+            callback=_settings,
+            metavar="key=value",
+            help="Change a parameter, with its unit; may be repeated.",
+        ),
+        _option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of all noise."),
+    ):
+        command = option(command)
+    return command
+
+
+_RUNS = _option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
+
+
+@app.command(short_help="Simulate a drive and navigate it; ends with PASS or FAIL.")
+@_RUNS
+@_out
+@_json
+@_debug
+def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
+    """Simulate a drive with a GNSS outage and navigate it; ends with PASS or FAIL."""
+    from robins.cli.work import simulate
+
+    out = out or Path("results") / "demo"
+    summary = simulate(DEMO, runs=runs, seed=0, filters=(), settings=(), out=out, as_json=as_json)
+    verdicts = {claim["id"]: claim["verdict"] for claim in summary["claims"]}
+    failed = [name for name, verdict in verdicts.items() if verdict != "reproduced"]
+    passed = bool(verdicts) and not failed
+    if not as_json and passed:
+        click.secho(f"PASS: all {len(verdicts)} claims reproduced.", fg="green", bold=True)
+    elif not as_json:
+        why = ", ".join(failed) or "there are no claims to check"
+        click.secho(f"FAIL: {why}.", fg="red", bold=True)
+    return Status.DONE if passed else Status.FAILED
+
+
+@app.command(
+    short_help="Simulate a scenario with several filters.",
+    epilog=_examples(
+        "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
+        'robins run my.toml --set gnss.sigma="2 m" --json',
+    ),
+)
+@click.argument("scenario")
+@_RUNS
+@_choices
+@_out
+@_json
+@_debug
+def run(scenario: str, out: Path | None, **options: Any) -> None:
+    """Simulate SCENARIO, a name that `robins list` tells or a TOML file, with several filters.
+
+    All filters get the same random numbers; run k of seed S is the same whatever N is.
+    """
+    from robins.cli.work import simulate
+
+    name = Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
+    simulate(scenario, out=out or Path("results") / name, **options)
+
+
+@app.command(
+    short_help="Navigate a recorded log.",
+    epilog=_examples(
+        "robins replay imu.csv gnss.pos --out walk",
+        'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
+    ),
+)
+@click.argument("log", nargs=-1, required=True, type=_LOGS)
+@_RUNS
+@_option("--system", default="ins-gnss", show_default=True, help="What navigates the log.")
+@_choices
+@_out
+@_json
+@_debug
+def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
+    """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
+
+    A file that ends in .toml says what the log does not: noise, mounting, lever arm.
+    """
+    from robins.cli.work import navigate
+
+    if runs not in (None, 1):
+        raise BadInput(f"--runs {runs}: a recorded log is one run; leave the option away.")
+    files = [path for path in log if path.suffix != ".toml"]
+    if not files:
+        raise BadInput(f"{log[0]}: is a configuration; give the files of the log beside it.")
+    navigate(log, out=out or Path("results") / files[0].name.split(".")[0], **options)
+
+
+@app.command(
+    short_help="Judge a log before anyone navigates it.",
+    epilog=_examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
+)
+@click.argument("log", nargs=-1, required=True, type=_LOGS)
+@_json
+@_debug
+def doctor(log: tuple[Path, ...], as_json: bool) -> int:
+    """Judge a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
+
+    Exit status 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... tells how
+    the sensor is mounted, as for `robins replay`.
+    """
+    from robins.cli.examine import examined, told
+
+    with only_json(as_json):
+        found = examined(log)
+    return told(found, log, as_json)
+
+
+@app.command(
+    short_help="Noise parameters of a resting IMU.",
+    epilog=_examples("robins allan still.csv", "robins allan still.csv --terms N --json"),
+)
+@click.argument("log", type=_LOGS)
+@_option("--terms", default="NBK", show_default=True, help="Noises to fit, of Q, N, B, K, R.")
+@_out
+@_json
+@_debug
+def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
+    """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
+
+    Q quantisation, N random walk, B bias instability, K rate random walk, R rate ramp.
+    """
+    from robins.cli.stability import stability
+
+    name = f"allan-{log.name.split('.')[0]}"
+    stability(log, terms, out or Path("results") / name, as_json)
+
+
+@app.command("list", short_help="Name the scenarios, systems, filters and claims.")
+@_json
+@_debug
+def list_(as_json: bool) -> None:
+    """Name the scenarios, systems, filters and claims there are."""
+    from robins.cli.listing import listing
+
+    listing(as_json)

@@ -1,0 +1,54 @@
+"""The command `list`."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+from robins.cli import cache
+from robins.cli.frame import only_json
+
+
+def listing(as_json: bool) -> None:
+    """Print scenarios, systems, filters and claims."""
+    cache.enable()
+    with only_json(as_json):
+        from robins.systems import SYSTEMS
+    known = inventory(SYSTEMS.values())
+    if as_json:
+        click.echo(json.dumps(known, indent=2))
+        return
+    for system in known["systems"]:
+        click.secho(system["name"], bold=True, nl=False)
+        click.echo(f"  {system['summary']}")
+        click.echo(f"  scenarios  {', '.join(system['scenarios']) or 'none'}")
+        click.echo(f"  filters    {', '.join(system['filters'])}")
+        click.echo(f"  logs       {'yes, with `robins replay`' if system['replays'] else 'no'}")
+        for claim in system["claims"]:
+            click.echo(f"  claim      {claim['id']}: {claim['text']}")
+        click.echo()
+    if known["scenarios"]:
+        click.echo(f"Next:   robins run {known['scenarios'][0]}")
+
+
+def inventory(systems: Any) -> dict[str, Any]:
+    """What there is, as it is printed with ``--json``."""
+    told = [
+        {
+            "name": system.name,
+            "summary": system.summary,
+            "scenarios": [f"{system.name}/{name}" for name in system.scenarios],
+            "filters": list(system.filters),
+            "claims": [{"id": claim["id"], "text": claim["text"]} for claim in system.claims],
+            "replays": system.replay is not None,
+        }
+        for system in systems
+    ]
+    return {
+        "scenarios": [name for system in told for name in system["scenarios"]],
+        "systems": told,
+        "filters": list(dict.fromkeys(name for system in told for name in system["filters"])),
+        "claims": [claim | {"system": s["name"]} for s in told for claim in s["claims"]],
+    }

@@ -1,0 +1,69 @@
+"""A progress bar for people who wait: on a terminal, on standard error, after two seconds."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from types import TracebackType
+from typing import Any
+
+WAIT_S = 2.0
+
+
+class Progress:
+    """Call it with the share done (0 to 1) and what is being done.
+
+    Used as a context manager, it shows a bar once `WAIT_S` have passed, even if nobody called it
+    yet (a compilation takes its time), and takes the bar away at the end.
+    """
+
+    def __init__(self, stream: Any = None, wait_s: float = WAIT_S):
+        self._stream = sys.stderr if stream is None else stream
+        self._lock = threading.Lock()
+        self._share, self._what = 0.0, "starting"
+        self._bar: Any = None
+        self._task: Any = None
+        self._timer = threading.Timer(wait_s, self._show)
+        self._timer.daemon = True
+
+    def __call__(self, share: float, what: str) -> None:
+        """Note how far it is."""
+        with self._lock:
+            self._share, self._what = min(max(share, 0.0), 1.0), what
+            if self._bar is not None:
+                self._bar.update(self._task, completed=self._share, description=self._what)
+
+    def _show(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bar
+
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+        )
+        with self._lock:
+            if self._timer.finished.is_set():
+                return  # the work ended while the bar was being made
+            self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)
+            self._task = self._bar.add_task(self._what, total=1.0, completed=self._share)
+            self._bar.start()
+
+    def __enter__(self) -> Progress:
+        if self._stream.isatty():
+            self._timer.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._timer.cancel()
+        with self._lock:
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None

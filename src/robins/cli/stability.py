@@ -1,0 +1,212 @@
+"""The command `allan`: from a log of a resting IMU to the noise parameters of its data sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+import xarray as xr
+
+from robins import report, results
+from robins.cli.frame import BadInput, command_line, only_json
+from robins.cli.progress import Progress
+from robins.dataset import ImuTable
+from robins.ins import allan
+from robins.logs import open_log
+from robins.logs.clean import clean_imu
+from robins.results import variable
+
+_NAMES = {
+    "Q": "quantisation",
+    "N": "random walk",
+    "B": "bias instability",
+    "K": "rate random walk",
+    "R": "rate ramp",
+}
+_AXES = ("x", "y", "z")
+_UNITS = {"gyro": ("rad/s", "deg/h"), "accel": ("m/s^2", "ug")}
+_TURNING = np.deg2rad(2.0)  # rad/s of mean rate over a second; sensors at rest are far below
+
+
+class Still(NamedTuple):
+    """Rates of the longest stretch of a log without gaps."""
+
+    rates: dict[str, np.ndarray]  # "gyro" [rad/s], "accel" [m/s^2]: (N, 3)
+    time_ns: np.ndarray  # (N,)
+    counts: dict[str, int]  # refused samples
+    notes: list[str]
+    body: str
+
+
+def still(path: Path) -> Still:
+    """Read and clean the log of a resting IMU; increments become rates.
+
+    Raises:
+        robins.logs.LogError: the file cannot be read.
+        BadInput: it holds no inertial samples.
+    """
+    findings: list[Any] = []
+    table = open_log(path, None, findings)
+    if not isinstance(table, ImuTable):
+        raise BadInput(f"{path}: holds no inertial samples; give the log of an IMU.")
+    cleaned, counts, _ = clean_imu(table)
+    notes = [str(finding) for finding in findings]
+    begin, end = longest_stretch(cleaned.time_ns)
+    time_ns = cleaned.time_ns[begin:end]
+    if end - begin < len(cleaned):
+        span = (time_ns[-1] - time_ns[0]) * 1e-9
+        notes.append(
+            f"The log has gaps: only its longest stretch without one is used, {span:.6g} s from "
+            f"{(time_ns[0] - cleaned.time_ns[0]) * 1e-9:.6g} s after its first sample."
+        )
+    rates = {"gyro": cleaned.gyro[begin:end], "accel": cleaned.accel[begin:end]}
+    if cleaned.kind == "increment":
+        dt_s = float(np.median(np.diff(time_ns))) * 1e-9
+        rates = {sensor: values / dt_s for sensor, values in rates.items()}
+    if _moved(rates["gyro"], time_ns):
+        notes.append("The sensor turned during the log: what follows is motion, not noise.")
+    return Still(rates, time_ns, {k: n for k, n in counts.items() if n}, notes, cleaned.body)
+
+
+def _moved(gyro: np.ndarray, time_ns: np.ndarray) -> bool:
+    """Whether the mean rate of any second is off by more than a resting sensor's could be."""
+    second = (time_ns - time_ns[0]) // 1_000_000_000
+    starts = np.flatnonzero(np.diff(second, prepend=-1))
+    count = np.diff(np.append(starts, len(second)))[:, None]
+    means = np.add.reduceat(gyro, starts, axis=0) / count
+    return bool(np.abs(means - np.median(means, axis=0)).max() > _TURNING)
+
+
+def longest_stretch(time_ns: np.ndarray) -> tuple[int, int]:
+    """First and last-plus-one sample of the longest part without a gap of 1.5 intervals."""
+    step = np.diff(time_ns)
+    edges = np.flatnonzero(step > 1.5 * np.median(step)) + 1
+    bounds = np.concatenate([[0], edges, [len(time_ns)]])
+    longest = int(np.argmax(np.diff(bounds)))
+    return int(bounds[longest]), int(bounds[longest + 1])
+
+
+def suffix(unit: str) -> str:
+    """A unit as the end of a metric's name: "deg/sqrt(h)" is "deg_per_sqrt_h"."""
+    plain = unit.replace("sqrt(", "sqrt_").replace(")", "").replace("^", "").lower()
+    return plain.replace("/", "_per_")
+
+
+def expected(fitted: allan.AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]:
+    """Allan deviation (T, axes) of each fitted term by itself, as in IEEE Std 952, Annex C."""
+    tau = tau_s[:, None]
+    shape = {
+        "Q": np.sqrt(3.0) / tau,
+        "N": 1.0 / np.sqrt(tau),
+        "B": np.sqrt(2.0 * np.log(2.0) / np.pi) * np.ones_like(tau),
+        "K": np.sqrt(tau / 3.0),
+        "R": tau / np.sqrt(2.0),
+    }
+    return {term: shape[term] * getattr(fitted.value, term) for term in fitted.terms}
+
+
+def _arrays(sensor: str, curve: allan.Allan, fitted: allan.AllanFit | None, body: str) -> dict:
+    si, shown = _UNITS[sensor]
+    axis = f"axis_{sensor}"
+
+    def one(values: np.ndarray, text: str, dims: tuple[str, ...] = ("tau", axis), **attrs: Any):
+        return variable(dims, values, si, text, body, display_unit=shown, **attrs)
+
+    made = {
+        f"allan_{sensor}": one(
+            curve.deviation, f"Allan deviation of the {sensor}", confidence=curve.confidence
+        ),
+        f"allan_low_{sensor}": one(curve.lower, "lower bound"),
+        f"allan_high_{sensor}": one(curve.upper, "upper bound"),
+    }
+    if fitted is not None:
+        parts = expected(fitted, curve.tau_s)
+        whole = np.sqrt(sum(part**2 for part in parts.values()))
+        made[f"allan_fit_{sensor}"] = one(whole, "fit")
+        dims = ("process", "tau", axis)
+        made[f"allan_slope_{sensor}"] = one(np.stack(list(parts.values())), "terms", dims)
+    return made
+
+
+def _metrics(sensor: str, fitted: allan.AllanFit) -> dict[str, dict[str, Any]]:
+    """Parameters and their intervals by axis."""
+    by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
+    for name, found in allan.in_field_units(fitted, sensor).items():  # type: ignore[arg-type]
+        unit = suffix(found.unit)
+        for k, axis in enumerate(_AXES):
+            by_axis[axis][f"{sensor}_{name}_{unit}"] = found.value[k]
+            by_axis[axis][f"{sensor}_{name}_interval_{unit}"] = [found.lower[k], found.upper[k]]
+    return by_axis
+
+
+def analysed(path: Path, terms: str, progress: Any) -> tuple[xr.Dataset, dict[str, Any], list[str]]:
+    """Solution, summary and notes of the Allan analysis of a log.
+
+    Raises:
+        BadInput: the log is too short, not even, or constant.
+    """
+    given = still(path)
+    notes = list(given.notes)
+    arrays: dict[str, Any] = {}
+    columns: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
+    tau_s = np.zeros(0)
+    for done, (sensor, rate) in enumerate(given.rates.items()):
+        progress(0.1 + 0.3 * done, f"{sensor}: Allan deviation")
+        try:
+            curve = allan.deviation(rate, time_ns=given.time_ns)
+        except ValueError as error:
+            raise BadInput(f"{path}: {sensor}: {error}") from error
+        fitted = None
+        try:
+            fitted = allan.fit(curve, terms)
+        except (ValueError, ArithmeticError) as error:
+            notes.append(f"No parameters of the {sensor}: {error}.")
+        else:
+            for axis, found in _metrics(sensor, fitted).items():
+                columns[axis] |= found
+        arrays |= _arrays(sensor, curve, fitted, given.body)
+        tau_s = curve.tau_s
+    coords: dict[str, Any] = {"tau": variable("tau", tau_s, "s", "averaging time")}
+    coords |= {f"axis_{sensor}": list(_AXES) for sensor in given.rates}
+    solution = xr.Dataset(arrays, coords)
+    if "process" in solution.sizes:
+        solution = solution.assign_coords(process=[_NAMES[term] for term in terms])
+    summary = {
+        "scenario": f"allan/{path.name.split('.')[0]}",
+        "seed": 0,
+        "runs": 1,
+        "filters": columns,
+        "claims": [],
+        "counts": given.counts,
+    }
+    return solution, summary, notes
+
+
+def stability(path: Path, terms: str, out: Path, as_json: bool) -> None:
+    """Analyse a log, write the result, print it."""
+    if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):
+        raise BadInput(f"--terms {terms}: give different letters out of {', '.join(_NAMES)}.")
+    command = command_line()
+    with (
+        only_json(as_json),
+        Progress() as progress,
+        results.ResultWriter(out, command=command) as writer,
+    ):
+        solution, summary, notes = analysed(path, terms, progress)
+        writer.save_solution(solution)
+        writer.save_summary(summary)
+        report.add(writer, lambda done, total, what: progress(0.7, what), notes)
+    if as_json:
+        click.echo((out / "summary.json").read_text("utf-8"), nl=False)
+        return
+    from rich.console import Console
+
+    Console().print(report.table(results.read(out).summary))
+    for note in notes:
+        click.echo(note)
+    click.echo(f"\nResult: {out}\nReport: {out / 'report.html'}   (open it in a browser)")
+    click.echo(
+        "Next:   put these numbers into the [imu] of a scenario or of a replay's configuration"
+    )

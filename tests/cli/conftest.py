@@ -1,0 +1,91 @@
+"""The command line run in this process, with a workbench and systems that compute nothing."""
+
+import sys
+from collections import namedtuple
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from robins import results
+from robins.cli import main
+
+Answer = namedtuple("Answer", "status out err")
+Done = namedtuple("Done", "path summary notes")
+
+
+@pytest.fixture
+def robins(capsys, monkeypatch, tmp_path):
+    """Run a command line in an empty folder: status, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments):
+        status = main([str(argument) for argument in arguments])
+        return Answer(status, *capsys.readouterr())
+
+    return run
+
+
+class Workbench:
+    """In the place of `robins.workbench`: notes what it is asked, writes a result or raises."""
+
+    def __init__(self):
+        self.asked = {}
+        self.verdict = "reproduced"
+        self.error = None
+        self.findings = []
+
+    def run_scenario(self, name, **asked):
+        return self._work(name, asked)
+
+    def replay_log(self, paths, *, findings, **asked):
+        findings(self.findings)
+        return self._work("ins-gnss/log", asked | {"paths": paths})
+
+    def _work(self, name, asked):
+        self.asked = asked | {"name": name}
+        print("noise of some library on standard output")
+        asked["progress"](0.5, "half way")
+        claim = {"id": "C1", "text": "it holds", "value": 1.0, "band": [0.0, 2.0]}
+        summary = {
+            "scenario": name,
+            "seed": asked["seed"],
+            "runs": asked.get("runs") or 1,
+            "filters": {"ekf": {"horizontal_rms_m": 0.25, "worst_m": float("nan")}},
+            "claims": [claim | {"verdict": self.verdict}] if self.verdict else [],
+            "counts": {"imu_nan": 2},
+        }
+        with results.ResultWriter(asked["out"], command=asked["command"]) as writer:
+            writer.save_summary(summary)
+            writer.save_report("<p>")
+            if self.error is not None:
+                raise self.error
+        path = Path(asked["out"])
+        return Done(path, results.read(path).summary, ("A note for the reader.",))
+
+
+@pytest.fixture
+def workbench(monkeypatch):
+    made = Workbench()
+    monkeypatch.setitem(sys.modules, "robins.workbench", made)
+    return made
+
+
+@pytest.fixture
+def systems(monkeypatch):
+    """Two systems in the registry."""
+    car = SimpleNamespace(
+        name="car",
+        summary="a car",
+        scenarios={"town": None, "road": None},
+        filters=("ekf", "ukf"),
+        claims=({"id": "C1", "text": "it holds"},),
+        replay=print,
+    )
+    kite = SimpleNamespace(
+        name="kite", summary="a kite", scenarios={}, filters=("ekf",), claims=(), replay=None
+    )
+    monkeypatch.setitem(
+        sys.modules, "robins.systems", SimpleNamespace(SYSTEMS={"car": car, "kite": kite})
+    )

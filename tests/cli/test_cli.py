@@ -1,0 +1,433 @@
+"""What the command promises: statuses, streams, errors in a line, nothing left behind."""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import click
+import pytest
+
+from robins import cli, results
+from robins.cli import Status, cache, commands, frame
+from robins.logs import Finding, LogError
+from robins.scenario import ScenarioError
+from robins.units import UnitError
+
+# ------------------------------------------------------------------------------------------- runs
+
+
+def test_json_is_the_summary_and_nothing_else(robins, workbench):
+    answer = robins("run", "car/town", "--json", "--out", "drive")
+    assert answer.status == Status.DONE == 0
+    assert answer.out == Path("drive/summary.json").read_text("utf-8")
+    told = json.loads(answer.out)
+    assert list(told) == [
+        *("scenario", "seed", "runs", "filters", "claims", "counts", "files", "seconds")
+    ]
+    assert told["filters"] == {"ekf": {"horizontal_rms_m": 0.25, "worst_m": None}}
+    assert "noise of some library" in answer.err
+
+
+def test_people_get_tables_paths_and_what_to_do_next(robins, workbench):
+    answer = robins("run", "car/town", "--seed", 4)
+    assert answer.status == 0
+    for expected in (
+        "Horizontal RMS [m]",
+        "0.25",
+        "reproduced",
+        "1 of 1 claim reproduced.",
+        "Refused samples: IMU nan 2",
+        "A note for the reader.",
+        "Result: results/car-town",
+        "Report: results/car-town/report.html",
+        "robins run car/town --seed 5",
+    ):
+        assert expected in answer.out
+    assert answer.err == ""
+
+
+def test_options_reach_the_workbench(robins, workbench):
+    arguments = (
+        *("run", "car/town", "--runs", 3, "--seed", 9, "--filters", "ekf, ukf", "--out", "a b"),
+        *("--set", "imu.gyro_bias=5 deg/h", "--set", "note=a=b"),
+    )
+    robins(*arguments)
+    asked = workbench.asked
+    assert asked["name"] == "car/town"
+    assert (asked["runs"], asked["seed"], asked["out"]) == (3, 9, Path("a b"))
+    assert asked["filters"] == ("ekf", "ukf")
+    assert asked["settings"] == ("imu.gyro_bias=5 deg/h", "note=a=b")
+    assert shlex.split(asked["command"]) == ["robins", *map(str, arguments)]
+    assert results.read("a b").manifest["command"] == asked["command"]
+
+
+def test_what_is_not_given_is_left_to_the_scenario(robins, workbench):
+    robins("run", "folder/town.toml")
+    asked = workbench.asked
+    assert (asked["runs"], asked["seed"], asked["filters"], asked["settings"]) == (None, 0, (), ())
+    assert asked["out"] == Path("results/town")
+
+
+def test_a_log_is_replayed_and_the_doctor_is_heard(robins, workbench):
+    workbench.findings = [
+        Finding("warning", "gap", "imu.csv", "line 3", 1.0, "imu.csv line 3: a gap."),
+        Finding("error", "unit", "imu.csv", "", 1.0, "imu.csv: degrees."),
+    ]
+    answer = robins("replay", "x/imu.csv.xz", "gnss.pos", "unit.toml", "--seed", 2, "--json")
+    assert answer.status == 0
+    assert workbench.asked["paths"] == tuple(map(Path, ("x/imu.csv.xz", "gnss.pos", "unit.toml")))
+    assert workbench.asked["system"] == "ins-gnss"
+    assert workbench.asked["out"] == Path("results/imu")
+    assert json.loads(answer.out)["seed"] == 2
+    assert "robins: warning: imu.csv line 3: a gap." in answer.err
+    assert "degrees" not in answer.err  # an error ends the command and is told there
+
+
+def test_a_log_is_one_run(robins, workbench):
+    assert robins("replay", "imu.csv", "--runs", 1).status == 0
+    answer = robins("replay", "imu.csv", "--runs", 5)
+    assert answer.status == Status.BAD_INPUT
+    assert answer.err == ("robins: --runs 5: a recorded log is one run; leave the option away.\n")
+    assert robins("replay", "unit.toml").status == Status.BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("verdict", "status", "line"),
+    [
+        ("reproduced", 0, "PASS: all 1 claims reproduced."),
+        ("partly", 1, "FAIL: C1."),
+        ("not", 1, "FAIL: C1."),
+        (None, 1, "FAIL: there are no claims to check."),
+    ],
+)
+def test_the_demonstration_ends_with_its_verdict(robins, workbench, verdict, status, line):
+    workbench.verdict = verdict
+    answer = robins("demo", "--runs", 2)
+    assert answer.status == status
+    assert answer.out.splitlines()[-1] == line
+    assert "Report: results/demo/report.html" in answer.out
+    assert workbench.asked["name"] == commands.DEMO
+    assert robins("demo", "--json").out == Path("results/demo/summary.json").read_text("utf-8")
+
+
+# ----------------------------------------------------------------------------------------- errors
+
+
+def refused_result():
+    return results.ResultError("out", "is a file, not a folder", "choose a new folder")
+
+
+def full_disk():
+    error = results.ResultError("out", "cannot write", "free some space")
+    error.__cause__ = OSError(28, "No space left on device")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "lines"),
+    [
+        (ScenarioError(["a.toml: imu.gyro_bais: unknown"]), 2, ["a.toml: imu.gyro_bais: unknown"]),
+        (ScenarioError(["x: one", "y: two"]), 2, ["x: one", "y: two"]),
+        (UnitError("deg is an angle"), 2, ["deg is an angle"]),
+        (LogError("imu.csv", "is empty", "give another"), 2, ["imu.csv: is empty; give another"]),
+        (refused_result(), 2, ["out: is a file, not a folder; choose a new folder"]),
+        (full_disk(), 1, ["out: cannot write; free some space"]),
+        (MemoryError(), 1, ["out of memory; ask for fewer runs or filters at a time."]),
+        (OSError(13, "Permission denied", "x"), 1, ["failed: PermissionError: [Errno 13] "]),
+        (ValueError("shapes\nand more"), 1, ["failed: ValueError: shapes", "this may be a fault"]),
+        (RuntimeError(""), 1, ["failed: RuntimeError: ", "this may be a fault of robins"]),
+    ],
+)
+@pytest.mark.parametrize("as_json", [True, False])
+def test_an_error_is_told_in_a_line_with_its_status(
+    robins, workbench, error, status, lines, as_json
+):
+    workbench.error = error
+    answer = robins("run", "car/town", "--out", "out", *(["--json"] if as_json else []))
+    assert answer.status == status
+    told = [line for line in answer.err.splitlines() if "noise" not in line]
+    assert len(told) <= 3
+    for line, expected in zip(told, lines, strict=False):
+        assert line.startswith(f"robins: {expected}")
+    assert "Traceback" not in answer.err
+    if as_json:
+        assert answer.out == ""
+    assert not Path("out").exists()
+
+
+def test_debug_shows_where(robins, workbench):
+    workbench.error = RuntimeError("somewhere")
+    for arguments in (("--debug", "run", "x/y"), ("run", "x/y", "--debug")):
+        answer = robins(*arguments)
+        assert answer.status == 1
+        assert "Traceback" in answer.err
+        assert "in _work" in answer.err
+
+
+def test_an_interrupt_is_told_and_leaves_the_earlier_result(robins, workbench):
+    robins("run", "car/town", "--out", "out", "--seed", 1)
+    workbench.error = KeyboardInterrupt()
+    answer = robins("run", "car/town", "--out", "out", "--seed", 2)
+    assert answer.status == Status.INTERRUPTED == 3
+    assert answer.err.strip().startswith("robins: interrupted.")
+    assert results.read("out").summary["seed"] == 1
+    assert os.listdir() == ["out"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rnu"], "No such command 'rnu'"),
+        (["run"], "Missing argument 'SCENARIO'"),
+        (["run", "x", "--rnus", "3"], "No such option"),
+        (["run", "x", "--runs", "0"], "'--runs': 0 is not in the range"),
+        (["run", "x", "--runs", "nan"], "'--runs': 'nan' is not a valid int"),
+        (["run", "x", "--seed", "-1"], "'--seed': -1 is not in the range"),
+        (["run", "x", "--seed", "1e3"], "'--seed': '1e3' is not a valid int"),
+        (["run", "x", "--filters", "a,,b"], "'--filters': 'a,,b' has an empty name"),
+        (["run", "x", "--filters", ""], "'--filters': '' has an empty name"),
+        (["run", "x", "--set", "imu"], "'--set': 'imu' is not key=value"),
+        (["run", "x", "--set", "=3"], "'--set': '=3' is not key=value"),
+        (["replay"], "Missing argument 'LOG"),
+        (["doctor"], "Missing argument 'LOG"),
+        (["allan", "x", "--terms", "NN"], "--terms NN: give different letters out of"),
+        (["allan", "x", "--terms", "NZ"], "--terms NZ: give different letters out of"),
+    ],
+)
+def test_bad_usage_is_refused_in_a_line_or_two(robins, arguments, message):
+    answer = robins(*arguments)
+    assert answer.status == Status.BAD_INPUT == 2
+    assert message in answer.err
+    assert len(answer.err.splitlines()) <= 2
+    assert all(line.startswith("robins: ") for line in answer.err.splitlines())
+    assert answer.out == ""
+
+
+# ------------------------------------------------------------------------------------------- help
+
+
+def all_commands():
+    return [(), *((name,) for name in cli.app.commands)]
+
+
+@pytest.mark.parametrize("command", all_commands())
+def test_help_is_given(robins, command):
+    answer = robins(*command, "--help")
+    assert answer.status == 0
+    assert answer.out.startswith("Usage: robins")
+    assert robins(*command, "-h").out == answer.out
+
+
+def examples():
+    """Every command line in the help of any command."""
+    texts = [cli.app.epilog, *(command.epilog or "" for command in cli.app.commands.values())]
+    lines = [line.split("   ")[0].strip() for text in texts for line in text.splitlines()]
+    return [line for line in lines if line.startswith("robins ")]
+
+
+def test_there_are_examples():
+    assert len(examples()) > 10
+
+
+@pytest.mark.parametrize("line", examples())
+def test_examples_in_the_help_are_commands(line):
+    words = shlex.split(line)
+    context = click.Context(cli.app, obj=[])
+    cli.app.commands[words[1]].make_context(words[1], words[2:], parent=context)
+
+
+def test_help_teaches_the_contract(robins):
+    text = " ".join(robins("--help").out.split())
+    assert "Exit status: 0 done, 1 failed, 2 bad input, 3 interrupted" in text
+    for command in ("demo", "run", "replay", "doctor", "allan", "list"):
+        assert f"robins {command}" in text
+
+
+def test_the_version_is_told(robins):
+    import robins as package
+
+    assert robins("--version").out == f"robins, version {package.__version__}\n"
+
+
+# ------------------------------------------------------------------------------------------- list
+
+
+def test_the_list_names_everything(robins, systems):
+    answer = robins("list", "--json")
+    assert answer.status == 0
+    assert json.loads(answer.out) == {
+        "scenarios": ["car/town", "car/road"],
+        "systems": [
+            {
+                "name": "car",
+                "summary": "a car",
+                "scenarios": ["car/town", "car/road"],
+                "filters": ["ekf", "ukf"],
+                "claims": [{"id": "C1", "text": "it holds"}],
+                "replays": True,
+            },
+            {
+                "name": "kite",
+                "summary": "a kite",
+                "scenarios": [],
+                "filters": ["ekf"],
+                "claims": [],
+                "replays": False,
+            },
+        ],
+        "filters": ["ekf", "ukf"],
+        "claims": [{"id": "C1", "text": "it holds", "system": "car"}],
+    }
+    people = robins("list").out
+    for expected in ("car  a car", "car/town, car/road", "ekf, ukf", "C1: it holds", "kite"):
+        assert expected in people
+    assert "robins run car/town" in people
+
+
+# ------------------------------------------------------------------------- in its own process
+
+
+def start(code, *arguments, **settings):
+    """Start a process that runs `main` after some code of the test's."""
+    prologue = "import sys\nfrom robins.cli import main\n"
+    script = f"{prologue}{textwrap.dedent(code)}\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.Popen([sys.executable, "-c", script, *arguments], text=True, **settings)
+
+
+def test_help_starts_in_a_blink():
+    code = """
+    import atexit, resource
+    def told():
+        heavy = {"jax", "numpy", "matplotlib", "xarray", "scipy", "pydantic", "rich"}
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        print(used.ru_utime + used.ru_stime, sorted(heavy & set(sys.modules)), file=sys.stderr)
+    atexit.register(told)
+    """
+    process = start(code, "--help", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out.startswith("Usage:")
+    seconds, loaded = err.split(maxsplit=1)
+    assert float(seconds) < 0.5  # of processor time, which other work on the machine does not touch
+    assert loaded.strip() == "[]"
+
+
+SLOW = """
+import time, types
+from pathlib import Path
+from robins import results
+def run_scenario(name, *, out, **asked):
+    with results.ResultWriter(out) as writer:
+        writer.save_file("large.bin", b"x" * 1000)
+        print("writing", flush=True)
+        time.sleep(60)
+sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workbench, number):
+    robins("run", "car/town", "--out", "out", "--seed", 1)
+    process = start(
+        SLOW,
+        *("run", "car/town", "--out", "out"),
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout.readline() == "writing\n"
+    assert len(list(tmp_path.iterdir())) == 2
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 3
+    assert "Traceback" not in err
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert results.read("out").summary["seed"] == 1
+
+
+LISTED = """
+import types
+claim = {"id": "C1", "text": "it holds " * 4000}
+car = types.SimpleNamespace(
+    name="car", summary="", scenarios={}, filters=(), claims=(claim,), replay=None
+)
+sys.modules["robins.systems"] = types.SimpleNamespace(SYSTEMS={"car": car})
+"""
+
+
+@pytest.mark.parametrize("command", [("list",), ("list", "--json"), ("--help",)])
+def test_a_full_standard_output_is_a_failure(command):
+    with open("/dev/full", "w") as full:
+        process = start(LISTED, *command, stdout=full, stderr=subprocess.PIPE)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert err == "robins: cannot write to standard output: No space left on device\n"
+
+
+def test_a_reader_that_goes_away_is_no_reason_to_complain():
+    process = start(LISTED, "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    process.wait(timeout=60)
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.returncode == 1
+
+
+def test_the_entry_point_is_installed():
+    done = subprocess.run(
+        [Path(sys.executable).with_name("robins"), "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.startswith("robins, version ")
+
+
+# ------------------------------------------------------------------------------------------- cache
+
+
+def test_compiled_filters_are_kept_where_the_user_keeps_caches(monkeypatch, tmp_path):
+    monkeypatch.delitem(sys.modules, "jax")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "7")
+    cache.enable()
+    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    assert folder.is_dir()
+    assert folder.parent == tmp_path / "robins"
+    assert os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] == "7"
+    monkeypatch.setattr(cache, "_machine", lambda: "another")
+    cache.enable()
+    assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) != folder
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+
+
+@pytest.mark.parametrize("why", ["told by the user", "jax is there", "no home"])
+def test_the_cache_keeps_out_of_the_way(monkeypatch, tmp_path, why):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    if why != "jax is there":
+        monkeypatch.delitem(sys.modules, "jax")
+    if why == "told by the user":
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
+    if why == "no home":
+        (tmp_path / "cache").write_text("a file where the folder should be")
+    cache.enable()
+    told = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    assert told == ("mine" if why == "told by the user" else None)
+
+
+def test_statuses_are_those_of_the_contract():
+    assert {s.name: int(s) for s in Status} == {
+        "DONE": 0,
+        "FAILED": 1,
+        "BAD_INPUT": 2,
+        "INTERRUPTED": 3,
+    }
+    assert frame.main is cli.main
