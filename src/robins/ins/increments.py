@@ -78,12 +78,13 @@ def _check(imu: ImuTable, time: np.ndarray, gyro: np.ndarray, accel: np.ndarray)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
             raise ValueError(
-                f"{name}: {label} in {_row(imu, bad[0])} is {values[bad[0]]}: samples that are not "
-                "finite must be bridged or cut out before they are integrated (robins.logs.clean)"
+                f"{name}: {label} in {_row(imu, int(bad[0]))} is {values[bad[0]]}: samples that "
+                "are not finite must be bridged or cut out before they are integrated "
+                "(robins.logs.clean)"
             )
     back = np.flatnonzero(np.diff(time) <= 0)
     if len(back):
-        k = back[0] + 1
+        k = int(back[0]) + 1
         raise ValueError(
             f"{name}: time stands still or runs backwards at {_row(imu, k)}: {time[k]} ns after "
             f"{time[k - 1]} ns, {len(back)} such row(s) in all; sort or cut them out first "
