@@ -1,0 +1,250 @@
+"""The commands that look at logs: the doctor, and the noise of an IMU at rest."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robins import logs, results, scenario
+from robins.cli import stability
+from robins.dataset import ImuTable
+from robins.ins import allan
+from robins.ins.allan_noise import moments
+from robins.report import numbers
+
+RATE_HZ = 100.0
+GYRO_NOISE = np.deg2rad(0.3) / 60.0  # rad/sqrt(s), 0.3 deg/sqrt(h)
+ACCEL_NOISE = 5e-4  # m/s^2/sqrt(Hz)
+
+
+def a_still_imu(seconds=60.0, gravity=-9.81, kind="rate"):
+    """White noise at rest, in forward-right-down axes."""
+    rng = np.random.default_rng(11)
+    n = int(seconds * RATE_HZ)
+    gyro = rng.normal(size=(n, 3)) * GYRO_NOISE * np.sqrt(RATE_HZ)
+    accel = rng.normal(size=(n, 3)) * ACCEL_NOISE * np.sqrt(RATE_HZ) + [0.0, 0.0, gravity]
+    time_ns = 1_700_000_000_000_000_000 + (np.arange(n) * (1e9 / RATE_HZ)).astype(np.int64)
+    if kind == "increment":
+        gyro, accel = gyro / RATE_HZ, accel / RATE_HZ
+    return ImuTable(time_ns, gyro, accel, kind)
+
+
+@pytest.fixture(scope="module")
+def still_log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("logs") / "still.csv"
+    logs.write_euroc_imu(path, a_still_imu())
+    return path
+
+
+@pytest.fixture(scope="module")
+def upside_down(tmp_path_factory):
+    path = tmp_path_factory.mktemp("logs") / "upside down.csv"
+    logs.write_euroc_imu(path, a_still_imu(gravity=9.81))
+    return path
+
+
+# -------------------------------------------------------------------------------------- the doctor
+
+
+def test_a_healthy_log_is_fit_to_navigate(robins, still_log):
+    answer = robins("doctor", still_log)
+    assert answer.status == 0
+    assert "0 errors" in answer.out
+    assert f"robins replay {still_log}" in answer.out
+
+
+def test_a_wrong_log_is_bad_input_and_the_reason_is_told(robins, upside_down):
+    answer = robins("doctor", upside_down)
+    assert answer.status == 2
+    (error,) = [line for line in answer.out.splitlines() if line.startswith("error:")]
+    assert "upside down.csv" in error
+    assert "gravity" in error
+    assert "1 error," in answer.out
+    assert answer.err == ""
+
+
+def test_findings_are_one_object_for_scripts(robins, upside_down):
+    answer = robins("doctor", upside_down, "--json")
+    assert answer.status == 2
+    told = json.loads(answer.out)
+    assert told["files"] == [str(upside_down)]
+    assert (told["errors"], told["warnings"]) == (1, 0)
+    assert set(told["findings"][0]) == {"severity", "code", "file", "where", "value", "sentence"}
+    assert told["findings"][0]["severity"] == "error"
+    assert len(told["findings"]) == told["errors"] + told["warnings"] + told["notes"]
+
+
+def test_the_mounting_of_a_configuration_is_heeded(robins, upside_down, monkeypatch, systems):
+    class System:
+        replay_parameters = object
+        orientation = staticmethod(lambda parameters: (np.pi, 0.0, 0.0))
+
+    monkeypatch.setitem(sys.modules["robins.systems"].SYSTEMS, "car", System)
+    monkeypatch.setattr(scenario, "parse", lambda *args, **kwargs: None)
+    Path("unit.toml").write_text('system = "car"\n')
+    assert robins("doctor", upside_down, "unit.toml").status == 0
+    Path("other.toml").write_text('system = "plane"\n')
+    refused = robins("doctor", upside_down, "other.toml")
+    assert refused.status == 2
+    assert refused.err.startswith('robins: other.toml: write system = "..." into it')
+    assert robins("doctor", upside_down, "unit.toml", "other.toml").status == 2
+    assert robins("doctor", "unit.toml").status == 2
+
+
+@pytest.mark.parametrize("command", ["doctor", "allan"])
+def test_a_file_that_is_no_log_is_refused_in_a_line(robins, command):
+    Path("poem.txt").write_text("roses are red\n")
+    for path in ("poem.txt", "nothing.csv", "."):
+        answer = robins(command, path)
+        assert answer.status == 2
+        assert answer.err.startswith(f"robins: {path}")
+        assert len(answer.err.splitlines()) == 1
+        assert answer.out == ""
+    assert [p.name for p in Path().iterdir()] == ["poem.txt"]
+
+
+# ------------------------------------------------------------------------------------------- Allan
+
+
+def test_noise_parameters_are_found_and_written(robins, still_log):
+    answer = robins("allan", still_log, "--terms", "N", "--json", "--out", "noise")
+    assert answer.status == 0
+    told = json.loads(answer.out)
+    assert answer.out == Path("noise/summary.json").read_text("utf-8")
+    table = a_still_imu()
+    for sensor, name, ending, truth in (
+        ("gyro", "angle_random_walk", "deg_per_sqrt_h", 0.3),
+        ("accel", "noise_density", "ug_per_sqrt_hz", ACCEL_NOISE / 9.80665e-6),
+    ):
+        fitted = allan.fit(allan.deviation(getattr(table, sensor), dt_s=1.0 / RATE_HZ), "N")
+        want = allan.in_field_units(fitted, sensor)[name]
+        for k, axis in enumerate("xyz"):
+            value = told["filters"][axis][f"{sensor}_{name}_{ending}"]
+            interval = told["filters"][axis][f"{sensor}_{name}_interval_{ending}"]
+            assert value == pytest.approx(want.value[k], rel=1e-6)
+            assert interval == pytest.approx([want.lower[k], want.upper[k]], rel=1e-6)
+            assert value == pytest.approx(truth, rel=0.03)  # sigma of the estimate: 0.9 %
+    back = results.read("noise")
+    assert back.summary["scenario"] == "allan/still"
+    assert set(back.figures) == {"allan_gyro", "allan_accel"}
+    assert "Gyro angle random walk" in back.report.read_text("utf-8")
+    curve = allan.deviation(a_still_imu().gyro, dt_s=1.0 / RATE_HZ)
+    np.testing.assert_allclose(back.solution["allan_gyro"], curve.deviation, rtol=1e-6)
+    np.testing.assert_allclose(back.solution["tau"], curve.tau_s, rtol=1e-9)
+    assert list(back.solution["process"].values) == ["random walk"]
+
+
+def test_people_see_the_parameters_with_their_units(robins, still_log):
+    answer = robins("allan", still_log)
+    assert answer.status == 0
+    for expected in (
+        "Gyro angle random walk [deg/√h]",
+        "Accel bias instability [µg]",
+        "Result: results/allan-still",
+        "Report: results/allan-still/report.html",
+        "Next:",
+    ):
+        assert expected in answer.out
+
+
+def test_increments_give_what_rates_give(tmp_path):
+    rates, increments = tmp_path / "rates.csv", tmp_path / "increments.csv"
+    logs.write_pyins(rates, a_still_imu(10.0))
+    logs.write_pyins(increments, a_still_imu(10.0, kind="increment"))
+    one, other = stability.still(rates), stability.still(increments)
+    np.testing.assert_allclose(one.rates["gyro"], other.rates["gyro"], rtol=1e-9)
+    np.testing.assert_allclose(one.rates["accel"], other.rates["accel"], rtol=1e-9)
+
+
+def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(robins, tmp_path):
+    table = a_still_imu(30.0)
+    keep = np.ones(len(table), bool)
+    keep[1000:1050] = False
+    gapped = ImuTable(table.time_ns[keep], table.gyro[keep], table.accel[keep], "rate")
+    logs.write_euroc_imu(tmp_path / "gapped.csv", gapped)
+    found = stability.still(tmp_path / "gapped.csv")
+    assert len(found.time_ns) == 1950
+    np.testing.assert_allclose(found.rates["gyro"], table.gyro[1050:], atol=1e-9)
+    answer = robins("allan", "gapped.csv", "--terms", "N")
+    assert answer.status == 0
+    assert "The log has gaps: only its longest stretch without one is used, 19.49 s" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("steps", "bounds"),
+    [
+        ([1, 1, 1, 1], (0, 5)),
+        ([1, 1, 5, 1, 1, 1], (3, 7)),
+        ([5, 1, 1, 1, 5], (1, 5)),
+        ([1, 1, 9, 1, 1], (0, 3)),  # of equals the first
+    ],
+)
+def test_the_longest_stretch(steps, bounds):
+    time_ns = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    assert stability.longest_stretch(time_ns) == bounds
+
+
+def test_a_moving_sensor_is_noticed(tmp_path):
+    table = a_still_imu(10.0)
+    turning = table.gyro.copy()
+    turning[400:600, 2] += 0.2
+    logs.write_euroc_imu(tmp_path / "a.csv", ImuTable(table.time_ns, turning, table.accel, "rate"))
+    logs.write_euroc_imu(tmp_path / "b.csv", table)
+    assert any("turned" in note for note in stability.still(tmp_path / "a.csv").notes)
+    assert not any("turned" in note for note in stability.still(tmp_path / "b.csv").notes)
+
+
+def test_a_stuck_sensor_is_refused(robins, tmp_path):
+    table = a_still_imu(10.0)
+    stuck = ImuTable(table.time_ns, np.zeros_like(table.gyro), table.accel, "rate")
+    logs.write_euroc_imu(tmp_path / "stuck.csv", stuck)
+    answer = robins("allan", "stuck.csv")
+    assert answer.status == 2
+    assert answer.err.startswith("robins: stuck.csv: gyro: axis 0 is constant")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["stuck.csv"]
+
+
+def test_a_short_log_gives_its_curve_and_the_reason_why_no_parameters(robins, tmp_path):
+    logs.write_euroc_imu(tmp_path / "short.csv", a_still_imu(2.0))
+    answer = robins("allan", "short.csv", "--terms", "QNBKR")
+    assert answer.status == 0
+    assert "No parameters of the gyro: too short for the 5 terms" in answer.out
+    assert "process" not in results.read("results/allan-short").solution.sizes
+
+
+@pytest.mark.parametrize("terms", ["Q", "N", "B", "K", "QNBKR"])
+def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms):
+    curve = allan.deviation(a_still_imu().gyro, dt_s=1.0 / RATE_HZ)
+    ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
+    fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), 1, terms, 0.95)
+    parts = stability.expected(fitted, curve.tau_s)
+    assert "".join(parts) == terms
+    mean = moments(curve.clusters, curve.n_samples, curve.dt_s).mean
+    for term, part in parts.items():
+        k = "QNBKR".index(term)
+        want = np.sqrt(mean[:, k]) * (1.0 + k)
+        np.testing.assert_allclose(part, np.stack([want] * 3, axis=1), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "ending", "shown"),
+    [
+        ("deg/sqrt(h)", "deg_per_sqrt_h", "deg/√h"),
+        ("deg/h/sqrt(h)", "deg_per_h_per_sqrt_h", "deg/h/√h"),
+        ("ug/sqrt(Hz)", "ug_per_sqrt_hz", "µg/√Hz"),
+        ("deg/h/h", "deg_per_h_per_h", "deg/h/h"),
+        ("m/s^2", "m_per_s2", "m/s²"),
+        ("arcsec", "arcsec", "arcsec"),
+    ],
+)
+def test_units_survive_the_name_of_a_metric(unit, ending, shown):
+    assert stability.suffix(unit) == ending
+    assert numbers.label(f"x_{stability.suffix(unit)}") == ("X", shown)
+
+
+def test_every_unit_of_the_fit_can_be_told():
+    for sensor in allan._FIELD_UNITS.values():
+        for name, (_, unit) in sensor.items():
+            assert numbers.label(f"{name}_{stability.suffix(unit)}").unit != ""
