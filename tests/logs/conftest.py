@@ -6,7 +6,7 @@ from made_logs import make_drive
 
 @pytest.fixture(scope="session")
 def drive():
-    """20 s at rest, two minutes of figures of eight; 100 Hz IMU of a consumer, 5 Hz RTK."""
+    """12 s at rest, a minute of figures of eight; 100 Hz IMU of a consumer, 5 Hz RTK."""
     return make_drive()
 
 

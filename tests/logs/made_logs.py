@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable
+from robins.logs import examine
 
 IMU_HZ, GNSS_HZ = 100, 5
-REST_S, TOTAL_S = 20.0, 140.0
+REST_S, TOTAL_S = 12.0, 80.0
 LAT_DEG, LON_DEG, ALT_M = 47.0, 8.0, 430.0
 START_NS = 1_700_000_000_000_000_000
 
@@ -118,3 +119,19 @@ def rows_of(table, keep):
         if isinstance(getattr(table, f.name), np.ndarray)
     }
     return dataclasses.replace(table, **arrays)
+
+
+def the(subject, code):
+    """The one finding with this code; it must be a whole sentence that names its file and place."""
+    (f,) = [f for f in examine(subject) if f.code == code]
+    assert f.file in ("drive_imu.csv", "drive_gnss.pos")
+    assert f.sentence.startswith(f"{f.file} {f.where}".rstrip() + ": ")
+    assert f.sentence.endswith((".", "?"))
+    assert len(f.sentence) > 60
+    assert "\n" not in f.sentence
+    return f
+
+
+def found(subject, severity=None):
+    """Codes of all findings, or of those of one severity."""
+    return [f.code for f in examine(subject) if severity in (None, f.severity)]

@@ -259,6 +259,10 @@ def test_a_component_without_a_usable_sigma_is_missing(bad, reason):
             r"sigma of north velocity = -0.05: .*real sigmas, or leave the velocities out",
         ),
         (
+            {"sigma_v": GNSS.sigma_v * np.nan},
+            r"sigma of north velocity = nan: .* no positive sigma",
+        ),
+        (
             {"sigma_m": GNSS.sigma_m * [1, 1, 0]},
             r"sigma of vertical position = 0.0: .*; zero means unknown, not exact: give real",
         ),

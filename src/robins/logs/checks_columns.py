@@ -12,7 +12,7 @@ from robins.logs.quiet import finding, usual_step_s
 
 _STUCK_S = 2.0
 _STUCK_SAMPLES = 100
-_SATURATED_RUN = 3
+_SATURATED_RUN, _SATURATED_LONG = 3, 10
 _COARSE = 64  # distinct values of a column
 _FULL_SCALES = {
     "gyro": [np.deg2rad(v) for v in (125, 245, 250, 450, 500, 1000, 2000, 4000)],
@@ -101,16 +101,20 @@ def _saturated(
 ) -> Iterator[Finding]:
     values = column[good]
     middle = np.median(values)
-    # Where the bulk is narrow, an extreme that is far out and met several times in a row is a stop.
+    # A stop is an extreme met several times in a row that is far from the bulk, or held for long;
+    # a coarse column holds its extremes for long without being stopped.
+    fine = len(np.unique(values)) > _COARSE
     spread = np.subtract(*np.percentile(values, [95, 5])) / 3.3 + 1e-300
     for extreme in (float(values.max()), float(values.min())):
         start, length = _longest_run(column == extreme)
-        if length < _SATURATED_RUN or abs(extreme - middle) < 4.0 * spread:
+        far = abs(extreme - middle) > 4.0 * spread
+        if length < (_SATURATED_RUN if far else _SATURATED_LONG) or not (far or fine):
             continue
         total = int(np.count_nonzero(column == extreme))
-        known = [s for s in _FULL_SCALES[sensor] if abs(abs(extreme) / s - 1.0) < 0.03]
+        near = min(_FULL_SCALES[sensor], key=lambda scale: abs(abs(extreme) - scale))
         unit = "rad/s" if sensor == "gyro" else "m/s^2"
-        range_ = f", a usual full scale ({known[0]:.4g} {unit})" if known else ""
+        usual = abs(abs(extreme) / near - 1.0) < 0.03
+        range_ = f", a usual full scale ({near:.4g} {unit})" if usual else ""
         yield finding(
             imu,
             "warning",

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from robins.dataset import GnssTable
+from robins.logs.clean import ALT_LIMIT_M, SPEED_LIMIT
 from robins.logs.findings import Finding
-from robins.logs.quiet import finding
+from robins.logs.quiet import finding, median_of
 
 _AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
 
@@ -18,28 +19,37 @@ def check_gnss(gnss: GnssTable) -> Iterator[Finding]:
     if not len(gnss):
         return
     yield from _missing(gnss)
-    yield from _place(gnss)
+    wrong_place = list(_place(gnss))
+    yield from wrong_place
     yield from _height(gnss)
     yield from _sigmas(gnss)
     yield from _quality(gnss)
-    yield from _resolution(gnss)
+    if not wrong_place:
+        yield from _resolution(gnss)
 
 
 def _missing(gnss: GnssTable) -> Iterator[Finding]:
-    columns = {"latitude": gnss.lat_rad, "longitude": gnss.lon_rad, "height": gnss.alt_m}
+    columns = {
+        "latitude": (gnss.lat_rad, np.finfo(float).max),  # wrong places have a check of their own
+        "longitude": (gnss.lon_rad, np.finfo(float).max),
+        "height": (gnss.alt_m, ALT_LIMIT_M),
+    }
     if gnss.v_n is not None:
-        columns |= {f"velocity {a}": gnss.v_n[:, k] for k, a in enumerate(_AXES[gnss.nav])}
-    for name, column in columns.items():
-        bad = ~np.isfinite(column)
+        for k, axis in enumerate(_AXES[gnss.nav]):
+            columns[f"velocity {axis}"] = gnss.v_n[:, k], SPEED_LIMIT
+    for name, (column, limit) in columns.items():
+        bad = ~(np.abs(column) <= limit)
         if bad.any():
+            k = int(np.argmax(bad))
             yield finding(
                 gnss,
-                "error" if bad.all() and name in ("latitude", "longitude") else "warning",
+                "error" if bad.all() else "warning",
                 "gnss_missing",
                 int(bad.sum()),
-                f"{name} is missing in {bad.sum()} of {len(gnss)} fixes, here first. The receiver "
-                "had none; the other components of those fixes are used.",
-                int(np.argmax(bad)),
+                f"{name} is {column[k]:g} here, missing or impossible in {bad.sum()} of "
+                f"{len(gnss)} fixes. The receiver had none, or the columns are others; `clean` "
+                "leaves it out and keeps the other components of those fixes.",
+                k,
             )
 
 
@@ -48,8 +58,7 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
     known = np.isfinite(lat) & np.isfinite(lon)
     if not known.any():
         return
-    with np.errstate(invalid="ignore"):
-        beyond = known & ((np.abs(lat) > np.pi / 2) | (np.abs(lon) > 2 * np.pi))
+    beyond = known & ((np.abs(lat) > np.pi / 2) | (np.abs(lon) > 2 * np.pi))
     if beyond.any():
         k = int(np.argmax(beyond))
         lat_deg, lon_deg = np.rad2deg(lat[k]), np.rad2deg(lon[k])
@@ -95,9 +104,7 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
 
 
 def _height(gnss: GnssTable) -> Iterator[Finding]:
-    if not np.isfinite(gnss.alt_m).any():
-        return
-    alt = float(np.nanmedian(gnss.alt_m))
+    alt = median_of(gnss.alt_m)
     if alt < -500.0 or alt > 12_000.0:
         hidden = alt < -12_000.0 or alt > 2_000_000.0
         yield finding(
@@ -117,8 +124,7 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
     if gnss.sigma_v is not None and gnss.v_n is not None:
         groups.append(("velocity", "m/s", gnss.sigma_v, gnss.v_n))
     for what, unit, sigma, values in groups:
-        with np.errstate(invalid="ignore"):
-            bad = (np.isfinite(values) & (sigma <= 0.0)).any(axis=1)
+        bad = (np.isfinite(values) & (sigma <= 0.0)).any(axis=1)
         if bad.any():
             k = int(np.argmax(bad))
             shown = ", ".join(f"{s:g}" for s in sigma[k])
@@ -132,10 +138,16 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
                 "ends in NaN; write real sigmas (RTK 0.02 m, code 2 m; velocity 0.05 m/s).",
                 k,
             )
-        good = sigma[np.isfinite(sigma) & (sigma > 0.0)]
-        if not len(good):
-            continue
-        typical = float(np.median(good))
+        if np.isfinite(values).any() and np.isnan(sigma).all():
+            yield finding(
+                gnss,
+                "error",
+                "sigma_missing",
+                len(gnss),
+                f"the {what} has no sigma in any fix. A filter cannot weigh it; write real sigmas "
+                "(RTK 0.02 m, code 2 m; velocity 0.05 m/s).",
+            )
+        typical = median_of(sigma[sigma > 0.0])
         if typical < 1e-3 or typical > 1e3:
             yield finding(
                 gnss,
@@ -155,17 +167,16 @@ def _quality(gnss: GnssTable) -> Iterator[Finding]:
     fixed, other = gnss.quality == 1, gnss.quality > 1
     if not (fixed.any() and other.any()):
         return
-    with np.errstate(invalid="ignore"):
-        ratio = float(np.nanmedian(size[other]) / np.nanmedian(size[fixed]))
+    sure, unsure = median_of(size[fixed]), median_of(size[other])
     k = int(np.argmax(other))
-    if ratio < 1.5:
+    if 0.0 < unsure < 1.5 * sure:
         yield finding(
             gnss,
             "warning",
             "float_sigma",
-            ratio,
+            unsure / sure,
             f"{other.sum()} of {len(gnss)} fixes are float or worse (Q > 1, from here on in part) "
-            f"but state {ratio:.2g} times the sigma of fixed ones ({np.nanmedian(size[other]):.3g} "
+            f"but state {unsure / sure:.2g} times the sigma of fixed ones ({unsure:.3g} "
             "m). The receiver is too sure of them; scale their sigmas, by 2 for float and 5 for "
             "single.",
             k,
@@ -178,8 +189,7 @@ def _resolution(gnss: GnssTable) -> Iterator[Finding]:
     if len(lat_deg) < 10:
         return
     step_m = float(np.min(np.diff(lat_deg))) * 111_000.0
-    with np.errstate(invalid="ignore"):
-        sigma = float(np.nanmedian(gnss.sigma_m[:, 0]))
+    sigma = median_of(gnss.sigma_m[:, 0])
     if step_m > sigma > 0.0:
         yield finding(
             gnss,

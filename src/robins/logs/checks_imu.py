@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -46,17 +47,11 @@ def check_imu(imu: ImuTable) -> Iterator[Finding]:
         yield from _rates(imu, signal, windows)
 
 
-def _quiet(windows: Windows) -> np.ndarray:
-    """Windows at rest, or all if there are none."""
-    return windows.at_rest if windows.at_rest.any() else np.ones_like(windows.at_rest)
-
-
 def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]:
-    quiet = _quiet(windows)
-    size = np.linalg.norm(windows.accel[quiet], axis=-1)
+    size = np.linalg.norm(windows.accel[windows.calm], axis=-1)
     measured = float(np.median(size))
-    row = int(signal.rows[windows.first[np.flatnonzero(quiet)[0]]])
-    where = "at rest" if windows.at_rest.any() else "on average (it never rests)"
+    row = int(signal.rows[windows.first[np.flatnonzero(windows.calm)[0]]])
+    where = "at rest" if windows.at_rest.any() else "at its calmest (it never rests)"
     if _GRAVITY[0] <= measured <= _GRAVITY[1]:
         return
     if abs(measured / G - 1.0) < _BIASED:
@@ -72,7 +67,8 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
             row,
         )
         return
-    causes = [*_kind_causes(imu, signal.step_s, measured), *_unit_causes(measured)]
+    causes = [*_rates_for_increments(imu, signal.step_s), *_unit_causes(measured)]
+    causes = [*_increments_for_rates(imu, signal.step_s, measured), *causes]
     shown = f"{where} the specific force is {measured:.4g} m/s^2 where gravity is 9.8"
     if causes:
         yield finding(
@@ -83,6 +79,16 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
             f"{shown}. {' Or '.join(f'{cause}.' for _, cause in causes)}",
             row,
         )
+    elif measured < 0.5:
+        yield finding(
+            imu,
+            "error",
+            "gravity_missing",
+            measured,
+            f"{shown}. Gravity was taken off: these are 'linear accelerations' of a phone or of "
+            "another filter. Log the raw accelerometers; gravity cannot be put back.",
+            row,
+        )
     elif windows.at_rest.any():
         yield finding(
             imu,
@@ -90,7 +96,7 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
             "gravity_unknown",
             measured,
             f"{shown}, and no usual unit makes it that. A scale factor is missing (counts of the "
-            "converter?), the columns are in another order, or gravity was taken off already.",
+            "converter?), or the columns are in another order.",
             row,
         )
     else:
@@ -105,29 +111,37 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
         )
 
 
-def _kind_causes(imu: ImuTable, step_s: float, measured: float) -> list[tuple[str, str]]:
-    """Rates taken for increments, and the reverse, in m/s^2 or g."""
-    out = []
-    for scale, unit, summed in ((G, "m/s^2", "m/s"), (1.0, "g", "g s")):
-        if imu.kind == "increment" and _near(measured, scale / step_s):
-            out.append(
-                (
-                    "rates_as_increments",
-                    f"The rows are rates in {unit}, not increments over {step_s * 1e3:.4g} ms: "
-                    f"multiply accelerations{_g_word(unit)} and angular rates by that time, or "
-                    "name a format of rates",
-                )
+_READINGS = ((G, "m/s^2", "m/s"), (1.0, "g", "g s"))
+
+
+def _rates_for_increments(imu: ImuTable, step_s: float) -> Iterator[tuple[str, str]]:
+    """Rates taken for increments: gravity shows before anything is divided by time."""
+    raw = signal_of(dataclasses.replace(imu, kind="rate"))
+    if imu.kind == "rate" or raw is None:
+        return
+    windows = windows_of(raw)
+    measured = float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
+    for scale, unit, _ in _READINGS:
+        if _near(measured, scale):
+            yield (
+                "rates_as_increments",
+                f"The rows are rates in {unit}, not increments over {step_s * 1e3:.4g} ms: "
+                f"multiply accelerations{_g_word(unit)} and angular rates by that time, or name a "
+                "format of rates",
             )
+
+
+def _increments_for_rates(
+    imu: ImuTable, step_s: float, measured: float
+) -> Iterator[tuple[str, str]]:
+    """Increments taken for rates: gravity shows as what it adds up to over one step."""
+    for scale, unit, summed in _READINGS:
         if imu.kind == "rate" and _near(measured, scale * step_s):
-            out.append(
-                (
-                    "increments_as_rates",
-                    f"The rows are increments over {step_s * 1e3:.4g} ms in {summed}, not rates: "
-                    f"divide both sensors by that time{_g_word(unit)}, or name a format of "
-                    "increments",
-                )
+            yield (
+                "increments_as_rates",
+                f"The rows are increments over {step_s * 1e3:.4g} ms in {summed}, not rates: "
+                f"divide both sensors by that time{_g_word(unit)}, or name a format of increments",
             )
-    return out
 
 
 def _g_word(unit: str) -> str:
@@ -148,7 +162,7 @@ def _near(measured: float, expected: float) -> bool:
 
 def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
     """The sign of gravity along z: specific force at rest points up."""
-    force = windows.accel[_quiet(windows)]
+    force = windows.accel[windows.calm]
     direction = np.median(force / np.linalg.norm(force, axis=-1, keepdims=True), axis=0)
     down = direction[2] if imu.body == "FRD" else -direction[2]
     axes = "forward-right-down" if imu.body == "FRD" else "right-forward-up"
@@ -209,7 +223,7 @@ def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]
             "error",
             "gyro_unit",
             most,
-            f"{shown}, more than any gyro of a vehicle. The columns are probably in {unit}: "
+            f"{shown}, too much for the gyro of a vehicle. The columns are probably in {unit}: "
             f"multiply by {mend}.",
             row,
         )

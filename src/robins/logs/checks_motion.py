@@ -17,12 +17,15 @@ from robins.logs.motion import (
     signed_permutations,
     travel_in_body,
     unexplained,
+    unexplained_but_for_biases,
 )
 from robins.logs.quiet import Signal, finding, name_of, signal_of, windows_of
 
-_GOOD = 0.5  # share left unexplained by data that fit
+_WELL = 0.05  # share left unexplained by data about which there is no question
+_GOOD = 0.5  # most that data which fit may leave
 _BETTER = 0.4  # a hypothesis must leave this share of what the data as they are leave
 _OFFSET_S = 0.05
+_SMALL_LAG_S = 5.0
 _SCALES = {
     np.pi / 180: ("deg/s", "multiply by pi/180"),
     np.pi / 180 / 3600: ("deg/h", "multiply by pi/180/3600"),
@@ -47,22 +50,29 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
             "to have them checked.",
         )
         return
-    as_is = float(np.nanmean(unexplained(pair, np.eye(3)[None]).proper))
-    if as_is < _GOOD:
+    as_is = float(np.mean(unexplained(pair, np.eye(3)[None]).proper))
+    if as_is > _WELL:  # a large bias must not look like a wrong axis
+        as_is = min(as_is, float(np.mean(unexplained_but_for_biases(pair, np.zeros(1)))))
+    wrong = _diagnosis(imu, gnss, signal, pair, as_is) if as_is > _WELL else None
+    if wrong is not None:
+        yield wrong
+    else:
         yield from _small_offset(imu, gnss, pair)
         yield from _forward(imu, gnss, pair)
-        return
-    yield _diagnosis(imu, gnss, signal, pair, as_is)
 
 
 def _pair(imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track) -> Pair | None:
     """Both on one time, specific force scaled to gravity, velocities without their delay."""
     windows = windows_of(signal)
-    quiet = windows.at_rest if windows.at_rest.any() else np.ones_like(windows.at_rest)
-    size = float(np.median(np.linalg.norm(windows.accel[quiet], axis=-1)))
+    size = float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
     if not size > 0.0:
         return None
-    scaled = signal._replace(accel=signal.accel * (GRAVITY / size))
+    # Half a minute of a cheap gyro's bias tilts gravity by more than the vehicle accelerates.
+    bias = (
+        np.median(windows.gyro[windows.at_rest], axis=0) if windows.at_rest.any() else np.zeros(3)
+    )
+    accel, gyro = signal.accel * (GRAVITY / size), signal.gyro - bias
+    scaled = signal._replace(accel=accel, gyro=gyro)
     v_n, noise = velocity_of(track)
     start = int(imu.time_ns[signal.rows[0]]) - int(gnss.time_ns[0])
     when = track.time_s - start * 1e-9 - (lateness(track) or 0.0)
@@ -70,9 +80,10 @@ def _pair(imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track) -> Pair 
 
 
 def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
-    lags = np.arange(-20, 21) * 0.05
-    fit = unexplained(pair, np.eye(3)[None], lags).proper
-    each = [lowest(lags, left) for left in fit if np.isfinite(left).all()]
+    lags = np.arange(-_SMALL_LAG_S, _SMALL_LAG_S + 0.05, 0.1)
+    left = _mean(unexplained(pair, np.eye(3)[None], lags))[0]
+    lags = lags[np.nanargmin(left)] + np.arange(-2, 3) * 0.1
+    each = [lowest(lags, left) for left in unexplained_but_for_biases(pair, lags)]
     clear = np.array([lag for lag in each if lag is not None])
     if len(clear) < max(1, len(each) // 2):
         return
@@ -80,7 +91,7 @@ def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Findin
     if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())):
         yield finding(
             gnss,
-            "warning",
+            "error" if abs(lag) > 1.0 else "warning",
             "time_offset",
             lag,
             f"the motion fits {name_of(imu)} best if {lag:+.2f} s is added to the stamps of this "
@@ -110,8 +121,10 @@ def _forward(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
         )
 
 
-def _diagnosis(imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is: float) -> Finding:
-    """The hypothesis that explains the motion best, or that none does."""
+def _diagnosis(
+    imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is: float
+) -> Finding | None:
+    """The hypothesis that explains the motion much better, or that none does what none should."""
     scales = [*_SCALES, signal.step_s, 1.0 / signal.step_s]
     lags = np.arange(-120, 121) * 0.25
     tried = {
@@ -119,11 +132,13 @@ def _diagnosis(imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is
         "axes": unexplained(pair, signed_permutations()),
         "lag": unexplained(pair, np.eye(3)[None], lags),
     }
-    left = {name: float(np.nanmin(_mean(fit))) for name, fit in tried.items()}
-    left["lag"] = float(np.nanmin(_mean(tried["lag"])[0]))  # a reflection has no delay
-    left["scale"] = float(np.nanmin(_mean(tried["scale"])[0]))
+    left = {name: _least(_mean(fit)) for name, fit in tried.items()}
+    left["lag"] = _least(_mean(tried["lag"])[0])  # a reflection has no delay
+    left["scale"] = _least(_mean(tried["scale"])[0])
     best = min(left, key=lambda name: left[name])
     if left[best] > min(_GOOD, _BETTER * as_is):
+        if as_is < _GOOD:
+            return None
         return finding(
             imu,
             "warning",
@@ -138,10 +153,16 @@ def _diagnosis(imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is
         f"(then {left[best]:.0%} of the change of velocity is left unexplained, now {_all(as_is)})"
     )
     if best == "lag":
-        return _late(imu, gnss, lags, tried["lag"], share)
+        late = _late(imu, gnss, lags, tried["lag"], share)
+        return late if abs(float(late.value)) > _SMALL_LAG_S else None
     if best == "scale":
         return _unit(imu, scales[int(np.nanargmin(_mean(tried["scale"])[0]))], signal.step_s, share)
     return _axes(imu, tried["axes"], share)
+
+
+def _least(left: np.ndarray) -> float:
+    finite = left[np.isfinite(left)]
+    return float(finite.min()) if len(finite) else np.inf
 
 
 def _all(share: float) -> str:
@@ -243,7 +264,7 @@ def _axes(imu: ImuTable, fit: Fit, share: str) -> Finding:
         imu,
         "error",
         code,
-        float(np.nanmin(left)),
+        _least(left),
         f"gyros and accelerometers together do not explain the GNSS velocities, with other axes "
         f"they do {share}. {cause}.",
     )

@@ -62,7 +62,7 @@ def _span(table: ImuTable | GnssTable | Trajectory) -> tuple[float, float]:
 def _offset(a: float, b: float, c: float, d: float) -> str:
     """Which shift of the other table's time [c, d] would put it on the IMU's [a, b]."""
 
-    def fits(shift: float) -> bool:
+    def fits(shift: float | int) -> bool:
         return min(b, d + shift) - max(a, c + shift) > 0.5 * min(b - a, d - c)
 
     weeks = round((a - GPS_EPOCH_S - c) / WEEK_S), round((c - GPS_EPOCH_S - a) / WEEK_S)
@@ -84,14 +84,14 @@ def _offset(a: float, b: float, c: float, d: float) -> str:
     ):
         if fits(shift):
             return f"Its times are probably {cause}: they fit if {shift:+.0f} s is added."
-    hours = round((a - c) / 3600.0)
-    if 0 < abs(hours) <= 14 and fits(hours * 3600.0):
-        return f"They fit if {hours:+d} h is added: one clock is in local time."
     for scale, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         for low, high, whose in ((c, d, "its"), (a, b, "the IMU's")):
             first, last = (a, b) if whose == "its" else (c, d)
             if min(last, high * scale) - max(first, low * scale) > 0:
                 return f"They fit if {whose} times are {unit}: convert that column to seconds."
+    hours = round((a - c) / 3600.0)
+    if 0 < abs(hours) <= 14 and fits(hours * 3600.0):
+        return f"They fit if {hours:+d} h is added: one clock is in local time."
     return (
         "No usual offset explains it: one counts from power-up, or the files are of different "
         "recordings. Give both one time base."

@@ -106,7 +106,7 @@ def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         if lost <= _BLIP:
             slips.append(int(k))
             continue
-        size = -step[k] + usual
+        size = float(-step[k]) + usual
         cause = _named(size, usual, _WRAPS | _STEPS) or "The clock was set, or the logger restarted"
         yield finding(
             table,
@@ -154,9 +154,9 @@ def _named(size: float, usual: float, names: dict[float, str]) -> str:
 
 
 def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
-    rows = np.flatnonzero(keep)
-    step = np.diff(table.time_ns[rows]) * 1e-9
-    long = np.flatnonzero(step > _GAP * usual)
+    rows = np.flatnonzero(keep).tolist()
+    step = (np.diff(table.time_ns[rows]) * 1e-9).tolist()
+    long = [k for k, s in enumerate(step) if s > _GAP * usual]
     jumps = [k for k in long if _jump(step[k] - usual, usual)]
     for k in jumps:
         size = step[k] - usual
@@ -164,10 +164,10 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
             table,
             "error" if size > 1.5 else "warning",
             "time_jump",
-            float(size),
+            size,
             f"time jumps ahead by {size:.6g} s. {_jump(size, usual)}, unless exactly that much was "
             "lost. If the motion goes on without a break, take the step off all later stamps.",
-            int(rows[k + 1]),
+            rows[k + 1],
         )
     gaps = [k for k in long if k not in jumps]
     if not gaps:
@@ -189,7 +189,7 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         f"no sample for {step[worst]:.6g} s before this one, where {usual:.6g} s is usual "
         f"({len(gaps)} gaps, {total:.6g} s in all, the first at {place(table, rows[gaps[0]])}). "
         f"{cause}.",
-        int(rows[worst + 1]),
+        rows[worst + 1],
     )
 
 

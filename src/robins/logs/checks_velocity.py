@@ -9,7 +9,7 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding
 from robins.logs.gnss_motion import Steps, Track, lateness, steps_of, track_of
-from robins.logs.quiet import finding
+from robins.logs.quiet import finding, median_of
 
 _AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
 _SCALES = {
@@ -116,7 +116,7 @@ def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
     for exchange in (False, True):
         for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             turned = (v[:, ::-1] if exchange else v) * signs
-            scale = float(np.sum(p * turned) / np.sum(v * v))
+            scale = max(float(np.sum(p * turned) / np.sum(v * v)), 0.0)
             left = float(np.sum((p - scale * turned) ** 2) / np.sum(p * p))
             words = "exchanged horizontal axes" if exchange else ""
             minus = [name for name, s in zip(("north", "east"), signs, strict=True) if s < 0]
@@ -156,7 +156,7 @@ def _wrong_scale(gnss: GnssTable, ratio: float) -> Finding:
     known = [words for value, words in _SCALES.items() if abs(ratio / value - 1.0) < 0.05]
     if known:
         cause = f"They are probably in {known[0][0]}: {known[0][1]}"
-    elif 10.0 < ratio < 60.0 and np.nanmax(np.abs(gnss.lat_rad)) < np.deg2rad(np.pi / 2):
+    elif 10.0 < ratio < 60.0 and abs(median_of(gnss.lat_rad)) < np.deg2rad(np.pi / 2):
         cause = "The positions are radians that were read as degrees: convert them"
     else:
         cause = "A unit or a column is wrong; compare with a known speed"

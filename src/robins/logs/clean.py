@@ -138,15 +138,15 @@ def _components(
         absurd = np.abs(values) > limit
         unsure = sigma <= 0.0
     for k, name in enumerate(_COMPONENTS):
-        stated = np.isfinite(values[:, k]) & np.isfinite(sigma[:, k])
-        if stated.any() and unsure[stated, k].all():
+        known = np.isfinite(values[:, k])
+        if known.any() and not (sigma[known, k] > 0.0).any():
             raise LogError(
                 gnss.source or "GnssTable",
-                f"the {name} {what} has {np.count_nonzero(stated)} fixes and no positive sigma",
+                f"the {name} {what} has {np.count_nonzero(known)} fixes and no positive sigma",
                 "zero means unknown, not exact: give real sigmas"
                 + (", or leave the velocities out" if what == "velocity" else ""),
                 field=f"sigma of {name} {what}",
-                value=float(sigma[stated, k][0]),
+                value=float(sigma[known, k][0]),
             )
     nan = np.isnan(values) | np.isnan(sigma)
     inf = (np.isinf(values) | np.isinf(sigma)) & ~nan

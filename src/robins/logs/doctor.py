@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
 from robins.logs.checks_columns import check_columns
@@ -40,7 +42,11 @@ def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
     Raises:
         LogError: arrays that are no tables: other lengths, types, shapes.
     """
-    tables, findings = _tables(subject)
+    with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
+        return by_severity(_examined(*_tables(subject)))
+
+
+def _examined(tables: list[Table], findings: list[Finding]) -> list[Finding]:
     imu = gnss = None
     for table in tables:
         if isinstance(table, ImuTable):
@@ -63,7 +69,7 @@ def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
                 findings += check_span(imu, table)
     if imu is not None and gnss is not None and not _SPOILT & {f.code for f in findings}:
         findings += check_motion(imu, gnss)
-    return by_severity(findings)
+    return findings
 
 
 def _tables(subject: Dataset | Table | Sequence[Table]) -> tuple[list[Table], list[Finding]]:

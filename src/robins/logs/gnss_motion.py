@@ -8,6 +8,7 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.earth import curvature_radii
+from robins.logs.clean import ALT_LIMIT_M, SPEED_LIMIT
 from robins.logs.ordering import increasing
 
 _BASE_S = 1.0
@@ -34,10 +35,10 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
     """
     lat, lon = (gnss.lon_rad, gnss.lat_rad) if swap else (gnss.lat_rad, gnss.lon_rad)
     place = np.stack([lat, lon, gnss.alt_m], axis=-1)
-    good = np.isfinite(place).all(axis=1) & (np.abs(lat) < np.deg2rad(89.9))
+    good = np.all(np.abs(place) <= [np.deg2rad(89.9), 2 * np.pi, ALT_LIMIT_M], axis=1)
     v = gnss.v_n
     if v is not None:
-        good &= np.isfinite(v).all(axis=1)
+        good &= np.all(np.abs(v) <= SPEED_LIMIT, axis=1)
     rows = np.flatnonzero(good)
     rows = rows[increasing(gnss.time_ns[rows])]
     if len(rows) < 10:
@@ -55,9 +56,8 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
         ],
         axis=-1,
     )
-    with np.errstate(invalid="ignore"):
-        sigma_v = np.inf if gnss.sigma_v is None else float(np.median(gnss.sigma_v[rows]))
-        sigma_m = float(np.median(gnss.sigma_m[rows][:, :2]))
+    sigma_v = np.inf if gnss.sigma_v is None else float(np.median(gnss.sigma_v[rows]))
+    sigma_m = float(np.median(gnss.sigma_m[rows][:, :2]))
     time_s = (gnss.time_ns[rows] - gnss.time_ns[0]) * 1e-9
     return Track(rows, time_s, r_n, v, sigma_m, sigma_v)
 
@@ -141,8 +141,13 @@ def lateness(track: Track) -> float | None:
 
 
 def lowest(x: np.ndarray, y: np.ndarray) -> float | None:
-    """Where a sampled curve is lowest, by the parabola through three points; None at an end."""
-    k = int(np.argmin(y))
+    """Where a sampled curve is lowest, by the parabola through three points.
+
+    None at an end, or beside a sample that is missing (NaN).
+    """
+    if np.isnan(y).all():
+        return None
+    k = int(np.nanargmin(y))
     if k in (0, len(x) - 1):
         return None
     below, here, above = y[k - 1 : k + 2]

@@ -26,6 +26,8 @@ _RATE_HZ = 20
 STRETCH_S = 30  # long enough to turn, short enough for the drift of cheap gyros
 _STRETCHES = 4
 _NO_LAG = np.zeros(1)
+_BIAS_STEP = 1e-4  # rad/s, m/s^2
+_BIAS_SIGMA = np.repeat([0.01, 0.1], 3)  # what the unknowns are measured in
 
 
 def signed_permutations() -> np.ndarray:
@@ -52,7 +54,6 @@ class Fit(NamedTuple):
 
     proper: np.ndarray  # (stretches, hypotheses) share left unexplained by the best rotation
     mirrored: np.ndarray  # (stretches, hypotheses) by the best reflection
-    R_nb: np.ndarray  # (stretches, hypotheses, 3, 3) that rotation, body at the start to NED
 
 
 def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -> Pair | None:
@@ -99,6 +100,16 @@ def unexplained(pair: Pair, gyro_maps: np.ndarray, lags_s: np.ndarray = _NO_LAG)
     return Fit(*(np.stack(part) for part in zip(*out, strict=True)))
 
 
+def unexplained_but_for_biases(pair: Pair, lags_s: np.ndarray) -> np.ndarray:
+    """(stretches, lags) share left by the data as they are, once constant biases are taken off.
+
+    A time offset and an accelerometer bias look alike where the motion is gentle, and a gyro bias
+    tilts gravity, so both are estimated with the rotation: two steps of Gauss-Newton on nine
+    parameters, differentiated numerically.
+    """
+    return np.stack([_judge_biased(pair, start, lags_s) for start in pair.starts])
+
+
 def travel_in_body(pair: Pair) -> np.ndarray:
     """(k, 3) velocities in body axes, where the pair fits as it is and moves: which way is forward.
 
@@ -106,33 +117,75 @@ def travel_in_body(pair: Pair) -> np.ndarray:
     """
     out = []
     for start in pair.starts:
-        _, _, R = _judge(pair, start, np.eye(3)[None], _NO_LAG)
-        fine = (np.arange(STRETCH_S * _RATE_HZ + 1) + start * _RATE_HZ)[None]
-        turn, push = (np.diff(_between(fine, x), axis=1) for x in (pair.turn, pair.push))
-        _, C = _sum_unturned(turn, push)
+        view = _view(pair, start, _NO_LAG)
+        sums, C = _sum_unturned(view.turn, view.push)
+        R, _, _ = _kabsch(sums, view.wanted)
         v_n = _at(start + np.arange(STRETCH_S), pair.gnss_s, pair.v_n)
         v_b = np.einsum("kji,lj,kl->ki", C[0], R[0], v_n)  # C^T R^T v
         out.append(v_b[np.linalg.norm(v_n, axis=-1) > 0.5])
     return np.concatenate(out)
 
 
-def _judge(
-    pair: Pair, start: float, gyro_maps: np.ndarray, lags_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class _View(NamedTuple):
+    """One stretch, the IMU seen with several delays."""
+
+    turn: np.ndarray  # (lags, fine, 3) rad
+    push: np.ndarray  # (lags, fine, 3) m/s
+    wanted: np.ndarray  # (seconds, 3) change of v - g dt
+    power: float  # squares of its change
+    seen: np.ndarray  # (lags,) bool: all of it was recorded
+
+
+def _view(pair: Pair, start: float, lags_s: np.ndarray) -> _View:
     seconds = start + np.arange(STRETCH_S + 1)
     wanted = np.diff(_at(seconds, pair.gnss_s, pair.v_n), axis=0) - [0.0, 0.0, GRAVITY]
-    power = np.sum((wanted - wanted.mean(axis=0)) ** 2)
+    power = float(np.sum((wanted - wanted.mean(axis=0)) ** 2))
     fine = np.arange(STRETCH_S * _RATE_HZ + 1) / _RATE_HZ + start
-    index = (fine + lags_s[:, None]) * _RATE_HZ  # (h or 1, fine)
+    index = (fine + lags_s[:, None]) * _RATE_HZ
     turn, push = (np.diff(_between(index, x), axis=1) for x in (pair.turn, pair.push))
+    seen = (index[:, 0] >= 0.0) & (index[:, -1] <= len(pair.turn) - 1)
+    return _View(turn, push, wanted, power, seen)
+
+
+def _judge(
+    pair: Pair, start: float, gyro_maps: np.ndarray, lags_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    view = _view(pair, start, lags_s)
     count = max(len(gyro_maps), len(lags_s))
-    turn, push = (np.broadcast_to(x, (count, *x.shape[1:])) for x in (turn, push))
+    turn, push = (np.broadcast_to(x, (count, *x.shape[1:])) for x in (view.turn, view.push))
     turn = np.einsum("hij,hkj->hki", np.broadcast_to(gyro_maps, (count, 3, 3)), turn)
     sums, _ = _sum_unturned(turn, push)
-    R, left, mirrored = _kabsch(sums, wanted)
-    seen = (index[:, 0] >= 0.0) & (index[:, -1] <= len(pair.turn) - 1)
-    left, mirrored = (np.where(seen, x / power, np.nan) for x in (left, mirrored))
-    return left, mirrored, R
+    _, left, mirrored = _kabsch(sums, view.wanted)
+    left, mirrored = (np.where(view.seen, x / view.power, np.nan) for x in (left, mirrored))
+    return left, mirrored
+
+
+def _judge_biased(pair: Pair, start: float, lags_s: np.ndarray) -> np.ndarray:
+    view = _view(pair, start, lags_s)
+    bias = np.zeros((len(lags_s), 6))  # gyro rad/s, accelerometer m/s^2
+    trials = np.concatenate([np.zeros((1, 6)), _BIAS_STEP * np.eye(6)])
+    for _ in range(2):
+        sums = _sums_without(view, bias[:, None] + trials)
+        R, _, _ = _kabsch(sums[:, 0], view.wanted)
+        for h in range(len(lags_s)):
+            here = sums[h, 0] @ R[h].T
+            by_bias = (sums[h, 1:] - sums[h, :1]) @ R[h].T / _BIAS_STEP
+            by_turn = np.cross(np.eye(3)[:, None], here)
+            design = np.concatenate([by_bias * _BIAS_SIGMA[:, None, None], by_turn])
+            rest = (view.wanted - here).ravel()
+            solution = np.linalg.lstsq(design.reshape(9, -1).T, rest, rcond=1e-6)[0]
+            bias[h] += solution[:6] * _BIAS_SIGMA
+    _, left, _ = _kabsch(_sums_without(view, bias[:, None])[:, 0], view.wanted)
+    return np.where(view.seen, left / view.power, np.nan)
+
+
+def _sums_without(view: _View, bias: np.ndarray) -> np.ndarray:
+    """(lags, trials, seconds, 3) sums after biases (lags, trials, 6) are taken off."""
+    off = bias[:, :, None] / _RATE_HZ
+    turn, push = view.turn[:, None] - off[..., :3], view.push[:, None] - off[..., 3:]
+    shape = (-1, *turn.shape[2:])
+    sums, _ = _sum_unturned(turn.reshape(shape), push.reshape(shape))
+    return sums.reshape(*bias.shape[:2], STRETCH_S, 3)
 
 
 def _integral(time_s: np.ndarray, rate: np.ndarray) -> np.ndarray:
@@ -156,14 +209,15 @@ def _sum_unturned(turn: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.nd
     """Velocity increments (h, seconds, 3) in the axes of the first moment, and C (h, seconds, 3, 3)
     from the axes at the start of each second to those.
     """
-    whole, half = _rotations(turn), _rotations(0.5 * turn)
+    whole = _rotations(turn)
+    push = np.einsum("hkij,hkj->hki", _rotations(0.5 * turn), push)
     C = np.broadcast_to(np.eye(3), (len(turn), 3, 3))
     out = np.zeros((len(turn), STRETCH_S, 3))
     attitudes = []
     for k in range(turn.shape[1]):
         if k % _RATE_HZ == 0:
             attitudes.append(C)
-        out[:, k // _RATE_HZ] += np.einsum("hij,hjk,hk->hi", C, half[:, k], push[:, k])
+        out[:, k // _RATE_HZ] += np.einsum("hij,hj->hi", C, push[:, k])
         C = C @ whole[:, k]
     return out, np.stack(attitudes, axis=1)
 

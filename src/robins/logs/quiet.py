@@ -12,6 +12,7 @@ from robins.logs.findings import Finding, Severity
 from robins.logs.ordering import increasing
 
 _WINDOW_S = 1.0
+_NONSENSE = 1e9
 _REST = 0.01  # relative scatter of |specific force| in a window at rest
 _STEADY = 0.003  # relative change of the specific force from one window at rest to the next
 
@@ -51,6 +52,12 @@ def usual_step_s(time_ns: np.ndarray) -> float:
     return float(np.median(step)) * 1e-9 if len(step) else np.nan
 
 
+def median_of(values: np.ndarray) -> float:
+    """Median of the finite numbers; NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else np.nan
+
+
 class Signal(NamedTuple):
     """An IMU table as rates, good rows only, in the order of time."""
 
@@ -63,7 +70,8 @@ class Signal(NamedTuple):
 
 def signal_of(imu: ImuTable) -> Signal | None:
     """The usable samples of a table; None if there are fewer than ten."""
-    good = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
+    # Wide enough for deg/h and milli-g, so that a wrong unit is seen, and squares do not overflow.
+    good = (np.abs(np.hstack([imu.gyro, imu.accel])) < _NONSENSE).all(axis=1)
     rows = np.flatnonzero(good)
     rows = rows[increasing(imu.time_ns[rows])]
     if len(rows) < 10:
@@ -85,6 +93,7 @@ class Windows(NamedTuple):
     accel: np.ndarray  # (w, 3) mean
     restless: np.ndarray  # (w,) scatter of |gyro - mean|
     at_rest: np.ndarray  # (w,) bool: the specific force hardly changes; needs no unit
+    calm: np.ndarray  # (w,) bool: those at rest; if there are none, the quietest tenth
 
 
 def windows_of(signal: Signal) -> Windows:
@@ -101,10 +110,13 @@ def windows_of(signal: Signal) -> Windows:
     # A smooth drive scatters as little as rest does, but its force changes with every turn.
     change = np.linalg.norm(np.diff(force, axis=0), axis=-1) < _STEADY * mean[1:]
     steady = np.concatenate([change, [False]]) | np.concatenate([[False], change])
+    scatter = size.std(axis=1)
+    at_rest = steady & (scatter < _REST * mean)
     return Windows(
         np.arange(count) * n,
         gyro.mean(axis=1),
         force,
         np.linalg.norm(gyro.std(axis=1), axis=-1),
-        steady & (size.std(axis=1) < _REST * mean),
+        at_rest,
+        at_rest if at_rest.any() else scatter <= np.percentile(scatter, 10.0),
     )
