@@ -106,8 +106,8 @@ def _write(
     for file, content in outcome.files.items():
         writer.save_file(file, content)
 
-    def drawing(done: float, total: float, what: str) -> None:
-        tell(0.85 + 0.15 * done / max(total, 1.0), what)
+    def drawing(done: int, total: int, what: str) -> None:
+        tell(0.85 + 0.15 * done / max(total, 1), what)
 
     report.add(writer, drawing)
     return Done(Path(out), {}, tuple(outcome.notes))

@@ -1,5 +1,6 @@
 """Standstill and the start of a replay, on motion that is known."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,11 +32,13 @@ def test_levelling_returns_the_tilt_of_every_attitude():
     for roll, pitch, heading in rng.uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (30, 3)):
         C_nb = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading)))
         q = level(C_nb.T @ [0.0, 0.0, -G], heading)
-        np.testing.assert_allclose(np.asarray(rotation.to_dcm(q)), C_nb, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(rotation.to_dcm(jnp.asarray(q))), C_nb, atol=1e-12)
         turned = with_heading(q, heading + 1.0)
         expected = rotation.from_euler(roll, pitch, heading + 1.0)
         np.testing.assert_allclose(
-            np.asarray(rotation.to_dcm(turned)), np.asarray(rotation.to_dcm(expected)), atol=1e-12
+            np.asarray(rotation.to_dcm(jnp.asarray(turned))),
+            np.asarray(rotation.to_dcm(expected)),
+            atol=1e-12,
         )
 
 
@@ -48,9 +51,7 @@ def _walk(rest_s, go_s, roll, pitch, heading_rest, course):
     C_rest = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading_rest)))
     # a turn about the vertical, seen in the body
     theta[n0:] += C_rest.T @ [0.0, 0.0, rate * DT]
-    dv = np.tile(C_rest.T @ [0.0, 0.0, -G] * DT, (n0 + n1, 1)) + rng.normal(
-        0, 1e-4, (n0 + n1, 3)
-    )
+    dv = np.tile(C_rest.T @ [0.0, 0.0, -G] * DT, (n0 + n1, 1)) + rng.normal(0, 1e-4, (n0 + n1, 3))
     shake = np.zeros_like(dv)
     shake[n0:] = 0.02 * rng.normal(size=(n1, 3))
     dt = np.full(n0 + n1, DT)
@@ -69,10 +70,10 @@ def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
     assert not np.any(still[900:])
     found = find_start(*log, 0.7, 100.0, Start(), Aids())
     assert found.time_s == pytest.approx(11.75, abs=0.3)
-    _, _, heading = (float(a) for a in rotation.to_euler(found.q_nb))
+    _, _, heading = (float(a) for a in rotation.to_euler(jnp.asarray(found.q_nb)))
     assert heading == pytest.approx(course, abs=1e-9)
     # turning about the vertical keeps roll and pitch
-    roll_found, pitch_found, _ = (float(a) for a in rotation.to_euler(found.q_nb))
+    roll_found, pitch_found, _ = (float(a) for a in rotation.to_euler(jnp.asarray(found.q_nb)))
     assert roll_found == pytest.approx(roll, abs=2e-3)
     assert pitch_found == pytest.approx(pitch, abs=2e-3)
     assert "at rest" in found.sentence
@@ -88,4 +89,4 @@ def test_start_says_why_it_cannot():
         find_start(time, dt, theta, 0.01 * dv, gnss_s, v_n, 0.7, 0.0, Start(), Aids())
     given = Start(known_heading=1.25)
     found = find_start(time, dt, theta, dv, gnss_s, None, 0.7, 0.0, given, Aids())
-    assert float(rotation.to_euler(found.q_nb)[2]) == pytest.approx(1.25, abs=1e-12)
+    assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(1.25, abs=1e-12)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 from scipy import stats
 
 from robins import linalg, manifold
@@ -37,7 +37,7 @@ def block_nees(belief: Belief, truth: State, block: slice) -> Float[Array, ""]:
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
 
 
-def chi2_band(dof: float | np.ndarray, count: int = 1, level: float = 0.95) -> np.ndarray:
+def chi2_band(dof: ArrayLike, count: int = 1, level: float = 0.95) -> np.ndarray:
     """Band that the mean of ``count`` independent chi-square(dof) numbers is in, at this level.
 
     Returns:

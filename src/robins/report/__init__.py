@@ -43,7 +43,7 @@ __all__ = [
     "verdict",
 ]
 
-Progress = Callable[[float, float, str], None]
+Progress = Callable[[int, int, str], None]
 
 
 def pictures(solution: xr.Dataset | None, summary: Mapping[str, Any]) -> list[Picture]:

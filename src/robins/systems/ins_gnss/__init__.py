@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from robins.systems.ins_gnss.drive import drive_problem
+from robins.systems.ins_gnss.drive import drive_dataset, drive_problem
 from robins.systems.ins_gnss.drive_claims import CLAIMS
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
@@ -26,4 +26,12 @@ SYSTEM = System(
     orientation=lambda parameters: parameters.imu.orientation,
 )
 
-__all__ = ["SYSTEM", "Drive", "Replay", "drive_problem", "ins_gnss_model", "replay"]
+__all__ = [
+    "SYSTEM",
+    "Drive",
+    "Replay",
+    "drive_dataset",
+    "drive_problem",
+    "ins_gnss_model",
+    "replay",
+]

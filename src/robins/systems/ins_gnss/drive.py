@@ -7,6 +7,7 @@ is consistent, and `Believed` makes it wrong on purpose.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
+from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.filters import Belief
 from robins.ins.blocks import Blocks, cut, epochs_between
@@ -25,7 +27,7 @@ from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.ins.state import InsState
 from robins.manifold import retract
 from robins.results import variable
-from robins.sim.gnss_sensor import GnssErrorModel, fix_times, observe
+from robins.sim.gnss_sensor import GnssErrorModel, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
@@ -207,6 +209,33 @@ def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     if not drive.gnss.use_velocity:
         del y[names.VELOCITY], aux[names.VELOCITY]
     return Case(start, u, y, aux, truth)
+
+
+def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:
+    """One run of a drive as a log: samples, all fixes, and the truth.
+
+    Its noise is that of the same run in a campaign.
+    """
+    motion = motion_of(drive.place, drive.legs)
+    truth = motion.trajectory(motion.times_ns(drive.imu_rate), source="simulated drive")
+    key = partial(stream, seed, run)
+    table = ideal_increments(truth)
+    dt = np.diff(table.time_ns) * 1e-9
+    theta, dv, _ = corrupt(
+        dt, table.gyro[1:], table.accel[1:], error_model(drive.imu), key(Component.IMU)
+    )
+    imu = replace(
+        table,
+        gyro=np.concatenate([table.gyro[:1], theta]),
+        accel=np.concatenate([table.accel[:1], dv]),
+        source="simulated drive",
+    )
+    receiver = receiver_model(drive)
+    times = fix_times(receiver, 1.0 / drive.gnss.rate, motion.duration_s)
+    k = motion.at(times.valid_s)
+    at_fix = (times.valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0])
+    gnss = as_table(observe(receiver, key(Component.GNSS), *at_fix), times.stamp_s)
+    return Dataset("simulated drive", imu, gnss, truth)
 
 
 def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:

@@ -66,7 +66,7 @@ def _joined(answers: list[Answer]) -> Answer:
 
     def join(*leaves):
         rows = [a for leaf in leaves for a in (blank(leaf), np.asarray(leaf))]
-        return np.concatenate(rows[1:])
+        return jnp.asarray(np.concatenate(rows[1:]))
 
     parts = jax.tree_util.tree_map(join, *((a.belief, a.antenna, a.info) for a in answers))
     return Answer(*parts, sum(a.log_likelihood for a in answers))
