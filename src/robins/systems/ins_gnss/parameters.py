@@ -125,8 +125,9 @@ class Leg(Parameters):
     do: Literal["stop", "straight", "accelerate", "turn", "climb"]
     seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
     speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
-    angle: Annotated[float, Quantity("angle")] | None = None  # positive to the right, or upwards
+    angle: Annotated[float, Quantity("angle")] | None = None  # positive to the right
     rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
+    height: Annotated[float, Quantity("length")] | None = None  # gained
 
 
 class Receiver(Gnss):
