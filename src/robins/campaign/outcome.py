@@ -100,6 +100,7 @@ def campaign_solution(problem: Problem, found: dict[str, Statistics]) -> xr.Data
     data["anees"] = variable(
         ft, _stack(found, lambda s: s.anees()), "1", "ANEES", runs=runs, degrees_of_freedom=n
     )
+    data |= problem.shown({name: s.example["mean"] for name, s in found.items()})
     more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
     return xr.Dataset(data | more, coords | places)
 

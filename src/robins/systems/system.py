@@ -69,6 +69,8 @@ class Problem(NamedTuple):
     context: xr.Dataset  # truth, fixes, outages: what figures show beside the filters
     metrics: Callable[[Any], dict[str, Any]]  # campaign statistics of a filter -> metrics
     claims: Callable[[Mapping[str, dict[str, Any]]], list[dict[str, Any]]]
+    # means of the first run by filter -> more variables of the solution, such as the track
+    shown: Callable[[Mapping[str, State]], dict[str, Any]] = lambda means: {}
     count_from: int = 0  # first epoch that counts for figures pooled over time
 
 

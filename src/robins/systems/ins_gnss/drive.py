@@ -7,6 +7,7 @@ is consistent, and `Believed` makes it wrong on purpose.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -268,8 +269,23 @@ def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:
         context=_context(course),
         metrics=partial(drive_metrics, course.outage, blocks),
         claims=drive_claims,
+        shown=_tracks,
         count_from=count_from,
     )
+
+
+def _tracks(means: Mapping[str, InsState]) -> dict[str, Any]:
+    """Where each filter thought it was in the first run."""
+
+    def of(field: str) -> np.ndarray:
+        return np.stack([np.asarray(getattr(m.position, field)) for m in means.values()])
+
+    ft = ("filter", "time")
+    return {
+        "lat_rad": variable(ft, of("lat"), "rad", "latitude"),
+        "lon_rad": variable(ft, of("lon"), "rad", "longitude"),
+        "alt_m": variable(ft, of("alt"), "m", "height"),
+    }
 
 
 def _context(course: Course) -> xr.Dataset:

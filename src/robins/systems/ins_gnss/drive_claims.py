@@ -13,7 +13,8 @@ from robins.systems.system import StateBlock
 CLAIMS = (
     {
         "id": "sigma",
-        "text": "The filter's sigma is within 5 % of the Monte Carlo RMS error on every state",
+        "text": "On no state the RMS error is proven, at 99 % confidence, to differ from the "
+        "filter's sigma by more than 5 %; value: the largest difference proven",
     },
     {"id": "anees", "text": "ANEES is inside its 95 % band at 90 % of the epochs or more"},
     {"id": "nis", "text": "The grand mean NIS of every sensor is inside its 99.9 % band"},
@@ -65,15 +66,14 @@ def drive_metrics(
 def drive_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """Verdict per claim; with several filters, of the worst of them.
 
-    The first claim is "partly" where a state is off by more than 5 % in these runs, but by no more
-    than so few runs scatter.
+    Ratios of RMS error to sigma scatter by 10 % in 50 runs, so what counts is how much of a
+    difference their bounds leave unexplained.
     """
-    off, explained = 0.0, True
+    off = 0.0
     share, inside, farthest = 1.0, True, 1.0
     for m in metrics.values():
-        off = max(off, float(np.max(np.abs(np.asarray(m["error_over_sigma"]) - 1.0))))
         bounds = np.asarray(m["error_over_sigma_bounds"])
-        explained &= bool(np.all((bounds[:, 0] <= 1.05) & (bounds[:, 1] >= 0.95)))
+        off = max(off, float(np.max(bounds[:, 0] - 1.0)), float(np.max(1.0 - bounds[:, 1])))
         share = min(share, m["anees_share_inside"])
         for name, band in m.items():
             if name.startswith("nis_") and name.endswith("_band"):
@@ -81,7 +81,7 @@ def drive_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
                 inside &= band[0] <= value <= band[1]
                 farthest = max(farthest, value, key=lambda v: abs(v - 1.0))
     verdicts = (
-        (off, [0.0, 0.05], "reproduced" if off <= 0.05 else "partly" if explained else "not"),
+        (off, [0.0, 0.05], "reproduced" if off <= 0.05 else "not"),
         (share, [0.9, 1.0], "reproduced" if share >= 0.9 else "not"),
         (farthest, None, "reproduced" if inside else "not"),
     )
