@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 import pyproj
 import pytest
-from conftest import FILTERS, a_drive, a_summary, an_allan_curve
+from example_results import FILTERS, a_drive, a_summary, an_allan_curve
 from matplotlib.transforms import Bbox
 from scipy.stats import chi2
 
@@ -236,6 +236,12 @@ def test_bands_are_those_of_the_field(drive):
     assert band.low[0, 0] == pytest.approx(13.5201, abs=5e-5)
     assert band.high[0, 0] == pytest.approx(16.5557, abs=5e-5)
     assert band.expected == 15.0
+    fifty["anees"].attrs["normalised"] = 1
+    normalised = bands.band(fifty, "anees")
+    assert normalised is not None
+    np.testing.assert_allclose(normalised.low, band.low / 15.0)
+    np.testing.assert_allclose(normalised.high, band.high / 15.0)
+    assert normalised.expected == 1.0
     single = bands.band(drive, "nis_gnss_position", "nis_dof_gnss_position")
     assert single is not None
     assert single.low[0, 0] == pytest.approx(chi2.ppf(0.025, 3))

@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from conftest import a_drive, a_summary
+from example_results import a_drive, a_summary
 from PIL import Image
 
 from robins import report, results
@@ -187,7 +187,7 @@ def test_a_simple_figure_is_embedded_as_lines_and_a_crowded_one_as_dots(shots):
 
 def test_a_palette_keeps_the_colours_that_carry_meaning(shots):
     shot = next(s for s in shots if s.picture.name == "error_attitude")
-    small = Image.open(io.BytesIO(embed.packed(shot.dots, 1.0, 24))).convert("RGB")
+    small = Image.open(io.BytesIO(embed.packed(shot.dots, 24))).convert("RGB")
     assert small.size == shot.dots.size
     before, after = np.asarray(shot.dots, int), np.asarray(small, int)
     for name in ("#ffffff", style.OUTAGE, style.COLOURS[0], style.COLOURS[1]):
@@ -199,14 +199,16 @@ def test_a_palette_keeps_the_colours_that_carry_meaning(shots):
 
 
 def test_fewer_colours_and_dots_are_fewer_bytes(shots):
-    dots = shots[1].dots
-    sizes = [len(embed.packed(dots, *rung)) for rung in embed._LADDER]
+    figure = shots[1].picture.figure
+    drawn = [(embed._dots(figure, dpi), colours) for dpi, colours in embed._LADDER]
+    assert drawn[0][0].tobytes() == shots[1].dots.tobytes()  # drawn again it is the same
+    sizes = [len(embed.packed(*one)) for one in drawn]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] < 0.6 * len(shots[1].png())
 
 
 def test_a_picture_of_one_colour_can_be_packed():
-    packed = embed.packed(Image.new("RGB", (40, 30), "#123456"), 1.0, 64)
+    packed = embed.packed(Image.new("RGB", (40, 30), "#123456"), 64)
     assert Image.open(io.BytesIO(packed)).convert("RGB").getcolors() == [(1200, (18, 52, 86))]
 
 

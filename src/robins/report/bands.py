@@ -47,12 +47,13 @@ def band(solution: xr.Dataset, name: str, degrees_from: str = "") -> Band | None
         # A mean of N independent chi-square variables of n degrees is chi2(N n)/N.
         tail = (1.0 - probability) / 2.0
         safe = np.where(degrees > 0.0, degrees, np.nan)
-        low, high = (quantile(p, runs * safe) / runs for p in (tail, 1.0 - tail))
+        scale = runs * (safe if attrs.get("normalised") else 1.0)
+        low, high = (quantile(p, runs * safe) / scale for p in (tail, 1.0 - tail))
     else:
         return None
     expected = np.nan
     if degrees is not None and np.isfinite(degrees).any():
-        expected = float(np.nanmean(degrees))
+        expected = 1.0 if attrs.get("normalised") else float(np.nanmean(degrees))
     return Band(low, high, probability, expected)
 
 

@@ -12,10 +12,12 @@ _PARTS = {
     **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
     **{u: u for u in ("h", "mg")},
     **{"ug": "µg", "us": "µs", "s2": "s²", "hz": "Hz", "percent": "%"},
+    "mps": "m/s",
     **{"sqrt_h": "√h", "sqrt_s": "√s", "sqrt_hz": "√Hz"},
 }
 _PART = "|".join(sorted(_PARTS, key=len, reverse=True))
 _UNIT = re.compile(rf"_((?:{_PART})(?:_per_(?:{_PART}))*)$")
+_FEW = 4  # numbers of a list that are all shown
 _CAPITALS = {
     *(
         "rms",
@@ -73,8 +75,20 @@ def show(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {show(item)}" for key, item in value.items())
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(show(item) for item in value)
+        return _many(value)
     return str(value)
+
+
+def _many(values: Sequence[Any]) -> str:
+    """A list; of a long one, or one of lists, only its range and length."""
+    nested = any(isinstance(item, Sequence) and not isinstance(item, str) for item in values)
+    if len(values) <= _FEW and not nested:
+        return ", ".join(show(item) for item in values)
+    flat = [item for part in values for item in (part if nested else [part])]
+    known = [item for item in flat if isinstance(item, int | float) and math.isfinite(item)]
+    if not known:
+        return f"{len(values)} values"
+    return f"{show(min(known))} to {show(max(known))} ({len(values)} values)"
 
 
 def _float(value: float) -> str:

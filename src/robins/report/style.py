@@ -38,7 +38,6 @@ _SETTINGS = {
     "axes.spines.right": False,
     "axes.edgecolor": GREY,
     "axes.formatter.limits": (-4, 5),
-    "axes.formatter.use_mathtext": True,
     "grid.color": "#E3E3E3",
     "grid.linewidth": 0.6,
     "xtick.color": GREY,
