@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import pytest
 from plain_docstrings import plain
 
+from robins.cli import Status, app
 from robins.logs import FORMATS
 from robins.results.summary import checked
 
@@ -143,6 +144,26 @@ def test_every_format_is_documented():
     assert [row[:2] for row in sorted(rows)] == [
         [f"`{f.name}`", holds[f.holds]] for f in sorted(FORMATS, key=lambda f: f.name)
     ]
+
+
+def test_the_contract_names_every_command_option_and_status():
+    contract = ROOT / "docs" / "contract.md"
+    rows = rows_of(contract, "## Commands")
+    commands = [row[0].split()[1].strip("`") for row in rows if row[0].startswith("`robins ")]
+    assert sorted(commands) == sorted(app.commands)
+    has: dict[str, list[str]] = {}
+    for name, command in app.commands.items():
+        for flag in itertools.chain(*(option.opts for option in command.params)):
+            if flag.startswith("--"):
+                has.setdefault(flag, []).append(name)
+    options = {
+        row[0].strip("`").split()[0]: list(app.commands) if row[1] == "all" else row[1].split(", ")
+        for row in rows
+        if row[0].startswith("`--")
+    }
+    assert {k: sorted(v) for k, v in options.items()} == {k: sorted(v) for k, v in has.items()}
+    statuses = re.findall(r"^\| (\d) \|", contract.read_text("utf-8"), re.MULTILINE)
+    assert [int(status) for status in statuses] == sorted(Status)
 
 
 def test_a_failing_example_is_found_at_its_line(tmp_path):

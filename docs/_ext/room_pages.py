@@ -6,6 +6,8 @@ import pkgutil
 import re
 from pathlib import Path
 
+from sphinx import addnodes
+
 import robins
 
 _ARRAY = re.compile(r"\bjax(lib)?(\.\w+)*\.Array\b")
@@ -68,9 +70,24 @@ def shorten(_app, _what, _name, _thing, _options, signature, returned):
     return tuple(text and _ARRAY.sub("Array", text) for text in (signature, returned))
 
 
+def qualify(_app, doctree) -> None:
+    """Let a bare name mean what it means in the module whose page it stands on.
+
+    Annotations that are text, and `names` in docstrings, say ``Motion`` where two rooms have one.
+    """
+    for link in doctree.findall(addnodes.pending_xref):
+        target, module = link.get("reftarget", ""), link.get("py:module")
+        if module and target.isidentifier():
+            thing = getattr(importlib.import_module(module), target, None)
+            home, name = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+            if home and name and home.split(".")[0] == "robins":
+                link["reftarget"] = f"{home}.{name}"
+
+
 def setup(app) -> dict:
     """Write the pages before Sphinx looks for sources."""
     app.connect("builder-inited", write)
     app.connect("autodoc-skip-member", skip_field_aliases)
     app.connect("autodoc-process-signature", shorten)
+    app.connect("doctree-read", qualify)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
