@@ -223,6 +223,17 @@ def test_compressed_streams_one_after_the_other_with_padding(tmp_path):
         assert findings == []
 
 
+@pytest.mark.parametrize("compress", [gzip.compress, lzma.compress])
+def test_output_that_waits_in_the_decompressor_is_fetched(tmp_path, monkeypatch, compress):
+    monkeypatch.setattr("robins.logs.opening._BLOCK", 64)
+    path = tmp_path / "log"
+    for n in range(1, 80):
+        path.write_bytes(compress(b"1,2,3\n" * n))
+        findings = []
+        assert len(read_columns(path, LAYOUT, findings).rows) == n
+        assert findings == []
+
+
 def test_garbage_behind_a_compressed_stream_is_refused(tmp_path):
     path = tmp_path / "log"
     path.write_bytes(lzma.compress("".join(lines(5)).encode()) + b"more, but not xz")

@@ -209,7 +209,8 @@ def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]
             f"The gyro column is in {unit}; convert it to rad/s.",
         )
     elif size > _REST_RATE or fastest[k] > _FASTEST:
-        row = int(signal.rows[windows.first[np.flatnonzero(calm)[0]] if calm.any() else k])
+        first = windows.first[np.flatnonzero(calm)[0]] if size > _REST_RATE else k
+        row = int(signal.rows[first])
         most = max(size, float(fastest[k]))
         shown = (
             f"at rest the gyros show {size:.3g} rad/s ({np.rad2deg(size):.0f} deg/s)"

@@ -26,7 +26,7 @@ _GOOD = 0.5  # most that data which fit may leave
 _BETTER = 0.4  # a hypothesis must leave this share of what the data as they are leave
 _OFFSET_S = 0.05
 _SMALL_LAG_S = 5.0
-_SCALES = {
+SCALES = {
     np.pi / 180: ("deg/s", "multiply by pi/180"),
     np.pi / 180 / 3600: ("deg/h", "multiply by pi/180/3600"),
     180 / np.pi: ("rad/s converted to radians once more", "take the conversion out"),
@@ -125,7 +125,7 @@ def _diagnosis(
     imu: ImuTable, gnss: GnssTable, signal: Signal, pair: Pair, as_is: float
 ) -> Finding | None:
     """The hypothesis that explains the motion much better, or that none does what none should."""
-    scales = [*_SCALES, signal.step_s, 1.0 / signal.step_s]
+    scales = [*SCALES, signal.step_s, 1.0 / signal.step_s]
     lags = np.arange(-120, 121) * 0.25
     tried = {
         "scale": unexplained(pair, np.array(scales)[:, None, None] * np.eye(3)),
@@ -202,8 +202,8 @@ def _late(imu: ImuTable, gnss: GnssTable, lags: np.ndarray, fit: Fit, share: str
 
 
 def _unit(imu: ImuTable, scale: float, step_s: float, share: str) -> Finding:
-    if scale in _SCALES:
-        unit, mend = _SCALES[scale]
+    if scale in SCALES:
+        unit, mend = SCALES[scale]
     elif scale == step_s:
         unit, mend = "rates where increments are expected", f"multiply by {step_s:g} s"
     else:
@@ -219,59 +219,52 @@ def _unit(imu: ImuTable, scale: float, step_s: float, share: str) -> Finding:
 
 
 def _axes(imu: ImuTable, fit: Fit, share: str) -> Finding:
-    """What it means that the gyro needs the map S, or the specific force a reflection as well."""
     left = _mean(fit)
     mirrored, k = np.unravel_index(int(np.nanargmin(left)), left.shape)
-    S = signed_permutations()[k]
-    if mirrored and np.array_equal(S, -np.eye(3)):
-        code, cause = (
-            "left_handed",
-            (
-                "Both triads are left-handed: two axes are exchanged or one is reversed, alike in "
-                "gyros and accelerometers. Check the axes against the data sheet's picture"
-            ),
-        )
-    elif mirrored and np.array_equal(S, np.eye(3)):
-        code, cause = (
-            "accel_reversed",
-            (
-                "The accelerometers have the opposite sign: the log holds gravity, or minus the "
-                "specific force. Turn the signs of all three"
-            ),
-        )
-    elif mirrored:
-        code, cause = (
-            "accel_axes",
-            (
-                f"The accelerometer axes do not belong to those of the gyros: take them as "
-                f"{_words(-S.T, 'accel')}. Columns were exchanged or a sign lost"
-            ),
-        )
-    elif np.array_equal(S, -np.eye(3)):
-        code, cause = (
-            "gyro_reversed",
-            ("The gyros have the opposite sense of rotation: turn the signs of all three"),
-        )
-    else:
-        code, cause = (
-            "gyro_axes",
-            (
-                f"The gyro axes do not belong to those of the accelerometers: take them as "
-                f"{_words(S, 'gyro')}. Columns were exchanged or a sign lost"
-            ),
-        )
+    code, cause = _meaning(signed_permutations()[k], bool(mirrored))
     return finding(
         imu,
         "error",
         code,
         _least(left),
-        f"gyros and accelerometers together do not explain the GNSS velocities, with other axes "
+        "gyros and accelerometers together do not explain the GNSS velocities, with other axes "
         f"they do {share}. {cause}.",
     )
 
 
-def _words(S: np.ndarray, sensor: str) -> str:
-    """The map as columns: "gyro_y, -gyro_x, gyro_z"."""
+def _meaning(S: np.ndarray, mirrored: bool) -> tuple[str, str]:
+    """Code and cause, if the gyro needs the map S, and the specific force a reflection or not.
+
+    An accelerometer triad that is a reflection M of the true one makes axes in which rates are
+    pseudovectors: they fit after the map S = -M. Both triads reflected alike need S = -1.
+    """
+    if mirrored and np.array_equal(S, -np.eye(3)):
+        return "left_handed", (
+            "Both triads are left-handed: two axes are exchanged or one is reversed, alike in "
+            "gyros and accelerometers. Check the axes against the data sheet's picture"
+        )
+    if mirrored and np.array_equal(S, np.eye(3)):
+        return "accel_reversed", (
+            "The accelerometers have the opposite sign: the log holds gravity, or minus the "
+            "specific force. Turn the signs of all three"
+        )
+    if mirrored:
+        return "accel_axes", (
+            "The accelerometer axes do not belong to those of the gyros: take them as "
+            f"{words_of(-S.T, 'accel')}. Columns were exchanged or a sign lost"
+        )
+    if np.array_equal(S, -np.eye(3)):
+        return "gyro_reversed", (
+            "The gyros have the opposite sense of rotation: turn the signs of all three"
+        )
+    return "gyro_axes", (
+        "The gyro axes do not belong to those of the accelerometers: take them as "
+        f"{words_of(S, 'gyro')}. Columns were exchanged or a sign lost"
+    )
+
+
+def words_of(S: np.ndarray, sensor: str) -> str:
+    """A signed permutation as columns: (gyro_y, -gyro_x, gyro_z)."""
     parts = []
     for row in S:
         j = int(np.argmax(np.abs(row)))

@@ -18,6 +18,7 @@ from robins.logs.checks_imu import check_imu
 from robins.logs.checks_motion import check_motion
 from robins.logs.checks_span import check_span
 from robins.logs.checks_time import check_time
+from robins.logs.checks_turning import check_turning
 from robins.logs.checks_velocity import check_velocity
 from robins.logs.findings import Finding, by_severity
 
@@ -25,8 +26,11 @@ Table = ImuTable | GnssTable | Trajectory
 
 # After these, checks that build on what they found wrong would only repeat it in other words.
 _NO_PLACE = {"position_unit", "no_fix_as_zero", "gnss_missing"}
-_SPOILT = {"no_overlap", "rates_as_increments", "increments_as_rates", "time_unit"}
-_SPOILT |= _NO_PLACE - {"gnss_missing"} | {"velocity_axes", "velocity_unit", "velocity_sign"}
+_SPOILT = {
+    *("no_overlap", "rates_as_increments", "increments_as_rates", "time_unit"),
+    *("position_unit", "no_fix_as_zero"),
+    *("velocity_axes", "velocity_unit", "velocity_sign"),
+}
 
 
 def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
@@ -67,8 +71,13 @@ def _examined(tables: list[Table], findings: list[Finding]) -> list[Finding]:
         for table in tables:
             if table is not imu and not isinstance(table, ImuTable):
                 findings += check_span(imu, table)
-    if imu is not None and gnss is not None and not _SPOILT & {f.code for f in findings}:
-        findings += check_motion(imu, gnss)
+    if imu is not None and not _SPOILT & {f.code for f in findings}:
+        of_motion = list(check_motion(imu, gnss)) if gnss is not None else []
+        if gnss is None or any(f.code == "motion_not_checked" for f in of_motion):
+            of_motion += check_turning(imu)
+        if any(f.code == "gyro_unit" for f in of_motion):  # with proof; once is enough
+            findings = [f for f in findings if f.code != "gyro_unit"]
+        findings += of_motion
     return findings
 
 

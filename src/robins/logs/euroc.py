@@ -9,6 +9,7 @@ file.
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 
@@ -93,9 +94,9 @@ def read_euroc_truth(
                 file,
                 "",
                 "0 0 0",
-                f"{file}: positions are local metres; they are put at latitude 0, longitude 0, "
-                "height 0, x to the east. Gravity and Earth rate there are not those of the "
-                "recording; give an origin if that matters.",
+                f"{Path(file).name}: positions are local metres; they are put at latitude 0, "
+                "longitude 0, height 0, x to the east. Gravity and Earth rate there are not those "
+                "of the recording; give an origin if that matters.",
             ),
         )
     local = LocalPath(

@@ -47,6 +47,7 @@ class Pair(NamedTuple):
     gnss_s: np.ndarray  # (m,) times of the velocities
     v_n: np.ndarray  # (m, 3) m/s, NED
     starts: np.ndarray  # first second of each stretch that is judged
+    power: str = "change"  # what the share left is a share of: "change" of velocity, or "gravity"
 
 
 class Fit(NamedTuple):
@@ -65,9 +66,8 @@ def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -
         v_n: (m, 3) finite velocities, north-east-down [m/s].
         noise: standard deviation of a velocity's change over a second [m/s].
     """
-    grid = np.arange(0.0, signal.time_s[-1], 1.0 / _RATE_HZ)
-    turn, push = (_at(grid, signal.time_s, _integral(signal.time_s, x)) for x in signal[2:4])
-    first, last = max(0.0, gnss_s[0]), min(grid[-1], gnss_s[-1])
+    turn, push, end = _sums_on_grid(signal)
+    first, last = max(0.0, gnss_s[0]), min(end, gnss_s[-1])
     starts = np.arange(np.ceil(first), last - STRETCH_S, STRETCH_S)
     lively = []
     for start in starts:
@@ -81,6 +81,36 @@ def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -
         return None
     best = sorted(start for _, start in sorted(lively)[-_STRETCHES:])
     return Pair(turn, push, gnss_s, v_n, np.array(best))
+
+
+def at_the_spot(signal: Signal) -> Pair | None:
+    """An IMU alone, taken to stay about where it is: then gravity must not turn.
+
+    None unless it is turned about enough that the specific force points elsewhere by 10 deg or so.
+    """
+    turn, push, end = _sums_on_grid(signal)
+    tilted = []
+    for start in np.arange(0.0, end - STRETCH_S, STRETCH_S):
+        if _has_gap(signal.time_s, start):
+            continue
+        force = np.diff(push[round(start * _RATE_HZ) :: _RATE_HZ][: STRETCH_S + 1], axis=0)
+        direction = force / np.linalg.norm(force, axis=-1, keepdims=True)
+        spread = 1.0 - float(np.linalg.norm(direction.mean(axis=0)))
+        if spread > 0.015:
+            tilted.append((spread, float(start)))
+    if not tilted:
+        return None
+    best = sorted(start for _, start in sorted(tilted)[-_STRETCHES:])
+    return Pair(turn, push, np.array([0.0, end]), np.zeros((2, 3)), np.array(best), "gravity")
+
+
+def _sums_on_grid(signal: Signal) -> tuple[np.ndarray, np.ndarray, float]:
+    """Integrals of rate and specific force up to each grid time, and the last of these times."""
+    grid = np.arange(0.0, signal.time_s[-1], 1.0 / _RATE_HZ)
+    turn, push = (
+        _at(grid, signal.time_s, _integral(signal.time_s, x)) for x in (signal.gyro, signal.accel)
+    )
+    return turn, push, float(grid[-1])
 
 
 def _has_gap(time_s: np.ndarray, start: float) -> bool:
@@ -139,7 +169,8 @@ class _View(NamedTuple):
 def _view(pair: Pair, start: float, lags_s: np.ndarray) -> _View:
     seconds = start + np.arange(STRETCH_S + 1)
     wanted = np.diff(_at(seconds, pair.gnss_s, pair.v_n), axis=0) - [0.0, 0.0, GRAVITY]
-    power = float(np.sum((wanted - wanted.mean(axis=0)) ** 2))
+    middle = wanted.mean(axis=0) if pair.power == "change" else 0.0
+    power = float(np.sum((wanted - middle) ** 2))
     fine = np.arange(STRETCH_S * _RATE_HZ + 1) / _RATE_HZ + start
     index = (fine + lags_s[:, None]) * _RATE_HZ
     turn, push = (np.diff(_between(index, x), axis=1) for x in (pair.turn, pair.push))

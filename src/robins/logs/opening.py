@@ -34,9 +34,12 @@ class _Gunzip:
 
     def __init__(self):
         self._inner = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+        self._full = False  # the last output filled its limit, so more may be waiting
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        return self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
+        out = self._inner.decompress(self._inner.unconsumed_tail + data, max_length)
+        self._full = len(out) == max_length
+        return out
 
     @property
     def eof(self) -> bool:
@@ -44,7 +47,7 @@ class _Gunzip:
 
     @property
     def needs_input(self) -> bool:
-        return not self._inner.unconsumed_tail
+        return not (self._full or self._inner.unconsumed_tail)
 
     @property
     def unused_data(self) -> bytes:

@@ -12,6 +12,7 @@ Frames are those of pyins: north-east-down and forward-right-down.
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -117,9 +118,10 @@ def _compare_dt(
                 file,
                 f"line {columns.rows[first]}",
                 float(dt[first]),
-                f"{file} line {columns.rows[first]}: dt is {dt[first]:g} s but the time has grown "
-                f"by {elapsed[first - 1]:g} s ({len(off)} such rows). Increments are taken over "
-                "the time since the row before; rows are missing, or dt belongs to the next row.",
+                f"{Path(file).name} line {columns.rows[first]}: dt is {dt[first]:g} s but the time "
+                f"has grown by {elapsed[first - 1]:g} s ({len(off)} such rows). Increments are "
+                "taken over the time since the row before; rows are missing, or dt belongs to the "
+                "next row.",
             ),
         )
 

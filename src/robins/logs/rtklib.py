@@ -8,6 +8,7 @@ not kept.
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 
@@ -151,8 +152,9 @@ def _no_velocity(file: str) -> Finding:
         file,
         "",
         0.0,
-        f"{file}: all velocities and their sigmas are zero, so RTKLIB did not solve for them; they "
-        "are left out. Heading will be found from the positions alone; set out-outvel = on.",
+        f"{Path(file).name}: all velocities and their sigmas are zero, so RTKLIB did not solve for "
+        "them; they are left out. Heading will be found from the positions alone; set "
+        "out-outvel = on.",
     )
 
 
@@ -163,7 +165,7 @@ def _above_geoid(file: str) -> Finding:
         file,
         "header",
         "geodetic",
-        f"{file} header: heights are above the geoid, and robins takes them as above the WGS-84 "
-        "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per metre. Set "
-        "out-height = ellipsoidal in RTKLIB.",
+        f"{Path(file).name} header: heights are above the geoid, and robins takes them as above "
+        "the WGS-84 ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
+        "metre. Set out-height = ellipsoidal in RTKLIB.",
     )

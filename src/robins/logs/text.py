@@ -16,6 +16,7 @@ import io
 import os
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -305,7 +306,7 @@ def _ends_early(file: str, line: int, rest: str, cut: bool) -> Finding:
         file,
         where,
         shown,
-        f"{file} ends early at line {line}: {what}{lost}. The recording or the copy was "
+        f"{Path(file).name} ends early at line {line}: {what}{lost}. The recording or the copy was "
         "interrupted; all lines before it were read. Copy it again if the original is longer.",
     )
 
@@ -317,6 +318,6 @@ def _begins_midway(file: str, line: int, text: str) -> Finding:
         file,
         f"line {line}",
         text[:60],
-        f"{file} line {line} ({text[:60]!r}) has fewer fields than the next: the recording began "
-        "in the middle of a line. It is left out; nothing else is affected.",
+        f"{Path(file).name} line {line} ({text[:60]!r}) has fewer fields than the next: the "
+        "recording began in the middle of a line. It is left out; nothing else is affected.",
     )

@@ -1,0 +1,115 @@
+"""The arithmetic behind the doctor's judgement of motion, each against another computation."""
+
+import numpy as np
+import pytest
+from made_logs import velocity_ned
+from pyins import transform
+from scipy.spatial.transform import Rotation
+
+from robins.logs import motion
+from robins.logs.gnss_motion import lateness, lowest, steps_of, track_of, velocity_of
+from robins.logs.quiet import signal_of, windows_of
+
+RNG = np.random.default_rng(6)
+
+
+def test_rotations_against_scipy():
+    phi = RNG.normal(size=(4, 5, 3)) * np.logspace(-9, 0.5, 5)[:, None]
+    expected = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix().reshape(4, 5, 3, 3)
+    np.testing.assert_allclose(motion._rotations(phi), expected, atol=1e-15)
+
+
+def test_best_rotation_against_scipy():
+    u = RNG.normal(size=(3, 12, 3))
+    v = RNG.normal(size=(12, 3))
+    R, left, _ = motion._kabsch(u, v)
+    for k in range(3):
+        best, rssd = Rotation.align_vectors(v, u[k])
+        np.testing.assert_allclose(R[k], best.as_matrix(), atol=1e-12)
+        assert left[k] == pytest.approx(rssd**2)
+
+
+def test_best_reflection_undoes_a_mirror():
+    u = RNG.normal(size=(1, 12, 3))
+    mirror = Rotation.random(random_state=3).as_matrix() @ np.diag([1, 1, -1])
+    _, proper, mirrored = motion._kabsch(u, u[0] @ mirror.T)
+    assert mirrored[0] == pytest.approx(0.0, abs=1e-12)
+    assert proper[0] > 1.0
+
+
+def test_sums_in_axes_that_do_not_turn_against_one_after_the_other():
+    n = motion.STRETCH_S * 20
+    turn, push = 0.05 * RNG.normal(size=(1, n, 3)), RNG.normal(size=(1, n, 3))
+    sums, attitudes = motion._sum_unturned(turn, push)
+    attitude, expected = Rotation.identity(), np.zeros((motion.STRETCH_S, 3))
+    for k in range(n):
+        if k % 20 == 0:
+            np.testing.assert_allclose(attitudes[0, k // 20], attitude.as_matrix(), atol=1e-12)
+        halfway = attitude * Rotation.from_rotvec(0.5 * turn[0, k])
+        expected[k // 20] += halfway.apply(push[0, k])
+        attitude = attitude * Rotation.from_rotvec(turn[0, k])
+    np.testing.assert_allclose(sums[0], expected, atol=1e-11)
+
+
+def test_there_are_48_signed_permutations_the_identity_first():
+    all_ = motion.signed_permutations()
+    assert len(np.unique(all_, axis=0)) == 48
+    np.testing.assert_array_equal(all_[0], np.eye(3))
+    np.testing.assert_array_equal(
+        all_ @ np.swapaxes(all_, 1, 2), np.broadcast_to(np.eye(3), (48, 3, 3))
+    )
+
+
+def test_a_healthy_drive_leaves_only_the_noise(drive):
+    signal, track = signal_of(drive.imu), track_of(drive.gnss)
+    pair = motion.pair_of(signal, track.time_s, *velocity_of(track))
+    assert pair.starts.tolist() == [0.0, 30.0]
+    assert np.all(motion.unexplained(pair, np.eye(3)[None]).proper < 0.1)
+    left = motion.unexplained_but_for_biases(pair, np.zeros(1))[:, 0]
+    # Two velocities of 0.03 m/s and a second of rest more or less: their share of the change.
+    for start, share in zip(pair.starts, left, strict=True):
+        change = np.diff(velocity_ned(start + np.arange(31.0)), axis=0)
+        noise = 6 * 0.03**2 * 30 / np.sum((change - change.mean(axis=0)) ** 2)
+        assert 0.4 * noise < share < 2.0 * noise
+
+
+def test_metres_against_pyins(drive):
+    track = track_of(drive.gnss)
+    lla = np.column_stack(
+        [np.rad2deg(drive.gnss.lat_rad), np.rad2deg(drive.gnss.lon_rad), drive.gnss.alt_m]
+    )
+    expected = transform.lla_to_ned(lla, lla[0])
+    # pyins' axes stay those of the first fix, ours follow the ellipsoid: 0.5 km squared over 2 R.
+    np.testing.assert_allclose(track.r_n, expected, atol=0.05)
+
+
+def test_velocities_from_positions(drive):
+    track = track_of(drive.gnss)
+    by_place, noise = velocity_of(track._replace(v_n=None))
+    t = track.time_s[5:-5]
+    np.testing.assert_allclose(by_place[5:-5], velocity_ned(t), atol=0.3)
+    assert noise == pytest.approx(np.sqrt(12) * 0.02)
+
+
+def test_steps_over_a_second_and_their_lateness(drive):
+    track = track_of(drive.gnss)
+    t = track.time_s
+    late = track._replace(v_n=velocity_ned(t - 0.25))
+    assert lateness(late) == pytest.approx(0.25, abs=0.02)
+    steps = steps_of(late, 0.25)
+    assert np.sqrt(np.mean((steps.of_position - steps.of_velocity) ** 2)) < 1.5 * 0.02 * np.sqrt(2)
+
+
+def test_lowest_point_of_a_parabola():
+    x = np.arange(5.0)
+    assert lowest(x, 3.0 + (x - 1.7) ** 2) == pytest.approx(1.7)
+    assert lowest(x, x) is None
+    assert lowest(x, x * np.nan) is None
+
+
+def test_windows_find_the_rest_of_the_drive(drive):
+    windows = windows_of(signal_of(drive.imu))
+    assert np.flatnonzero(windows.at_rest)[:12].tolist() == list(range(12))
+    assert np.count_nonzero(windows.at_rest) < 16
+    k = int(windows.first[3])
+    np.testing.assert_allclose(windows.accel[3], drive.imu.accel[k : k + 100].mean(axis=0))
