@@ -12,7 +12,6 @@ import xarray as xr
 from robins.earth import Geodetic
 from robins.filters import Belief, Code, StepInfo
 from robins.filters.consistency import grand_mean_nis
-from robins.manifold import leaves
 from robins.results import variable
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log
@@ -115,7 +114,7 @@ def replay_solution(flight: Flight, answers: dict[str, Answer], parameters: Repl
             block.frame,
             display_unit=block.display_unit,
         )
-        if block.name == "position":
+        if block.name in ("attitude", "position"):
             continue
         data[f"estimate_{block.name}"] = variable(
             (*ft, axis),
@@ -125,6 +124,15 @@ def replay_solution(flight: Flight, answers: dict[str, Answer], parameters: Repl
             block.frame,
             display_unit=block.display_unit,
         )
+    coords["axis_euler"] = ["roll", "pitch", "heading"]
+    data["estimate_euler"] = variable(
+        (*ft, "axis_euler"),
+        _stack(answers, lambda a: np.stack(a.belief.mean.q_nb.as_euler(), -1)),
+        "rad",
+        "estimated roll, pitch, heading",
+        "FRD to NED",
+        display_unit="deg",
+    )
     data |= _fixes(flight.log)
     coords["gnss_time"] = variable("gnss_time", flight.log.gnss_s, "s", "time of the fixes")
     more, places = innovation_tables(_seen(answers), SENSORS, flight.epoch_s)
@@ -132,11 +140,8 @@ def replay_solution(flight: Flight, answers: dict[str, Answer], parameters: Repl
 
 
 def _estimate(answer: Answer, block: str) -> np.ndarray:
-    mean = answer.belief.mean
-    if block == "attitude":
-        return np.stack([np.asarray(a) for a in mean.q_nb.as_euler()], -1)
     field = {"velocity": "v_n"}.get(block, block)
-    return np.asarray(leaves(getattr(mean, field))[0])
+    return np.asarray(getattr(answer.belief.mean, field))
 
 
 def _fixes(log: Log) -> dict[str, Any]:

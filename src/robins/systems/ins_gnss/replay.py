@@ -129,9 +129,6 @@ def replay(
     flight = _flight(log, parts)
     together = {name: _joined(rows) for name, rows in answers.items()}
     counts = dict(dataset.counts) | {
-        "imu_samples": len(dataset.imu),
-        "gnss_fixes": len(log.gnss),
-        "gnss_withheld": int(np.sum(log.withheld)),
         "imu_gaps_declared": len(found) - 1,
         "blocks_over_imu_gaps": sum(int(np.sum(np.asarray(p.u.noise_scale) > 1)) for p in parts),
         "pieces_not_navigated": len(problems),
