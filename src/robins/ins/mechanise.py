@@ -51,19 +51,24 @@ def step(nav: Nav, inc: Increments) -> Nav:
     return unpacked(advance(vector(nav), rows(inc)))
 
 
-@jax.jit
 def mechanise(nav: Nav, increments: Increments) -> Nav:
     """Navigate from `nav` over N increments; the N states at the ends of the intervals.
 
     Compiled for each N anew; `mechanise_chunked` is not.
     """
+    return _run(nav, increments)[1]
+
+
+@jax.jit
+def _run(nav: Nav, increments: Increments) -> tuple[Nav, Nav]:
+    """The last state, and all of them."""
 
     def body(x, row):
         x = advance(x, row)
         return x, x
 
-    _, path = lax.scan(body, vector(nav), rows(increments))
-    return unpacked(path)
+    last, path = lax.scan(body, vector(nav), rows(increments))
+    return unpacked(last), unpacked(path)
 
 
 def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> Nav:
@@ -84,8 +89,7 @@ def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> N
     for start in range(0, total, size):
         stop = min(start + size, total)
         block = jax.tree.map(lambda a, at=slice(start, stop): _padded(a[at], size), inc)
-        part = mechanise(nav, block)
-        nav = jax.tree.map(lambda leaf: leaf[-1], part)
+        nav, part = _run(nav, block)
         for whole, piece in zip(jax.tree.leaves(path), jax.tree.leaves(part), strict=True):
             whole[start:stop] = np.asarray(piece)[: stop - start]
     return path

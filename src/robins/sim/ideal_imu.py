@@ -11,12 +11,11 @@ there are.
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from robins.dataset import ImuTable, Trajectory
-from robins.ins.frames import swap, to_ned_frd
+from robins.ins.frames import swap
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, step
 from robins.sim.trajectory import Motion
@@ -70,8 +69,7 @@ def ideal_increments(
     if len(trajectory) < 2:
         raise ValueError(f"{len(trajectory)} row(s): an increment needs two")
     refuse_polar(trajectory.lat_rad)
-    path = nav_at(to_ned_frd(trajectory), slice(None))
-    before, after = (jax.tree.map(lambda a, k=k: a[k], path) for k in (slice(-1), slice(1, None)))
+    before, after = (nav_at(trajectory, rows) for rows in (slice(-1), slice(1, None)))
     n = len(trajectory) - 1
     gyro, accel, size = np.zeros((n, 3)), np.zeros((n, 3)), np.inf
     for _ in range(iterations):
@@ -79,8 +77,9 @@ def ideal_increments(
             trajectory.time_ns, _doubled(gyro), _doubled(accel), "increment", source="trajectory"
         )
         miss = _miss(before, after, from_imu(imu)[0])
-        gyro, accel = gyro + np.asarray(miss[0]), accel + np.asarray(miss[1])
-        size = float(jnp.max(jnp.abs(jnp.stack(miss))))
+        turn, push = (np.asarray(a) for a in miss)
+        gyro, accel = gyro + turn, accel + push
+        size = max(np.abs(turn).max(), np.abs(push).max())
         if size < tolerance:
             break
     else:

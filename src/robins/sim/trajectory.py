@@ -13,25 +13,25 @@ north-east-down and forward-right-down; time in seconds from the start of the mo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
+from scipy.spatial.transform import Rotation as _Rotation
 
-from robins import earth, rotation
+from robins import earth
 from robins.dataset import Trajectory
 from robins.earth import A_M, E2, OMEGA_E, Geodetic
 from robins.ins.mechanise import refuse_polar
 
 Vehicle = Literal["ground", "aircraft"]
+Values = float | int | Sequence | np.ndarray  # one for all axes, or a column of them
 
 _DEGREE = 5
 _SLOWEST = 0.1  # m/s; below it a course is not a heading
-
-gravity_n = jax.jit(earth.gravity_n)
 
 
 class Kinematics(NamedTuple):
@@ -55,12 +55,9 @@ class Kinematics(NamedTuple):
         omega_en[:, 1] = -self.v_n[:, 0] / (meridian + self.alt)
         omega_en[:, 2] = -omega_en[:, 0] * np.tan(self.lat)
         f_n = self.a_n + np.cross(2.0 * omega_ie + omega_en, self.v_n)
-        f_n -= np.asarray(gravity_n(self.lat, self.alt))
-        to_body = np.swapaxes(dcm(self.q_nb), 1, 2)
-        return (
-            self.omega_nb_b + np.einsum("nij,nj->ni", to_body, omega_ie + omega_en),
-            np.einsum("nij,nj->ni", to_body, f_n),
-        )
+        f_n -= _gravity_n(self.lat, self.alt)
+        to_body = _Rotation.from_quat(self.q_nb, scalar_first=True).inv()
+        return self.omega_nb_b + to_body.apply(omega_ie + omega_en), to_body.apply(f_n)
 
 
 @dataclass(frozen=True)
@@ -112,11 +109,11 @@ class Motion:
 
 
 def from_waypoints(
-    time_s: ArrayLike,
-    lat_rad: ArrayLike,
-    lon_rad: ArrayLike,
-    alt_m: ArrayLike,
-    q_nb: ArrayLike | None = None,
+    time_s: Values,
+    lat_rad: Values,
+    lon_rad: Values,
+    alt_m: Values,
+    q_nb: Values | None = None,
     vehicle: Vehicle = "ground",
 ) -> Motion:
     """Through given points at given times.
@@ -195,11 +192,11 @@ def from_velocity(time_s: np.ndarray, v_n: np.ndarray, start: Geodetic, q_nb: np
 
 def sine_velocity(
     start: Geodetic,
-    mean_mps: ArrayLike = 10.0,
-    amplitude_mps: ArrayLike = 60.0,
+    mean_mps: Values = 10.0,
+    amplitude_mps: Values = 60.0,
     period_s: float = 30.0,
     duration_s: float = 600.0,
-    phase_rad: ArrayLike = (0.0, np.pi / 2.0, 0.0),
+    phase_rad: Values = (0.0, np.pi / 2.0, 0.0),
 ) -> Motion:
     """Velocity ``mean + amplitude sin(2 pi t / period + phase)`` along north, east and down.
 
@@ -230,17 +227,10 @@ def along(
     return quaternion(np.arctan2(f[:, 1], -f[:, 2]), pitch_rad, heading_rad)
 
 
-def quaternion(roll_rad, pitch_rad, heading_rad) -> np.ndarray:
-    """q_nb (N, 4), NumPy; see `robins.rotation.from_euler`."""
-    return np.asarray(_from_euler(roll_rad, pitch_rad, heading_rad))
-
-
-def dcm(q: np.ndarray) -> np.ndarray:
-    """C_nb (N, 3, 3), NumPy; see `robins.rotation.to_dcm`."""
-    return np.asarray(_to_dcm(q))
-
-
-_from_euler, _to_dcm = jax.jit(rotation.from_euler), jax.jit(rotation.to_dcm)
+def quaternion(roll_rad: np.ndarray, pitch_rad: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+    """q_nb (N, 4) of angles (N,); as `robins.rotation.from_euler`, with nothing to compile."""
+    angles = np.stack([heading_rad, pitch_rad, roll_rad], -1)
+    return _Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
 
 
 def _knots(duration_s: float, spacing_s: float) -> np.ndarray:
@@ -260,13 +250,25 @@ def _vector_part(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return p[:, :1] * b - q[:, :1] * a - np.cross(a, b)
 
 
+_compiled_gravity_n = jax.jit(earth.gravity_n)
+
+
+def _gravity_n(lat: np.ndarray, alt: np.ndarray, block: int = 4096) -> np.ndarray:
+    """`robins.earth.gravity_n` in blocks of one size, so that it compiles once for all lengths."""
+    out = np.empty((len(lat), 3))
+    for k in range(0, len(lat), block):
+        part = [np.pad(a[k : k + block], (0, max(k + block - len(lat), 0))) for a in (lat, alt)]
+        out[k : k + block] = np.asarray(_compiled_gravity_n(*part))[: len(lat) - k]
+    return out
+
+
 def _radii(lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     w_sq = 1.0 - E2 * np.sin(lat) ** 2
     transverse = A_M / np.sqrt(w_sq)
     return transverse * (1.0 - E2) / w_sq, transverse
 
 
-def _column(name: str, values: ArrayLike, n: int) -> np.ndarray:
+def _column(name: str, values: Values, n: int) -> np.ndarray:
     a = np.asarray(values, float)
     if a.shape != (n,) or not np.isfinite(a).all():
         raise ValueError(f"{name}: {n} finite numbers are needed, got shape {a.shape}: {values!r}")
