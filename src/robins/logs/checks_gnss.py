@@ -170,15 +170,16 @@ def _quality(gnss: GnssTable) -> Iterator[Finding]:
     sure, unsure = median_of(size[fixed]), median_of(size[other])
     k = int(np.argmax(other))
     if 0.0 < unsure < 1.5 * sure:
+        ratio = unsure / sure
+        share = "the sigma" if abs(ratio - 1.0) < 0.05 else f"{ratio:.2g} times the sigma"
         yield finding(
             gnss,
             "warning",
             "float_sigma",
-            unsure / sure,
-            f"{other.sum()} of {len(gnss)} fixes are float or worse (Q > 1, from here on in part) "
-            f"but state {unsure / sure:.2g} times the sigma of fixed ones ({unsure:.3g} "
-            "m). The receiver is too sure of them; scale their sigmas, by 2 for float and 5 for "
-            "single.",
+            ratio,
+            f"{other.sum()} of {len(gnss)} fixes are float or worse (Q > 1), the first of them "
+            f"here, but state {share} of fixed ones ({unsure:.3g} m). The receiver is too sure of "
+            "them; scale their sigmas, by 2 for float and 5 for single.",
             k,
         )
 
