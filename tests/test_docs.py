@@ -12,9 +12,11 @@ import matplotlib.pyplot as plt
 import pytest
 from plain_docstrings import plain
 
+from robins import scenario
 from robins.cli import Status, app
 from robins.logs import FORMATS
 from robins.results.summary import checked
+from robins.systems import SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "robins"
@@ -164,6 +166,18 @@ def test_the_contract_names_every_command_option_and_status():
     assert {k: sorted(v) for k, v in options.items()} == {k: sorted(v) for k, v in has.items()}
     statuses = re.findall(r"^\| (\d) \|", contract.read_text("utf-8"), re.MULTILINE)
     assert [int(status) for status in statuses] == sorted(Status)
+
+
+def test_the_configurations_shown_can_be_read():
+    shown = [
+        scenario.mapping_of(code)
+        for page in pages()
+        for _, language, code in blocks(page.read_text("utf-8"))
+        if language == "toml"
+    ]
+    assert shown
+    for mapping in shown:
+        scenario.validate(SYSTEMS[mapping["system"]].replay_parameters, mapping)
 
 
 def test_a_failing_example_is_found_at_its_line(tmp_path):
