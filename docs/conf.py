@@ -23,7 +23,6 @@ extensions = [
     "plain_docstrings",
 ]
 exclude_patterns = ["_build"]
-suppress_warnings = ["toc.empty_glob"]  # a chapter that has no pages yet
 default_role = "py:obj"  # `name` in a docstring links to the name where there is one
 highlight_language = "text"
 myst_enable_extensions = ["deflist"]
