@@ -108,7 +108,7 @@ def test_a_file_that_is_no_log_is_refused_in_a_line(robins, command):
 # ------------------------------------------------------------------------------------------- Allan
 
 
-def test_noise_parameters_are_found_and_written(robins, still_log):
+def test_noise_parameters_are_found_and_written(robins, still_log, curve):
     answer = robins("allan", still_log, "--terms", "N", "--json", "--out", "noise")
     assert answer.status == 0
     told = json.loads(answer.out)
@@ -130,7 +130,6 @@ def test_noise_parameters_are_found_and_written(robins, still_log):
     assert back.summary["scenario"] == "allan/still"
     assert set(back.figures) == {"allan_gyro", "allan_accel"}
     assert "Gyro angle random walk" in back.report.read_text("utf-8")
-    curve = allan.deviation(a_still_imu().gyro, dt_s=1.0 / RATE_HZ)
     np.testing.assert_allclose(back.solution["allan_gyro"], curve.deviation, rtol=1e-6)
     np.testing.assert_allclose(back.solution["tau"], curve.tau_s, rtol=1e-9)
     assert list(back.solution["process"].values) == ["random walk"]
@@ -158,7 +157,7 @@ def test_increments_give_what_rates_give(tmp_path):
     np.testing.assert_allclose(one.rates["accel"], other.rates["accel"], rtol=1e-9)
 
 
-def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(robins, tmp_path):
+def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(tmp_path):
     table = a_still_imu(30.0)
     keep = np.ones(len(table), bool)
     keep[1000:1050] = False
@@ -167,9 +166,10 @@ def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(robins, tmp_pa
     found = stability.still(tmp_path / "gapped.csv")
     assert len(found.time_ns) == 1950
     np.testing.assert_allclose(found.rates["gyro"], table.gyro[1050:], atol=1e-9)
-    answer = robins("allan", "gapped.csv", "--terms", "N")
-    assert answer.status == 0
-    assert "The log has gaps: only its longest stretch without one is used, 19.49 s" in answer.out
+    (note,) = found.notes
+    assert note.startswith(
+        "The log has gaps: only its longest stretch without one is used, 19.49 s"
+    )
 
 
 @pytest.mark.parametrize(
@@ -206,17 +206,29 @@ def test_a_stuck_sensor_is_refused(robins, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["stuck.csv"]
 
 
-def test_a_short_log_gives_its_curve_and_the_reason_why_no_parameters(robins, tmp_path):
+def test_a_short_log_gives_its_curve_and_the_reason_why_no_parameters(tmp_path):
     logs.write_euroc_imu(tmp_path / "short.csv", a_still_imu(2.0))
-    answer = robins("allan", "short.csv", "--terms", "QNBKR")
-    assert answer.status == 0
-    assert "No parameters of the gyro: too short for the 5 terms" in answer.out
-    assert "process" not in results.read("results/allan-short").solution.sizes
+    heard = []
+    solution, summary, notes = stability.analysed(
+        tmp_path / "short.csv", "QNBKR", lambda share, what: heard.append(share)
+    )
+    assert [note[:53] for note in notes] == [
+        "No parameters of the gyro: too short for the 5 terms ",
+        "No parameters of the accel: too short for the 5 terms",
+    ]
+    assert "process" not in solution.sizes
+    assert np.isfinite(solution["allan_gyro"]).all()
+    assert summary["filters"] == {"x": {}, "y": {}, "z": {}}
+    assert heard == sorted(heard)
+
+
+@pytest.fixture(scope="module")
+def curve():
+    return allan.deviation(a_still_imu().gyro, dt_s=1.0 / RATE_HZ)
 
 
 @pytest.mark.parametrize("terms", ["Q", "N", "B", "K", "QNBKR"])
-def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms):
-    curve = allan.deviation(a_still_imu().gyro, dt_s=1.0 / RATE_HZ)
+def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
     fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), 1, terms, 0.95)
     parts = stability.expected(fitted, curve.tau_s)
