@@ -124,6 +124,19 @@ def test_everything_comes_back(tmp_path):
     }
 
 
+def test_a_run_without_any_update_comes_back(tmp_path):
+    dims = ("filter", "update_time", "axis_gnss")
+    empty = xr.Dataset(
+        {"innovation_gnss": variable(dims, np.zeros((1, 0, 3)), "m", "innovation", "NED")},
+        coords={"update_time": variable("update_time", np.zeros(0), "s", "time"), "filter": ["a"]},
+    )
+    write(tmp_path / "out", a_summary(), empty)
+    back = read(tmp_path / "out").solution
+    assert back.identical(empty)
+    write(tmp_path / "again", a_summary(), back)  # what was read can be written
+    assert read(tmp_path / "again").solution.identical(empty)
+
+
 def test_the_checksums_are_those_of_a_common_tool(earlier):
     for name, entry in read(earlier).manifest["files"].items():
         printed = subprocess.run(
