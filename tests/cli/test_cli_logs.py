@@ -140,7 +140,7 @@ def test_people_see_the_parameters_with_their_units(robins, still_log):
     assert answer.status == 0
     for expected in (
         "Gyro angle random walk [deg/√h]",
-        "Accel bias instability [µg]",
+        "Accelerometer bias instability [µg]",
         "Result: results/allan-still",
         "Report: results/allan-still/report.html",
         "Next:",

@@ -1,161 +1,14 @@
-"""Figures show the numbers they are given, in their units, and nothing covers anything."""
+"""Figures show the numbers they are given, in their units, whatever is absent."""
 
-import itertools
-import re
-
-import matplotlib
 import numpy as np
-import pyproj
 import pytest
 from example_results import FILTERS, a_drive, a_summary, an_allan_curve
-from matplotlib.transforms import Bbox
+from figure_reading import collisions, lines_of
 from scipy.stats import chi2
 
 from robins import report
-from robins.report import allan_curve, bands, bars, curves, maps, series, style, updates
+from robins.report import allan_curve, bands, bars, curves, series, style, updates
 from robins.results import variable
-
-
-def lines_of(axes, colour):
-    """Line data of a colour, by how they were drawn: x, y."""
-    return [
-        (np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float))
-        for line in axes.lines
-        if line.get_color() == colour
-    ]
-
-
-@pytest.fixture(scope="module")
-def drawn(drive, town):
-    """Every picture of the drive, of a campaign and of an Allan analysis, drawn once."""
-    settings = dict(matplotlib.rcParams)
-    made = report.pictures(drive, town)
-    made += report.pictures(a_drive(3, runs=50, seconds=120.0), a_summary(3))
-    made += report.pictures(an_allan_curve(), a_summary(1))
-    shots = [report.draw(picture) for picture in made]
-    assert dict(matplotlib.rcParams) == settings  # nothing is left behind
-    return shots
-
-
-def test_every_array_gets_its_figure(drawn):
-    assert [shot.picture.name for shot in drawn] == [
-        *("track", "error_position", "error_velocity", "error_attitude", "error_gyro_bias"),
-        *("estimate_gyro_bias", "height", "innovation_gnss_position", "nees", "comparison"),
-        *("rms_position", "rms_velocity", "rms_attitude", "rms_gyro_bias", "anees", "comparison"),
-        "allan_gyro",
-    ]
-
-
-def test_no_figure_is_left_to_pyplot(drawn):
-    from matplotlib import pyplot
-
-    assert drawn
-    assert pyplot.get_fignums() == []
-
-
-def test_every_axis_says_what_it_shows_and_in_which_unit(drawn):
-    pure = {"NIS", "NEES", "ANEES"}
-    for shot in drawn:
-        picture = shot.picture
-        for axes in picture.figure.axes:
-            if not axes.get_visible():
-                continue
-            if picture.name == "comparison":  # categories upwards; the title names the metric
-                assert re.search(r"\w+ \[.+\]$", axes.get_title(loc="left")), picture.name
-                continue
-            if axes.get_subplotspec().is_last_row():
-                assert re.search(r"\w+.* \[\w+\]$", axes.get_xlabel()), picture.name
-            if axes.get_subplotspec().is_first_col():
-                label = axes.get_ylabel()
-                assert label in pure or re.search(r"\w+ \[.+\]$", label), picture.name
-
-
-def visible_texts(figure):
-    """Every text a reader sees, with its box in pixels."""
-    texts = [text for legend in figure.legends for text in legend.texts]
-    for axes in figure.axes:
-        if axes.get_visible():
-            texts += [*axes.texts, axes.xaxis.label, axes.yaxis.label, axes._left_title]
-            for axis in (axes.xaxis, axes.yaxis):
-                texts.append(axis.get_offset_text())
-                # Matplotlib keeps labels of ticks out of range; this lists the ones it draws.
-                texts += [tick.label1 for tick in axis._update_ticks()]
-    seen = [(t.get_text(), t.get_window_extent()) for t in texts if t.get_visible()]
-    return [(text, box) for text, box in seen if text.strip()]
-
-
-def collisions(figure):
-    """Texts that stick out of the figure or cover another."""
-    texts = visible_texts(figure)
-    bad = []
-    for text, box in texts:
-        outside = (-box.x0, -box.y0, box.x1 - figure.bbox.x1, box.y1 - figure.bbox.y1)
-        if max(outside) > 1.0:
-            bad.append(text)
-    for (a, first), (b, second) in itertools.combinations(texts, 2):
-        shared = Bbox.intersection(first, second)
-        if shared is not None and shared.width > 1.0 and shared.height > 1.0:
-            bad.append(f"{a!r} covers {b!r}")
-    return bad
-
-
-def test_no_text_covers_another_or_leaves_the_figure(drawn):
-    for shot in drawn:
-        assert len(visible_texts(shot.picture.figure)) > 5
-        assert collisions(shot.picture.figure) == [], shot.picture.name
-
-
-def test_planted_collisions_are_found():
-    figure, grid = style.new(1, 1)
-    figure.set_layout_engine("none")  # it would make room for what sticks out
-    for x in (0.5, 0.51, 1.2):
-        grid[0, 0].text(x, 0.5, f"at {x}", transform=grid[0, 0].transAxes)
-    figure.canvas.draw()
-    assert "'at 0.5' covers 'at 0.51'" in collisions(figure)
-    assert "at 1.2" in collisions(figure)
-
-
-def test_no_legend_covers_data(drawn):
-    for shot in drawn:
-        figure = shot.picture.figure
-        for legend in figure.legends:
-            box = legend.get_window_extent()
-            assert all(not box.overlaps(axes.get_window_extent()) for axes in figure.axes)
-        assert not any(axes.get_legend() for axes in figure.axes)
-
-
-def luminance(colour):
-    """Relative luminance (WCAG 2)."""
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
-    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
-
-
-# Machado, Oliveira and Fernandes (2009), severity 1: what is seen of linear RGB.
-_BLIND = {
-    "protanopia": [
-        [0.152286, 1.052583, -0.204868],
-        [0.114503, 0.786281, 0.099216],
-        [-0.003882, -0.048116, 1.051998],
-    ],
-    "deuteranopia": [
-        [0.367322, 0.860646, -0.227968],
-        [0.280085, 0.672501, 0.047413],
-        [-0.011820, 0.042940, 0.968881],
-    ],
-}
-
-
-@pytest.mark.parametrize("kind", _BLIND)
-def test_the_first_colours_differ_for_the_colour_blind(kind):
-    rgb = np.array([matplotlib.colors.to_rgb(c) for c in style.COLOURS[:4]])
-    seen = np.clip(rgb @ np.array(_BLIND[kind]).T, 0.0, 1.0)
-    for a, b in itertools.combinations(seen, 2):
-        assert np.linalg.norm(a - b) > 0.15
-    for colour in rgb[:3]:
-        assert 1.05 / (luminance(colour) + 0.05) > 3.0  # contrast on white
-
-
-# ---------------------------------------------------------------------------------- the numbers
 
 
 def test_errors_are_drawn_in_their_unit_with_three_sigma(drive):
@@ -284,6 +137,37 @@ def test_innovations_are_drawn_between_three_sigma_and_refusals_are_marked(drive
     assert "refused" in labels
 
 
+def test_a_filter_without_updates_is_not_in_the_legend(drive):
+    smoothed = drive.copy(deep=True)
+    for name in ("innovation", "innovation_sigma", "nis", "refused"):
+        array = smoothed[f"{name}_gnss_position"].astype(float)
+        array[1] = np.nan
+        smoothed[f"{name}_gnss_position"] = array.assign_attrs(
+            smoothed[f"{name}_gnss_position"].attrs
+        )
+    smoothed["refused_gnss_position"][0] = 0.0
+    figure = updates.innovations(smoothed, "gnss_position").figure
+    labels = [text.get_text() for text in figure.legends[0].texts]
+    assert labels == ["kalman", "±3σ expected", "chi-square band", "outage"]
+
+
+def test_a_few_large_innovations_do_not_hide_the_others(drive):
+    wild = drive.copy(deep=True)
+    wild["innovation_gnss_position"][0, 50, 1] = -80.0
+    picture = updates.innovations(wild, "gnss_position")
+    scales = [axes.get_yscale() for axes in picture.figure.axes]
+    assert scales == ["linear", "symlog", "linear", "linear"]
+    assert "logarithmic" in picture.caption
+    axes = picture.figure.axes[1]
+    assert axes.get_ylim()[0] < -80.0
+    small, large = (axes.transData.transform((0.0, y))[1] for y in (2.7, 80.0))
+    middle = axes.transData.transform((0.0, 0.0))[1]
+    assert (small - middle) > 0.1 * (large - middle)  # three sigma of 80 would be 0.03
+    report.draw(picture)
+    assert collisions(picture.figure) == []
+    assert "logarithmic" not in updates.innovations(drive, "gnss_position").caption
+
+
 def test_a_steep_statistic_is_drawn_on_a_logarithmic_axis(drive):
     wild = drive.copy(deep=True)
     wild["nis_gnss_position"][0, 7] = 5e4
@@ -358,103 +242,6 @@ def test_the_allan_curve_is_drawn_in_field_units_with_its_fit():
     labels = [text.get_text() for text in figure.legends[0].texts]
     assert "95\u00a0% confidence" in labels
     assert "rate random walk" in labels
-
-
-# -------------------------------------------------------------------------------------- the map
-
-
-@pytest.mark.parametrize("lat_deg", [-75.0, 0.0, 48.7, 80.0])
-def test_metres_on_the_map_are_those_of_the_ellipsoid(lat_deg):
-    geod = pyproj.Geod(ellps="WGS84")
-    for azimuth in (0.0, 37.0, 90.0, 200.0):
-        lon, lat, _ = geod.fwd(179.99, lat_deg, azimuth, 2000.0)
-        got = maps.metres(
-            np.deg2rad([lat]), np.deg2rad([lon]), (np.deg2rad(lat_deg), np.deg2rad(179.99))
-        )
-        want = 2000.0 * np.array([np.cos(np.deg2rad(azimuth)), np.sin(np.deg2rad(azimuth))])
-        # A map without projection bends by d^2 tan(lat)/2R over a distance d.
-        bend = 2000.0**2 * abs(np.tan(np.deg2rad(lat_deg))) / 6.35e6 + 0.01
-        np.testing.assert_allclose([got.north[0], got.east[0]], want, atol=bend)
-
-
-def test_crossing_180_degrees_draws_no_line_across_the_map(drive):
-    home = maps.paths(drive)["track"]
-    there = a_drive(lon0=np.pi - 1e-5)
-    assert np.ptp(there["lon_rad"].values) > 6.0  # it really crosses
-    crossing = maps.paths(there)["track"]
-    np.testing.assert_allclose(crossing.east, home.east, atol=1e-3)
-    np.testing.assert_allclose(crossing.north, home.north, atol=1e-3)
-    picture = maps.track(there)
-    assert picture is not None
-    for line in picture.figure.axes[0].lines:
-        if line.get_linestyle() != "None" and line.get_linewidth() != 3.0:  # the scale bar
-            assert np.nanmax(np.abs(np.diff(line.get_xdata())), initial=0.0) < 100.0
-
-
-def test_a_given_track_that_jumps_around_the_globe_is_broken_there(drive):
-    east = np.where(drive["time"].values < 300.0, 0.0, -3e7) + np.zeros((2, 1))
-    given = drive.assign(
-        track_north_m=variable(("filter", "time"), np.zeros_like(east), "m", "north"),
-        track_east_m=variable(("filter", "time"), east, "m", "east"),
-    )
-    path = maps.paths(given)["track"]
-    np.testing.assert_array_equal(path.east, east)
-    broken = maps.unwrapped(maps.Path(path.north[0], path.east[0]))
-    assert np.isnan(broken.east).sum() == 1
-    assert np.nanmax(np.abs(np.diff(broken.east))) == 0.0
-
-
-@pytest.mark.parametrize("seconds", [30.0, 600.0])
-def test_a_metre_is_as_long_north_as_east(seconds):
-    picture = maps.track(a_drive(seconds=seconds))
-    assert picture is not None
-    report.draw(picture)
-    axes = picture.figure.axes[0]
-    (x0, y0), (x1, y1) = axes.transData.transform([(0.0, 0.0), (10.0, 10.0)])
-    assert (x1 - x0) == pytest.approx(y1 - y0, rel=1e-3)
-
-
-def test_the_map_holds_everything_and_marks_fixes_ends_and_outage(drive):
-    picture = maps.track(drive)
-    assert picture is not None
-    axes = picture.figure.axes[0]
-    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
-    for path in maps.paths(drive).values():
-        assert west < np.nanmin(path.east) <= np.nanmax(path.east) < east
-        assert south < np.nanmin(path.north) <= np.nanmax(path.north) < north
-    quality = drive["gnss_quality"].values
-    labels = [text.get_text() for text in picture.figure.legends[0].texts]
-    for value, name in ((1, "fix"), (2, "float"), (5, "single")):
-        assert f"GNSS {name} ({np.sum(quality == value)})" in labels
-    assert {"start", "end", "outage", "reference", "kalman", "robust"} <= set(labels)
-    (outage,) = [line for line in axes.lines if line.get_linewidth() == 6.0]
-    reference = maps.paths(drive)["reference"]
-    hidden = drive["outage"].values
-    shown = np.asarray(outage.get_xdata(), float)
-    assert np.nanmin(shown) == pytest.approx(reference.east[hidden].min())
-    assert np.nanmax(shown) == pytest.approx(reference.east[hidden].max())
-    start = next(line for line in axes.lines if line.get_marker() == "o")
-    assert start.get_xdata()[0] == pytest.approx(maps.paths(drive)["track"].east[0, 0])
-    assert "N" in [text.get_text() for text in axes.texts]
-
-
-def test_qualities_are_named_as_the_data_name_them(drive):
-    drive = drive.copy(deep=True)
-    drive["gnss_quality"].attrs |= {"flag_values": [1, 2], "flag_meanings": "wet half_dry"}
-    picture = maps.track(drive)
-    assert picture is not None
-    labels = " ".join(text.get_text() for text in picture.figure.legends[0].texts)
-    assert "GNSS wet (" in labels
-    assert "GNSS half dry (" in labels
-    assert "GNSS quality 5 (" in labels
-
-
-def test_the_scale_bar_is_as_long_as_it_says():
-    for length in (0.7, 1.0, 3.0, 730.0, 99999.0):
-        bar = maps._round(length)
-        assert bar <= length * 1.00001
-        assert length / bar < 2.5
-        assert f"{bar:e}"[0] in "125"
 
 
 # ----------------------------------------------------------------------------- what may be absent

@@ -22,6 +22,8 @@ from robins.report import numbers
         ("peak_m_per_s2", "Peak", "m/s²"),
         ("nis_inside_percent", "NIS inside", "%"),
         ("anees", "ANEES", ""),
+        ("euler", "Euler angles", ""),
+        ("accel_bias_rms_mg", "Accelerometer bias RMS", "mg"),
         ("step_us", "Step", "µs"),
         ("updates", "Updates", ""),
         ("m", "M", ""),

@@ -37,6 +37,8 @@ _CAPITALS = {
     *("rtk", "2d", "3d", "nhc", "zupt", "lmi"),
 }
 
+_WORDS = {"euler": "Euler angles", "accel": "accelerometer"}
+
 
 class Label(NamedTuple):
     """A metric's name in words, and its unit ("" for a pure number)."""
@@ -59,7 +61,7 @@ def label(metric: str) -> Label:
 def words(name: str) -> str:
     """A name of a program as words: ``gnss_position`` is "GNSS position"."""
     split = (word for word in name.split("_") if word)
-    return " ".join(word.upper() if word in _CAPITALS else word for word in split)
+    return " ".join(_WORDS.get(w, w.upper() if w in _CAPITALS else w) for w in split)
 
 
 def show(value: Any) -> str:

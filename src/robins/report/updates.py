@@ -13,6 +13,7 @@ from robins.report.bands import band, inside
 from robins.report.numbers import words
 from robins.report.style import Picture
 
+_FAR = 10.0  # an innovation this much larger than most bends the axis
 _STEEP = 15.0  # a statistic this far above its band is shown on a logarithmic axis
 
 
@@ -29,30 +30,35 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     stack, clock = grid[:, 0], series.clock(data.x)
     x = data.x / clock.seconds
     outage = series.outage(solution)
-    refused = series.get(solution, "refused", sensor)
+    refused = _refused(solution, sensor, data.values.shape[:2])
+    present = [i for i in range(len(filters)) if np.isfinite(data.values[i]).any()]
     for axes in stack:
         if outage is not None:
             style.shade(axes, outage[0] / clock.seconds, outage[1])
         axes.margins(x=0.0)
     for k, label in enumerate(data.axes):
         axes = stack[k]
-        for i in range(len(filters)):
+        shown = []
+        for i in present:
             y = data.values[i, :, k]
             _points(axes, x, y, i)
-            if refused is not None:
-                out = refused.values[i, :, 0] != 0.0
+            shown.append(np.abs(y))
+            out = refused[i]
+            if out.any():
                 axes.plot(x[out], y[out], **_CROSS)
             if sigma is not None:
                 reach = 3.0 * sigma.values[i, :, k]
+                shown.append(np.where(np.isfinite(y), reach, np.nan))
+                look = {"color": style.colour(i), "linestyle": style.line(i), "linewidth": 0.8}
                 for sign in (-1.0, 1.0):
-                    look = {"color": style.colour(i), "linestyle": style.line(i)}
-                    axes.plot(*series.thin(x, sign * reach), linewidth=0.8, **look)
+                    axes.plot(*series.thin(x, sign * reach), **look)
+        _compress(axes, shown)
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
         axes.set_ylabel(f"{label} [{data.unit}]" if data.unit else label)
-    keys: list[Any] = [_dot(name, i) for i, name in enumerate(filters)]
+    keys: list[Any] = [_dot(filters[i], i) for i in present]
     if sigma is not None:
         keys.append(style.key("±3σ expected", color=style.GREY, linewidth=0.8))
-    if refused is not None and np.any(refused.values != 0.0):
+    if refused.any():
         keys.append(style.key("refused", **_CROSS))
     if has_nis:
         shares = _statistic(stack[-1], solution, f"nis_{sensor}", f"nis_dof_{sensor}", clock)
@@ -69,7 +75,37 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
         "Measured minus predicted. They should look like white noise "
         "between the lines; runs to one side tell of an error the filter does not model."
     )
+    if any(axes.get_yscale() == "symlog" for axes in stack):
+        caption += " Far from zero the scale is logarithmic."
     return Picture(f"innovation_{sensor}", f"Innovations of {name}", caption, figure)
+
+
+def _refused(solution: xr.Dataset, sensor: str, shape: tuple[int, int]) -> np.ndarray:
+    """Where a gate refused an update, (filter, update time)."""
+    found = series.get(solution, "refused", sensor)
+    return np.zeros(shape, bool) if found is None else found.values[..., 0] > 0.0
+
+
+def _compress(axes: Axes, values: list[np.ndarray]) -> None:
+    """Bend the scale if a few updates, those after an outage or gross errors, are far larger."""
+    known = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.zeros(0)
+    if known.size == 0:
+        return
+    usual, most = np.percentile(known, 90.0), known.max()
+    if usual > 0.0 and most > _FAR * usual:
+        near, far = _round_up(1.3 * usual), _round_up(most)
+        # Near zero, where nearly all of them are, gets about two thirds of the height.
+        axes.set_yscale("symlog", linthresh=near, linscale=2.0 * np.log10(far / near))
+        ticks = [-far, -near, 0.0, near, far]
+        axes.set_yticks(ticks, [f"{tick:g}".replace("-", "−") for tick in ticks])
+        axes.set_yticks([], minor=True)
+        axes.set_ylim(-1.3 * far, 1.3 * far)
+
+
+def _round_up(value: float) -> float:
+    """The next 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(min(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))
 
 
 _CROSS = {

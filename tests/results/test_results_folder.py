@@ -1,0 +1,395 @@
+"""What was there before survives every failure, and nothing of the user is ever deleted."""
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from example_folder import a_figure, a_solution, a_summary, names
+
+from robins import results
+from robins.results import ResultError, ResultWriter, folder, read, write
+
+# ------------------------------------------------------------------- nothing of the user is lost
+
+
+def test_a_folder_of_the_user_is_not_replaced(tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
+    with pytest.raises(ResultError, match="not a result of robins; choose a new folder"):
+        ResultWriter(tmp_path / "thesis")
+    assert (tmp_path / "thesis" / "chapter.tex").read_text() == "years of work"
+    assert names(tmp_path) == ["thesis"]
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"schema": "1"}', '{"schema": 1, "files": 3}'])
+def test_a_folder_with_a_manifest_of_something_else_is_not_replaced(tmp_path, text):
+    (tmp_path / "app").mkdir()
+    (tmp_path / "app" / "manifest.json").write_text(text)
+    with pytest.raises(ResultError, match="choose a new folder"):
+        ResultWriter(tmp_path / "app")
+    assert names(tmp_path / "app") == ["manifest.json"]
+
+
+def test_a_result_with_notes_of_the_user_is_not_replaced(earlier):
+    (earlier / "notes.txt").write_text("seen")
+    with pytest.raises(ResultError, match=r"holds 'notes\.txt', which robins did not write"):
+        write(earlier, a_summary())
+    (earlier / "notes.txt").rename(earlier / ".DS_Store")
+    write(earlier, a_summary(seed=2))
+    assert read(earlier).summary["seed"] == 2
+
+
+def test_notes_added_while_the_run_goes_on_are_kept(earlier):
+    writer = ResultWriter(earlier)
+    writer.save_summary(a_summary())
+    (earlier / "notes.txt").write_text("seen")
+    with pytest.raises(ResultError, match=r"holds 'notes\.txt'"), writer:
+        pass
+    assert (earlier / "notes.txt").read_text() == "seen"
+    assert names(earlier.parent) == ["out"]
+
+
+def test_the_folder_one_stands_in_is_not_replaced(earlier, monkeypatch):
+    monkeypatch.chdir(earlier)
+    for path in (".", "..", earlier):
+        with pytest.raises(ResultError, match="is the folder you are in"):
+            ResultWriter(path)
+    write("inner", a_summary())
+    assert read(earlier / "inner").summary["seed"] == 7
+
+
+def test_a_mount_point_is_refused_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "mnt").mkdir()
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == tmp_path / "mnt")
+    with pytest.raises(ResultError, match="is a mount point; choose a folder inside it"):
+        ResultWriter(tmp_path / "mnt")
+
+
+def test_an_empty_folder_is_used(tmp_path):
+    (tmp_path / "out").mkdir()
+    write(tmp_path / "out", a_summary())
+    assert read(tmp_path / "out").summary["seed"] == 7
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_linked_folder_is_replaced_where_it_lies(earlier):
+    link = earlier.parent / "latest"
+    link.symlink_to(earlier)
+    write(link, a_summary(seed=2))
+    assert link.is_symlink()
+    assert read(earlier).summary["seed"] == 2
+
+
+@pytest.mark.parametrize("name", ["x" * 255, "ä" * 127, "with space", "ﷺ 航法", "-n", "a'b\"c"])
+def test_odd_names_work(tmp_path, name):
+    for seed in (1, 2):
+        write(tmp_path / name, a_summary(seed=seed), a_solution())
+    assert read(tmp_path / name).summary["seed"] == 2
+    assert names(tmp_path) == [name]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("x" * 256, "name too long; choose a shorter name"),
+        ("file", "is a file, not a folder"),
+        ("file/out", "choose a path whose parents are folders"),
+        ("/dev/full", "is a file, not a folder"),
+        ("/dev/full/out", "choose a path whose parents are folders"),
+    ],
+)
+def test_impossible_paths_are_refused_before_the_work(tmp_path, name, message):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ResultError, match=rf"(?i){message}"):
+        ResultWriter(tmp_path / name)
+    assert names(tmp_path) == ["file"]
+
+
+# ------------------------------------------------------------------ failures leave what was there
+
+
+def still_there(earlier):
+    assert read(earlier).summary["seed"] == 1
+    assert names(earlier.parent) == ["out"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit, MemoryError])
+def test_a_failure_in_between_leaves_the_earlier_result(earlier, error):
+    def run():
+        with ResultWriter(earlier) as writer:
+            writer.save_solution(a_solution(2.0))
+            writer.save_summary(a_summary())
+            raise error
+
+    with pytest.raises(error):
+        run()
+    still_there(earlier)
+
+
+def test_parents_made_for_a_failed_result_go_with_it(tmp_path):
+    writer = ResultWriter(tmp_path / "a" / "b" / "out")
+    assert names(tmp_path) == ["a"]
+    writer.discard()
+    assert names(tmp_path) == []
+
+
+def full_disk(*_args, **_kwargs):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("what", ["solution", "figure", "summary.json", "manifest.json", "sync"])
+def test_a_full_disk_leaves_the_earlier_result(earlier, monkeypatch, what):
+    real = Path.write_bytes
+    named = {"solution": "solution.nc", "figure": "x.png"}.get(what, what)
+    monkeypatch.setattr(
+        Path, "write_bytes", lambda p, b: full_disk() if p.name == named else real(p, b)
+    )
+    if what == "sync":
+        monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(ResultError, match="No space left on device; free some space"):
+        write(earlier, a_summary(seed=2), a_solution(), figures={"x": a_figure()})
+    monkeypatch.undo()
+    still_there(earlier)
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EROFS, errno.EPERM, errno.EDQUOT])
+def test_a_folder_without_permission_is_refused_before_the_work(earlier, monkeypatch, code):
+    # Tests may run as root, whom no permission stops, so the refusal is played.
+    def refuse(*_args, **_kwargs):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "mkdir", refuse)
+    with pytest.raises(ResultError, match=f"cannot make the result folder: {os.strerror(code)}"):
+        ResultWriter(earlier)
+    monkeypatch.undo()
+    still_there(earlier)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.EACCES, "no")])
+def test_a_failed_exchange_is_taken_back(earlier, monkeypatch, which, error):
+    real, calls = os.rename, []
+
+    def rename(a, b):
+        calls.append(a)
+        if len(calls) == which + 1:
+            raise error
+        real(a, b)
+
+    monkeypatch.setattr(os, "rename", rename)
+    with pytest.raises((ResultError, KeyboardInterrupt)):
+        write(earlier, a_summary(seed=2))
+    monkeypatch.undo()
+    still_there(earlier)
+
+
+def test_an_interrupt_at_any_line_leaves_a_whole_result(earlier):
+    """Ctrl-C can fall between any two lines of the code that moves folders about."""
+    modules = (folder.__file__, results.writer.__file__)
+
+    class Countdown:
+        def __init__(self, lines):
+            self.left = lines
+
+        def __call__(self, frame, event, _arg):
+            if frame.f_code.co_filename not in modules:
+                return None
+            if event == "line":
+                self.left -= 1
+                if self.left == 0:
+                    sys.settrace(None)
+                    raise KeyboardInterrupt
+            return self
+
+    outer, seeds, lines = sys.gettrace(), [], 0
+    while True:
+        lines += 1
+        sys.settrace(Countdown(lines))
+        try:
+            write(earlier, a_summary(seed=2))
+        except KeyboardInterrupt:
+            seeds.append(read(earlier).summary["seed"])
+            hidden = [name for name in names(earlier.parent) if name != "out"]
+            assert all(name.startswith(".robins-") for name in hidden), f"line {lines}"
+            for name in hidden:  # this process lives, so no later writer may sweep them
+                shutil.rmtree(earlier.parent / name)
+        else:
+            break
+        finally:
+            sys.settrace(outer)
+    assert set(seeds) == {1, 2}  # 2 after an interrupt that fell behind the exchange
+    assert seeds == sorted(seeds)
+    write(earlier, a_summary(seed=1))
+    still_there(earlier)
+
+
+PROLOGUE = """
+    import os, resource, sys
+    from pathlib import Path
+    sys.path[:0] = [{tests!r}]
+    from example_folder import a_solution, a_summary, names
+    from robins.results import ResultError, ResultWriter, read, write
+    out = Path({out!r})
+"""
+
+
+def in_a_process(script, out):
+    code = textwrap.dedent(PROLOGUE.format(tests=str(Path(__file__).parent), out=str(out)))
+    done = subprocess.run(
+        [sys.executable, "-c", code + textwrap.dedent(script)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_kill_at_any_call_leaves_a_whole_result(earlier):
+    """The process dies, without any clean-up, at the k-th call that changes the disk."""
+    printed = in_a_process(
+        """
+        CALLS = ("mkdir", "rename", "fsync", "rmdir", "unlink", "open")
+        def attempt(k):
+            pid = os.fork()
+            if pid == 0:
+                for name in CALLS:
+                    def dying(*args, real=getattr(os, name), **kwargs):
+                        global k_left
+                        k_left -= 1
+                        if k_left < 0:
+                            os._exit(9)
+                        return real(*args, **kwargs)
+                    setattr(os, name, dying)
+                globals()["k_left"] = k
+                write(out, a_summary(seed=2))
+                os._exit(0)
+            return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        k = 0
+        while (code := attempt(k)) == 9:
+            print(read(out).summary["seed"], names(out.parent) != ["out"])
+            k += 1
+        assert code == 0, code
+        assert names(out.parent) == ["out"], names(out.parent)
+        """,
+        earlier,
+    )
+    lines = [line.split() for line in printed.splitlines()]
+    assert {seed for seed, _ in lines} == {"1", "2"}
+    assert any(left == "True" for _, left in lines)  # else the test did not kill at a bad moment
+
+
+def test_a_file_size_limit_leaves_the_earlier_result(earlier):
+    in_a_process(
+        """
+        for limit in (0, 10, 1000, 3000):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+            try:
+                write(out, a_summary(seed=2), a_solution())
+            except ResultError as error:
+                assert "raise the file size limit" in str(error), error
+            else:
+                raise SystemExit(f"written under a limit of {limit}")
+            assert read(out).summary["seed"] == 1
+            assert names(out.parent) == ["out"]
+        """,
+        earlier,
+    )
+
+
+# ------------------------------------------------------------------- other writers, left-overs
+
+
+def test_two_writers_of_one_folder(earlier):
+    first = ResultWriter(earlier)
+    first.save_summary(a_summary(seed=2))
+    write(earlier, a_summary(seed=3))  # must not take the first for dead
+    assert read(earlier).summary["seed"] == 3
+    first.commit()
+    assert read(earlier).summary["seed"] == 2
+    assert names(earlier.parent) == ["out"]
+
+
+def test_a_writer_that_is_overtaken_in_the_exchange_tries_again(earlier, monkeypatch):
+    real, done = os.rename, []
+
+    def rename(a, b):
+        real(a, b)
+        if not done:  # the earlier result is aside: another writer now takes the place
+            done.append(True)
+            write(earlier, a_summary(seed=3))
+
+    monkeypatch.setattr(os, "rename", rename)
+    write(earlier, a_summary(seed=2))
+    assert read(earlier).summary["seed"] == 2
+    assert names(earlier.parent) == ["out"]
+
+
+def test_what_a_dead_writer_set_aside_is_read_and_brought_back(earlier):
+    aside = folder._hidden(earlier, "old")
+    earlier.rename(aside)
+    assert read(earlier).summary["seed"] == 1
+    assert read(earlier).path == aside
+    assert names(earlier.parent) == [aside.name]  # reading changes nothing
+    with pytest.raises(RuntimeError), ResultWriter(earlier):
+        raise RuntimeError
+    still_there(earlier)
+
+
+def test_hidden_folders_of_others_are_not_touched(earlier):
+    other = folder._hidden(earlier.with_name("other"), "new")
+    looks_alike = earlier.parent / f"{folder._hidden(earlier, 'new').name}.backup"
+    for path in (other, looks_alike):
+        path.mkdir()
+    write(earlier, a_summary())
+    assert names(earlier.parent) == sorted([other.name, looks_alike.name, "out"])
+
+
+def test_without_locks_nothing_is_taken_for_dead(earlier, monkeypatch):
+    def unsupported(*_args):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(folder.fcntl, "flock", unsupported)
+    unknown = folder._hidden(earlier, "new")
+    unknown.mkdir()
+    write(earlier, a_summary(seed=2))
+    assert read(earlier).summary["seed"] == 2
+    assert names(earlier.parent) == sorted([unknown.name, "out"])
+
+
+# -------------------------------------------------------------------------------------- extension
+
+
+def test_a_result_is_extended(earlier):
+    before = (earlier / "solution.nc").read_bytes()
+    with results.extend(read(earlier)) as writer:
+        writer.save_report("<p>")
+    after = read(earlier)
+    assert after.report.read_text() == "<p>"
+    assert after.summary["files"]["report"] == "report.html"
+    assert after.summary["seed"] == 1
+    assert (earlier / "solution.nc").read_bytes() == before
+
+
+def test_a_failed_extension_changes_nothing(earlier):
+    writer = results.extend(read(earlier))
+    writer.save_solution(a_solution(3.0))  # the file is a link into the earlier result
+    writer.save_summary(a_summary(seed=5))
+    writer.discard()
+    still_there(earlier)
+
+
+def test_an_extension_works_where_files_cannot_be_linked(earlier, monkeypatch):
+    def unsupported(*_args):
+        raise OSError(errno.EPERM, "no links")
+
+    monkeypatch.setattr(os, "link", unsupported)
+    with results.extend(read(earlier)) as writer:
+        writer.save_report("<p>")
+    assert read(earlier).solution.identical(a_solution())
