@@ -76,31 +76,38 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     """The Kalman update for a linearised observation.
 
     With H S known as the spread, gain and covariance follow from S_y, the innovation's factor:
-    K = (S spread') (S_y S_y')^-1 and P = (S - K spread)(..)' + K (Omega + R) K'.
+    K = (S spread') (S_y S_y')^-1 and P = (S - K spread)(..)' + K (Omega + R) K'. The mean moves by
+    the cross-covariance with the whitened innovation, S spread' S_y'^-1, times that innovation:
+    the gain's large numbers, which would cancel, do not come in.
     """
     spread, excess, noise, deficit, used = left_out(o)
     S = prior.factor
     if form == "sqrt":
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
-        gain = linalg.solve_lower_transposed(S_y, cross.T).T
+        # After an exact measurement nothing is left in its direction, not even rounding: that
+        # would be a covariance of its own to measurements yet to come.
+        exact = jnp.any(used & ~jnp.any(noise != 0.0, axis=1) & ~jnp.any(excess != 0.0, axis=1))
+        lost = linalg.lost_in_rounding(S_post, prior.sigma)
+        S_post = jnp.where(exact & lost, 0.0, S_post)
     else:
         R = excess @ excess.T + noise @ noise.T
         if deficit is not None:
             R = R - deficit[:, None] @ deficit[None, :]
         S_y = linalg.cholesky(spread @ spread.T + R)
-        gain = linalg.solve_spd(S_y, spread @ S.T).T
-        A = S - gain @ spread
-        S_post = linalg.cholesky(A @ A.T + gain @ R @ gain.T)
+        cross = linalg.solve_lower(S_y, spread @ S.T).T
+        K = linalg.solve_lower_transposed(S_y, cross.T).T
+        A = S - K @ spread
+        S_post = linalg.cholesky(A @ A.T + K @ R @ K.T)
 
-    gain = jnp.where(used[None, :], gain, 0.0)
     seen = whiten(S_y, used, o.residual)
-    mean = manifold.retract(prior.mean, gain @ jnp.where(used, o.residual, 0.0))
+    mean = manifold.retract(prior.mean, cross @ seen.white)
+    gain = linalg.solve_lower_transposed(S_y, cross.T).T
     # With nothing to use the belief stands bit for bit, as if there had been no update.
     posterior = _select(jnp.any(used), Belief(mean, S_post), prior)
     info = StepInfo(
         innovation=jnp.where(o.present, o.residual, jnp.nan),
         factor=S_y,
-        gain=gain,
+        gain=jnp.where(used[None, :], gain, 0.0),
         used=used,
         nis=seen.nis,
         dof=seen.dof,

@@ -63,10 +63,24 @@ def _shape(leaf):
     return None if leaf is None else jnp.shape(leaf)
 
 
+def _magnitude(x: State) -> Array:
+    """Size of the numbers behind each tangent component of a state: rounding is 1e-16 of it."""
+    x = jax.lax.stop_gradient(x)
+
+    def of(leaf):
+        if not manifold.is_element(leaf):
+            return jnp.abs(leaf).reshape(-1)
+        # How far one unit in the last place leads, whatever the element is made of.
+        moved = jax.tree_util.tree_map(lambda v: jnp.nextafter(v, jnp.inf), leaf)
+        return jnp.abs(leaf.local(moved)).reshape(-1) / jnp.finfo(float).eps
+
+    return jnp.concatenate([of(leaf) for leaf in manifold.leaves(x)])
+
+
 def _observe(
     sensor: Sensor, prior: Belief, z: Any, y: Any, aux: Any, spread, excess, size, deficit=None
 ) -> Observation:
-    """An observation from what a linearisation found; ``size`` is what the spread was summed from.
+    """An observation from what a linearisation found.
 
     Raises:
         ValueError: the sensor reads another number of components than it says, or its measurement
@@ -82,18 +96,16 @@ def _observe(
             f"sensor '{sensor.name}' says dim = {sensor.dim}, but reads {manifold.dim(z)} numbers"
         )
     residual, present = innovation(z, y)
-    noise = sensor.noise_factor(prior.mean, aux)
-    if deficit is not None:
-        deficit = linalg.without_rounding(deficit[:, None], size)[:, 0]
     return Observation(
         sensor=sensor.name,
         prior=prior,
         residual=residual,
         present=present,
         accepted=present,
-        spread=linalg.without_rounding(spread, size),
-        excess=linalg.without_rounding(excess, size),
-        noise=noise,
+        spread=spread,
+        excess=excess,
+        noise=sensor.noise_factor(prior.mean, aux),
+        size=size,
         deficit=deficit,
     )
 
@@ -127,7 +139,7 @@ def taylor() -> Linearisation:
             z, H = sensor.linear(prior.mean, aux)
         else:
             z, H = _jacobian(lambda x: sensor.read(x, aux), prior.mean)
-        size = jnp.abs(H) @ prior.sigma
+        size = jnp.abs(H) @ (prior.sigma + _magnitude(prior.mean))
         nothing = linalg.zeros(sensor.dim, 0)
         return _observe(sensor, prior, z, y, aux, H @ prior.factor, nothing, size)
 
@@ -207,15 +219,6 @@ def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
     return mean, spread.T, root * even.T, math.sqrt(-lack) * b
 
 
-def _greatest(values: Any) -> Array:
-    """Greatest size of each component over the sigma points; zero for those of elements."""
-    parts = [
-        jnp.zeros(v.dim) if manifold.is_element(v) else jnp.max(jnp.abs(v), axis=0).reshape(-1)
-        for v in manifold.leaves(values)
-    ]
-    return jnp.concatenate(parts)
-
-
 def unscented(alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0) -> Linearisation:
     """Sigma points (Julier & Uhlmann 2004), drawn anew before every prediction and update.
 
@@ -236,7 +239,7 @@ def unscented(alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0) -> L
         weights = sigma_weights(n, alpha, beta, kappa)
         values = jax.vmap(lambda x: sensor.read(x, aux))(sigma_points(prior, weights.reach))
         z, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
-        size = _greatest(values) / weights.reach
+        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / weights.reach
         return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
 
     return Linearisation(transition, observation)

@@ -24,6 +24,7 @@ class Observation(NamedTuple):
     spread: Array  # (m, n) H S
     excess: Array  # (m, k) factor of what the linearisation leaves over; k = 0 for Taylor
     noise: Array  # (m, q) measurement noise factor
+    size: Array  # (m,) of what the spread was summed from: 1e-14 of it is rounding
     deficit: Array | None = None  # (m,) vector to take away again, for indefinite weights
 
 
@@ -85,12 +86,15 @@ def _present(predicted, measured) -> Array:
 def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
     """Spread, excess, noise, deficit without the rows that are not used, and which ones are.
 
-    Not used is what was not accepted, and what repeats components above it without noise of its
-    own: a second reading of a number that is known exactly. Such a row becomes unit noise,
-    uncorrelated with the rest, so shapes stay and nothing else changes.
+    Not used is what was not accepted, and what has no noise and nothing of its own to say: it
+    repeats components above it, or reads what is known exactly, so that its spread is mere
+    rounding and would correlate it with everything. Such a row becomes unit noise, uncorrelated
+    with the rest, so shapes stay and nothing else changes.
     """
     kept = [jnp.where(o.accepted[:, None], b, 0.0) for b in (o.spread, o.excess, o.noise)]
-    used = linalg.independent_rows(jnp.concatenate(kept, axis=1))
+    exact = o.accepted & ~jnp.any(kept[2] != 0.0, axis=1)
+    size = jnp.where(exact, o.size, 0.0)
+    used = linalg.independent_rows(jnp.concatenate(kept, axis=1), size)
     spread, excess, noise = (jnp.where(used[:, None], b, 0.0) for b in kept)
     unit = jnp.diag(jnp.where(used, 0.0, 1.0))
     deficit = None if o.deficit is None else jnp.where(used, o.deficit, 0.0)

@@ -48,7 +48,9 @@ def rts_smoother(solution: Solution) -> Belief:
         deficit = None if t.deficit is None else jnp.where(used, t.deficit, 0.0)
         S, cross, rest = linalg.block_factor(spread, (excess, noise, unit), now.factor, deficit)
         G = jnp.where(used[None, :], linalg.solve_lower_transposed(S, cross.T).T, 0.0)
-        mean = manifold.retract(now.mean, G @ manifold.local(prediction.belief.mean, later.mean))
+        ahead = jnp.where(used, manifold.local(prediction.belief.mean, later.mean), 0.0)
+        step = cross @ linalg.solve_lower(S, ahead[:, None])[:, 0]
+        mean = manifold.retract(now.mean, step)
         smoothed = Belief(mean, linalg.tria(rest, G @ later.factor))
         # A prediction that was not taken left the state where it was: the two are one.
         taken = prediction.code == int(Code.DONE)

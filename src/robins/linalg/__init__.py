@@ -16,13 +16,13 @@ from robins.linalg.dense import (
     identity,
     independent_rows,
     log_diagonal,
+    lost_in_rounding,
     solve_lower,
     solve_lower_transposed,
     solve_spd,
     symmetric_root,
     tria,
     where,
-    without_rounding,
     zeros,
 )
 from robins.linalg.systems import steady_state, van_loan
@@ -38,6 +38,7 @@ __all__ = [
     "identity",
     "independent_rows",
     "log_diagonal",
+    "lost_in_rounding",
     "solve_lower",
     "solve_lower_transposed",
     "solve_spd",
@@ -46,6 +47,5 @@ __all__ = [
     "tria",
     "van_loan",
     "where",
-    "without_rounding",
     "zeros",
 ]

@@ -80,52 +80,57 @@ def _with_diagonal(L, diagonal):
     return jnp.where(jnp.eye(L.shape[0], dtype=bool), diagonal[:, None], L)
 
 
-def independent_rows(rows: Float[Array, "m k"]) -> Bool[Array, "m"]:
+def independent_rows(
+    rows: Float[Array, "m k"], size: Float[Array, "m"] | None = None
+) -> Bool[Array, "m"]:
     """Which rows are independent of those above them, to rounding; a row of zeros is not.
 
     A row that is not finite counts as independent, so that a fault is not taken for a repetition.
     Gram-Schmidt, each row twice (Parlett 1998, sec. 6.9). QR without row exchange cannot tell: past
     a lost pivot its later ones are arbitrary.
+
+    Args:
+        rows: (m, k), each with a scale of its own.
+        size: (m,) of what each row was summed from, where that was larger than the row.
     """
     m = rows.shape[0]
     rows = jax.lax.stop_gradient(rows)
-    size = jnp.max(jnp.abs(rows), axis=1, initial=0.0, keepdims=True)
-    rows = rows / jnp.where(size > 0.0, size, 1.0)
+    length = jnp.max(jnp.abs(rows), axis=1, initial=0.0)
+    unit = jnp.where(length > 0.0, length, 1.0)
+    rows = rows / unit[:, None]
+    floor = jnp.full(m, DEPENDENT)
+    if size is not None:
+        floor = jnp.maximum(DEPENDENT, DEPENDENT * jax.lax.stop_gradient(size) / unit)
 
-    def orthogonalise(row, basis, weight):
+    def orthogonalise(row, least, basis, weight):
         rest = row
         for _ in range(2):
             rest = rest - (weight * (basis @ rest)) @ basis
         left = rest @ rest
-        solid = ~(left <= DEPENDENT**2 * (row @ row))
+        solid = ~(left <= least**2)
         return rest, jnp.where(solid, 1.0 / jnp.where(solid, left, 1.0), 0.0), solid
 
     if m > UNROLLED:
 
         def body(i, state):
-            found = orthogonalise(rows[i], *state[:2])
+            found = orthogonalise(rows[i], floor[i], *state[:2])
             return tuple(x.at[i].set(f) for x, f in zip(state, found, strict=True))
 
         state = jnp.zeros_like(rows), jnp.zeros(m), jnp.zeros(m, dtype=bool)
         return jax.lax.fori_loop(0, m, body, state)[2]
 
     basis, weight, independent = rows[:0], jnp.zeros(0), []
-    for row in rows:
-        rest, share, solid = orthogonalise(row, basis, weight)
+    for row, least in zip(rows, floor, strict=True):
+        rest, share, solid = orthogonalise(row, least, basis, weight)
         basis = jnp.concatenate([basis, rest[None]])
         weight = jnp.append(weight, share)
         independent.append(solid)
     return jnp.stack(independent)
 
 
-def without_rounding(rows: Float[Array, "m k"], size: Float[Array, "m"]) -> Float[Array, "m k"]:
-    """Rows that are lost in rounding against the size of what they were summed from become zero.
-
-    The spread of a number that is known exactly comes out as 1e-16 of its terms, in some direction:
-    to believe in it would correlate the number with everything.
-    """
-    length = jnp.max(jnp.abs(jax.lax.stop_gradient(rows)), axis=1, initial=0.0)
-    return jnp.where((length <= DEPENDENT * size)[:, None], 0.0, rows)
+def lost_in_rounding(rows: Float[Array, "m k"], size: Float[Array, "m"]) -> Bool[Array, "m k"]:
+    """Which entries are rounding against the size of what their row was summed from."""
+    return jnp.abs(rows) <= DEPENDENT * size[:, None]
 
 
 def block_factor(
