@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code
+from robins.filters.kalman import Prediction
 from robins.filters.run import Solution
 
 
@@ -33,33 +34,36 @@ def rts_smoother(solution: Solution) -> Belief:
     steps = solution.steps
     if not hasattr(steps, "prediction"):
         raise ValueError("smoothing needs a run that kept its steps: leave `keep` at its default")
-    posterior: Belief = steps.posterior
+    return _backwards(steps.posterior, steps.prediction)
+
+
+@jax.jit
+def _backwards(posterior: Belief, predictions: Prediction) -> Belief:
     last = jax.tree_util.tree_map(lambda x: x[-1], posterior)
-
-    def back(later: Belief, row):
-        now, prediction = row
-        t = prediction.transition
-        # As an update of `now` by the state that followed, whose prediction has the noise t.noise.
-        used = linalg.independent_rows(jnp.concatenate([t.spread, t.excess, t.noise], axis=1))
-        spread, excess, noise = (
-            jnp.where(used[:, None], b, 0.0) for b in (t.spread, t.excess, t.noise)
-        )
-        unit = jnp.diag(jnp.where(used, 0.0, 1.0))
-        deficit = None if t.deficit is None else jnp.where(used, t.deficit, 0.0)
-        S, cross, rest = linalg.block_factor(spread, (excess, noise, unit), now.factor, deficit)
-        G = jnp.where(used[None, :], linalg.solve_lower_transposed(S, cross.T).T, 0.0)
-        ahead = jnp.where(used, manifold.local(prediction.belief.mean, later.mean), 0.0)
-        step = cross @ linalg.solve_lower(S, ahead[:, None])[:, 0]
-        mean = manifold.retract(now.mean, step)
-        smoothed = Belief(mean, linalg.tria(rest, G @ later.factor))
-        # A prediction that was not taken left the state where it was: the two are one.
-        taken = prediction.code == int(Code.DONE)
-        smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(taken, a, b), smoothed, later)
-        return smoothed, smoothed
-
     rows = (
         jax.tree_util.tree_map(lambda x: x[:-1], posterior),
-        jax.tree_util.tree_map(lambda x: x[1:], steps.prediction),
+        jax.tree_util.tree_map(lambda x: x[1:], predictions),
     )
-    _, earlier = jax.lax.scan(back, last, rows, reverse=True)
+    _, earlier = jax.lax.scan(_back, last, rows, reverse=True)
     return jax.tree_util.tree_map(lambda a, b: jnp.concatenate([a, b[None]]), earlier, last)
+
+
+def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief]:
+    """One step back: an update of `now` by the state that followed."""
+    now, prediction = row
+    t = prediction.transition
+    used = linalg.independent_rows(jnp.concatenate([t.spread, t.excess, t.noise], axis=1))
+    spread, excess, noise = (
+        jnp.where(used[:, None], b, 0.0) for b in (t.spread, t.excess, t.noise)
+    )
+    unit = jnp.diag(jnp.where(used, 0.0, 1.0))
+    deficit = None if t.deficit is None else jnp.where(used, t.deficit, 0.0)
+    S, cross, rest = linalg.block_factor(spread, (excess, noise, unit), now.factor, deficit)
+    ahead = jnp.where(used, manifold.local(prediction.belief.mean, later.mean), 0.0)
+    step = cross @ linalg.solve_lower(S, ahead[:, None])[:, 0]
+    G = jnp.where(used[None, :], linalg.solve_lower_transposed(S, cross.T).T, 0.0)
+    smoothed = Belief(manifold.retract(now.mean, step), linalg.tria(rest, G @ later.factor))
+    # A prediction that was not taken left the state where it was: the two are one.
+    taken = prediction.code == int(Code.DONE)
+    smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(taken, a, b), smoothed, later)
+    return smoothed, smoothed
