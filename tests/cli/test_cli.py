@@ -350,6 +350,66 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
     assert results.read("out").summary["seed"] == 1
 
 
+DEAF = """
+import gc, os, signal, time, types
+def run_scenario(name, *, progress, **asked):
+    def _xla_gc_callback(phase, info):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+    gc.callbacks.append(_xla_gc_callback)
+    gc.collect()
+    gc.callbacks.clear()
+    time.sleep(30)
+sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
+"""
+
+SWALLOWED = """
+import os, signal, time, types
+def run_scenario(name, *, progress, **asked):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1)
+    except BaseException:
+        pass
+    progress(0.5, "on and on")
+    time.sleep(30)
+sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
+"""
+
+
+@pytest.mark.parametrize("code", [DEAF, SWALLOWED], ids=["in a callback", "swallowed"])
+def test_an_interrupt_is_not_lost(tmp_path, code):
+    process = start(
+        code, "run", "car/town", cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    _, err = process.communicate(timeout=15)
+    assert process.returncode == 3
+    assert err.strip().startswith("robins: interrupted.")
+
+
+def test_an_interrupted_process_ends_with_its_status_whatever_its_threads_do(tmp_path):
+    """Compilers leave threads that crash when the interpreter is taken away beneath them."""
+    code = f"""{SLOW}
+import atexit, os
+atexit.register(os.abort)
+main_of_the_process = main
+main = lambda arguments: main_of_the_process()
+"""
+    process = start(
+        code,
+        *("run", "car/town", "--out", "out"),
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout.readline() == "writing\n"
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 3
+    assert err.strip().startswith("robins: interrupted.")
+    assert list(tmp_path.iterdir()) == []
+
+
 LISTED = """
 import types
 claim = {"id": "C1", "text": "it holds " * 4000}

@@ -6,14 +6,14 @@ import contextlib
 import enum
 import errno
 import os
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import click
+
+from robins.cli import interrupts
 
 
 class Status(enum.IntEnum):
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     given = list(sys.argv[1:] if arguments is None else arguments)
     output = _Output(sys.stdout)
-    with _terminated_like_interrupted(), contextlib.redirect_stdout(output):
+    with interrupts.heeded(), contextlib.redirect_stdout(output):
         try:
             status = app.main(given, prog_name="robins", standalone_mode=False, obj=given)
             output.flush()
@@ -84,6 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "interrupted. No half result was written and an earlier one is as it was; the same "
                 "command starts again."
             )
+            if arguments is None:
+                _leave(Status.INTERRUPTED)
             return Status.INTERRUPTED
         except Exception as error:
             if output.failure is not None:
@@ -95,6 +97,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if "--debug" in given and not isinstance(error, click.ClickException):
                 traceback.print_exception(error)
             return _told(error)
+
+
+def _leave(status: Status) -> NoReturn:
+    """End the process here and now.
+
+    A compilation goes on in threads of its own when the interpreter takes the rest away, and that
+    ends in a segmentation fault instead of the status. Files are closed already.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)
 
 
 def _told(error: Exception) -> Status:
@@ -143,23 +157,6 @@ def _tell(text: str) -> None:
     with contextlib.suppress(OSError, ValueError):
         for line in text.splitlines():
             print(f"robins: {line}", file=sys.stderr)
-
-
-@contextlib.contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """Let SIGTERM unwind as Ctrl-C does, so that no half folder stays behind."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(_number: int, _frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager

@@ -7,6 +7,8 @@ import threading
 from types import TracebackType
 from typing import Any
 
+from robins.cli import interrupts
+
 WAIT_S = 2.0
 
 
@@ -27,7 +29,12 @@ class Progress:
         self._timer.daemon = True
 
     def __call__(self, share: float, what: str) -> None:
-        """Note how far it is."""
+        """Note how far it is.
+
+        Raises:
+            KeyboardInterrupt: somebody asked for it, and it got lost.
+        """
+        interrupts.obey()
         with self._lock:
             self._share, self._what = min(max(share, 0.0), 1.0), what
             if self._bar is not None:

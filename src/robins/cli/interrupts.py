@@ -1,0 +1,64 @@
+"""Ctrl-C that is heard: an interrupt must not get lost in a compiler or a garbage collector.
+
+Python raises KeyboardInterrupt wherever the main thread happens to be. After a long call into
+compiled code that is often a callback of the garbage collector, from which nothing can be raised:
+the interrupt would be printed and forgotten.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+# Functions whose exceptions Python ignores; JAX hangs the first into every garbage collection.
+_DEAF = frozenset({"_xla_gc_callback", "__del__"})
+_AGAIN_S = 0.05
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+
+_asked = False
+
+
+def _is_deaf(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_name in _DEAF:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _interrupt(_number: int, frame: FrameType | None) -> None:
+    global _asked
+    _asked = True
+    if _is_deaf(frame):
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # ask again a little later
+        return
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def heeded() -> Iterator[None]:
+    """While this lasts, SIGINT and SIGTERM raise KeyboardInterrupt where it will be heard.
+
+    SIGTERM too, so that a killed command unwinds and leaves no half folder.
+    """
+    global _asked
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _asked = False
+    before = {number: signal.signal(number, _interrupt) for number in _SIGNALS}
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def obey() -> None:
+    """Raise KeyboardInterrupt if one was asked for and swallowed by somebody on its way."""
+    if _asked:
+        raise KeyboardInterrupt
