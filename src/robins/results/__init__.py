@@ -31,7 +31,7 @@ drawn from whatever of the following is there; dimensions are recognised by thei
 time dimension serves whose coordinate is in seconds since the start (``time``, ``update_time``,
 ``gnss_time``, ...).
 
-======================================  =========================================================
+======================================= =========================================================
 ``lat_rad, lon_rad, alt_m``             (filter, time) position of each filter
 ``track_north_m, track_east_m``         (filter, time) the same on a map about any origin; made
                                         from latitude and longitude where absent
@@ -60,7 +60,7 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``allan_low_SENSOR, allan_high_SENSOR`` the same; confidence bounds
 ``allan_fit_SENSOR``                    the same; the fitted model
 ``allan_slope_SENSOR``                  (process, tau, axis_SENSOR) its parts, by name
-======================================  =========================================================
+======================================= =========================================================
 
 BLOCK is a part of the state (``attitude``, ``velocity``, ``position``, ``gyro_bias``, ...). The
 attribute ``display_unit`` ("deg", "deg/h", "mg") is the unit of figures. Bands of consistency
