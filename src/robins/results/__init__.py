@@ -35,8 +35,9 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``lat_rad, lon_rad, alt_m``             (filter, time) position of each filter
 ``track_north_m, track_east_m``         (filter, time) the same on a map about any origin; made
                                         from latitude and longitude where absent
-``reference_lat_rad, ..._lon_rad,       (any time) the truth or the best known path; also
-..._alt_m, ..._north_m, ..._east_m``    ``reference_north_m`` where ``track_north_m`` is given
+``reference_lat_rad, ...``              (any time) the truth or the best known path; also
+                                        ``..._lon_rad``, ``..._alt_m``, and ``..._north_m``,
+                                        ``..._east_m`` where ``track_north_m`` is given
 ``gnss_lat_rad, ..., gnss_east_m``      (any time) fixes, as for the reference
 ``gnss_quality``                        (as the fixes) whole numbers; attributes ``flag_values``
                                         and ``flag_meanings`` as in the CF conventions, else as
