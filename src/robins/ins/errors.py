@@ -51,14 +51,14 @@ def error_dynamics(
     into = {}  # how the errors of a sensor enter the nine
     for sensor, at, _ in kinds:
         blocks = [zero, zero, zero]
-        blocks[at // 3] = -C / (1.0 + scale_of(state, sensor))
+        blocks[at // 3] = -C / (1.0 + scale_of(state, sensor))[None]
         into[sensor] = jnp.concatenate(blocks)
     G_nav = jnp.concatenate([into["gyro"], into["accel"]], 1)
     if not hasattr(state, "gyro_bias"):
         return F_nav, G_nav
     columns = [into["gyro"], into["accel"]]
     columns += [
-        into[sensor] * value
+        into[sensor] * value[None]
         for sensor, _, value in kinds
         if getattr(state, f"{sensor}_scale") is not None
     ]
