@@ -177,7 +177,9 @@ def test_the_configurations_shown_can_be_read():
     ]
     assert shown
     for mapping in shown:
-        scenario.validate(SYSTEMS[mapping["system"]].replay_parameters, mapping)
+        parameters = SYSTEMS[mapping["system"]].replay_parameters
+        assert parameters
+        scenario.validate(parameters, mapping)
 
 
 def test_a_failing_example_is_found_at_its_line(tmp_path):
