@@ -56,7 +56,9 @@ def main():
         (Sensor(lambda x, a: H_ @ x, jnp.ones(M), M),),
     )
     start = Belief.of(jnp.zeros(N), np.eye(N))
-    starts = Belief(jnp.zeros((BATCH, N)), jnp.eye(N) * jnp.linspace(0.9, 1.1, BATCH)[:, None, None])
+    starts = Belief(
+        jnp.zeros((BATCH, N)), jnp.eye(N) * jnp.linspace(0.9, 1.1, BATCH)[:, None, None]
+    )
     mean = lambda step: step.posterior.mean  # noqa: E731
     kinds = {
         "ekf, square root": kalman(taylor()),
@@ -90,7 +92,12 @@ def main():
             online.update(row)
         return online.belief
 
-    show("ukf streaming, predict and update", best_of({"s": streaming})["s"] / PEER_STEPS, 1.0, "step")
+    show(
+        "ukf streaming, predict and update",
+        best_of({"s": streaming})["s"] / PEER_STEPS,
+        1.0,
+        "step",
+    )
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ def drive():
 
 
 def pyins_run(d):
-    """pyins on run 0 of the drive, as a call."""
+    """Run 0 of the drive through pyins, as a call."""
     log = drive_dataset(d, seed=0)
     columns = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
     time = log.imu.time_ns * 1e-9

@@ -109,7 +109,7 @@ def _write(
     def drawing(done: int, total: int, what: str) -> None:
         tell(0.85 + 0.15 * done / max(total, 1), what)
 
-    report.add(writer, drawing)
+    report.add(writer, drawing, outcome.notes)
     return Done(Path(out), {}, tuple(outcome.notes))
 
 
@@ -145,7 +145,7 @@ def run_scenario(
     system, label, text = find_scenario(name)
     settings = tuple(settings)
     parameters = scenario.parse(system.parameters, text, settings, source=name)
-    chosen = _check_filters(system, filters) or tuple(parameters.filters)
+    chosen = _check_filters(system, filters) or parameters.filters
     count = parameters.runs if runs is None else runs
     with _writer(out, text, settings, command) as writer:
         problem = system.problem(parameters, chosen, seed)
@@ -206,7 +206,7 @@ def replay_log(
     if len(configurations) > 1:
         raise InputError(f"one configuration is wanted, got {', '.join(configurations)}")
     chosen_path = configurations[0] if configurations else chosen_system.replay_default
-    text = scenario.read_text(chosen_path)
+    text = scenario.read_text(chosen_path) if chosen_path is not None else ""
     settings = tuple(settings)
     source = configurations[0] if configurations else "the default configuration"
     parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)

@@ -12,7 +12,8 @@ from robins.ins.increments import Increments
 def stream():
     rng = np.random.default_rng(4)
     dt = rng.uniform(0.006, 0.009, 400)
-    return Increments(dt, rng.normal(0, 0.02, (400, 3)), rng.normal(0, 0.1, (400, 3))), np.cumsum(dt)
+    theta, dv = rng.normal(0, 0.02, (400, 3)), rng.normal(0, 0.1, (400, 3))
+    return Increments(dt, theta, dv), np.cumsum(dt)
 
 
 def test_every_increment_is_used_once_in_its_block(stream):

@@ -73,8 +73,8 @@ def campaign_solution(problem: Problem, found: dict[str, Statistics]) -> xr.Data
     """Statistics of all filters over time, and the first run as an example."""
     ft = ("filter", "time")
     runs = next(iter(found.values())).runs
-    data: dict[str, Any] = dict(problem.context.data_vars)
-    coords: dict[str, Any] = dict(problem.context.coords)
+    data: dict[str, Any] = {str(k): v for k, v in problem.context.data_vars.items()}
+    coords: dict[str, Any] = {str(k): v for k, v in problem.context.coords.items()}
     coords["filter"] = list(found)
     coords["time"] = variable("time", problem.epoch_s, "s", "time since the start")
     for b in problem.blocks:
@@ -92,25 +92,31 @@ def campaign_solution(problem: Problem, found: dict[str, Statistics]) -> xr.Data
                 **attrs,
             )
 
-        add("error", f"error of {words}, first run", lambda s: s.example["error"])
-        add("sigma", f"stated sigma of {words}, first run", lambda s: s.example["sigma"])
+        add("error", f"error of {words}, first run", lambda s: s.first_run["error"])
+        add("sigma", f"stated sigma of {words}, first run", lambda s: s.first_run["sigma"])
         add("rms", f"RMS error of {words}", lambda s: s.rms, runs=runs)
         add("mean_sigma", f"stated sigma of {words}", lambda s: s.sigma, runs=runs)
     n = next(iter(found.values())).n
     data["anees"] = variable(
-        ft, _stack(found, lambda s: s.anees()), "1", "ANEES", runs=runs, degrees_of_freedom=n
+        ft,
+        _stack(found, lambda s: s.anees()),
+        "1",
+        "ANEES",
+        runs=runs,
+        degrees_of_freedom=n,
+        normalised=1,
     )
-    data |= problem.shown({name: s.example["mean"] for name, s in found.items()})
+    data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
     return xr.Dataset(data | more, coords | places)
 
 
 def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:
     """Innovations of the first run, by sensor."""
-    sensors = next(iter(found.values())).example["innovation"]
+    sensors = next(iter(found.values())).first_run["innovation"]
 
     def of(kind: str, sensor: str) -> np.ndarray:
-        return _stack(found, lambda s: s.example[kind][sensor])
+        return _stack(found, lambda s: s.first_run[kind][sensor])
 
     return {
         k: Seen(

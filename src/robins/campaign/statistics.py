@@ -68,6 +68,17 @@ class Statistics:
         self._run_rms.append(np.sqrt(np.mean(error[:, self.count_from :] ** 2, axis=1)))
 
     @property
+    def first_run(self) -> dict[str, Any]:
+        """The record of the first run.
+
+        Raises:
+            ValueError: nothing was added yet.
+        """
+        if self.example is None:
+            raise ValueError("there is no run yet: add the records of a campaign first")
+        return self.example
+
+    @property
     def rms(self) -> np.ndarray:
         """(E, n) root mean square error over the runs."""
         return np.sqrt(self._square / self.runs)

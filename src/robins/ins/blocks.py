@@ -8,6 +8,7 @@ is split there, so that every measurement meets the state at its own time.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ def epochs_between(
     wanted = wanted[(wanted > start_s) & (wanted <= end_s)]
     edges = np.unique(np.concatenate([[start_s], wanted, [end_s]]))
     out = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         # a block is split evenly; a hair of tolerance keeps 1.0000001 s from becoming two
         pieces = max(1, int(np.ceil((b - a) / longest_s - 1e-6)))
         out.append(a + (b - a) * np.arange(1, pieces + 1) / pieces)

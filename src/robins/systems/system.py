@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import pydantic
 import xarray as xr
 from jaxtyping import Array
 
@@ -86,6 +87,13 @@ class Outcome:
     notes: list[str] = field(default_factory=list)  # sentences for the reader of the report
 
 
+class Scenario(Parameters):
+    """What every simulated scenario says; a system adds its own."""
+
+    runs: Annotated[int, pydantic.Field(ge=1)] = 50
+    filters: tuple[str, ...] = ()
+
+
 class System(NamedTuple):
     """One entry of the registry."""
 
@@ -94,7 +102,7 @@ class System(NamedTuple):
     filters: tuple[str, ...]
     scenarios: Mapping[str, Path]  # packaged scenario files by name
     claims: tuple[Mapping[str, str], ...]  # {"id", "text"} of what scenarios check
-    parameters: type[Parameters]  # of a simulated scenario
+    parameters: type[Scenario]
     problem: Callable[..., Problem]  # (parameters, filters, seed) -> problem
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one

@@ -58,7 +58,7 @@ class Course(NamedTuple):
     blocks: Blocks
     start: Nav
     truth: Nav  # at each epoch, leading axis E
-    index: np.ndarray  # (E,) sample that ends at each epoch
+    sample: np.ndarray  # (E,) the one that ends at each epoch
     rate_b: np.ndarray  # (E, 3) rad/s true gyro rate at each epoch
     at_fix: tuple[np.ndarray, ...]  # the truth at each fix, as `observe` takes it
     fix: np.ndarray  # (E,) number of the fix at each epoch, -1 where there is none
@@ -138,7 +138,7 @@ def lay_out(drive: Drive) -> Course:
         blocks=blocks,
         start=start,
         truth=jax.tree_util.tree_map(lambda x: x[index], path),
-        index=index,
+        sample=index,
         rate_b=motion.at(epochs).rates()[0],
         at_fix=(times.valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0]),
         fix=fix,
@@ -164,7 +164,7 @@ def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
         ),
         jnp.ones(len(parent)),
     )
-    at = course.index
+    at = course.sample
     scales: list[Any] = [None, None]
     if drive.imu.scale_states:
         count = len(at)

@@ -50,7 +50,7 @@ class Velocity(NamedTuple):
 
     sigma: ArrayLike  # (3,) m/s, north east down
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
-    gained_b: ArrayLike = (0.0, 0.0, 0.0)  # (3,) m/s, raw, in body axes at the fix
+    gained_b: ArrayLike = 0.0  # (3,) m/s, raw, in body axes at the fix
     age_s: ArrayLike = 0.0  # s, mean age over the window: half its length
 
 

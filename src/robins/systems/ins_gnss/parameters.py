@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, default
+from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
 
@@ -145,12 +146,11 @@ class Believed(Parameters):
     r_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the fixes' covariance
 
 
-class Drive(Parameters):
+class Drive(Scenario):
     """A simulated drive; sensor errors are drawn from what the filter is told of them."""
 
     system: Literal["ins-gnss"] = "ins-gnss"
     title: str = "INS/GNSS drive"
-    runs: Annotated[int, pydantic.Field(ge=1)] = 50
     imu_rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("100 Hz")
     place: Place
     legs: tuple[Leg, ...]

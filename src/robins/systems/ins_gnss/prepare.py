@@ -172,7 +172,7 @@ def _belief(log: Log, first: int, start: StartPoint, parameters: Replay) -> Beli
     """At the first fix, moved from the antenna to the IMU."""
     v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[first])
     g = log.gnss
-    antenna = Geodetic(*(jnp.asarray(a[first]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
+    antenna = Geodetic(*map(jnp.asarray, (g.lat_rad[first], g.lon_rad[first], g.alt_m[first])))
     arm = Rotation(jnp.asarray(start.q_nb)).apply(np.asarray(parameters.gnss.lever_arm))
     position = antenna.retract(-arm + jnp.asarray(v * parameters.gnss.latency))
     sigma = sigma_of(
@@ -248,7 +248,7 @@ def _fixes(log: Log, fix_epoch: np.ndarray, rate: np.ndarray) -> tuple[dict, dic
         return _at_epochs(values[given], at, count, fill)
 
     y: dict[str, Any] = {
-        names.POSITION: Geodetic(*(sorted_in(a) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
+        names.POSITION: Geodetic(sorted_in(g.lat_rad), sorted_in(g.lon_rad), sorted_in(g.alt_m))
     }
     aux: dict[str, Any] = {names.POSITION: Fix(sorted_in(log.sigma_m, 1.0), rate)}
     if log.v_n is not None and log.sigma_v is not None:

@@ -68,8 +68,10 @@ def _joined(answers: list[Answer]) -> Answer:
         rows = [a for leaf in leaves for a in (blank(leaf), np.asarray(leaf))]
         return jnp.asarray(np.concatenate(rows[1:]))
 
-    parts = jax.tree_util.tree_map(join, *((a.belief, a.antenna, a.info) for a in answers))
-    return Answer(*parts, sum(a.log_likelihood for a in answers))
+    belief, place, info = jax.tree_util.tree_map(
+        join, *((a.belief, a.antenna, a.info) for a in answers)
+    )
+    return Answer(belief, place, info, sum(a.log_likelihood for a in answers))
 
 
 def _flight(log: Log, parts: list[Prepared]) -> Flight:
