@@ -200,8 +200,8 @@ def sine_velocity(
 ) -> Motion:
     """Velocity ``mean + amplitude sin(2 pi t / period + phase)`` along north, east and down.
 
-    The body points along the velocity, with its wings level. The motion pyins (N. Mayorov) tests
-    its mechanisation with.
+    The body points along the velocity, with its wings level. The path is that of the generator
+    pyins (N. Mayorov) tests its mechanisation with; its pitch has the other sign.
     """
     mean, amplitude, phase = (
         np.broadcast_to(np.asarray(a, float), 3) for a in (mean_mps, amplitude_mps, phase_rad)
