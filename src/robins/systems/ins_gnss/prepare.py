@@ -262,7 +262,7 @@ def _knowledge(y, aux, increments, time_s, epochs, rate, parameters: Replay) -> 
     aids = parameters.aids
     if not (aids.zero_velocity or aids.non_holonomic):
         return
-    still, mean_rate = standstill(*increments[:3], aids)
+    still, mean_rate = standstill(increments.dt, increments.theta, increments.dv, aids)
     last = np.minimum(np.searchsorted(time_s, epochs - 1e-9), len(time_s) - 1)
     at_rest = still[last][:, None]
     if aids.zero_velocity:
