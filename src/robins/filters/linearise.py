@@ -1,7 +1,7 @@
 r"""Ways to linearise: first-order Taylor, unscented, cubature.
 
 All of them answer with the same thing, a statistical linear regression
-y ~ F x + c + e, e ~ N(0, Omega) (Särkkä 2013, sec. 5.3; Arasaratnam & Haykin 2007), so one
+y ~ F x + c + e, e ~ N(0, Omega) (Särkkä 2013, sec. 5.3; Arasaratnam, Haykin & Elliott 2007), so one
 Kalman update serves them all. What the update needs is not F but F S, the *spread*: for
 sigma points it falls out without inverting S, which may then be singular.
 
