@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from robins import _float64, rotation
+from robins import _float64
 from robins.dataset import Trajectory
 from robins.earth import A_M, E2, OMEGA_E, Geodetic
 from robins.ins.frames import to_ned_frd
@@ -149,8 +149,11 @@ def unpacked(x: Float[Array, "*b 10"]) -> Nav:
 def rows(inc: Increments) -> Float[Array, "*b 11"]:
     """What a step needs of an increment and nothing else depends on: dt, exp(theta/2), dv, dr."""
     inc = Increments(*(None if a is None else jnp.asarray(a, float) for a in inc))
-    q_bb = rotation.from_rotvec(inc.theta)
-    return jnp.concatenate([inc.dt[..., None], q_bb, inc.dv, displacement(inc)], -1)
+    half = 0.5 * inc.theta
+    sq = jnp.sum(half * half, -1, keepdims=True)
+    # As `rotation.from_rotvec`, for turns of at most two pi, by the cheaper series.
+    q_bb = [_horner(_COS, sq), half * _horner(_SIN, sq)]
+    return jnp.concatenate([inc.dt[..., None], *q_bb, inc.dv, displacement(inc)], -1)
 
 
 def _horner(coefficients, x):

@@ -74,8 +74,9 @@ def step(x: InsState, inc: Increments, noise: InsNoise | None = None) -> InsStat
 
 def propagate(x: InsState, block: Increments, noise: InsNoise | None = None) -> InsState:
     """Move over a block of K raw increments (leading axis); zero ones change nothing."""
-    x, *_ = _moved(x, block, noise)
-    return x
+    true, faded = _corrected(x, block, noise)
+    last, _ = lax.scan(lambda at, row: (advance(at, row), None), vector(x.nav), rows(true))
+    return _at(x, last, faded)
 
 
 def propagate_linear(
@@ -96,18 +97,19 @@ def propagate_linear(
         The state at the end; Phi, with ``error(end) = Phi error(start)``; and a lower-triangular
         factor L of the covariance Q = L L' that the noise adds to the error.
     """
-    end, true, starts = _moved(x, block, noise)
+    true, faded = _corrected(x, block, noise)
+    last, starts = lax.scan(lambda at, row: (advance(at, row), at), vector(x.nav), rows(true))
     Phi, L = linearise(x, true, starts, noise, segments)
-    return end, Phi, L
+    return _at(x, last, faded), Phi, L
 
 
-def _moved(x: InsState, block: Increments, noise: InsNoise | None):
-    """The state at the end, the corrected increments, and the vectors each of them starts from."""
+def _corrected(x: InsState, block: Increments, noise: InsNoise | None):
+    """The increments without the errors of the sensors; what is left of the biases at the end."""
     block = Increments(*(None if a is None else jnp.asarray(a, float) for a in block))
     dt = block.dt[:, None]
     until = jnp.cumsum(dt, 0)
-    rates = decay_rates(x, noise)
-    fading = jnp.exp(-(until - 0.5 * dt) * rates[None, :6])  # in the middle of each increment
+    rates = decay_rates(x, noise)[:6]
+    fading = jnp.exp(-(until - 0.5 * dt) * rates[None])  # in the middle of each increment
     gyro_bias = x.gyro_bias[None] * fading[:, :3]
     accel_bias = x.accel_bias[None] * fading[:, 3:]
     gyro_gain = 1.0 / (1.0 + scale_of(x, "gyro"))[None]
@@ -118,15 +120,12 @@ def _moved(x: InsState, block: Increments, noise: InsNoise | None):
         (block.dv - accel_bias * dt) * accel_gain,
         (displacement(block) - 0.5 * accel_bias * dt**2) * accel_gain,
     )
+    return true, jnp.exp(-until[-1] * rates)
 
-    def body(at, row):
-        return advance(at, row), at
 
-    last, starts = lax.scan(body, vector(x.nav), rows(true))
-    faded = jnp.exp(-until[-1] * rates)
-    end = x._replace(
+def _at(x: InsState, last: Float[Array, "10"], faded: Float[Array, "6"]) -> InsState:
+    return x._replace(
         **unpacked(last)._asdict(),
         gyro_bias=x.gyro_bias * faded[:3],
-        accel_bias=x.accel_bias * faded[3:6],
+        accel_bias=x.accel_bias * faded[3:],
     )
-    return end, true, starts
