@@ -293,6 +293,13 @@ def test_chunks_give_the_same_numbers(whole):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
+def test_no_increments_make_an_empty_path():
+    path = navigate(nav(), shaken(0))
+    assert path.v_n.shape == (0, 3)
+    with pytest.raises(ValueError, match="chunk = 0"):
+        mechanise_chunked(nav(), shaken(3), chunk=0)
+
+
 def test_a_batch_gives_the_same_numbers(whole):
     inc, path = whole
     many = jax.tree.map(lambda a: jnp.stack([a, jnp.roll(a, 7, 0), a]), inc)

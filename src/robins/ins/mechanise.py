@@ -78,13 +78,15 @@ def mechanise_chunked(nav: Nav, increments: Increments, chunk: int = 16384) -> N
     lengths, the last chunk being padded.
 
     Raises:
-        ValueError: the start is too near a pole, see `refuse_polar`.
+        ValueError: the start is too near a pole, see `refuse_polar`; or `chunk` is less than one.
     """
     _float64.require()
     refuse_polar(nav.position.lat)
+    if chunk < 1:
+        raise ValueError(f"chunk = {chunk}: at least one increment is taken at a time")
     inc = Increments(*(None if a is None else np.asarray(a, float) for a in increments))
     total = len(inc.dt)
-    size = min(chunk, total)
+    size = max(min(chunk, total), 1)
     path = jax.tree.map(lambda leaf: np.empty((total, *jnp.shape(leaf))), nav)
     for start in range(0, total, size):
         stop = min(start + size, total)
