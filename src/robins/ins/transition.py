@@ -102,34 +102,41 @@ def _segment(x, true: Increments, starts, noise):
         [[slow @ fast @ slow, slow @ inputs * fade[None]], [jnp.zeros((m, 9)), jnp.diag(fade**2)]]
     )
 
-    # Noise: unit impulses at the Gauss points, their size times the root of the weight.
     safe = jnp.where(total > 0.0, total, 1.0)
-    weight = jnp.where(total > 0.0, jnp.sqrt(0.5 * safe), 0.0)
-    f = push / safe  # skew of the mean specific force
-    mean_turn, mean_drive = -by_gyro[0] / safe, -by_accel[1] / safe
-    sigma = _drives(x, noise)
+    means = (push / safe, -by_gyro[0] / safe, -by_accel[1] / safe)
+    return Phi, _impulses(x, noise, C, total, means)
+
+
+def _impulses(x, noise, C, total, means) -> Float[Array, "n c"]:
+    """Columns M with M M' the covariance that noise adds over a segment of length `total`.
+
+    The response at the end to unit impulses at the Gauss points, times the size of the noise and
+    the root of the weight. `means` are over the segment: skew of the specific force in n, and what
+    errors of gyros and accelerometers do to attitude and velocity a second.
+    """
+    force, turn, drive = means
+    rates, sigma = decay_rates(x, noise), _drives(x, noise)
+    m = len(rates)
     columns = []
     for c in _GAUSS:
         to_end = total * (1.0 - c)
-        C_c = C[int(c * len(starts))]
+        C_c = C[int(c * len(C))]
         phi = C_c * (_spread(noise.gyro_arw) / (1.0 + scale_of(x, "gyro")))[None]
         dv = C_c * (_spread(noise.accel_vrw) / (1.0 + scale_of(x, "accel")))[None]
-        nav = jnp.block(
-            [[phi, zero], [-to_end * f @ phi, dv], [-0.5 * to_end**2 * f @ phi, to_end * dv]]
+        pull = to_end * force  # a misalignment becomes velocity at this share
+        white = jnp.block(
+            [[phi, jnp.zeros((3, 3))], [-pull @ phi, dv], [-0.5 * to_end * pull @ phi, to_end * dv]]
         )
-        g, a = to_end * mean_turn, to_end * mean_drive
-        by_gyro = (-g, 0.5 * to_end * f @ g, to_end**2 / 6.0 * f @ g)
+        g, a = to_end * turn, to_end * drive
+        by_gyro = (-g, 0.5 * pull @ g, to_end / 6.0 * pull @ g)
         by_accel = (jnp.zeros_like(a), -a, -0.5 * to_end * a)
-        drift = _in_order(jnp.concatenate(by_gyro), jnp.concatenate(by_accel))
-        columns.append(
-            jnp.block(
-                [
-                    [nav, drift * sigma[None]],
-                    [jnp.zeros((m, 6)), jnp.diag(jnp.exp(-to_end * rates) * sigma)],
-                ]
-            )
-        )
-    return Phi, weight * jnp.concatenate(columns, 1)
+        walk = _in_order(jnp.concatenate(by_gyro), jnp.concatenate(by_accel)) * sigma[None]
+        left = jnp.diag(jnp.exp(-to_end * rates) * sigma)
+        columns.append(jnp.block([[white, walk], [jnp.zeros((m, 6)), left]]))
+    # The root of zero has no slope, and a block may be all padding.
+    safe = jnp.where(total > 0.0, 0.5 * total, 1.0)
+    weight = jnp.where(total > 0.0, jnp.sqrt(safe), 0.0)
+    return weight * jnp.concatenate(columns, 1)
 
 
 def _into(C, dt, value, x, sensor: str):
