@@ -148,7 +148,10 @@ def run_scenario(
     chosen = _check_filters(system, filters) or parameters.filters
     count = parameters.runs if runs is None else runs
     with _writer(out, text, settings, command) as writer:
-        problem = system.problem(parameters, chosen, seed)
+        try:
+            problem = system.problem(parameters, chosen, seed)
+        except ValueError as error:
+            raise InputError(f"{name}: {error}") from error
         outcome = simulate(problem, count, progress=lambda s, w: tell(0.85 * s, w))
         done = _write(
             outcome,

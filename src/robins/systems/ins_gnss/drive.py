@@ -41,6 +41,7 @@ from robins.systems.ins_gnss.outages import outage_mask
 from robins.systems.ins_gnss.parameters import Drive, Imu
 from robins.systems.ins_gnss.setup import (
     SENSORS,
+    SMOOTHED,
     make_filter,
     model_of,
     sigma_of,
@@ -116,7 +117,8 @@ def lay_out(drive: Drive) -> Course:
     stamps, k = times.stamp_s, motion.at(times.valid_s)
     if len(stamps) < 2:
         raise ValueError(f"the legs last {time_s[-1]:.1f} s, too short for two fixes")
-    epochs = epochs_between(0.0, float(time_s[-1]), stamps, drive.update.longest_block)
+    # what comes after the last fix would end on no sample, so the run ends with the fix
+    epochs = epochs_between(0.0, float(stamps[-1]), stamps, drive.update.longest_block)
     blocks = cut(compensated, time_s, 0.0, epochs)
     start = nav_at(trajectory, 0)
     path = mechanise(start, jax.tree_util.tree_map(jnp.asarray, compensated))
@@ -245,6 +247,10 @@ def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:
     Raises:
         ValueError: the drive cannot be laid out, or a filter is unknown or a smoother.
     """
+    if smoothers := [name for name in filters if name.endswith(SMOOTHED)]:
+        raise ValueError(
+            f"{smoothers[0]}: campaigns compare causal filters; `robins replay` smooths a log"
+        )
     course = lay_out(drive)
     believed = drive.imu
     if drive.believed.q_factor != 1.0:
