@@ -13,6 +13,7 @@ from robins import manifold
 from robins.earth import Geodetic
 from robins.filters import (
     Belief,
+    Code,
     Model,
     Motion,
     Sensor,
@@ -294,6 +295,7 @@ def test_moments_of_an_uncertain_turn_against_quadrature():
     assert 3.6 < twice[0] / first[0] < 4.4  # where a first-order expansion misses the second
     assert all(a < b for a, b in zip(small, first, strict=True))
     assert small[0] < 1e-3 * first[0]
+    assert small[2] < 0.5 * first[2]  # deviations read off about the mean, not the centre point
 
 
 def test_a_measured_attitude_is_a_measurement_on_the_manifold():
@@ -310,6 +312,16 @@ def test_a_measured_attitude_is_a_measurement_on_the_manifold():
         np.testing.assert_allclose(info.innovation, [-0.01, 0.02, -0.015], rtol=1e-3)
         nothing = Rotation(jnp.full(4, jnp.nan))
         assert int(update(state, sensor, nothing)[1].dof) == 0
+
+
+def test_an_attitude_that_the_model_cannot_tell_is_a_fault():
+    belief = Belief(Rotation.identity(), 0.05 * jnp.eye(3))
+    sensor = Sensor(lambda x, aux: Rotation(x.wxyz * aux), jnp.full(3, 1e-3), 3)
+    update = jax.jit(kalman().update)
+    state = kalman().init(belief, {"y": 3})
+    nothing, seen = Rotation(jnp.full(4, jnp.nan)), Rotation.identity()
+    codes = [int(update(state, sensor, y, jnp.nan)[1].code) for y in (seen, nothing)]
+    assert codes == [Code.NOT_FINITE, Code.MISSING]
 
 
 def test_a_place_whose_height_is_missing():

@@ -116,6 +116,19 @@ def test_another_prior_has_the_measurement_seen_again(way):
     assert np.max(np.abs(narrow.factor - seen.factor)) > 0.01
 
 
+def test_seeing_again_keeps_what_other_rules_refused():
+    def refuse(memory, prior, o):
+        return memory, prior, o._replace(accepted=o.accepted & jnp.array([False, True, True]))
+
+    def fade(memory, prior, o):
+        return memory, prior._replace(factor=1.5 * prior.factor), o
+
+    one = kalman(rules=[Rule(before=refuse), Rule(before=fade)])
+    state = one.init(START, MODEL.dims)
+    _, info = one.update(state, MODEL.sensors[0], jnp.ones(3))
+    assert info.used.tolist() == [False, True, True]
+
+
 def test_a_prior_that_is_left_alone_is_not_seen_again():
     looks = []
 

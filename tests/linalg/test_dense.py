@@ -133,6 +133,14 @@ def test_rows_with_a_little_of_their_own_or_a_fault_are_independent():
     assert independent_rows(rows).tolist() == [True, True, False, True]
 
 
+def test_two_passes_are_enough_and_one_is_not():
+    # The second row all but repeats the first, so its direction is only known to 1e-6 after one.
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(2, 9))
+    rows = np.array([a, a + 1e-10 * b, 0.3 * a + (a + 1e-10 * b), b])
+    assert independent_rows(jnp.array(rows)).tolist() == [True, True, False, True]
+
+
 def test_a_row_may_be_summed_from_larger_numbers():
     rows = jnp.array([[1e-9, 0.0], [0.0, 1e-6]])
     assert independent_rows(rows, jnp.array([1e6, 1e6])).tolist() == [False, True]
@@ -260,6 +268,11 @@ def test_factor_of_a_singular_covariance_has_no_noise_of_its_own():
     L = linalg.factor(P)
     assert_factor(L, P, 10 * EPS)
     assert independent_rows(L).tolist() == [True, False, False, False]
+    for seed in range(10):
+        A = draw(seed, 5, 2, 4.0)
+        L = linalg.factor(A @ A.T)
+        assert_factor(L, A @ A.T, 30 * EPS)
+        assert np.linalg.matrix_rank(L / np.linalg.norm(A, axis=1, keepdims=True), tol=1e-13) == 2
     np.testing.assert_array_equal(linalg.factor(np.zeros((3, 3))), np.zeros((3, 3)))
     assert linalg.factor(np.zeros((0, 0))).shape == (0, 0)
 
