@@ -4,6 +4,8 @@ from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
 from robins.filters.linearise import (
     Linearisation,
+    Points,
+    Reuse,
     Transition,
     cubature,
     sigma_points,
@@ -31,7 +33,9 @@ __all__ = [
     "Normalised",
     "Observation",
     "OnlineFilter",
+    "Points",
     "Prediction",
+    "Reuse",
     "Rule",
     "Sensor",
     "Solution",

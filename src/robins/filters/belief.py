@@ -68,6 +68,8 @@ class Code(IntEnum):
     REFUSED = 3
     INDEFINITE = 4
     NOT_FINITE = 5
+    INFEASIBLE = 6
+    TOO_OLD = 7
 
 
 SENTENCES: dict[Code, str] = {
@@ -82,6 +84,13 @@ SENTENCES: dict[Code, str] = {
     Code.NOT_FINITE: (
         "the step would have made the state infinite or NaN and was not taken: look at the model, "
         "the units and the size of the measurement"
+    ),
+    Code.INFEASIBLE: (
+        "the bound asked of an H-infinity filter does not exist here and the step was not taken: "
+        "raise gamma above gamma_min, or choose a policy"
+    ),
+    Code.TOO_OLD: (
+        "the measurement is older than the buffer of the filter reaches back, so the belief stands"
     ),
 }
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.observation import Observation, left_out, whiten
-from robins.filters.rule import Memory, Rule
+from robins.filters.rule import Memory, Rule, keep_belief
 
 Form = Literal["sqrt", "joseph"]
 
@@ -30,29 +31,40 @@ class FilterState(NamedTuple):
     """All a filter carries from step to step."""
 
     belief: Belief
-    memory: tuple[Memory, ...]  # one per rule
+    memory: Any  # a tuple with one per rule; other filters keep what they need
+    points: Any = ()  # sigma points on their way from a prediction to its update
 
 
 class Prediction(NamedTuple):
     """What a predict step leaves for a smoother and a log."""
 
-    transition: Transition
+    transition: Transition | None  # None where there is not one, as in a mixture
     belief: Belief  # predicted
     code: Array  # a `Code`
+    origin: Belief | None = None  # where it began, if a rule has settled another belief
+
+
+Again = Callable[[FilterState], FilterState]  # a run once more, from another first state
 
 
 class Filter(NamedTuple):
-    """Three pure functions; a run, a campaign, a bench or a user's loop calls them alike.
+    """Pure functions; a run, a campaign, a bench or a user's loop calls them alike.
 
     Attributes:
         init: ``(belief, dims) -> state``; dims maps sensor names to dimensions (`Model.dims`).
         predict: ``(state, motion, u) -> (state, prediction)``.
         update: ``(state, sensor, y, aux) -> (state, info)``.
+        reset: ``(state, belief) -> state``: go on from another belief, keeping what was learned of
+            the noise; a filter inside a federated filter or a mixture is told so.
+        audit: ``(start, final, again, time)``, outside compiled code: raises what a rule has to
+            report of a run; None where no rule has anything to say.
     """
 
     init: Callable[[Belief, Mapping[str, int]], FilterState]
     predict: Callable[[FilterState, Motion, Any], tuple[FilterState, Prediction]]
     update: Callable[[FilterState, Sensor, Any, Any], tuple[FilterState, StepInfo]]
+    reset: Callable[[FilterState, Belief], FilterState]
+    audit: Callable[[FilterState, FilterState, Again | None, Any], None] | None = None
 
 
 def predicted_factor(t: Transition, form: Form) -> Array:
@@ -168,26 +180,51 @@ def kalman(
     way = taylor() if linearise is None else linearise
     rules = tuple(rules)
 
+    settling = any(rule.settle is not keep_belief for rule in rules)
+
+    def drawn(belief: Belief):
+        return () if way.reuse is None else way.reuse.draw(belief)
+
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return FilterState(belief, tuple(rule.init(belief, dims) for rule in rules))
+        memory = tuple(rule.init(belief, dims) for rule in rules)
+        return FilterState(belief, memory, drawn(belief))
+
+    def settle(state: FilterState):
+        """The belief of a step whose measurements are all in, as the rules leave it."""
+        belief, memory, code = state.belief, list(state.memory), jnp.asarray(int(Code.DONE))
+        for i, rule in enumerate(rules):
+            memory[i], belief, found = rule.settle(memory[i], belief)
+            code = jnp.where(code == int(Code.DONE), found, code)
+        return belief, tuple(memory), code
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
-        transition = way.transition(state.belief, motion, u)
+        origin, held, settled = settle(state) if settling else (state.belief, state.memory, None)
+        transition = way.transition(origin, motion, u)
         memory = []
-        for rule, held in zip(rules, state.memory, strict=True):
-            held, transition = rule.process(held, transition)
-            memory.append(held)
+        for rule, one in zip(rules, held, strict=True):
+            one, transition = rule.process(one, transition)
+            memory.append(one)
         belief = Belief(transition.mean, predicted_factor(transition, form))
-        new = FilterState(belief, tuple(memory))
+        points = () if transition.points is None else transition.points
+        new = FilterState(belief, tuple(memory), points)
         ok = _finite(new)
         why = _failure(transition, belief.factor)
+        if settled is not None:
+            why = jnp.where(settled == int(Code.DONE), why, settled)
+            ok = ok & (settled == int(Code.DONE))
+            kept = _select(_finite(held), held, state.memory)
+            state = state._replace(memory=kept)
         code = jnp.where(ok, int(Code.DONE), why)
         new = _select(ok, new, state)
-        return new, Prediction(transition, new.belief, code)
+        transition = transition._replace(points=None)
+        return new, Prediction(transition, new.belief, code, origin if settling else None)
 
     def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
         prior, memory = state.belief, list(state.memory)
-        seen = way.observation(prior, sensor, y, aux)
+        if way.reuse is None:
+            seen = way.observation(prior, sensor, y, aux)
+        else:
+            seen = way.reuse.observation(state.points, prior, sensor, y, aux)
         for i, rule in enumerate(rules):
             memory[i], faded, seen = rule.before(memory[i], prior, seen)
             if faded is not prior:  # the rule built another prior; seen while tracing
@@ -198,10 +235,24 @@ def kalman(
         posterior, info = updated(prior, seen, form)
         for i, rule in enumerate(rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
-        new = FilterState(posterior, tuple(memory))
+        new = FilterState(posterior, tuple(memory), drawn(posterior))
         ok = _finite((new, info.nis))
         inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *left_out(seen)[:3])
         why = _failure(inputs, posterior.factor)
         return _select(ok, new, state), _not_taken(ok, info, why)
 
-    return Filter(init, predict, update)
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        return FilterState(belief, state.memory, drawn(belief))
+
+    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
+        def rerun(i: int, again: Again, first: Memory) -> Memory:
+            memory = (*start.memory[:i], first, *start.memory[i + 1 :])
+            return again(start._replace(memory=memory)).memory[i]
+
+        for i, rule in enumerate(rules):
+            if rule.audit is not None:
+                once_more = None if again is None else partial(rerun, i, again)
+                rule.audit(start.memory[i], final.memory[i], once_more, time)
+
+    audited = any(rule.audit is not None for rule in rules)
+    return Filter(init, predict, update, reset, audit if audited else None)

@@ -46,13 +46,29 @@ class Transition(NamedTuple):
     excess: Array  # (n, k) factor of what the linearisation leaves over; k = 0 for Taylor
     noise: Array  # (n, q) factor of the process noise
     deficit: Array | None = None  # (n,) vector to take away again, for indefinite weights
+    points: Points | None = None  # where sigma points are used again in the update
+
+
+class Points(NamedTuple):
+    """Sigma points that have moved with the state, and the noise they know nothing of."""
+
+    states: State  # leading axis 2n + 1, centre first
+    noise: Array  # (n, n) factor
+
+
+class Reuse(NamedTuple):
+    """How to update with the points of the prediction."""
+
+    draw: Callable[[Belief], Points]
+    observation: Callable[[Points, Belief, Sensor, Any, Any], Observation]
 
 
 class Linearisation(NamedTuple):
-    """A way to linearise, as two functions."""
+    """A way to linearise, as two functions; and a third where points are not drawn anew."""
 
     transition: Callable[[Belief, Motion, Any], Transition]
     observation: Callable[[Belief, Sensor, Any, Any], Observation]
+    reuse: Reuse | None = None
 
 
 def _is_none(leaf):
@@ -219,12 +235,23 @@ def _regress(values: Any, n: int, alpha: Number, beta: Number, kappa: Number):
     return mean, spread.T, root * even.T, math.sqrt(-lack) * b
 
 
-def unscented(alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0) -> Linearisation:
+def unscented(
+    alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0, redraw: bool = True
+) -> Linearisation:
     """Sigma points (Julier & Uhlmann 2004), drawn anew before every prediction and update.
 
     The defaults use points at +- sqrt(n) standard deviations. ``alpha``, ``beta`` and ``kappa`` are
     plain numbers without unit; kappa alpha^2 + n beta >= 0 keeps every covariance a sum of squares.
     On linear models all of them give the Kalman filter.
+
+    Args:
+        alpha: spread of the points.
+        beta: 2 is best for Gaussians.
+        kappa: 3 - n in older texts, 0 here.
+        redraw: False updates with the points that were predicted, as many papers print the filter.
+            Points know nothing of the process noise, so the gain leaves it out: less is learned
+            from a measurement than could be, unless the noise is small. Only the first update after
+            a prediction that no rule has faded has such points; the others draw.
     """
 
     def transition(belief: Belief, motion: Motion, u) -> Transition:
@@ -232,7 +259,9 @@ def unscented(alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0) -> L
         points = sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach)
         values = jax.vmap(lambda x: motion.step(x, u))(points)
         mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
-        return Transition(mean, spread, excess, motion.noise_factor(belief.mean, u), deficit)
+        noise = motion.noise_factor(belief.mean, u)
+        moved = None if redraw else Points(values, _square(noise))
+        return Transition(mean, spread, excess, noise, deficit, moved)
 
     def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
@@ -242,7 +271,46 @@ def unscented(alpha: Number = 1.0, beta: Number = 2.0, kappa: Number = 0.0) -> L
         size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / weights.reach
         return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
 
-    return Linearisation(transition, observation)
+    if redraw:
+        return Linearisation(transition, observation)
+
+    def draw(belief: Belief) -> Points:
+        n = belief.factor.shape[0]
+        reach = sigma_weights(n, alpha, beta, kappa).reach
+        return Points(sigma_points(belief, reach), linalg.zeros(n, n))
+
+    def observe_again(points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
+        n = prior.factor.shape[0]
+        values = jax.vmap(lambda x: sensor.read(x, aux))(points.states)
+        _, *state, lack = _regress(points.states, n, alpha, beta, kappa)
+        z, *reading, deficit = _regress(values, n, alpha, beta, kappa)
+        if lack is not None or deficit is not None:
+            raise ValueError(
+                "sigma points can be used again only where kappa alpha^2 + n beta >= 0, got "
+                f"alpha = {alpha}, beta = {beta}, kappa = {kappa}, n = {n}"
+            )
+        # State and reading are the same combinations of the same unit deviations, the noise of the
+        # motion aside: state = S T with T T' = I, so what of the reading lies along T is its
+        # spread and what lies across is left over.
+        wide = jnp.concatenate([*state, points.noise], axis=1)
+        deviation = jnp.concatenate([*reading, linalg.zeros(sensor.dim, n)], axis=1)
+        solid, independent = linalg.guard(prior.factor)
+        T = jnp.where(independent[:, None], linalg.solve_lower(solid, wide), 0.0)
+        spread = deviation @ T.T
+        size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / (
+            sigma_weights(n, alpha, beta, kappa).reach
+        )
+        return _observe(sensor, prior, z, y, aux, spread, deviation - spread @ T, size)
+
+    return Linearisation(transition, observation, Reuse(draw, observe_again))
+
+
+def _square(noise: Array) -> Array:
+    """The same noise with as many columns as rows."""
+    n, q = noise.shape
+    if q > n:
+        return linalg.tria(noise)
+    return jnp.concatenate([noise, linalg.zeros(n, n - q)], axis=1)
 
 
 def cubature() -> Linearisation:

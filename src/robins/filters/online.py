@@ -57,6 +57,7 @@ class OnlineFilter:
         code = Code(int(prediction.code))
         if code is not Code.DONE:
             self.counts[code.name] += 1
+        self._audit()
         return prediction
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
@@ -81,4 +82,9 @@ class OnlineFilter:
         numbers = as_measurement(sensor, y)
         self.state, info = _update(self._filter, chosen, self.state, numbers, aux)
         self.counts[Code(int(info.code)).name] += 1
+        self._audit()
         return info
+
+    def _audit(self) -> None:
+        if self._filter.audit is not None:
+            self._filter.audit(self.state, self.state, None, None)

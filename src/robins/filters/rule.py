@@ -1,4 +1,4 @@
-"""A rule: one published adaptation of the Kalman filter, as four pure hooks.
+"""A rule: one published adaptation of the Kalman filter, as pure hooks.
 
 Rules know nothing of how the model was linearised, and keep what they remember in the filter's
 state, so that a run stays one scan, a batch one `vmap`, and streaming use the same code.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from robins.filters.belief import Belief, StepInfo
+from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 
@@ -36,11 +36,17 @@ def _keep_posterior(
     return memory, posterior, info
 
 
+def keep_belief(memory: Memory, belief: Belief) -> tuple[Memory, Belief, int]:
+    """The default of `Rule.settle`."""
+    return memory, belief, int(Code.DONE)
+
+
 class Rule(NamedTuple):
     """One adaptation; every hook is pure and defaults to identity.
 
     Attributes:
-        init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension.
+        init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension, in the
+            order in which the model updates them.
         process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
             and before the covariance is formed: adapt ``noise``, remember ``spread``.
         before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
@@ -50,6 +56,14 @@ class Rule(NamedTuple):
         after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
             project, learn from the innovation; may add to ``info.notes``. The observation is the
             one the update used.
+        settle: ``(memory, belief) -> (memory, belief, code)``, once a step, when all its
+            measurements are in and the state is about to be predicted: inflate what the whole step
+            left. A code other than ``DONE`` says that the step cannot be taken: the belief then
+            stays, the memory of this hook is kept.
+        audit: ``(start, final, again, time)``, outside compiled code: raises what the memory a run
+            ended with has to report. ``again`` runs once more from another first memory and
+            returns the last one (None where samples came one by one); ``time`` holds the seconds of
+            the steps, or None.
         name: prefix of its notes.
     """
 
@@ -61,4 +75,6 @@ class Rule(NamedTuple):
     after: Callable[[Memory, Belief, StepInfo, Observation], tuple[Memory, Belief, StepInfo]] = (
         _keep_posterior
     )
+    settle: Callable[[Memory, Belief], tuple[Memory, Belief, Any]] = keep_belief
+    audit: Callable[[Memory, Memory, Callable[[Memory], Memory] | None, Any], None] | None = None
     name: str = "rule"

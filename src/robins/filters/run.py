@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
 
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
@@ -49,6 +50,15 @@ class Solution(NamedTuple):
 
 def _everything(step: Step) -> Step:
     return step
+
+
+def _nothing(step: Step) -> tuple[()]:
+    return ()
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether numbers are stand-ins of a transformation, so that nothing can be asked of them."""
+    return any(isinstance(x, Tracer) for x in jax.tree_util.tree_leaves(tree))
 
 
 def _by_sensor(model: Model, data: Any) -> dict[str, Any]:
@@ -121,6 +131,7 @@ def run(
     u: Any = None,
     aux: Mapping[str, Any] | None = None,
     keep: Callable[[Step], Any] = _everything,
+    time_s: ArrayLike | None = None,
 ) -> Solution:
     """Run a filter over measurements: for each step predict, then update with row k of y.
 
@@ -137,8 +148,11 @@ def run(
         u: input of the motion at each step, a pytree of arrays with leading axis T.
         aux: what sensors need besides the state, by sensor name, leading axis T.
         keep: what to keep of each `Step`; long campaigns keep little.
+        time_s: (T,) time of each step [s], which errors then name.
 
     Raises:
+        Exception: what a rule has to report, where it is its policy to raise (`Rule.audit`). In
+            transformed or compiled code nothing can be raised: the codes of the steps say it.
         TypeError: a measurement is not a real number.
         ValueError: lengths differ, a measurement names no sensor of the model or is not of the
             shape that its sensor reads.
@@ -149,12 +163,12 @@ def run(
     _check_lengths(measurements, u, extra)
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-    return _scan(
-        filter_,
-        model,
-        as_arrays(state),
-        as_arrays(u),
-        measurements,
-        as_arrays(extra),
-        keep,
-    )
+    state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
+    solution = _scan(filter_, model, state, u, measurements, extra, keep)
+    if filter_.audit is not None and not is_traced(solution.final):
+
+        def again(first: FilterState) -> FilterState:
+            return _scan(filter_, model, first, u, measurements, extra, _nothing).final
+
+        filter_.audit(state, solution.final, again, time_s)
+    return solution

@@ -21,9 +21,8 @@ def rts_smoother(solution: Solution) -> Belief:
     The first two terms of P_s are what an update of P by the predicted state leaves, and come from
     the same triangularisation, so nothing is subtracted (Park & Kailath 1995).
 
-    It undoes process and measurement noise as the run used them; covariance a rule added in an
-    update (fading, inflation) is not undone: a run with such rules is smoothed as if it were
-    process noise.
+    It undoes process and measurement noise as the run used them; covariance a rule added (fading,
+    inflation) is not undone: a run with such rules is smoothed as if it were process noise.
 
     Returns:
         Beliefs with leading axis T; the last one is the filter's.
@@ -34,6 +33,8 @@ def rts_smoother(solution: Solution) -> Belief:
     steps = solution.steps
     if not hasattr(steps, "prediction"):
         raise ValueError("smoothing needs a run that kept its steps: leave `keep` at its default")
+    if steps.prediction.transition is None:
+        raise ValueError("smoothing needs one transition a step, which this kind of filter has not")
     return _backwards(steps.posterior, steps.prediction)
 
 
@@ -51,7 +52,9 @@ def _backwards(posterior: Belief, predictions: Prediction) -> Belief:
 def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief]:
     """One step back: an update of `now` by the state that followed."""
     now, prediction = row
+    now = now if prediction.origin is None else prediction.origin
     t = prediction.transition
+    assert t is not None  # looked at before
     used = linalg.independent_rows(jnp.concatenate([t.spread, t.excess, t.noise], axis=1))
     spread, excess, noise = (
         jnp.where(used[:, None], b, 0.0) for b in (t.spread, t.excess, t.noise)
