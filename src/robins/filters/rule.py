@@ -56,6 +56,7 @@ class Rule(NamedTuple):
         after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
             project, learn from the innovation; may add to ``info.notes``. The observation is the
             one the update used.
+        name: prefix of its notes.
         settle: ``(memory, belief) -> (memory, belief, code)``, once a step, when all its
             measurements are in and the state is about to be predicted: inflate what the whole step
             left. A code other than ``DONE`` says that the step cannot be taken: the belief then
@@ -64,7 +65,6 @@ class Rule(NamedTuple):
             ended with has to report. ``again`` runs once more from another first memory and
             returns the last one (None where samples came one by one); ``time`` holds the seconds of
             the steps, or None.
-        name: prefix of its notes.
     """
 
     init: Callable[[Belief, Mapping[str, int]], Memory] = _no_memory
@@ -75,6 +75,6 @@ class Rule(NamedTuple):
     after: Callable[[Memory, Belief, StepInfo, Observation], tuple[Memory, Belief, StepInfo]] = (
         _keep_posterior
     )
+    name: str = "rule"
     settle: Callable[[Memory, Belief], tuple[Memory, Belief, Any]] = keep_belief
     audit: Callable[[Memory, Memory, Callable[[Memory], Memory] | None, Any], None] | None = None
-    name: str = "rule"
