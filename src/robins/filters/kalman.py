@@ -72,7 +72,8 @@ def predicted_factor(t: Transition, form: Form) -> Array:
     if form == "sqrt":
         S = linalg.tria(t.spread, t.excess, t.noise)
         return S if t.deficit is None else linalg.downdate(S, t.deficit)
-    P = t.spread @ t.spread.T + t.excess @ t.excess.T + t.noise @ t.noise.T
+    wide = jnp.concatenate([t.spread, t.excess, t.noise], axis=1)
+    P = wide @ wide.T
     if t.deficit is not None:
         P = P - t.deficit[:, None] @ t.deficit[None, :]
     return linalg.cholesky(P)
@@ -102,14 +103,20 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         lost = linalg.lost_in_rounding(S_post, prior.sigma)
         S_post = jnp.where(exact & lost, 0.0, S_post)
     else:
-        R = excess @ excess.T + noise @ noise.T
+        wide = jnp.concatenate([spread, excess, noise], axis=1)
+        P_y = wide @ wide.T
         if deficit is not None:
-            R = R - deficit[:, None] @ deficit[None, :]
-        S_y = linalg.cholesky(spread @ spread.T + R)
+            P_y = P_y - deficit[:, None] @ deficit[None, :]
+        S_y = linalg.cholesky(P_y)
         cross = linalg.solve_lower(S_y, spread @ S.T).T
         K = linalg.solve_lower_transposed(S_y, cross.T).T
-        A = S - K @ spread
-        S_post = linalg.cholesky(A @ A.T + K @ R @ K.T)
+        # [S - K spread, -K excess, -K noise] is a factor of (I - K H) P (I - K H)' + K R K'.
+        A = jnp.pad(S, ((0, 0), (0, wide.shape[1] - S.shape[1]))) - K @ wide
+        P = A @ A.T
+        if deficit is not None:
+            taken = K @ deficit[:, None]
+            P = P - taken @ taken.T
+        S_post = linalg.cholesky(P)
 
     seen = whiten(S_y, used, o.residual)
     mean = manifold.retract(prior.mean, cross @ seen.white)

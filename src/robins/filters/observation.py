@@ -94,7 +94,11 @@ def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
     kept = [jnp.where(o.accepted[:, None], b, 0.0) for b in (o.spread, o.excess, o.noise)]
     exact = o.accepted & ~jnp.any(kept[2] != 0.0, axis=1)
     size = jnp.where(exact, o.size, 0.0)
-    used = linalg.independent_rows(jnp.concatenate(kept, axis=1), size)
+    used = jax.lax.cond(
+        linalg.plainly_independent(o.noise),
+        lambda: o.accepted,  # noise of their own: nothing to look for, which is the usual case
+        lambda: linalg.independent_rows(jnp.concatenate(kept, axis=1), size),
+    )
     spread, excess, noise = (jnp.where(used[:, None], b, 0.0) for b in kept)
     unit = jnp.diag(jnp.where(used, 0.0, 1.0))
     deficit = None if o.deficit is None else jnp.where(used, o.deficit, 0.0)

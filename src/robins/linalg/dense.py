@@ -128,6 +128,17 @@ def independent_rows(
     return jnp.stack(independent)
 
 
+def plainly_independent(rows: Float[Array, "m k"]) -> Bool[Array, ""]:
+    """Whether rows are lower triangular with a solid diagonal: independent at a glance."""
+    m, k = rows.shape
+    if k < m:
+        return jnp.zeros((), bool)
+    rows = jax.lax.stop_gradient(rows)
+    pivot = jnp.abs(jnp.diagonal(rows))
+    solid = pivot > DEPENDENT * jnp.max(jnp.abs(rows), axis=1, initial=0.0)
+    return jnp.all(solid) & ~jnp.any(jnp.triu(rows, 1) != 0.0)
+
+
 def lost_in_rounding(rows: Float[Array, "m k"], size: Float[Array, "m"]) -> Bool[Array, "m k"]:
     """Which entries are rounding against the size of what their row was summed from."""
     return jnp.abs(rows) <= DEPENDENT * size[:, None]
@@ -157,7 +168,22 @@ def block_factor(
 
 def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower Cholesky factor; all NaN where P is not positive definite."""
-    return jnp.linalg.cholesky(P)
+    n = P.shape[0]
+    if n > UNROLLED:
+        return jnp.linalg.cholesky(P)
+    L: list[list[Array]] = []
+    pivots = []
+    for i in range(n):
+        row: list[Array] = []
+        for j in range(i + 1):
+            rest = P[i, j] - sum((a * b for a, b in zip(row, (*L, row)[j], strict=False)), 0.0)
+            row.append(jnp.sqrt(rest) if i == j else rest / L[j][j])
+            pivots += [rest] if i == j else []
+        L.append(row)
+    blank = jnp.zeros(())
+    lower = jnp.stack([jnp.stack([*row, *[blank] * (n - len(row))]) for row in L])
+    positive = jnp.all(jnp.stack(pivots) > 0.0)
+    return jnp.where(positive, lower, jnp.nan)
 
 
 def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -181,12 +207,24 @@ def downdate(L: Float[Array, "n n"], v: Float[Array, "n"]) -> Float[Array, "n n"
 
 def solve_lower(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """``L^-1 B`` for lower-triangular L."""
-    return solve_triangular(L, B, lower=True)
+    n = L.shape[0]
+    if n > UNROLLED:
+        return solve_triangular(L, B, lower=True)
+    X: list[Array] = []
+    for i in range(n):
+        X.append((B[i] - sum((L[i, j] * x for j, x in enumerate(X)), 0.0)) / L[i, i])
+    return jnp.stack(X)
 
 
 def solve_lower_transposed(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """``L^-T B`` for lower-triangular L."""
-    return solve_triangular(L, B, lower=True, trans=1)
+    n = L.shape[0]
+    if n > UNROLLED:
+        return solve_triangular(L, B, lower=True, trans=1)
+    X: dict[int, Array] = {}
+    for i in reversed(range(n)):
+        X[i] = (B[i] - sum((L[j, i] * x for j, x in X.items()), 0.0)) / L[i, i]
+    return jnp.stack([X[i] for i in range(n)])
 
 
 def solve_spd(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n k"]:
