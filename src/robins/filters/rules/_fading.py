@@ -1,0 +1,157 @@
+"""What fading rules share: innovations in units of the noise, their power, faded covariances."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from robins import linalg
+from robins.filters.observation import Observation
+
+Number = float | int  # where types are checked an int is no float
+
+# Directions less certain than this share of a state's deviation are solved with as if they had it.
+_FLOOR = 1e-10
+
+
+class White(NamedTuple):
+    """A measurement whitened by R^-1/2, so that traces add what has no unit."""
+
+    residual: Array  # (m,) R^-1/2 r
+    spread: Array  # (m, n) R^-1/2 H S
+    left_over: Array  # () trace of what the linearisation leaves over
+    counts: Array  # (m,) bool: used, and with noise of its own; the others are zero
+
+    @property
+    def predicted(self) -> Array:
+        """Trace of R^-1 H P H', with what the linearisation leaves over."""
+        return jnp.sum(self.spread**2) + self.left_over
+
+    @property
+    def dof(self) -> Array:
+        """Number of components, which is the trace of R^-1 R."""
+        return jnp.sum(self.counts).astype(float)
+
+
+def whitened(o: Observation) -> White:
+    """An innovation, and what was expected of it, in units of the sensor's own noise.
+
+    A component without noise of its own has no such unit and does not count.
+    """
+    noise = jnp.where((o.accepted & o.present)[:, None], o.noise, 0.0)
+    root, counts = linalg.guard(noise)
+    n = o.spread.shape[1]
+    away = jnp.zeros_like(o.residual) if o.deficit is None else o.deficit
+    columns = [o.residual[:, None], away[:, None], o.spread, o.excess]
+    white = linalg.solve_lower(root, jnp.concatenate(columns, axis=1))
+    left_over = jnp.sum(white[:, n + 2 :] ** 2) - jnp.sum(white[:, 1] ** 2)
+    return White(white[:, 0], white[:, 2 : n + 2], left_over, counts)
+
+
+def averaged(power: Array, white: White, keep: Number) -> Array:
+    """A step of the exponential average of squared residuals; those that do not count stay."""
+    fresh = keep * power + (1.0 - keep) * white.residual**2
+    return jnp.where(white.counts, fresh, power)
+
+
+def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Array:
+    """Whether averaged squares exceed what the filter expects by so many standard deviations.
+
+    An average with weights (1 - keep) keep^i of squares of m unit normals has mean m and relative
+    variance 2 (1 - keep) / ((1 + keep) m).
+    """
+    dof = jnp.maximum(white.dof, 1.0)
+    deviation = math.sqrt(2.0 * (1.0 - keep) / (1.0 + keep)) / jnp.sqrt(dof)
+    return power > (1.0 + sigmas * deviation) * (white.predicted + white.dof)
+
+
+def total(power: Array, white: White) -> Array:
+    """Trace of the averaged power of the components that count."""
+    return jnp.sum(jnp.where(white.counts, power, 0.0))
+
+
+def ratio(N: Array, M: Array, limit: Number) -> Array:
+    """Fading factor max(1, N / M), up to a limit; 1 where there is nothing to fade."""
+    solid = M > 0.0
+    return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
+
+
+def seen_through(spread: Array, S: Array, columns: Array) -> Array:
+    """H A for columns A in the range of S, where only the spread H S is known.
+
+    H = (H S) S' (S S')^-1, with a floor under what is all but certain: that errs by 1e-10 of a
+    state's deviation at most, and a state known exactly may be among them.
+    """
+    sigma = jnp.sqrt(jnp.sum(S**2, axis=1))
+    floor = jnp.where(sigma > 0.0, _FLOOR * sigma, 1.0)
+    L = linalg.tria(S, jnp.diag(floor))
+    n = len(sigma)
+    both = linalg.solve_lower(L, jnp.concatenate([S, columns], axis=1))
+    return (spread @ both[:, :n].T) @ both[:, n:]
+
+
+def where_seen(S: Array, spread: Array, factor: Array) -> Array:
+    """Factor of P + (lambda - 1) P H' (H P H')^+ H P: H P H' grows by lambda and nothing else does.
+
+    The added part is S T'T S' with T the orthonormal rows that span those of H S.
+    """
+    root, _ = linalg.guard(spread)
+    T = linalg.solve_lower(root, spread)
+    wider = linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
+    return jnp.where(factor > 1.0, wider, S)
+
+
+def fade(
+    S: Array, white: White, N: Array, form: str, weights: np.ndarray | None, limit: Number
+) -> tuple[Array, Array]:
+    """A factor S of P faded such that the channel expects N more than its noise.
+
+    Args:
+        S: (n, n).
+        white: the measurement as S lets it expect.
+        N: () excess power to be explained.
+        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, "projected" as `where_seen`.
+        weights: (n,) of states for "multiple", greatest 1; None for all alike.
+        limit: upper bound of lambda.
+
+    Returns:
+        The faded factor and lambda (the greatest of them where there are several).
+    """
+    if form == "projected":
+        factor = ratio(N, white.predicted, limit)
+        return where_seen(S, white.spread, factor), factor
+    if form == "lumped" or weights is None:
+        factor = ratio(N, white.predicted, limit)
+        return jnp.sqrt(factor) * S, factor
+    # sum of weight_j (P H' H)_jj is the trace of (H diag(weight) S) (H S)'
+    weighted = seen_through(white.spread, S, jnp.asarray(weights)[:, None] * S)
+    factor = ratio(N, jnp.sum(weighted * white.spread) + white.left_over, limit)
+    return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
+
+
+def checked_weights(rule: str, weights: ArrayLike | None) -> np.ndarray | None:
+    """Weights of states, scaled to a greatest of 1.
+
+    Raises:
+        ValueError: some are negative or not finite, or none is positive.
+    """
+    if weights is None:
+        return None
+    w = np.asarray(weights, dtype=float)
+    if w.ndim != 1 or not np.all(np.isfinite(w)) or np.any(w < 0.0) or not np.any(w > 0.0):
+        raise ValueError(f"{rule} weights must be (n,) numbers >= 0, not all 0, got {weights}")
+    return w / np.max(w)
+
+
+def check_size(rule: str, weights: np.ndarray | None, n: int) -> None:
+    """One weight a state.
+
+    Raises:
+        ValueError: there are more or fewer.
+    """
+    if weights is not None and len(weights) != n:
+        raise ValueError(f"{rule} weights are {len(weights)}, the state has {n} components")

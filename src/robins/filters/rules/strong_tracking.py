@@ -1,0 +1,182 @@
+"""Strong tracking: fade the past when innovations are larger than the filter expects."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from robins import linalg
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.linearise import Transition
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+from robins.filters.rules._fading import (
+    Number,
+    White,
+    averaged,
+    check_size,
+    checked_weights,
+    fade,
+    ratio,
+    seen_through,
+    significant,
+    total,
+    whitened,
+)
+
+Form = Literal["outside", "lumped", "multiple", "projected"]
+Power = Literal["classic", "ewma"]
+
+
+class _Memory(NamedTuple):
+    power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
+    begun: dict[str, Array]  # (m,) bool: the average has a first value
+    moved: Array  # (n, 2n + 1) F S and what its linearisation left over
+    noise: Array  # (n, n) factor of Q
+    fresh: Array  # () bool: nothing has been used since the prediction
+    factor: Array  # () lambda of the update under way, 1 between updates
+
+
+def strong_tracking(
+    rho: Number = 0.95,
+    beta: Number = 1.0,
+    form: Form = "outside",
+    power: Power = "classic",
+    threshold: Number | None = None,
+    limit: Number = 1e3,
+    weights: ArrayLike | None = None,
+) -> Rule:
+    r"""Fade the prior so that the innovation is as large as expected (Zhou & Frank 1996).
+
+    With r, H whitened by R^-1/2, so that the traces add numbers without unit,
+
+        V = r r' at first, then (rho V + r r') / (1 + rho)
+        lambda = max(1, tr N / tr M)
+
+        form       N                    tr M                   prior becomes
+        outside    V - H Q H' - beta R  tr H F P F' H'         lambda F P F' + Q
+        lumped     V - beta R           tr H P H'              lambda P
+        multiple   V - beta R           sum_j a_j (P H' H)_jj  Lam^1/2 P Lam^1/2
+        projected  V - beta R           tr H P H'              P + (lambda-1) P H' (H P H')^+ H P
+
+    with Lam_j = max(1, a_j lambda).
+
+    The outside form is that of the paper; lumped fades Q too; multiple knows which states may have
+    moved; projected widens only what the sensor sees, so that nothing else grows without bound.
+    Sigma points are drawn anew from the faded prior; where h is linear that is the same as scaling
+    Pxz and Pzz - R, the "simplified" form of some papers. ``H P H'`` contains what sigma points
+    find left over. Where several sensors follow one prediction, the first that is used knows Q
+    apart; the later ones see a posterior, which the outside form fades as lumped does.
+
+    The classic V is an average with the weights of keep = rho / (1 + rho) <= 1/2: it remembers two
+    samples, and lambda follows noise. ``power="ewma"`` takes keep = rho, starts at R, and fades
+    only when tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
+
+    Noted as ``strong_tracking.lambda``: lambda, for multiple the greatest. Components that are
+    missing, refused, or without noise of their own leave V and lambda alone. The Kalman filter is
+    ``limit=1``, ``threshold=inf`` or beta large enough.
+
+    Args:
+        rho: forgetting factor of V, in (0, 1].
+        beta: weakening, at least 1: so many R are noise.
+        form: which covariance is faded.
+        power: how V is averaged.
+        threshold: standard deviations by which V must exceed what is expected; None is 3 for
+            "ewma", and no test for "classic".
+        limit: upper bound of lambda, at least 1.
+        weights: (n,) a_j >= 0 of the states for "multiple"; None is all alike (then as lumped).
+
+    Raises:
+        ValueError: an argument is out of its range; when the filter starts, if the weights are not
+            one a state.
+    """
+    if not 0.0 < rho <= 1.0:
+        raise ValueError(f"strong_tracking rho must lie in (0, 1], got {rho}")
+    if not 1.0 <= beta < math.inf:
+        raise ValueError(f"strong_tracking beta must be at least 1 and finite, got {beta}")
+    if form not in get_args(Form):
+        raise ValueError(f"strong_tracking form must be one of {get_args(Form)}, got {form!r}")
+    if power not in get_args(Power):
+        raise ValueError(f"strong_tracking power must be one of {get_args(Power)}, got {power!r}")
+    if threshold is not None and not threshold >= 0.0:
+        raise ValueError(f"strong_tracking threshold must not be negative, got {threshold}")
+    if not 1.0 <= limit < math.inf:
+        raise ValueError(f"strong_tracking limit must be at least 1 and finite, got {limit}")
+    if weights is not None and form != "multiple":
+        raise ValueError(f"strong_tracking weights are for form 'multiple', not {form!r}")
+    shares = checked_weights("strong_tracking", weights)
+    classic = power == "classic"
+    keep = rho / (1.0 + rho) if classic else rho
+    sigmas = threshold if classic or threshold is not None else 3.0
+
+    def init(belief: Belief, dims):
+        n = belief.factor.shape[0]
+        check_size("strong_tracking", shares, n)
+        return _Memory(
+            power={name: jnp.ones(m) for name, m in dims.items()},
+            begun={name: jnp.full(m, not classic) for name, m in dims.items()},
+            moved=linalg.zeros(n, 2 * n + 1),
+            noise=linalg.zeros(n, n),
+            fresh=jnp.array(False),
+            factor=jnp.ones(()),
+        )
+
+    def process(memory: _Memory, t: Transition):
+        if form != "outside":
+            return memory, t
+        moved, noise = (jnp.concatenate([t.spread, t.excess], axis=1), t.noise)
+        moved, noise = _fitted(moved, memory.moved.shape[1]), _fitted(noise, len(noise))
+        return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), t
+
+    def before(memory: _Memory, prior: Belief, o: Observation):
+        white = whitened(o)
+        V, begun = memory.power[o.sensor], memory.begun[o.sensor]
+        first = white.counts & ~begun
+        V = jnp.where(first, white.residual**2, averaged(V, white, keep))
+        N = total(V, white) - beta * white.dof
+        if sigmas is not None:
+            N = jnp.where(significant(total(V, white), white, keep, sigmas), N, 0.0)
+        if form == "outside":
+            S, factor = _faded_outside(memory, prior.factor, white, N, limit)
+        else:
+            S, factor = fade(prior.factor, white, N, form, shares, limit)
+        memory = memory._replace(
+            power={**memory.power, o.sensor: V},
+            begun={**memory.begun, o.sensor: begun | white.counts},
+            factor=factor,
+        )
+        return memory, Belief(prior.mean, S), o
+
+    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
+        notes = {**info.notes, "strong_tracking.lambda": memory.factor}
+        fresh = memory.fresh & ~jnp.any(info.used)
+        memory = memory._replace(fresh=fresh, factor=jnp.ones(()))
+        return memory, posterior, info._replace(notes=notes)
+
+    return Rule(init=init, process=process, before=before, after=after, name="strong_tracking")
+
+
+def _faded_outside(memory: _Memory, S: Array, white: White, N: Array, limit: Number):
+    """P + (lambda - 1) F P F', which is lambda F P F' + Q; P itself instead of F P F' once used."""
+    n = len(S)
+    whole = jnp.concatenate([S, linalg.zeros(n, memory.moved.shape[1] - n)], axis=1)
+    moved = jnp.where(memory.fresh, memory.moved, whole)
+    noise = jnp.where(memory.fresh, memory.noise, 0.0)
+    seen = seen_through(white.spread, S, jnp.concatenate([moved, noise], axis=1))
+    of_moved, of_noise = seen[:, : moved.shape[1]], seen[:, moved.shape[1] :]
+    M = jnp.sum(of_moved**2) + white.left_over
+    factor = ratio(N - jnp.sum(of_noise**2), M, limit)
+    more = factor > 1.0
+    gain = jnp.where(more, jnp.sqrt(jnp.where(more, factor - 1.0, 1.0)), 0.0)
+    return jnp.where(more, linalg.tria(S, gain * moved), S), factor
+
+
+def _fitted(columns: Array, width: int) -> Array:
+    """The same covariance from a factor of so many columns, at least one a row."""
+    n, k = columns.shape
+    if k > width:
+        columns, k = linalg.tria(columns), n
+    return jnp.concatenate([columns, linalg.zeros(n, width - k)], axis=1)
