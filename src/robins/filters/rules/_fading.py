@@ -105,7 +105,7 @@ def where_seen(S: Array, spread: Array, factor: Array) -> Array:
     return jnp.where(factor > 1.0, wider, S)
 
 
-def fade(
+def faded(
     S: Array, white: White, N: Array, form: str, weights: np.ndarray | None, limit: Number
 ) -> tuple[Array, Array]:
     """A factor S of P faded such that the channel expects N more than its noise.

@@ -1,70 +1,66 @@
-"""How much noise makes an innovation as likely as a limit says."""
+"""Noise by its variances: what the rules that learn or weigh a noise have in common.
+
+A learnt noise is kept as a ratio to the nominal one, component by component. Units then do not
+matter, and a nominal noise that changes from step to step stays what it is: the nominal one.
+"""
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
-from robins import linalg
-from robins.filters.observation import Observation, normalised
+from robins.filters.observation import Observation
+from robins.filters.rules._quantile import scale_to_quantile
 
-MOST = 1e12  # noise raised this far is noise of infinity, and still leaves digits to compare with
-_STEPS = 40  # some four are needed; forty is a bound, not a plan
-_CLOSE = 1e-13
+__all__ = ["scale_to_quantile"]
+
+Number = float | int  # where types are checked an int is no float
 
 
-def scale_to_quantile(o: Observation, limit: ArrayLike) -> Array:
-    r"""Factor s >= 1 of R such that the normalised innovation squared equals a limit.
+def variance(factor: Array) -> Array:
+    """Diagonal of ``factor factor'``."""
+    return jnp.sum(factor**2, axis=1)
 
-    Solves r' (H P H' + s R)^-1 r = limit, the joint Mahalanobis distance of Chang (2014); exactly 1
-    where the NIS is not above the limit. With S = H P H' + R = L L', w = L^-1 r, B = L^-1 R L^-T
 
-        g(s) = w' (I + (s - 1) B)^-1 w,
+def reading_variance(o: Observation) -> Array:
+    """(m,) diagonal of ``H P H' + Omega``: the share of the state in the innovation."""
+    total = variance(o.spread) + variance(o.excess)
+    return total if o.deficit is None else total - o.deficit**2
 
-    and 1 / g is concave in s, so that Newton's steps on it climb to the root from s = 1 without
-    ever passing it (the secular equation of trust regions; Moré & Sorensen 1983), and reach it in
-    one where there is one component.
 
-    Args:
-        o: the measurement as the prior sees it; components not used do not count.
-        limit: () upper bound of the NIS, more than 0.
+def ratio(a: Array, b: Array) -> Array:
+    """``a / b``; 0 where b is 0, with finite gradients."""
+    some = b > 0.0
+    return jnp.where(some, a, 0.0) / jnp.where(some, b, 1.0)
 
-    Returns:
-        () the factor of the covariance R, at most 1e12: an innovation without noise of its own
-        cannot be made likely. Its derivative is that of the root.
+
+def scaled(factor: Array, scale: Array) -> Array:
+    """Factor of a covariance whose variances are multiplied by a scale; correlations stay."""
+    return factor * jnp.sqrt(scale)[:, None]
+
+
+def numbered(name: str, values: Array) -> dict[str, Array]:
+    """Notes of one scalar a component: ``name.0``, ``name.1``, ..."""
+    return {f"{name}.{i}": values[i] for i in range(len(values))}
+
+
+def check_forgetting(rule: str, forgetting: Number) -> None:
+    """A share that is kept from sample to sample.
+
+    Raises:
+        ValueError: it is not in (0, 1].
     """
-    seen = normalised(o)
-    noise = jnp.where(seen.used[:, None], o.noise, 0.0)
-    W = linalg.solve_lower(seen.factor, noise)
-    B = W @ W.T
-    above = seen.nis > limit
-    nis = jnp.where(above, seen.nis, 1.0)
-    ratio = jnp.where(above, nis / limit, 1.0)
-    unit = jnp.where(above, seen.white, 0.0) / jnp.sqrt(nis)
-    B_, unit_, ratio_ = jax.lax.stop_gradient((B, unit, ratio))
+    if not 0.0 < forgetting <= 1.0:
+        raise ValueError(f"{rule} forgetting must lie in (0, 1], got {forgetting}")
 
-    def at(s):
-        """Of the unit innovation: (I + (s-1) B)^-1 u, g and -g'."""
-        L = linalg.cholesky(linalg.identity(len(unit_)) + (s - 1.0) * B_)
-        v = linalg.solve_spd(L, unit_[:, None])[:, 0]
-        return v, unit_ @ v, v @ (B_ @ v)
 
-    def unfinished(state):
-        s, (_, g, _), count = state
-        return (g * ratio_ > 1.0 + _CLOSE) & (s < MOST) & (count < _STEPS)
+def check_band(rule: str, floor: Number, ceiling: Number) -> None:
+    """Bounds of a scale, which begins at 1.
 
-    def newton(state):
-        s, (_, g, slope), count = state
-        step = (g * ratio_ - 1.0) * g / jnp.where(slope > 0.0, slope, 1.0)
-        s = jnp.minimum(jnp.where(slope > 0.0, s + step, MOST), MOST)
-        return s, at(s), count + 1
-
-    first = jnp.ones(()), (unit_, jnp.sum(unit_**2), unit_ @ (B_ @ unit_)), 0
-    s, (v, g, slope), _ = jax.lax.while_loop(unfinished, newton, first)
-    # One more step whose value is rounding but whose derivative is the root's: dg is 2 v'du -
-    # (s-1) v'dB v, whatever else v depends on.
-    again = 2.0 * (v @ unit) - v @ v - (s - 1.0) * (v @ (B @ v))
-    free = above & (s < MOST) & (slope > 0.0)
-    turn = jnp.where(free, g / jnp.where(free, slope, 1.0), 0.0)
-    return jnp.where(above, s + turn * (again * ratio - 1.0), 1.0)
+    Raises:
+        ValueError: not 0 < floor <= 1 <= ceiling < infinity.
+    """
+    if not 0.0 < floor <= 1.0:
+        raise ValueError(f"{rule} floor must lie in (0, 1], got {floor}")
+    if not 1.0 <= ceiling < float("inf"):
+        raise ValueError(f"{rule} ceiling must be finite and not below 1, got {ceiling}")

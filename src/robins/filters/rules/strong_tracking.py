@@ -19,7 +19,7 @@ from robins.filters.rules._fading import (
     averaged,
     check_size,
     checked_weights,
-    fade,
+    faded,
     ratio,
     seen_through,
     significant,
@@ -142,7 +142,7 @@ def strong_tracking(
         if form == "outside":
             S, factor = _faded_outside(memory, prior.factor, white, N, limit)
         else:
-            S, factor = fade(prior.factor, white, N, form, shares, limit)
+            S, factor = faded(prior.factor, white, N, form, shares, limit)
         memory = memory._replace(
             power={**memory.power, o.sensor: V},
             begun={**memory.begun, o.sensor: begun | white.counts},

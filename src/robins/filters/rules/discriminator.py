@@ -1,0 +1,173 @@
+"""Tell outliers from model errors by how long they last: weigh the ones, fade for the others."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+from scipy import stats
+
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.observation import Observation, normalised
+from robins.filters.rule import Rule
+from robins.filters.rules._fading import (
+    Number,
+    averaged,
+    check_size,
+    checked_weights,
+    faded,
+    significant,
+    total,
+    whitened,
+)
+from robins.filters.rules._quantile import scale_to_quantile
+
+Fade = Literal["projected", "multiple"]
+Robust = Literal["huber", "gate"]
+
+
+class Verdict(IntEnum):
+    """What the discriminator takes a measurement for; noted as ``discriminator.state``."""
+
+    CLEAN = 0
+    OUTLIER = 1
+    MODEL = 2
+
+
+class _Said(NamedTuple):
+    """Of the update under way; between updates as if there was nothing to say."""
+
+    weight: Array  # of the measurement's covariance R: 1 / s, 0 where refused
+    factor: Array  # lambda
+    state: Array  # a `Verdict`
+
+
+class _Memory(NamedTuple):
+    power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
+    counter: dict[str, Array]  # () measurements in a row that were too large to be chance
+    said: _Said
+
+
+def _nothing() -> _Said:
+    return _Said(jnp.ones(()), jnp.ones(()), jnp.asarray(int(Verdict.CLEAN)))
+
+
+def discriminator(
+    patience: int = 30,
+    probability: Number = 0.999,
+    rho: Number = 0.98,
+    fade: Fade = "projected",
+    robust: Robust = "huber",
+    threshold: Number = 3.0,
+    limit: Number = 1e3,
+    weights: ArrayLike | None = None,
+) -> Rule:
+    r"""Short excess is a fault of the sensor, lasting excess one of the model (a rule of robins).
+
+    g = r' S^-1 r is compared with the chi-square quantile k2 of the components present; c counts
+    the measurements of a sensor, one after the other, for which g > k2.
+
+        0 < c < patience   outlier: R becomes s R with r' (H P H' + s R)^-1 r = k2
+                           ("huber"), or the measurement is refused ("gate"); V stands
+        otherwise          V = rho V + (1 - rho) r r', from V = R; where V is significantly above
+                           H P H' + R the model is wrong, and the prior is faded by
+                           lambda = (tr V - m) / tr H P H'
+
+    with r, H whitened by R^-1/2 as in `strong_tracking`, and "significantly" as its "ewma" has it.
+    Faded is only what the channel sees ("projected": P + (lambda-1) P H' (H P H')^+ H P), or
+    Lam^1/2 P Lam^1/2, Lam_j = max(1, a_j lambda), by weights a_j ("multiple").
+
+    It is blind to a true change for ``patience`` measurements, and takes a fault of the sensor that
+    lasts longer for a change of the model: patience is a statement about the sensor.
+
+    Noted are ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
+    ``.state`` (a `Verdict`: 0 clean, 1 outlier, 2 the model is wrong: faded, or c >= patience).
+    What is missing, refused by a rule before or has no noise of its own leaves V and c alone. The
+    Kalman filter is ``probability=1`` with ``threshold=inf`` or ``limit=1``.
+
+    Args:
+        patience: how many measurements in a row a fault of the sensor may spoil, plus one; 1 knows
+            no outliers.
+        probability: share of right measurements with g <= k2, in (0, 1].
+        rho: forgetting factor of V, in (0, 1].
+        fade: which part of the prior is faded. "multiple" adapts faster after a change, but where
+            a sensor does not see all that has weight, the unseen grows without bound.
+        robust: what is done to outliers. "gate" is safer where they last long.
+        threshold: standard deviations by which tr V must exceed what is expected.
+        limit: upper bound of lambda, at least 1.
+        weights: (n,) a_j >= 0 of the states for "multiple"; None is all alike, which fades all P.
+
+    Raises:
+        ValueError: an argument is out of its range; when the filter starts, if the weights are not
+            one a state.
+    """
+    if patience < 1:
+        raise ValueError(f"discriminator patience must be at least 1, got {patience}")
+    if not 0.0 < probability <= 1.0:
+        raise ValueError(f"discriminator probability must lie in (0, 1], got {probability}")
+    if not 0.0 < rho <= 1.0:
+        raise ValueError(f"discriminator rho must lie in (0, 1], got {rho}")
+    if fade not in get_args(Fade):
+        raise ValueError(f"discriminator fade must be one of {get_args(Fade)}, got {fade!r}")
+    if robust not in get_args(Robust):
+        raise ValueError(f"discriminator robust must be one of {get_args(Robust)}, got {robust!r}")
+    if not threshold >= 0.0:
+        raise ValueError(f"discriminator threshold must not be negative, got {threshold}")
+    if not 1.0 <= limit < math.inf:
+        raise ValueError(f"discriminator limit must be at least 1 and finite, got {limit}")
+    if weights is not None and fade != "multiple":
+        raise ValueError(f"discriminator weights are for fade 'multiple', not {fade!r}")
+    shares = checked_weights("discriminator", weights)
+
+    def init(belief: Belief, dims):
+        check_size("discriminator", shares, belief.factor.shape[0])
+        power = {name: jnp.ones(m) for name, m in dims.items()}
+        return _Memory(power, {name: jnp.zeros((), int) for name in dims}, _nothing())
+
+    def before(memory: _Memory, prior: Belief, o: Observation):
+        seen = normalised(o)
+        # quantile by number of components used; none used is never too much
+        table = np.array([np.inf, *stats.chi2.ppf(probability, range(1, len(o.residual) + 1))])
+        quantile = jnp.asarray(table)[seen.dof]
+        count, power = memory.counter[o.sensor], memory.power[o.sensor]
+        longer = jnp.where(seen.nis > quantile, count + 1, 0)
+        count = jnp.where(seen.dof == 0, count, longer)
+        outlier = (seen.dof > 0) & (count > 0) & (count < patience)
+
+        white = whitened(o)
+        power = jnp.where(outlier, power, averaged(power, white, rho))
+        lasting = ~outlier & significant(total(power, white), white, rho, threshold)
+        N = jnp.where(lasting, total(power, white) - white.dof, 0.0)
+        S, factor = faded(prior.factor, white, N, fade, shares, limit)
+
+        if robust == "gate":
+            weight = jnp.where(outlier, 0.0, 1.0)
+            o = o._replace(accepted=o.accepted & ~outlier)
+        else:
+            s = jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0)
+            weight = 1.0 / s
+            o = o._replace(noise=jnp.sqrt(s) * o.noise)
+        wrong = (factor > 1.0) | ((seen.dof > 0) & (count >= patience))
+        state = jnp.where(outlier, int(Verdict.OUTLIER), jnp.where(wrong, int(Verdict.MODEL), 0))
+        memory = _Memory(
+            {**memory.power, o.sensor: power},
+            {**memory.counter, o.sensor: count},
+            _Said(weight, factor, state),
+        )
+        return memory, Belief(prior.mean, S), o
+
+    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
+        notes = {
+            **info.notes,
+            "discriminator.weight": memory.said.weight,
+            "discriminator.lambda": memory.said.factor,
+            "discriminator.counter": memory.counter[o.sensor],
+            "discriminator.state": memory.said.state,
+        }
+        return memory._replace(said=_nothing()), posterior, info._replace(notes=notes)
+
+    return Rule(init=init, before=before, after=after, name="discriminator")
