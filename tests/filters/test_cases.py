@@ -135,10 +135,8 @@ def test_ekf_filter(cases_dir, form):
 @pytest.mark.parametrize("form", ["sqrt", "joseph"])
 def test_ukf_filter(cases_dir, form):
     for case in cases(cases_dir, "ukf_filter"):
-        if not case["given"]["redraw"]:
-            pytest.skip(f"{case['name']} reuses its points; unscented() draws them anew")
         model, start, y = nonlinear(case)
-        ukf = kalman(unscented(*weights_of(case)), form=form)
+        ukf = kalman(unscented(*weights_of(case), redraw=case["given"]["redraw"]), form=form)
         check(case, series=True, **filtered(run(ukf, model, start, y)))
 
 

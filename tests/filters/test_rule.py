@@ -397,3 +397,68 @@ def test_a_gate_believes_after_its_patience():
 def test_a_gate_that_makes_no_sense(probability, patience):
     with pytest.raises(ValueError, match=r"gate (probability|patience) must"):
         gate(probability, patience)
+
+
+# ------------------------------------------------------------------------- settle, audit, reset
+
+
+def settle_at(limit: int):
+    """Inflate by two once a step; refuse to go on after so many steps, and complain of it."""
+
+    def settle(steps, belief):
+        code = jnp.where(steps < limit, int(Code.DONE), int(Code.INFEASIBLE))
+        return steps + 1, belief._replace(factor=2.0 * belief.factor), code
+
+    def audit(start, final, again, time):
+        if int(final) > limit:
+            longer = None if again is None else int(again(start - 1))
+            raise ArithmeticError(f"{int(final)} steps from {int(start)}, else {longer}, {time}")
+
+    return Rule(init=lambda belief, dims: jnp.zeros((), int), settle=settle, audit=audit)
+
+
+def test_a_step_is_settled_once_however_many_sensors_it_has():
+    one = kalman(rules=[settle_at(100)])
+    solution = run(one, MODEL, START, Y)
+    inflated = SYSTEM._replace(P0=4.0 * SYSTEM.P0)
+    by_the_book_means, covariances, _, _ = kalman_filter(inflated, Y[:1])
+    np.testing.assert_allclose(solution.mean[0], by_the_book_means[0], rtol=1e-10)
+    np.testing.assert_allclose(solution.covariance[0], covariances[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(
+        solution.steps.prediction.origin.factor[1:], 2.0 * solution.steps.posterior.factor[:-1]
+    )
+    assert int(solution.final.memory[0]) == T
+    assert run(kalman(), MODEL, START, Y).steps.prediction.origin is None
+
+
+def test_a_step_that_cannot_be_settled_is_not_taken_and_is_audited():
+    one = kalman(rules=[settle_at(3)])
+    with pytest.raises(ArithmeticError, match=r"20 steps from 0, else 19, \[ 0"):
+        run(one, MODEL, START, Y, time_s=np.arange(20.0))
+    final = jax.jit(lambda y: run(one, MODEL, START, y))(Y)  # nothing can be raised in here
+    code = final.steps.prediction.code
+    np.testing.assert_array_equal(code[:3], Code.DONE)
+    np.testing.assert_array_equal(code[3:], Code.INFEASIBLE)
+    np.testing.assert_array_equal(
+        final.steps.prediction.belief.mean[4], final.steps.posterior.mean[3]
+    )
+    assert float(final.log_likelihood) == -np.inf
+    live = OnlineFilter(one, MODEL, START)
+    for _ in range(3):
+        live.predict()
+    with pytest.raises(ArithmeticError, match="4 steps from 4, else None, None"):
+        live.predict()
+    assert live.counts == {"INFEASIBLE": 1}
+
+
+def test_reset_keeps_what_was_learned():
+    one = kalman(unscented(redraw=False), rules=[count_outcomes()])
+    state = one.init(START, MODEL.dims)
+    state, _ = one.predict(state, MODEL.motion, None)
+    other = Belief(START.mean + 1.0, 0.5 * START.factor)
+    fresh = one.reset(state, other)
+    assert fresh.belief is other
+    assert fresh.memory is state.memory
+    again, _ = one.update(fresh, MODEL.sensors[0], jnp.ones(3))
+    direct, _ = one.update(one.init(other, MODEL.dims), MODEL.sensors[0], jnp.ones(3))
+    np.testing.assert_array_equal(again.belief.mean, direct.belief.mean)

@@ -140,8 +140,8 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
 
 def _finite(tree: Any) -> Array:
     leaves = [jnp.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
-    numbers = [x for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
+    finite = [jnp.all(jnp.isfinite(x)) for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
+    return jnp.all(jnp.stack(finite)) if finite else jnp.ones((), bool)
 
 
 def _select(condition: Array, new: Any, old: Any) -> Any:
