@@ -1,0 +1,95 @@
+"""Linearise again where the measurement says the state is: iterated filters."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief
+from robins.filters.linearise import Linearisation, taylor
+from robins.filters.model import Sensor
+from robins.filters.observation import Observation, left_out, whiten
+
+# Below this share of the prior's spread, sigma points lie too close for their differences.
+_NARROW = 1e-6
+
+
+def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Linearisation:
+    """A linearisation that looks again: the measurement is linearised about its own update.
+
+    With Taylor this is the iterated extended Kalman filter, Gauss-Newton on the posterior density
+    (Bell & Cathey 1993, eq. 12), whose fixed point is the most probable state. In the tangent space
+    of the prior mean m, with g(e) = h(retract(m, e)) and H_i its slope at e_i,
+
+        e_i+1 = K_i (y - g(e_i) + H_i e_i),        K_i = P H_i' (H_i P H_i' + R)^-1
+
+    With sigma points it is iterated posterior linearisation: the regression is done over
+    the last posterior, mean and covariance (García-Fernández, Svensson, Morelande & Särkkä 2015,
+    sec. III). Where a measurement leaves less than 1e-6 of a prior deviation, differences of points
+    would be rounding: their spread is then the prior's, about the new mean (Sibley, Sukhatme &
+    Matthies 2006).
+
+    The update gets the last linearisation with the *effective* residual y - g(e) + H e: that is
+    what rules judge and what `StepInfo.innovation` holds. What rules do to noise and components
+    bears on the last step only: where to linearise is decided with the sensor's own noise.
+    Gauss-Newton is not damped, so on a measurement that is far off it need not converge.
+
+    Args:
+        linearise: how to linearise each time; `taylor` by default.
+        iterations: how often a measurement is linearised; 1 is the filter without iteration.
+
+    Raises:
+        ValueError: iterations is not positive, or the way to linearise uses its points again.
+    """
+    if iterations < 1:
+        raise ValueError(f"iterated: iterations must be at least 1, got {iterations}")
+    way = taylor() if linearise is None else linearise
+    if way.reuse is not None:
+        raise ValueError(
+            "iterated: points that were predicted cannot be drawn about another mean; "
+            "use unscented(redraw=True)"
+        )
+
+    def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
+        first = way.observation(prior, sensor, y, aux)
+        if iterations == 1:
+            return first
+        unit = linalg.identity(prior.factor.shape[0])
+        by_slope = first.excess.shape[1] == 0  # how uncertain the state is does not matter
+
+        def look(t, M):
+            """The measurement about retract(m, S t), regressed over S M, as the prior sees it."""
+            mean, S = _carried(prior, t)
+            seen = way.observation(Belief(mean, S @ M), sensor, y, aux)
+            spread = linalg.solve_lower_transposed(M, seen.spread.T).T
+            residual = jnp.where(seen.present, seen.residual + spread @ t, 0.0)
+            return seen._replace(prior=prior, residual=residual, spread=spread)
+
+        def update(o):
+            """The posterior in units of the prior: the state moves by S t, its factor is S M."""
+            spread, excess, noise, deficit, used = left_out(o)
+            S_y, cross, M = linalg.block_factor(spread, (excess, noise), unit, deficit)
+            t = cross @ whiten(S_y, used, o.residual).white
+            narrow = by_slope | jnp.any(jnp.diagonal(M) < _NARROW)
+            return t, linalg.where(narrow, unit, M)
+
+        t, M = jax.lax.fori_loop(
+            0, iterations - 2, lambda _, state: update(look(*state)), update(first)
+        )
+        return look(t, M)
+
+    return Linearisation(way.transition, observation)
+
+
+def _carried(prior: Belief, t):
+    """The state retract(m, S t), and S seen from its tangent space."""
+    S = prior.factor
+    mean = manifold.retract(prior.mean, S @ t)
+    if not any(manifold.is_element(leaf) for leaf in manifold.leaves(prior.mean)):
+        return mean, S
+
+    def moved(shift):
+        return manifold.local(mean, manifold.retract(prior.mean, S @ (t + shift)))
+
+    return mean, jax.jacfwd(moved)(jnp.zeros_like(t))

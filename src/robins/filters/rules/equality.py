@@ -1,0 +1,147 @@
+"""Hold the state to a constraint that is always true."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+from scipy import stats
+
+from robins import linalg
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.constrain import (
+    ITERATIONS,
+    Function,
+    Weight,
+    as_sensor,
+    check_rows,
+    constrain,
+)
+from robins.filters.linearise import Transition
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+
+Number = float | int
+
+
+def equality(
+    g: Function,
+    d: Any = None,
+    weight: Weight = "covariance",
+    noise: ArrayLike | None = None,
+    hard: bool = False,
+    gate: Number | None = None,
+    iterations: int = ITERATIONS,
+) -> Rule:
+    """Hold the state to ``g(x) = d`` after each update (Simon & Chia 2002; `constrain`).
+
+        G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
+
+    with V = P or W^-1. A constraint without noise holds after each sensor's update, and nothing is
+    uncertain across it any more, so that no trace of P grows (W = P^-1: no variance at all). Wants
+    ``form="sqrt"`` where other sensors follow: P is singular. A noisy one is information: it is
+    used once a step, by the first sensor, and as a measurement would be, K = P D' (D P D' +
+    R_d)^-1. Errors of it that last from step to step are not white, and want a state of their own.
+
+    It also holds where the sensor's measurement is missing. What comes with data (air data, a map
+    that is read) is a sensor, not a rule.
+
+    Notes: ``equality.residual``, the greatest entry of d - g(x) before; ``equality.nis``, all of
+    them squared by D P D' + R_d; ``equality.refused``. Infinite noise is the Kalman filter.
+
+    Args:
+        g: (c, n) matrix D or a function of the state, as in `constrain`.
+        d: what it equals; zero if left out.
+        weight: "covariance", "identity" or an (n, n) matrix W.
+        noise: (c,) standard deviations or a (c, k) factor of R_d; exact if left out.
+        hard: put the mean on a noisy constraint, as other weights always do.
+        gate: probability below which a residual is chance: beyond that chi-square quantile the
+            constraint is refused. None: never.
+        iterations: how often a function is linearised.
+
+    Raises:
+        ValueError: rows of D depend on each other or contradict (the rank and the row are named),
+            numbers are not finite, a parameter is not of its range; and by `init`, D, noise or
+            weight do not fit the state.
+    """
+    if gate is not None and not 0.0 < gate < 1.0:
+        raise ValueError(f"equality gate must lie between 0 and 1, or be None, got {gate}")
+    if iterations < 1:
+        raise ValueError(f"equality iterations must be at least 1, got {iterations}")
+    _check_finite(d=d, noise=noise)
+    _check_weight(weight)
+    if not callable(g):
+        _check_rows(g, d, noise)
+    once = noise is not None
+
+    def init(belief: Belief, dims):
+        sensor, _ = as_sensor(belief.mean, g, d, noise)
+        n = belief.factor.shape[0]
+        if not isinstance(weight, str) and np.shape(weight) != (n, n):
+            raise ValueError(f"equality weight is {np.shape(weight)}, the state needs ({n}, {n})")
+        if sensor.dim > n:
+            raise ValueError(f"equality has {sensor.dim} components, the state only {n}")
+        return jnp.zeros((), bool)  # whether this step has used a noisy constraint
+
+    def process(used, transition: Transition):
+        return jnp.zeros((), bool), transition
+
+    def after(used, posterior: Belief, info: StepInfo, o: Observation):
+        held = constrain(posterior, g, d, weight, noise, hard, iterations)
+        refused = jnp.zeros((), bool)
+        if gate is not None:
+            table = [np.inf, *stats.chi2.ppf(gate, range(1, len(held.residual) + 1))]
+            refused = held.nis > jnp.asarray(table)[held.dof]
+        skip = refused | used
+        belief = jax.tree_util.tree_map(
+            lambda new, old: linalg.where(skip, old, new), held.belief, posterior
+        )
+        notes = {
+            "equality.residual": jnp.max(jnp.abs(held.residual)),
+            "equality.nis": held.nis,
+            "equality.refused": refused,
+        }
+        return used | once, belief, info._replace(notes={**info.notes, **notes})
+
+    return Rule(init=init, process=process, after=after, name="equality")
+
+
+def _check_finite(**given) -> None:
+    for name, value in given.items():
+        for leaf in jax.tree_util.tree_leaves(value):
+            if not np.all(np.isfinite(np.asarray(leaf, float))):
+                raise ValueError(f"equality {name} has entries that are not finite numbers")
+
+
+def _check_weight(weight: Weight) -> None:
+    if isinstance(weight, str):
+        if weight not in ("covariance", "identity"):
+            raise ValueError(
+                f"equality weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
+            )
+        return
+    root = np.asarray(linalg.factor(weight, "equality weight"))
+    if not np.all(np.diag(root) > 0.0):
+        raise ValueError("equality weight is not positive definite: each state wants a weight")
+
+
+def _check_rows(g: ArrayLike, d: Any, noise: ArrayLike | None) -> None:
+    D = np.asarray(g, float)
+    if D.ndim != 2 or D.shape[0] == 0:
+        raise ValueError(f"equality D must be (c, n), a row for each constraint, got {D.shape}")
+    _check_finite(D=D)
+    value = np.zeros(len(D)) if d is None else np.asarray(d, float)
+    if value.shape != (len(D),):
+        raise ValueError(f"equality d is {value.shape}: ({len(D)},), one for each row of D")
+    exact = np.ones(len(D), bool)
+    if noise is not None:
+        root = np.asarray(noise, float)
+        if root.shape[0] == len(D):  # other shapes are refused where they are used
+            exact = ~np.any(root.reshape(len(D), -1) != 0.0, axis=1)
+    try:
+        check_rows(D, value, exact)
+    except ValueError as error:
+        raise ValueError(f"equality: {error}") from None

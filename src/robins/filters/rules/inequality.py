@@ -1,0 +1,114 @@
+"""Keep the state within bounds that always hold."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from robins import linalg
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.bound import clip, truncate
+from robins.filters.constrain import Function, as_sensor
+from robins.filters.linearise import Transition
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+
+Method = Literal["active-set", "truncation"]
+
+
+def inequality(
+    g: Function,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
+    method: Method = "active-set",
+) -> Rule:
+    """Keep ``lower <= g(x) <= upper`` after each update (Simon 2010, secs. 2.5 and 2.6).
+
+    "active-set" puts a mean that is outside on the nearest state inside, by the metric P^-1 (Gupta
+    & Hauser 2007), and keeps P. A projection on a convex set never leads away from a truth in it,
+    in its own metric, so P stays as honest as it was; held as an equality the bound would freeze
+    the states it touches. "truncation" takes mean and covariance of the density inside the bounds
+    (Simon & Simon 2010): smaller errors while the bound has something to say. But the same bound is
+    then used as information again and again: where the state hardly moves from step to step the
+    mean is pushed away from it, and P gets too small.
+
+    Truncation acts when something was measured, and at the first sensor of each step; clipping
+    always. Notes: ``inequality.outside``, the number of bounds that the mean violated;
+    ``inequality.infeasible``, whether no state fulfils them all (the belief then stays). Bounds at
+    infinity are the Kalman filter.
+
+    Args:
+        g: (c, n) matrix D, or a function of the state with values in an array, linearised about
+            the mean.
+        lower: (c,) least values; None or -inf where there are none.
+        upper: (c,) greatest values; None or inf where there are none.
+        method: "active-set" or "truncation".
+
+    Raises:
+        ValueError: there is no bound, one is NaN, lower exceeds upper, a row of D is zero, the
+            method is unknown; and by `init`, D does not fit the state.
+    """
+    if method not in ("active-set", "truncation"):
+        raise ValueError(f"inequality method must be 'active-set' or 'truncation', got {method!r}")
+    low, high = _bounds(lower, upper)
+    if not callable(g):
+        _check_rows(g, len(low))
+
+    def init(belief: Belief, dims):
+        sensor, _ = as_sensor(belief.mean, g, None, None)
+        if sensor.dim != len(low):
+            raise ValueError(f"inequality has {len(low)} bounds for {sensor.dim} components of g")
+        return jnp.zeros((), bool)  # whether this step has been cut
+
+    def process(cut, transition: Transition):
+        return jnp.zeros((), bool), transition
+
+    def after(cut, posterior: Belief, info: StepInfo, o: Observation):
+        if method == "active-set":
+            kept = clip(posterior, g, low, high)
+            belief = kept.belief
+        else:
+            kept = truncate(posterior, g, low, high)
+            skip = cut & ~jnp.any(info.used)
+            belief = jax.tree_util.tree_map(
+                lambda new, old: linalg.where(skip, old, new), kept.belief, posterior
+            )
+            cut = jnp.ones((), bool)
+        notes = {
+            "inequality.outside": jnp.sum(kept.outside),
+            "inequality.infeasible": kept.infeasible,
+        }
+        return cut, belief, info._replace(notes={**info.notes, **notes})
+
+    return Rule(init=init, process=process, after=after, name="inequality")
+
+
+def _bounds(lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
+    if lower is None and upper is None:
+        raise ValueError("inequality wants lower or upper bounds")
+    high = np.asarray(np.inf if upper is None else upper, float)
+    low = np.full(high.shape, -np.inf) if lower is None else np.asarray(lower, float)
+    high = np.full(low.shape, np.inf) if upper is None else high
+    if low.ndim != 1 or low.shape != high.shape or low.size == 0:
+        raise ValueError(
+            f"inequality bounds must be (c,) and alike, got lower {low.shape}, upper {high.shape}"
+        )
+    if np.any(np.isnan(low) | np.isnan(high)):
+        raise ValueError("inequality bounds hold NaN: use -inf and inf where there are none")
+    if np.any(low > high) or np.any(low == np.inf) or np.any(high == -np.inf):
+        raise ValueError(f"inequality lower must not exceed upper, got {low} and {high}")
+    return low, high
+
+
+def _check_rows(g: ArrayLike, count: int) -> None:
+    D = np.asarray(g, float)
+    if D.ndim != 2 or len(D) != count:
+        raise ValueError(f"inequality D must be ({count}, n), a row for each bound, got {D.shape}")
+    if not np.all(np.isfinite(D)):
+        raise ValueError("inequality D has entries that are not finite numbers")
+    for row in np.flatnonzero(~np.any(D != 0.0, axis=1)):
+        raise ValueError(f"inequality: row {row} of D is zero and bounds nothing")
