@@ -1,0 +1,103 @@
+"""Reckon with what is not to be estimated."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+
+
+def consider(states: Sequence[int] | ArrayLike) -> Rule:
+    """The Schmidt filter: considered states keep their mean and count in every covariance.
+
+    The gain of the considered states p is put to zero (Schmidt 1966; Zanetti & D'Souza 2012,
+    sec. III), which leaves the covariance of any other gain than the best,
+
+        K_c = (I - M) K,   P+ = (I - K_c H) P (I - K_c H)' + K_c R K_c'
+                              = P_best + (M K) S_y (M K)',         M = diag(1 on p, else 0)
+
+    S_y the covariance of the innovation: what the measurement would have told of p is put back as
+    columns beside the factor. So P_pp stays as predicted and nothing is subtracted. For states
+    that are weakly observed and wrongly modelled (a scale factor, a lever arm): their uncertainty
+    keeps the others honest, but a model fault is not poured into them.
+
+    Give it first: the mean is that of the measured update, so what rules before it did in `after`
+    to the means of considered states is undone. `StepInfo.gain` becomes K_c.
+
+    Notes: ``consider.withheld``, the greatest move withheld from a considered state, in its
+    standard deviations. No state considered is the Kalman filter, bit for bit.
+
+    Args:
+        states: indices of tangent components, or an (n,) mask of booleans.
+
+    Raises:
+        ValueError: an index is negative, repeated or no integer; by `init`, the state has fewer
+            components or the mask another size.
+    """
+    chosen = _chosen(states)
+
+    def init(belief: Belief, dims):
+        n = belief.factor.shape[0]
+        _mask(chosen, n)
+        return ()
+
+    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
+        held = _mask(chosen, posterior.factor.shape[0])
+        if not np.any(held):
+            notes = {**info.notes, "consider.withheld": jnp.zeros(())}
+            return memory, posterior, info._replace(notes=notes)
+        some = jnp.any(info.used)
+        column = jnp.asarray(held)[:, None]
+        told = jnp.where(column, info.gain @ info.factor, 0.0)
+        factor = linalg.where(some, linalg.tria(posterior.factor, told), posterior.factor)
+        move = manifold.local(o.prior.mean, posterior.mean)
+        mean = manifold.retract(o.prior.mean, jnp.where(held, 0.0, move))
+        sigma = o.prior.sigma
+        share = jnp.where(held & (sigma > 0.0), jnp.abs(move), 0.0)
+        withheld = jnp.max(share / jnp.where(sigma > 0.0, sigma, 1.0))
+        info = info._replace(
+            gain=jnp.where(column, 0.0, info.gain),
+            notes={**info.notes, "consider.withheld": withheld},
+        )
+        return memory, Belief(mean, factor), info
+
+    return Rule(init=init, after=after, name="consider")
+
+
+def _chosen(states: Sequence[int] | ArrayLike) -> np.ndarray:
+    """Indices, or a mask of booleans."""
+    given = np.asarray(states)
+    if given.size == 0:
+        return np.zeros(0, int)
+    if given.ndim == 1 and given.dtype == bool:
+        return given
+    try:
+        indices = [operator.index(i) for i in given.reshape(-1).tolist()]
+    except TypeError:
+        indices = [-1]
+    if given.ndim != 1 or min(indices) < 0 or len(set(indices)) < len(indices):
+        raise ValueError(
+            "consider states must be different indices, counted from 0, or a mask of booleans, "
+            f"got {states}"
+        )
+    return given
+
+
+def _mask(chosen: np.ndarray, n: int) -> np.ndarray:
+    if chosen.dtype == bool:
+        if chosen.shape != (n,):
+            raise ValueError(f"consider mask is {chosen.shape}, the state needs ({n},)")
+        return chosen
+    if chosen.size and int(np.max(chosen)) >= n:
+        raise ValueError(f"consider has state {np.max(chosen)}, the last one is {n - 1}")
+    mask = np.zeros(n, bool)
+    mask[chosen] = True
+    return mask
