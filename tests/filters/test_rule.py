@@ -1,11 +1,10 @@
-"""What the hooks of a rule promise, with rules made for the purpose; and the gate."""
+"""What the hooks of a rule promise, with rules made for the purpose."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import kalman_filter, random_system, simulate
-from scipy import stats
 
 from robins.filters import (
     Belief,
@@ -341,124 +340,3 @@ def test_normalised_is_what_the_update_will_say():
         np.testing.assert_array_equal(judged.used, info.used)
         assert int(judged.dof) == int(info.dof) == int(np.isfinite(Y[0]).sum())
         assert float(jnp.sum(judged.white**2)) == pytest.approx(float(judged.nis), rel=1e-14)
-
-
-# ------------------------------------------------------------------------------------------ gate
-
-
-def test_a_gate_lets_chance_pass_and_stops_what_is_not():
-    long = simulate(SYSTEM, 3, 4000)[1]
-    solution = run(kalman(rules=[gate(0.99)]), MODEL, START, long)
-    code = np.asarray(solution.steps.info["y"].code)
-    refused = np.mean(code == Code.REFUSED)
-    # binomial, four standard deviations
-    assert abs(refused - 0.01) < 4 * np.sqrt(0.01 * 0.99 / 4000)
-    ratio = np.asarray(solution.steps.info["y"].notes["gate.ratio"])
-    np.testing.assert_array_equal(ratio > 1.0, code == Code.REFUSED)
-
-
-def test_the_ratio_of_a_gate_is_of_the_components_there():
-    y = Y.copy()
-    solution = run(kalman(rules=[gate(0.95, patience=T)]), MODEL, START, y)
-    plain = run(kalman(), MODEL, START, y).steps.info["y"]
-    ratio = solution.steps.info["y"].notes["gate.ratio"]
-    first = int(np.argmax(np.asarray(ratio) > 1.0)) or T  # alike until one is refused
-    dof = np.isfinite(y).sum(axis=1)
-    quantile = np.array([np.inf, *stats.chi2.ppf(0.95, [1, 2, 3])])[dof]
-    np.testing.assert_allclose(ratio[:first], (plain.nis / quantile)[:first], rtol=1e-9)
-
-
-STRICT = kalman(rules=[gate(1 - 1e-9)])
-
-
-@pytest.mark.parametrize("wild", [1e3, 1e155, 1e308])
-def test_a_gate_equals_a_run_without_the_outlier(wild):
-    y, without = Y.copy(), Y.copy()
-    y[6] = wild
-    without[6] = np.nan
-    got, want = run(STRICT, MODEL, START, y), run(STRICT, MODEL, START, without)
-    np.testing.assert_array_equal(got.mean, want.mean)
-    np.testing.assert_array_equal(got.covariance, want.covariance)
-    assert float(got.log_likelihood) == float(want.log_likelihood)
-    assert int(got.steps.info["y"].code[6]) == Code.REFUSED
-
-
-def test_a_gate_believes_after_its_patience():
-    y = Y + 1e3 * (np.arange(T) >= 5)[:, None]
-    y[7] = np.nan  # missing is neither refused nor agreed
-    solution = run(kalman(rules=[gate(0.9999, patience=3)]), MODEL, START, y)
-    code = np.asarray(solution.steps.info["y"].code)
-    refused = np.flatnonzero(code == Code.REFUSED)
-    assert refused[:3].tolist() == [5, 6, 8]
-    assert code[9] in (Code.DONE, Code.PARTLY_MISSING)
-
-
-@pytest.mark.parametrize(("probability", "patience"), [(0.0, 1), (1.0, 1), (np.nan, 1), (0.9, -1)])
-def test_a_gate_that_makes_no_sense(probability, patience):
-    with pytest.raises(ValueError, match=r"gate (probability|patience) must"):
-        gate(probability, patience)
-
-
-# ------------------------------------------------------------------------- settle, audit, reset
-
-
-def settle_at(limit: int):
-    """Inflate by two once a step; refuse to go on after so many steps, and complain of it."""
-
-    def settle(steps, belief):
-        code = jnp.where(steps < limit, int(Code.DONE), int(Code.INFEASIBLE))
-        return steps + 1, belief._replace(factor=2.0 * belief.factor), code
-
-    def audit(start, final, again, time):
-        if int(final) > limit:
-            longer = None if again is None else int(again(start - 1))
-            raise ArithmeticError(f"{int(final)} steps from {int(start)}, else {longer}, {time}")
-
-    return Rule(init=lambda belief, dims: jnp.zeros((), int), settle=settle, audit=audit)
-
-
-def test_a_step_is_settled_once_however_many_sensors_it_has():
-    one = kalman(rules=[settle_at(100)])
-    solution = run(one, MODEL, START, Y)
-    inflated = SYSTEM._replace(P0=4.0 * SYSTEM.P0)
-    by_the_book_means, covariances, _, _ = kalman_filter(inflated, Y[:1])
-    np.testing.assert_allclose(solution.mean[0], by_the_book_means[0], rtol=1e-10)
-    np.testing.assert_allclose(solution.covariance[0], covariances[0], rtol=1e-9, atol=1e-12)
-    np.testing.assert_array_equal(
-        solution.steps.prediction.origin.factor[1:], 2.0 * solution.steps.posterior.factor[:-1]
-    )
-    assert int(solution.final.memory[0]) == T
-    assert run(kalman(), MODEL, START, Y).steps.prediction.origin is None
-
-
-def test_a_step_that_cannot_be_settled_is_not_taken_and_is_audited():
-    one = kalman(rules=[settle_at(3)])
-    with pytest.raises(ArithmeticError, match=r"20 steps from 0, else 19, \[ 0"):
-        run(one, MODEL, START, Y, time_s=np.arange(20.0))
-    final = jax.jit(lambda y: run(one, MODEL, START, y))(Y)  # nothing can be raised in here
-    code = final.steps.prediction.code
-    np.testing.assert_array_equal(code[:3], Code.DONE)
-    np.testing.assert_array_equal(code[3:], Code.INFEASIBLE)
-    np.testing.assert_array_equal(
-        final.steps.prediction.belief.mean[4], final.steps.posterior.mean[3]
-    )
-    assert float(final.log_likelihood) == -np.inf
-    live = OnlineFilter(one, MODEL, START)
-    for _ in range(3):
-        live.predict()
-    with pytest.raises(ArithmeticError, match="4 steps from 4, else None, None"):
-        live.predict()
-    assert live.counts == {"INFEASIBLE": 1}
-
-
-def test_reset_keeps_what_was_learned():
-    one = kalman(unscented(redraw=False), rules=[count_outcomes()])
-    state = one.init(START, MODEL.dims)
-    state, _ = one.predict(state, MODEL.motion, None)
-    other = Belief(START.mean + 1.0, 0.5 * START.factor)
-    fresh = one.reset(state, other)
-    assert fresh.belief is other
-    assert fresh.memory is state.memory
-    again, _ = one.update(fresh, MODEL.sensors[0], jnp.ones(3))
-    direct, _ = one.update(one.init(other, MODEL.dims), MODEL.sensors[0], jnp.ones(3))
-    np.testing.assert_array_equal(again.belief.mean, direct.belief.mean)

@@ -1,53 +1,190 @@
-"""Refuse a measurement whose innovation is too large to be chance."""
+"""Refuse a measurement whose innovation is too large to be chance, but not for ever."""
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Literal, NamedTuple, get_args
+
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 from scipy import stats
 
+from robins import linalg
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
+from robins.filters.rules._reopen import reopened
+
+Recovery = Literal["accept", "inflate", "reinitialise"]
+Scope = Literal["joint", "component"]
+
+# Doubt added on re-initialisation, in units of R: the gain is then at least 0.99 of a copy.
+_OPEN = 100.0
 
 
-def gate(probability: float = 0.9999, patience: int = 10) -> Rule:
-    """Chi-square gate on the whole innovation of a sensor (Bar-Shalom et al. 2001, sec. 2.3.2).
+class _Channel(NamedTuple):
+    """What a gate remembers of a sensor; g is () for a joint gate, (m,) for one by component."""
 
-    A measurement is refused when its NIS exceeds the chi-square quantile for the components
-    present. Noted as ``gate.ratio``, NIS over that quantile: above 1 means refused, as on the
-    innovation test ratio scale of autopilots.
+    refused: Array  # (g) refusals in a row
+    ratio: Array  # () greatest test ratio of the last measurement
+    recovered: Array  # () bool, it was used although it was too large
+    residual: Array  # (k, m) the last innovations that were too large, newest last
+    known: Array  # (k, m) bool, components they had
 
-    A filter that has gone wrong refuses for ever, so after ``patience`` refusals of a sensor in a
-    row its next measurement is used whatever its size.
+
+def gate(
+    probability: float = 0.9999,
+    patience: int = 10,
+    recovery: Recovery = "accept",
+    scope: Scope = "joint",
+) -> Rule:
+    r"""Chi-square gate on the innovation of a sensor (Bar-Shalom et al. 2001, sec. 2.3.2).
+
+    A measurement is refused when its NIS r' S^-1 r exceeds q, the chi-square quantile for the
+    components present; by component, when r_i^2 / S_ii exceeds that of one. A filter that has gone
+    wrong would refuse for ever, so after ``patience`` refusals of a sensor in a row the next
+    measurement that is too large recovers it:
+
+    - ``accept`` uses it with the gain there is;
+    - ``inflate`` first doubts the prior along the innovation until the NIS is q,
+      P' = P + a G r r' G', G = P H' (H P H')^-1, a = 1 / q - 1 / NIS; by component D = diag(a_i
+      r_i^2) stands in for a r r', with a_i = 1 / q - S_ii / r_i^2;
+    - ``reinitialise`` believes it only if it and the refused ones before it *agree*: their scatter
+      about their mean, sum (r_k - mean)' R^-1 (r_k - mean), is within the chi-square quantile of
+      patience times m degrees of freedom. It then re-opens what is seen, D = r r' + 100 R, and
+      the measurement is followed. Refusals that disagree go on being refused.
+
+    Notes: ``gate.ratio``, min(NIS / q, 1), where 1 is refused or recovered (the innovation test
+    ratio of autopilots; by component the greatest), ``gate.refused``, refusals in a row (the most),
+    and ``gate.recovered``.
 
     Args:
         probability: share of right measurements that pass.
-        patience: refusals in a row that are believed.
+        patience: refusals in a row before recovery.
+        recovery: what then happens.
+        scope: judge the measurement as a whole, or each component by itself.
 
     Raises:
-        ValueError: the probability is not between 0 and 1, or patience is negative.
+        ValueError: the probability is not between 0 and 1, patience is negative or too short to
+            agree in, or recovery or scope is none of those above.
     """
     if not 0.0 < probability < 1.0:
         raise ValueError(f"gate probability must lie between 0 and 1, got {probability}")
-    if patience < 0:
-        raise ValueError(f"gate patience must not be negative, got {patience}")
+    if recovery not in get_args(Recovery):
+        raise ValueError(f"gate recovery must be one of {get_args(Recovery)}, got {recovery!r}")
+    if scope not in get_args(Scope):
+        raise ValueError(f"gate scope must be one of {get_args(Scope)}, got {scope!r}")
+    agreeing = recovery == "reinitialise"
+    if patience < int(agreeing):
+        raise ValueError(
+            f"gate patience must be at least {int(agreeing)} to {recovery}, got {patience}"
+        )
+    joint = scope == "joint"
+    kept = patience + 1 if agreeing else 0
 
     def init(belief, dims):
-        return {name: (jnp.zeros((), int), jnp.zeros(())) for name in dims}
+        def channel(m):
+            shape = () if joint else (m,)
+            no = jnp.zeros((), bool)
+            residual = jnp.zeros((kept, m))
+            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), no, residual, residual > 0.0)
+
+        return {name: channel(m) for name, m in dims.items()}
 
     def before(memory, prior: Belief, o: Observation):
-        seen = normalised(o)
-        # quantile by number of components used; none used passes
-        table = [jnp.inf, *stats.chi2.ppf(probability, range(1, len(o.residual) + 1))]
-        ratio = jnp.minimum(seen.nis / jnp.asarray(table)[seen.dof], jnp.finfo(float).max)
-        refused, _ = memory[o.sensor]
-        passed = (ratio <= 1.0) | (refused >= patience)
-        refused = jnp.where(seen.dof == 0, refused, jnp.where(passed, 0, refused + 1))
-        memory = {**memory, o.sensor: (refused, ratio)}
-        return memory, prior, o._replace(accepted=o.accepted & passed)
+        was: _Channel = memory[o.sensor]
+        q, ratio, judged, used = _judge(o, probability, joint)
+        over = judged & ~(ratio <= 1.0)
+        due = over & (was.refused >= patience)
+        residual, known = was.residual, was.known
+        if agreeing:
+            fresh = jnp.broadcast_to(over, used.shape)[None, :]
+            residual = jnp.where(fresh, _push(residual, o.residual), residual)
+            known = jnp.where(fresh, _push(known, used), known)
+            agree = partial(_agree_as_one if joint else _agree_each, probability)
+            due = jax.lax.cond(
+                jnp.any(due),
+                lambda: due & agree(residual, known, o.noise),
+                lambda: due,
+            )
+        passed = ~over | due
+        refused = jnp.where(judged, jnp.where(passed, 0, was.refused + 1), was.refused)
+        worst = jnp.max(jnp.where(over, 1.0, ratio), initial=0.0)
+        worst = jnp.where(jnp.any(judged), worst, was.ratio)
+        now = _Channel(refused, worst, jnp.any(due), residual, known)
+
+        if recovery != "accept":
+            doubted = due & used
+            jump = jnp.where(doubted, o.residual, 0.0)
+            if not agreeing:
+                excess = jnp.where(due, 1.0 - 1.0 / jnp.where(due, ratio, 2.0), 0.0)
+                jump = jump * jnp.sqrt(excess / q)
+            root = jump[:, None] if joint else jnp.diag(jump)
+            if agreeing:
+                root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
+            prior = jax.lax.cond(
+                jnp.any(due),
+                lambda: reopened(prior, o, doubted, root),
+                lambda: Belief(*prior),
+            )
+        return {**memory, o.sensor: now}, prior, o._replace(accepted=o.accepted & passed)
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "gate.ratio": memory[o.sensor][1]}
+        channel: _Channel = memory[o.sensor]
+        notes = {
+            **info.notes,
+            "gate.ratio": channel.ratio,
+            "gate.refused": jnp.max(channel.refused, initial=0),
+            "gate.recovered": channel.recovered,
+        }
         return memory, posterior, info._replace(notes=notes)
 
     return Rule(init=init, before=before, after=after, name="gate")
+
+
+def _judge(o: Observation, probability: float, joint: bool):
+    """Limit, ratio to it, whether there is something to judge, and the components used."""
+    seen = normalised(o)
+    if joint:
+        table = jnp.asarray(_quantiles(probability, 1, len(o.residual)))
+        q = table[seen.dof]
+        return q, seen.nis / q, seen.dof > 0, seen.used
+    q = _quantiles(probability, 1, 1)[1]
+    variance = jnp.sum(seen.factor**2, axis=1)
+    square = jnp.where(seen.used, o.residual, 0.0) ** 2
+    return q, square / variance / q, seen.used, seen.used
+
+
+def _quantiles(probability: float, each: int, most: int) -> list[float]:
+    """Chi-square quantiles of 0, 1, ..., most times ``each`` degrees of freedom."""
+    dof = range(each, each * most + 1, each)
+    return [float("inf"), *stats.chi2.ppf(probability, dof).tolist()]
+
+
+def _push(rows: Array, newest: Array) -> Array:
+    return jnp.concatenate([rows[1:], newest[None]])
+
+
+def _scatter(residual: Array, known: Array) -> Array:
+    """Deviations from the mean, 0 in components that were not always there."""
+    shared = jnp.all(known, axis=0, keepdims=True)
+    return jnp.where(shared, residual - jnp.mean(residual, axis=0, keepdims=True), 0.0)
+
+
+def _agree_as_one(probability: float, residual: Array, known: Array, noise: Array) -> Array:
+    shared = jnp.all(known, axis=0)
+    N = jnp.where(shared[:, None], noise, 0.0)
+    L = linalg.tria(N, jnp.diag(jnp.where(shared, 0.0, 1.0)))
+    # A component without noise agrees only if it repeats: the least pivot makes all else huge.
+    L = L + jnp.diag(jnp.where(jnp.diagonal(L) == 0.0, jnp.finfo(float).tiny, 0.0))
+    white = linalg.solve_lower(L, _scatter(residual, known).T)
+    limits = _quantiles(probability, len(residual) - 1, len(shared))
+    count = jnp.sum(shared)
+    return (count > 0) & (jnp.sum(white**2) <= jnp.asarray(limits)[count])
+
+
+def _agree_each(probability: float, residual: Array, known: Array, noise: Array) -> Array:
+    limit = _quantiles(probability, len(residual) - 1, 1)[1]
+    scatter = jnp.sum(_scatter(residual, known) ** 2, axis=0)
+    return jnp.all(known, axis=0) & (scatter <= limit * jnp.sum(noise**2, axis=1))
