@@ -1,0 +1,247 @@
+"""Interacting multiple model: several filters of one state, and how likely each is the right one.
+
+Blom & Bar-Shalom, *The interacting multiple model algorithm for systems with Markovian switching
+coefficients*, IEEE Trans. Automatic Control 33 (1988). With p_ij the probability of a change from
+mode i to mode j in a step and mu_i that of mode i, each step
+
+    predicts    c_j = sum_i p_ij mu_i
+    mixes       filter j begins with the moments of the mixture of all, weights p_ij mu_i / c_j
+    updates     mu_j = c_j L_j / sum_k c_k L_k, L_j the likelihood that filter j gives what is seen
+
+and answers with the moments of the mixture under mu. Probabilities are kept as logarithms, and
+moments are taken on the state's manifold and on factors, so that nothing is subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from robins import linalg
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.mixture import deviations, log_normalised, matched, wide
+from robins.filters.model import Motion, Sensor
+
+Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
+
+_ONE = 1e-9  # how far a sum of probabilities may be off
+
+
+class Mode(NamedTuple):
+    """A filter and what of the model is its own."""
+
+    filter_: Filter
+    motion: Motion | None = None
+    sensors: tuple[Sensor, ...] = ()
+
+
+class Interaction(NamedTuple):
+    """Memory of a mixture of filters."""
+
+    states: tuple[FilterState, ...]  # one a mode
+    log_probability: Array  # (modes,)
+
+
+def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor] = ()) -> Mode:
+    """One mode of `imm`.
+
+    Args:
+        filter_: from `kalman` and its kin.
+        motion: of this mode, of the same state; else the run's.
+        sensors: of this mode, each in the place of the run's sensor of its name.
+    """
+    return Mode(filter_, motion, tuple(sensors))
+
+
+def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = None) -> Filter:
+    """Interacting multiple model filter over any filters of the same state.
+
+    Modes may differ in rules, in linearisation, and by `mode` in motion and sensors. Each keeps the
+    memory of its rules; only beliefs are mixed. With nothing measured, probabilities only mix.
+
+    The `StepInfo` is that of the mixture: innovation and factor are its moments before the update,
+    the gain is the mean of the modes' gains, and ``imm.probability`` (modes,) is noted. What rules
+    of mode i note is found under ``imm.i.`` and its name.
+
+    Likelihoods only compare where all modes use the same components. Where a rule of one mode
+    refuses what another uses, the measurement leaves the probabilities as they are. A mode whose
+    step fails is out until the next mixing; the code is a failure only where all fail.
+
+    Args:
+        modes: filters, or what `mode` makes of one.
+        transition: (modes, modes), row i the probabilities to change from i in one step.
+        start: (modes,) probabilities before the first prediction; all equal where not given.
+
+    Raises:
+        ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
+            one. When a run begins: a mode brings a sensor that the model does not have.
+    """
+    every = tuple(m if isinstance(m, Mode) else Mode(m) for m in modes)
+    count = len(every)
+    if not count:
+        raise ValueError("imm needs at least one mode")
+    even = np.full(count, 1.0 / count)
+    first = _probabilities("start", even if start is None else start, (count,))
+    with np.errstate(divide="ignore"):
+        log_change = np.log(_probabilities("transition", transition, (count, count)))
+        log_first = np.log(first)
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        own = {s.name for m in every for s in m.sensors}
+        if unknown := own - set(dims):
+            raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
+        states = tuple(m.filter_.init(belief, dims) for m in every)
+        return FilterState(belief, Interaction(states, jnp.asarray(log_first)))
+
+    def mixed(states: tuple[FilterState, ...], joint: Array) -> tuple[list[FilterState], Array]:
+        """Where each filter begins, and the predicted log-probabilities."""
+        begun, log_next = [], []
+        beliefs = _stack([s.belief for s in states])
+        for j, (m, state) in enumerate(zip(every, states, strict=True)):
+            log_weight, log_sum = log_normalised(joint[:, j])
+            weight = jnp.exp(log_weight)
+            other = m.filter_.reset(state, matched(beliefs, weight, state.belief.mean))
+            # A mode that nothing comes to goes on alone, and so bit for bit does one that mixes
+            # with none.
+            alone = ~jnp.isfinite(log_sum) | (weight[j] == 1.0)
+            begun.append(_select(alone, state, other))
+            log_next.append(log_sum)
+        return begun, jnp.stack(log_next)
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        states, log_now = state.memory
+        joint = log_now[:, None] + jnp.asarray(log_change)
+        begun, log_next = (list(states), log_now) if count == 1 else mixed(states, joint)
+        after, codes = [], []
+        for m, one in zip(every, begun, strict=True):
+            one, prediction = m.filter_.predict(one, motion if m.motion is None else m.motion, u)
+            after.append(one)
+            codes.append(prediction.code)
+        code = jnp.stack(codes)
+        taken = code == int(Code.DONE)
+        log_next = _among(taken, log_next)
+        failed = code[jnp.argmax(log_now)]
+        belief = _mixture(after, log_next)
+        memory = Interaction(tuple(after), log_next)
+        outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
+        return FilterState(belief, memory), Prediction(None, belief, outcome)
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        states, log_prior = state.memory
+        after, infos = [], []
+        for m, one in zip(every, states, strict=True):
+            own = next((s for s in m.sensors if s.name == sensor.name), sensor)
+            one, info = m.filter_.update(one, own, y, aux)
+            after.append(one)
+            infos.append(info)
+        notes = {f"imm.{i}.{k}": v for i, info in enumerate(infos) for k, v in info.notes.items()}
+        seen = _stack([info._replace(notes={}) for info in infos])
+        sound = ~jnp.isneginf(seen.log_likelihood)
+        of_all = jnp.any(seen.used & sound[:, None], axis=0)
+        alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
+        gained = jnp.where(sound & ~alike, 0.0, seen.log_likelihood)
+        log_post, _ = log_normalised(log_prior + gained)
+        log_post = jnp.where(jnp.any(sound), log_post, log_prior)
+        if count == 1:
+            info = infos[0]._replace(notes={})
+        else:
+            info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
+        notes["imm.probability"] = jnp.exp(log_post)
+        # Where no mode has moved the mixture stands bit for bit.
+        still = _equal([s.belief for s in after], [s.belief for s in states])
+        belief = _select(still, state.belief, _mixture(after, log_post))
+        return FilterState(belief, Interaction(tuple(after), log_post)), info._replace(notes=notes)
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        held = state.memory
+        states = [m.filter_.reset(s, belief) for m, s in zip(every, held.states, strict=True)]
+        return FilterState(belief, held._replace(states=tuple(states)))
+
+    def audit(begin: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
+        def rerun(i: int, again: Again, inner: FilterState) -> FilterState:
+            states = begin.memory.states
+            states = (*states[:i], inner, *states[i + 1 :])
+            return again(begin._replace(memory=begin.memory._replace(states=states))).memory.states[
+                i
+            ]
+
+        for i, m in enumerate(every):
+            if m.filter_.audit is not None:
+                once_more = None if again is None else (lambda x, i=i, a=again: rerun(i, a, x))
+                m.filter_.audit(begin.memory.states[i], final.memory.states[i], once_more, time)
+
+    audited = any(m.filter_.audit is not None for m in every)
+    return Filter(init, predict, update, reset, audit if audited else None)
+
+
+def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:
+    value = np.asarray(given, dtype=float)
+    if value.shape != shape:
+        raise ValueError(f"{name} of imm has shape {value.shape}, its modes need {shape}")
+    total = value.sum(axis=-1)
+    if not (np.all(value >= 0.0) and np.all(np.abs(total - 1.0) <= _ONE)):
+        raise ValueError(
+            f"{name} of imm must hold probabilities, rows that sum to one: got {value.tolist()}"
+        )
+    return value / total[..., None]
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
+
+
+def _select(condition: Array, new: Any, old: Any) -> Any:
+    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _among(taken: Array, log_probability: Array) -> Array:
+    """The same without modes whose step failed, unless all did."""
+    kept = jnp.where(taken | ~jnp.any(taken), log_probability, -jnp.inf)
+    return log_normalised(kept)[0]
+
+
+def _mixture(states: Sequence[FilterState], log_probability: Array) -> Belief:
+    """Moments of all modes; those of one that is certain are its own, bit for bit."""
+    if len(states) == 1:
+        return states[0].belief
+    beliefs = _stack([s.belief for s in states])
+    likely = jnp.argmax(log_probability)
+    best = jax.tree_util.tree_map(lambda a: a[likely], beliefs)
+    weight = jnp.exp(log_probability)
+    return _select(weight[likely] == 1.0, best, matched(beliefs, weight, best.mean))
+
+
+def _equal(one: Any, other: Any) -> Array:
+    pairs = zip(jax.tree_util.tree_leaves(one), jax.tree_util.tree_leaves(other), strict=True)
+    return jnp.all(jnp.stack([jnp.all(a == b) for a, b in pairs]))
+
+
+def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:
+    """One `StepInfo` for the mixture of predicted measurements."""
+    _, log_likelihood = log_normalised(log_prior + seen.log_likelihood)
+    lost = jnp.isneginf(log_likelihood)
+    used = used & ~lost
+    prior = jnp.exp(log_normalised(log_prior)[0])
+    missing = jnp.any(jnp.isnan(seen.innovation), axis=0)
+    residual = jnp.where(missing[None], 0.0, seen.innovation)
+    mean = prior @ residual
+    residual = jnp.where(used[None], residual, mean[None])
+    factor = linalg.tria(wide(deviations(residual, seen.factor, prior, mean)))
+    white = linalg.solve_lower(factor, jnp.where(used, mean, 0.0)[:, None])[:, 0]
+    return StepInfo(
+        innovation=jnp.where(missing, jnp.nan, mean),
+        factor=factor,
+        gain=jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain),
+        used=used,
+        nis=jnp.sum(white**2),
+        dof=jnp.sum(used),
+        log_likelihood=log_likelihood,
+        code=seen.code[jnp.argmax(log_post)],
+        notes={},
+    )

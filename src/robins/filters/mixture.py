@@ -1,0 +1,100 @@
+"""The Gaussian that has the mean and covariance of several, weighted: moments on a manifold."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief
+from robins.manifold import State
+
+_ROUNDS = 6  # of the mean on a curved space: it comes nearer by about the square of the spread
+
+
+def log_normalised(log_weight: Array) -> tuple[Array, Array]:
+    """Logarithms of weights that sum to one, and the logarithm of the sum they had.
+
+    Weights that are all zero (or not a number) become equal, and their sum is then -inf.
+    """
+    log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
+    total = jax.scipy.special.logsumexp(log_weight)
+    lost = ~jnp.isfinite(total)
+    even = jnp.full_like(log_weight, -jnp.log(float(log_weight.shape[0])))
+    # The sum is taken of safe numbers where it is lost, so that no derivative is NaN.
+    safe = jnp.where(lost, 0.0, total)
+    return jnp.where(lost, even, log_weight - safe), jnp.where(lost, -jnp.inf, total)
+
+
+def root(weight: Array) -> Array:
+    """Square root of weights, with a finite derivative at zero."""
+    some = weight > 0.0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, weight, 1.0)), 0.0)
+
+
+def mean_of(states: State, weight: Array, about: State) -> State:
+    """Weighted mean of states (leading axis), by Gauss-Newton steps begun at ``about``.
+
+    States of weight zero do not count, even if they are not finite.
+    """
+    curved = any(manifold.is_element(leaf) for leaf in manifold.leaves(about))
+    for _ in range(_ROUNDS if curved else 1):
+        about = manifold.retract(about, weight @ _offsets(states, weight, about))
+    return about
+
+
+def deviations(states: State, factors: Array, weight: Array, mean: State) -> Array:
+    """Columns of a factor of the mixture's covariance about a mean, one block a state.
+
+    The covariance is the sum of w_i (J_i P_i J_i' + d_i d_i'), with d_i leading from the mean to
+    state i and J_i what becomes of small errors at state i when they are seen from the mean.
+
+    Args:
+        states: leading axis r.
+        factors: (r, n, k), zero rows and columns welcome; k = 0 for points.
+        weight: (r,), sums to one.
+        mean: a single state.
+
+    Returns:
+        (r, n, k + 1).
+    """
+    d = _offsets(states, weight, mean)
+    share = root(weight)[:, None, None]
+    kept = jnp.where(share > 0.0, factors, 0.0)
+    if factors.shape[2] and any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
+        kept = jax.vmap(lambda x, S: _transport(mean, x) @ S)(_sound(states, weight, mean), kept)
+    return share * jnp.concatenate([kept, d[:, :, None]], axis=2)
+
+
+def matched(beliefs: Belief, weight: Array, about: State) -> Belief:
+    """The Gaussian with the first two moments of a mixture (leading axis r)."""
+    mean = mean_of(beliefs.mean, weight, about)
+    blocks = deviations(beliefs.mean, beliefs.factor, weight, mean)
+    return Belief(mean, linalg.tria(wide(blocks)))
+
+
+def wide(blocks: Array) -> Array:
+    """(r, n, k) blocks side by side, (n, r k)."""
+    r, n, k = blocks.shape
+    return jnp.moveaxis(blocks, 0, 1).reshape(n, r * k)
+
+
+def _sound(states: State, weight: Array, instead: State) -> State:
+    """The states, with another in the place of those that do not count."""
+
+    def pick(leaf, other):
+        counts = (weight > 0.0).reshape(-1, *(1,) * jnp.ndim(other))
+        return jnp.where(counts, leaf, other[None])
+
+    return jax.tree_util.tree_map(pick, states, instead)
+
+
+def _offsets(states: State, weight: Array, about: State) -> Array:
+    return jax.vmap(lambda x: manifold.local(about, x))(_sound(states, weight, about))
+
+
+def _transport(mean: State, x: State) -> Array:
+    """Jacobian of ``local(mean, retract(x, e))`` at e = 0."""
+    origin = jnp.zeros(manifold.dim(mean))
+    return jax.jacfwd(lambda e: manifold.local(mean, manifold.retract(x, e)))(origin)
