@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
@@ -14,8 +15,8 @@ from robins.filters.observation import Observation
 
 Number = float | int  # where types are checked an int is no float
 
-# Directions less certain than this share of a state's deviation are solved with as if they had it.
-_FLOOR = 1e-10
+_SOLID = 1e-6  # pivots below this share of a state's deviation are not divided by just so
+_FLOOR = 1e-10  # and nothing is taken to be more certain than this share
 
 
 class White(NamedTuple):
@@ -42,14 +43,31 @@ def whitened(o: Observation) -> White:
 
     A component without noise of its own has no such unit and does not count.
     """
-    noise = jnp.where((o.accepted & o.present)[:, None], o.noise, 0.0)
-    root, counts = linalg.guard(noise)
+    root, counts = _root(o.noise, o.accepted & o.present)
     n = o.spread.shape[1]
     away = jnp.zeros_like(o.residual) if o.deficit is None else o.deficit
     columns = [o.residual[:, None], away[:, None], o.spread, o.excess]
     white = linalg.solve_lower(root, jnp.concatenate(columns, axis=1))
     left_over = jnp.sum(white[:, n + 2 :] ** 2) - jnp.sum(white[:, 1] ** 2)
     return White(white[:, 0], white[:, 2 : n + 2], left_over, counts)
+
+
+def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
+    """Factor of R without the rows not taken, safe to solve with, and which rows it knows."""
+    m = len(noise)
+    kept = jnp.where(taken[:, None], noise, 0.0)
+    if noise.shape[1] < m:
+        return linalg.guard(kept)
+    # The usual noise is a triangle already, and what is missing correlates with nothing.
+    square = kept[:, :m] + jnp.diag(jnp.where(taken, 0.0, 1.0))
+    whole = jnp.concatenate([square, kept[:, m:]], axis=1)
+    apart = ~jnp.any((kept[:, :m] != 0.0) & ~taken[None, :])
+    pivots = jnp.where(jnp.eye(m, dtype=bool) & ~taken[None, :], jnp.inf, square)
+    return jax.lax.cond(
+        linalg.plainly_independent(whole) & apart,
+        lambda: (pivots, taken),
+        lambda: linalg.guard(kept),
+    )
 
 
 def averaged(power: Array, white: White, keep: Number) -> Array:
@@ -80,29 +98,34 @@ def ratio(N: Array, M: Array, limit: Number) -> Array:
     return jnp.where(solid, jnp.clip(N / jnp.where(solid, M, 1.0), 1.0, limit), 1.0)
 
 
-def seen_through(spread: Array, S: Array, columns: Array) -> Array:
-    """H A for columns A in the range of S, where only the spread H S is known.
+def seen_by(spread: Array, S: Array) -> Array:
+    """H where only S and the spread H S are known.
 
-    H = (H S) S' (S S')^-1, with a floor under what is all but certain: that errs by 1e-10 of a
-    state's deviation at most, and a state known exactly may be among them.
+    Where S is all but singular H = (H S) S' (S S')^-1 has a floor under what is all but certain:
+    for A in the range of S, H A errs by 1e-10 of a state's deviation at most, and a state known
+    exactly may be among them.
     """
     sigma = jnp.sqrt(jnp.sum(S**2, axis=1))
-    floor = jnp.where(sigma > 0.0, _FLOOR * sigma, 1.0)
-    L = linalg.tria(S, jnp.diag(floor))
-    n = len(sigma)
-    both = linalg.solve_lower(L, jnp.concatenate([S, columns], axis=1))
-    return (spread @ both[:, :n].T) @ both[:, n:]
+
+    def solid():
+        return linalg.solve_lower_transposed(S, spread.T).T
+
+    def singular():
+        L = linalg.tria(S, jnp.diag(jnp.where(sigma > 0.0, _FLOOR * sigma, 1.0)))
+        return linalg.solve_lower_transposed(L, linalg.solve_lower(L, S) @ spread.T).T
+
+    pivots = jnp.abs(jnp.diagonal(S))
+    return jax.lax.cond(jnp.all(pivots > _SOLID * sigma), solid, singular)
 
 
-def where_seen(S: Array, spread: Array, factor: Array) -> Array:
+def _where_seen(S: Array, spread: Array, factor: Array) -> Array:
     """Factor of P + (lambda - 1) P H' (H P H')^+ H P: H P H' grows by lambda and nothing else does.
 
     The added part is S T'T S' with T the orthonormal rows that span those of H S.
     """
     root, _ = linalg.guard(spread)
     T = linalg.solve_lower(root, spread)
-    wider = linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
-    return jnp.where(factor > 1.0, wider, S)
+    return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
 
 
 def faded(
@@ -114,7 +137,7 @@ def faded(
         S: (n, n).
         white: the measurement as S lets it expect.
         N: () excess power to be explained.
-        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, "projected" as `where_seen`.
+        form: "lumped" lambda P, "multiple" Lam^1/2 P Lam^1/2, "projected" only what is seen.
         weights: (n,) of states for "multiple", greatest 1; None for all alike.
         limit: upper bound of lambda.
 
@@ -123,13 +146,13 @@ def faded(
     """
     if form == "projected":
         factor = ratio(N, white.predicted, limit)
-        return where_seen(S, white.spread, factor), factor
+        wider = jax.lax.cond(factor > 1.0, lambda: _where_seen(S, white.spread, factor), lambda: S)
+        return wider, factor
     if form == "lumped" or weights is None:
         factor = ratio(N, white.predicted, limit)
         return jnp.sqrt(factor) * S, factor
-    # sum of weight_j (P H' H)_jj is the trace of (H diag(weight) S) (H S)'
-    weighted = seen_through(white.spread, S, jnp.asarray(weights)[:, None] * S)
-    factor = ratio(N, jnp.sum(weighted * white.spread) + white.left_over, limit)
+    each = jnp.sum((S @ white.spread.T) * seen_by(white.spread, S).T, axis=1)  # (P H' H)_jj
+    factor = ratio(N, jnp.sum(weights * each) + white.left_over, limit)
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal, NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -21,7 +22,7 @@ from robins.filters.rules._fading import (
     checked_weights,
     faded,
     ratio,
-    seen_through,
+    seen_by,
     significant,
     total,
     whitened,
@@ -165,13 +166,12 @@ def _faded_outside(memory: _Memory, S: Array, white: White, N: Array, limit: Num
     whole = jnp.concatenate([S, linalg.zeros(n, memory.moved.shape[1] - n)], axis=1)
     moved = jnp.where(memory.fresh, memory.moved, whole)
     noise = jnp.where(memory.fresh, memory.noise, 0.0)
-    seen = seen_through(white.spread, S, jnp.concatenate([moved, noise], axis=1))
-    of_moved, of_noise = seen[:, : moved.shape[1]], seen[:, moved.shape[1] :]
-    M = jnp.sum(of_moved**2) + white.left_over
-    factor = ratio(N - jnp.sum(of_noise**2), M, limit)
+    H = seen_by(white.spread, S)
+    M = jnp.sum((H @ moved) ** 2) + white.left_over
+    factor = ratio(N - jnp.sum((H @ noise) ** 2), M, limit)
     more = factor > 1.0
-    gain = jnp.where(more, jnp.sqrt(jnp.where(more, factor - 1.0, 1.0)), 0.0)
-    return jnp.where(more, linalg.tria(S, gain * moved), S), factor
+    gain = jnp.sqrt(jnp.where(more, factor - 1.0, 1.0))
+    return jax.lax.cond(more, lambda: linalg.tria(S, gain * moved), lambda: S), factor
 
 
 def _fitted(columns: Array, width: int) -> Array:
