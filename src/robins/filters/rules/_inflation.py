@@ -1,0 +1,129 @@
+"""What the H-infinity rules share: weights, local bounds, and inflation of a factor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from robins import linalg
+from robins.filters.belief import Belief
+from robins.manifold import State
+
+Weight = Callable[[State], Array]  # mean -> (q, n)
+
+
+def as_weight(weight: Any, whose: str) -> Weight:
+    """L, the rows whose error is bounded, as a function of the mean.
+
+    Args:
+        weight: (q, n) matrix, (n,) diagonal, or ``mean -> `` one of these.
+        whose: rule it belongs to, for messages.
+
+    Raises:
+        TypeError: it is not made of real numbers.
+        ValueError: it has another shape, is not finite or says that nothing counts.
+    """
+    if callable(weight):
+        return lambda mean: _rows(jnp.asarray(weight(mean), float), whose)
+    numbers = np.asarray(weight)
+    if numbers.dtype.kind not in "iuf":
+        raise TypeError(f"{whose}: weight holds {numbers.dtype}, real numbers are wanted")
+    numbers = numbers.astype(float)
+    if not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{whose}: weight has entries that are not finite numbers")
+    if not np.any(numbers):
+        raise ValueError(f"{whose}: weight is zero, so no error would count")
+    if numbers.ndim == 1:
+        numbers = np.diag(numbers)
+    if numbers.ndim == 2:
+        numbers = numbers[np.any(numbers != 0.0, axis=1)]
+    L = _rows(jax.device_put(numbers), whose)
+    return lambda mean: L
+
+
+def _rows(L: Array, whose: str) -> Array:
+    if jnp.ndim(L) not in (1, 2):
+        raise ValueError(
+            f"{whose}: weight has shape {jnp.shape(L)}; a (q, n) matrix or an (n,) diagonal is "
+            "wanted, in the units in which an error is to count"
+        )
+    return linalg.as_factor(L)
+
+
+def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, "q n"]:
+    """L S, whose greatest singular value is the local bound.
+
+    Raises:
+        ValueError: L has another number of columns than the state has components.
+    """
+    L, n = weight(belief.mean), belief.factor.shape[0]
+    if L.shape[1] != n:
+        raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")
+    return L @ belief.factor
+
+
+def local_bound(weighted: Float[Array, "q n"]) -> Float[Array, ""]:
+    """sqrt(lambda_max(L P L')), the least gamma that this step alone allows; no derivative."""
+    B = jax.lax.stop_gradient(weighted)
+    gram = B @ B.T if B.shape[0] <= B.shape[1] else B.T @ B
+    return jnp.sqrt(jnp.maximum(linalg.eigenvalue_bounds(gram)[1], 0.0))
+
+
+def inflated(
+    factor: Float[Array, "n n"], A: Float[Array, "q n"]
+) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """Factor of ``S (I - A'A)^-1 S'`` for A = L S / gamma, and whether that exists.
+
+    It exists when I - A'A has a Cholesky factor, which is asked before anything is solved. Where it
+    does not, the factor comes back as it was.
+    """
+    return _divided(factor, jnp.eye(factor.shape[0]) - A.T @ A)
+
+
+def deflated(
+    factor: Float[Array, "n n"], A: Float[Array, "q n"], share: float
+) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """Factor of the largest P that leaves L P L' within share gamma^2, and whether that is less.
+
+    With S'L'LS / gamma^2 = U diag(a) U' it is S U diag(min(1, share / a)) U'S'. As an inverse that
+    is I + (a - share)_+ / share, so that only what is too much has a root taken. Derivatives take
+    what is too much as given.
+    """
+    n = factor.shape[0]
+    excess = linalg.symmetric_root(jax.lax.stop_gradient(A.T @ A - share * jnp.eye(n)))
+    lower, _ = _divided(factor, jnp.eye(n) + excess @ excess.T / share)
+    return lower, jnp.any(excess != 0.0)
+
+
+def _divided(factor, M):
+    """Lower factor of S M^-1 S', and whether M is positive definite.
+
+    With N upper triangular, N N' = M, the product S N^-T is lower triangular as S is. N is the
+    Cholesky factor of M with rows and columns in reverse.
+    """
+    C = _root(M[::-1, ::-1])
+    exists = C[0, 0] > 0.0
+    divided = linalg.solve_lower(jnp.where(exists, C, jnp.eye(C.shape[0])), factor.T[::-1])
+    return divided[::-1].T, exists
+
+
+@jax.custom_jvp
+def _root(M):
+    """Cholesky factor, zero where there is none: derivatives must not meet NaN."""
+    C = linalg.cholesky(M)
+    return jnp.where(jnp.all(jnp.isfinite(C)), C, 0.0)
+
+
+@_root.defjvp
+def _root_jvp(primals, tangents):
+    # C C' = M gives dC = C half(C^-1 dM C^-T), half being the lower triangle with half a diagonal.
+    C = _root(*primals)
+    solid = jnp.where(C[0, 0] > 0.0, C, jnp.eye(C.shape[0]))
+    inner = linalg.solve_lower(solid, linalg.solve_lower(solid, tangents[0]).T)
+    half = jnp.tril(inner) - 0.5 * jnp.diag(jnp.diagonal(inner))
+    return C, C @ half

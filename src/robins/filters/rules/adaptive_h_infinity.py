@@ -1,0 +1,146 @@
+"""Choose the bound of an H-infinity filter step by step, from how surprising measurements are."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+from robins.filters.rules._inflation import (
+    as_weight,
+    deflated,
+    inflated,
+    local_bound,
+    weighted_factor,
+)
+
+Number = float | int
+
+NAME = "adaptive_h_infinity"
+SHARE = 0.95  # of xi^2 that a compensated P is left with
+LARGEST = 1e200  # a NIS beyond it counts as this, so that sums stay finite
+
+
+class AdaptiveMemory(NamedTuple):
+    """What the rule remembers from step to step."""
+
+    nis: Array  # (window,) NIS of the last steps, summed over sensors; a ring
+    dof: Array  # (window,) components used in them
+    at: Array  # () where in the ring this step is
+    inverse: Array  # () 1 / xi of the last step; 0 before there was one
+    events: Array  # () steps in which P was compensated
+
+
+def adaptive_h_infinity(
+    weight: Any,
+    zeta: Number = 1.0,
+    window: int = 10,
+    floor: Number = 1.05,
+    ceiling: Number = 1e6,
+    compensate_first: bool = False,
+) -> Rule:
+    """H-infinity with a bound of its own at each step: a *reconstruction*.
+
+    After the adaptive-compensation H-infinity filter of a patent on transfer alignment (Southeast
+    University) whose formulas (6) to (24) are lost; the kind of each step is known from its words,
+    the formulas are a reading of them and were not checked against the source:
+
+        q      NIS over its degrees of freedom, over the last ``window`` steps with a measurement
+        alpha  1 + 1 / (zeta max(q - 1, 1e-6)), kept between ``floor`` and ``ceiling``
+        xi^2   alpha lambda_max(L P L')
+        P      becomes (P^-1 - xi^-2 L'L)^-1 before the next prediction, as in `h_infinity`
+
+    so it exists by construction, is nearly the Kalman filter while innovations are as expected
+    (q = 1 if the model is right), and raises the gain when they are not. It cannot tell a wrong
+    motion, where that is right, from a wrong measurement, where it is not. With L / xi_k for the
+    weights of the steps, the bound of `h_infinity` holds for gamma = 1.
+
+    Notes, after each sensor (the last one's are the step's): ``adaptive_h_infinity.q``, ``.alpha``,
+    ``.xi`` and ``.bound``, sqrt(lambda_max(L P L')), in units of L x; ``.compensated`` if asked
+    for. Derivatives take the local bound as given. ``floor = ceiling = inf`` is the Kalman filter.
+
+    Args:
+        weight: L, which errors count and in what units: (q, n) matrix, (n,) diagonal, or
+            ``mean -> `` one of these. No default.
+        zeta: how fast surprise raises the gain; 0.01 to 1 hardly differ.
+        window: steps that q is taken over.
+        floor: least alpha, above 1: 1.05 inflates by up to 21.
+        ceiling: largest alpha.
+        compensate_first: as the patent orders it: where P does not allow the xi of the step before,
+            shrink it (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before choosing the
+            new one. This claims knowledge that nobody has.
+
+    Raises:
+        TypeError: the weight is not of real numbers.
+        ValueError: zeta is not positive, the window less than 1, floor not above 1, ceiling below
+            floor, or the weight is not finite or of the wrong shape.
+    """
+    if not zeta > 0.0:
+        raise ValueError(f"zeta must be positive, got {zeta}")
+    if window < 1:
+        raise ValueError(f"window must be at least one step, got {window}")
+    if not 1.0 < floor <= ceiling:
+        raise ValueError(f"1 < floor <= ceiling is wanted, got floor {floor}, ceiling {ceiling}")
+    rows = as_weight(weight, NAME)
+
+    def choose(memory: AdaptiveMemory):
+        dof = jnp.sum(memory.dof)
+        q = jnp.where(dof > 0.0, jnp.sum(memory.nis) / jnp.maximum(dof, 1.0), 1.0)
+        return q, jnp.clip(1.0 + 1.0 / (zeta * jnp.maximum(q - 1.0, 1e-6)), floor, ceiling)
+
+    def init(belief: Belief, dims):
+        weighted_factor(rows, belief, NAME)
+        counts = jnp.zeros((), int)
+        return AdaptiveMemory(jnp.zeros(window), jnp.zeros(window), counts, jnp.zeros(()), counts)
+
+    def compensate(memory: AdaptiveMemory, factor: Array, weighted: Array):
+        """The factor that allows the last xi, and whether it had to be made."""
+        asked = memory.inverse * local_bound(weighted) >= 1.0
+        shrunk, _ = deflated(factor, memory.inverse * weighted, SHARE)
+        return jnp.where(asked, shrunk, factor), asked
+
+    def after(memory: AdaptiveMemory, posterior: Belief, info: StepInfo, o: Observation):
+        here = memory.at
+        memory = memory._replace(
+            nis=memory.nis.at[here].add(jnp.minimum(info.nis, LARGEST)),
+            dof=memory.dof.at[here].add(info.dof.astype(float)),
+        )
+        weighted = weighted_factor(rows, posterior, NAME)
+        bound = local_bound(weighted)
+        q, alpha = choose(memory)
+        notes = {"q": q, "alpha": alpha, "xi": jnp.sqrt(alpha) * bound, "bound": bound}
+        if compensate_first:
+            factor, asked = compensate(memory, posterior.factor, weighted)
+            left = local_bound(weighted_factor(rows, posterior._replace(factor=factor), NAME))
+            notes |= {"xi": jnp.sqrt(alpha) * left, "compensated": asked & (memory.dof[here] > 0.0)}
+        named = {f"{NAME}.{key}": value for key, value in notes.items()}
+        return memory, posterior, info._replace(notes={**info.notes, **named})
+
+    def settle(memory: AdaptiveMemory, belief: Belief):
+        counts = memory.dof[memory.at] > 0.0
+        weighted = weighted_factor(rows, belief, NAME)
+        factor, asked = belief.factor, jnp.array(False)
+        if compensate_first:
+            factor, asked = compensate(memory, factor, weighted)
+            weighted = weighted_factor(rows, belief._replace(factor=factor), NAME)
+        alpha, bound = choose(memory)[1], local_bound(weighted)
+        xi = jnp.sqrt(alpha) * bound
+        inverse = jnp.where(xi > 0.0, 1.0 / jnp.where(xi > 0.0, xi, 1.0), 0.0)
+        wide, exists = inflated(factor, inverse * weighted)
+        acts = counts & exists & (asked | (inverse > 0.0))
+        following = jnp.where(counts, (memory.at + 1) % window, memory.at)
+        memory = AdaptiveMemory(
+            nis=memory.nis.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
+            dof=memory.dof.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
+            at=following,
+            inverse=jnp.where(counts, inverse, memory.inverse),
+            events=memory.events + (counts & asked).astype(int),
+        )
+        code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
+        return memory, belief._replace(factor=jnp.where(acts, wide, belief.factor)), code
+
+    return Rule(init=init, after=after, name=NAME, settle=settle)

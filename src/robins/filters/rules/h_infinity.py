@@ -1,0 +1,220 @@
+"""Bound the worst case: a Kalman update, an inflation, a prediction."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import manifold
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.kalman import FilterState
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+from robins.filters.rules._feasibility import (
+    HInfinityMemory,
+    Infeasible,
+    anew,
+    raise_infeasible,
+)
+from robins.filters.rules._inflation import (
+    as_weight,
+    deflated,
+    inflated,
+    local_bound,
+    weighted_factor,
+)
+
+__all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
+
+Policy = Literal["raise", "raise_gamma", "compensate"]
+Estimate = Literal["a-posteriori", "a-priori", "predictor"]
+
+NAME = "h_infinity"
+
+
+def h_infinity(
+    gamma: Any,
+    weight: Any,
+    policy: Policy = "raise",
+    estimate: Estimate = "a-posteriori",
+    margin: float = 0.05,
+    count_missing: bool = False,
+) -> Rule:
+    """The central H-infinity filter (Hassibi, Sayed & Kailath 1999, ch. 4).
+
+    Keeps the energy of the estimation error L (x - x_hat), summed over a run, below gamma^2 times
+
+        |x0 - x0_hat|^2_{P0^-1} + sum |w_k|^2_{Q^-1} + sum |v_k|^2_{R^-1}
+
+    whatever the disturbances are. When the measurements of a step have given P as in the Kalman
+    filter, and before the next prediction,
+
+        it exists if   lambda_max(L P L') < gamma^2
+        P becomes      (P^-1 - gamma^-2 L'L)^-1 = P + P L' (gamma^2 I - L P L')^-1 L P
+
+    in square-root form S N^-T with N N' = I - (L S / gamma)' (L S / gamma): it exists where this
+    has a Cholesky factor. The beliefs that a run reports are those before the inflation. P is
+    then no covariance of the error: NEES, NIS and chi-square gates do not apply as they stand.
+
+    Notes, after each sensor (the last one's are the step's): ``h_infinity.bound``,
+    sqrt(lambda_max(L P L')); ``.gamma``, in force by the policy; ``.margin``, 1 - bound^2 /
+    gamma^2; ``.raised`` or ``.compensated`` under these policies. Derivatives take a raised gamma
+    as given.
+
+    Args:
+        gamma: bound, in units of L x per unit of whitened noise; inf is the Kalman filter, bit for
+            bit. It lives in the memory as data: see `with_gamma`.
+        weight: L, which errors count and in what units: (q, n) matrix, (n,) diagonal, or
+            ``mean -> `` one of these. There is no default: gamma means nothing without it.
+        policy: what to do where the filter does not exist. "raise": stop predicting, with code
+            ``INFEASIBLE``; `run` then raises `Infeasible`. "raise_gamma": in that step, the least
+            gamma that leaves ``margin``. "compensate": shrink P in the directions at fault until
+            ``margin`` is left, which claims knowledge that nobody has.
+        estimate: whose error is bounded. "a-posteriori": the one after the measurement. "a-priori":
+            the one before it, with gain P~ H' R^-1 for the inflated P~; exists where
+            lambda_max(L P L') < gamma^2 for the *predicted* P. "predictor": the same gain under the
+            test after the measurement, as Simon (2006) has it in eq. 11.89 and 11.90: a weaker
+            test, which does not guarantee the bound.
+        margin: 1 - bound^2 / gamma^2 that the policies leave, between 0 and 1.
+        count_missing: whether a step counts in which nothing was measured, or all was refused. By
+            default it does not, and P stays as it is.
+
+    Raises:
+        TypeError: gamma or the weight is not of real numbers.
+        ValueError: gamma is not positive, the weight is not finite or of the wrong shape, policy or
+            estimate is unknown or they do not go together, or the margin is not between 0 and 1.
+    """
+    asked = _as_gamma(gamma)
+    for name, value, known in (
+        ("policy", policy, get_args(Policy)),
+        ("estimate", estimate, get_args(Estimate)),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}; got {value!r}")
+    if not 0.0 < margin < 1.0:
+        raise ValueError(f"margin must lie between 0 and 1, got {margin}")
+    judges_prior = estimate == "a-priori"
+    if judges_prior and policy == "compensate":
+        raise ValueError(
+            "policy='compensate' mends P after the measurement, estimate='a-priori' needs it "
+            "before: use 'raise_gamma'"
+        )
+    moves_on = estimate != "a-posteriori"
+    rows = as_weight(weight, NAME)
+
+    def in_force(inverse, bound):
+        """1 / gamma of this step, as the policy leaves it."""
+        if policy != "raise_gamma":
+            return inverse
+        some = jnp.where(bound > 0.0, bound, 1.0)
+        return jnp.where(bound > 0.0, jnp.minimum(inverse, (1.0 - margin) ** 0.5 / some), inverse)
+
+    def init(belief: Belief, dims):
+        weighted = weighted_factor(rows, belief, NAME)
+        return HInfinityMemory(
+            inverse=jnp.asarray(1.0 / asked),
+            steps=jnp.zeros((), int),
+            fresh=jnp.array(True),
+            measured=jnp.array(False),
+            predicted=belief.mean if moves_on else (),
+            weighted=weighted,
+            events=jnp.zeros((), int),
+            first=jnp.array(-1),
+            weighted_first=jnp.zeros_like(weighted),
+        )
+
+    def process(memory: HInfinityMemory, transition):
+        if moves_on:
+            memory = memory._replace(predicted=transition.mean)
+        return memory, transition
+
+    def before(memory: HInfinityMemory, prior: Belief, o: Observation):
+        if judges_prior:
+            seen = weighted_factor(rows, prior, NAME)
+            memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
+        return memory._replace(fresh=jnp.array(False)), prior, o
+
+    def after(memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
+        if not judges_prior:
+            memory = memory._replace(weighted=weighted_factor(rows, posterior, NAME))
+        memory = memory._replace(measured=memory.measured | jnp.any(info.used))
+        # Noted but not remembered, so that a run which does not keep it does not compute it.
+        bound = local_bound(memory.weighted)
+        inverse = in_force(memory.inverse, bound)
+        left = 1.0 - (bound * inverse) ** 2
+        notes = {"bound": bound, "gamma": 1.0 / inverse, "margin": left}
+        counts = memory.measured | count_missing
+        if policy == "raise_gamma":
+            notes["raised"] = counts & (inverse < memory.inverse)
+        if policy == "compensate":
+            notes["compensated"] = counts & (left < margin)
+        named = {f"{NAME}.{key}": value for key, value in notes.items()}
+        return memory, posterior, info._replace(notes={**info.notes, **named})
+
+    def settle(memory: HInfinityMemory, belief: Belief):
+        counts = memory.measured | (count_missing & (memory.steps > 0))
+        weighted = weighted_factor(rows, belief, NAME)
+        judged = jnp.where(memory.fresh, weighted, memory.weighted) if judges_prior else weighted
+        inverse, factor, acted = memory.inverse, belief.factor, jnp.array(False)
+        if policy == "raise_gamma":
+            inverse = in_force(memory.inverse, local_bound(judged))
+            acted = inverse < memory.inverse
+        if policy == "compensate":
+            factor, acted = deflated(factor, inverse * weighted, 1.0 - margin)
+            weighted = weighted_factor(rows, belief._replace(factor=factor), NAME)
+        wide, exists = inflated(factor, inverse * weighted)
+        if judges_prior:
+            exists = exists & inflated(factor, inverse * judged)[1]
+        new = Belief(belief.mean, wide)
+        if moves_on:
+            # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
+            d = manifold.local(memory.predicted, belief.mean)
+            L = inverse * rows(belief.mean)
+            new = new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
+        active = counts & exists & (memory.inverse > 0.0)
+        new = jax.tree_util.tree_map(lambda a, b: jnp.where(active, a, b), new, belief)
+
+        missed = counts & ~exists
+        acted = missed | (counts & acted)
+        begins = acted & (memory.events == 0)
+        memory = memory._replace(
+            steps=memory.steps + 1,
+            fresh=jnp.array(True),
+            measured=memory.measured & missed,
+            events=memory.events + acted.astype(int),
+            first=jnp.where(begins, memory.steps - 1, memory.first),
+            weighted_first=jnp.where(begins, judged, memory.weighted_first),
+        )
+        return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
+
+    audit = raise_infeasible if policy == "raise" else None
+    return Rule(init, process, before, after, name=NAME, settle=settle, audit=audit)
+
+
+def _as_gamma(gamma: Any) -> float:
+    value = np.asarray(gamma)
+    if value.dtype.kind not in "iuf" or value.ndim:
+        raise TypeError(f"gamma must be one real number, got {gamma!r}")
+    if not value > 1e-300:  # its inverse must be finite
+        raise ValueError(f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    return float(value)
+
+
+def with_gamma(state: FilterState, gamma: Any) -> FilterState:
+    """A filter state that goes on with another gamma, positive or inf, and no events counted.
+
+    Gamma is data here: it may be traced, and nothing compiles anew.
+
+    Raises:
+        ValueError: the filter has no `h_infinity` rule.
+    """
+    held = [isinstance(one, HInfinityMemory) for one in state.memory]
+    if not any(held):
+        raise ValueError("this filter has no h_infinity rule whose gamma could be exchanged")
+    memory = tuple(
+        anew(one, gamma) if here else one for one, here in zip(state.memory, held, strict=True)
+    )
+    return state._replace(memory=memory)
