@@ -1,0 +1,245 @@
+"""Channels: filters side by side, each with sensors of its own, joined into one filter.
+
+What the federated and the distributed filter have in common: who reads which sensor, a measurement
+on its way to its local filter, the belief fused again after it, and steps that cannot be taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.fusion import is_singular
+from robins.filters.kalman import Again, Filter, FilterState, Prediction, kalman
+from robins.filters.linearise import Transition
+from robins.filters.model import Motion, Sensor, as_noise
+
+
+class Channel(NamedTuple):
+    """A local filter and the sensors it uses; made by `channel`."""
+
+    sensors: tuple[str, ...]
+    filter: Filter
+
+    @property
+    def name(self) -> str:
+        """Its sensors, for messages."""
+        return "+".join(self.sensors)
+
+
+class Joined(NamedTuple):
+    """What a filter of channels carries besides the fused belief."""
+
+    members: tuple[FilterState, ...]  # by channel; a master last, where there is one
+    shares: Array  # (members, 1 or n) of the information
+    silent: Array  # (channels,) steps since a measurement was used
+    singular: Array  # (members,) steps not taken because information was infinite
+
+
+Fuse = Callable[[Sequence[Belief]], Belief]
+
+
+def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Channel:
+    """A local filter and the names of the sensors it uses.
+
+    Args:
+        sensors: a name, or several.
+        filter: `kalman(...)` with rules of its own, or any other `Filter`; `kalman()` by default.
+
+    Raises:
+        ValueError: no sensor is named, or one twice.
+    """
+    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"a channel needs sensors, each named once, got {list(names)}")
+    return Channel(names, kalman() if filter is None else filter)
+
+
+def owners(channels: Sequence[Channel]) -> dict[str, int]:
+    """Which channel has which sensor.
+
+    Raises:
+        ValueError: there is no channel, or a sensor belongs to two.
+    """
+    if not channels:
+        raise ValueError("no channels: at least one local filter is wanted")
+    owner: dict[str, int] = {}
+    for i, one in enumerate(channels):
+        for name in one.sensors:
+            if name in owner:
+                raise ValueError(
+                    f"sensor '{name}' belongs to two channels: what it measures would be counted "
+                    "twice"
+                )
+            owner[name] = i
+    return owner
+
+
+def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dict[str, int]]:
+    """Sensor dimensions by channel, in the model's order.
+
+    Raises:
+        ValueError: a sensor of the model belongs to no channel, or a channel names one that the
+            model has not.
+    """
+    owner = owners(channels)
+    if homeless := [name for name in dims if name not in owner]:
+        raise ValueError(
+            f"no channel uses sensor {homeless[0]!r}: name it in one, or take it out of the model"
+        )
+    if unknown := [name for name in owner if name not in dims]:
+        raise ValueError(
+            f"channel '{channels[owner[unknown[0]]].name}' uses sensor {unknown[0]!r}; this model "
+            f"has {sorted(dims)}"
+        )
+    return [{k: v for k, v in dims.items() if owner[k] == i} for i in range(len(channels))]
+
+
+# ----------------------------------------------------------------------------- steps of the whole
+
+
+def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
+    """The `update` of a joined filter: the sensor's local filter updates, then all are fused."""
+    owner = owners(channels)
+
+    def update(
+        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
+    ) -> tuple[FilterState, StepInfo]:
+        if sensor.name not in owner:
+            raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
+        joined: Joined = state.memory
+        i = owner[sensor.name]
+        before = joined.members[i]
+        after, info = channels[i].filter.update(before, sensor, y, aux)
+        members = (*joined.members[:i], after, *joined.members[i + 1 :])
+        silent = jnp.where(info.dof > 0, joined.silent.at[i].set(0), joined.silent)
+        # What a measurement did not touch stands bit for bit.
+        same = _equal(before.belief, after.belief)
+        belief = _select(same, state.belief, fuse([m.belief for m in members]))
+        singular = jnp.stack([is_singular(m.belief) for m in members])
+        ok = same | (_finite(belief) & ~jnp.any(singular))
+        new = FilterState(belief, joined._replace(members=members, silent=silent))
+        info = info._replace(
+            used=info.used & ok,
+            nis=jnp.where(ok, info.nis, 0.0),
+            dof=jnp.where(ok, info.dof, 0),
+            log_likelihood=jnp.where(ok, info.log_likelihood, -jnp.inf),
+            code=jnp.where(ok, info.code, int(Code.NOT_FINITE)),
+            notes={
+                **info.notes,
+                f"{name}.share": jnp.mean(joined.shares[i]),
+                f"{name}.silent": joined.silent[i],
+            },
+        )
+        return _select(ok, new, _refused(state, singular)), info
+
+    return update
+
+
+class Moved(NamedTuple):
+    """Members after a prediction, and how it went with each filter that predicted."""
+
+    members: tuple[FilterState, ...]
+    codes: tuple[Any, ...]  # by member
+    belief: Belief  # fused
+    shares: Array
+    transition: Transition | None = None  # of a prediction common to all
+    code: Any = int(Code.DONE)  # of that prediction
+
+
+def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction]:
+    """The end of the `predict` of a joined filter: taken by all members, or by none.
+
+    A member that cannot take the step keeps its memory of that (`Rule.settle`).
+    """
+    joined: Joined = state.memory
+    joined = joined._replace(silent=joined.silent + 1)
+    done = int(Code.DONE)
+    singular = jnp.stack([is_singular(m.belief) for m in moved.members])
+    sound = _finite(moved.belief) & ~jnp.any(singular)
+    code = jnp.where(sound, done, int(Code.NOT_FINITE))
+    for one in (*reversed(moved.codes), moved.code):
+        code = jnp.where(one == done, code, one)
+    ok = code == done
+    kept = tuple(
+        old._replace(memory=_select(one == done, old.memory, new.memory))
+        for old, new, one in zip(joined.members, moved.members, moved.codes, strict=True)
+    )
+    stays = state._replace(memory=joined._replace(members=kept))
+    new = FilterState(moved.belief, joined._replace(members=moved.members, shares=moved.shares))
+    new = _select(ok, new, _refused(stays, singular))
+    return new, Prediction(moved.transition, new.belief, code)
+
+
+def auditing(channels: Sequence[Channel]):
+    """The `audit` of a joined filter: that of each local filter, then its own."""
+
+    def rerun(start: FilterState, i: int, again: Again, first: FilterState) -> FilterState:
+        members = (*start.memory.members[:i], first, *start.memory.members[i + 1 :])
+        return again(start._replace(memory=start.memory._replace(members=members))).memory.members[
+            i
+        ]
+
+    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
+        for i, one in enumerate(channels):
+            if one.filter.audit is not None:
+                once_more = None if again is None else partial(rerun, start, i, again)
+                one.filter.audit(start.memory.members[i], final.memory.members[i], once_more, time)
+        for i, count in enumerate(np.asarray(final.memory.singular).tolist()):
+            if count > 0:
+                name = f"channel '{channels[i].name}'" if i < len(channels) else "the master"
+                raise ValueError(
+                    f"the covariance of {name} was singular in {count} steps, which were not "
+                    "taken: infinite information cannot be fused. Give a constraint, a "
+                    "measurement or a state without noise some noise, or constrain what is fused"
+                )
+
+    return audit
+
+
+def _refused(state: FilterState, singular: Array) -> FilterState:
+    joined: Joined = state.memory
+    return state._replace(memory=joined._replace(singular=joined.singular + singular.astype(int)))
+
+
+def _finite(belief: Belief) -> Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(belief)]))
+
+
+def _equal(a: Belief, b: Belief) -> Array:
+    pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
+    return jnp.all(jnp.stack([jnp.all(x == y) for x, y in pairs]))
+
+
+def _select(condition: Any, new: Any, old: Any) -> Any:
+    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def starting(
+    states: Sequence[FilterState], belief: Belief, shares: Array, count: int
+) -> FilterState:
+    """The state of a joined filter of ``count`` channels at its start."""
+    zero = partial(jnp.zeros, dtype=int)
+    return FilterState(belief, Joined(tuple(states), shares, zero(count), zero(len(states))))
+
+
+def with_noise(motion: Motion, scale: Callable[[Array], Array]) -> Motion:
+    """The same motion, its noise factor put through a function."""
+    known = motion.linear
+
+    def noise(x, u):
+        return scale(motion.noise_factor(x, u))
+
+    def linear(x, u):
+        assert known is not None
+        mean, F, given = known(x, u)
+        return mean, F, scale(as_noise(given, F.shape[0], "the motion"))
+
+    return Motion(motion.step, noise, None if known is None else linear)

@@ -1,0 +1,143 @@
+r"""Distributed filters: locals that each know everything, and what they find, fused.
+
+The airship paper fuses two full filters as if they were independent (its eq. 51):
+
+    P_g = (P_1^-1 + P_2^-1)^-1        x_g = P_g (P_1^-1 x_1 + P_2^-1 x_2)
+
+and feeds x_g back to the navigation state. It does not say what becomes of the local filters then;
+the three readings are ``feedback``:
+
+    own    each goes on from its own mean and covariance: error states shifted by -x_g
+    mean   each takes the fused mean, and keeps its covariance: error states set to zero
+    full   each takes the fused mean and covariance: all information counted again at every step
+
+Locals with the same prior and process noise are not independent, so even the first is somewhat
+overconfident. The federated filter (`robins.filters.federated`) shares both out and is not;
+covariance intersection is safe whatever the correlation.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import jax.numpy as jnp
+
+from robins.filters.belief import Belief
+from robins.filters.channels import (
+    Channel,
+    Fuse,
+    Joined,
+    Moved,
+    auditing,
+    concluded,
+    local_dims,
+    owners,
+    starting,
+    updating,
+)
+from robins.filters.fusion import Criterion, check_criterion, information_sum, intersection_weights
+from robins.filters.kalman import Filter, FilterState
+from robins.filters.model import Motion
+
+Feedback = Literal["own", "mean", "full"]
+
+FULL = (
+    "feedback='full' gives every local filter the information of all, to be counted again at the "
+    "next fusion: the covariance shrinks without bound (NEES of 1e7 was measured); use 'own', or "
+    "the federated filter"
+)
+
+
+def distributed(channels: Sequence[Channel], feedback: Feedback = "own") -> Filter:
+    """Local filters with the whole prior and process noise, fused by an information sum (51).
+
+    The belief of its state is the fused one. Locals have their prior and process noise in common,
+    which (51) takes for independent: expect too small a covariance, and see `federated` for the
+    filter that is right. What an update says of itself is what the sensor's local filter says.
+
+    A local covariance that is singular (a hard constraint, a measurement without noise) has no
+    inverse. The step is not taken, with `Code.NOT_FINITE`, and a run raises a ValueError with what
+    to do at its end; nothing is added to make it regular.
+
+    Args:
+        channels: from `channel`; every sensor of the model belongs to exactly one.
+        feedback: "own", "mean" or "full" (module docstring).
+
+    Raises:
+        ValueError: a sensor in two channels, an unknown feedback; at `init`, a sensor without a
+            channel.
+    """
+    if feedback not in ("own", "mean", "full"):
+        raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
+    if feedback == "full":
+        warnings.warn(FULL, UserWarning, stacklevel=2)
+    return _side_by_side(channels, information_sum, feedback, "distributed")
+
+
+def intersecting(
+    channels: Sequence[Channel],
+    criterion: Criterion | Sequence[float] = "trace",
+    feedback: Feedback = "own",
+) -> Filter:
+    """Local filters with the whole prior and process noise, fused by covariance intersection.
+
+    Consistent whatever the correlation of the locals, at the price of a covariance that is never
+    smaller than that of the best combination of one's own (Julier & Uhlmann 1997).
+
+    Args:
+        channels: from `channel`; every sensor of the model belongs to exactly one.
+        criterion: "trace", "det", or (N,) weights; see `covariance_intersection`.
+        feedback: "own" or "mean"; "full" makes the locals one and the same, which loses information
+            without harm.
+
+    Raises:
+        ValueError: as `distributed`, or the criterion is none of these.
+    """
+    if feedback not in ("own", "mean", "full"):
+        raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
+    check_criterion(criterion, len(channels))
+
+    def intersect(beliefs: Sequence[Belief]) -> Belief:
+        return information_sum(beliefs, intersection_weights(beliefs, criterion))
+
+    return _side_by_side(channels, intersect, feedback, "intersecting")
+
+
+def _side_by_side(channels: Sequence[Channel], fuse: Fuse, feedback: Feedback, name: str) -> Filter:
+    channels = tuple(channels)
+    owners(channels)
+    count = len(channels)
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        each = local_dims(channels, dims)
+        states = [c.filter.init(belief, d) for c, d in zip(channels, each, strict=True)]
+        return starting(states, belief, jnp.ones((count, 1)), count)
+
+    def fed_back(state: FilterState) -> list[FilterState]:
+        joined: Joined = state.memory
+        if feedback == "own":
+            return list(joined.members)
+        fused = state.belief
+        return [
+            c.filter.reset(m, fused if feedback == "full" else Belief(fused.mean, m.belief.factor))
+            for c, m in zip(channels, joined.members, strict=True)
+        ]
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        members, codes = [], []
+        for one, member in zip(channels, fed_back(state), strict=True):
+            member, prediction = one.filter.predict(member, motion, u)
+            members.append(member)
+            codes.append(prediction.code)
+        fused = fuse([m.belief for m in members])
+        return concluded(state, Moved(tuple(members), tuple(codes), fused, state.memory.shares))
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        joined: Joined = state.memory
+        pairs = zip(channels, joined.members, strict=True)
+        members = tuple(c.filter.reset(m, belief) for c, m in pairs)
+        return FilterState(belief, joined._replace(members=members))
+
+    return Filter(init, predict, updating(channels, fuse, name), reset, auditing(channels))
