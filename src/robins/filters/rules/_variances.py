@@ -10,9 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.filters.observation import Observation
-from robins.filters.rules._quantile import scale_to_quantile
-
-__all__ = ["scale_to_quantile"]
 
 Number = float | int  # where types are checked an int is no float
 

@@ -1,0 +1,134 @@
+"""Estimate the measurement noise together with the state, by variational Bayes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins import linalg
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.observation import Observation, left_out
+from robins.filters.rule import Rule
+from robins.filters.rules._variances import (
+    Number,
+    check_band,
+    check_forgetting,
+    numbered,
+    ratio,
+    scaled,
+    variance,
+)
+
+
+class InverseGamma(NamedTuple):
+    """What is believed of each variance, as a multiple of its nominal value; mean rate / shape."""
+
+    shape: Array  # (m,) alpha, half the number of samples it is worth
+    rate: Array  # (m,) beta
+    scale: Array  # (m,) multiple in use; the mean between updates
+
+
+def _left(factor: Array, residual: Array, noise: Array) -> Array:
+    """(m,) expected square of what measurements differ from the posterior by.
+
+    In measurement space, without the state: with S = H P- H' + R,
+
+        y - H x+ = R S^-1 e,        H P+ H' = R - R S^-1 R.
+    """
+    R = noise @ noise.T
+    white = linalg.solve_lower(factor, jnp.concatenate([residual[:, None], R], axis=1))
+    G = white[:, 1:]
+    return (G.T @ white[:, 0]) ** 2 + jnp.maximum(jnp.diagonal(R) - jnp.sum(G**2, axis=0), 0.0)
+
+
+def variational_bayes(
+    forgetting: Number = 0.98,
+    iterations: int = 2,
+    initial_dof: Number = 10.0,
+    floor: Number = 0.01,
+    ceiling: Number = 1000.0,
+) -> Rule:
+    """Measurement noise of unknown size, VB-AKF (Särkkä & Nummenmaa 2009, table I).
+
+    State and variances are estimated together, as a Gaussian times inverse gammas: with a-, b- what
+    is known of variance i before the sample, in multiples of the nominal one,
+
+        a = rho a- + 1/2
+        repeat:  R = diag(b / a);  x+, P+ from the Kalman update with this R;
+                 b = rho b- + ( (y - H x+)_i^2 + (H P+ H')_ii ) / 2
+
+    The update uses the last R, the next sample begins with the last b. Since the *posterior*
+    residual and its covariance are used, b stays positive by itself. rho b- / a is the first R, so
+    the estimate of one sample is less than its own square; the mean of many is right.
+
+    Nominal correlations stay: rows of the noise factor are scaled. The nominal noise is that of the
+    model at the step, as the rules before this one leave it; put a gate before it, for what is
+    large raises the noise at once and is then no longer surprising. What is learnt is what the
+    update did use, with the weights of rules behind this one: a component that is missing, or
+    refused by any rule, neither teaches nor ages.
+
+    Notes, a number a component: ``variational_bayes.r_scale.i``, the multiples in use.
+    floor = ceiling = 1 is the Kalman filter, bit for bit.
+
+    Args:
+        forgetting: rho, in (0, 1]: about 1 / (1 - rho) samples are remembered, 1 remembers all.
+        iterations: updates per sample, the final one included. A third moves the mean of what is
+            learnt by about one per cent and adds as much to the cost as the second.
+        initial_dof: how many samples the nominal noise is worth at the start.
+        floor: least variance, as a share of the nominal one.
+        ceiling: greatest variance, as a multiple of the nominal one.
+
+    Raises:
+        ValueError: a parameter is not of its range.
+    """
+    check_forgetting("variational_bayes", forgetting)
+    check_band("variational_bayes", floor, ceiling)
+    if iterations < 1:
+        raise ValueError(f"variational_bayes iterations must be 1 or more, got {iterations}")
+    if not 0.0 < initial_dof < float("inf"):
+        raise ValueError(
+            f"variational_bayes initial_dof must be positive and finite, got {initial_dof}"
+        )
+
+    def init(belief: Belief, dims):
+        half = 0.5 * initial_dof
+        return {
+            name: InverseGamma(jnp.full(m, half), jnp.full(m, half), jnp.ones(m))
+            for name, m in dims.items()
+        }
+
+    def before(memory, prior: Belief, o: Observation):
+        known = memory[o.sensor]
+        a, b = forgetting * known.shape + 0.5, forgetting * known.rate
+        scale = jnp.clip(b / a, floor, ceiling)
+        spread, excess, noise, deficit, used = left_out(o._replace(accepted=o.accepted & o.present))
+        reading = linalg.tria(spread, excess) if iterations > 1 else spread
+        e, nominal = jnp.where(used, o.residual, 0.0), variance(noise)
+        for _ in range(iterations - 1):
+            R_root = scaled(noise, jnp.where(used, scale, 1.0))
+            S_root = linalg.tria(reading, R_root)
+            if deficit is not None:
+                S_root = linalg.downdate(S_root, deficit)
+            left = ratio(_left(S_root, e, R_root), nominal)
+            scale = jnp.clip((b + 0.5 * left) / a, floor, ceiling)
+        scale = jnp.where(used, scale, known.scale)
+        memory = {**memory, o.sensor: known._replace(scale=scale)}
+        return memory, prior, o._replace(noise=scaled(o.noise, scale))
+
+    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
+        known = memory[o.sensor]
+        # Rules behind this one may have weighed the noise again: that is part of the nominal one.
+        R = variance(o.noise)
+        here = info.used & (R > 0.0)
+        noise = jnp.where(here[:, None], o.noise, 0.0)
+        left = ratio(_left(info.factor, jnp.where(here, o.residual, 0.0), noise), R / known.scale)
+        a, b = forgetting * known.shape + 0.5, forgetting * known.rate + 0.5 * left
+        shape = jnp.where(here, a, known.shape)
+        rate = jnp.where(here, jnp.clip(b, floor * a, ceiling * a), known.rate)
+        memory = {**memory, o.sensor: InverseGamma(shape, rate, rate / shape)}
+        notes = info.notes | numbered("variational_bayes.r_scale", known.scale)
+        return memory, posterior, info._replace(notes=notes)
+
+    return Rule(init=init, before=before, after=after, name="variational_bayes")
