@@ -1,0 +1,94 @@
+"""Widen the prior while the innovations of a sensor are larger than expected."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.linearise import Transition
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+from robins.filters.rules._variances import Number, ratio, reading_variance, variance
+
+
+class Window(NamedTuple):
+    """The last samples of a sensor, newest first; each component has its own."""
+
+    surplus: Array  # (window, m) e_i^2 / R_ii - 1; 0 where not filled yet
+    filled: Array  # (m,) int, samples in it
+
+
+class Memory(NamedTuple):
+    """Windows by sensor, and whether this step has been faded already."""
+
+    windows: dict[str, Window]
+    faded: Array  # () bool
+    factor: Array  # () lambda of the last update
+
+
+def innovation_fading(window: int = 10, limit: Number = 5.0) -> Rule:
+    """One fading factor from the mean innovation of a window (Mehra 1972, covariance matching).
+
+    The form that robust adaptive filters of integrated navigation pair with robust weights
+    (RAUKF), whitened by R so that radians and metres may be added. With e the innovation and the
+    mean taken over the last ``window`` samples of the sensor:
+
+        lambda = clip( sum_i (mean e_i^2 / R_ii - 1) / sum_i (H P- H')_ii / R_ii,  1,  limit )
+        P-  :=  lambda P-
+
+    R is the noise as the rules before this one leave it: behind a robust weight w the terms are
+    w_i e_i^2 / R_ii, so that an outlier does not fade. A component that is missing or refused is
+    left out of the sums, and its window does not move; until the window is full, the mean is of
+    what there is.
+
+    A step is faded once: by the first of its sensors whose lambda exceeds 1; those after it see the
+    prior that this one has left.
+
+    Notes: ``innovation_fading.lambda``. limit = 1 is the Kalman filter, bit for bit.
+
+    Args:
+        window: samples in the mean.
+        limit: greatest lambda.
+
+    Raises:
+        ValueError: a parameter is not of its range.
+    """
+    if window < 1:
+        raise ValueError(f"innovation_fading window must be 1 sample or more, got {window}")
+    if not 1.0 <= limit < float("inf"):
+        raise ValueError(f"innovation_fading limit must be finite and not below 1, got {limit}")
+
+    def init(belief: Belief, dims) -> Memory:
+        windows = {
+            name: Window(jnp.zeros((window, m)), jnp.zeros(m, int)) for name, m in dims.items()
+        }
+        return Memory(windows, jnp.zeros((), bool), jnp.ones(()))
+
+    def process(memory: Memory, transition: Transition):
+        return memory._replace(faded=jnp.zeros((), bool)), transition
+
+    def before(memory: Memory, prior: Belief, o: Observation):
+        R = variance(o.noise)
+        here = o.accepted & o.present & (R > 0.0)
+        e = jnp.where(here, o.residual, 0.0)
+        old = memory.windows[o.sensor]
+        rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
+        surplus = jnp.where(here[None, :], rolled, old.surplus)
+        filled = jnp.minimum(old.filled + here.astype(int), window)
+        mean = jnp.sum(surplus, axis=0) / jnp.maximum(filled, 1).astype(float)
+        unexplained = jnp.sum(jnp.where(here, mean, 0.0))
+        explained = jnp.sum(jnp.where(here, ratio(reading_variance(o), R), 0.0))
+        factor = jnp.clip(ratio(unexplained, explained), 1.0, limit)
+        factor = jnp.where(memory.faded, 1.0, factor)
+        windows = {**memory.windows, o.sensor: Window(surplus, filled)}
+        memory = Memory(windows, memory.faded | (factor > 1.0), factor)
+        return memory, prior._replace(factor=jnp.sqrt(factor) * prior.factor), o
+
+    def after(memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
+        notes = {**info.notes, "innovation_fading.lambda": memory.factor}
+        return memory, posterior, info._replace(notes=notes)
+
+    return Rule(init=init, process=process, before=before, after=after, name="innovation_fading")
