@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
+from robins.filters.rules.innovation_fading import innovation_fading
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.variational_bayes import variational_bayes
 
@@ -93,6 +94,17 @@ def test_the_noise_of_the_motion_is_found_where_the_sensor_is_known():
         assert low < notes["sage_husa.q_scale.1"] < high
         assert rms < 1.05 * told
         assert q_times == 1.0 or plain > 1.2 * rms
+
+
+def test_fading_by_innovations_is_for_motions_and_not_for_sensors():
+    one = kalman(rules=[innovation_fading()], form="joseph")
+    ratios = {}
+    for name, r_times, q_times in (("right", 1.0, 1.0), ("motion", 1.0, 9.0), ("sensor", 4.0, 1.0)):
+        states, y = walks(5, r_times, q_times)
+        ratios[name] = track(one, states, y)[0] / track(KF, states, y)[0]
+    assert ratios["motion"] < 0.9
+    assert 1.0 < ratios["right"] < 1.15
+    assert ratios["sensor"] > 1.5
 
 
 # ------------------------------------------------------------------------------------- bad input
