@@ -22,10 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from robins import linalg
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
-from robins.filters.mixture import deviations, log_normalised, matched, wide
+from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
 
 Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
@@ -227,20 +226,14 @@ def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> Ste
     _, log_likelihood = log_normalised(log_prior + seen.log_likelihood)
     lost = jnp.isneginf(log_likelihood)
     used = used & ~lost
-    prior = jnp.exp(log_normalised(log_prior)[0])
-    missing = jnp.any(jnp.isnan(seen.innovation), axis=0)
-    residual = jnp.where(missing[None], 0.0, seen.innovation)
-    mean = prior @ residual
-    residual = jnp.where(used[None], residual, mean[None])
-    factor = linalg.tria(wide(deviations(residual, seen.factor, prior, mean)))
-    white = linalg.solve_lower(factor, jnp.where(used, mean, 0.0)[:, None])[:, 0]
+    expected = innovation(seen, jnp.exp(log_normalised(log_prior)[0]), used)
     return StepInfo(
-        innovation=jnp.where(missing, jnp.nan, mean),
-        factor=factor,
+        innovation=expected.mean,
+        factor=expected.factor,
         gain=jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain),
         used=used,
-        nis=jnp.sum(white**2),
-        dof=jnp.sum(used),
+        nis=expected.nis,
+        dof=expected.dof,
         log_likelihood=log_likelihood,
         code=seen.code[jnp.argmax(log_post)],
         notes={},

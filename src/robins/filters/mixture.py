@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief
+from robins.filters.belief import Belief, StepInfo
 from robins.manifold import State
 
 _ROUNDS = 6  # of the mean on a curved space: it comes nearer by about the square of the spread
@@ -78,6 +80,27 @@ def wide(blocks: Array) -> Array:
     """(r, n, k) blocks side by side, (n, r k)."""
     r, n, k = blocks.shape
     return jnp.moveaxis(blocks, 0, 1).reshape(n, r * k)
+
+
+class Innovation(NamedTuple):
+    """What a mixture of filters expected of a measurement, and what it got."""
+
+    mean: Array  # (m,) y minus its prediction; NaN where missing
+    factor: Array  # (m, m) of its covariance; identity rows where not used
+    nis: Array
+    dof: Array
+
+
+def innovation(seen: StepInfo, weight: Array, used: Array) -> Innovation:
+    """Moments of the innovations of several filters (leading axis), weighted."""
+    counts = (weight > 0.0)[:, None]
+    missing = jnp.any(jnp.isnan(seen.innovation) & counts, axis=0)
+    residual = jnp.where(counts & ~missing[None], seen.innovation, 0.0)
+    mean = weight @ residual
+    residual = jnp.where(used[None], residual, mean[None])
+    factor = linalg.tria(wide(deviations(residual, seen.factor, weight, mean)))
+    white = linalg.solve_lower(factor, jnp.where(used, mean, 0.0)[:, None])[:, 0]
+    return Innovation(jnp.where(missing, jnp.nan, mean), factor, jnp.sum(white**2), jnp.sum(used))
 
 
 def _sound(states: State, weight: Array, instead: State) -> State:
