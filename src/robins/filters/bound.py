@@ -7,13 +7,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.constrain import Function, Weight, as_sensor, metric_of
+from robins.filters.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
-from robins.filters.observation import Observation, normalised
+from robins.filters.observation import Observation
 
 # Gauss-Legendre nodes and how many e-folds of a density they span: moments to 1e-15.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
@@ -37,8 +37,8 @@ def _seen(belief: Belief, g: Function) -> Observation:
 def clip(
     belief: Belief,
     g: Function,
-    lower: ArrayLike,
-    upper: ArrayLike,
+    lower: Numbers,
+    upper: Numbers,
     weight: Weight = "covariance",
 ) -> Bounded:
     """Move the mean m to the nearest state within ``lower <= g(x) <= upper``; P is kept.
@@ -65,10 +65,10 @@ def clip(
     at_low, at_high, infeasible = _active(o.spread, o.size, low - value, high - value)
     # Which rows are active does not change with small changes, so gradients pass them by.
     shift = jnp.where(at_low, low - value, jnp.where(at_high, high - value, 0.0))
-    active = normalised(o._replace(residual=shift, accepted=at_low | at_high))
-    spread = jnp.where(active.used[:, None], o.spread, 0.0)
-    move = metric.factor @ (linalg.solve_lower(active.factor, spread).T @ active.white)
-    mean = manifold.retract(belief.mean, jnp.where(infeasible, 0.0, move))
+    moved = nearest(metric, o._replace(residual=shift, accepted=at_low | at_high))[0]
+    mean = jax.tree_util.tree_map(
+        lambda new, old: jnp.where(infeasible, old, new), moved, belief.mean
+    )
     return Bounded(belief._replace(mean=mean), (value < low) | (value > high), infeasible)
 
 
@@ -127,7 +127,7 @@ def _active(spread: Array, size: Array, low: Array, high: Array) -> tuple[Array,
     return end[1][:c], end[1][c:], end[4] | go_on((*end[:5], 0))
 
 
-def truncate(belief: Belief, g: Function, lower: ArrayLike, upper: ArrayLike) -> Bounded:
+def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bounded:
     """Cut the density at ``lower <= g(x) <= upper`` and keep its mean and covariance.
 
     Row by row: z = D_i x is N(mu, s^2), its density cut to the bounds has mean mu + s alpha and

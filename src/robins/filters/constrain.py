@@ -13,7 +13,7 @@ covariance is got by subtracting another.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,11 +27,12 @@ from robins.filters.iterated import iterated
 from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Sensor, as_noise
-from robins.filters.observation import normalised
+from robins.filters.observation import Observation, normalised
 from robins.manifold import State
 
-Function = ArrayLike | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
-Weight = Literal["covariance", "identity"] | ArrayLike
+Numbers = ArrayLike | Sequence[Any]
+Function = Numbers | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
+Weight = Literal["covariance", "identity"] | Numbers
 
 ITERATIONS = 4
 
@@ -54,7 +55,7 @@ def constrain(
     g: Function,
     d: Any = None,
     weight: Weight = "covariance",
-    noise: ArrayLike | None = None,
+    noise: Numbers | None = None,
     hard: bool = False,
     iterations: int = ITERATIONS,
 ) -> Constrained:
@@ -90,24 +91,32 @@ def constrain(
     if metric is belief and (noise is None or not hard):
         seen = way.observation(belief, sensor, target, None)
         posterior, info = updated(belief, seen, "sqrt")
+        used = info.used
     else:
         exact = Sensor(sensor.read, linalg.zeros(sensor.dim, 0), sensor.dim, "", sensor.linear)
         seen = way.observation(metric, exact, target, None)
-        placed, info = updated(metric, seen, "sqrt")
-        S, G = belief.factor, info.gain
+        mean, G, used = nearest(metric, seen)
+        S = belief.factor
         rest = S - G @ (seen.spread if root is None else seen.spread @ (root.T @ S))
         if noise is None:
             factor = linalg.tria(rest)
-            lost = linalg.lost_in_rounding(factor, belief.sigma)
-            factor = jnp.where(lost, 0.0, factor)
+            factor = jnp.where(linalg.lost_in_rounding(factor, belief.sigma), 0.0, factor)
         else:
             factor = linalg.tria(rest, G @ sensor.noise)
-        some = jnp.any(info.used)
-        posterior = Belief(placed.mean, linalg.where(some, factor, S))
-    return Constrained(posterior, before.residual, info.used, judged.nis, judged.dof)
+        posterior = Belief(mean, linalg.where(jnp.any(used), factor, S))
+    return Constrained(posterior, before.residual, used, judged.nis, judged.dof)
 
 
-def as_sensor(mean: State, g: Function, d: Any, noise: ArrayLike | None) -> tuple[Sensor, Any]:
+def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array]:
+    """The state nearest to the mean that meets an exact observation, its gain, what was used."""
+    seen = normalised(o)
+    spread = jnp.where(seen.used[:, None], o.spread, 0.0)
+    cross = metric.factor @ linalg.solve_lower(seen.factor, spread).T
+    gain = linalg.solve_lower_transposed(seen.factor, cross.T).T
+    return manifold.retract(metric.mean, cross @ seen.white), gain, seen.used
+
+
+def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[Sensor, Any]:
     """A constraint as a sensor, and what that sensor reads.
 
     Raises:
@@ -127,7 +136,7 @@ def as_sensor(mean: State, g: Function, d: Any, noise: ArrayLike | None) -> tupl
     return Sensor(lambda x, aux: read(x), root, c, "constraint", linear), target
 
 
-def _by_matrix(mean: State, matrix: ArrayLike) -> tuple[Any, Any, Array]:
+def _by_matrix(mean: State, matrix: Numbers) -> tuple[Any, Any, Array]:
     """D x as a function, the same with its slope, and a value of it."""
     if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
         raise ValueError(

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 from scipy import stats
 
 from robins import linalg
@@ -15,6 +14,7 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.constrain import (
     ITERATIONS,
     Function,
+    Numbers,
     Weight,
     as_sensor,
     check_rows,
@@ -31,7 +31,7 @@ def equality(
     g: Function,
     d: Any = None,
     weight: Weight = "covariance",
-    noise: ArrayLike | None = None,
+    noise: Numbers | None = None,
     hard: bool = False,
     gate: Number | None = None,
     iterations: int = ITERATIONS,
@@ -123,12 +123,12 @@ def _check_weight(weight: Weight) -> None:
                 f"equality weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
             )
         return
-    root = np.asarray(linalg.factor(weight, "equality weight"))
+    root = np.asarray(linalg.factor(np.asarray(weight, float), "equality weight"))
     if not np.all(np.diag(root) > 0.0):
         raise ValueError("equality weight is not positive definite: each state wants a weight")
 
 
-def _check_rows(g: ArrayLike, d: Any, noise: ArrayLike | None) -> None:
+def _check_rows(g: Numbers, d: Any, noise: Numbers | None) -> None:
     D = np.asarray(g, float)
     if D.ndim != 2 or D.shape[0] == 0:
         raise ValueError(f"equality D must be (c, n), a row for each constraint, got {D.shape}")

@@ -7,12 +7,11 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.bound import clip, truncate
-from robins.filters.constrain import Function, as_sensor
+from robins.filters.constrain import Function, Numbers, as_sensor
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -22,8 +21,8 @@ Method = Literal["active-set", "truncation"]
 
 def inequality(
     g: Function,
-    lower: ArrayLike | None = None,
-    upper: ArrayLike | None = None,
+    lower: Numbers | None = None,
+    upper: Numbers | None = None,
     method: Method = "active-set",
 ) -> Rule:
     """Keep ``lower <= g(x) <= upper`` after each update (Simon 2010, secs. 2.5 and 2.6).
@@ -87,7 +86,7 @@ def inequality(
     return Rule(init=init, process=process, after=after, name="inequality")
 
 
-def _bounds(lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(lower: Numbers | None, upper: Numbers | None) -> tuple[np.ndarray, np.ndarray]:
     if lower is None and upper is None:
         raise ValueError("inequality wants lower or upper bounds")
     high = np.asarray(np.inf if upper is None else upper, float)
@@ -104,7 +103,7 @@ def _bounds(lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[np.ndarra
     return low, high
 
 
-def _check_rows(g: ArrayLike, count: int) -> None:
+def _check_rows(g: Numbers, count: int) -> None:
     D = np.asarray(g, float)
     if D.ndim != 2 or len(D) != count:
         raise ValueError(f"inequality D must be ({count}, n), a row for each bound, got {D.shape}")
