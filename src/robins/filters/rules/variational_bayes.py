@@ -64,10 +64,10 @@ def variational_bayes(
     the estimate of one sample is less than its own square; the mean of many is right.
 
     Nominal correlations stay: rows of the noise factor are scaled. The nominal noise is that of the
-    model at the step, as the rules before this one leave it; put a gate before it, for what is
-    large raises the noise at once and is then no longer surprising. What is learnt is what the
-    update did use, with the weights of rules behind this one: a component that is missing, or
-    refused by any rule, neither teaches nor ages.
+    model at the step, as the rules before this one leave it. What is learnt is what the update did
+    use, with the weights of rules behind this one; so put gates and weights behind it, where they
+    judge by the noise that was learnt. A component that is missing, or refused by any rule, neither
+    teaches nor ages.
 
     Notes, a number a component: ``variational_bayes.r_scale.i``, the multiples in use.
     floor = ceiling = 1 is the Kalman filter, bit for bit.
