@@ -1,0 +1,272 @@
+"""gamma_min and the worst-case gain: what an H-infinity filter promises, without a Riccati."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from attitude_matching import attitude_matching
+from dense_h_infinity import greatest, h_infinity_filter
+from dense_kalman import random_system, simulate, times
+from jax.tree_util import Partial
+
+from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
+from robins.filters.bounds import (
+    Channel,
+    error_operator,
+    existence_margin,
+    gamma_min,
+    spectral_norm,
+    steady_h_infinity,
+    worst_case_gain,
+)
+from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
+from robins.filters.rules.h_infinity import h_infinity, with_gamma
+from robins.manifold import Angle
+
+T = 20
+SYSTEM = random_system(3)
+MODEL, START = SYSTEM.model(), SYSTEM.start()
+Y = simulate(SYSTEM, 3, T, 0.2)[1]
+Y[6] = Y[13] = np.nan
+L = np.array([[1.0, 0.5, 0.0, -0.3], [0.0, 2.0, 1.0, 0.0]])
+HERE = np.isfinite(Y).any(axis=1)
+KF = kalman()
+
+
+def dense_least(y, estimate="a-posteriori", count_missing=False):
+    here = np.isfinite(y).any(axis=1) | count_missing
+
+    def exists(gamma):
+        done = h_infinity_filter(SYSTEM, y, L, gamma, estimate, count_missing)
+        positive = np.linalg.eigvalsh(done.P_wide)[:, 0] > 0.0
+        return np.all(done.bound[here] < gamma) and np.all(positive)
+
+    low, high = 1e-3, 1e3
+    while high > low * (1.0 + 1e-9):
+        middle = np.sqrt(low * high)
+        low, high = (low, middle) if exists(middle) else (middle, high)
+    return high
+
+
+# --------------------------------------------------------------------------------- least gamma
+
+
+@pytest.mark.parametrize("estimate", ["a-posteriori", "a-priori"])
+def test_least_gamma_is_that_of_the_dense_recursion(estimate):
+    found = gamma_min(MODEL, START, Y, L, rtol=1e-6, estimate=estimate)
+    want = dense_least(Y, estimate)
+    assert want * (1.0 - 1e-8) <= found <= want * (1.0 + 1.1e-6)
+
+
+def test_an_outage_raises_least_gamma_only_if_it_counts():
+    y = Y.copy()
+    y[8:16] = np.nan
+    left_out = gamma_min(MODEL, START, y, L)
+    counted = gamma_min(MODEL, START, y, L, count_missing=True)
+    assert counted == pytest.approx(dense_least(y, count_missing=True), rel=1.1e-4)
+    assert left_out == pytest.approx(dense_least(y), rel=1.1e-4)
+    assert counted > 1.05 * left_out
+
+
+def test_with_nothing_measured_any_gamma_will_do():
+    assert gamma_min(MODEL, START, np.full((T, 3), np.nan), L) == 0.0
+
+
+def test_a_kalman_filter_that_fails_is_not_searched():
+    broken = Model(Motion(lambda x, u: x * jnp.nan, np.ones(4)), MODEL.sensors)
+    with pytest.raises(ValueError, match="a step of the Kalman filter cannot be taken"):
+        gamma_min(broken, START, Y, L)
+
+
+def test_the_margin_is_the_least_eigenvalue():
+    P, gamma = SYSTEM.P0, 3.0
+    want = np.linalg.eigvalsh(np.linalg.inv(P) - L.T @ L / gamma**2)[0]
+    assert float(existence_margin(START, L, gamma)) == pytest.approx(want, rel=1e-10)
+    assert existence_margin(START, L, np.inf) == pytest.approx(1.0 / greatest(P) ** 2, rel=1e-10)
+    # it is zero where gamma is the local bound
+    bound = greatest(L @ P @ L.T)
+    assert abs(float(existence_margin(START, L, bound))) < 1e-10
+
+
+# -------------------------------------------------------------------------------------- the gain
+
+MEMBERS = {
+    "a-posteriori": kalman(rules=[h_infinity(np.inf, L)]),
+    "a-priori": kalman(rules=[h_infinity(np.inf, L, estimate="a-priori")]),
+}
+
+
+def gain(solution, estimate="a-posteriori", count_missing=False):
+    return worst_case_gain(MODEL, START, solution, L, None, None, estimate, count_missing)
+
+
+@pytest.mark.parametrize("estimate", MEMBERS)
+def test_the_bound_holds_is_reached_and_the_kalman_filter_is_above_it(estimate):
+    one = MEMBERS[estimate]
+    least = gamma_min(MODEL, START, Y, L, rtol=1e-8, estimate=estimate)
+
+    def of(gamma):
+        state = with_gamma(one.init(START, MODEL.dims), gamma)
+        return gain(run(one, MODEL, state, Y), estimate)
+
+    for share in (1.0001, 1.05, 1.5, 4.0):
+        assert of(share * least) < share * least
+    assert least * (1.0 - 1e-6) < of(1.0001 * least) < 1.00001 * least
+    assert gain(run(KF, MODEL, START, Y), estimate) >= least * (1.0 - 1e-8)
+    assert of(np.inf) == pytest.approx(gain(run(KF, MODEL, START, Y), estimate), rel=1e-12)
+
+
+def test_the_predictor_of_the_textbook_does_not_keep_its_bound():
+    # Its test looks at P after the measurement, whose error it does not estimate.
+    gamma = 1.05 * gamma_min(MODEL, START, Y, L, estimate="predictor")
+    one = kalman(rules=[h_infinity(gamma, L, estimate="predictor")])
+    assert gain(run(one, MODEL, START, Y), "predictor") > 1.1 * gamma
+
+
+def operator(solution, scale=None):
+    """The error operator of the standard problem, from plain arrays."""
+    info = solution.steps.info["y"]
+
+    def all_steps(a):
+        return np.tile(a, (T, 1, 1))
+
+    channel = Channel(np.asarray(info.gain), all_steps(SYSTEM.H), all_steps(SYSTEM.W))
+    weight = np.where(HERE[:, None, None], L, 0.0)
+    if scale is not None:
+        weight = weight / np.asarray(scale)[:, None, None]
+    F, G, S0 = all_steps(SYSTEM.F), all_steps(SYSTEM.G), np.linalg.cholesky(SYSTEM.P0)
+    return error_operator(S0, F, G, [channel], weight)
+
+
+def test_members_whose_bound_changes_keep_it_step_by_step():
+    # With L / gamma_k for weights the bound is one.
+    least = gamma_min(MODEL, START, Y, L)
+    rules = {
+        "h_infinity.gamma": h_infinity(0.7 * least, L, policy="raise_gamma"),
+        "adaptive_h_infinity.xi": adaptive_h_infinity(L, window=3),
+    }
+    y = Y + 5.0 * (np.arange(T) % 7 == 3)[:, None]  # surprises
+    for name, rule in rules.items():
+        solution = run(kalman(rules=[rule]), MODEL, START, y)
+        bounds = solution.steps.info["y"].notes[name]
+        assert np.ptp(bounds[HERE]) > 0.05 * np.min(bounds[HERE])
+        assert 0.5 < spectral_norm(operator(solution, bounds)) < 1.0
+
+
+def test_the_operator_moves_errors_as_the_filter_does():
+    # Run the filter on what disturbances make of the truth: its errors are the operator's.
+    one = MEMBERS["a-posteriori"]
+    state = with_gamma(one.init(START, MODEL.dims), 3.0 * dense_least(Y))
+    rng = np.random.default_rng(1)
+    x0, w, v = rng.normal(size=4), rng.normal(size=(T, 4)), rng.normal(size=(T, 3))
+    x, y, truth = SYSTEM.m0 + np.linalg.cholesky(SYSTEM.P0) @ x0, np.empty((T, 3)), []
+    for k in range(T):
+        x = SYSTEM.F @ x + SYSTEM.G @ w[k]
+        y[k] = SYSTEM.H @ x + SYSTEM.W @ v[k]
+        truth.append(x)
+    solution = run(one, MODEL, state, np.where(np.isfinite(Y), y, np.nan))
+    error = (np.array(truth) - np.asarray(solution.mean)) @ L.T
+    disturbance = np.concatenate([x0, np.concatenate([w, v], axis=1).ravel()])
+    moved = (operator(solution) @ disturbance).reshape(T, 2)
+    np.testing.assert_allclose(moved[HERE], error[HERE], rtol=1e-9, atol=1e-10)
+    assert gain(solution) == pytest.approx(np.linalg.norm(operator(solution), 2), rel=1e-12)
+
+
+def test_sensors_in_sequence_are_one():
+    W = np.diag([0.5, 0.7, 2.0])
+    F, G, H = (jnp.array(a) for a in SYSTEM[:3])
+    near = Sensor(Partial(times, H[:2]), jnp.array([0.5, 0.7]), 2, "near")
+    far = Sensor(Partial(times, H[2:]), jnp.array([2.0]), 1, "far")
+    two, one = Model(Motion(Partial(times, F), G), (near, far)), SYSTEM._replace(W=W).model()
+    gamma = 9.0
+    for estimate, member in MEMBERS.items():
+        state = with_gamma(member.init(START, two.dims), gamma)
+        split = run(member, two, state, {"near": Y[:, :2], "far": Y[:, 2:]})
+        whole = run(member, one, with_gamma(member.init(START, one.dims), gamma), Y)
+        got = worst_case_gain(two, START, split, L, estimate=estimate)
+        want = worst_case_gain(one, START, whole, L, estimate=estimate)
+        assert got == pytest.approx(want, rel=1e-9)
+
+
+def test_a_model_that_is_not_linear_is_taken_along_its_run():
+    # A range and a bearing to a target: disturbances that are small enough move the error so.
+    G, sigma = np.diag([1e-3, 2e-3]), np.array([0.01, 0.02])
+    motion = Motion(lambda x, u: x + 0.05 * jnp.stack([x[1], -x[0]]) * u, G)
+    sensor = Sensor(
+        lambda x, aux: (jnp.hypot(x[:1], x[1:]), Angle(jnp.arctan2(x[1], x[0]))), sigma, 2
+    )
+    model, start = Model(motion, (sensor,)), Belief.of(jnp.array([-2.0, 0.1]), 1e-4 * np.eye(2))
+    one, u = kalman(unscented(), [h_infinity(1.0, np.eye(2))]), 1.0 + np.arange(6) % 3
+    x, clean = np.array(start.mean), []
+    for k in range(6):
+        x = np.array(motion.step(x, u[k]))
+        clean.append([np.hypot(*x), np.arctan2(x[1], x[0])])
+    clean = np.array(clean)
+    quiet = run(one, model, start, (clean[:, :1], Angle(clean[:, 1])), u)
+    h, columns = 1e-5, []
+    for k in range(6):
+        for i in range(2):
+            moved = clean.copy()
+            moved[k, i] += h * sigma[i]
+            shifted = run(one, model, start, (moved[:, :1], Angle(moved[:, 1])), u)
+            columns.append(np.asarray(shifted.mean - quiet.mean).ravel() / h)
+    measured = np.linalg.norm(np.array(columns).T, 2)  # of the measurement noises alone
+    silent = Model(Motion(motion.step, 0.0 * G), (sensor,))
+    known = Belief(start.mean, 0.0 * start.factor)
+    found = worst_case_gain(silent, known, quiet, np.eye(2), u)
+    assert found == pytest.approx(measured, rel=2e-3)
+
+
+def test_a_gain_wants_its_steps():
+    kept = run(KF, MODEL, START, Y, keep=lambda step: step.posterior.mean)
+    with pytest.raises(ValueError, match="kept its steps"):
+        gain(kept)
+
+
+def test_attitude_matching_has_the_published_worst_cases():
+    # 80 updates in degrees, R = I, L = I: reference values of an independent prototype
+    model, start, F, aux = attitude_matching("deg", 80).run_with()
+    y, weight = np.zeros((80, 3)), np.eye(9)
+    least = gamma_min(model, start, y, weight, F, aux, rtol=1e-7)
+    assert least == pytest.approx(3.18570, abs=5e-6)
+    one = kalman(rules=[h_infinity(np.inf, weight)])
+    want = {1.0001: 1.0000003, 1.5: 1.0163, np.inf: 1.0216}
+    for share, ratio in want.items():
+        state = with_gamma(one.init(start, model.dims), share * least)
+        solution = run(one, model, state, y, F, aux)
+        found = worst_case_gain(model, start, solution, weight, F, aux) / least
+        assert found == pytest.approx(ratio, abs=3e-7 if share == 1.0001 else 5e-5)
+
+
+# ----------------------------------------------------------------------------------- steady state
+
+
+def test_the_steady_filter_is_where_the_recursion_goes():
+    y = np.zeros((2000, 3))
+    for gamma in (1.05 * dense_least(np.zeros((60, 3))), 30.0, np.inf):
+        done = h_infinity_filter(SYSTEM, y, L, gamma)
+        steady = steady_h_infinity(SYSTEM.F, SYSTEM.Q, SYSTEM.H, SYSTEM.R, L, gamma)
+        np.testing.assert_allclose(steady.P_pred, done.P_pred[-1], rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(steady.P, done.P[-1], rtol=1e-8, atol=1e-9)
+        HR = SYSTEM.H.T @ np.linalg.inv(SYSTEM.R)
+        np.testing.assert_allclose(steady.K, done.P[-1] @ HR, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(steady.K_a_priori, done.P_wide[-1] @ HR, rtol=1e-8, atol=1e-9)
+
+
+def test_the_scalar_of_the_textbook_in_closed_form():
+    # F = H = Q = R = L = 1: Simon (2006) sect. 11.3, theta = gamma^-2
+    one = np.eye(1)
+    for theta in (0.1, 0.3, 0.5):
+        P = ((1 - theta) + np.sqrt((1 - theta) * (5 - theta))) / (2 * (1 - theta))
+        steady = steady_h_infinity(one, one, one, one, one, theta**-0.5)
+        assert steady.P_pred[0, 0] == pytest.approx(P, rel=1e-12)
+        assert steady.K_a_priori[0, 0] == pytest.approx(P / (1 + (1 - theta) * P), rel=1e-12)
+    with pytest.raises(ValueError, match=r"no steady H-infinity filter with gamma = 0\.9 exists"):
+        steady_h_infinity(one, one, one, one, one, 0.9)
+    with pytest.raises(ValueError, match="gamma must be positive"):
+        steady_h_infinity(one, one, one, one, one, np.nan)
+
+
+def test_an_unseen_drift_has_no_steady_filter():
+    eye, unseen = np.eye(2), np.array([[1.0, 0.0]])
+    with pytest.raises(ValueError, match="no steady H-infinity filter"):
+        steady_h_infinity(eye, eye, unseen, np.eye(1), eye, 10.0)
