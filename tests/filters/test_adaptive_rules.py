@@ -152,7 +152,7 @@ def test_sage_husa_takes_all_of_the_prediction_from_the_innovation():
 
 
 def dense_variational_bayes(y, W, rho, iterations, dof, low, high):
-    """The table of the paper: each iteration a whole update of the state."""
+    """The recursion of the paper: each iteration a whole update of the state."""
     F, Q, H, R0 = SYSTEM.F, SYSTEM.Q, SYSTEM.H, W @ W.T
     m, P = SYSTEM.m0, SYSTEM.P0
     a, b = np.full(3, dof / 2), np.full(3, dof / 2)

