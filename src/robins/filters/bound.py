@@ -160,7 +160,7 @@ def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bou
         s = jnp.sqrt(jnp.where(known, 1.0, a @ a))
         a = jnp.where(known, 0.0, a / s)
         at = reading @ t
-        alpha, v = truncated_moments((low - at) / s, (high - at) / s)
+        alpha, v = truncated_moments(_scaled(low, at, s), _scaled(high, at, s))
         solid = v > 0.0
         root = jnp.where(solid, jnp.sqrt(jnp.where(solid, v, 1.0)), 0.0)
         column = M @ a
@@ -172,6 +172,12 @@ def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bou
     S = belief.factor
     cut_belief = Belief(manifold.retract(belief.mean, S @ t), linalg.tria(S @ M))
     return Bounded(cut_belief, (low > 0.0) | (high < 0.0), jnp.zeros((), bool))
+
+
+def _scaled(bound: Array, mean: Array, s: Array) -> Array:
+    # The slope of inf / s would be no number.
+    finite = jnp.isfinite(bound)
+    return jnp.where(finite, (jnp.where(finite, bound, 0.0) - mean) / s, bound)
 
 
 def truncated_moments(low: Array, high: Array) -> tuple[Array, Array]:

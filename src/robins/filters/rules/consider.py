@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 
 
-def consider(states: Sequence[int] | ArrayLike) -> Rule:
+def consider(states: Sequence[Any] | ArrayLike) -> Rule:
     """The Schmidt filter: considered states keep their mean and count in every covariance.
 
     The gain of the considered states p is put to zero (Schmidt 1966; Zanetti & D'Souza 2012,
@@ -72,7 +73,7 @@ def consider(states: Sequence[int] | ArrayLike) -> Rule:
     return Rule(init=init, after=after, name="consider")
 
 
-def _chosen(states: Sequence[int] | ArrayLike) -> np.ndarray:
+def _chosen(states: Sequence[Any] | ArrayLike) -> np.ndarray:
     """Indices, or a mask of booleans."""
     given = np.asarray(states)
     if given.size == 0:
