@@ -19,7 +19,7 @@ MODEL = Model(
     (Sensor(Partial(times, jnp.array(H)), jnp.array([0.6]), 1),),
 )
 START = Belief.of(jnp.array([1.0, -1.0]), np.array([[2.0, 0.5], [0.5, 1.0]]))
-T, KEYS = 12, 100
+T, KEYS = 8, 64
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def many(count, model, start, y, keys=KEYS, **options):
 def test_one_step_errs_as_the_integral_says():
     # Self-normalised importance sampling from the prior q to the posterior p errs by
     # N var = integral of p^2/q (x - mean)^2 (Owen 2013, eq. 9.8); 0.3 % of it lies past N^-1.
-    count, keys, sigma, r, y = 400, 2000, 2.0, 0.7, 1.3
+    count, keys, sigma, r, y = 200, 1000, 2.0, 0.7, 1.3
     model = Model(
         Motion(lambda x, u: x, jnp.zeros(1)), (Sensor(lambda x, aux: x, jnp.array([r]), 1),)
     )
@@ -70,15 +70,15 @@ def test_one_step_errs_as_the_integral_says():
 def test_it_converges_to_the_kalman_filter_as_the_root_of_the_count(y):
     exact = run(kalman(), MODEL, START, y)
     errors = []
-    for count in (64, 1024):
+    for count in (64, 576):
         mean, covariance, log_likelihood = many(count, MODEL, START, y)
         errors.append(np.sqrt(np.mean(((mean - exact.mean[None]) / exact.sigma[None]) ** 2)))
         ratio = np.exp(np.asarray(log_likelihood) - float(exact.log_likelihood))
         assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std() / np.sqrt(KEYS)
     # Error over sigma is about c / sqrt(count), c between 1 (independent draws) and what unequal
-    # weights add; 16 times as many particles, a quarter of the error.
-    assert 1.0 < errors[1] * np.sqrt(1024) < 2.5
-    assert 3.0 < errors[0] / errors[1] < 5.5
+    # weights add; nine times as many particles, a third of the error.
+    assert 1.0 < errors[1] * np.sqrt(576) < 2.5
+    assert 2.3 < errors[0] / errors[1] < 3.9
     assert np.std(log_likelihood) < 0.3
     average = np.mean(covariance, axis=0)
     np.testing.assert_allclose(
@@ -121,15 +121,14 @@ BENT = Model(
 
 def test_rao_blackwell_has_less_variance_and_the_same_mean():
     start = Belief.of(jnp.array([0.5, 0.0]), np.diag([1.0, 4.0]))
-    y = np.array([[0.4], [0.9], [1.7], [0.6], [1.1], [-0.2]])
-    mean, _, log_likelihood = many(300, BENT, start, y, 200, sampled=[0])
-    plain, _, other = many(300, BENT, start, y, 200)
-    # both likelihoods are without bias, so they agree
+    y = np.array([[0.4], [0.9], [1.7], [0.6]])
+    mean, _, log_likelihood = many(150, BENT, start, y, 200, sampled=[0])
+    plain, _, other = many(150, BENT, start, y, 200)
+    # A likelihood is without bias, and so is a likelihood times a mean.
     a, b = (np.exp(np.asarray(x)) for x in (log_likelihood, other))
-    assert abs(a.mean() - b.mean()) < 4.0 * np.hypot(a.std(), b.std()) / np.sqrt(200)
-    gap = np.abs(np.mean(mean, axis=0) - np.mean(plain, axis=0))
-    error = np.hypot(np.std(mean, axis=0), np.std(plain, axis=0)) / np.sqrt(200)
-    assert np.all(gap < 4.0 * error + 4.0 / 300 * np.std(plain, axis=0))
+    for one, two in ((a, b), (a[:, None] * mean[:, -1], b[:, None] * plain[:, -1])):
+        error = np.hypot(np.std(one, axis=0), np.std(two, axis=0)) / np.sqrt(200)
+        assert np.all(np.abs(np.mean(one, axis=0) - np.mean(two, axis=0)) < 4.0 * error)
     assert np.all(np.var(mean, axis=0) < np.var(plain, axis=0))
     assert np.mean(np.var(plain, axis=0)) > 2.0 * np.mean(np.var(mean, axis=0))
     assert np.var(other) > 2.0 * np.var(log_likelihood)
@@ -232,7 +231,7 @@ def test_regularising_keeps_the_moments_and_makes_no_copies():
         ratio = float(live.belief.sigma[0] / before.sigma[0])
         assert ratio == pytest.approx(1.0, abs=4 / np.sqrt(2 * 2000))
         gap = abs(float(live.belief.mean[0] - before.mean[0]) / float(before.sigma[0]))
-        assert gap < 4 * max(share, 0.02) / np.sqrt(2000) * 2
+        assert gap < 4 * np.hypot(0.5, share) / np.sqrt(2000)  # 0.5: how uneven copies are
     assert spread[0.3] == 2000
     assert spread[0.0] < 1200
 
