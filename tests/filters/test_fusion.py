@@ -1,7 +1,6 @@
 """Beliefs fused, shared out and intersected, against dense sums of inverses."""
 
 import inspect
-from functools import partial
 
 import jax
 import jax.numpy as jnp

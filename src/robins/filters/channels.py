@@ -135,7 +135,7 @@ def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
             notes={
                 **info.notes,
                 f"{name}.share": jnp.mean(joined.shares[i]),
-                f"{name}.silent": joined.silent[i],
+                f"{name}.silent": silent[i],
             },
         )
         return _select(ok, new, _refused(state, singular)), info

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -87,6 +88,7 @@ def is_singular(belief: Belief) -> Array:
     return jnp.any(pivots)
 
 
+@jax.jit
 def information_sum(beliefs: Sequence[Belief], weights: Array | None = None) -> Belief:
     """`fuse` without a look at the numbers, each information times a weight where there are some.
 
@@ -190,6 +192,7 @@ def _halley_weights(least: float) -> list[tuple[float, float, float]]:
 _WEIGHTS = _halley_weights(1e-10)
 
 
+@jax.jit
 def _to_symmetric(factor: Array) -> Array:
     """The rotation W that makes D^-1 factor W symmetric, D the lengths of the rows.
 
@@ -213,7 +216,7 @@ def _to_symmetric(factor: Array) -> Array:
 
 # -------------------------------------------------------------------------------------- intersect
 
-_BARRIERS = [10.0**-k for k in range(11)]
+_BARRIERS = [10.0**-k for k in range(11) for _ in range(2)]
 
 
 def covariance_intersection(
@@ -243,6 +246,11 @@ def intersection_weights(beliefs: Sequence[Belief], criterion: Any) -> Array:
     check_criterion(criterion, len(beliefs))
     if not isinstance(criterion, str):
         return jnp.asarray(criterion, float)
+    return _best_weights(list(beliefs), criterion)
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _best_weights(beliefs: list[Belief], criterion: Criterion) -> Array:
     slopes = _SLOPES[criterion]
     count, n = len(beliefs), beliefs[0].factor.shape[0]
     unit = jnp.min(jnp.stack([b.sigma for b in beliefs]), axis=0)
@@ -263,7 +271,7 @@ def intersection_weights(beliefs: Sequence[Belief], criterion: Any) -> Array:
         w = w + longest * move
         return w / jnp.sum(w)
 
-    steps = jnp.repeat(jnp.asarray(_BARRIERS), 3)
+    steps = jnp.asarray(_BARRIERS)
     return jax.lax.scan(lambda w, b: (newton(w, b), None), jnp.full(count, 1.0 / count), steps)[0]
 
 
