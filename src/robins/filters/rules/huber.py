@@ -1,0 +1,61 @@
+"""Give a measurement that is too large to be chance the noise that makes it chance."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.observation import Observation, normalised
+from robins.filters.rule import Rule
+from robins.filters.rules._quantile import scale_to_quantile
+
+Number = float | int  # where types are checked an int is no float
+
+
+def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
+    r"""Huber weight on the joint Mahalanobis distance of a measurement (Chang 2014, sec. 3).
+
+    Where the NIS exceeds k^2, the measurement covariance R becomes s R with
+
+        r' (H P H' + s R)^-1 r = k^2,   k^2 = the chi-square quantile of the components present,
+
+    solved exactly (Chang iterates his eq. 23, s <- s NIS(s) / k^2). One weight for the whole
+    measurement: correlated noise stays what it is, and no unit enters. The state is pulled by about
+    k^2 / |r| at the most, less the further off the measurement: what is absurd is forgotten.
+
+    Notes: ``huber.weight``, 1 / s. Components without noise of their own cannot be weighed down.
+    The Kalman filter is ``probability=1`` or ``threshold=inf``.
+
+    Args:
+        probability: share of right measurements that keep their weight, in (0, 1].
+        threshold: k, in standard deviations, whatever the number of components; None takes it from
+            the probability.
+
+    Raises:
+        ValueError: the probability is not in (0, 1], or the threshold not positive.
+    """
+    if not 0.0 < probability <= 1.0:
+        raise ValueError(f"huber probability must lie in (0, 1], got {probability}")
+    if threshold is not None and not threshold > 0.0:
+        raise ValueError(f"huber threshold must be positive, got {threshold}")
+
+    def init(belief, dims):
+        return jnp.ones(())  # of the update under way
+
+    def before(memory, prior: Belief, o: Observation):
+        seen = normalised(o)
+        if threshold is None:
+            dof = np.arange(1, len(o.residual) + 1)
+            limit = jnp.asarray([np.inf, *stats.chi2.ppf(probability, dof)])[seen.dof]
+        else:
+            limit = float(threshold) ** 2
+        s = scale_to_quantile(o, limit, seen)
+        return 1.0 / s, prior, o._replace(noise=jnp.sqrt(s) * o.noise)
+
+    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
+        notes = {**info.notes, "huber.weight": memory}
+        return jnp.ones(()), posterior, info._replace(notes=notes)
+
+    return Rule(init=init, before=before, after=after, name="huber")

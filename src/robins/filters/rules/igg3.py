@@ -1,0 +1,106 @@
+"""Equivalent weights in three zones: believe, doubt, leave out."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.observation import Observation, normalised
+from robins.filters.rule import Rule
+from robins.filters.rules._reopen import reopened
+
+Number = float | int  # where types are checked an int is no float
+
+
+class _Memory(NamedTuple):
+    doubted: dict[str, Array]  # () measurements of each sensor in a row with no weight left
+    weight: Array  # () least weight of the update under way
+    recovered: Array  # () bool, in the update under way
+
+
+def igg3(
+    k0: Number = 1.5, k1: Number = 4.0, floor: Number = 1e-4, patience: int | None = 10
+) -> Rule:
+    r"""IGG-III equivalent weights, component by component (Yang, Song & Xu 2002).
+
+        t_i = |r_i| / sqrt(S_ii)
+        w_i = 1                                      t_i <= k0
+              (k0 / t_i) ((k1 - t_i) / (k1 - k0))^2  k0 < t_i < k1, at least the floor
+              floor                                  beyond k1
+        R_ij becomes R_ij / sqrt(w_i w_j)
+
+    With the floor at zero a component beyond k1 is refused.
+
+    A filter that has gone wrong would doubt everything for ever: when no component of a sensor has
+    had more weight than the floor ``patience`` times in a row, its next such measurement is used
+    with all its weight, after the prior has been doubted along the innovation until no t_i exceeds
+    k0: P' = P + a G r r' G', G = P H' (H P H')^-1, a = max_i (1 / k0^2 - 1 / t_i^2).
+
+    Notes: ``igg3.weight``, the least of the measurement, and ``igg3.recovered``. The Kalman filter
+    is the limit of k0 above every t_i.
+
+    Args:
+        k0: end of full weight, in standard deviations of the innovation.
+        k1: begin of none.
+        floor: least weight, in [0, 1).
+        patience: measurements in a row that may be doubted whole; None never recovers.
+
+    Raises:
+        ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
+    """
+    if not 0.0 < k0 < k1 < math.inf:
+        raise ValueError(f"igg3 needs 0 < k0 < k1 < inf, got k0 = {k0}, k1 = {k1}")
+    if not 0.0 <= floor < 1.0:
+        raise ValueError(f"igg3 floor must lie in [0, 1), got {floor}")
+    if patience is not None and patience < 0:
+        raise ValueError(f"igg3 patience must not be negative, got {patience}")
+
+    def init(belief, dims):
+        doubted = {name: jnp.zeros((), int) for name in dims}
+        return _Memory(doubted, jnp.ones(()), jnp.zeros((), bool))
+
+    def before(memory: _Memory, prior: Belief, o: Observation):
+        seen = normalised(o)
+        deviation = jnp.sqrt(jnp.sum(seen.factor**2, axis=1))
+        t = jnp.abs(jnp.where(seen.used, o.residual, 0.0)) / deviation
+        far = t > k0
+        beyond = jnp.where(far, t, k1)
+        share = jnp.maximum(k1 - beyond, 0.0) / (k1 - k0)
+        weight = jnp.where(far, jnp.maximum(k0 / beyond * share**2, floor), 1.0)
+
+        measured = jnp.any(seen.used)
+        hopeless = measured & jnp.all(~seen.used | (weight <= floor))
+        before_ = memory.doubted[o.sensor]
+        if patience is None:
+            recovered = jnp.zeros((), bool)
+        else:
+            recovered = hopeless & (before_ >= patience)
+            a = jnp.max(jnp.where(far, 1.0 / k0**2 - 1.0 / beyond**2, 0.0))
+            root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
+            prior = jax.lax.cond(
+                recovered,
+                lambda: reopened(prior, o, seen.used, root),
+                lambda: Belief(*prior),
+            )
+        weight = jnp.where(recovered, 1.0, weight)
+        count = jnp.where(hopeless & ~recovered, before_ + 1, 0)
+        count = jnp.where(measured, count, before_)
+        now = _Memory({**memory.doubted, o.sensor: count}, jnp.min(weight), recovered)
+        heavier = o.noise / jnp.sqrt(jnp.where(weight > 0.0, weight, 1.0))[:, None]
+        return now, prior, o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
+
+    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
+        notes = {
+            **info.notes,
+            "igg3.weight": memory.weight,
+            "igg3.recovered": memory.recovered,
+        }
+        quiet = memory._replace(weight=jnp.ones(()), recovered=jnp.zeros((), bool))
+        return quiet, posterior, info._replace(notes=notes)
+
+    return Rule(init=init, before=before, after=after, name="igg3")

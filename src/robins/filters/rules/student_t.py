@@ -1,0 +1,95 @@
+"""Noise with heavy tails: a measurement says itself how much it is to be believed."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins import linalg
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+from robins.filters.rules._quantile import MOST
+from robins.filters.rules._shares import shares
+
+Whose = Literal["R", "both"]
+Number = float | int  # where types are checked an int is no float
+
+
+def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rule:
+    r"""Student's t filter by variational Bayes (Huang, Zhang, Li, Wu & Chambers 2017, sec. III).
+
+    Noise of v ~ t(0, R, nu) is Gaussian of covariance R / u with u ~ Gamma(nu/2, nu/2) (Roth,
+    Özkan & Gustafsson 2013). Given the posterior of the state, u has the mean 1 / c below; given
+    that, the update is a Kalman update with c R. With e the residual *after* the update,
+
+        c = (nu + E[e' R^-1 e]) / (nu + m),   e ~ N(c R S^-1 r, c R - c R S^-1 c R)
+        S = b H P H' + c R,                   b = 1
+
+    iterated from c = 1, in the space of the measurement: m x m. ``whose="both"`` gives the prior
+    such tails too, b = (nu + E[d' P^-1 d]) / (nu + n), d being the correction of the state: a
+    surprise is then shared between prior and measurement. Both are scales about the covariances
+    given, so that on Gaussian data the filter is a little wasteful; weights below one are common
+    and mean nothing by themselves.
+
+    Notes: ``student_t.weight``, 1 / c, and ``student_t.prior``, 1 / b. Components without noise of
+    their own do not count. The Kalman filter is ``dof=inf``.
+
+    Args:
+        dof: nu, degrees of freedom of the tails: 3 to 10; 1 are those of Cauchy.
+        iterations: of c, at least 1.
+        whose: tails of the measurement noise "R" only, or of "both" it and the prior.
+
+    Raises:
+        ValueError: dof is not positive, there is no iteration, or whose is neither.
+    """
+    if not dof > 0.0:
+        raise ValueError(f"student_t dof must be positive, got {dof}")
+    if iterations < 1:
+        raise ValueError(f"student_t iterations must be at least 1, got {iterations}")
+    if whose not in get_args(Whose):
+        raise ValueError(f"student_t whose must be one of {get_args(Whose)}, got {whose!r}")
+    nu = float(dof)
+
+    def scales(o: Observation, n: int) -> tuple[Array, Array]:
+        of = shares(o)
+        noisy = jnp.any(of.noise != 0.0, axis=1)
+        m = jnp.sum(noisy).astype(float)
+        exact = jnp.sum(of.seen.used & ~noisy).astype(float)
+        W, one = of.white_noise, linalg.identity(len(noisy))
+        R = W @ W.T
+        columns = jnp.concatenate([of.seen.white[:, None], W, one], axis=1)
+
+        def better(_, scale):
+            b, c = scale
+            root = linalg.cholesky(b * of.prior + c * R + of.idle)
+            X = linalg.solve_lower(root, columns)
+            w, W_, inverse = X[:, 0], X[:, 1 : -len(one)], X[:, -len(one) :]
+            v = inverse.T @ w
+            known = b * jnp.sum((inverse.T @ inverse) * of.prior)  # trace of S^-1 H P H'
+            left = c * c * jnp.sum((W_.T @ w) ** 2) + c * jnp.maximum(known - exact, 0.0)
+            if whose == "both":
+                moved = b * b * (v @ (of.prior @ v)) + b * (n - known)
+                b = jnp.minimum((1.0 + moved / nu) / (1.0 + n / nu), MOST)
+            return b, jnp.minimum((1.0 + left / nu) / (1.0 + m / nu), MOST)
+
+        return jax.lax.fori_loop(0, iterations, better, (jnp.ones(()), jnp.ones(())))
+
+    def init(belief, dims):
+        return jnp.ones(()), jnp.ones(())  # of the update under way
+
+    def before(memory, prior: Belief, o: Observation):
+        b, c = scales(o, prior.factor.shape[0])
+        if whose == "both":
+            prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
+        return (1.0 / c, 1.0 / b), prior, o._replace(noise=jnp.sqrt(c) * o.noise)
+
+    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
+        weight, other = memory
+        notes = {**info.notes, "student_t.weight": weight, "student_t.prior": other}
+        return (jnp.ones(()), jnp.ones(())), posterior, info._replace(notes=notes)
+
+    return Rule(init=init, before=before, after=after, name="student_t")

@@ -1,0 +1,411 @@
+"""Robust rules against recursions written with inverses, their limits, and planted outliers."""
+
+import inspect
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dense_kalman import random_system, simulate
+from scipy import optimize, stats
+
+from robins.filters import (
+    Belief,
+    Code,
+    Model,
+    Motion,
+    OnlineFilter,
+    Sensor,
+    kalman,
+    run,
+    unscented,
+)
+from robins.filters.rules.correntropy import correntropy
+from robins.filters.rules.gate import gate
+from robins.filters.rules.huber import huber
+from robins.filters.rules.igg3 import igg3
+from robins.filters.rules.student_t import student_t
+from robins.rotation import Rotation
+
+T = 60
+SYSTEM = random_system(2)
+MODEL, START = SYSTEM.model(), SYSTEM.start()
+
+
+def spoiled(seed: int) -> np.ndarray:
+    """A run with gaps, outliers of all sizes in single components and in all, and a jump."""
+    rng = np.random.default_rng(seed)
+    y = simulate(SYSTEM, 2, T, 0.1)[1]
+    y += np.where(rng.random(y.shape) < 0.1, 10.0 ** rng.uniform(0.5, 4.0, y.shape), 0.0)
+    y[20] += 50.0 * rng.normal(size=3)
+    y[40:] += 200.0
+    y[30] = np.nan
+    return y
+
+
+Y = spoiled(1)
+
+# ----------------------------------------------------------------------- by the book, with inverses
+
+
+class Adapted(NamedTuple):
+    """A prior and a noise covariance as a rule leaves them, the components kept, what it notes."""
+
+    P: np.ndarray
+    R: np.ndarray
+    keep: np.ndarray
+    notes: dict
+
+
+def update(m, P, H, R, z):
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return m + K @ (z - H @ m), (np.eye(len(m)) - K @ H) @ P
+
+
+def book_huber(m, P, H, R, z, memory, limit=None):
+    r = z - H @ m
+    k2 = stats.chi2.ppf(0.99, len(z)) if limit is None else limit**2
+
+    def nis(s):
+        return r @ np.linalg.solve(H @ P @ H.T + s * R, r)
+
+    s = 1.0
+    if nis(1.0) > k2:
+        s = optimize.brentq(lambda s: nis(s) / k2 - 1.0, 1.0, 1e11, xtol=1e-12, rtol=1e-14)
+    return Adapted(P, s * R, np.full(len(z), True), {"huber.weight": 1 / s}), memory
+
+
+def book_igg3(m, P, H, R, z, memory, floor=0.01, patience=4):
+    k0, k1 = 1.5, 4.0
+    r = z - H @ m
+    t = np.abs(r) / np.sqrt(np.diag(H @ P @ H.T + R))
+    w = []
+    for one in t:
+        if one <= k0:
+            w.append(1.0)
+        elif one < k1:
+            w.append(max(k0 / one * ((k1 - one) / (k1 - k0)) ** 2, floor))
+        else:
+            w.append(floor)
+    w = np.array(w)
+    recovered = np.all(w <= floor) and memory >= patience
+    if recovered:
+        G = P @ H.T @ np.linalg.inv(H @ P @ H.T)
+        a = 1 / k0**2 - 1 / np.max(t) ** 2
+        P, w = P + a * np.outer(G @ r, G @ r), np.ones(len(z))
+        assert np.max(np.abs(r) / np.sqrt(np.diag(H @ P @ H.T + R))) < k0 * (1 + 1e-9)
+        memory = 0
+    else:
+        memory = memory + 1 if np.all(w <= floor) else 0
+    keep = w > 0.0
+    safe = np.where(keep, w, 1.0)
+    notes = {"igg3.weight": np.min(w), "igg3.recovered": recovered}
+    return Adapted(P, R / np.sqrt(np.outer(safe, safe)), keep, notes), memory
+
+
+def book_student_t(m, P, H, R, z, memory, both=False):
+    nu, b, c = 4.0, 1.0, 1.0
+    for _ in range(3):
+        m_, P_ = update(m, b * P, H, c * R, z)
+        e, d = z - H @ m_, m_ - m
+        D = e @ np.linalg.solve(R, e) + np.trace(np.linalg.solve(R, H @ P_ @ H.T))
+        E = d @ np.linalg.solve(P, d) + np.trace(np.linalg.solve(P, P_))
+        c = (nu + D) / (nu + len(z))
+        b = (nu + E) / (nu + len(m)) if both else 1.0
+    notes = {"student_t.weight": 1 / c, "student_t.prior": 1 / b}
+    return Adapted(b * P, c * R, np.full(len(z), True), notes), memory
+
+
+def book_correntropy(m, P, H, R, z, memory):
+    sigma, w = 2.5, np.ones(len(z))
+    for _ in range(4):
+        m_, _ = update(m, P, H, R / np.sqrt(np.outer(w, w)), z)
+        e = (z - H @ m_) / np.sqrt(np.diag(R))
+        w = np.maximum(np.exp(-(e**2) / (2 * sigma**2)), 1e-3 / (1e5 + np.abs(e)))
+    scaled = R / np.sqrt(np.outer(w, w))
+    return Adapted(P, scaled, np.full(len(z), True), {"correntropy.weight": np.min(w)}), memory
+
+
+def by_the_book(s, y, adapt):
+    """Means, covariances and notes of a filter that adapts each update."""
+    m, P, memory, out = s.m0, s.P0, 0, []
+    for row in y:
+        m, P = s.F @ m, s.F @ P @ s.F.T + s.Q
+        here = np.isfinite(row)
+        notes = None
+        if np.any(here):
+            H, R, z = s.H[here], s.R[np.ix_(here, here)], row[here]
+            (P, R, keep, notes), memory = adapt(m, P, H, R, z, memory)
+            if np.any(keep):
+                m, P = update(m, P, H[keep], R[np.ix_(keep, keep)], z[keep])
+        out.append((m, P, notes))
+    means, covariances, notes = zip(*out, strict=True)
+    return np.array(means), np.array(covariances), notes
+
+
+PAIRS = {
+    "huber": (huber(0.99), book_huber),
+    "huber by threshold": (huber(threshold=2), lambda *a: book_huber(*a, limit=2.0)),
+    "igg3": (igg3(floor=0.01, patience=4), book_igg3),
+    "igg3 that refuses": (igg3(floor=0.0, patience=4), lambda *a: book_igg3(*a, floor=0.0)),
+    "student_t": (student_t(4.0), book_student_t),
+    "student_t of both": (
+        student_t(4.0, whose="both"),
+        lambda *a: book_student_t(*a, both=True),
+    ),
+    "correntropy": (correntropy(2.5, 4), book_correntropy),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_rule_by_the_book(name):
+    rule, adapt = PAIRS[name]
+    solution = run(kalman(rules=[rule]), MODEL, START, Y)
+    means, covariances, notes = by_the_book(SYSTEM, Y, adapt)
+    np.testing.assert_allclose(solution.mean, means, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(solution.covariance, covariances, rtol=1e-7, atol=1e-7)
+    info = solution.steps.info["y"]
+    seen = [k for k in range(T) if notes[k] is not None]
+    assert seen == [k for k in range(T) if info.code[k] != Code.MISSING]
+    for note in notes[seen[0]]:
+        want = np.array([notes[k][note] for k in seen], dtype=float)
+        got = np.asarray(info.notes[note])
+        np.testing.assert_allclose(got[seen], want, rtol=1e-6, atol=1e-12)
+        others = np.delete(got, seen)
+        assert np.all(others == (0.0 if note.endswith("recovered") else 1.0))
+        assert note == "student_t.prior" or np.ptp(want) > 0.5
+    if "igg3" in name:
+        assert 0 < sum(n["igg3.recovered"] for n in notes if n) < 5
+
+
+LIMITS = {
+    "huber by probability": huber(1),
+    "huber": huber(threshold=math.inf),
+    "igg3": igg3(1e9, 2e9),
+    "igg3 for ever": igg3(1e9, 2e9, patience=None),
+    "student_t": student_t(math.inf),
+    "student_t of both": student_t(math.inf, whose="both"),
+    "correntropy": correntropy(math.inf),
+}
+
+
+def test_at_its_limit_a_rule_is_the_kalman_filter_bit_for_bit():
+    plain = run(kalman(), MODEL, START, Y)
+    chain = run(kalman(rules=tuple(LIMITS.values())), MODEL, START, Y)
+    np.testing.assert_array_equal(chain.mean, plain.mean)
+    np.testing.assert_array_equal(chain.steps.posterior.factor, plain.steps.posterior.factor)
+    for note, value in chain.steps.info["y"].notes.items():
+        np.testing.assert_array_equal(value, np.zeros(T) + (not note.endswith("recovered")))
+
+
+# --------------------------------------------------------------------------------- planted outliers
+
+RUNS, LONG = 48, 150
+F = np.kron([[1.0, 1.0], [0.0, 1.0]], np.eye(2))  # 1 s steps of a point in a plane
+G = 0.03 * np.kron([[0.5], [1.0]], np.eye(2))
+PLANE = Model(
+    Motion(lambda x, u: jnp.asarray(F) @ x, jnp.asarray(G)),
+    (Sensor(lambda x, aux: x[:2], jnp.ones(2), 2),),
+)
+STILL = Belief.of(jnp.zeros(4), np.eye(4))
+
+
+def outliers():
+    """Truth, and measurements of it (case, run, step, 2) with faults as the fault list has them."""
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=(RUNS, 4))
+    truth = []
+    for _ in range(LONG):
+        x = x @ F.T + rng.normal(size=(RUNS, 2)) @ G.T
+        truth.append(x[:, :2])
+    truth = np.stack(truth, axis=1)
+    clean = truth + rng.normal(size=truth.shape)
+
+    def direction():
+        d = rng.normal(size=truth.shape)
+        return d / np.linalg.norm(d, axis=2, keepdims=True)
+
+    def share(part, sigmas):
+        return clean + np.where(rng.random((RUNS, LONG, 1)) < part, sigmas * direction(), 0.0)
+
+    once = clean + 1e9 * direction() * (np.arange(LONG) == 75)[:, None]
+    return truth, np.stack([clean, once, share(0.05, 10.0), share(0.3, 5.0)])
+
+
+TRUTH, FAULTY = outliers()
+
+
+def rmse(*rules):
+    """Position error [m] of each case."""
+    one = kalman(rules=rules)
+
+    def means(y):
+        return run(one, PLANE, STILL, y, keep=lambda step: step.posterior.mean[:2]).steps
+
+    found = np.asarray(jax.jit(jax.vmap(jax.vmap(means)))(jnp.asarray(FAULTY)))
+    return np.sqrt(np.mean(np.sum((found - TRUTH) ** 2, axis=-1)[:, :, 10:], axis=(1, 2)))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return rmse()
+
+
+def test_the_kalman_filter_fails_on_outliers(plain):
+    assert plain[1] / plain[0] > 1e6
+    assert plain[2] / plain[0] > 1.5
+    assert plain[3] / plain[0] > 1.8
+
+
+@pytest.mark.parametrize(
+    ("rule", "bounds"),
+    [
+        (huber(), (1.01, 1.1, 1.3, 2.0)),
+        (student_t(), (1.05, 1.1, 1.3, 2.0)),
+        (correntropy(), (1.02, 1.1, 1.3, 2.0)),
+        # What leaves out five sigma leaves out too much when a third is like that.
+        (gate(0.99), (1.05, 1.1, 1.3, math.inf)),
+        (igg3(floor=0.0), (1.12, 1.12, 1.3, math.inf)),
+    ],
+    ids=["huber", "student_t", "correntropy", "gate", "igg3"],
+)
+def test_outliers_cost_a_robust_filter_little(rule, bounds, plain):
+    got = rmse(rule) / plain[0]
+    assert np.all(got < bounds), got
+
+
+# ---------------------------------------------------------------------------------------- manifold
+
+STAR = Sensor(lambda x, aux: x["attitude"], jnp.full(3, 1e-4), 3)
+TUMBLING = Model(
+    Motion(
+        lambda x, u: {
+            **x,
+            "attitude": x["attitude"].retract(0.1 * (jnp.array([0.3, 2.0, -1.0]) - x["bias"])),
+        },
+        jnp.concatenate([jnp.full(3, 1e-5), jnp.full(3, 1e-7)]),
+    ),
+    (STAR,),
+)
+
+
+def test_star_frames_wrong_by_ten_degrees_do_not_turn_an_attitude():
+    rng = np.random.default_rng(3)
+    rate, bias, steps = np.array([0.3, 2.0, -1.0]), np.array([1e-4, -1e-4, 0.0]), 40
+    turned = 0.1 * np.arange(1.0, steps + 1.0)[:, None] * (rate - bias)
+    fault = 1e-4 * rng.normal(size=(steps, 3)) + 0.17 * (np.arange(steps) == 25)[:, None]
+    truth = jax.vmap(Rotation.identity().retract)(jnp.asarray(turned))
+    frames = jax.vmap(lambda x, d: x.retract(d))(truth, jnp.asarray(fault))
+    start = {"attitude": Rotation.identity(), "bias": jnp.zeros(3)}
+    belief = Belief.of(start, np.diag([1e-4] * 3 + [1e-8] * 3))
+    rules = (huber(), igg3(), student_t(), correntropy())
+    robust, plain = (run(kalman(rules=r), TUMBLING, belief, frames) for r in (rules, ()))
+    worst = [
+        float(np.max(np.linalg.norm(s.mean["attitude"].local(truth), axis=1)[5:]))
+        for s in (robust, plain)
+    ]
+    assert worst[0] < 3e-4
+    assert worst[1] > 0.03  # contrast
+    assert np.all(np.abs(robust.mean["bias"][-1] - bias) < 5 * robust.sigma[-1, 3:])
+
+
+# ------------------------------------------------------------------- extremes, memory and gradients
+
+ALL = (huber(), igg3(), student_t(), correntropy())
+CHAIN = kalman(rules=(*ALL, student_t(whose="both"), gate(recovery="reinitialise", patience=2)))
+
+
+def test_extremes_leave_a_covariance():
+    # Nothing known, everything known, exact and repeated measurements, and outliers among them.
+    rng = np.random.default_rng(4)
+    steps, n, m = 1500, 4, 3
+    A = rng.normal(size=(m, n))
+    sensors = np.array([A, 0 * A, A[[0, 0, 0]], A[[0, 0, 1]], np.vstack([A[:2], A[0] - A[1]])])
+    H = sensors[rng.integers(len(sensors), size=steps)]
+    W = np.array([0.0, 1e-6, 1.0])[rng.integers(3, size=(steps, m))][:, :, None] * np.eye(m)
+    y = 10.0 ** rng.uniform(-3, 9, (steps, m)) * rng.normal(size=(steps, m))
+    y[rng.random(y.shape) < 0.1] = np.nan
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    noise = np.where(rng.random((steps, 1)) < 0.1, 1.0, 0.0) * np.ones(n)
+    model = Model(
+        Motion(lambda x, u: jnp.asarray(turn) @ x, lambda x, u: u),
+        (Sensor(lambda x, aux: aux[0] @ x, lambda x, aux: aux[1], m),),
+    )
+    for P0 in (0.0, 1e12):
+        solution = run(
+            CHAIN, model, Belief.of(jnp.zeros(n), P0 * np.eye(n)), y, noise, {"y": (H, W)}
+        )
+        P = np.asarray(solution.covariance)
+        assert np.all(np.isfinite(solution.mean))
+        assert np.all(np.isfinite(P))
+        least, greatest = np.linalg.eigvalsh(P)[:, [0, -1]].T
+        assert np.all(least >= -1e-15 * greatest)
+        codes = set(np.unique(solution.steps.info["y"].code).tolist())
+        assert codes <= {Code.DONE, Code.MISSING, Code.PARTLY_MISSING, Code.REFUSED}
+
+
+def test_gradients_of_robust_filters_are_right():
+    y = jnp.array(Y[:25])
+
+    def likelihood(scale):
+        sensor = MODEL.sensors[0]
+        wide = Sensor(sensor.read, scale * sensor.noise, sensor.dim)
+        return run(kalman(rules=ALL), Model(MODEL.motion, (wide,)), START, y).log_likelihood
+
+    step = 1e-6
+    points = jnp.array([1.0, 1.0 + step, 1.0 - step])
+    value, gradient = jax.jit(jax.vmap(jax.value_and_grad(likelihood)))(points)
+    difference = float(value[1] - value[2]) / (2 * step)
+    assert float(gradient[0]) == pytest.approx(difference, rel=1e-5)
+
+
+def test_sigma_points_and_joseph_give_the_same():
+    whole = run(CHAIN, MODEL, START, Y)
+    rules = (*ALL, student_t(whose="both"), gate(recovery="reinitialise", patience=2))
+    other = run(kalman(unscented(), rules, "joseph"), MODEL, START, Y)
+    np.testing.assert_allclose(other.mean, whole.mean, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(other.covariance, whole.covariance, rtol=1e-6, atol=1e-6)
+    code = other.steps.info["y"].code
+    np.testing.assert_array_equal(code, whole.steps.info["y"].code)
+
+
+def test_memory_streams_and_stands_still_where_nothing_is_measured():
+    whole = run(CHAIN, MODEL, START, Y)
+    live = OnlineFilter(CHAIN, MODEL, START)
+    for k, row in enumerate(Y[:45]):
+        live.predict()
+        before = live.state.memory
+        live.update(row)
+        if k == 30:
+            jax.tree.map(np.testing.assert_array_equal, live.state.memory, before)
+    np.testing.assert_allclose(live.belief.mean, whole.mean[44], rtol=1e-9)
+    np.testing.assert_allclose(live.belief.covariance, whole.covariance[44], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("rule", "wrong", "said"),
+    [
+        (huber, {"probability": 0.0}, r"huber probability must lie in \(0, 1\], got 0.0"),
+        (huber, {"probability": 1.1}, "huber probability"),
+        (huber, {"probability": math.nan}, "huber probability"),
+        (huber, {"threshold": 0.0}, "huber threshold must be positive, got 0.0"),
+        (igg3, {"k0": 4.0}, "igg3 needs 0 < k0 < k1 < inf, got k0 = 4.0, k1 = 4.0"),
+        (igg3, {"k0": 0.0}, "igg3 needs"),
+        (igg3, {"k1": math.inf}, "igg3 needs"),
+        (igg3, {"floor": 1.0}, r"igg3 floor must lie in \[0, 1\), got 1.0"),
+        (igg3, {"patience": -1}, "igg3 patience must not be negative, got -1"),
+        (student_t, {"dof": 0.0}, "student_t dof must be positive, got 0.0"),
+        (student_t, {"dof": math.nan}, "student_t dof"),
+        (student_t, {"iterations": 0}, "student_t iterations must be at least 1, got 0"),
+        (student_t, {"whose": "Q"}, "student_t whose must be one of .*both.*, got 'Q'"),
+        (correntropy, {"kernel": 0.0}, "correntropy kernel must be positive, got 0.0"),
+        (correntropy, {"kernel": math.nan}, "correntropy kernel"),
+        (correntropy, {"iterations": 0}, "correntropy iterations must be at least 1"),
+    ],
+)
+def test_parameters_that_make_no_sense(rule, wrong, said):
+    # A wrong literal is caught by the type check in tests, by the rule itself elsewhere.
+    with pytest.raises(ValueError, match=said):
+        inspect.unwrap(rule)(**wrong)
