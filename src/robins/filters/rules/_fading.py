@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from robins import linalg
 from robins.filters.observation import Observation
 
 Number = float | int  # where types are checked an int is no float
+Weights = ArrayLike | Sequence[Number] | None
 
 _SOLID = 1e-6  # pivots below this share of a state's deviation are not divided by just so
 _FLOOR = 1e-10  # and nothing is taken to be more certain than this share
@@ -156,7 +158,7 @@ def faded(
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
 
 
-def checked_weights(rule: str, weights: ArrayLike | None) -> np.ndarray | None:
+def checked_weights(rule: str, weights: Weights) -> np.ndarray | None:
     """Weights of states, scaled to a greatest of 1.
 
     Raises:

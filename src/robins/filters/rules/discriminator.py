@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 from scipy import stats
 
 from robins.filters.belief import Belief, StepInfo
@@ -16,6 +16,7 @@ from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._fading import (
     Number,
+    Weights,
     averaged,
     check_size,
     checked_weights,
@@ -64,7 +65,7 @@ def discriminator(
     robust: Robust = "huber",
     threshold: Number = 3.0,
     limit: Number = 1e3,
-    weights: ArrayLike | None = None,
+    weights: Weights = None,
 ) -> Rule:
     r"""Short excess is a fault of the sensor, lasting excess one of the model (a rule of robins).
 
@@ -81,8 +82,9 @@ def discriminator(
     Faded is only what the channel sees ("projected": P + (lambda-1) P H' (H P H')^+ H P), or
     Lam^1/2 P Lam^1/2, Lam_j = max(1, a_j lambda), by weights a_j ("multiple").
 
-    It is blind to a true change for ``patience`` measurements, and takes a fault of the sensor that
-    lasts longer for a change of the model: patience is a statement about the sensor.
+    A true change with g > k2 from the start goes unnoticed for ``patience`` measurements, and a
+    fault of the sensor that lasts longer is taken for a change of the model: patience is a
+    statement about how long the sensor's faults last.
 
     Noted are ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
     ``.state`` (a `Verdict`: 0 clean, 1 outlier, 2 the model is wrong: faded, or c >= patience).

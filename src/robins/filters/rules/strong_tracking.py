@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
@@ -16,6 +16,7 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules._fading import (
     Number,
+    Weights,
     White,
     averaged,
     check_size,
@@ -48,7 +49,7 @@ def strong_tracking(
     power: Power = "classic",
     threshold: Number | None = None,
     limit: Number = 1e3,
-    weights: ArrayLike | None = None,
+    weights: Weights = None,
 ) -> Rule:
     r"""Fade the prior so that the innovation is as large as expected (Zhou & Frank 1996).
 
