@@ -1,0 +1,148 @@
+"""The group SE_2(3): attitude, velocity and position as one element.
+
+Barrau & Bonnabel, *The invariant extended Kalman filter as a stable observer*, IEEE Trans.
+Automatic Control 62 (2017), sec. IV; Hartley, Ghaffari, Eustice & Grizzle, *Contact-aided invariant
+extended Kalman filtering for robot state estimation*, Int. J. Robotics Research 39 (2020). An
+element is the matrix
+
+        [C v p]
+    X = [0 1 0],   xi = (phi, nu, rho):   exp(xi) = (exp(phi x), J(phi) nu, J(phi) rho)
+        [0 0 1]
+
+with J the left Jacobian of the rotations. In these coordinates the error of strapdown navigation
+moves by a linear law that does not depend on the path, however large the error (`ins.invariant`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.rotation import Rotation, skew
+
+_SMALL = 1e-2  # rad^2; below it the series, of which no dropped term exceeds 1e-16 of the first
+
+Side = Literal["right", "left"]
+
+
+def _coefficients(phi: Array) -> tuple[Array, Array, Array]:
+    """(1 - cos a)/a^2, (a - sin a)/a^3 and (1 - (a/2) cot(a/2))/a^2 for a = |phi|."""
+    sq = jnp.sum(phi * phi, -1)
+    # Double `where`, as in `robins.rotation`: the root has no slope at zero.
+    small = sq < _SMALL
+    a = jnp.sqrt(jnp.where(small, 1.0, sq))
+    x = jnp.where(small, sq, 0.0)
+    half = jnp.sin(0.5 * a) / a
+    once = 0.5 - x / 24.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0 * (1.0 - x / 90.0)))
+    twice = 1.0 / 6.0 - x / 120.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0 * (1.0 - x / 110.0)))
+    # 1/12 and the next Bernoulli numbers over factorials
+    back = 1.0 / 12.0 + x * (1 / 720 + x * (1 / 30240 + x * (1 / 1209600 + x / 47900160)))
+    return (
+        jnp.where(small, once, 2.0 * half**2),
+        jnp.where(small, twice, (a - jnp.sin(a)) / a**3),
+        jnp.where(small, back, (1.0 - 0.5 * jnp.cos(0.5 * a) / half) / a**2),
+    )
+
+
+def _turn(phi: Array, v: Array, once: Array, twice: Array) -> Array:
+    """(I + once phi x + twice phi x phi x) v."""
+    cross = jnp.cross(phi, v)
+    return v + once[..., None] * cross + twice[..., None] * jnp.cross(phi, cross)
+
+
+def left_jacobian(phi: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """J(phi): exp((phi + d) x) = exp((J d) x) exp(phi x) to first order in d."""
+    once, twice, _ = _coefficients(phi)
+    turn = skew(phi)
+    return jnp.eye(3) + once * turn + twice * turn @ turn
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ExtendedPose:
+    """Attitude, velocity and position; tangent order phi [rad], nu [m/s], rho [m].
+
+    ``error`` says on which side the error stands:
+
+    - "right" invariant: ``true = exp(xi) estimate``, xi seen in the frame the attitude maps *to*.
+      Its attitude part is the package's own error, ``C_true = exp(phi x) C``.
+    - "left" invariant: ``true = estimate exp(xi)``, xi seen in the body.
+    """
+
+    rotation: Rotation  # body to navigation
+    velocity: Any  # (..., 3) m/s, navigation axes
+    position: Any  # (..., 3) m, navigation axes
+    error: Side = field(default="right", metadata={"static": True})
+
+    dim = 9
+
+    @classmethod
+    def identity(cls, error: Side = "right") -> ExtendedPose:
+        """At the origin, at rest, unturned."""
+        return cls(Rotation.identity(), jnp.zeros(3), jnp.zeros(3), error)
+
+    @classmethod
+    def exp(cls, xi: Float[Array, "*b 9"], error: Side = "right") -> ExtendedPose:
+        """The group exponential."""
+        phi = xi[..., :3]
+        once, twice, _ = _coefficients(phi)
+        velocity, position = (_turn(phi, v, once, twice) for v in (xi[..., 3:6], xi[..., 6:]))
+        return cls(Rotation.from_rotvec(phi), velocity, position, error)
+
+    def log(self) -> Float[Array, "*b 9"]:
+        """The xi, of attitude part at most pi, with ``exp(xi)`` this element."""
+        phi = self.rotation.as_rotvec()
+        _, _, twice = _coefficients(phi)
+        half = jnp.full_like(twice, -0.5)
+        parts = [phi, *(_turn(phi, v, half, twice) for v in (self.velocity, self.position))]
+        return jnp.concatenate(parts, -1)
+
+    def __matmul__(self, other: ExtendedPose) -> ExtendedPose:
+        """The group product."""
+        return ExtendedPose(
+            self.rotation @ other.rotation,
+            self.rotation.apply(other.velocity) + self.velocity,
+            self.rotation.apply(other.position) + self.position,
+            self.error,
+        )
+
+    def inverse(self) -> ExtendedPose:
+        """The opposite element."""
+        back = self.rotation.inverse()
+        return ExtendedPose(
+            back, -back.apply(self.velocity), -back.apply(self.position), self.error
+        )
+
+    def adjoint(self) -> Float[Array, "9 9"]:
+        """Ad with ``X exp(xi) = exp(Ad xi) X``: body errors as errors seen outside."""
+        C, zero = self.rotation.as_dcm(), jnp.zeros((3, 3))
+        rows = (
+            (C, zero, zero),
+            (skew(self.velocity) @ C, C, zero),
+            (skew(self.position) @ C, zero, C),
+        )
+        return jnp.block([list(row) for row in rows])
+
+    def retract(self, delta: Float[Array, "*b 9"]) -> ExtendedPose:
+        """The element an error of delta leads to; the quaternion is renormalised."""
+        step = ExtendedPose.exp(delta, self.error)
+        moved = step @ self if self.error == "right" else self @ step
+        wxyz = moved.rotation.wxyz
+        unit = wxyz / jnp.linalg.norm(wxyz, axis=-1, keepdims=True)
+        return ExtendedPose(Rotation(unit), moved.velocity, moved.position, self.error)
+
+    def local(self, other: ExtendedPose) -> Float[Array, "*b 9"]:
+        """The delta for which ``self.retract(delta) == other``.
+
+        Raises:
+            ValueError: the errors of the two stand on different sides.
+        """
+        if other.error != self.error:
+            raise ValueError(f"a pose of {self.error} error against one of {other.error} error")
+        back = self.inverse()
+        return (other @ back if self.error == "right" else back @ other).log()
