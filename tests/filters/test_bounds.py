@@ -177,8 +177,10 @@ def test_sensors_in_sequence_are_one():
     near = Sensor(Partial(times, H[:2]), jnp.array([0.5, 0.7]), 2, "near")
     far = Sensor(Partial(times, H[2:]), jnp.array([2.0]), 1, "far")
     two, one = Model(Motion(Partial(times, F), G), (near, far)), SYSTEM._replace(W=W).model()
-    gamma = 9.0
-    for estimate, member in MEMBERS.items():
+    raising = h_infinity(1.0, L, policy="raise_gamma", estimate="predictor")  # gamma by sensor
+    members = {"a-priori": MEMBERS["a-priori"], "predictor": kalman(rules=[raising])}
+    for estimate, member in members.items():
+        gamma = {"a-priori": 9.0, "predictor": 1.0}[estimate]
         state = with_gamma(member.init(START, two.dims), gamma)
         split = run(member, two, state, {"near": Y[:, :2], "far": Y[:, 2:]})
         whole = run(member, one, with_gamma(member.init(START, one.dims), gamma), Y)

@@ -215,10 +215,11 @@ def worst_case_gain(
     gain_on = None
     if estimate != "a-posteriori":
         gain_on = np.tile(np.eye(F.shape[1]), (len(F), 1, 1))
-        gamma = [i.notes.get("h_infinity.gamma") for i in steps.info.values()]
-        if steps.prediction.origin is not None and gamma and gamma[-1] is not None:
+        last = [steps.info[s.name].notes for s in model.sensors if s.name in steps.info][-1:]
+        gamma = [notes["h_infinity.gamma"] for notes in last if "h_infinity.gamma" in notes]
+        if steps.prediction.origin is not None and gamma:
             # P~ L'L / gamma^2 of the settled belief that the next prediction began with
-            scaled = L[:-1] / np.asarray(gamma[-1])[:-1, None, None]
+            scaled = L[:-1] / np.asarray(gamma[0])[:-1, None, None]
             wide = np.asarray(steps.prediction.origin.covariance)[1:]
             gain_on[:-1] += wide @ np.swapaxes(scaled, 1, 2) @ scaled
     return spectral_norm(error_operator(S0, F, G, channels, L, gain_on))

@@ -1,0 +1,146 @@
+"""The adaptive H-infinity rule against a dense recursion, its limit and its memory."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dense_h_infinity import compensated, greatest, h_infinity_filter
+from dense_kalman import random_system, simulate, times
+from jax.tree_util import Partial
+
+from robins.filters import Model, Motion, OnlineFilter, Sensor, kalman, run
+from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
+
+T = 30
+SYSTEM = random_system(3)
+MODEL, START = SYSTEM.model(), SYSTEM.start()
+Y = simulate(SYSTEM, 3, T, 0.2)[1] + 20.0 * ((np.arange(T) // 3) % 4 == 2)[:, None]
+Y[6] = Y[13] = np.nan
+L = np.array([[1.0, 0.5, 0.0, -0.3], [0.0, 2.0, 1.0, 0.0]])
+HERE = np.isfinite(Y).any(axis=1)
+NAME = "adaptive_h_infinity"
+
+
+class Chosen:
+    """xi step by step, as the docstring of the rule has it."""
+
+    def __init__(self, zeta=1.0, window=10, floor=1.05, ceiling=1e6, compensate=False):
+        self.zeta, self.window, self.floor, self.ceiling = zeta, window, floor, ceiling
+        self.compensate = compensate
+        self.past, self.q, self.alpha, self.xi, self.events = [], [], [], np.inf, 0
+
+    def __call__(self, k, P, weight, nis, dof):
+        if dof:
+            self.past.append((nis, dof))
+        last = np.array(self.past[-self.window :])
+        q = last[:, 0].sum() / last[:, 1].sum()
+        alpha = 1.0 + 1.0 / (self.zeta * max(q - 1.0, 1e-6))
+        self.q.append(q)
+        self.alpha.append(min(max(alpha, self.floor), self.ceiling))
+        before = self.xi
+        if dof:
+            if self.compensate and greatest(weight @ P @ weight.T) >= before:
+                P = compensated(P, weight, before)
+                self.events += 1
+            self.xi = np.sqrt(self.alpha[-1]) * greatest(weight @ P @ weight.T)
+        self.before = before
+        return self.xi
+
+    def mend(self, P, weight, xi):
+        broken = self.compensate and greatest(weight @ P @ weight.T) >= self.before
+        return compensated(P, weight, self.before) if broken else P
+
+
+def agrees(solution, dense, chosen, last="y"):
+    for got, want in (
+        (solution.mean, dense.m),
+        (solution.covariance, dense.P),
+        (solution.steps.prediction.belief.covariance, dense.P_pred),
+    ):
+        np.testing.assert_allclose(got, want, rtol=1e-8, atol=1e-8 * np.max(np.abs(want)))
+    notes = solution.steps.info[last].notes
+    for name, want in (("q", chosen.q), ("alpha", chosen.alpha)):
+        np.testing.assert_allclose(notes[f"{NAME}.{name}"][HERE], np.array(want)[HERE], rtol=1e-6)
+    np.testing.assert_allclose(notes[f"{NAME}.bound"], dense.bound, rtol=1e-8)
+    np.testing.assert_allclose(notes[f"{NAME}.xi"][HERE], dense.gamma[HERE], rtol=1e-7)
+    assert not np.any(solution.steps.prediction.code)
+
+
+@pytest.mark.parametrize("form", ["sqrt", "joseph"])
+def test_the_recursion_is_as_documented(form):
+    rule = adaptive_h_infinity(L, zeta=0.3, window=4, floor=1.2, ceiling=50.0)
+    chosen = Chosen(0.3, 4, 1.2, 50.0)
+    solution = run(kalman(rules=[rule], form=form), MODEL, START, Y)
+    dense = h_infinity_filter(SYSTEM, Y, L, chosen)
+    agrees(solution, dense, chosen)
+    # the range of alpha is used, its ends included
+    assert min(chosen.alpha) < 2.0
+    assert max(chosen.alpha) == 50.0
+
+
+def test_the_order_of_the_patent_compensates_first():
+    chosen = Chosen(window=4, compensate=True)
+    rule = adaptive_h_infinity(L, window=4, compensate_first=True)
+    solution = run(kalman(rules=[rule]), MODEL, START, Y)
+    dense = h_infinity_filter(SYSTEM, Y, L, chosen, mend=chosen.mend)
+    agrees(solution, dense, chosen)
+    acted = np.asarray(solution.steps.info["y"].notes[f"{NAME}.compensated"])
+    assert 0 < chosen.events == acted.sum()
+    assert int(solution.final.memory[0].events) == acted[:-1].sum()  # the last step is still open
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_infinite_alpha_is_the_kalman_filter_bit_for_bit(first):
+    rule = adaptive_h_infinity(L, floor=np.inf, ceiling=np.inf, compensate_first=first)
+    got, want = run(kalman(rules=[rule]), MODEL, START, Y), run(kalman(), MODEL, START, Y)
+    np.testing.assert_array_equal(got.mean, want.mean)
+    np.testing.assert_array_equal(got.steps.posterior.factor, want.steps.posterior.factor)
+
+
+def test_sensors_add_up_to_one_step_and_streams_are_runs():
+    F, G, H = (jnp.array(a) for a in SYSTEM[:3])
+    near = Sensor(Partial(times, H[:2]), jnp.array([0.5, 0.7]), 2, "near")
+    far = Sensor(Partial(times, H[2:]), jnp.array([2.0]), 1, "far")
+    model = Model(Motion(Partial(times, F), G), (near, far))
+    y = {"near": Y[:, :2], "far": Y[:, 2:]}
+    one = kalman(rules=[adaptive_h_infinity(L, window=4)])
+    solution = run(one, model, START, y)
+    chosen = Chosen(window=4)
+    dense = h_infinity_filter(SYSTEM._replace(W=np.diag([0.5, 0.7, 2.0])), Y, L, chosen)
+    agrees(solution, dense, chosen, "far")
+
+    live = OnlineFilter(one, model, START)
+    for k in range(T):
+        live.predict()
+        live.update(y["near"][k], "near")
+        live.update(y["far"][k], "far")
+    for a, b in zip(jax.tree.leaves(live.state), jax.tree.leaves(solution.final), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
+    # what is not there is not remembered
+    before = live.state.memory
+    live.update(np.full(1, np.nan), "far")
+    for a, b in zip(jax.tree.leaves(live.state.memory), jax.tree.leaves(before), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"zeta": 0.0}, "zeta must be positive"),
+        ({"zeta": np.nan}, "zeta must be positive"),
+        ({"window": 0}, "window must be at least one"),
+        ({"floor": 1.0}, "1 < floor <= ceiling"),
+        ({"floor": np.nan}, "1 < floor <= ceiling"),
+        ({"ceiling": 1.01}, "1 < floor <= ceiling"),
+        ({"weight": np.zeros(4)}, "no error would count"),
+        ({"weight": np.array([1.0, np.inf])}, "not finite"),
+    ],
+)
+def test_bad_parameters_are_refused(changed, says):
+    with pytest.raises(ValueError, match=says):
+        adaptive_h_infinity(**{"weight": L, **changed})
+
+
+def test_a_weight_must_fit_the_state():
+    with pytest.raises(ValueError, match="weight has 3 columns, the state has 4 components"):
+        run(kalman(rules=[adaptive_h_infinity(np.eye(3))]), MODEL, START, Y)
