@@ -1,6 +1,14 @@
 """Filters: a way to linearise and a chain of rules. Knows no navigation, no sensor, no file."""
 
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
+from robins.filters.bounds import existence_margin, gamma_min, steady_h_infinity, worst_case_gain
+from robins.filters.channels import Channel, channel
+from robins.filters.delayed import Late, delayed
+from robins.filters.distributed import distributed, intersecting
+from robins.filters.federated import federated
+from robins.filters.fusion import covariance_intersection, information_sum, share
+from robins.filters.imm import imm, mode
+from robins.filters.iterated import iterated
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
 from robins.filters.linearise import (
     Linearisation,
@@ -17,16 +25,20 @@ from robins.filters.linearise import (
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
+from robins.filters.particle import particle
 from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
+from robins.filters.shares import observability_shares
 from robins.filters.smooth import rts_smoother
 
 __all__ = [
     "SENTENCES",
     "Belief",
+    "Channel",
     "Code",
     "Filter",
     "FilterState",
+    "Late",
     "Linearisation",
     "Model",
     "Motion",
@@ -42,15 +54,32 @@ __all__ = [
     "Step",
     "StepInfo",
     "Transition",
+    "channel",
+    "covariance_intersection",
     "cubature",
+    "delayed",
+    "distributed",
+    "existence_margin",
+    "federated",
     "filter_step",
+    "gamma_min",
+    "imm",
+    "information_sum",
+    "intersecting",
+    "iterated",
     "kalman",
+    "mode",
     "normalised",
+    "observability_shares",
+    "particle",
     "rts_smoother",
     "run",
+    "share",
     "sigma_points",
     "sigma_weights",
+    "steady_h_infinity",
     "taylor",
     "unscented",
     "unscented_transform",
+    "worst_case_gain",
 ]
