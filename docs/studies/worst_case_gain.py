@@ -100,7 +100,7 @@ def draw(steps: int, smallest: float, target: Path) -> None:
             right.plot(time_s, bound, style, color=colour, label=label)
     right.set(xlabel="time [s]", ylabel="local bound / gamma_min", ylim=(0.0, None))
     right.set_title("what gamma must exceed, 400 updates")
-    right.legend(loc="upper center")
+    right.legend(loc=(0.13, 0.66), fontsize="small")
     figure.savefig(target, dpi=110)
     print(f"wrote {target.name}")
 
