@@ -352,7 +352,8 @@ def test_gradients_of_robust_filters_are_right():
     def likelihood(scale):
         sensor = MODEL.sensors[0]
         wide = Sensor(sensor.read, scale * sensor.noise, sensor.dim)
-        return run(kalman(rules=ALL), Model(MODEL.motion, (wide,)), START, y).log_likelihood
+        rules = (huber(), student_t(), correntropy())
+        return run(kalman(rules=rules), Model(MODEL.motion, (wide,)), START, y).log_likelihood
 
     step = 1e-6
     points = jnp.array([1.0, 1.0 + step, 1.0 - step])
