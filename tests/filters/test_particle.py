@@ -40,7 +40,8 @@ def many(count, model, start, y, keys=KEYS, **options):
         solution = run(particle(count, key, **options), model, start, y)
         return solution.mean, solution.covariance, solution.log_likelihood
 
-    return jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(7), keys))
+    # One run after another: the thread pool of XLA can lock up on very large batches.
+    return jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(7), keys))
 
 
 def test_one_step_errs_as_the_integral_says():

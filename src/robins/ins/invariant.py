@@ -23,6 +23,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
@@ -105,8 +106,8 @@ def invariant_motion(noise: InsNoise, gravity: Vector = (0.0, 0.0, GRAVITY)) -> 
     Raises:
         ValueError: gravity is not three numbers.
     """
-    if jnp.shape(gravity) != (3,):
-        raise ValueError(f"gravity must be three numbers [m/s^2], got shape {jnp.shape(gravity)}")
+    if np.shape(gravity) != (3,):
+        raise ValueError(f"gravity must be three numbers [m/s^2], got shape {np.shape(gravity)}")
     white = jnp.concatenate([_each(noise.gyro_arw), _each(noise.accel_vrw)])
     walk = jnp.concatenate([_each(noise.gyro_bias_rw), _each(noise.accel_bias_rw)])
 
