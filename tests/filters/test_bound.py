@@ -106,12 +106,12 @@ def test_moments_of_a_cut_normal_number():
     np.testing.assert_allclose(variance, want.var(), rtol=1e-8)  # scipy's, by subtraction
     # far out, from the asymptotic series of the ratio of Mills
     for a in (1e2, 1e4, 1e7):
-        mean, variance = truncated_moments(a, jnp.inf)
+        mean, variance = truncated_moments(jnp.array(a), jnp.array(jnp.inf))
         assert float(mean) == pytest.approx(a + 1 / a - 2 / a**3 + 10 / a**5, rel=1e-14)
         assert float(variance) == pytest.approx(1 / a**2 - 6 / a**4 + 50 / a**6, rel=1e-9)
-        other = truncated_moments(-jnp.inf, -a)
+        other = truncated_moments(jnp.array(-jnp.inf), jnp.array(-a))
         assert (float(other[0]), float(other[1])) == (-float(mean), float(variance))
-    assert [float(x) for x in truncated_moments(2.0, 2.0)] == [2.0, 0.0]
+    assert [float(x) for x in truncated_moments(jnp.array(2.0), jnp.array(2.0))] == [2.0, 0.0]
 
 
 def test_one_cut_is_the_density_inside():

@@ -303,7 +303,7 @@ def recursion(noise=None, weight="covariance", gate=np.inf):
     ("way", "weight"), [(taylor(), "identity"), (unscented(), "covariance")], ids=["taylor", "ukf"]
 )
 def test_an_exact_rule_holds_after_every_sensor(way, weight):
-    one = kalman(way, [equality(D, d, weight)])
+    one = kalman(way, [equality(D.tolist(), d.tolist(), weight)])
     solution = run(one, TWO, SYSTEM.start(), DATA)
     means, covariances = recursion(weight=weight)
     np.testing.assert_allclose(solution.mean, means, rtol=1e-8, atol=1e-9)

@@ -127,7 +127,9 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[
     read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
     c = manifold.dim(value)
     if d is not None:
-        target = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), d)
+        target = jax.tree_util.tree_map(
+            lambda x: jnp.asarray(x, float), d, is_leaf=lambda x: isinstance(x, list)
+        )
     elif any(manifold.is_element(leaf) for leaf in manifold.leaves(value)):
         raise ValueError("a constraint on angles or rotations wants to be told d, its value")
     else:
