@@ -95,12 +95,12 @@ def draw(steps: int, smallest: float, target: Path) -> None:
         over_all = least(unit)
         for share, style in ((np.inf, "-"), (1.0001, "--")):
             notes = filtered(unit, share * over_all)[2].steps.info["y"].notes
-            label = f"{unit}, " + ("Kalman filter" if share == np.inf else "gamma = gamma_min")
+            label = f"{unit}, " + ("Kalman" if share == np.inf else "gamma_min")
             bound = notes["h_infinity.bound"] / over_all
             right.plot(time_s, bound, style, color=colour, label=label)
     right.set(xlabel="time [s]", ylabel="local bound / gamma_min", ylim=(0.0, None))
     right.set_title("what gamma must exceed, 400 updates")
-    right.legend(loc=(0.13, 0.66), fontsize="small")
+    right.legend(loc=(0.14, 0.68), fontsize="small")
     figure.savefig(target, dpi=110)
     print(f"wrote {target.name}")
 
