@@ -134,7 +134,7 @@ def test_all_filters_see_the_same_numbers(problem):
     assert outcome.solution["rms_line"].attrs["runs"] == 5
 
 
-def test_bounds_cover(problem):
+def test_worst_case_cover(problem):
     rng = np.random.default_rng(3)
     hits = 0
     for _ in range(400):

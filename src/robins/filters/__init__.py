@@ -1,7 +1,6 @@
 """Filters: a way to linearise and a chain of rules. Knows no navigation, no sensor, no file."""
 
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
-from robins.filters.bounds import existence_margin, gamma_min, steady_h_infinity, worst_case_gain
 from robins.filters.channels import Channel, channel
 from robins.filters.delayed import Late, delayed
 from robins.filters.distributed import distributed, intersecting
@@ -30,6 +29,12 @@ from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
 from robins.filters.shares import observability_shares
 from robins.filters.smooth import rts_smoother
+from robins.filters.worst_case import (
+    existence_margin,
+    gamma_min,
+    steady_h_infinity,
+    worst_case_gain,
+)
 
 __all__ = [
     "SENTENCES",

@@ -10,8 +10,8 @@ import numpy as np
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.bound import clip, truncate
 from robins.filters.constrain import Function, Numbers, as_sensor
+from robins.filters.interval import clip, truncate
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule

@@ -9,7 +9,9 @@ from dense_kalman import random_system, simulate, times
 from jax.tree_util import Partial
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
-from robins.filters.bounds import (
+from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
+from robins.filters.rules.h_infinity import h_infinity, with_gamma
+from robins.filters.worst_case import (
     Channel,
     error_operator,
     existence_margin,
@@ -18,8 +20,6 @@ from robins.filters.bounds import (
     steady_h_infinity,
     worst_case_gain,
 )
-from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
-from robins.filters.rules.h_infinity import h_infinity, with_gamma
 from robins.manifold import Angle
 
 T = 20

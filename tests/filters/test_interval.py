@@ -11,7 +11,7 @@ from dense_kalman import random_system, simulate
 from scipy import stats
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
-from robins.filters.bound import clip, truncate, truncated_moments
+from robins.filters.interval import clip, truncate, truncated_moments
 from robins.filters.rules.inequality import inequality
 from robins.manifold import Angle
 
@@ -197,7 +197,7 @@ def test_a_rule_keeps_its_bounds(method, way, form):
 
 
 @pytest.mark.parametrize("method", ["active-set", "truncation"])
-def test_bounds_at_infinity_are_the_kalman_filter(method):
+def test_worst_case_at_infinity_are_the_kalman_filter(method):
     plain = run(kalman(), MODEL, START, Y)
     solution = run(kalman(rules=[inequality(D, [-np.inf], [np.inf], method)]), MODEL, START, Y)
     np.testing.assert_allclose(solution.mean, plain.mean, rtol=1e-12, atol=1e-13)
@@ -242,13 +242,13 @@ def test_a_height_on_a_manifold_and_its_gradient(method):
         ({"lower": [0.0], "g": [[np.nan, 0.0]]}, "D has entries"),
     ],
 )
-def test_bounds_that_make_no_sense(given, said):
+def test_worst_case_that_make_no_sense(given, said):
     with pytest.raises(ValueError, match=said):
         # A wrong literal is caught by the type check in tests, by the rule itself elsewhere.
         inspect.unwrap(inequality)(**({"g": [[1.0, 0.0]]} | given))
 
 
-def test_bounds_that_do_not_fit_the_state():
+def test_worst_case_that_do_not_fit_the_state():
     with pytest.raises(ValueError, match="one column for each of 4 states"):
         inequality([[1.0]], [0.0]).init(START, MODEL.dims)
     with pytest.raises(ValueError, match="2 bounds for 4 components"):
