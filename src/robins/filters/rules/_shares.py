@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters.observation import Normalised, Observation, left_out, normalised
+from robins.filters.observation import Normalised, Observation, left_out, whiten
 
 
 class Shares(NamedTuple):
@@ -27,11 +27,14 @@ class Shares(NamedTuple):
 
 def shares(o: Observation) -> Shares:
     """The parts of an innovation's covariance."""
-    seen = normalised(o)
-    spread, excess, _, deficit, used = left_out(o)
-    noise = jnp.where(used[:, None], o.noise, 0.0)
+    # What `normalised` does, and its blocks again: looking for what is used twice costs time.
+    spread, excess, padded, deficit, used = left_out(o)
+    L = linalg.tria(spread, excess, padded)
+    if deficit is not None:
+        L = linalg.downdate(L, deficit)
+    seen, noise = whiten(L, used, o.residual), padded[:, : o.noise.shape[1]]
     columns = [spread, excess, noise] + ([] if deficit is None else [deficit[:, None]])
-    white = linalg.solve_lower(seen.factor, jnp.concatenate(columns, axis=1))
+    white = linalg.solve_lower(L, jnp.concatenate(columns, axis=1))
     known = spread.shape[1] + excess.shape[1]
     W, rest = white[:, :known], white[:, known : known + noise.shape[1]]
     prior = W @ W.T

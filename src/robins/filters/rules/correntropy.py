@@ -20,7 +20,7 @@ def _least(e: Array) -> Array:
     return 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e9)
 
 
-def correntropy(kernel: Number = 3.0, iterations: int = 5) -> Rule:
+def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
     r"""Maximum correntropy Kalman filter (Chen, Liu, Zhao & Principe 2017), in the measurement.
 
     The state that maximises -(x - m)' P^-1 (x - m) / 2 + sigma^2 sum G(e_i), the Gaussian kernel
