@@ -24,7 +24,7 @@ from robins.filters.linearise import (
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
-from robins.filters.particle import particle
+from robins.filters.particle import particle, reseed
 from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
 from robins.filters.shares import observability_shares
@@ -77,6 +77,7 @@ __all__ = [
     "normalised",
     "observability_shares",
     "particle",
+    "reseed",
     "rts_smoother",
     "run",
     "share",

@@ -20,32 +20,47 @@ from robins.ins.alignment import (
     level,
 )
 from robins.ins.errors import error_dynamics
+from robins.ins.extended_pose import ExtendedPose
 from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.imu_grades import grade
 from robins.ins.increments import Increments, from_imu, thin
+from robins.ins.invariant import (
+    InvariantState,
+    direction_sensor,
+    invariant_motion,
+    landmark_sensor,
+    position_sensor,
+    velocity_sensor,
+)
 from robins.ins.mechanise import Nav, as_trajectory, nav_at, refuse_polar
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 
 __all__ = [
     "Alignment",
+    "ExtendedPose",
     "ImuErrorModel",
     "Increments",
     "InsNoise",
     "InsState",
+    "InvariantState",
     "Nav",
     "StaticCheck",
     "TriadErrors",
     "align",
     "as_trajectory",
+    "direction_sensor",
     "error_dynamics",
     "from_imu",
     "grade",
     "gyrocompass",
     "heading_from_velocity",
+    "invariant_motion",
     "is_static",
+    "landmark_sensor",
     "level",
     "nav_at",
+    "position_sensor",
     "propagate",
     "propagate_linear",
     "refuse_polar",
@@ -54,4 +69,5 @@ __all__ = [
     "thin",
     "to_enu_rfu",
     "to_ned_frd",
+    "velocity_sensor",
 ]
