@@ -5,8 +5,8 @@ navigation coordinates, ``v_n = rotate(q_nb, v_b)``. All functions work on one o
 last axis holds the components, leading axes broadcast. Euler angles are roll, pitch, heading of
 the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame.
 
-Small-angle series live here, and for SE_2(3) in `ins.extended_pose`; they are exact to rounding on both sides of their
-switch and have finite derivatives at zero.
+Small-angle series live here, and for SE_2(3) in `ins.extended_pose`; they are exact to rounding on
+both sides of their switch and have finite derivatives at zero.
 """
 
 from __future__ import annotations
