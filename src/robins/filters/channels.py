@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -20,6 +19,7 @@ from robins.filters.fusion import is_singular
 from robins.filters.kalman import Again, Filter, FilterState, Prediction, kalman
 from robins.filters.linearise import Transition
 from robins.filters.model import Motion, Sensor, as_noise
+from robins.filters.trees import equal, finite, select
 
 
 class Channel(NamedTuple):
@@ -121,10 +121,10 @@ def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
         members = (*joined.members[:i], after, *joined.members[i + 1 :])
         silent = jnp.where(info.dof > 0, joined.silent.at[i].set(0), joined.silent)
         # What a measurement did not touch stands bit for bit.
-        same = _equal(before.belief, after.belief)
-        belief = _select(same, state.belief, fuse([m.belief for m in members]))
+        same = equal(before.belief, after.belief)
+        belief = select(same, state.belief, fuse([m.belief for m in members]))
         singular = jnp.stack([is_singular(m.belief) for m in members])
-        ok = same | (_finite(belief) & ~jnp.any(singular))
+        ok = same | (finite(belief) & ~jnp.any(singular))
         new = FilterState(belief, joined._replace(members=members, silent=silent))
         info = info._replace(
             used=info.used & ok,
@@ -138,7 +138,7 @@ def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
                 f"{name}.silent": silent[i],
             },
         )
-        return _select(ok, new, _refused(state, singular)), info
+        return select(ok, new, _refused(state, singular)), info
 
     return update
 
@@ -163,18 +163,18 @@ def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction
     joined = joined._replace(silent=joined.silent + 1)
     done = int(Code.DONE)
     singular = jnp.stack([is_singular(m.belief) for m in moved.members])
-    sound = _finite(moved.belief) & ~jnp.any(singular)
+    sound = finite(moved.belief) & ~jnp.any(singular)
     code = jnp.where(sound, done, int(Code.NOT_FINITE))
     for one in (*reversed(moved.codes), moved.code):
         code = jnp.where(one == done, code, one)
     ok = code == done
     kept = tuple(
-        old._replace(memory=_select(one == done, old.memory, new.memory))
+        old._replace(memory=select(one == done, old.memory, new.memory))
         for old, new, one in zip(joined.members, moved.members, moved.codes, strict=True)
     )
     stays = state._replace(memory=joined._replace(members=kept))
     new = FilterState(moved.belief, joined._replace(members=moved.members, shares=moved.shares))
-    new = _select(ok, new, _refused(stays, singular))
+    new = select(ok, new, _refused(stays, singular))
     return new, Prediction(moved.transition, new.belief, code)
 
 
@@ -207,19 +207,6 @@ def auditing(channels: Sequence[Channel]):
 def _refused(state: FilterState, singular: Array) -> FilterState:
     joined: Joined = state.memory
     return state._replace(memory=joined._replace(singular=joined.singular + singular.astype(int)))
-
-
-def _finite(belief: Belief) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(belief)]))
-
-
-def _equal(a: Belief, b: Belief) -> Array:
-    pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
-    return jnp.all(jnp.stack([jnp.all(x == y) for x, y in pairs]))
-
-
-def _select(condition: Any, new: Any, old: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def starting(

@@ -21,6 +21,7 @@ from jaxtyping import Array
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Again, Filter, FilterState
 from robins.filters.model import Model, Motion, Sensor
+from robins.filters.trees import select
 
 _WHOLE = 1e-6  # how far an age may be off a whole number: the rounding of a ratio of times
 
@@ -198,18 +199,18 @@ def delayed(
             row = jax.tree_util.tree_map(lambda a: a[j], past)
             before = jax.tree_util.tree_map(lambda a, x: a.at[j].set(x), before, inner)
             moved, prediction = filter_.predict(inner, known.motion, row.u)
-            inner = _select(row.moved, moved, inner)
+            inner = select(row.moved, moved, inner)
             taken = taken & (~row.moved | (prediction.code == int(Code.DONE)))
             for k, each in enumerate(known.sensors):
                 after, seen = filter_.update(inner, each, row.y[each.name], row.aux[each.name])
-                inner = _select(row.asked[k], after, inner)
+                inner = select(row.asked[k], after, inner)
                 gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
                 if k == which:
-                    own = _select(i == 0, seen, own)
+                    own = select(i == 0, seen, own)
             return inner, before, gained, own, taken
 
         start = jax.tree_util.tree_map(lambda a: a[at], past.before)
-        inner = _select(again, start, inner)
+        inner = select(again, start, inner)
         carry = (inner, past.before, past.log_likelihood, info, jnp.ones((), bool))
         inner, before, gained, own, taken = jax.lax.fori_loop(
             0, jnp.where(again, steps + 1, 0), repeat, carry
@@ -265,10 +266,6 @@ def _unread(sensor: Sensor, state: FilterState, aux: Any) -> Any:
     """A measurement of a sensor that tells nothing."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)
-
-
-def _select(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:

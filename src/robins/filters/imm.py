@@ -26,6 +26,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Again, Filter, FilterState, Prediction
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
+from robins.filters.trees import equal, select
 
 Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
 
@@ -109,7 +110,7 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
             # A mode that nothing comes to goes on alone, and so bit for bit does one that mixes
             # with none.
             alone = ~jnp.isfinite(log_sum) | (weight[j] == 1.0)
-            begun.append(_select(alone, state, other))
+            begun.append(select(alone, state, other))
             log_next.append(log_sum)
         return begun, jnp.stack(log_next)
 
@@ -153,8 +154,8 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
             info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
         notes["imm.probability"] = jnp.exp(log_post)
         # Where no mode has moved the mixture stands bit for bit.
-        still = _equal([s.belief for s in after], [s.belief for s in states])
-        belief = _select(still, state.belief, _mixture(after, log_post))
+        still = equal([s.belief for s in after], [s.belief for s in states])
+        belief = select(still, state.belief, _mixture(after, log_post))
         return FilterState(belief, Interaction(tuple(after), log_post)), info._replace(notes=notes)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
@@ -195,10 +196,6 @@ def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
 
 
-def _select(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
-
-
 def _among(taken: Array, log_probability: Array) -> Array:
     """The same without modes whose step failed, unless all did."""
     kept = jnp.where(taken | ~jnp.any(taken), log_probability, -jnp.inf)
@@ -213,12 +210,7 @@ def _mixture(states: Sequence[FilterState], log_probability: Array) -> Belief:
     likely = jnp.argmax(log_probability)
     best = jax.tree_util.tree_map(lambda a: a[likely], beliefs)
     weight = jnp.exp(log_probability)
-    return _select(weight[likely] == 1.0, best, matched(beliefs, weight, best.mean))
-
-
-def _equal(one: Any, other: Any) -> Array:
-    pairs = zip(jax.tree_util.tree_leaves(one), jax.tree_util.tree_leaves(other), strict=True)
-    return jnp.all(jnp.stack([jnp.all(a == b) for a, b in pairs]))
+    return select(weight[likely] == 1.0, best, matched(beliefs, weight, best.mean))
 
 
 def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:

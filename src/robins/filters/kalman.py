@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -23,6 +22,7 @@ from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.observation import Observation, left_out, whiten
 from robins.filters.rule import Memory, Rule, keep_belief
+from robins.filters.trees import finite, select
 
 Form = Literal["sqrt", "joseph"]
 
@@ -122,7 +122,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     mean = manifold.retract(prior.mean, cross @ seen.white)
     gain = linalg.solve_lower_transposed(S_y, cross.T).T
     # With nothing to use the belief stands bit for bit, as if there had been no update.
-    posterior = _select(jnp.any(used), Belief(mean, S_post), prior)
+    posterior = select(jnp.any(used), Belief(mean, S_post), prior)
     info = StepInfo(
         innovation=jnp.where(o.present, o.residual, jnp.nan),
         factor=S_y,
@@ -138,19 +138,9 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     return posterior, info
 
 
-def _finite(tree: Any) -> Array:
-    leaves = [jnp.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
-    finite = [jnp.all(jnp.isfinite(x)) for x in leaves if jnp.issubdtype(x.dtype, jnp.inexact)]
-    return jnp.all(jnp.stack(finite)) if finite else jnp.ones((), bool)
-
-
-def _select(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
-
-
 def _failure(inputs: Any, factor: Array) -> Array:
     """Why a step failed: from finite inputs a factor that is not finite was not a covariance's."""
-    indefinite = _finite(inputs) & ~_finite(factor)
+    indefinite = finite(inputs) & ~finite(factor)
     return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))
 
 
@@ -214,15 +204,15 @@ def kalman(
         belief = Belief(transition.mean, predicted_factor(transition, form))
         points = () if transition.points is None else transition.points
         new = FilterState(belief, tuple(memory), points)
-        ok = _finite(new)
+        ok = finite(new)
         why = _failure(transition, belief.factor)
         if settled is not None:
             why = jnp.where(settled == int(Code.DONE), why, settled)
             ok = ok & (settled == int(Code.DONE))
-            kept = _select(_finite(held), held, state.memory)
+            kept = select(finite(held), held, state.memory)
             state = state._replace(memory=kept)
         code = jnp.where(ok, int(Code.DONE), why)
-        new = _select(ok, new, state)
+        new = select(ok, new, state)
         transition = transition._replace(points=None)
         return new, Prediction(transition, new.belief, code, origin if settling else None)
 
@@ -243,10 +233,10 @@ def kalman(
         for i, rule in enumerate(rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
         new = FilterState(posterior, tuple(memory), drawn(posterior))
-        ok = _finite((new, info.nis))
+        ok = finite((new, info.nis))
         inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *left_out(seen)[:3])
         why = _failure(inputs, posterior.factor)
-        return _select(ok, new, state), _not_taken(ok, info, why)
+        return select(ok, new, state), _not_taken(ok, info, why)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
         return FilterState(belief, state.memory, drawn(belief))

@@ -33,6 +33,7 @@ from robins.filters.kalman import Filter, FilterState, Prediction, predicted_fac
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
+from robins.filters.trees import finite, select
 
 _GENERATOR = "threefry2x32"  # named, so that a key gives the same draws whatever JAX is set to
 
@@ -137,7 +138,7 @@ def particle(
         index = jnp.where(due, _systematic(choose, weight), jnp.arange(count))
         particles = jax.tree_util.tree_map(lambda x: x[index], cloud.particles)
         if regularise > 0.0:
-            particles = _select(due, jittered(particles, state.belief, jitter), particles)
+            particles = select(due, jittered(particles, state.belief, jitter), particles)
         return particles, jnp.where(due, -jnp.log(float(count)), cloud.log_weight)
 
     def jittered(particles: Belief, cloud: Belief, key: Array) -> Belief:
@@ -164,12 +165,12 @@ def particle(
             return t.mean, predicted_factor(t, "sqrt")
 
         after = drawn(draw, *jax.vmap(ahead)(before))
-        sound = jax.vmap(_finite)(after)
+        sound = jax.vmap(finite)(after)
         log_weight, total = log_normalised(jnp.where(sound, log_weight, -jnp.inf))
         taken = jnp.isfinite(total)
         cloud = Cloud(_each(sound, after, before), log_weight, key)
         new = FilterState(gaussian(cloud), cloud)
-        new = _select(taken, new, state._replace(memory=state.memory._replace(key=key)))
+        new = select(taken, new, state._replace(memory=state.memory._replace(key=key)))
         code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
         return new, Prediction(None, new.belief, code)
 
@@ -182,14 +183,14 @@ def particle(
             return posterior, info, b.factor @ jnp.where(info.used[:, None], o.spread, 0.0).T
 
         after, infos, cross = jax.vmap(one)(before)
-        sound = jax.vmap(_finite)((after, infos.log_likelihood))
+        sound = jax.vmap(finite)((after, infos.log_likelihood))
         gained = jnp.where(sound, infos.log_likelihood, -jnp.inf)
         log_post, total = log_normalised(log_prior + gained)
         lost = ~jnp.isfinite(total)
         cloud = Cloud(_each(sound, after, before), log_post, key)
-        cloud = _select(lost, state.memory, cloud)
+        cloud = select(lost, state.memory, cloud)
         used = jnp.any(infos.used & sound[:, None], axis=0) & ~lost
-        belief = _select(jnp.any(used), gaussian(cloud), state.belief)
+        belief = select(jnp.any(used), gaussian(cloud), state.belief)
 
         weight = jnp.exp(log_normalised(jnp.where(sound, log_prior, -jnp.inf))[0])
         expected = innovation(infos, weight, used)
@@ -274,14 +275,6 @@ def _gain(prior: Belief, cloud: Belief, infos: StepInfo, weight, cross, expected
     return linalg.solve_spd(expected.factor, covariance.T).T
 
 
-def _finite(tree: Any) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(tree)]))
-
-
-def _select(condition: Array, new: Any, old: Any) -> Any:
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
-
-
 def _each(condition: Array, new: Any, old: Any) -> Any:
     """Particle by particle."""
-    return jax.vmap(_select)(condition, new, old)
+    return jax.vmap(select)(condition, new, old)
