@@ -3,6 +3,7 @@
 Loaded by each worker of a parallel run before any test module, so before `robins` is imported.
 """
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -41,6 +42,27 @@ hypothesis.settings.register_profile(
     "explore", hypothesis.settings.get_profile("repeatable"), derandomize=False, max_examples=2000
 )
 hypothesis.settings.load_profile("repeatable")
+
+
+# Linux gives a process 65530 memory maps, and a compiled run of a filter takes 400 of them: a
+# worker that keeps every program it compiled crashes in the compiler.
+MAPS = Path("/proc/self/maps")
+MANY_MAPS = 25_000
+LOOK_EVERY = 10  # tests
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Forget compiled programs when there are many."""
+    count = item.config.stash.get(FINISHED, 0) + 1
+    item.config.stash[FINISHED] = count
+    if count % LOOK_EVERY or not MAPS.exists():
+        return
+    if MAPS.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()
+
+
+FINISHED = pytest.StashKey[int]()
 
 
 def outside(variable: str, folder: str) -> Path:
