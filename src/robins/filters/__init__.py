@@ -5,7 +5,7 @@ from robins.filters.channels import Channel, channel
 from robins.filters.delayed import Late, delayed
 from robins.filters.distributed import distributed, intersecting
 from robins.filters.federated import federated
-from robins.filters.fusion import covariance_intersection, information_sum, share
+from robins.filters.fusion import covariance_intersection, fuse, share
 from robins.filters.imm import imm, mode
 from robins.filters.iterated import iterated
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
@@ -67,9 +67,9 @@ __all__ = [
     "existence_margin",
     "federated",
     "filter_step",
+    "fuse",
     "gamma_min",
     "imm",
-    "information_sum",
     "intersecting",
     "iterated",
     "kalman",
