@@ -22,6 +22,6 @@ def equal(a: Any, b: Any) -> Array:
     return jnp.all(jnp.stack([jnp.all(x == y) for x, y in pairs]))
 
 
-def select(condition: Array, new: Any, old: Any) -> Any:
+def select(condition: Any, new: Any, old: Any) -> Any:
     """``new`` where the condition holds, else ``old``, leaf by leaf."""
     return jax.tree_util.tree_map(lambda a, b: jnp.where(condition, a, b), new, old)
