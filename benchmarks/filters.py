@@ -48,6 +48,34 @@ def peer_ukf(A, H, y):
     return go
 
 
+def textbook_ukf(A, H, y):
+    """The UKF of the textbook in JAX: covariances, one subtraction, nothing checked or missing."""
+    Q, R = 0.01 * jnp.eye(N), jnp.eye(M)
+
+    def points(m, P):
+        L = np.sqrt(N) * jnp.linalg.cholesky(P)
+        return jnp.concatenate([m[None], m + L.T, m - L.T])
+
+    def moments(values, noise):
+        mean = jnp.sum(values[1:], axis=0) / (2 * N)
+        d = values - mean
+        return mean, d, d[1:].T @ d[1:] / (2 * N) + 2.0 * d[:1].T @ d[:1] + noise
+
+    def body(state, row):
+        x = points(*state)
+        m, _, P = moments(x @ A.T + 0.01 * jnp.sin(x), Q)
+        x = points(m, P)
+        z, e, S = moments(x @ H.T, R)
+        cross = (x - m)[1:].T @ e[1:] / (2 * N)
+        K = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), cross.T).T
+        m = m + K @ (row - z)
+        return (m, P - K @ S @ K.T), m
+
+    start = jnp.zeros(N), jnp.eye(N)
+    go = jax.jit(lambda rows: jax.lax.scan(body, start, rows)[1])
+    return lambda: go(y)
+
+
 def main():
     A, H, y = problem()
     A_, H_ = jnp.asarray(A), jnp.asarray(H)
@@ -69,6 +97,7 @@ def main():
         "ukf, square root, gate": kalman(unscented(), (gate(),)),
     }
     contenders = {"filterpy ukf": peer_ukf(A, H, y)}
+    contenders["textbook ukf in JAX"] = textbook_ukf(A_, H_, jnp.asarray(y))
     for name, f in kinds.items():
         contenders[name] = lambda f=f: run(f, model, start, y, keep=mean)
         batch = jax.jit(jax.vmap(lambda b, f=f: run(f, model, b, y, keep=mean).steps))
