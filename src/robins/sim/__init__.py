@@ -2,12 +2,14 @@
 
 - `trajectory`: smooth motions from waypoints, velocity or a sine.
 - `commands`: smooth motions from manoeuvres (import the manoeuvres by their module).
+- `flexure`: structure that swings and bends between two inertial units.
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
 - `random`: streams of random numbers by seed, run and component.
 """
 
 from robins.sim.commands import from_commands
+from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments, ideal_rates, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
@@ -16,6 +18,7 @@ from robins.sim.trajectory import Motion, from_velocity, from_waypoints, sine_ve
 
 __all__ = [
     "Component",
+    "Flexure",
     "GnssErrorModel",
     "GnssFixes",
     "ImuTruth",
@@ -31,6 +34,7 @@ __all__ = [
     "ideal_increments",
     "ideal_rates",
     "observe",
+    "simulate_flexure",
     "sine_velocity",
     "stream",
     "true_increments",
