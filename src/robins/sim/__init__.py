@@ -3,6 +3,9 @@
 - `trajectory`: smooth motions from waypoints, velocity or a sine.
 - `commands`: smooth motions from manoeuvres (import the manoeuvres by their module).
 - `flexure`: structure that swings and bends between two inertial units.
+- `manoeuvres`: smooth motions of an aircraft that banks, a ship in the sea, a rough road.
+- `lever_arm`: the motion of another point of the body.
+- `disturbance`: heavy tails, outliers, steps of noise and drift (import it by its name).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
 - `random`: streams of random numbers by seed, run and component.
@@ -13,6 +16,8 @@ from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments, ideal_rates, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
+from robins.sim.lever_arm import at_lever_arm
+from robins.sim.manoeuvres import fly, roughen, sail
 from robins.sim.random import Component, generator, stream
 from robins.sim.trajectory import Motion, from_velocity, from_waypoints, sine_velocity
 
@@ -24,9 +29,11 @@ __all__ = [
     "ImuTruth",
     "Motion",
     "as_table",
+    "at_lever_arm",
     "corrupt",
     "corrupt_table",
     "fix_times",
+    "fly",
     "from_commands",
     "from_velocity",
     "from_waypoints",
@@ -34,6 +41,8 @@ __all__ = [
     "ideal_increments",
     "ideal_rates",
     "observe",
+    "roughen",
+    "sail",
     "simulate_flexure",
     "sine_velocity",
     "stream",

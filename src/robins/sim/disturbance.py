@@ -1,0 +1,83 @@
+"""What disturbs sensors beyond white noise: heavy tails, outliers, steps of noise and of drift.
+
+Pure JAX; keys come from `robins.sim.random.stream`. Noise is drawn with unit standard deviation, to
+be scaled, and a disturbance that is switched off leaves the numbers of the rest as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+
+
+def outlier_factor(
+    key: Array, shape: Sequence[int], share: float, factor: float
+) -> Float[Array, "..."]:
+    """``factor`` for a share of the samples, drawn one by one, and 1 for the rest.
+
+    Normal noise times this is the contaminated normal distribution (Tukey 1960; Huber & Ronchetti
+    2009, section 1.1), of variance ``1 + share (factor^2 - 1)``.
+
+    Raises:
+        ValueError: a share beyond 0 to 1, or a negative factor.
+    """
+    if not 0.0 <= share <= 1.0:
+        raise ValueError(f"share is {share}; it must be from 0 to 1")
+    if not factor >= 0.0:
+        raise ValueError(f"factor is {factor}; it must not be negative")
+    struck = jax.random.uniform(key, tuple(shape)) < share
+    return jnp.where(struck, float(factor), 1.0)
+
+
+def contaminated_normal(
+    key: Array, shape: Sequence[int], share: float, factor: float
+) -> Float[Array, "..."]:
+    """Normal noise of unit deviation, of which a share is `factor` times as large.
+
+    Raises:
+        ValueError: as `outlier_factor`.
+    """
+    normal, chance = jax.random.split(key)
+    return jax.random.normal(normal, tuple(shape)) * outlier_factor(chance, shape, share, factor)
+
+
+def student_t(key: Array, shape: Sequence[int], dof: float) -> Float[Array, "..."]:
+    """Student-t noise scaled to unit standard deviation.
+
+    Raises:
+        ValueError: no more than two degrees of freedom, where there is no variance.
+    """
+    if not dof > 2.0:
+        raise ValueError(f"dof is {dof}; Student's t has a variance only above 2")
+    return jax.random.t(key, float(dof), tuple(shape)) * (1.0 - 2.0 / dof) ** 0.5
+
+
+def window_factor(
+    time_s: Float[Array, "*n"], begin_s: ArrayLike, end_s: ArrayLike, factor: ArrayLike
+) -> Float[Array, "*n"]:
+    """``factor`` from begin (included) to end (not), else 1: noise that steps up and down."""
+    inside = (time_s >= begin_s) & (time_s < end_s)
+    return jnp.where(inside, jnp.asarray(factor, float), 1.0)
+
+
+def drift_step(
+    begin_s: Float[Array, "n"], dt_s: Float[Array, "n"], at_s: ArrayLike, size: Float[Array, "3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """A bias that appears at a time: its value at the end of each interval, and its integral.
+
+    Args:
+        begin_s: start of each interval.
+        dt_s: its length.
+        at_s: when the bias appears; it is there at that instant.
+        size: of the bias.
+    """
+    end = begin_s + dt_s
+    present = jnp.where(end >= at_s, 1.0, 0.0)
+    time = jnp.clip(end - at_s, 0.0, dt_s)
+    return present[:, None] * size[None], time[:, None] * size[None]

@@ -1,0 +1,159 @@
+"""Parameters of a master and a slave on one vehicle, with units.
+
+A scenario class takes them all by inheriting `PairParameters` beside `Scenario`. Vectors along the
+body are forward, right, down; along the Earth north, east, down.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, default
+from robins.systems.ins_gnss.parameters import Leg, Place
+
+Three = tuple[float, float, float]
+
+
+class BankLeg(Parameters):
+    """A bank angle, right wing down positive, and how long the leg lasts."""
+
+    bank: Annotated[float, Quantity("angle", above="-85 deg", below="85 deg")]
+    seconds: Annotated[float, Quantity("time", above="0 s")]
+
+
+class Sway(Parameters):
+    """A sine of an angle."""
+
+    amplitude: Annotated[float, Quantity("angle", least="0 deg")]
+    period: Annotated[float, Quantity("time", above="0 s")]
+    phase: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
+class Heave(Parameters):
+    """A sine of height."""
+
+    amplitude: Annotated[float, Quantity("length", least="0 m")]
+    period: Annotated[float, Quantity("time", above="0 s")]
+    phase: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
+class Aircraft(Place):
+    """Level flight at constant speed through commanded banks; see `robins.sim.manoeuvres.fly`."""
+
+    kind: Literal["aircraft"]
+    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    pitch: Annotated[float, Quantity("angle", least="-80 deg", most="80 deg")] = default("0 deg")
+    roll_time: Annotated[float, Quantity("time", above="0 s")] = default("2 s")
+    legs: tuple[BankLeg, ...]
+
+
+class Ship(Place):
+    """A straight course in the sea; without any sway the sea of `MODERATE_SEA`."""
+
+    kind: Literal["ship"]
+    speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")
+    seconds: Annotated[float, Quantity("time", above="0 s")]
+    roll: tuple[Sway, ...] | None = None
+    pitch: tuple[Sway, ...] | None = None
+    yaw: tuple[Sway, ...] | None = None
+    heave: tuple[Heave, ...] | None = None
+
+
+class Vehicle(Place):
+    """A ground vehicle that drives legs, on a road that may be rough."""
+
+    kind: Literal["vehicle"]
+    speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")  # at the start
+    legs: tuple[Leg, ...]
+    roll: tuple[Sway, ...] = ()
+    pitch: tuple[Sway, ...] = ()
+
+
+class Slave(Parameters):
+    """The inertial unit to be aligned; biases are constant in a run, drawn with these sigmas."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("50 Hz")
+    gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")]
+    accel_noise: Annotated[Three, Quantity("velocity random walk", least="0 m/s/sqrt(h)")]
+    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")]
+    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
+
+
+class Master(Parameters):
+    """The records of the master; one at each epoch of the filters."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("10 Hz")
+    # one sigma about north, east, down; flutter of the structure belongs to it
+    attitude_noise: Annotated[Three, Quantity("angle", least="0 deg")]
+    velocity_noise: Annotated[Three, Quantity("speed", least="0 m/s")]
+    position_noise: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
+    # a record stamped t describes t - delay
+    delay: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+
+
+class Mounting(Parameters):
+    """How the slave sits: ``C_ms = C(nominal) exp(error x)``, the error in slave axes."""
+
+    nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of the slave
+    error: Annotated[Three, Quantity("angle")] = default("0 deg")  # the same in every run
+    sigma: Annotated[Three, Quantity("angle", least="0 deg")] = default("0 deg")  # drawn on top
+
+
+class Structure(Parameters):
+    """What bends and swings between master and slave, in master axes: roll, pitch, heading."""
+
+    sigma: Annotated[Three, Quantity("angle", least="0 deg")] = default("0 deg")
+    time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
+    damping: Annotated[float, pydantic.Field(gt=0.0)] = 1.0
+    # degrees of freedom of the Student-t noise that drives it; without, normal
+    tail_dof: Annotated[float, pydantic.Field(gt=2.0)] | None = None
+    bending: Annotated[Three, Quantity("angle")] = default("0 deg")  # per g of load factor above 1
+
+
+class Window(Parameters):
+    """A stretch of time, its end not included."""
+
+    begin: Annotated[float, Quantity("time", least="0 s")]
+    end: Annotated[float, Quantity("time", above="0 s")]
+
+
+class Disturbance(Parameters):
+    """What no filter is told of, unless a scenario says so."""
+
+    # records of the master with attitude and velocity noise that many times as large
+    outlier_share: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.0
+    outlier_factor: Annotated[float, pydantic.Field(ge=1.0)] = 10.0
+    # degrees of freedom of Student-t noise of the master, of the stated sigmas; without, normal
+    tail_dof: Annotated[float, pydantic.Field(gt=2.0)] | None = None
+    gyro_noise_factor: Annotated[float, pydantic.Field(ge=0.0)] = 1.0  # in the window
+    gyro_noise_window: Window | None = None
+    drift_step: Annotated[Three, Quantity("angle rate")] = default("0 deg/h")  # slave axes
+    drift_step_time: Annotated[float, Quantity("time", least="0 s")] | None = None
+    dropouts: tuple[Window, ...] = ()  # no records of the master
+
+
+class Start(Parameters):
+    """One sigma of the initial errors of the slave's navigation, north, east, down.
+
+    They are drawn from normal distributions; or all +1 sigma; or 1 sigma of random sign.
+    """
+
+    attitude: Annotated[Three, Quantity("angle", least="0 deg")]
+    velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0 m/s")
+    position: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
+    draw: Literal["normal", "plus-sigma", "random-sign"] = "normal"
+
+
+class PairParameters(Parameters):
+    """A master, a slave, what is between them, and how they move."""
+
+    manoeuvre: Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")]
+    slave: Slave
+    master: Master
+    start: Start
+    mounting: Mounting = pydantic.Field(default_factory=Mounting)
+    lever_arm: Annotated[Three, Quantity("length")] = default("0 m")  # master to slave, master axes
+    flexure: Structure = pydantic.Field(default_factory=Structure)
+    disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
