@@ -1,4 +1,4 @@
-"""What a run starts from: tables of IMU samples, GNSS fixes and, where known, the truth.
+"""What a run starts from: tables of IMU samples, GNSS fixes or a master INS, and any known truth.
 
 Readers of real logs and simulators both produce a `Dataset`; nothing downstream knows which. The
 tables are NumPy, float64, time in integer nanoseconds, SI and radians, and each states its frames.
@@ -61,7 +61,10 @@ class GnssTable:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A path: position, velocity and attitude over time (truth or a solution)."""
+    """A path: position, velocity and attitude over time (the truth, or what a system reported).
+
+    As the report of a master INS it may have NaN where a component is missing, and turn rates.
+    """
 
     time_ns: np.ndarray  # (K,) int64
     lat_rad: np.ndarray
@@ -72,6 +75,8 @@ class Trajectory:
     nav: NavFrame = "NED"
     body: BodyFrame = "FRD"
     source: str = ""
+    omega_ib_b: np.ndarray | None = None  # (K, 3) rad/s turn rate against inertial space, body axes
+    rows: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -85,5 +90,6 @@ class Dataset:
     imu: ImuTable
     gnss: GnssTable | None = None
     truth: Trajectory | None = None
+    master: Trajectory | None = None  # another INS on the vehicle, to align the IMU to
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
     meta: dict[str, Any] = field(default_factory=dict)

@@ -35,6 +35,14 @@ EUROC_TRUTH = (
     "[], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]\n"
     "1403636580838555648,4.6,-1.7,0.7,1,0,0,0,0,0,0,0\n"
 )
+NAMED_IMU = (
+    "# frames: FRD\ntime_s,gyro_x_deg_s,gyro_y_deg_s,gyro_z_deg_s,accel_x_g,accel_y_g,accel_z_g\n"
+    "0.01,0,0,0,0,0,-1\n"
+)
+NAMED_PATH = (
+    "time_ms,lat_deg,lon_deg,height_m,v_north_m_s,v_east_m_s,v_down_m_s,q_w,q_x,q_y,q_z\n"
+    "100,48,11,500,1,2,0,1,0,0,0\n"
+)
 SAMPLES = {
     "gnss-imu": (GNSS_IMU, ImuTable),
     "rtklib-pos": (RTKLIB, GnssTable),
@@ -45,6 +53,8 @@ SAMPLES = {
     "pyins-trajectory": (PYINS_PATH, Trajectory),
     "euroc-imu": (EUROC_IMU, ImuTable),
     "euroc-truth": (EUROC_TRUTH, Trajectory),
+    "named-imu": (NAMED_IMU, ImuTable),
+    "named-path": (NAMED_PATH, Trajectory),
 }
 
 

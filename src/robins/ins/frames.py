@@ -83,8 +83,14 @@ def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
         q = np.asarray(multiply(jnp.asarray(_HALF_TURN), jnp.asarray(q)))
     elif turn_body:
         q = np.asarray(multiply(jnp.asarray(q), jnp.asarray(-_HALF_TURN)))
+    omega = table.omega_ib_b
     return replace(
-        table, v_n=swap(table.v_n) if turn_nav else table.v_n, q_nb=q, nav=nav, body=body
+        table,
+        v_n=swap(table.v_n) if turn_nav else table.v_n,
+        q_nb=q,
+        nav=nav,
+        body=body,
+        omega_ib_b=swap(omega) if turn_body and omega is not None else omega,
     )
 
 

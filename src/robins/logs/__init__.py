@@ -1,11 +1,11 @@
 """Logs: read and write them, have them examined, make them safe.
 
-- `open_log`, `load_dataset`: any known format, recognised by content, into the tables of
-  `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.
+- `open_log`, `load_dataset`, `load_pair`: any known format, recognised by content, into the tables
+  of `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.
 - `Mounting`: how the IMU sits in the vehicle.
 - `examine`: the doctor; findings in sentences about units, axes, time, sigmas.
 - `clean`: refuses bad samples and counts them, so that a run never sees a NaN or a step back.
-- `write_kfgins_imu`, `write_pyins`, `write_tum`, ...: for other tools.
+- `write_named`: what this room reads best; `write_kfgins_imu`, `write_pyins`, ...: for others.
 """
 
 from robins.logs.clean import clean
@@ -21,9 +21,10 @@ from robins.logs.kfgins import (
     write_kfgins_imu,
     write_kfgins_nav,
 )
-from robins.logs.loading import load_dataset
+from robins.logs.loading import load_dataset, load_pair
 from robins.logs.local import Origin
 from robins.logs.mounting import Mounting
+from robins.logs.named_csv import read_named_imu, read_named_path, write_named
 from robins.logs.pyins_csv import read_pyins, write_pyins
 from robins.logs.registry import FORMATS, Format, open_log
 from robins.logs.rtklib import read_rtklib
@@ -40,6 +41,7 @@ __all__ = [
     "clean",
     "examine",
     "load_dataset",
+    "load_pair",
     "open_log",
     "read_euroc_imu",
     "read_euroc_truth",
@@ -47,12 +49,15 @@ __all__ = [
     "read_kfgins_gnss",
     "read_kfgins_imu",
     "read_kfgins_nav",
+    "read_named_imu",
+    "read_named_path",
     "read_pyins",
     "read_rtklib",
     "write_euroc_imu",
     "write_kfgins_gnss",
     "write_kfgins_imu",
     "write_kfgins_nav",
+    "write_named",
     "write_pyins",
     "write_tum",
 ]

@@ -26,8 +26,9 @@ _TRUTH: dict[str, int | None] = {
     "alt_m": None,
     "v_n": 3,
     "q_nb": 4,
+    "omega_ib_b": 3,
 }
-_OPTIONAL = {"v_n", "sigma_v", "quality", "rows"}
+_OPTIONAL = {"v_n", "sigma_v", "quality", "rows", "omega_ib_b"}
 
 
 def checked_imu(imu: ImuTable) -> ImuTable:
@@ -62,7 +63,7 @@ def checked_gnss(gnss: GnssTable) -> GnssTable:
 
 def checked_truth(truth: Trajectory) -> Trajectory:
     """As `checked_imu`."""
-    return dataclasses.replace(truth, **_checked(truth, _TRUTH, integers=()))
+    return dataclasses.replace(truth, **_checked(truth, _TRUTH, integers=("rows",)))
 
 
 def _name(table: Any) -> str:

@@ -33,7 +33,8 @@ def clean(dataset: Dataset) -> Dataset:
 
     Counts, in samples, begin with the table's name: ``imu_nan``, ``imu_inf``, ``imu_absurd`` (a
     magnitude no vehicle has), ``imu_duplicate``, ``imu_backward`` and ``imu_ahead`` (time stamps
-    out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``.
+    out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``,
+    ``master_...``.
     Counts already in the dataset are added to.
 
     A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if that was
@@ -46,16 +47,20 @@ def clean(dataset: Dataset) -> Dataset:
             component whose sigma is never positive.
     """
     imu, counts, gaps = clean_imu(dataset.imu)
-    gnss = truth = None
+    gnss = truth = master = None
     if dataset.gnss is not None:
         gnss, more = clean_gnss(dataset.gnss)
         counts |= more
     if dataset.truth is not None:
         truth, more = clean_truth(dataset.truth)
         counts |= more
+    if dataset.master is not None:
+        master, more = clean_master(dataset.master)
+        counts |= more
     total = {k: dataset.counts.get(k, 0) + counts.get(k, 0) for k in dataset.counts | counts}
     meta = {**dataset.meta, "imu_gaps": gaps}
-    return dataclasses.replace(dataset, imu=imu, gnss=gnss, truth=truth, counts=total, meta=meta)
+    tables = {"imu": imu, "gnss": gnss, "truth": truth, "master": master}
+    return dataclasses.replace(dataset, **tables, counts=total, meta=meta)
 
 
 def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, int]]]:
@@ -83,6 +88,44 @@ def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     limit = np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M, *[SPEED_LIMIT] * 3, *[1.001] * 4])
     keep, counts = _whole_rows(truth.time_ns, values, limit)
     return _rows(truth, keep), {f"truth_{k}": n for k, n in counts.items()}
+
+
+def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
+    """Clean the report of a master INS: what is missing in a row stays missing, the rest is kept.
+
+    An attitude is one thing, so it is missing whole.
+    """
+    master = checked_truth(master)
+    parts = {
+        "position": (
+            np.stack([master.lat_rad, master.lon_rad, master.alt_m], -1),
+            np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M]),
+        ),
+        "v_n": (master.v_n, np.full(3, SPEED_LIMIT)),
+        "q_nb": (master.q_nb, np.full(4, 1.001)),
+    }
+    if master.omega_ib_b is not None:
+        parts["omega_ib_b"] = (master.omega_ib_b, np.full(3, GYRO_LIMIT))
+    kept: dict[str, np.ndarray] = {}
+    refused = {reason: np.zeros(len(master), bool) for reason in ("nan", "inf", "absurd")}
+    for name, (values, limit) in parts.items():
+        nan, inf = np.isnan(values), np.isinf(values)
+        with np.errstate(invalid="ignore"):
+            absurd = (np.abs(values) > limit) & ~inf
+        missing = nan | inf | absurd
+        if name == "q_nb":
+            missing = np.broadcast_to(missing.any(axis=1)[:, None], missing.shape)
+        kept[name] = np.where(missing, np.nan, values)
+        for reason, mask in zip(refused, (nan, inf, absurd), strict=True):
+            refused[reason] |= mask.any(axis=1)
+    have = np.any([np.isfinite(values).any(axis=1) for values in kept.values()], axis=0)
+    in_order = np.zeros(len(master), bool)
+    in_order[have] = increasing(master.time_ns[have])
+    counts = {reason: int(rows.sum()) for reason, rows in refused.items()}
+    counts |= reasons(master.time_ns[have], in_order[have])
+    lat, lon, alt = kept.pop("position").T
+    table = dataclasses.replace(master, lat_rad=lat, lon_rad=lon, alt_m=alt, **kept)
+    return _rows(table, in_order), {f"master_{k}": n for k, n in counts.items()}
 
 
 def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:

@@ -15,6 +15,7 @@ from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
 from robins.logs.checks_columns import check_columns
 from robins.logs.checks_gnss import check_gnss
 from robins.logs.checks_imu import check_imu
+from robins.logs.checks_master import check_master
 from robins.logs.checks_motion import check_motion
 from robins.logs.checks_span import check_span
 from robins.logs.checks_time import check_time
@@ -47,7 +48,10 @@ def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
         LogError: arrays that are no tables: other lengths, types, shapes.
     """
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
-        return by_severity(_examined(*_tables(subject)))
+        findings = _examined(*_tables(subject))
+        if isinstance(subject, Dataset) and subject.master is not None:
+            findings += check_master(checked_imu(subject.imu), checked_truth(subject.master))
+        return by_severity(findings)
 
 
 def _examined(tables: list[Table], findings: list[Finding]) -> list[Finding]:
@@ -83,7 +87,7 @@ def _examined(tables: list[Table], findings: list[Finding]) -> list[Finding]:
 
 def _tables(subject: Dataset | Table | Sequence[Table]) -> tuple[list[Table], list[Finding]]:
     if isinstance(subject, Dataset):
-        tables = [subject.imu, subject.gnss, subject.truth]
+        tables = [subject.imu, subject.gnss, subject.truth, subject.master]
         return [t for t in tables if t is not None], list(subject.meta.get("findings", []))
     if isinstance(subject, ImuTable | GnssTable | Trajectory):
         return [subject], []

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from robins.dataset import GnssTable, ImuTable, Trajectory
-from robins.logs import euroc, gnss_imu, kfgins, pyins_csv, rtklib
+from robins.logs import euroc, gnss_imu, kfgins, named_csv, pyins_csv, rtklib
 from robins.logs.findings import Finding, LogError
 from robins.logs.text import Head, peek
 
@@ -89,6 +89,10 @@ def _is_pyins(*tables: str) -> Callable[[Head], bool]:
     return lambda head: pyins_csv.table_of(pyins_csv.header(head)) in tables
 
 
+def _is_named(kind: str) -> Callable[[Head], bool]:
+    return lambda head: named_csv.holds(head, kind)
+
+
 def _is_euroc(column: str) -> Callable[[Head], bool]:
     def recognise(head: Head) -> bool:
         first, *others = head.lines[0].split(",")
@@ -160,6 +164,20 @@ FORMATS: tuple[Format, ...] = (
         "EuRoC/ASL CSV: #timestamp, p_RS_R_x .. q_RS_w .. v_RS_R_z",
         _is_euroc("p_RS_R_x"),
         euroc.read_euroc_truth,
+    ),
+    Format(
+        "named-imu",
+        "imu",
+        "CSV with units in its header: time_s, gyro_x_rad_s .. accel_z_m_s2, or dtheta .. dv",
+        _is_named("imu"),
+        named_csv.read_named_imu,
+    ),
+    Format(
+        "named-path",
+        "trajectory",
+        "CSV with units in its header: time_s, lat_deg .. v_down_m_s, roll_deg .. or q_w ..",
+        _is_named("trajectory"),
+        named_csv.read_named_path,
     ),
 )
 

@@ -1,0 +1,183 @@
+"""The doctor on a master INS and the IMU to be aligned to it, as views of one motion.
+
+Both sit on one vehicle, so they turn together, whatever flexes between them. The IMU must be given
+along the master's axes, as nearly as its mounting is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.ins.frames import to_ned_frd
+from robins.logs.checks_motion import SCALES, words_of
+from robins.logs.checks_velocity import check_velocity
+from robins.logs.findings import Finding
+from robins.logs.motion import signed_permutations
+from robins.logs.ordering import increasing
+from robins.logs.quiet import finding, name_of, signal_of
+
+_WINDOW_S = 0.5  # at most of which a change of attitude is compared with the gyros
+_LONGEST_S = 2.0
+_LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; below it noise of the attitudes is all there is
+_WELL, _BETTER = 0.3, 0.1  # shares of the turning left unexplained
+_LAGS_S = np.arange(-50, 51) * 0.02
+_LATE_S = 0.03
+
+
+def check_master(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
+    """Findings about what is missing, velocities against positions, attitudes against gyros."""
+    if not len(master):
+        return
+    imu, master = to_ned_frd(imu), to_ned_frd(master)
+    yield from _missing(master)
+    yield from check_velocity(_as_fixes(master))
+    yield from _turning(imu, master)
+
+
+def _as_fixes(master: Trajectory) -> GnssTable:
+    rough = np.ones((len(master), 3))
+    return GnssTable(
+        time_ns=master.time_ns,
+        lat_rad=master.lat_rad,
+        lon_rad=master.lon_rad,
+        alt_m=master.alt_m,
+        sigma_m=rough,
+        v_n=master.v_n,
+        sigma_v=rough,
+        source=master.source,
+        rows=master.rows,
+    )
+
+
+def _missing(master: Trajectory) -> Iterator[Finding]:
+    position = np.stack([master.lat_rad, master.lon_rad, master.alt_m], -1)
+    for name, values in (
+        ("position", position),
+        ("velocity", master.v_n),
+        ("attitude", master.q_nb),
+    ):
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            k = int(np.argmax(bad))
+            yield finding(
+                master,
+                "error" if bad.all() else "warning",
+                "master_missing",
+                int(bad.sum()),
+                f"the {name} is not whole here, nor in {bad.sum()} of {len(master)} records. The "
+                "rest of those records is used.",
+                k,
+            )
+
+
+def _turning(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
+    turns = _turns(imu, master)
+    if turns is None:
+        yield finding(
+            imu,
+            "note",
+            "turning_not_checked",
+            0,
+            f"gyro unit, axes and time offset could not be checked against {name_of(master)}: the "
+            "vehicle hardly turns while both were recorded.",
+        )
+        return
+    of_master, of_gyros = turns
+    at = int(np.flatnonzero(_LAGS_S == 0.0)[0])
+    as_is = _left(of_master, of_gyros[at])
+    lags = np.array([_left(of_master, turn) for turn in of_gyros])
+    best = int(np.argmin(lags))
+    if as_is > _WELL and lags[best] > _BETTER:
+        yield _diagnosis(imu, master, of_master, of_gyros[at], as_is)
+    elif 0 < best < len(lags) - 1 and np.isfinite(lags[best - 1 : best + 2]).all():
+        below, here, above = lags[best - 1 : best + 2]
+        curve = below - 2.0 * here + above
+        late = _LAGS_S[best] + (0.5 * (below - above) / curve * 0.02 if curve > 0.0 else 0.0)
+        if abs(late) > _LATE_S:
+            yield finding(
+                master,
+                "warning" if as_is > _WELL else "note",
+                "master_late",
+                float(late),
+                f"its attitudes are {abs(late):.2f} s {'older' if late > 0 else 'younger'} than "
+                f"their stamps, judged by the gyros of {name_of(imu)}. State that as its delay.",
+            )
+
+
+def _turns(imu: ImuTable, master: Trajectory) -> tuple[np.ndarray, list[np.ndarray]] | None:
+    """How far the master turned in each window (w, 3) [rad], and what the gyros say, by lag.
+
+    Means are taken out, so a bias of the gyros takes no part. None where there is too little.
+    """
+    signal = signal_of(imu)
+    known = np.flatnonzero(np.isfinite(master.q_nb).all(axis=1))
+    known = known[increasing(master.time_ns[known])]
+    if signal is None or len(known) < 2:
+        return None
+    start = int(imu.time_ns[signal.rows[0]])
+    time = (master.time_ns[known] - start) * 1e-9
+    first = np.concatenate([[True], np.diff(np.floor(time / _WINDOW_S)) > 0])
+    known, time = known[first], time[first]
+    inside = (time[:-1] > _LAGS_S[-1]) & (time[1:] < signal.time_s[-1] - _LAGS_S[-1])
+    inside &= np.diff(time) < _LONGEST_S
+    if np.count_nonzero(inside) < 10:
+        return None
+    q = Rotation.from_quat(master.q_nb[known][:, [1, 2, 3, 0]])
+    of_master = (q[:-1].inv() * q[1:]).as_rotvec()[inside]
+    steps = np.diff(signal.time_s, prepend=signal.time_s[0] - signal.step_s)
+    angle = np.cumsum(signal.gyro * steps[:, None], axis=0)
+
+    def by_gyros(lag: float) -> np.ndarray:
+        at = [np.interp(time - lag, signal.time_s, a) for a in angle.T]
+        turned = np.diff(np.stack(at, -1), axis=0)[inside]
+        return turned - turned.mean(axis=0)
+
+    of_master = of_master - of_master.mean(axis=0)
+    length = float(np.median(np.diff(time)[inside]))
+    if np.sqrt(np.mean(np.sum(of_master**2, axis=1))) < _LEAST_RATE * length:
+        return None
+    return of_master, [by_gyros(lag) for lag in _LAGS_S]
+
+
+def _left(of_master: np.ndarray, of_gyros: np.ndarray) -> float:
+    """Share of the master's turning that the gyros do not explain."""
+    return float(np.sum((of_master - of_gyros) ** 2) / np.sum(of_master**2))
+
+
+def _diagnosis(
+    imu: ImuTable, master: Trajectory, of_master: np.ndarray, of_gyros: np.ndarray, as_is: float
+) -> Finding:
+    """Another unit or other axes of the gyros, if one of them explains the turning."""
+    maps = signed_permutations()
+    scales = np.array([*SCALES, *(1.0 / s for s in SCALES)])
+    tried = np.concatenate([maps, scales[:, None, None] * np.eye(3)])
+    left = np.array([_left(of_master, of_gyros @ m.T) for m in tried])
+    k = int(np.argmin(left))
+    shown = (
+        f"the gyros do not turn as the attitudes of {name_of(master)} do ({as_is:.0%} of the "
+        f"turning is left over"
+    )
+    if left[k] > _BETTER:
+        return finding(
+            imu,
+            "error",
+            "turning_disagrees",
+            as_is,
+            f"{shown}), whatever unit, axis or shift of a second is tried. The files are of "
+            "different recordings or clocks, or the nominal mounting is another.",
+        )
+    if k < len(maps):
+        code = "gyro_axes"
+        cause = f"They fit as {words_of(maps[k], 'gyro')}: correct the nominal mounting or the axes"
+    else:
+        code = "gyro_unit"
+        scale = float(tried[k][0, 0])
+        unit, mend = SCALES.get(scale, ("of the attitudes in another unit", "check both files"))
+        cause = f"They are probably {unit}: {mend}"
+    return finding(
+        imu, "error", code, float(left[k]), f"{shown}, with other gyros {left[k]:.0%}). {cause}."
+    )
