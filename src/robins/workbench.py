@@ -18,7 +18,7 @@ import numpy as np
 from robins import _float64, logs, report, results, scenario
 from robins.campaign import simulate
 from robins.logs import Finding
-from robins.systems import SYSTEMS, Outcome, System
+from robins.systems import SYSTEMS, Outcome, Study, System
 
 Progress = Callable[[float, str], None]
 
@@ -70,12 +70,25 @@ def find_scenario(name: str) -> tuple[System, str, str]:
     return SYSTEMS[chosen], Path(name).stem, text
 
 
-def _check_filters(system: System, wanted: Sequence[str]) -> tuple[str, ...]:
+def _study_of(system: System, text: str, source: str) -> Study:
+    """The study that a scenario is of."""
+    names = ", ".join(system.studies)
+    chosen = scenario.mapping_of(text).get("study")
+    if chosen is None and len(system.studies) == 1:
+        return next(iter(system.studies.values()))
+    if not isinstance(chosen, str) or chosen not in system.studies:
+        raise InputError(
+            f'{source}: write study = "..." into its first lines, one of {names}; it says '
+            f"{chosen!r}"
+        )
+    return system.studies[chosen]
+
+
+def _check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
     for name in wanted:
-        if name not in system.filters:
+        if name not in known:
             raise InputError(
-                f"no filter '{name}' in {system.name}{_hint(name, system.filters)}. It has "
-                f"{', '.join(system.filters)}"
+                f"no filter '{name}' in {where}{_hint(name, known)}. It has {', '.join(known)}"
             )
     return tuple(dict.fromkeys(wanted))
 
@@ -144,12 +157,13 @@ def run_scenario(
     tell = progress or (lambda share, what: None)
     system, label, text = find_scenario(name)
     settings = tuple(settings)
-    parameters = scenario.parse(system.parameters, text, settings, source=name)
-    chosen = _check_filters(system, filters) or parameters.filters
+    study = _study_of(system, text, name)
+    parameters = scenario.parse(study.parameters, text, settings, source=name)
+    chosen = _check_filters(label, study.filters, filters or parameters.filters)
     count = parameters.runs if runs is None else runs
     with _writer(out, text, settings, command) as writer:
         try:
-            problem = system.problem(parameters, chosen, seed)
+            problem = study.problem(parameters, chosen, seed)
         except ValueError as error:
             raise InputError(f"{name}: {error}") from error
         outcome = simulate(problem, count, progress=lambda s, w: tell(0.85 * s, w))
@@ -213,7 +227,7 @@ def replay_log(
     settings = tuple(settings)
     source = configurations[0] if configurations else "the default configuration"
     parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
-    chosen = _check_filters(chosen_system, filters)
+    chosen = _check_filters(system, chosen_system.replay_filters, filters)
     with _writer(out, text, settings, command) as writer:
         tell(0.0, "reading")
         angles = np.degrees(chosen_system.orientation(parameters))

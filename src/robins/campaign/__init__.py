@@ -1,6 +1,6 @@
 """Campaigns: many runs of a problem, in chunks, with statistics that say how sure they are."""
 
-from robins.campaign.monte_carlo import CHUNK, chunks
+from robins.campaign.monte_carlo import CHUNK, chunks, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
 from robins.campaign.statistics import (
     Statistics,
@@ -16,6 +16,8 @@ __all__ = [
     "chunks",
     "collect",
     "mean_with_bounds",
+    "record",
     "rms_with_bounds",
     "simulate",
+    "worlds",
 ]

@@ -2,7 +2,8 @@
 
 A chunk is the unit of everything: of compilation (one shape, the last chunk padded), of memory, of
 progress and, for stores and clusters, of work. Run number k draws the same random numbers in any
-chunk of any campaign.
+chunk of any campaign. A chunk of worlds is simulated once, and every filter sees it; filters that
+differ in numbers only share what was compiled for them.
 """
 
 from __future__ import annotations
@@ -14,42 +15,105 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import Solution, Step, run
-from robins.filters.consistency import block_nees, nees
-from robins.manifold import local
+from robins.filters import Belief, Solution, Step, run
+from robins.filters.consistency import nees, normalised_sq
+from robins.manifold import State, local
 from robins.systems.system import Contender, Problem
 
 CHUNK = 64  # runs; large enough to fill a core's vectors, small enough for the cache
 
+_Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reported components
+
 
 def _kept(step: Step) -> Any:
     """What a campaign keeps of a step: enough for errors, bounds and innovations."""
-    info = {name: (i.innovation, i.sigma, i.nis, i.dof, i.code) for name, i in step.info.items()}
+    info = {
+        name: (i.innovation, i.sigma, i.nis, i.dof, i.code, i.notes)
+        for name, i in step.info.items()
+    }
     return step.posterior, info
 
 
-def _record(problem: Problem, contender: Contender, index: Array) -> dict[str, Any]:
-    """One run of one filter, from its number to what statistics need."""
-    case = problem.simulate(index)
+def _reported(contender: Contender, belief: Belief, truth: State) -> tuple[Array, Array]:
+    """Error and factor of what the filters of a problem report alike."""
+    error, factor = local(belief.mean, truth), belief.factor
+    if contender.reported is not None:
+        rows = jnp.asarray(contender.reported, float)
+        error, factor = rows @ error, rows @ factor
+    return error, factor
+
+
+def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]:
+    """One run of one filter, to what statistics need."""
+    case = contender.case(world)
     solution: Solution = run(
         contender.filter, contender.model, case.start, case.y, case.u, case.aux, keep=_kept
     )
     posterior, info = solution.steps
-    blocks = {b.name: jax.vmap(partial(block_nees, block=b.where)) for b in problem.blocks}
+    error, factor = jax.vmap(partial(_reported, contender))(posterior, case.truth)
+    of = {name: (slice(None), slice(first, last)) for name, first, last in blocks}
     return {
-        "error": jax.vmap(local)(posterior.mean, case.truth),
-        "sigma": posterior.sigma,
+        "error": error,
+        "sigma": jnp.sqrt(jnp.sum(factor * factor, -1)),
         "nees": jax.vmap(nees)(posterior, case.truth),
-        "block_nees": {name: f(posterior, case.truth) for name, f in blocks.items()},
+        "dim": jnp.asarray(posterior.factor.shape[-1]),
+        "block_nees": {k: jax.vmap(normalised_sq)(error[at], factor[at]) for k, at in of.items()},
         "mean": posterior.mean,
         "innovation": {k: v[0] for k, v in info.items()},
         "innovation_sigma": {k: v[1] for k, v in info.items()},
         "nis": {k: v[2] for k, v in info.items()},
         "dof": {k: v[3] for k, v in info.items()},
         "code": {k: v[4] for k, v in info.items()},
+        "notes": {k: v[5] for k, v in info.items()},
     }
+
+
+@partial(jax.jit, static_argnames=("filter_", "blocks"))
+def _records(filter_, blocks: _Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
+    contender = Contender(filter_, model, case, reported)
+    return jax.vmap(partial(_record, blocks, contender))(worlds)
+
+
+def worlds(
+    problem: Problem, runs: int, chunk: int = CHUNK, first: int = 0
+) -> Iterator[tuple[Any, int]]:
+    """Simulate runs first .. first + runs - 1, a chunk at a time.
+
+    Yields:
+        What `Problem.simulate` returns, with a leading axis of ``min(chunk, runs)``, and how many
+        of them count: the last chunk is padded with runs to be thrown away.
+
+    Raises:
+        ValueError: runs or chunk is not positive.
+    """
+    if runs < 1 or chunk < 1:
+        raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
+    width = min(chunk, runs)
+    batch = jax.jit(jax.vmap(problem.simulate))
+    for begin in range(first, first + runs, width):
+        yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
+
+
+def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, Any]:
+    """Run a filter of a problem in a chunk of worlds.
+
+    Returns:
+        NumPy records with a leading axis of ``count`` runs. Of the reported components error and
+        sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
+        innovation, innovation_sigma, nis, dof, code and the notes of rules.
+
+    Raises:
+        ValueError: there is no such contender.
+    """
+    if name not in problem.contenders:
+        raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
+    c = problem.contenders[name]
+    blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
+    found = _records(c.filter, blocks, c.model, Partial(c.case), c.reported, worlds)
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
 
 
 def chunks(
@@ -60,7 +124,7 @@ def chunks(
     first: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Run a filter of a problem over runs first .. first + runs - 1.
+    """Records of one filter over runs first .. first + runs - 1, as `record` gives them.
 
     Args:
         problem: what to simulate.
@@ -70,23 +134,12 @@ def chunks(
         first: number of the first run.
         progress: called with the number of runs done after each chunk.
 
-    Yields:
-        NumPy records with a leading axis of at most ``chunk`` runs: error (E, n), sigma, nees (E,),
-        block_nees by block, mean, and by sensor innovation, innovation_sigma, nis, dof, code.
-
     Raises:
         ValueError: runs or chunk is not positive, or there is no such contender.
     """
-    if runs < 1 or chunk < 1:
-        raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
-    if name not in problem.contenders:
-        raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
-    width = min(chunk, runs)
-    batch = jax.jit(jax.vmap(partial(_record, problem, problem.contenders[name])))
-    for begin in range(first, first + runs, width):
-        count = min(width, first + runs - begin)
-        # the last chunk is padded with runs that are computed and thrown away
-        record = batch(jnp.arange(begin, begin + width))
-        yield jax.tree_util.tree_map(lambda x, c=count: np.asarray(x)[:c], record)
+    done = 0
+    for batch, count in worlds(problem, runs, chunk, first):
+        yield record(problem, name, batch, count)
+        done += count
         if progress is not None:
-            progress(begin - first + count)
+            progress(done)

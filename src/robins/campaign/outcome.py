@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from robins.campaign.monte_carlo import CHUNK, chunks
+from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
 from robins.filters import Code
 from robins.results import variable
@@ -31,19 +31,18 @@ def simulate(
         progress: called with the share done in 0..1 and what is being done.
     """
     tell = progress if progress is not None else (lambda share, what: None)
-    found: dict[str, Statistics] = {}
     names = list(problem.contenders)
-    for i, name in enumerate(names):
-        tell(i / len(names), f"{name}: compiling")
-
-        def step(done: int, i=i, name=name):
-            tell((i + done / runs) / len(names), f"{name}: {done} of {runs} runs")
-
-        statistics = Statistics(problem.blocks, problem.count_from)
-        for record in chunks(problem, name, runs, chunk, progress=step):
-            statistics.add(record)
-        found[name] = statistics
-    metrics = {name: problem.metrics(s) for name, s in found.items()}
+    found = {n: Statistics(problem.blocks, problem.count_from, problem.limits) for n in names}
+    done = 0
+    for batch, count in worlds(problem, runs, chunk):
+        for i, name in enumerate(names):
+            verb = "compiling, " if done == 0 else ""
+            share = (done + count * i / len(names)) / runs
+            tell(share, f"{name}: {verb}runs {done + 1} to {done + count} of {runs}")
+            found[name].add(record(problem, name, batch, count))
+        done += count
+    facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
+    metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
     return Outcome(
         solution=campaign_solution(problem, found),
         metrics=metrics,
@@ -96,19 +95,52 @@ def campaign_solution(problem: Problem, found: dict[str, Statistics]) -> xr.Data
         add("sigma", f"stated sigma of {words}, first run", lambda s: s.first_run["sigma"])
         add("rms", f"RMS error of {words}", lambda s: s.rms, runs=runs)
         add("mean_sigma", f"stated sigma of {words}", lambda s: s.sigma, runs=runs)
-    n = next(iter(found.values())).n
+    # what an H-infinity filter states is no covariance, so no chi-square test applies to it
+    bound = np.array([problem.contenders[name].bounds for name in found])
+    data["bounds"] = variable("filter", bound.astype(np.int8), "1", "states bounds, not sigmas")
+    blank = np.where(bound, np.nan, 1.0)[:, None]
     data["anees"] = variable(
-        ft,
-        _stack(found, lambda s: s.anees()),
-        "1",
-        "ANEES",
-        runs=runs,
-        degrees_of_freedom=n,
-        normalised=1,
+        ft, blank * _stack(found, lambda s: s.anees()), "1", "ANEES", runs=runs, normalised=1
     )
+    data["anees_dof"] = variable(
+        ft, blank * _stack(found, lambda s: np.full(s.anees().shape, s.n)), "1", "state dimension"
+    )
+    for limit in problem.limits:
+        data[f"within_{limit.name}"] = variable(
+            ft,
+            _stack(found, lambda s, name=limit.name: s.share_within(name)),
+            "1",
+            f"runs with {limit.block.replace('_', ' ')} within {limit.name.replace('_', ' ')}",
+            runs=runs,
+        )
+    data |= _notes(found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
     return xr.Dataset(data | more, coords | places)
+
+
+def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
+    """What rules noted in the first run, NaN for filters that have no such rule.
+
+    With several sensors the last one's are those of the step.
+    """
+    of: dict[str, dict[str, np.ndarray]] = {}
+    for name, s in found.items():
+        for notes in s.first_run["notes"].values():
+            for note, value in notes.items():
+                if np.ndim(value) == 1:
+                    of.setdefault(note, {})[name] = np.asarray(value, dtype=float)
+    epochs = next(iter(found.values())).rms.shape[0]
+    none = np.full(epochs, np.nan)
+    return {
+        f"note_{note.replace('.', '_')}": variable(
+            ("filter", "time"),
+            np.stack([by.get(name, none) for name in found]),
+            "1",
+            f"{note.replace('.', ': ').replace('_', ' ')}, first run",
+        )
+        for note, by in of.items()
+    }
 
 
 def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
-from robins.systems.system import StateBlock
+from robins.systems.system import Limit, StateBlock
 
 
 @dataclass
@@ -25,14 +25,16 @@ class Statistics:
         runs: added so far.
         diverged: runs whose error or covariance stopped being finite; they stay in the count, and
             every statistic that they touch is infinite rather than flattered.
-        run_rms: (runs, n) root mean square of the error of each run over the epochs counted.
+        run_rms: (runs, r) root mean square of the error of each run over the epochs counted.
         example: the record of the first run, for figures.
     """
 
     blocks: Sequence[StateBlock]
     count_from: int = 0  # first epoch that counts for per-run figures
+    limits: Sequence[Limit] = ()
     runs: int = 0
     diverged: int = 0
+    n: int = 0  # tangent dimension of the filter's state, which may have more than is reported
     example: dict[str, Any] | None = None
     _square: Any = 0.0
     _variance: Any = 0.0
@@ -42,6 +44,9 @@ class Statistics:
     _dof: dict[str, Any] = field(default_factory=dict)
     _codes: dict[str, dict[int, int]] = field(default_factory=dict)
     _run_rms: list[np.ndarray] = field(default_factory=list)
+    _run_worst: list[np.ndarray] = field(default_factory=list)
+    _within: dict[str, Any] = field(default_factory=dict)
+    _settled: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.chunks` yields it."""
@@ -65,7 +70,17 @@ class Statistics:
             tally = self._codes.setdefault(name, {})
             for kind, number in zip(kinds.tolist(), numbers.tolist(), strict=True):
                 tally[kind] = tally.get(kind, 0) + number
-        self._run_rms.append(np.sqrt(np.mean(error[:, self.count_from :] ** 2, axis=1)))
+        self.n = int(record["dim"][0])
+        counted = error[:, self.count_from :]
+        self._run_rms.append(np.sqrt(np.mean(counted**2, axis=1)))
+        self._run_worst.append(np.max(np.abs(counted), axis=1))
+        for limit in self.limits:
+            where = next(b.where for b in self.blocks if b.name == limit.block)
+            over = np.max(np.abs(error[:, :, where]), axis=2) > limit.value
+            self._within[limit.name] = self._within.get(limit.name, 0) + np.sum(~over, axis=0)
+            last = over.shape[1] - np.argmax(over[:, ::-1], axis=1)
+            settled = np.where(np.any(over, axis=1), last, 0)
+            self._settled.setdefault(limit.name, []).append(settled)
 
     @property
     def first_run(self) -> dict[str, Any]:
@@ -80,23 +95,31 @@ class Statistics:
 
     @property
     def rms(self) -> np.ndarray:
-        """(E, n) root mean square error over the runs."""
+        """(E, r) root mean square error over the runs."""
         return np.sqrt(self._square / self.runs)
 
     @property
     def sigma(self) -> np.ndarray:
-        """(E, n) root of the mean variance that the filter states."""
+        """(E, r) root of the mean variance that the filter states."""
         return np.sqrt(self._variance / self.runs)
 
     @property
     def run_rms(self) -> np.ndarray:
-        """(runs, n)."""
+        """(runs, r)."""
         return np.concatenate(self._run_rms)
 
     @property
-    def n(self) -> int:
-        """Tangent dimension."""
-        return self.rms.shape[1]
+    def run_worst(self) -> np.ndarray:
+        """(runs, r) largest error of each run over the epochs counted."""
+        return np.concatenate(self._run_worst)
+
+    def share_within(self, limit: str) -> np.ndarray:
+        """(E,) share of the runs whose largest error in the block is within a limit."""
+        return self._within[limit] / self.runs
+
+    def settled(self, limit: str) -> np.ndarray:
+        """(runs,) number of the epoch from which on a run is within a limit; E: never."""
+        return np.concatenate(self._settled[limit])
 
     @property
     def codes(self) -> dict[str, dict[int, int]]:
@@ -104,12 +127,12 @@ class Statistics:
         return self._codes
 
     def overall_ratio(self) -> np.ndarray:
-        """(n,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
+        """(r,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
         start = self.count_from
         return np.sqrt(np.sum(self._square[start:], 0) / np.sum(self._variance[start:], 0))
 
     def ratio_bounds(self, level: float = 0.99) -> np.ndarray:
-        """(n, 2) bounds of `overall_ratio` that hold for all states at once at this level.
+        """(r, 2) bounds of `overall_ratio` that hold for all states at once at this level.
 
         Runs are independent, the epochs of one are not, so the spread between runs is what counts;
         the level is shared out over the states (Bonferroni).
@@ -149,10 +172,13 @@ class Statistics:
 
 
 def collect(
-    records: Iterable[dict[str, Any]], blocks: Sequence[StateBlock], count_from: int = 0
+    records: Iterable[dict[str, Any]],
+    blocks: Sequence[StateBlock],
+    count_from: int = 0,
+    limits: Sequence[Limit] = (),
 ) -> Statistics:
     """Statistics of all chunks."""
-    out = Statistics(blocks, count_from)
+    out = Statistics(blocks, count_from, limits)
     for record in records:
         out.add(record)
     return out

@@ -25,15 +25,20 @@ def nees(belief: Belief, truth: State) -> Float[Array, ""]:
 
     Directions in which nothing is uncertain (a known constant) do not count, whatever their error.
     """
-    error = manifold.local(belief.mean, truth)
-    solid, _ = linalg.guard(belief.factor)
-    return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
+    return normalised_sq(manifold.local(belief.mean, truth), belief.factor)
 
 
 def block_nees(belief: Belief, truth: State, block: slice) -> Float[Array, ""]:
     """NEES of some components alone, from their marginal covariance."""
-    error = manifold.local(belief.mean, truth)[block]
-    solid, _ = linalg.guard(belief.factor[block])
+    return normalised_sq(manifold.local(belief.mean, truth)[block], belief.factor[block])
+
+
+def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Float[Array, ""]:
+    """Error e' (S S')^-1 e of some components, from the rows of the factor that are theirs.
+
+    Directions without uncertainty do not count.
+    """
+    solid, _ = linalg.guard(factor)
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
 
 

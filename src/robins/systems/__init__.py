@@ -4,11 +4,13 @@ from robins.systems import ins_gnss
 from robins.systems.system import (
     Case,
     Contender,
+    Limit,
     Outcome,
     Problem,
     Progress,
     SensorAxes,
     StateBlock,
+    Study,
     System,
 )
 
@@ -18,10 +20,12 @@ __all__ = [
     "SYSTEMS",
     "Case",
     "Contender",
+    "Limit",
     "Outcome",
     "Problem",
     "Progress",
     "SensorAxes",
     "StateBlock",
+    "Study",
     "System",
 ]

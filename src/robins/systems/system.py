@@ -52,27 +52,50 @@ class Case(NamedTuple):
     truth: State  # leading axis E
 
 
+def as_simulated(world: Any) -> Case:
+    """The case of a problem whose filters all take what is simulated as it is."""
+    return world
+
+
 class Contender(NamedTuple):
-    """A filter with the model it believes in."""
+    """A filter with the model it believes in.
+
+    Filters of one problem may have states of their own: each makes its own case of the simulated
+    world, and all report the same components.
+    """
 
     filter: Filter
     model: Model
+    case: Callable[[Any], Case] = as_simulated  # from what the problem simulates
+    reported: np.ndarray | None = None  # (r, n) reported = this @ tangent error; None: all of it
+    bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
+    facts: Mapping[str, Any] = {}  # figures known without a run, put among its metrics
+
+
+class Limit(NamedTuple):
+    """A size that the errors of a block should stay below."""
+
+    name: str  # "5_arcmin"
+    block: str
+    value: float  # SI, of the largest component
 
 
 class Problem(NamedTuple):
     """A simulated scenario, ready to be run any number of times."""
 
-    simulate: Callable[[Array], Case]  # run number (traced) -> case; pure, so it batches
+    simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it batches
     contenders: Mapping[str, Contender]
     epoch_s: np.ndarray  # (E,)
-    blocks: Sequence[StateBlock]
+    blocks: Sequence[StateBlock]  # of the reported components
     sensors: Mapping[str, SensorAxes]
     context: xr.Dataset  # truth, fixes, outages: what figures show beside the filters
     metrics: Callable[[Any], dict[str, Any]]  # campaign statistics of a filter -> metrics
     claims: Callable[[Mapping[str, dict[str, Any]]], list[dict[str, Any]]]
-    # means of the first run by filter -> more variables of the solution, such as the track
+    # means of the first run by filter -> more variables of the solution, such as the track. A
+    # mean is the state of its own filter.
     shown: Callable[[Mapping[str, State]], dict[str, Any]] = lambda means: {}
     count_from: int = 0  # first epoch that counts for figures pooled over time
+    limits: Sequence[Limit] = ()
 
 
 @dataclass(frozen=True)
@@ -88,10 +111,19 @@ class Outcome:
 
 
 class Scenario(Parameters):
-    """What every simulated scenario says; a system adds its own."""
+    """What every simulated scenario says; a study adds its own, and `study`, its name."""
 
     runs: Annotated[int, pydantic.Field(ge=1)] = 50
     filters: tuple[str, ...] = ()
+
+
+class Study(NamedTuple):
+    """One kind of scenario of a system."""
+
+    parameters: type[Scenario]
+    problem: Callable[..., Problem]  # (parameters, filters, seed) -> problem
+    filters: tuple[str, ...]
+    claims: tuple[Mapping[str, str], ...] = ()  # {"id", "text"} of what its scenarios check
 
 
 class System(NamedTuple):
@@ -99,13 +131,22 @@ class System(NamedTuple):
 
     name: str
     summary: str
-    filters: tuple[str, ...]
+    studies: Mapping[str, Study]
     scenarios: Mapping[str, Path]  # packaged scenario files by name
-    claims: tuple[Mapping[str, str], ...]  # {"id", "text"} of what scenarios check
-    parameters: type[Scenario]
-    problem: Callable[..., Problem]  # (parameters, filters, seed) -> problem
+    replay_filters: tuple[str, ...] = ()
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one
     replay: Callable[..., Outcome] | None = None  # (dataset, parameters, filters, progress)
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Names of all filters, each once."""
+        named = [name for study in self.studies.values() for name in study.filters]
+        return tuple(dict.fromkeys([*named, *self.replay_filters]))
+
+    @property
+    def claims(self) -> tuple[Mapping[str, str], ...]:
+        """What scenarios check."""
+        return tuple(claim for study in self.studies.values() for claim in study.claims)

@@ -8,18 +8,17 @@ from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
 from robins.systems.ins_gnss.replay import replay
 from robins.systems.ins_gnss.setup import FILTERS, SMOOTHED
-from robins.systems.system import System
+from robins.systems.system import Study, System
 
 _HERE = Path(__file__).parent / "scenarios"
+_FILTERS = (*FILTERS, *(name + SMOOTHED for name in FILTERS))
 
 SYSTEM = System(
     name="ins-gnss",
     summary="loosely coupled INS/GNSS: a simulated drive with an outage, and recorded logs",
-    filters=(*FILTERS, *(name + SMOOTHED for name in FILTERS)),
+    studies={"drive": Study(Drive, drive_problem, _FILTERS, CLAIMS)},
     scenarios={"drive": _HERE / "drive.toml"},
-    claims=CLAIMS,
-    parameters=Drive,
-    problem=drive_problem,
+    replay_filters=_FILTERS,
     replay_parameters=Replay,
     replay_default=_HERE / "replay.toml",
     replay=replay,

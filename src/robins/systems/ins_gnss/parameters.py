@@ -150,6 +150,7 @@ class Drive(Scenario):
     """A simulated drive; sensor errors are drawn from what the filter is told of them."""
 
     system: Literal["ins-gnss"] = "ins-gnss"
+    study: Literal["drive"] = "drive"
     title: str = "INS/GNSS drive"
     imu_rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("100 Hz")
     place: Place
