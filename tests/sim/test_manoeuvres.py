@@ -86,7 +86,7 @@ def test_bank_in_the_turn_is_that_of_the_closed_form(s_turn):
     """Level turn over a rotating Earth: side acceleration over what is felt down, with pitch."""
     t = np.array([5.0, 20.0, 30.0, 40.9, 50.0, 60.0, 70.9, 100.0])
     k = s_turn.at(t)
-    roll, pitch, heading = euler(k)
+    roll, pitch, _ = euler(k)
     commanded = np.array([0.0, 30.0, 30.0, 30.0, -30.0, -30.0, -30.0, 0.0]) * DEG
     np.testing.assert_allclose(roll, commanded, rtol=0, atol=0.15 * DEG)
     np.testing.assert_allclose(pitch, PITCH, rtol=0, atol=1e-8)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.sim.trajectory import Motion, from_waypoints
 
 
-def at_lever_arm(motion: Motion, lever_b_m: ArrayLike, knots_hz: float = 100.0) -> Motion:
+def at_lever_arm(
+    motion: Motion, lever_b_m: Sequence[float] | np.ndarray, knots_hz: float = 100.0
+) -> Motion:
     """The motion of a point that is carried along, with the axes of the body.
 
     The point's path is that of ``r_e + C_eb lever_b``, and its velocity and acceleration are the

@@ -288,12 +288,18 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
 
 
 def start_estimate(run: PairRun) -> Nav:
-    """The slave's own idea of where it is at time zero, `initial_error` away from the truth."""
+    """The slave's own idea of where it is at time zero, `initial_error` away from the truth.
+
+    The position is so to the curvature of the Earth, 2e-5 m at 10 m.
+    """
     return retract(run.start, -run.initial_error)
 
 
 def _flexure(pair: PairParameters, course: Course, key: Array) -> tuple[Array, Array]:
     f = pair.flexure
+    if not any((*f.sigma, *f.bending)):
+        stiff = jnp.zeros((len(course.dt) + 1, 3))
+        return stiff, stiff
     model = Flexure(
         np.asarray(f.sigma), np.asarray(f.time), f.damping, f.tail_dof, np.asarray(f.bending)
     )
