@@ -7,10 +7,10 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from robins.campaign import chunks, collect, rms_with_bounds, simulate
+from robins.campaign import chunks, collect, monte_carlo, rms_with_bounds, simulate
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
 from robins.sim.random import Component, stream
-from robins.systems.system import Case, Contender, Problem, SensorAxes, StateBlock
+from robins.systems.system import Case, Contender, Limit, Problem, SensorAxes, StateBlock
 
 STEPS = 60
 F = jnp.array([[1.0, 0.5], [0.0, 1.0]])
@@ -132,6 +132,79 @@ def test_all_filters_see_the_same_numbers(problem):
     # the first innovation is y - F m0 whatever R is believed
     np.testing.assert_allclose(y, y[0], atol=1e-14)
     assert outcome.solution["rms_line"].attrs["runs"] == 5
+
+
+def test_filters_may_have_states_of_their_own(problem):
+    """A filter of a wider state, and one in centimetres, report what the others do."""
+    wide = Model(
+        Motion(
+            lambda x, u: jnp.concatenate([F @ x[:2], x[2:]]),
+            jnp.concatenate([Q_FACTOR, jnp.zeros((1, 2))]),
+        ),
+        (Sensor(lambda x, a: x[:1], jnp.array([0.4]), 1),),
+    )
+
+    def widened(case):
+        start = Belief(jnp.zeros(3), jnp.eye(3))
+        truth = jnp.concatenate([case.truth, jnp.zeros((STEPS, 1))], 1)
+        return case._replace(start=start, truth=truth)
+
+    def scaled(case):
+        start = Belief(jnp.zeros(2), 100.0 * jnp.eye(2))
+        y = {"y": 100.0 * case.y["y"]}
+        return case._replace(start=start, y=y, truth=100.0 * case.truth)
+
+    right = problem.contenders["right"].filter
+    mixed = problem._replace(
+        contenders={
+            "right": problem.contenders["right"],
+            "wide": Contender(right, wide, widened, np.eye(2, 3), facts={"states": 3}),
+            "cm": Contender(
+                right, _model(40.0, 100.0 * Q_FACTOR), scaled, 0.01 * np.eye(2), bounds=True
+            ),
+        },
+        limits=(Limit("1_m", "line", 1.0),),
+    )
+    outcome = simulate(mixed, 6, chunk=4)
+    ds = outcome.solution
+    for name in ("rms_line", "mean_sigma_line", "error_line"):
+        np.testing.assert_allclose(ds[name][1], ds[name][0], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(ds[name][2], ds[name][0], rtol=1e-9, atol=1e-12)
+    assert outcome.metrics["wide"]["states"] == 3
+    np.testing.assert_array_equal(ds["bounds"], [0, 0, 1])
+    np.testing.assert_array_equal(ds["anees_dof"][:2, 0], [2, 3])
+    assert np.all(np.isnan(ds["anees"][2]))
+    records = [np.concatenate([r["error"] for r in chunks(problem, "right", 6)])]
+    inside = np.mean(np.max(np.abs(records[0]), axis=2) <= 1.0, axis=0)
+    np.testing.assert_allclose(ds["within_1_m"][0], inside)
+
+
+def test_limits_say_how_many_are_inside_and_since_when(problem):
+    limit = Limit("1_m", "line", 1.0)
+    records = list(chunks(problem, "right", 5))
+    s = collect(records, problem.blocks, limits=(limit,))
+    worst = np.max(np.abs(np.concatenate([r["error"] for r in records])), axis=2)
+    for i, since in enumerate(s.settled("1_m")):
+        assert np.all(worst[i, since:] <= 1.0)
+        assert since == 0 or worst[i, since - 1] > 1.0
+    np.testing.assert_allclose(np.max(s.run_worst, axis=1), np.max(worst, axis=1))
+
+
+def test_filters_that_differ_in_numbers_share_what_was_compiled(problem):
+    step = problem.contenders["right"].filter
+    models = [Model(Motion(_move, Q_FACTOR), (Sensor(_read, jnp.array([s]), 1),)) for s in (1, 2)]
+    pair = problem._replace(contenders={str(i): Contender(step, m) for i, m in enumerate(models)})
+    before = monte_carlo._records._cache_size()
+    simulate(pair, 3, chunk=3)
+    assert monte_carlo._records._cache_size() == before + 1
+
+
+def _move(x, u):
+    return F @ x
+
+
+def _read(x, aux):
+    return x[:1]
 
 
 def test_worst_case_cover(problem):

@@ -22,6 +22,7 @@ from robins.report.bars import comparison
 from robins.report.curves import campaign, errors, estimates, height
 from robins.report.document import LIMIT, Origin, page
 from robins.report.embed import Drawn, draw
+from robins.report.limits import within, worst_case
 from robins.report.maps import track
 from robins.report.numbers import verdict
 from robins.report.style import Picture
@@ -68,6 +69,9 @@ def _drawings(
         if ds[f"rms_{block}"].attrs.get("runs", 2) == 1:
             continue  # the error itself, without its sign
         drawings.append(lambda block=block: campaign(ds, block))
+    for limit in series.find(ds, "within"):
+        drawings.append(lambda limit=limit: within(ds, limit))
+    drawings.append(lambda: worst_case(ds))
     for block in series.find(ds, "estimate"):
         # Beside its error an estimate tells something new only where it should settle on a value.
         if f"error_{block}" not in ds or "bias" in block or "scale" in block:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from robins.report import series, style
 from robins.report.bands import quantile
+from robins.report.limits import bound_names, bound_note
 from robins.report.numbers import words
 from robins.report.series import Series
 from robins.report.style import Picture
@@ -72,6 +73,10 @@ def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, se
     return figure, grid[:, 0], clock
 
 
+def _or_bound(solution: xr.Dataset) -> str:
+    return " (H-infinity: √P, a bound, not a covariance)" if bound_names(solution) else ""
+
+
 def _keys(filters: list[str], solution: xr.Dataset, *more) -> list:
     keys = [*style.filter_keys(filters), *more]
     return [*keys, style.outage_key()] if series.outage(solution) else keys
@@ -96,7 +101,8 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
                 lines.append(3.0 * sigma.values[i, :, k])
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
         _limit(axes, error.x, lines)
-    bounds = [style.key("±3σ stated", color=style.GREY, linewidth=0.8)] if sigma is not None else []
+    label = f"±3σ stated{_or_bound(solution)}"
+    bounds = [style.key(label, color=style.GREY, linewidth=0.8)] if sigma is not None else []
     style.legend(figure, _keys(filters, solution, *bounds))
     name = words(block)
     caption = "True minus estimated."
@@ -104,6 +110,7 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
         caption += (
             " A filter that knows its own accuracy keeps 99.7\u00a0% of it between the thin lines."
         )
+        caption += bound_note(solution)
     caption += _frame_of(solution, f"error_{block}")
     return Picture(f"error_{block}", f"Error of the {name}", caption, figure)
 
@@ -201,7 +208,8 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
                 lines.append(stated.values[i, :, k])
         if not _limit(axes, rms.x, lines, centred=False):
             axes.set_ylim(bottom=0.0)
-    more = [style.key("σ stated", color=style.GREY, linewidth=0.8)] if stated is not None else []
+    label = f"σ stated{_or_bound(solution)}"
+    more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = f"Root mean square error of the {name} over {runs or 'all'} runs."
@@ -209,6 +217,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
         caption += (
             " If the stated sigma (thin) is true, the line stays in the tint 95\u00a0% of the time."
         )
+        caption += bound_note(solution)
     caption += _frame_of(solution, f"rms_{block}")
     return Picture(f"rms_{block}", f"Scatter of the {name} over the runs", caption, figure)
 

@@ -155,11 +155,14 @@ def _statistic(
             _points(axes, x, values[i], i)
     if limits is None or not np.isfinite(limits.high).any():
         return ""
-    finite = np.isfinite(limits.high[0])
+    # filters whose states differ in size have bands of their own; the widest is drawn
+    width = np.where(np.isfinite(limits.high), limits.high - limits.low, -np.inf).max(axis=1)
+    widest = int(np.argmax(width))
+    finite = np.isfinite(limits.high[widest])
     axes.fill_between(
         x[finite],
-        limits.low[0][finite],
-        limits.high[0][finite],
+        limits.low[widest][finite],
+        limits.high[widest][finite],
         color=style.BAND,
         linewidth=0,
         zorder=0.5,
@@ -191,8 +194,9 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
     outage = series.outage(solution)
     if outage is not None:
         style.shade(axes, outage[0] / clock.seconds, outage[1])
-    shares = _statistic(axes, solution, name, "", clock)
-    limits = band(solution, name)
+    degrees = f"{name}_dof"
+    shares = _statistic(axes, solution, name, degrees, clock)
+    limits = band(solution, name, degrees)
     filters = series.filters(solution)
     keys = [_dot(f, i) for i, f in enumerate(filters)]
     if _is_smooth(solution, name):

@@ -55,8 +55,13 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``rms_BLOCK``                           (filter, time, axis_BLOCK) over the runs of a campaign;
                                         attribute ``runs``
 ``mean_sigma_BLOCK``                    the same; root of the mean variance the filter states
-``anees``                               (filter, time); ``runs``, ``degrees_of_freedom``, and
-                                        ``normalised=1`` if it is divided by these
+``anees``                               (filter, time); ``runs``, ``degrees_of_freedom`` or an
+                                        array ``anees_dof`` of its shape, and ``normalised=1`` if
+                                        it is divided by these
+``bounds``                              (filter) nonzero where what the filter states are bounds,
+                                        not standard deviations
+``within_LIMIT``                        (filter, time) share of the runs within a limit; ``runs``
+``note_RULE_NOTE``                      (filter, time) what a rule noted in the first run
 ``allan_SENSOR``                        (tau, axis_SENSOR) Allan deviation over averaging time
 ``allan_low_SENSOR, allan_high_SENSOR`` the same; confidence bounds
 ``allan_fit_SENSOR``                    the same; the fitted model

@@ -1,0 +1,113 @@
+"""Shares within a limit, worst-case margins, and bounds that are told from standard deviations."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from figure_reading import collisions, lines_of
+
+from robins import report
+from robins.report import bands, curves, limits, style, updates
+from robins.results import variable
+
+NAMES = ["kf", "hinf-deg", "adaptive-hinf"]
+TIME = np.arange(40) * 0.5
+
+
+@pytest.fixture(scope="module")
+def aligned():
+    ft, size = ("filter", "time"), (3, 40)
+    rng = np.random.default_rng(1)
+    share = np.linspace(0.0, 1.0, 40) * np.array([[1.0], [0.6], [0.3]])
+    gamma = np.array([[np.nan], [2.0], [np.nan]]) * np.ones(size)
+    xi = np.array([[np.nan], [np.nan], [4.0]]) * np.ones(size)
+    bound = np.linspace(1.9, 0.5, 40)
+    block = ("filter", "time", "axis_attitude")
+    return xr.Dataset(
+        {
+            "bounds": variable("filter", np.array([0, 1, 1], np.int8), "1", "bounds"),
+            "within_5_arcmin": variable(ft, share, "1", "runs within 5 arcmin", runs=50),
+            "note_h_infinity_bound": variable(ft, np.where(gamma > 0, bound, np.nan), "1", "b"),
+            "note_h_infinity_gamma": variable(ft, gamma, "1", "g"),
+            "note_adaptive_h_infinity_bound": variable(
+                ft, np.where(xi > 0, bound, np.nan), "1", "b"
+            ),
+            "note_adaptive_h_infinity_xi": variable(ft, xi, "1", "xi"),
+            "rms_attitude": variable(
+                block, rng.random((*size, 3)), "rad", "RMS", "ENU", display_unit="arcmin", runs=50
+            ),
+            "mean_sigma_attitude": variable(
+                block, rng.random((*size, 3)), "rad", "sigma", "ENU", display_unit="arcmin"
+            ),
+            "anees": variable(
+                ft,
+                np.where([[1.0], [np.nan], [np.nan]], 1.0 + 0.01 * rng.random(size), np.nan)
+                * np.array([[1.0], [np.nan], [np.nan]]),
+                "1",
+                "ANEES",
+                runs=50,
+                normalised=1,
+            ),
+            "anees_dof": variable(
+                ft, np.array([[9.0], [np.nan], [np.nan]]) * np.ones(size), "1", "dimension"
+            ),
+        },
+        {
+            "filter": NAMES,
+            "time": variable("time", TIME, "s", "time"),
+            "axis_attitude": ["E", "N", "U"],
+        },
+    )
+
+
+def test_shares_are_drawn_as_they_are(aligned):
+    picture = limits.within(aligned, "5_arcmin")
+    (axes,) = picture.figure.axes
+    for i in range(3):
+        ((x, y),) = lines_of(axes, style.colour(i))
+        np.testing.assert_allclose(x, TIME)
+        np.testing.assert_allclose(y, aligned["within_5_arcmin"].values[i])
+    assert "50" in picture.caption
+    picture.figure.canvas.draw()
+    assert not collisions(picture.figure)
+
+
+def test_worst_case_curves_are_of_the_filters_that_have_a_gamma(aligned):
+    picture = limits.worst_case(aligned)
+    (axes,) = picture.figure.axes
+    assert not lines_of(axes, style.colour(0))
+    for i, gamma in ((1, 2.0), (2, 4.0)):
+        ((_, y),) = lines_of(axes, style.colour(i))
+        np.testing.assert_allclose(y, np.linspace(1.9, 0.5, 40) / gamma)
+    picture.figure.canvas.draw()
+    assert not collisions(picture.figure)
+    assert limits.worst_case(aligned.drop_vars("note_h_infinity_gamma")) is not None
+    plain = aligned.drop_vars([n for n in aligned if str(n).startswith("note_")])
+    assert limits.worst_case(plain) is None
+
+
+def test_bounds_are_never_called_covariances(aligned):
+    picture = curves.campaign(aligned, "attitude")
+    assert "hinf-deg, adaptive-hinf" in picture.caption
+    assert "a bound, not a covariance" in picture.caption
+    (legend,) = picture.figure.legends
+    assert any("a bound, not a covariance" in t.get_text() for t in legend.texts)
+    picture.figure.canvas.draw()
+    assert not collisions(picture.figure)
+    honest = aligned.assign(bounds=aligned["bounds"] * 0)
+    assert "bound" not in curves.campaign(honest, "attitude").caption
+
+
+def test_the_band_is_that_of_the_filter_with_a_covariance(aligned):
+    band = bands.band(aligned, "anees", "anees_dof")
+    np.testing.assert_allclose(band.low[0], bands.quantile(0.025, 450.0) / 450.0)
+    picture = updates.consistency(aligned, "anees")
+    assert "hinf" not in picture.figure.axes[0].get_title(loc="left")
+    assert picture.figure.axes[0].collections
+    flipped = aligned.isel(filter=[1, 0, 2])
+    assert updates.consistency(flipped, "anees").figure.axes[0].collections
+
+
+def test_all_are_on_the_page(aligned):
+    summary = {"filters": {n: {} for n in NAMES}, "claims": [], "counts": {}}
+    names = [p.name for p in report.pictures(aligned, summary)]
+    assert {"within_5_arcmin", "worst_case", "rms_attitude", "anees"} <= set(names)
