@@ -120,7 +120,7 @@ def prepare(log: Log, piece: slice, parameters: Replay) -> Prepared:
     blocks = cut(increments, time_s, start.time_s, epochs)
     fix_epoch = np.full(len(log.gnss), -1)
     fix_epoch[used] = np.searchsorted(epochs, log.gnss_s[used] - 1e-9)
-    rate = mean_rate(increments, time_s, epochs)
+    rate = _mean_rate(increments, time_s, epochs)
     y, aux = _fixes(log, fix_epoch, rate)
     if names.VELOCITY in y:
         gained = gained_in_window(increments, time_s, epochs, parameters.gnss.velocity_window)
@@ -181,8 +181,8 @@ def _belief(log: Log, first: int, start: StartPoint, parameters: Replay) -> Beli
     return belief_at(start.q_nb, v, position, sigma, parameters.imu, start.gyro_bias)
 
 
-def mean_rate(increments: Increments, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """Gyro rate about times (E,): mean over the increments that end within 10 ms, (E, 3) rad/s."""
+def _mean_rate(increments: Increments, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    """Gyro rate about a time: mean over the increments that end within 10 ms of it."""
     dt, theta = increments.dt, increments.theta
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(theta, axis=0)])
     length = np.concatenate([[0.0], np.cumsum(dt)])

@@ -1,0 +1,209 @@
+"""A simulated pair written as two files and read back is the same pair."""
+
+import dataclasses
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from robins import logs, scenario
+from robins.ins.mechanise import Nav, nav_at
+from robins.manifold import local
+from robins.rotation import Rotation
+from robins.systems.transfer_alignment.pair import lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair_log import Recording, pair_dataset, pieces_of, recorded
+from robins.systems.transfer_alignment.pair_parameters import PairParameters
+
+TEXT = """
+lever_arm = ["2 m", "-1 m", "0.5 m"]
+[manoeuvre]
+kind = "aircraft"
+latitude = "32 deg"
+longitude = "110 deg"
+height = "1000 m"
+speed = "100 m/s"
+pitch = "2 deg"
+legs = [
+  { bank = "0 deg", seconds = "3 s" },
+  { bank = "30 deg", seconds = "6 s" },
+  { bank = "-30 deg", seconds = "6 s" },
+]
+[slave]
+rate = "50 Hz"
+gyro_noise = "0.05 deg/sqrt(h)"
+accel_noise = "50 ug/sqrt(Hz)"
+gyro_bias = "5 deg/h"
+accel_bias = "1 mg"
+[master]
+attitude_noise = "1 arcmin"
+velocity_noise = "0.05 m/s"
+position_noise = "1 m"
+[mounting]
+nominal = ["1 deg", "-2 deg", "90 deg"]
+sigma = "0.3 deg"
+[flexure]
+sigma = "2 arcmin"
+time = "2 s"
+[start]
+attitude = "0.5 deg"
+"""
+
+
+def parameters(*settings):
+    return scenario.parse(PairParameters, TEXT, settings)
+
+
+PAIR = parameters()
+RECORDING = Recording()
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate_pair(PAIR, lay_out(PAIR), 5, jnp.asarray(0))
+
+
+@pytest.fixture(scope="module")
+def log(run, tmp_path_factory):
+    """The pair as it is read from two files."""
+    folder = tmp_path_factory.mktemp("pair")
+    dataset = recorded(run, "made")
+    logs.write_named(folder / "master.csv", dataset.master)
+    logs.write_named(folder / "slave.csv", dataset.imu)
+    return logs.load_pair(folder / "master.csv", folder / "slave.csv")
+
+
+def only_piece(dataset, pair=PAIR, recording=RECORDING):
+    pieces, problems = pieces_of(logs.clean(dataset), pair, recording)
+    assert not problems
+    (piece,) = pieces
+    return piece
+
+
+def test_what_is_read_back_is_what_was_simulated(run, log):
+    piece = only_piece(log)
+    # the first record, at the end of the first epoch, is where the slave starts from
+    assert piece.start_s == pytest.approx(0.1)
+    assert piece.first == 0
+    np.testing.assert_array_equal(piece.record, np.arange(1, 150))
+    for got, wanted, tolerance in (
+        (piece.run.increments.theta, run.increments.theta, 1e-12),
+        (piece.run.increments.dv, run.increments.dv, 1e-12),
+        (piece.run.increments.dt, run.increments.dt, 1e-12),
+    ):
+        width = wanted.shape[1]
+        np.testing.assert_allclose(got[:, :width], np.asarray(wanted)[1:], rtol=0, atol=tolerance)
+        assert not np.any(got[:, width:])
+    np.testing.assert_array_equal(piece.run.master_v_n, np.asarray(run.master_v_n)[1:])
+    np.testing.assert_array_equal(piece.run.master_omega_b, np.asarray(run.master_omega_b)[1:])
+    turned = jax.vmap(lambda a, b: Rotation(a).local(Rotation(b)))
+    off = turned(jnp.asarray(piece.run.master_q_nb), run.master_q_nb[1:])
+    assert np.max(np.abs(off)) < 1e-14
+    assert np.max(np.abs(piece.run.master_position.lat - run.master_position.lat[1:])) < 1e-15
+
+
+def test_a_log_of_a_run_is_that_run_of_the_campaign(run):
+    again = pair_dataset(PAIR, seed=5)
+    np.testing.assert_array_equal(again.master.v_n, run.master_v_n)
+    np.testing.assert_array_equal(again.truth.q_nb, run.truth.q_nb)
+    other = pair_dataset(PAIR, seed=5, run=1)
+    assert not np.allclose(again.master.v_n, other.master.v_n, atol=1e-3)
+
+
+QUIET = (
+    *('master.attitude_noise="0 deg"', 'master.velocity_noise="0 m/s"'),
+    *('master.position_noise="0 m"', 'mounting.sigma="0 deg"', 'flexure.sigma="0 deg"'),
+)
+
+
+@pytest.mark.parametrize("delay", ["0 s", "0.14 s"])
+def test_the_slave_starts_where_the_record_was_true(delay):
+    pair = parameters(*QUIET, f'master.delay="{delay}"')
+    dataset = pair_dataset(pair, 1)
+    silent = replace(dataset, master=replace(dataset.master, omega_ib_b=None))
+    piece, without_rates = only_piece(dataset, pair), only_piece(silent, pair)
+    # the gyros are off by 5 deg/h and noise, and mean over a sample to either side of the record
+    told, found = (p.run.master_omega_b[:-1] for p in (piece, without_rates))
+    assert np.sqrt(np.mean(told**2)) > 0.03
+    assert np.sqrt(np.mean((found - told) ** 2)) < 5e-4
+    assert np.max(np.abs(local(piece.run.start, without_rates.run.start))) < 2e-4
+    k = int(np.flatnonzero(np.isfinite(dataset.master.v_n[:, 0]))[0])
+    assert piece.start_s == pytest.approx(dataset.master.time_ns[k] * 1e-9 - pair.master.delay)
+    # before 3 s the flight is straight, so the true slave there lies on a line between epochs
+    epoch_s = dataset.truth.time_ns * 1e-9
+    early, late = (nav_at(dataset.truth, j) for j in (0, 1))
+    back = (piece.start_s - epoch_s[0]) / (epoch_s[1] - epoch_s[0])
+    true = Nav(early.q_nb, *jax.tree.map(lambda a, b: a + back * (b - a), early[1:], late[1:]))
+    off = np.asarray(local(piece.run.start, true))
+    assert np.max(np.abs(off[:3])) < 2e-5  # the frame turns with the Earth meanwhile
+    assert np.max(np.abs(off[3:6])) < 2e-3
+    assert np.max(np.abs(off[6:])) < 1e-3
+
+
+def test_outages_of_the_master_leave_steps_without_a_record(log):
+    keep = (log.master.time_ns < 5e9) | (log.master.time_ns > 7e9)
+    rows = np.flatnonzero(keep)
+    master = log.master
+    fields = ("time_ns", "lat_rad", "lon_rad", "alt_m", "v_n", "q_nb", "omega_ib_b", "rows")
+    short = replace(master, **{f: getattr(master, f)[rows] for f in fields})
+    piece = only_piece(replace(log, master=short))
+    silent = (piece.epoch_s > 5.0) & (piece.epoch_s < 7.0)
+    assert np.all(piece.record[silent] == -1)
+    assert np.max(np.diff(piece.epoch_s)) <= 0.25 + 1e-9
+    assert np.isnan(piece.run.master_v_n[silent]).all()
+    assert np.isfinite(piece.run.master_omega_b).all()
+    np.testing.assert_array_equal(np.sort(piece.record[piece.record >= 0]), np.arange(1, len(rows)))
+
+
+def test_missing_components_stay_missing_and_the_start_waits(log):
+    v_n = log.master.v_n.copy()
+    v_n[:4, 1] = np.nan
+    v_n[9, 2] = np.nan
+    piece = only_piece(replace(log, master=replace(log.master, v_n=v_n)))
+    assert piece.first == 4
+    assert piece.start_s == pytest.approx(0.5)
+    here = int(np.flatnonzero(piece.record == 9)[0])
+    np.testing.assert_array_equal(np.isnan(piece.run.master_v_n[here]), [False, False, True])
+    assert np.isfinite(piece.run.master_q_nb[here]).all()
+
+
+def without_samples(dataset, begin_s, end_s):
+    t = dataset.imu.time_ns * 1e-9
+    keep = (t <= begin_s) | (t >= end_s)
+    imu = dataset.imu
+    return replace(
+        dataset,
+        imu=replace(
+            imu,
+            **{f: getattr(imu, f)[keep] for f in ("time_ns", "gyro", "accel", "rows")},
+        ),
+    )
+
+
+def test_a_short_gap_is_bridged_with_noise_and_a_long_one_divides_the_log(log):
+    piece = only_piece(without_samples(log, 8.0, 8.2))
+    assert set(piece.noise_scale) == {1.0, 30.0}
+    struck = piece.epoch_s[piece.noise_scale > 1.0]
+    assert np.all((struck > 8.0) & (struck < 8.21))
+    pieces, _ = pieces_of(logs.clean(without_samples(log, 8.0, 9.0)), PAIR, RECORDING)
+    assert [len(pieces), pieces[0].epoch_s[-1]] == [2, pytest.approx(8.0)]
+    assert pieces[1].start_s == pytest.approx(9.0)
+    assert np.all(pieces[1].noise_scale == 1.0)
+
+
+def test_a_pair_that_cannot_be_aligned_says_why(log):
+    def refused(words, **changes):
+        with pytest.raises(ValueError, match=words):
+            pieces_of(logs.clean(replace(log, **changes)), PAIR, RECORDING)
+
+    refused("this log has none", master=None)
+    late = replace(log.master, time_ns=log.master.time_ns + 10**12)
+    refused("the slave spans 0 to 15.0 s, the master 1000.1 to 1015.0 s", master=late)
+    blind = replace(log.master, q_nb=np.full_like(log.master.q_nb, np.nan))
+    refused("no record of the master with position, velocity and attitude", master=blind)
+    polar = replace(log.master, lat_rad=np.full_like(log.master.lat_rad, np.deg2rad(89.95)))
+    refused("not defined there", master=polar)
+    alone = {f.name: getattr(log.master, f.name) for f in dataclasses.fields(log.master)}
+    alone = {k: v[:1] if isinstance(v, np.ndarray) else v for k, v in alone.items()}
+    refused("no record after the first whole one", master=replace(log.master, **alone))
