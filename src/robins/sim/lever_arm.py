@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation as _Rotation
 
+from robins import _float64  # noqa: F401
 from robins.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
+from robins.rotation import from_dcm, to_dcm
 from robins.sim.trajectory import Motion, from_waypoints
 
 
@@ -37,9 +40,16 @@ def at_lever_arm(
     count = max(int(np.ceil(motion.duration_s * knots_hz)), 8)
     t = np.linspace(0.0, motion.duration_s, count + 1)
     k = motion.at(t)
-    axes = _Rotation.from_matrix(np.asarray(dcm_en(k.lat, k.lon)))
-    body = axes * _Rotation.from_quat(k.q_nb, scalar_first=True)
-    r_e = np.asarray(ecef_from_geodetic(k.lat, k.lon, k.alt)) + body.apply(lever)
-    lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r_e))
-    there = _Rotation.from_matrix(np.asarray(dcm_en(lat, lon)))
-    return from_waypoints(t, lat, lon, alt, (there.inv() * body).as_quat(scalar_first=True))
+    lat, lon, alt, q_nb = _carried(k.lat, k.lon, k.alt, k.q_nb, lever)
+    return from_waypoints(t, *(np.asarray(a) for a in (lat, lon, alt)), q_nb=np.asarray(q_nb))
+
+
+@jax.jit
+def _carried(lat, lon, alt, q_nb, lever_b):
+    """Latitude, longitude, height and attitude of a point carried along (leading axis)."""
+    C_en = dcm_en(lat, lon)
+    C_eb = C_en @ to_dcm(q_nb)
+    r_e = ecef_from_geodetic(lat, lon, alt) + jnp.sum(C_eb * lever_b[None, None], -1)
+    there = geodetic_from_ecef(r_e)
+    C_en_there = dcm_en(there[0], there[1])
+    return *there, from_dcm(jnp.swapaxes(C_en_there, -1, -2) @ C_eb)

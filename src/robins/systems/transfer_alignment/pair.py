@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation as _Rotation
 
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, gravity
@@ -31,15 +32,7 @@ from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.manifold import retract
-from robins.rotation import (
-    Rotation,
-    conjugate,
-    from_euler,
-    from_rotvec,
-    multiply,
-    rotate,
-    to_rotvec,
-)
+from robins.rotation import Rotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.sim.commands import from_commands
 from robins.sim.disturbance import drift_step, outlier_factor, student_t, window_factor
 from robins.sim.flexure import Flexure, simulate_flexure
@@ -100,7 +93,9 @@ class Course(NamedTuple):
     each: int  # K, samples in an epoch
     dt: np.ndarray  # (N,) s, N = E K
     begin_s: np.ndarray  # (N,) start of each sample
+    q_nominal: np.ndarray  # (4,) nominal mounting, slave to master axes
     nominal: Increments  # of a slave without flexure and mounting error, (N,), (N, 3), (N, 3)
+    turn: np.ndarray  # (N, 4) exp(theta) of these
     q_nb: np.ndarray  # (N + 1, 4) attitude of that slave
     path: Nav  # that slave at each epoch, leading axis E
     start: Nav  # and at time zero
@@ -157,9 +152,9 @@ def lay_out(pair: PairParameters) -> Course:
 
     carried = at_lever_arm(motion, pair.lever_arm)
     truth = carried.trajectory(time_ns)
-    q_nominal = np.asarray(from_euler(*pair.mounting.nominal))
-    q_nb = np.asarray(multiply(jnp.asarray(truth.q_nb), jnp.asarray(q_nominal)))
-    truth = replace(truth, q_nb=q_nb)
+    mounted = _Rotation.from_euler("ZYX", pair.mounting.nominal[::-1])
+    q_nb = _Rotation.from_quat(truth.q_nb, scalar_first=True) * mounted
+    truth = replace(truth, q_nb=q_nb.as_quat(scalar_first=True))
     nominal = from_imu(ideal_increments(truth))[0]._replace(dr=None)
     start = nav_at(truth, 0)
     path = mechanise(start, jax.tree.map(jnp.asarray, nominal))
@@ -177,8 +172,10 @@ def lay_out(pair: PairParameters) -> Course:
         each=each,
         dt=np.asarray(nominal.dt),
         begin_s=time_s[:-1],
+        q_nominal=mounted.as_quat(scalar_first=True),
         nominal=nominal,
-        q_nb=np.concatenate([q_nb[:1], np.asarray(path.q_nb.wxyz)]),
+        turn=_Rotation.from_rotvec(nominal.theta).as_quat(scalar_first=True),
+        q_nb=np.concatenate([truth.q_nb[:1], np.asarray(path.q_nb.wxyz)]),
         path=jax.tree.map(lambda x: np.asarray(x)[each - 1 :: each], path),
         start=start,
         load_factor=force / g,
@@ -253,7 +250,9 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
         pair.mounting.sigma
     ) * jax.random.normal(jax.random.fold_in(initial, _MOUNTING), (3,))
     angle, rate = _flexure(pair, course, stream(seed, index, Component.FLEXURE))
-    d = _turn(pair, angle, mounting)
+    # From true to nominal slave axes: q_nominal^-1 exp(lambda) q_nominal exp(mu).
+    in_slave_axes = rotate(conjugate(jnp.asarray(course.q_nominal)), angle)
+    d = multiply(from_rotvec(in_slave_axes), from_rotvec(mounting))
     theta, dv = _felt(course, d)
     q_nb = multiply(jnp.asarray(course.q_nb), d)
     errors = _slave_errors(pair, course, stream(seed, index, Component.IMU))
@@ -307,19 +306,11 @@ def _flexure(pair: PairParameters, course: Course, key: Array) -> tuple[Array, A
     return simulate_flexure(model, key, 1.0 / pair.slave.rate, len(course.dt), load)
 
 
-def _turn(pair: PairParameters, angle, mounting) -> Float[Array, "n 4"]:
-    """From true to nominal slave axes: ``q_nominal^-1 exp(lambda) q_nominal exp(mu)``."""
-    q_nominal = from_euler(*pair.mounting.nominal)
-    in_slave = rotate(conjugate(q_nominal), angle)
-    return multiply(from_rotvec(in_slave), from_rotvec(mounting))
-
-
 def _felt(course: Course, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
     """Increments of the true slave axes, (N, 3) each."""
-    theta, dv = (jnp.asarray(a) for a in course.nominal[1:3])
     back = conjugate(d[:-1])
-    turned = multiply(multiply(back, from_rotvec(theta)), d[1:])
-    return to_rotvec(turned), rotate(back, dv)
+    turned = multiply(multiply(back, jnp.asarray(course.turn)), d[1:])
+    return to_rotvec(turned), rotate(back, jnp.asarray(course.nominal.dv))
 
 
 class _SlaveErrors(NamedTuple):
