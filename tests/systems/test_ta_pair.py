@@ -53,8 +53,8 @@ LEVEL = f"""
 kind = "aircraft"
 {PLACE}
 speed = "100 m/s"
-legs = [{{bank = "0 deg", seconds = "20 s"}}]
-"""
+legs = [{{bank = "0 deg", seconds = "120 s"}}]
+"""  # as long as the S-turn, to share its compilations
 NOMINAL = np.array([10.0, -20.0, 70.0]) * DEG
 LEVER = np.array([-1.0, 3.5, 0.5])
 FLEXURE = np.array([8.0, 5.6, 2.4]) * ARCMIN
@@ -77,7 +77,7 @@ DISTURBED = (
     ' drift_step=["200 deg/h", "-100 deg/h", "0 deg/h"], drift_step_time="8 s",'
     ' dropouts=[{begin="3 s", end="4 s"}, {begin="15 s", end="15.05 s"}]}',
 )
-RUNS = 200
+RUNS = 100
 
 
 def parsed(text, *settings, cls=PairParameters):
@@ -108,7 +108,7 @@ def quiet():
 
 @pytest.fixture(scope="module")
 def disturbed():
-    """20 s straight and level, every sensor error and disturbance on, a stiff structure."""
+    """Straight and level, every sensor error and disturbance on, a stiff structure."""
     pair = parsed(LEVEL + SENSORS, *DISTURBED)
     course = lay_out(pair)
     simulate = compiled(pair, course)
@@ -190,7 +190,7 @@ def test_gyro_noise_steps_and_drift_appears(disturbed):
     bias = np.asarray(runs.truth.gyro_bias)
     t = course.epoch_s
     np.testing.assert_allclose(
-        bias[:, t > 7.95] - bias[:, :1], np.broadcast_to(STEP, (200, 121, 3))
+        bias[:, t > 7.95] - bias[:, :1], np.broadcast_to(STEP, (RUNS, 1121, 3))
     )
     assert np.all(bias[:, t < 7.95] == bias[:, :1])
     np.testing.assert_allclose(bias[:, 0].std(0), 5.0 * DEG_H, rtol=4.0 / np.sqrt(2 * RUNS))
@@ -220,7 +220,7 @@ def test_accelerometer_errors_are_as_stated(disturbed):
     dv = np.asarray(in_one_row(runs.increments).dv)
     noise = dv - course.nominal.dv - bias[:, :1] * course.dt[:, None]
     sigma = 0.05 * mg * np.sqrt(course.dt[0])
-    np.testing.assert_allclose(noise.std((0, 1)), sigma, rtol=4.0 / np.sqrt(2 * 200 * 1000))
+    np.testing.assert_allclose(noise.std((0, 1)), sigma, rtol=4.0 / np.sqrt(2 * RUNS * 6000))
 
 
 def test_records_are_noisy_struck_and_lost_as_stated(disturbed):
@@ -264,9 +264,10 @@ def test_records_are_noisy_struck_and_lost_as_stated(disturbed):
     np.testing.assert_allclose(runs.master_omega_b[0][~lost], k.rates()[0], rtol=0, atol=1e-12)
 
 
-def test_heavy_tails_keep_the_sigma():
+def test_heavy_tails_keep_the_sigma(disturbed):
+    _, course, _, _ = disturbed
     pair = parsed(LEVEL + SENSORS, "disturbance.tail_dof=5.0")
-    course = lay_out(pair)
+    course = course._replace(there=np.full(1200, True))
     v_n = np.asarray(many(pair, course, lambda run: run.master_v_n))
     x = (v_n - course.motion.at(course.epoch_s).v_n) / np.array(pair.master.velocity_noise)
     assert np.mean(x**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(8.0 / x.size))
@@ -299,10 +300,16 @@ def test_initial_errors_are_drawn_as_told(disturbed):
         assert plus == (1.0 if draw == "plus-sigma" else pytest.approx(0.5, abs=0.06))
 
     one = jax.tree.map(lambda x: x[5], runs)
-    estimate = start_estimate(one)
-    back = retract(estimate, one.initial_error)
-    assert np.abs(local(back, one.start)).max() < 2e-5
-    assert np.abs(local(estimate, one.start) - one.initial_error)[:6].max() < 1e-12
+
+    @jax.jit
+    def misses(one):
+        estimate = start_estimate(one)
+        back = local(retract(estimate, one.initial_error), one.start)
+        return back, local(estimate, one.start) - one.initial_error
+
+    back, ahead = misses(one)
+    assert np.abs(back).max() < 2e-5
+    assert np.abs(ahead)[:6].max() < 1e-12
 
 
 def test_a_run_is_named_by_its_number_alone(disturbed):
@@ -316,9 +323,9 @@ def test_a_run_is_named_by_its_number_alone(disturbed):
 @pytest.mark.parametrize(
     ("manoeuvre", "slowest", "fastest"),
     [
-        (f'kind = "ship"\n{PLACE}\nspeed = "6 m/s"\nseconds = "20 s"', 6.0, 6.1),
+        (f'kind = "ship"\n{PLACE}\nspeed = "6 m/s"\nseconds = "120 s"', 6.0, 6.1),
         (
-            f'kind = "ship"\n{PLACE}\nseconds = "20 s"\n'
+            f'kind = "ship"\n{PLACE}\nseconds = "120 s"\n'
             'roll = [{amplitude = "5 deg", period = "9 s"}]',
             0.0,
             1e-6,
@@ -326,7 +333,7 @@ def test_a_run_is_named_by_its_number_alone(disturbed):
         (
             f'kind = "vehicle"\n{PLACE}\nroll = [{{amplitude = "0.5 deg", period = "1 s"}}]\n'
             'legs = [{do = "accelerate", speed = "9 m/s", seconds = "5 s"},'
-            ' {do = "straight", seconds = "15 s"}]',
+            ' {do = "straight", seconds = "115 s"}]',
             8.999,
             9.001,
         ),
@@ -334,8 +341,8 @@ def test_a_run_is_named_by_its_number_alone(disturbed):
 )
 def test_ships_and_vehicles_make_pairs_too(manoeuvre, slowest, fastest):
     course = lay_out(parsed(f"[manoeuvre]\n{manoeuvre}\n{SENSORS}"))
-    assert len(course.epoch_s) == 200
-    assert course.epoch_s[-1] == pytest.approx(20.0)
+    assert len(course.epoch_s) == 1200
+    assert course.epoch_s[-1] == pytest.approx(120.0)
     speed = np.linalg.norm(course.motion.at(course.epoch_s).v_n, axis=1)
     assert slowest <= speed.max() <= fastest
     np.testing.assert_allclose(course.path.v_n, course.motion.at(course.epoch_s).v_n, atol=1e-8)
@@ -347,7 +354,7 @@ def test_a_scenario_class_takes_the_pieces_by_inheritance():
 
     product = parsed("runs = 7\n" + LEVEL + SENSORS, cls=Product)
     assert product.runs == 7
-    assert motion_of(product.manoeuvre).duration_s == pytest.approx(20.0)
+    assert motion_of(product.manoeuvre).duration_s == pytest.approx(120.0)
 
 
 @pytest.mark.parametrize(
@@ -355,10 +362,10 @@ def test_a_scenario_class_takes_the_pieces_by_inheritance():
     [
         ('slave.rate="55 Hz"', r"slave.rate is 55 Hz, not a multiple of master.rate, 10 Hz"),
         ('slave.rate="5 Hz"', "slave.rate is 5 Hz, not a multiple"),
-        ('master.rate="0.01 Hz"', "lasts 20 s, less than an epoch of the master at 0.01 Hz"),
+        ('master.rate="0.001 Hz"', "lasts 120 s, less than an epoch of the master at 0.001 Hz"),
         (
-            'disturbance.gyro_noise_window={begin="9 s", end="21 s"}',
-            r"gyro_noise_window from 9 s to 21 s must lie within the run, 0 s to 20 s",
+            'disturbance.gyro_noise_window={begin="9 s", end="121 s"}',
+            r"gyro_noise_window from 9 s to 121 s must lie within the run, 0 s to 120 s",
         ),
         (
             'disturbance.dropouts=[{begin="9 s", end="9 s"}]',
@@ -368,10 +375,10 @@ def test_a_scenario_class_takes_the_pieces_by_inheritance():
         ('disturbance.drift_step="9 deg/h"', "drift_step and drift_step_time belong together"),
         ('disturbance.drift_step_time="9 s"', "drift_step and drift_step_time belong together"),
         (
-            'disturbance={drift_step="9 deg/h", drift_step_time="20 s"}',
-            "drift_step_time is 20 s, the run ends at 20 s",
+            'disturbance={drift_step="9 deg/h", drift_step_time="120 s"}',
+            "drift_step_time is 120 s, the run ends at 120 s",
         ),
-        ('manoeuvre.roll_time="30 s"', "bank 0 lasts 20 s, less than the 30 s it takes to roll"),
+        ('manoeuvre.roll_time="130 s"', "bank 0 lasts 120 s, less than the 130 s it takes to roll"),
     ],
 )
 def test_pieces_that_do_not_fit_are_refused(setting, message):

@@ -58,6 +58,8 @@ _NAVIGATION, _MOUNTING = 0, 1  # of the initial state
 _ATTITUDE, _VELOCITY, _POSITION = 0, 1, 2  # of the master
 _MASTER = unit(Component.IMU, 1)
 
+_SLACK_S = 1e-8  # times are rounded to nanoseconds
+
 
 class SlaveTruth(NamedTuple):
     """What is true of the slave at each epoch."""
@@ -163,9 +165,9 @@ def lay_out(pair: PairParameters) -> Course:
     g = np.asarray(_compiled_gravity(truth.lat_rad, truth.alt_m))
     described_s = epoch_s - pair.master.delay
     described_ns = np.round(np.maximum(described_s, 0.0) * 1e9).astype(np.int64)
-    there = described_s >= -1e-9
+    there = described_s >= -_SLACK_S
     for window in pair.disturbance.dropouts:
-        there &= ~((epoch_s >= window.begin) & (epoch_s < window.end))
+        there &= ~_within(epoch_s, window)
     return Course(
         motion=motion,
         epoch_s=epoch_s,
@@ -188,6 +190,10 @@ def lay_out(pair: PairParameters) -> Course:
 _compiled_gravity = jax.jit(gravity)
 
 
+def _within(time_s: np.ndarray, window: Window) -> np.ndarray:
+    return (time_s >= window.begin - _SLACK_S) & (time_s < window.end - _SLACK_S)
+
+
 def _samples_an_epoch(slave_hz: float, master_hz: float) -> int:
     each = round(slave_hz / master_hz)
     if each < 1 or abs(slave_hz - each * master_hz) > 1e-9 * slave_hz:
@@ -202,7 +208,7 @@ def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
     d = disturbance
 
     def inside(name: str, window: Window) -> None:
-        if not window.begin < window.end or window.begin >= end_s or window.end > end_s + 1e-9:
+        if not window.begin < window.end <= end_s + _SLACK_S:
             raise ValueError(
                 f"disturbance.{name} from {window.begin:g} s to {window.end:g} s must lie within "
                 f"the run, 0 s to {end_s:g} s, and begin before it ends"
@@ -221,7 +227,7 @@ def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
         raise ValueError(
             "disturbance.drift_step and drift_step_time belong together: give both or neither"
         )
-    if d.drift_step_time is not None and d.drift_step_time >= end_s:
+    if d.drift_step_time is not None and d.drift_step_time >= end_s - _SLACK_S:
         raise ValueError(
             f"disturbance.drift_step_time is {d.drift_step_time:g} s, the run ends at {end_s:g} s"
         )
@@ -330,7 +336,10 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> _SlaveErr
         w = d.gyro_noise_window
         constant = bias * dt[:, None]
         factor = window_factor(
-            jnp.asarray(course.begin_s), w.begin - 1e-9, w.end - 1e-9, d.gyro_noise_factor
+            jnp.asarray(course.begin_s),
+            w.begin - _SLACK_S,
+            w.end - _SLACK_S,
+            d.gyro_noise_factor,
         )
         theta = constant + factor[:, None] * (theta - constant)
     if d.drift_step_time is not None:
