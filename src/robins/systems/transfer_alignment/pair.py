@@ -5,60 +5,54 @@ and the mounting error mu (slave axes):
 
     q_ns = q_nm exp(lambda) q_nominal exp(mu)
 
-and its gyros and accelerometers feel all of it. `lay_out` inverts the mechanisation once, for a
+and its gyros and accelerometers feel all of it. `pair_course` inverts the mechanisation once, for a
 slave without lambda and mu; `simulate_pair` turns its increments run by run. With d the turn from
 true to nominal slave axes at either end of a sample,
 
     exp(theta) = d_begin^-1 exp(theta_nominal) d_end,        dv = d_begin^-1 dv_nominal
 
 which is exact, so an error-free slave navigates to its true attitude and velocity whatever the
-flexure. The flexure moves the slave by millimetres at most, which is left out of the lever arm.
+flexure. The lever arm is rigid: that a structure which bends also shifts the slave is left out.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation as _Rotation
 
 from robins import _float64  # noqa: F401
-from robins.earth import Geodetic, gravity
+from robins.earth import Geodetic
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
-from robins.ins.increments import Increments, from_imu
-from robins.ins.mechanise import Nav, mechanise, nav_at
+from robins.ins.increments import Increments
+from robins.ins.mechanise import Nav
 from robins.manifold import retract
 from robins.rotation import Rotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
-from robins.sim.commands import from_commands
 from robins.sim.disturbance import drift_step, outlier_factor, student_t, window_factor
 from robins.sim.flexure import Flexure, simulate_flexure
-from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
-from robins.sim.lever_arm import at_lever_arm
-from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
-from robins.sim.trajectory import Motion
-from robins.systems.ins_gnss.legs import command_of
-from robins.systems.transfer_alignment.pair_parameters import (
-    Aircraft,
-    Disturbance,
-    PairParameters,
-    Ship,
-    Start,
-    Vehicle,
-    Window,
-)
+from robins.systems.transfer_alignment.pair_course import SLACK_S, Course, lay_out, motion_of
+from robins.systems.transfer_alignment.pair_parameters import PairParameters, Start
+
+__all__ = [
+    "Course",
+    "PairRun",
+    "SlaveTruth",
+    "error_model",
+    "lay_out",
+    "motion_of",
+    "simulate_pair",
+    "start_estimate",
+]
 
 # Streams folded into the keys of a run; part of the file format, as `Component` is.
 _NAVIGATION, _MOUNTING = 0, 1  # of the initial state
 _ATTITUDE, _VELOCITY, _POSITION = 0, 1, 2  # of the master
 _MASTER = unit(Component.IMU, 1)
-
-_SLACK_S = 1e-8  # times are rounded to nanoseconds
 
 
 class SlaveTruth(NamedTuple):
@@ -87,152 +81,6 @@ class PairRun(NamedTuple):
     truth: SlaveTruth
 
 
-class Course(NamedTuple):
-    """What all runs share."""
-
-    motion: Motion  # of the master
-    epoch_s: np.ndarray  # (E,)
-    each: int  # K, samples in an epoch
-    dt: np.ndarray  # (N,) s, N = E K
-    begin_s: np.ndarray  # (N,) start of each sample
-    q_nominal: np.ndarray  # (4,) nominal mounting, slave to master axes
-    nominal: Increments  # of a slave without flexure and mounting error, (N,), (N, 3), (N, 3)
-    turn: np.ndarray  # (N, 4) exp(theta) of these
-    q_nb: np.ndarray  # (N + 1, 4) attitude of that slave
-    path: Nav  # that slave at each epoch, leading axis E
-    start: Nav  # and at time zero
-    load_factor: np.ndarray  # (N + 1,) specific force over g
-    master: Nav  # what the master's records describe, leading axis E
-    master_omega_b: np.ndarray  # (E, 3) rad/s
-    there: np.ndarray  # (E,) bool: the record is not lost
-
-
-def motion_of(manoeuvre: Aircraft | Ship | Vehicle) -> Motion:
-    """The motion of the master.
-
-    Raises:
-        ValueError: legs that cannot be flown or driven.
-    """
-    m = manoeuvre
-    start = Geodetic(m.latitude, m.longitude, m.height)
-    if isinstance(m, Aircraft):
-        banks = [Bank(leg.bank, leg.seconds) for leg in m.legs]
-        return fly(start, banks, m.speed, m.heading, m.pitch, m.roll_time)
-    if isinstance(m, Ship):
-        given = (m.roll, m.pitch, m.yaw, m.heave)
-        sea = MODERATE_SEA
-        if any(waves is not None for waves in given):
-            sea = Sea(*(_waves(waves or ()) for waves in given))
-        return sail(start, m.seconds, m.speed, m.heading, sea)
-    legs = [command_of(leg) for leg in m.legs]
-    return roughen(from_commands(start, legs, m.heading, m.speed), _waves(m.roll), _waves(m.pitch))
-
-
-def _waves(waves) -> tuple[Wave, ...]:
-    return tuple(Wave(w.amplitude, w.period, w.phase) for w in waves)
-
-
-def lay_out(pair: PairParameters) -> Course:
-    """Everything that does not depend on a run.
-
-    Raises:
-        ValueError: a motion that cannot be; rates that do not divide; a run shorter than an epoch;
-            a window or a step of a disturbance outside the run or without its partner.
-    """
-    each = _samples_an_epoch(pair.slave.rate, pair.master.rate)
-    motion = motion_of(pair.manoeuvre)
-    count = int(np.floor(motion.duration_s * pair.master.rate * (1.0 + 1e-12)))
-    if count < 1:
-        raise ValueError(
-            f"the manoeuvre lasts {motion.duration_s:g} s, less than an epoch of the master at "
-            f"{pair.master.rate:g} Hz"
-        )
-    time_ns = np.round(np.arange(count * each + 1) * (1e9 / pair.slave.rate)).astype(np.int64)
-    time_s = time_ns * 1e-9
-    epoch_s = time_s[each::each]
-    _check_disturbance(pair.disturbance, float(epoch_s[-1]))
-
-    carried = at_lever_arm(motion, pair.lever_arm)
-    truth = carried.trajectory(time_ns)
-    mounted = _Rotation.from_euler("ZYX", pair.mounting.nominal[::-1])
-    q_nb = _Rotation.from_quat(truth.q_nb, scalar_first=True) * mounted
-    truth = replace(truth, q_nb=q_nb.as_quat(scalar_first=True))
-    nominal = from_imu(ideal_increments(truth))[0]._replace(dr=None)
-    start = nav_at(truth, 0)
-    path = mechanise(start, jax.tree.map(jnp.asarray, nominal))
-
-    force = np.linalg.norm(carried.at(time_s).rates()[1], axis=-1)
-    g = np.asarray(_compiled_gravity(truth.lat_rad, truth.alt_m))
-    described_s = epoch_s - pair.master.delay
-    described_ns = np.round(np.maximum(described_s, 0.0) * 1e9).astype(np.int64)
-    there = described_s >= -_SLACK_S
-    for window in pair.disturbance.dropouts:
-        there &= ~_within(epoch_s, window)
-    return Course(
-        motion=motion,
-        epoch_s=epoch_s,
-        each=each,
-        dt=np.asarray(nominal.dt),
-        begin_s=time_s[:-1],
-        q_nominal=mounted.as_quat(scalar_first=True),
-        nominal=nominal,
-        turn=_Rotation.from_rotvec(nominal.theta).as_quat(scalar_first=True),
-        q_nb=np.concatenate([truth.q_nb[:1], np.asarray(path.q_nb.wxyz)]),
-        path=jax.tree.map(lambda x: np.asarray(x)[each - 1 :: each], path),
-        start=start,
-        load_factor=force / g,
-        master=nav_at(motion.trajectory(described_ns), slice(None)),
-        master_omega_b=motion.at(described_ns * 1e-9).rates()[0],
-        there=there,
-    )
-
-
-_compiled_gravity = jax.jit(gravity)
-
-
-def _within(time_s: np.ndarray, window: Window) -> np.ndarray:
-    return (time_s >= window.begin - _SLACK_S) & (time_s < window.end - _SLACK_S)
-
-
-def _samples_an_epoch(slave_hz: float, master_hz: float) -> int:
-    each = round(slave_hz / master_hz)
-    if each < 1 or abs(slave_hz - each * master_hz) > 1e-9 * slave_hz:
-        raise ValueError(
-            f"slave.rate is {slave_hz:g} Hz, not a multiple of master.rate, {master_hz:g} Hz: "
-            "every epoch must end with a sample of the slave"
-        )
-    return each
-
-
-def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
-    d = disturbance
-
-    def inside(name: str, window: Window) -> None:
-        if not window.begin < window.end <= end_s + _SLACK_S:
-            raise ValueError(
-                f"disturbance.{name} from {window.begin:g} s to {window.end:g} s must lie within "
-                f"the run, 0 s to {end_s:g} s, and begin before it ends"
-            )
-
-    if d.gyro_noise_window is not None:
-        inside("gyro_noise_window", d.gyro_noise_window)
-    elif d.gyro_noise_factor != 1.0:
-        raise ValueError(
-            f"disturbance.gyro_noise_factor is {d.gyro_noise_factor:g} without a "
-            "gyro_noise_window to act in"
-        )
-    for k, window in enumerate(d.dropouts):
-        inside(f"dropouts[{k}]", window)
-    if (d.drift_step_time is None) != (not any(d.drift_step)):
-        raise ValueError(
-            "disturbance.drift_step and drift_step_time belong together: give both or neither"
-        )
-    if d.drift_step_time is not None and d.drift_step_time >= end_s - _SLACK_S:
-        raise ValueError(
-            f"disturbance.drift_step_time is {d.drift_step_time:g} s, the run ends at {end_s:g} s"
-        )
-
-
 def error_model(pair: PairParameters) -> ImuErrorModel:
     """The errors of the slave's sensors, disturbances left out."""
     s = pair.slave
@@ -252,9 +100,8 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
         index: () number of the run.
     """
     initial = stream(seed, index, Component.INITIAL_STATE)
-    mounting = jnp.asarray(pair.mounting.error) + jnp.asarray(
-        pair.mounting.sigma
-    ) * jax.random.normal(jax.random.fold_in(initial, _MOUNTING), (3,))
+    normal = jax.random.normal(jax.random.fold_in(initial, _MOUNTING), (3,))
+    mounting = jnp.asarray(pair.mounting.error) + jnp.asarray(pair.mounting.sigma) * normal
     angle, rate = _flexure(pair, course, stream(seed, index, Component.FLEXURE))
     # From true to nominal slave axes: q_nominal^-1 exp(lambda) q_nominal exp(mu).
     in_slave_axes = rotate(conjugate(jnp.asarray(course.q_nominal)), angle)
@@ -264,9 +111,11 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
     errors = _slave_errors(pair, course, stream(seed, index, Component.IMU))
     each = course.each
     shape = (len(course.epoch_s), each)
-    at_epochs = lambda x: x[each - 1 :: each]  # noqa: E731
     position, v_n, q_m = _records(pair, course, seed, index)
-    count = shape[0]
+
+    def at_epochs(x: Array) -> Array:
+        return x[each - 1 :: each]
+
     return PairRun(
         increments=Increments(
             jnp.asarray(course.dt).reshape(shape),
@@ -285,7 +134,7 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
             jax.tree.map(jnp.asarray, course.path.position),
             at_epochs(errors.gyro_bias),
             at_epochs(errors.accel_bias),
-            jnp.broadcast_to(mounting, (count, 3)),
+            jnp.broadcast_to(mounting, (shape[0], 3)),
             at_epochs(angle[1:]),
             at_epochs(rate[1:]),
         ),
@@ -335,17 +184,12 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> _SlaveErr
     if d.gyro_noise_window is not None:
         w = d.gyro_noise_window
         constant = bias * dt[:, None]
-        factor = window_factor(
-            jnp.asarray(course.begin_s),
-            w.begin - _SLACK_S,
-            w.end - _SLACK_S,
-            d.gyro_noise_factor,
-        )
+        begin, end = w.begin - SLACK_S, w.end - SLACK_S
+        factor = window_factor(jnp.asarray(course.begin_s), begin, end, d.gyro_noise_factor)
         theta = constant + factor[:, None] * (theta - constant)
     if d.drift_step_time is not None:
-        step, turned = drift_step(
-            jnp.asarray(course.begin_s), dt, d.drift_step_time, jnp.asarray(d.drift_step)
-        )
+        at = d.drift_step_time - SLACK_S
+        step, turned = drift_step(jnp.asarray(course.begin_s), dt, at, jnp.asarray(d.drift_step))
         theta, bias = theta + turned, bias + step
     return _SlaveErrors(theta, dv, bias, seen.accel.bias)
 
