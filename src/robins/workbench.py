@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ import numpy as np
 
 from robins import _float64, logs, report, results, scenario
 from robins.campaign import simulate
+from robins.dataset import Dataset
+from robins.ins.frames import to_ned_frd
 from robins.logs import Finding
 from robins.systems import SYSTEMS, Outcome, Study, System
 
@@ -232,12 +234,7 @@ def replay_log(
         tell(0.0, "reading")
         angles = np.degrees(chosen_system.orientation(parameters))
         dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles))
-        found = logs.examine(dataset)
-        if findings is not None:
-            findings(found)
-        errors = [f for f in found if f.severity == "error"]
-        if errors:
-            raise InputError("\n".join(f.sentence for f in errors))
+        _examine(dataset, findings)
         dataset = logs.clean(dataset)
         try:
             outcome = chosen_system.replay(
@@ -257,6 +254,93 @@ def replay_log(
             writer=writer,
         )
     return _finished(done)
+
+
+def align_pair(
+    name: str,
+    master: str | os.PathLike[str],
+    slave: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str],
+    filters: Sequence[str] = (),
+    settings: Iterable[str] = (),
+    seed: int = 0,
+    command: str = "",
+    progress: Progress | None = None,
+    findings: Callable[[Sequence[Finding]], None] | None = None,
+) -> Done:
+    """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
+
+    Args:
+        name: "system/name" or the path of a TOML file: what is believed of the two units.
+        master: what the master reported, a path in any format of `robins.logs`.
+        slave: inertial samples, along the axes of the slave.
+        out: the result folder.
+        filters: names; by default those of the scenario.
+        settings: "path=value" texts that change the scenario.
+        seed: recorded in the result; nothing is drawn.
+        command: how to make the result again.
+        progress: called with the share done and what is being done.
+        findings: called with what the doctor says.
+
+    Raises:
+        InputError: the pair or what was asked of it cannot be used.
+        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
+        robins.results.ResultError: the folder cannot be written.
+    """
+    _float64.require()
+    tell = progress or (lambda share, what: None)
+    system, label, text = find_scenario(name)
+    settings = tuple(settings)
+    alignment = system.alignment
+    study = scenario.mapping_of(text).get("study")
+    if alignment is None or study != alignment.study:
+        able = [f"{s.name}, study {s.alignment.study!r}" for s in SYSTEMS.values() if s.alignment]
+        raise InputError(
+            f"{label} cannot be given a recorded master and slave: it is of {system.name}, study "
+            f"{study!r}; what can is {', '.join(able) or 'nothing'}"
+        )
+    parameters: Any = scenario.parse(alignment.parameters, text, settings, source=name)
+    chosen = _check_filters(label, alignment.filters, filters or parameters.filters)
+    with _writer(out, text, settings, command) as writer:
+        tell(0.0, "reading")
+        dataset = logs.load_pair(master, slave)
+        # the doctor looks along the master's axes, the filter along those of the slave
+        turn = logs.Mounting(*np.degrees(system.orientation(parameters)))
+        _examine(replace(dataset, imu=turn.turn(to_ned_frd(dataset.imu))), findings)
+        dataset = logs.clean(dataset)
+        try:
+            outcome = alignment.align(
+                dataset, parameters, chosen, lambda s, w: tell(0.1 + 0.75 * s, w)
+            )
+        except ValueError as error:
+            raise InputError(f"{dataset.name}: {error}") from error
+        done = _write(
+            outcome,
+            out,
+            name=f"{system.name}/{dataset.name}",
+            text=text,
+            seed=seed,
+            runs=1,
+            command=command,
+            tell=tell,
+            writer=writer,
+        )
+    return _finished(done)
+
+
+def _examine(dataset: Dataset, findings: Callable[[Sequence[Finding]], None] | None) -> None:
+    """Ask the doctor.
+
+    Raises:
+        InputError: there are errors; the message has all of them.
+    """
+    found = logs.examine(dataset)
+    if findings is not None:
+        findings(found)
+    errors = [f for f in found if f.severity == "error"]
+    if errors:
+        raise InputError("\n".join(f.sentence for f in errors))
 
 
 def _writer(out, text: str, settings: Sequence[str], command: str) -> results.ResultWriter:

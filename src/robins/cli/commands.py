@@ -139,23 +139,40 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
     epilog=_examples(
         "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
         'robins run my.toml --set gnss.sigma="2 m" --json',
+        "robins run transfer-alignment/replay --master master.csv --slave slave.csv",
     ),
 )
 @click.argument("scenario")
 @_RUNS
+@_option("--master", type=_LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
+@_option("--slave", type=_LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
 @_choices
 @_out
 @_json
 @_debug
-def run(scenario: str, out: Path | None, **options: Any) -> None:
+def run(
+    scenario: str, out: Path | None, master: Path | None, slave: Path | None, **options: Any
+) -> None:
     """Simulate SCENARIO, a name that `robins list` tells or a TOML file, with several filters.
 
     All filters get the same random numbers; run k of seed S is the same whatever N is.
+
+    With --master and --slave a recorded pair takes the place of the simulation.
     """
-    from robins.cli.work import simulate
+    from robins.cli import work
 
     name = Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
-    simulate(scenario, out=out or Path("results") / name, **options)
+    if master is None and slave is None:
+        work.simulate(scenario, out=out or Path("results") / name, **options)
+        return
+    if master is None or slave is None:
+        raise BadInput("--master and --slave belong together: give both files, or neither.")
+    runs = options.pop("runs")
+    if runs not in (None, 1):
+        raise BadInput(f"--runs {runs}: a recorded pair is one run; leave the option away.")
+    work.align(
+        scenario, master, slave, out=out or Path("results") / slave.name.split(".")[0], **options
+    )
 
 
 @app.command(

@@ -45,6 +45,30 @@ def navigate(log: Sequence[Path], *, out: Path, as_json: bool, **options: Any) -
         )
 
 
+def align(scenario: str, master: Path, slave: Path, *, out: Path, as_json: bool, **options: Any):
+    """Align a recorded slave to its master and tell what came out."""
+    cache.enable()
+    command = command_line()
+    with only_json(as_json), Progress() as progress:
+        from robins.workbench import align_pair
+
+        done = align_pair(
+            scenario,
+            master,
+            slave,
+            out=out,
+            command=command,
+            progress=progress,
+            findings=_warn,
+            **options,
+        )
+    _tell(done, as_json)
+    if not as_json:
+        click.echo(
+            f"Next:   robins run {scenario}   simulates such a pair and shows what can be expected"
+        )
+
+
 def _warn(findings: Sequence[Any]) -> None:
     for finding in findings:
         if finding.severity != "error":  # errors end the command and are told there

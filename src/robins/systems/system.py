@@ -126,6 +126,15 @@ class Study(NamedTuple):
     claims: tuple[Mapping[str, str], ...] = ()  # {"id", "text"} of what its scenarios check
 
 
+class Alignment(NamedTuple):
+    """How a system takes a recorded master and slave in the place of its simulation."""
+
+    study: str  # whose scenarios serve as configurations
+    parameters: type[Parameters]
+    filters: tuple[str, ...]
+    align: Callable[..., Outcome]  # (dataset with a master, parameters, filters, progress)
+
+
 class System(NamedTuple):
     """One entry of the registry."""
 
@@ -139,6 +148,7 @@ class System(NamedTuple):
     replay: Callable[..., Outcome] | None = None  # (dataset, parameters, filters, progress)
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
+    alignment: Alignment | None = None
 
     @property
     def filters(self) -> tuple[str, ...]:
