@@ -58,7 +58,8 @@ def pair_dataset(parameters: PairParameters, seed: int, run: int = 0) -> Dataset
         ValueError: as `lay_out`.
     """
     course = lay_out(parameters)
-    return recorded(simulate_pair(parameters, course, seed, jnp.asarray(run)), "simulated pair")
+    simulated = jax.jit(lambda k: simulate_pair(parameters, course, seed, k))(run)
+    return recorded(simulated, "simulated pair")
 
 
 def recorded(run: PairRun, name: str) -> Dataset:
@@ -273,7 +274,7 @@ def _run(
         flexure_rad=three,
         flexure_rate_rad_s=three,
     )
-    return PairRun(
+    found = PairRun(
         increments=increments,
         start=slave_at(master, first, turn[first], parameters),
         initial_error=np.zeros(9),
@@ -283,6 +284,7 @@ def _run(
         master_omega_b=at_epochs(turn, 0.0),
         truth=unknown,
     )
+    return jax.tree.map(jnp.asarray, found)
 
 
 def _place(master: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,212 @@
+"""What the alignment of a recorded pair found: figures with their sigmas, and time series."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from robins import units
+from robins.dataset import Trajectory
+from robins.filters import Belief, Code, StepInfo
+from robins.filters.consistency import grand_mean_nis
+from robins.results import variable
+from robins.systems.system import SensorAxes, StateBlock
+from robins.systems.tables import Seen, innovation_tables
+from robins.systems.transfer_alignment.product import ATTITUDE, POSITION, VELOCITY
+
+_NED, _FRD = ("north", "east", "down"), ("forward", "right", "down")
+BLOCKS = (
+    StateBlock("attitude", slice(0, 3), "rad", "arcmin", "NED", _NED),
+    StateBlock("velocity", slice(3, 6), "m/s", "m/s", "NED", _NED),
+    StateBlock("position", slice(6, 9), "m", "m", "NED", _NED),
+    StateBlock("gyro_bias", slice(9, 12), "rad/s", "deg/h", "FRD of the slave", _FRD),
+    StateBlock("accel_bias", slice(12, 15), "m/s^2", "mg", "FRD of the slave", _FRD),
+    StateBlock("mounting", slice(15, 18), "rad", "arcmin", "FRD of the slave", _FRD),
+    StateBlock("flexure", slice(18, 21), "rad", "arcmin", "FRD of the master", _FRD),
+)
+SENSORS = {
+    ATTITUDE: SensorAxes("rad", "NED", _NED),
+    VELOCITY: SensorAxes("m/s", "NED", _NED),
+    POSITION: SensorAxes("m", "NED", _NED),
+}
+_FOUND = {"mounting": "arcmin", "gyro_bias": "deg_per_h", "accel_bias": "mg"}
+_UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly seen
+_LARGE_RAD = np.deg2rad(5.0)
+
+
+class Answer(NamedTuple):
+    """What one filter says; leading axis E epochs."""
+
+    belief: Belief
+    info: Mapping[str, StepInfo]  # by sensor
+    start: Belief
+    log_likelihood: float
+    bounds: bool  # its sigmas are bounds of an H-infinity filter
+
+
+class Recorded(NamedTuple):
+    """What was recorded, on the clock of the epochs."""
+
+    epoch_s: np.ndarray  # (E,)
+    master: Trajectory  # NED/FRD
+    master_s: np.ndarray  # (M,)
+
+
+def estimate(mean: Any, block: str) -> np.ndarray | None:
+    """(..., 3) what a mean holds of a block that is a vector; None where it has no such states."""
+    fields = {
+        "velocity": mean.ins.v_n,
+        "gyro_bias": mean.ins.gyro_bias,
+        "accel_bias": mean.ins.accel_bias,
+        "mounting": mean.mounting_rad,
+        "flexure": mean.flexure_rad,
+    }
+    value = fields.get(block)
+    return None if value is None else np.asarray(value)
+
+
+def sigma(belief: Belief, block: StateBlock) -> np.ndarray | None:
+    """(..., 3) standard deviations of a block; None where there are no such states."""
+    here = np.asarray(belief.sigma)[..., block.where]
+    return here if here.shape[-1] == 3 else None
+
+
+def metrics_of(answer: Answer) -> dict[str, Any]:
+    """Mounting, biases and attitude at the end with their sigmas; NIS by sensor."""
+    out: dict[str, Any] = {}
+    for block in BLOCKS:
+        ending = "arcmin" if block.name == "attitude" else _FOUND.get(block.name)
+        spread = sigma(answer.belief, block)
+        if ending is None or spread is None:
+            continue
+        convert = (block.units, block.display_unit)
+        value = estimate(answer.belief.mean, block.name)
+        if value is not None:
+            out[f"{block.name}_{ending}"] = units.convert(value[-1], *convert).tolist()
+        out[f"{block.name}_sigma_{ending}"] = units.convert(spread[-1], *convert).tolist()
+    for sensor, info in answer.info.items():
+        code = np.asarray(info.code)
+        used = np.asarray(info.dof) * (code != int(Code.REFUSED))
+        out[f"refused_{sensor}"] = int(np.sum(code == int(Code.REFUSED)))
+        # what an H-infinity filter expects is no covariance, so chi-square says nothing of it
+        if np.sum(used) and not answer.bounds:
+            verdict = grand_mean_nis(np.asarray(info.nis), used)
+            out[f"nis_{sensor}"] = verdict.value
+            out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+    out["log_likelihood"] = answer.log_likelihood
+    return out
+
+
+def remarks(name: str, answer: Answer) -> list[str]:
+    """Sentences on what the motion did not show, and on a mounting far from the nominal one."""
+    said = []
+    for block in BLOCKS:
+        before, after = sigma(answer.start, block), sigma(answer.belief, block)
+        if block.name not in _FOUND or before is None or after is None:
+            continue
+        hidden = [
+            a for a, s, t in zip(block.axes, before, after[-1], strict=True) if t > _UNKNOWN * s > 0
+        ]
+        if hidden:
+            said.append(
+                f"{name}: {block.name.replace('_', ' ')} {', '.join(hidden)} was hardly observed; "
+                "its sigma is near what it was before. Another manoeuvre would show it."
+            )
+    mounting = estimate(answer.belief.mean, "mounting")
+    size = 0.0 if mounting is None else float(np.linalg.norm(mounting[-1]))
+    if size > _LARGE_RAD:
+        said.append(
+            f"{name}: the slave sits {np.degrees(size):.1f} deg from its nominal mounting. Models "
+            "of first order do not hold beyond 5 deg; this one keeps whole rotations, but a better "
+            "nominal mounting makes it converge sooner."
+        )
+    return said
+
+
+def solution_of(recorded: Recorded, answers: Mapping[str, Answer]) -> xr.Dataset:
+    """Time series of every filter, labelled as `robins.results` lists them."""
+    ft = ("filter", "time")
+
+    def stack(pick) -> np.ndarray:
+        return np.stack([np.asarray(pick(a)) for a in answers.values()])
+
+    place = stack(lambda a: np.stack([*_place(a.belief.mean.ins.position)], -1))
+    data: dict[str, Any] = {
+        "lat_rad": variable(ft, place[..., 0], "rad", "latitude of the slave"),
+        "lon_rad": variable(ft, place[..., 1], "rad", "longitude of the slave"),
+        "alt_m": variable(ft, place[..., 2], "m", "height of the slave"),
+    }
+    coords: dict[str, Any] = {
+        "filter": list(answers),
+        "time": variable("time", recorded.epoch_s, "s", "time since the slave's first sample"),
+        "axis_euler": ["roll", "pitch", "heading"],
+    }
+    for block in BLOCKS:
+        axis, words = f"axis_{block.name}", block.name.replace("_", " ")
+
+        def add(kind: str, text: str, pick, block=block, axis=axis):
+            rows = [pick(answer) for answer in answers.values()]
+            if all(row is None for row in rows):
+                return
+            blank = np.full((len(recorded.epoch_s), 3), np.nan)
+            values = np.stack([blank if row is None else row for row in rows])
+            coords[axis] = list(block.axes)
+            data[f"{kind}_{block.name}"] = variable(
+                (*ft, axis), values, block.units, text, block.frame, display_unit=block.display_unit
+            )
+
+        add("sigma", f"standard deviation of {words}", lambda a, b=block: sigma(a.belief, b))
+        add(
+            "estimate",
+            f"estimated {words}",
+            lambda a, b=block: estimate(a.belief.mean, b.name),
+        )
+    data["estimate_euler"] = variable(
+        (*ft, "axis_euler"),
+        stack(lambda a: np.stack(a.belief.mean.ins.q_nb.as_euler(), -1)),
+        "rad",
+        "estimated roll, pitch, heading of the slave",
+        "FRD to NED",
+        display_unit="deg",
+    )
+    bounds = np.array([a.bounds for a in answers.values()], dtype=np.int8)
+    data["bounds"] = variable("filter", bounds, "1", "states bounds, not standard deviations")
+    master, mt = recorded.master, "master_time"
+    coords[mt] = variable(mt, recorded.master_s, "s", "time of the master's records")
+    data["reference_lat_rad"] = variable(mt, master.lat_rad, "rad", "latitude of the master")
+    data["reference_lon_rad"] = variable(mt, master.lon_rad, "rad", "longitude of the master")
+    data["reference_alt_m"] = variable(mt, master.alt_m, "m", "height of the master")
+    more, places = innovation_tables(_seen(answers), SENSORS, recorded.epoch_s)
+    return xr.Dataset(data | more, coords | places)
+
+
+def _place(position: Any) -> tuple[Any, Any, Any]:
+    return position.lat, position.lon, position.alt
+
+
+def _seen(answers: Mapping[str, Answer]) -> dict[str, Seen]:
+    """Innovations by sensor; NaN for a filter that does not use it."""
+    sensors = dict.fromkeys(sensor for answer in answers.values() for sensor in answer.info)
+
+    def of(pick: Any, sensor: str) -> np.ndarray:
+        rows = {
+            name: np.asarray(pick(a.info[sensor]), dtype=float)
+            for name, a in answers.items()
+            if sensor in a.info
+        }
+        blank = np.full_like(next(iter(rows.values())), np.nan)
+        return np.stack([rows.get(name, blank) for name in answers])
+
+    return {
+        k: Seen(
+            of(lambda i: i.innovation, k),
+            of(lambda i: i.sigma, k),
+            of(lambda i: i.nis, k),
+            of(lambda i: i.dof, k),
+            of(lambda i: i.code == int(Code.REFUSED), k),
+        )
+        for k in sensors
+    }
