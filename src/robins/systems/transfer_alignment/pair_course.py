@@ -50,7 +50,7 @@ class Course(NamedTuple):
     q_nb: np.ndarray  # (N + 1, 4) attitude of that slave
     path: Nav  # that slave at each epoch, leading axis E
     start: Nav  # and at time zero
-    load_factor: np.ndarray  # (N + 1,) specific force over g
+    load_factor: np.ndarray  # (N + 1,) specific force of the master over g
     master: Nav  # what the master's records describe, leading axis E
     master_omega_b: np.ndarray  # (E, 3) rad/s
     there: np.ndarray  # (E,) bool: the record is not lost
@@ -110,7 +110,7 @@ def lay_out(pair: PairParameters) -> Course:
     start = nav_at(truth, 0)
     path = mechanise(start, jax.tree.map(jnp.asarray, nominal))
 
-    force = np.linalg.norm(carried.at(time_s).rates()[1], axis=-1)
+    force = np.linalg.norm(motion.at(time_s).rates()[1], axis=-1)
     g = np.asarray(_compiled_gravity(truth.lat_rad, truth.alt_m))
     described_s = epoch_s - pair.master.delay
     described_ns = np.round(np.maximum(described_s, 0.0) * 1e9).astype(np.int64)
