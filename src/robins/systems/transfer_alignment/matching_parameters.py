@@ -1,0 +1,113 @@
+"""Parameters of the study "attitude-matching": manoeuvre, errors, flexure, what filters believe."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, default
+from robins.systems.system import Scenario
+
+Three = tuple[float, float, float]
+Claim = Literal["five-arcmin", "gamma-50", "units", "beats-kf", "saves-the-model"]
+Positive = Annotated[float, pydantic.Field(gt=0.0)]
+
+FILTERS = (
+    "kf",
+    "kf-told-flutter",
+    "kf-inflated",
+    "kf-flexure",
+    "hinf-rad",
+    "hinf-rad-identity",
+    "hinf-deg",
+    "hinf-deg-inf",
+    "hinf-arcmin",
+    "hinf-weighted",
+)
+
+
+class Manoeuvre(Parameters):
+    """A level bank turn: roll in from the start, turn, roll out, fly on."""
+
+    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    acceleration: Annotated[float, Quantity("acceleration")]  # horizontal, in the turn
+    roll_time: Annotated[float, Quantity("time", above="0 s")]  # of each roll
+    turn_time: Annotated[float, Quantity("time", least="0 s")]  # between the rolls
+    duration: Annotated[float, Quantity("time", above="0 s")]  # of the run
+    latitude: Annotated[float, Quantity("angle", least="-85 deg", most="85 deg")]
+    heading: Annotated[float, Quantity("angle")] = default("0 deg")  # at the start
+
+
+class Master(Parameters):
+    """The attitude that the master reports, with white noise at each update."""
+
+    attitude_noise: Annotated[float, Quantity("angle", above="0 rad")]
+    # no attitude comes from the first to the second time, as in an outage of the link
+    outage: Annotated[tuple[float, float], Quantity("time", least="0 s")] | None = None
+
+
+class Slave(Parameters):
+    """True errors of the slave: constant drift, noise, and where its attitude begins."""
+
+    gyro_bias: Annotated[Three, Quantity("angle rate")]
+    gyro_noise: Annotated[float, Quantity("angle random walk", least="0 deg/sqrt(h)")]
+    attitude_error: Annotated[Three, Quantity("angle", least="-30 deg", most="30 deg")]  # E, N, U
+
+
+class Mounting(Parameters):
+    """How the slave sits on the master: as drawn, and the true error (slave axes)."""
+
+    nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # rotation vector
+    error: Annotated[Three, Quantity("angle", least="-30 deg", most="30 deg")]
+
+
+class Flexing(Parameters):
+    """How the structure moves between the two, in axes right, forward, up of the master."""
+
+    sigma: Annotated[Three, Quantity("angle", least="0 rad")]
+    time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
+    damping: Positive = 1.0
+    bending: Annotated[Three, Quantity("angle")] = default("0 rad")  # per g of load above one
+    flutter: Annotated[float, Quantity("angle", least="0 rad")]  # white at each update
+
+
+class Believed(Parameters):
+    """What all filters are told of the start, and the one with flexure states of its flexure."""
+
+    attitude: Annotated[float, Quantity("angle", above="0 rad")]
+    gyro_bias: Annotated[float, Quantity("angle rate", above="0 rad/s")]
+    mounting: Annotated[float, Quantity("angle", above="0 rad")]
+    flexure_sigma_factor: Positive = 1.0  # believed over true
+    flexure_time_factor: Positive = 1.0
+
+
+class HInfinity(Parameters):
+    """What is asked of the H-infinity filters."""
+
+    gamma: Positive = 50.0  # of those with R = 1 unit^2, in their unit
+    weighted_over_least: Positive = 1.05  # of the weighted one: gamma over its least
+
+
+class Matching(Scenario):
+    """Attitude matching in a bank turn; axes of the paper, ENU and RFU."""
+
+    system: Literal["transfer-alignment"] = "transfer-alignment"
+    study: Literal["attitude-matching"] = "attitude-matching"
+    title: str = "Attitude matching in a bank turn"
+    runs: Annotated[int, pydantic.Field(ge=1)] = 200
+    filters: tuple[str, ...] = FILTERS
+    step: Annotated[float, Quantity("time", above="0 s")] = default("10 ms")  # of the truth
+    period: Annotated[float, Quantity("time", above="0 s")] = default("50 ms")  # of the filters
+    # figures pooled over time count from here
+    settle: Annotated[float, Quantity("time", least="0 s")] = default("15 s")
+    # initial errors as given, or of that size with a sign drawn for each axis and run
+    signs: Literal["fixed", "random"] = "fixed"
+    claims: tuple[Claim, ...] = ()  # which published claims are checked
+    manoeuvre: Manoeuvre
+    master: Master
+    slave: Slave
+    mounting: Mounting
+    flexure: Flexing
+    believed: Believed
+    h_infinity: HInfinity = pydantic.Field(default_factory=HInfinity)
