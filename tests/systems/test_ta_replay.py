@@ -1,0 +1,334 @@
+"""Alignment of recorded pairs whose truth is known: right within its own sigmas, and honest."""
+
+import dataclasses
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation as SciRotation
+
+from robins import logs, scenario
+from robins.ins.state import InsState
+from robins.manifold import local
+from robins.results.solution import check
+from robins.rotation import Rotation
+from robins.systems.transfer_alignment import pair_replay
+from robins.systems.transfer_alignment.pair import lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair_answer import remarks
+from robins.systems.transfer_alignment.pair_log import pieces_of, recorded
+from robins.systems.transfer_alignment.pair_replay import (
+    Replay,
+    aligned,
+    orientation,
+    replay,
+    start_belief,
+)
+from robins.systems.transfer_alignment.product import ATTITUDE, VELOCITY, ProductState
+from robins.systems.transfer_alignment.product_filters import product_contender
+
+# Blocks as long as the master's interval: whatever is missing, one shape, so one compilation.
+TEXT = """
+lever_arm = ["2 m", "-1 m", "0.5 m"]
+[manoeuvre]
+kind = "aircraft"
+latitude = "32 deg"
+longitude = "110 deg"
+height = "1000 m"
+speed = "100 m/s"
+pitch = "2 deg"
+legs = [
+  { bank = "0 deg", seconds = "3 s" },
+  { bank = "40 deg", seconds = "14 s" },
+  { bank = "-40 deg", seconds = "18 s" },
+  { bank = "0 deg", seconds = "5 s" },
+]
+[slave]
+rate = "50 Hz"
+gyro_noise = "0.05 deg/sqrt(h)"
+accel_noise = "50 ug/sqrt(Hz)"
+gyro_bias = "20 deg/h"
+accel_bias = "1 mg"
+[master]
+rate = "5 Hz"
+attitude_noise = "1 arcmin"
+velocity_noise = "0.02 m/s"
+position_noise = "1 m"
+delay = "0.06 s"
+[mounting]
+nominal = ["1 deg", "-2 deg", "90 deg"]
+sigma = "0.3 deg"
+[flexure]
+sigma = "3 arcmin"
+time = "2 s"
+[start]
+attitude = "0.1 deg"
+[believed]
+mounting = "0.3 deg"
+flexure = { sigma = "3 arcmin", time = "2 s" }
+[recording]
+longest_block = "0.2 s"
+"""
+PAIR = scenario.parse(Replay, TEXT)
+PRODUCT = product_contender(PAIR, "product", PAIR.believed)
+RUNS = 8
+
+
+def read_back(dataset, folder):
+    logs.write_named(folder / "master.csv", dataset.master)
+    logs.write_named(folder / "slave.csv", dataset.imu)
+    return logs.load_pair(folder / "master.csv", folder / "slave.csv")
+
+
+@pytest.fixture(scope="module")
+def runs():
+    course = lay_out(PAIR)
+    several = jax.jit(jax.vmap(lambda k: simulate_pair(PAIR, course, 3, k)))(jnp.arange(RUNS))
+    return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), several) for k in range(RUNS)]
+
+
+@pytest.fixture(scope="module")
+def pairs(runs, tmp_path_factory):
+    """Each run as it is read from its two files, and cleaned."""
+    folder = tmp_path_factory.mktemp("pairs")
+    return [logs.clean(read_back(recorded(run, "made"), folder)) for run in runs]
+
+
+@pytest.fixture(scope="module")
+def answers(pairs):
+    return [aligned(only_piece(pair), PRODUCT, PAIR) for pair in pairs]
+
+
+@pytest.fixture(scope="module")
+def clean(pairs):
+    return replay(pairs[0], PAIR)
+
+
+def only_piece(pair):
+    (piece,), problems = pieces_of(pair, PAIR, PAIR.recording)
+    assert not problems
+    return piece
+
+
+def true_state(run, epoch):
+    t = jax.tree.map(lambda x: jnp.asarray(x[epoch]), run.truth)
+    ins = InsState(Rotation(t.q_nb), t.v_n, t.position, t.gyro_bias, t.accel_bias)
+    return ProductState(ins, t.mounting_rad, t.flexure_rad, t.flexure_rate_rad_s)
+
+
+def at(tree, epoch):
+    return jax.tree.map(lambda x: x[epoch], tree)
+
+
+# ------------------------------------------------------------------------- right within its sigmas
+
+
+def test_errors_are_as_large_as_stated_over_several_pairs(runs, answers):
+    """NEES by a dense solve, of the whole state, over all pairs, early and late."""
+    for epoch in (1, 60, len(answers[0].belief.factor) - 1):
+        total, n = 0.0, 24
+        for run, answer in zip(runs, answers, strict=True):
+            belief = at(answer.belief, epoch)
+            e = np.asarray(local(belief.mean, true_state(run, epoch)))
+            S = np.asarray(belief.factor)
+            total += e @ np.linalg.solve(S @ S.T, e)
+        low, high = stats.chi2.ppf([0.0005, 0.9995], n * RUNS)
+        assert low < total < high, epoch
+
+
+def test_what_is_estimated_is_within_its_sigmas_and_they_have_shrunk(clean, runs):
+    found, truth = clean.metrics["product"], at(runs[0].truth, -1)
+    arcmin, deg_h, mg = np.deg2rad(1 / 60), np.deg2rad(1 / 3600), 9.80665e-3
+    for name, unit, true, before in (
+        ("mounting", arcmin, truth.mounting_rad, PAIR.mounting.sigma),
+        ("gyro_bias", deg_h, truth.gyro_bias, PAIR.slave.gyro_bias),
+        ("accel_bias", mg, truth.accel_bias, PAIR.slave.accel_bias),
+    ):
+        (estimate,) = (v for k, v in found.items() if k.startswith(name) and "sigma" not in k)
+        (sigma,) = (v for k, v in found.items() if k.startswith(f"{name}_sigma"))
+        assert np.all(np.abs(np.array(estimate) * unit - true) < 3.5 * np.array(sigma) * unit)
+        assert np.all(np.array(sigma) * unit < 0.6 * np.array(before)), name
+    for sensor in (ATTITUDE, VELOCITY):
+        low, high = found[f"nis_{sensor}_band"]
+        assert low < found[f"nis_{sensor}"] < high
+        assert found[f"refused_{sensor}"] == 0
+
+
+def test_the_start_is_correlated_as_its_making_is(pairs):
+    piece = only_piece(pairs[0])
+    plain = PRODUCT.case(piece.run).start
+    P = np.asarray(start_belief(plain, PAIR).covariance)
+    q = SciRotation.from_quat(np.asarray(piece.run.start.q_nb.wxyz), scalar_first=True)
+    C_ns = q.as_matrix()
+    C_nm = C_ns @ SciRotation.from_euler("ZYX", PAIR.mounting.nominal[::-1]).as_matrix().T
+    P0 = np.asarray(plain.covariance)
+    mounting, flexure = P0[15:18, 15:18], P0[18:21, 18:21]
+    record = np.diag(np.square(PAIR.master.attitude_noise))
+    want = P0[:3, :3] + C_ns @ mounting @ C_ns.T + C_nm @ flexure @ C_nm.T + record
+    np.testing.assert_allclose(P[:3, :3], want, atol=1e-18)
+    np.testing.assert_allclose(P[:3, 15:18], C_ns @ mounting, atol=1e-18)
+    np.testing.assert_allclose(P[:3, 18:21], C_nm @ flexure, atol=1e-18)
+    np.testing.assert_allclose(P[3:6, 3:6], np.diag(np.square(PAIR.master.velocity_noise)))
+    np.testing.assert_allclose(P[9:, 9:], P0[9:, 9:], rtol=1e-12, atol=1e-20)
+
+
+def test_the_solution_is_that_of_the_slave(clean, runs):
+    solution, truth = clean.solution.sel(filter="product"), runs[0].truth
+    # from the second epoch on they are those of the simulation
+    q = SciRotation.from_quat(truth.q_nb, scalar_first=True)
+    heading, pitch, roll = q.as_euler("ZYX").T
+    off = solution["estimate_euler"].values - np.stack([roll, pitch, heading], -1)
+    off = np.angle(np.exp(1j * off))
+    assert np.rad2deg(np.sqrt(np.mean(off[60:] ** 2))) * 60 < 5.0
+    wrong = solution["estimate_velocity"].values - truth.v_n
+    assert np.sqrt(np.mean(wrong[1:] ** 2)) < 0.05
+    assert set(clean.solution["reference_lat_rad"].dims) == {"master_time"}
+    check(clean.solution)
+
+
+# ------------------------------------------------------------------------------- faults of the log
+
+
+def changed(dataset, rows=None, **arrays):
+    """The pair with other arrays in its master, or with only some of its records."""
+    master = replace(dataset.master, **{k: v.copy() for k, v in arrays.items()})
+    if rows is not None:
+        kept = {
+            f.name: getattr(master, f.name)[rows]
+            for f in dataclasses.fields(master)
+            if isinstance(getattr(master, f.name), np.ndarray)
+        }
+        master = replace(master, **kept)
+    return logs.clean(replace(dataset, master=master))
+
+
+def spoil(dataset, kind, k=90):
+    m = dataset.master
+    if kind == "nan":
+        v_n = m.v_n.copy()
+        v_n[k] = np.nan
+        q_nb = m.q_nb.copy()
+        q_nb[k] = np.nan
+        return changed(dataset, v_n=v_n, q_nb=q_nb)
+    if kind == "inf":
+        v_n = m.v_n.copy()
+        v_n[k] = np.inf
+        q_nb = m.q_nb.copy()
+        q_nb[k, 0] = np.inf
+        return changed(dataset, v_n=v_n, q_nb=q_nb)
+    rows = np.insert(np.arange(len(m)), k, [k - 1, k - 20])  # a duplicate and a step back
+    return changed(dataset, rows=rows)
+
+
+@pytest.mark.parametrize("kind", ["nan", "inf"])
+def test_a_bad_record_is_as_good_as_none_and_counted(pairs, kind):
+    spoilt = spoil(pairs[0], kind)
+    assert spoilt.counts[f"master_{kind}"] == 1
+    rows = np.delete(np.arange(len(pairs[0].master)), 90)
+    absent = replay(changed(pairs[0], rows=rows), PAIR)
+    found = replay(spoilt, PAIR)
+    assert found.counts[f"master_{kind}"] == 1
+    for name in ("estimate_mounting", "sigma_mounting", "estimate_gyro_bias"):
+        got, want = (o.solution[name].values[0, -1] for o in (found, absent))
+        np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-12)
+
+
+def test_records_out_of_order_change_nothing(pairs, clean):
+    spoilt = spoil(pairs[0], "order")
+    assert (spoilt.counts["master_duplicate"], spoilt.counts["master_backward"]) == (1, 1)
+    found = replay(spoilt, PAIR)
+    for name, array in clean.solution.data_vars.items():
+        np.testing.assert_array_equal(found.solution[name].values, array.values, err_msg=name)
+
+
+def test_an_outlying_record_does_little_harm(pairs, clean):
+    q_nb = pairs[0].master.q_nb.copy()
+    turn = SciRotation.from_rotvec([0.0, 0.0, 0.1])  # 344 arcmin
+    struck = turn * SciRotation.from_quat(q_nb[90], scalar_first=True)
+    q_nb[90] = struck.as_quat(scalar_first=True)
+    found = replay(changed(pairs[0], q_nb=q_nb), PAIR)
+    off = found.solution["estimate_mounting"] - clean.solution["estimate_mounting"]
+    assert np.max(np.abs(off.values[0, -1]) / clean.solution["sigma_mounting"].values[0, -1]) < 0.5
+
+
+def test_an_outage_of_the_master_is_lived_through(pairs):
+    t = pairs[0].master.time_ns * 1e-9
+    outage = (t > 12.0) & (t < 17.0)
+    outcome = replay(changed(pairs[0], rows=np.flatnonzero(~outage)), PAIR)
+    time = outcome.solution.time.values
+    sigma = outcome.solution["sigma_velocity"].values[0, :, 0]
+    begin, end = np.searchsorted(time, [12.0, 16.9])
+    assert sigma[end] > 2.0 * sigma[begin]
+    assert np.all(np.isfinite(sigma))
+    found = outcome.metrics["product"]
+    low, high = found[f"nis_{ATTITUDE}_band"]
+    assert low < found[f"nis_{ATTITUDE}"] < high
+
+
+def test_a_long_gap_of_the_slave_is_declared_and_the_pieces_are_joined(pairs, answers, monkeypatch):
+    imu, t = pairs[0].imu, pairs[0].imu.time_ns * 1e-9
+    keep = (t < 19.61) | (t > 20.51)
+    arrays = {f: getattr(imu, f)[keep] for f in ("time_ns", "gyro", "accel", "rows")}
+
+    def instead(piece, contender, parameters):  # of a compilation for each piece's shape
+        rows = slice(0, len(piece.epoch_s))
+        info = {k: at(i, rows) for k, i in answers[0].info.items()}
+        return replace_belief(answers[0], rows)._replace(info=info)
+
+    monkeypatch.setattr(pair_replay, "aligned", instead)
+    outcome = replay(logs.clean(replace(pairs[0], imu=replace(imu, **arrays))), PAIR)
+    assert outcome.counts["imu_gaps_declared"] == 1
+    assert len([n for n in outcome.notes if n.startswith("Aligned from")]) == 2
+    rows = outcome.solution["estimate_mounting"].values[0]
+    assert np.sum(np.isnan(rows).all(axis=1)) == 1
+    assert np.all(np.diff(outcome.solution.time.values) > 0)
+    check(outcome.solution)
+
+
+# ------------------------------------------------------------------------------ what it says of it
+
+
+def test_what_the_motion_does_not_show_is_said(answers, clean):
+    """In the straight part, 3 s long, a mounting error and one of attitude are the same."""
+    early = replace_belief(answers[0], slice(0, 12))
+    (said,) = [n for n in remarks("product", early) if "mounting" in n]
+    assert "product: mounting" in said
+    assert "down" in said
+    assert "hardly observed" in said
+    assert not [n for n in clean.notes if "hardly observed" in n]
+
+
+def replace_belief(answer, rows):
+    return answer._replace(belief=at(answer.belief, rows))
+
+
+def test_a_mounting_far_from_nominal_is_found_and_remarked(runs, pairs):
+    """The nominal mounting stated 7 deg wrong: a whole rotation is estimated, not a small angle."""
+    settings = ('mounting.nominal=["1 deg", "-2 deg", "97 deg"]', 'believed.mounting="5 deg"')
+    wrong = scenario.parse(Replay, TEXT, settings)
+    outcome = replay(pairs[0], wrong)
+    (said,) = [n for n in outcome.notes if "from its nominal mounting" in n]
+    assert "Models of first order do not hold beyond 5 deg" in said
+    nominal = [SciRotation.from_euler("ZYX", p.mounting.nominal[::-1]) for p in (PAIR, wrong)]
+    true = nominal[0] * SciRotation.from_rotvec(runs[0].truth.mounting_rad[-1].copy())
+    solution = outcome.solution
+    found = nominal[1] * SciRotation.from_rotvec(solution["estimate_mounting"].values[0, -1])
+    sigma = np.linalg.norm(solution["sigma_mounting"].values[0, -1])
+    assert (found.inv() * true).magnitude() < 3.0 * sigma
+
+
+def test_the_doctor_sees_the_slave_along_the_axes_of_the_master(pairs):
+    turn = logs.Mounting(*np.degrees(orientation(PAIR)))
+    turned = replace(pairs[0], imu=turn.turn(pairs[0].imu))
+    codes = {f.code for f in logs.examine(turned) if f.severity != "note"}
+    assert not codes & {"gyro_axes", "gyro_unit", "turning_disagrees", "left_handed"}
+    assert "gyro_axes" in {f.code for f in logs.examine(pairs[0])}
+    (late,) = [f for f in logs.examine(turned) if f.code == "master_late"]
+    assert late.value == pytest.approx(PAIR.master.delay, abs=0.01)
+
+
+def test_a_filter_that_is_not_there_is_named(pairs):
+    with pytest.raises(ValueError, match="no filter 'ghost'"):
+        replay(pairs[0], PAIR, ("ghost",))
