@@ -1,0 +1,112 @@
+"""What a campaign of the product study says: errors, their bounds, and whether they fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from robins import units
+
+FIVE_ARCMIN = "5_arcmin"
+JUDGED = "product"  # the filter whose consistency is claimed
+
+CLAIMS = (
+    {
+        "id": "sigma",
+        "text": "On no state the RMS error of the filter 'product' is proven, at 99 % confidence, "
+        "to differ from its sigma by more than 5 %; value: the largest difference proven",
+    },
+    {
+        "id": "anees",
+        "text": "ANEES of the filter 'product' is inside its 95 % band at 90 % of the epochs or "
+        "more; value: the share",
+    },
+    {
+        "id": "nis",
+        "text": "The grand mean NIS of every sensor is inside its 99.9 % band for the filter "
+        "'product'; value: the one farthest from 1",
+    },
+    {
+        "id": "aligned",
+        "text": "Once it counts, the attitude RMS of the filter 'product' is at most 1.15 times "
+        "what its covariance allows, pooled over the axes; value: the ratio",
+    },
+)
+
+_FIGURES = {  # block -> metric, unit
+    "velocity": ("velocity_rms_mps", "m/s"),
+    "position": ("position_rms_m", "m"),
+    "gyro_bias": ("gyro_bias_rms_deg_per_h", "deg/h"),
+    "accel_bias": ("accel_bias_rms_mg", "mg"),
+    "mounting": ("mounting_rms_arcmin", "arcmin"),
+}
+_KINDS = {"rad": "angle", "rad/s": "angle rate", "m/s^2": "acceleration"}
+_ENU = [1, 0, 2]  # of sizes, which have no sign
+
+
+def product_metrics(statistics: Any) -> dict[str, Any]:
+    """Metrics of one filter from its campaign statistics, over the epochs that count.
+
+    Attitudes are listed east, north, up, as in the other studies; the rest as in its block. The
+    last sigmas are those that the filter states at the end.
+    """
+    start = statistics.count_from
+    rms = np.sqrt(np.mean(statistics.rms[start:] ** 2, axis=0))
+    sigma = np.sqrt(np.mean(statistics.sigma[start:] ** 2, axis=0))
+    last = statistics.sigma[-1]
+    minute = units.parse("1 arcmin", "angle")
+    out: dict[str, Any] = {}
+    for block in statistics.blocks:
+        here = block.where
+        if block.name == "attitude":
+            out["attitude_rms_arcmin"] = (rms[here][_ENU] / minute).tolist()
+            out["attitude_rms_all_arcmin"] = float(np.sqrt(np.mean(rms[here] ** 2)) / minute)
+            out["attitude_last_sigma_arcmin"] = (last[here][_ENU] / minute).tolist()
+            ratio = np.sqrt(np.sum(rms[here] ** 2) / np.sum(sigma[here] ** 2))
+            out["attitude_over_sigma"] = float(ratio)
+            continue
+        name, unit = _FIGURES[block.name]
+        one = units.parse(f"1 {unit}", _KINDS[block.units]) if block.units in _KINDS else 1.0
+        out[name] = (rms[here] / one).tolist()
+        if block.name == "mounting":
+            out["mounting_last_sigma_arcmin"] = (last[here] / one).tolist()
+    settled = statistics.settled(FIVE_ARCMIN)
+    out["share_below_5_arcmin"] = float(np.mean(settled <= start))
+    out["error_over_sigma"] = statistics.overall_ratio().tolist()
+    out["error_over_sigma_bounds"] = statistics.ratio_bounds().tolist()
+    out["anees_share_inside"] = statistics.anees_share_inside()
+    out["anees_mean"] = float(np.mean(statistics.anees()[start:]))
+    for sensor in statistics.sensors:
+        verdict = statistics.nis(sensor, 0.999)
+        out[f"nis_{sensor}"] = verdict.value
+        out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+    out["diverged_runs"] = statistics.diverged
+    return out
+
+
+def product_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Verdict per claim; none where the filter they are about was not run."""
+    if JUDGED not in metrics:
+        return []
+    m = metrics[JUDGED]
+    bounds = np.asarray(m["error_over_sigma_bounds"])
+    off = max(float(np.max(bounds[:, 0] - 1.0)), float(np.max(1.0 - bounds[:, 1])), 0.0)
+    farthest, inside = 1.0, True
+    for name, band in m.items():
+        if name.startswith("nis_") and name.endswith("_band"):
+            value = m[name.removesuffix("_band")]
+            inside &= band[0] <= value <= band[1]
+            farthest = max(farthest, value, key=lambda v: abs(v - 1.0))
+    share, ratio = m["anees_share_inside"], m["attitude_over_sigma"]
+    verdicts = (
+        (off, [0.0, 0.05], off <= 0.05),
+        (share, [0.9, 1.0], share >= 0.9),
+        (farthest, None, inside),
+        (ratio, [0.0, 1.15], ratio <= 1.15),
+    )
+    return [
+        {**claim, "verdict": "reproduced" if holds else "not", "value": value, "band": band}
+        for claim, (value, band, holds) in zip(CLAIMS, verdicts, strict=True)
+    ]
