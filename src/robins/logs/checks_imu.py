@@ -18,7 +18,7 @@ _BIASED = 0.05  # share of gravity that a bad sensor may be off
 _REST_RATE = 0.2  # rad/s (11 deg/s): more than the bias of almost any gyro
 _FASTEST = 75.0  # rad/s (4300 deg/s): beyond the range of gyros for vehicles
 
-_UNITS = {
+UNITS = {
     1.0: ("g", "multiply by 9.80665"),
     1e3: ("milli-g", "multiply by 0.00980665"),
     100.0 * G: ("cm/s^2", "divide by 100"),
@@ -151,7 +151,7 @@ def _g_word(unit: str) -> str:
 def _unit_causes(measured: float) -> list[tuple[str, str]]:
     return [
         ("gravity_unit", f"The unit is probably {unit}: {mend}")
-        for value, (unit, mend) in _UNITS.items()
+        for value, (unit, mend) in UNITS.items()
         if _near(measured, value)
     ]
 

@@ -13,29 +13,40 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import GnssTable, ImuTable, Trajectory
 from robins.ins.frames import to_ned_frd
+from robins.logs.checks_imu import UNITS, G
 from robins.logs.checks_motion import SCALES, words_of
 from robins.logs.checks_velocity import check_velocity
 from robins.logs.findings import Finding
 from robins.logs.motion import signed_permutations
 from robins.logs.ordering import increasing
-from robins.logs.quiet import finding, name_of, signal_of
+from robins.logs.quiet import Signal, finding, name_of, signal_of
 
 _WINDOW_S = 0.5  # at most of which a change of attitude is compared with the gyros
 _LONGEST_S = 2.0
 _LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; below it noise of the attitudes is all there is
 _WELL, _BETTER = 0.3, 0.1  # shares of the turning left unexplained
+_WRONG, _RIGHT = 0.1, 0.03  # shares of the specific force left unexplained
+# What an IMU alone is judged by, at rest or nearly so; a master tells more, in any motion.
+BY_REST = frozenset(
+    (
+        *("gravity_unit", "gravity_unknown", "gravity_bias", "gravity_not_seen"),
+        *("gravity_missing", "z_axis_reversed", "not_level"),
+        *("rates_as_increments", "increments_as_rates"),
+    )
+)
 _LAGS_S = np.arange(-50, 51) * 0.02
 _LATE_S = 0.03
 
 
 def check_master(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
-    """Findings about what is missing, velocities against positions, attitudes against gyros."""
+    """Findings about what is missing, velocities against positions, and the IMU against both."""
     if not len(master):
         return
     imu, master = to_ned_frd(imu), to_ned_frd(master)
     yield from _missing(master)
     yield from check_velocity(_as_fixes(master))
     yield from _turning(imu, master)
+    yield from _force(imu, master)
 
 
 def _as_fixes(master: Trajectory) -> GnssTable:
@@ -126,7 +137,7 @@ def _turns(imu: ImuTable, master: Trajectory) -> tuple[np.ndarray, list[np.ndarr
     inside &= np.diff(time) < _LONGEST_S
     if np.count_nonzero(inside) < 10:
         return None
-    q = Rotation.from_quat(master.q_nb[known][:, [1, 2, 3, 0]])
+    q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
     of_master = (q[:-1].inv() * q[1:]).as_rotvec()[inside]
     steps = np.diff(signal.time_s, prepend=signal.time_s[0] - signal.step_s)
     angle = np.cumsum(signal.gyro * steps[:, None], axis=0)
@@ -181,3 +192,82 @@ def _diagnosis(
     return finding(
         imu, "error", code, float(left[k]), f"{shown}, with other gyros {left[k]:.0%}). {cause}."
     )
+
+
+def _force(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
+    """Accelerometers against what the master's velocities and attitudes ask for."""
+    signal = signal_of(imu)
+    known = np.flatnonzero(
+        np.isfinite(master.q_nb).all(axis=1) & np.isfinite(master.v_n).all(axis=1)
+    )
+    known = known[increasing(master.time_ns[known])]
+    forces = None if signal is None or len(known) < 2 else _forces(imu, master, signal, known)
+    if signal is None or forces is None:
+        yield finding(
+            imu,
+            "note",
+            "force_not_checked",
+            0,
+            f"the accelerometers could not be checked against {name_of(master)}: too few seconds "
+            "of both.",
+        )
+        return
+    wanted, measured = forces
+    as_is = _left(wanted, measured)
+    if as_is < _WRONG:
+        return
+    maps = signed_permutations()
+    units = [(G / value, "gravity_unit", *words) for value, words in UNITS.items()]
+    if imu.kind == "increment":  # before cm/s^2, which look the same at 100 Hz
+        mend = (signal.step_s, "rates_as_increments", "rates", "name a format of rates")
+    else:
+        mend = (1.0 / signal.step_s, "increments_as_rates", "increments", "name a format of those")
+    units.insert(0, mend)
+    tried = np.concatenate([maps, [factor * np.eye(3) for factor, *_ in units]])
+    left = np.array([_left(wanted, measured @ m.T) for m in tried])
+    k = int(np.argmax(left < np.min(left) + 1e-3))
+    if left[k] > _RIGHT:
+        code, cause = (
+            "force_disagrees",
+            (
+                "No usual unit or order of the axes makes them fit: another recording, a nominal "
+                "mounting that is another, or gravity taken off"
+            ),
+        )
+    elif k >= len(maps):
+        _, code, unit, mend = units[k - len(maps)]
+        cause = f"They are probably {unit}: {mend}"
+    elif np.array_equal(maps[k], -np.eye(3)):
+        code, cause = "accel_reversed", "They have the opposite sign: turn all three"
+    else:
+        code = "accel_axes"
+        fit = words_of(maps[k], "accel")
+        cause = f"They fit as {fit}: correct the nominal mounting or the axes"
+    yield finding(
+        imu,
+        "error",
+        code,
+        float(left[k]),
+        f"the accelerometers do not feel what the velocities and attitudes of {name_of(master)} "
+        f"ask for ({as_is:.0%} of the specific force is left over). {cause}.",
+    )
+
+
+def _forces(
+    imu: ImuTable, master: Trajectory, signal: Signal, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean specific force (w, 3) along the body in each window: by the master, by the IMU."""
+    time = (master.time_ns[known] - int(imu.time_ns[signal.rows[0]])) * 1e-9
+    first = np.concatenate([[True], np.diff(np.floor(time / _WINDOW_S)) > 0])
+    known, time = known[first], time[first]
+    length = np.diff(time)
+    inside = (time[:-1] > 0.0) & (time[1:] < signal.time_s[-1]) & (length < _LONGEST_S)
+    if np.count_nonzero(inside) < 10:
+        return None
+    q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
+    middle = q[:-1] * Rotation.from_rotvec(0.5 * (q[:-1].inv() * q[1:]).as_rotvec())
+    f_n = np.diff(master.v_n[known], axis=0) / length[:, None] - [0.0, 0.0, G]
+    steps = np.diff(signal.time_s, prepend=signal.time_s[0] - signal.step_s)
+    gained = np.cumsum(signal.accel * steps[:, None], axis=0)
+    at = np.stack([np.interp(time, signal.time_s, a) for a in gained.T], -1)
+    return middle.inv().apply(f_n)[inside], (np.diff(at, axis=0) / length[:, None])[inside]

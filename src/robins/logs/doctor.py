@@ -15,7 +15,7 @@ from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
 from robins.logs.checks_columns import check_columns
 from robins.logs.checks_gnss import check_gnss
 from robins.logs.checks_imu import check_imu
-from robins.logs.checks_master import check_master
+from robins.logs.checks_master import BY_REST, check_master
 from robins.logs.checks_motion import check_motion
 from robins.logs.checks_span import check_span
 from robins.logs.checks_time import check_time
@@ -48,13 +48,16 @@ def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
         LogError: arrays that are no tables: other lengths, types, shapes.
     """
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
-        findings = _examined(*_tables(subject))
-        if isinstance(subject, Dataset) and subject.master is not None:
-            findings += check_master(checked_imu(subject.imu), checked_truth(subject.master))
-        return by_severity(findings)
+        return by_severity(_examined(*_tables(subject), _master_of(subject)))
 
 
-def _examined(tables: list[Table], findings: list[Finding]) -> list[Finding]:
+def _master_of(subject: Dataset | Table | Sequence[Table]) -> Trajectory | None:
+    return subject.master if isinstance(subject, Dataset) else None
+
+
+def _examined(
+    tables: list[Table], findings: list[Finding], master: Trajectory | None
+) -> list[Finding]:
     imu = gnss = None
     for table in tables:
         if isinstance(table, ImuTable):
@@ -75,6 +78,11 @@ def _examined(tables: list[Table], findings: list[Finding]) -> list[Finding]:
         for table in tables:
             if table is not imu and not isinstance(table, ImuTable):
                 findings += check_span(imu, table)
+    if imu is not None and master is not None:
+        of_both = list(check_master(imu, checked_truth(master)))
+        if not any(f.code == "force_not_checked" for f in of_both):
+            findings = [f for f in findings if f.code not in BY_REST]
+        return findings + of_both
     if imu is not None and not _SPOILT & {f.code for f in findings}:
         of_motion = list(check_motion(imu, gnss)) if gnss is not None else []
         if gnss is None or any(f.code == "motion_not_checked" for f in of_motion):
