@@ -1,6 +1,6 @@
 """Systems: one problem each, with model, scenarios, filters and claims; here is the registry."""
 
-from robins.systems import ins_gnss
+from robins.systems import ins_gnss, transfer_alignment
 from robins.systems.system import (
     Case,
     Contender,
@@ -14,7 +14,7 @@ from robins.systems.system import (
     System,
 )
 
-SYSTEMS: dict[str, System] = {s.name: s for s in (ins_gnss.SYSTEM,)}
+SYSTEMS: dict[str, System] = {s.name: s for s in (ins_gnss.SYSTEM, transfer_alignment.SYSTEM)}
 
 __all__ = [
     "SYSTEMS",

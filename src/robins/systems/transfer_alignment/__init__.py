@@ -1,0 +1,39 @@
+"""Transfer alignment: a slave inertial unit on a flexing mount aligns itself to a master INS.
+
+- study "attitude-matching": nine states in a bank turn, after Gu & Qin (2005).
+- study "velocity-attitude": twelve states in an S-turn, after the patent of Southeast University.
+- study "product": total state with mounting and flexure, closed loop; also for recorded pairs.
+"""
+
+from pathlib import Path
+
+from robins.systems.system import Study, System
+from robins.systems.transfer_alignment import (
+    matching_claims,
+    matching_parameters,
+    product_claims,
+    product_filters,
+)
+from robins.systems.transfer_alignment.matching import matching_problem
+from robins.systems.transfer_alignment.matching_parameters import Matching
+from robins.systems.transfer_alignment.pair_replay import ALIGNMENT, orientation
+from robins.systems.transfer_alignment.product_problem import Product, product_problem
+
+_HERE = Path(__file__).parent / "scenarios"
+_SCENARIOS = ("s0", "s0r", "s1", "s2", "s3", "aircraft", "ship", "vehicle", "replay")
+
+SYSTEM = System(
+    name="transfer-alignment",
+    summary="a slave IMU on a flexing mount aligns itself to a master INS",
+    studies={
+        "attitude-matching": Study(
+            Matching, matching_problem, matching_parameters.FILTERS, matching_claims.CLAIMS
+        ),
+        "product": Study(Product, product_problem, product_filters.FILTERS, product_claims.CLAIMS),
+    },
+    scenarios={name: _HERE / f"{name}.toml" for name in _SCENARIOS},
+    orientation=orientation,
+    alignment=ALIGNMENT,
+)
+
+__all__ = ["SYSTEM"]
