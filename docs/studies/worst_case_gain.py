@@ -3,10 +3,10 @@
 python docs/studies/worst_case_gain.py [picture]
 
 Attitude matching of a slave inertial unit with its master, nine states, weights R = I and L = I
-(tests/filters/attitude_matching.py). Three forms of the filter against each other, the gain that
-the worst disturbances have against the gamma asked for, and the least gamma in three units of
-angle: the same filter of the same aircraft is harmless in one and impossible in another. Reference
-values are those of an independent prototype.
+(`robins.systems.transfer_alignment.attitude_matching`). Three forms of the filter against each
+other, the gain that the worst disturbances have against the gamma asked for, and the least gamma in
+three units of angle: the same filter of the same aircraft is harmless in one and impossible in
+another. Reference values are those of an independent prototype.
 """
 
 import importlib.util
@@ -47,14 +47,14 @@ def row(what: str, found: str, reference: str) -> None:
 
 def filtered(unit: str, gamma: float, steps: int = 400):
     """A run, and what its worst-case gain wants to know of it."""
-    model, start, F, aux = matching.attitude_matching(unit, steps).run_with()
+    model, start, F, aux = matching.run_with(matching.in_unit(unit, steps))
     state = with_gamma(FILTER.init(start, model.dims), gamma)
     return model, start, run(FILTER, model, state, np.zeros((steps, 3)), F, aux), F, aux
 
 
 def least(unit: str, steps: int = 400, P0: str = "physical", rtol: float = 1e-6) -> float:
     """gamma_min."""
-    model, start, F, aux = matching.attitude_matching(unit, steps, P0).run_with()
+    model, start, F, aux = matching.run_with(matching.in_unit(unit, steps, P0))
     return gamma_min(model, start, np.zeros((steps, 3)), WEIGHT, F, aux, rtol=rtol)
 
 
@@ -66,7 +66,7 @@ def gain(unit: str, gamma: float, steps: int) -> float:
 
 def three_forms(gamma: float) -> float:
     """Largest difference of the Riccati variables, in standard deviations."""
-    s = matching.attitude_matching("deg")
+    s = matching.in_unit("deg")
     ours = np.asarray(filtered("deg", gamma)[2].steps.prediction.belief.covariance)
     joseph, krein = (
         form(s.F, s.Q, s.H, np.eye(3), s.P0, WEIGHT, gamma)
@@ -94,7 +94,7 @@ def draw(steps: int, smallest: float, target: Path) -> None:
     for unit, colour in (("deg", "tab:blue"), ("arcmin", "tab:orange")):
         over_all = least(unit)
         for share, style in ((np.inf, "-"), (1.0001, "--")):
-            notes = filtered(unit, share * over_all)[2].steps.info["y"].notes
+            notes = filtered(unit, share * over_all)[2].steps.info["attitude"].notes
             label = f"{unit}, " + ("Kalman" if share == np.inf else "gamma_min")
             bound = notes["h_infinity.bound"] / over_all
             right.plot(time_s, bound, style, color=colour, label=label)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from attitude_matching import PERIOD_S, attitude_matching
+from attitude_matching import PERIOD_S, in_unit, run_with
 from dense_h_infinity import (
     compensated,
     greatest,
@@ -121,9 +121,9 @@ def matching():
 
 def test_three_forms_agree_to_1e_13(matching):
     # 400 updates, scaled by standard deviations
-    s = attitude_matching("deg")
+    s = in_unit("deg")
     gamma = 1.05 * 4.656093988
-    model, start, F, aux = s.run_with()
+    model, start, F, aux = run_with(s)
     state = at(gamma, matching, model, start)
     solution = run(matching, model, state, np.zeros((400, 3)), F, aux)
     root = np.asarray(solution.steps.prediction.belief.covariance)
@@ -138,7 +138,7 @@ def test_three_forms_agree_to_1e_13(matching):
 
 
 def test_the_paper_in_arcminutes_is_refused_at_its_sixth_update(matching):
-    model, start, F, aux = attitude_matching("arcmin").run_with()
+    model, start, F, aux = run_with(in_unit("arcmin"))
     state, time_s = at(50.0, matching, model, start), PERIOD_S * np.arange(1, 401)
     with pytest.raises(Infeasible) as caught:
         run(matching, model, state, np.zeros((400, 3)), F, aux, time_s=time_s)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from attitude_matching import attitude_matching
+from attitude_matching import in_unit, run_with
 from dense_h_infinity import greatest, h_infinity_filter
 from dense_kalman import random_system, simulate, times
 from jax.tree_util import Partial
@@ -226,7 +226,7 @@ def test_a_gain_wants_its_steps():
 
 def test_attitude_matching_has_the_published_worst_cases():
     # 80 updates in degrees, R = I, L = I: reference values of an independent prototype
-    model, start, F, aux = attitude_matching("deg", 80).run_with()
+    model, start, F, aux = run_with(in_unit("deg", 80))
     y, weight = np.zeros((80, 3)), np.eye(9)
     least = gamma_min(model, start, y, weight, F, aux, rtol=1e-7)
     assert least == pytest.approx(3.18570, abs=5e-6)

@@ -40,12 +40,12 @@ def roll_rad(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
 def heading_rad(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
     """Heading, clockwise from north; not wrapped."""
     turning = np.clip(np.asarray(t_s, float) - turn.roll_time_s, 0.0, turn.turn_time_s)
-    return turn.heading_rad + turn.acceleration_m_s2 / turn.speed_m_s * turning
+    return np.asarray(turn.heading_rad + turn.acceleration_m_s2 / turn.speed_m_s * turning)
 
 
 def load_factor(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
     """Specific force over g that holds the height at this roll: 1 / cos(roll)."""
-    return 1.0 / np.cos(roll_rad(turn, t_s))
+    return np.asarray(1.0 / np.cos(roll_rad(turn, t_s)))
 
 
 def attitude_enu(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
@@ -75,4 +75,4 @@ def rate_in_enu(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
     h = heading_rad(turn, t_s)
     v_ned = turn.speed_m_s * np.stack([np.cos(h), np.sin(h), np.zeros_like(h)], -1)
     over_earth = np.asarray(transport_rate_n(turn.lat_rad, 0.0, v_ned))
-    return swap(over_earth + np.asarray(earth_rate_n(turn.lat_rad)))
+    return np.asarray(swap(over_earth + np.asarray(earth_rate_n(turn.lat_rad))))

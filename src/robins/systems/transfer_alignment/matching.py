@@ -10,6 +10,7 @@ filter "in degrees" with R = I and L = I is one with R = (1 deg)^2 and gamma in 
 
 from __future__ import annotations
 
+import math
 import warnings
 from functools import partial
 from typing import NamedTuple
@@ -148,9 +149,9 @@ def simulate(course: Course, sizes: Sizes, seed: int, index: Array) -> World:
     """One run, from its number; pure."""
     key = partial(stream, seed, index)
     c, s = (jax.tree_util.tree_map(jnp.asarray, x) for x in (course, sizes))
-    steps = len(course.turned_n)
+    steps, dt = len(course.turned_n), course.step_s
     swing, flutter = (jax.random.fold_in(key(Component.FLEXURE), part) for part in range(2))
-    angle, rate = simulate_flexure(s.flexure, swing, c.step_s, steps, c.load)
+    angle, rate = simulate_flexure(s.flexure, swing, dt, steps, c.load)
     phi0, bias, mu = _initial(s, key(Component.INITIAL_STATE))
 
     seat = rotation.multiply(c.q_nominal, rotation.from_rotvec(mu))
@@ -158,8 +159,8 @@ def simulate(course: Course, sizes: Sizes, seed: int, index: Array) -> World:
     # C(k+1) = exp(-omega_in dt) C(k) exp(theta), solved for what ideal gyros report
     unturned = rotation.multiply(c.turned_n, q_sn[1:])
     theta = rotation.to_rotvec(rotation.multiply(rotation.conjugate(q_sn[:-1]), unturned))
-    walk = s.gyro_noise * jnp.sqrt(c.step_s) * jax.random.normal(key(Component.IMU), theta.shape)
-    turned_s = rotation.from_rotvec(theta + (bias * c.step_s)[None] + walk)
+    walk = s.gyro_noise * math.sqrt(dt) * jax.random.normal(key(Component.IMU), theta.shape)
+    turned_s = rotation.from_rotvec(theta + (bias * dt)[None] + walk)
 
     def carry(q, turned):
         n, b = turned
