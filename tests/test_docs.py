@@ -177,7 +177,9 @@ def test_the_configurations_shown_can_be_read():
     ]
     assert shown
     for mapping in shown:
-        parameters = SYSTEMS[mapping["system"]].replay_parameters
+        system = SYSTEMS[mapping["system"]]
+        aligned = system.alignment and system.alignment.parameters
+        parameters = system.replay_parameters or aligned
         assert parameters
         scenario.validate(parameters, mapping)
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
 
-from robins import logs, scenario
+from robins import logs, results, scenario
 from robins.ins.state import InsState
 from robins.manifold import local
 from robins.results.solution import check
@@ -28,6 +28,7 @@ from robins.systems.transfer_alignment.pair_replay import (
 )
 from robins.systems.transfer_alignment.product import ATTITUDE, VELOCITY, ProductState
 from robins.systems.transfer_alignment.product_filters import product_contender
+from robins.workbench import InputError, align_pair
 
 # Blocks as long as the master's interval: whatever is missing, one shape, so one compilation.
 TEXT = """
@@ -332,3 +333,65 @@ def test_the_doctor_sees_the_slave_along_the_axes_of_the_master(pairs):
 def test_a_filter_that_is_not_there_is_named(pairs):
     with pytest.raises(ValueError, match="no filter 'ghost'"):
         replay(pairs[0], PAIR, ("ghost",))
+
+
+# ------------------------------------------------------------------------------------ the command
+
+
+@pytest.fixture(scope="module")
+def files(runs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    dataset = recorded(runs[0], "made")
+    logs.write_named(folder / "master.csv", dataset.master)
+    logs.write_named(folder / "slave.csv", dataset.imu)
+    imu = dataset.imu
+    logs.write_named(folder / "late.csv", replace(imu, time_ns=imu.time_ns + 10**13))
+    (folder / "mine.toml").write_text('system = "transfer-alignment"\nstudy = "product"\n' + TEXT)
+    return folder
+
+
+def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
+    heard = []
+    done = align_pair(
+        str(files / "mine.toml"),
+        files / "master.csv",
+        files / "slave.csv",
+        out=files / "result",
+        settings=('title="Mine"',),
+        findings=heard.extend,
+    )
+    assert done.summary["scenario"] == "transfer-alignment/slave"
+    found, want = done.summary["filters"]["product"], clean.metrics["product"]
+    assert found["mounting_arcmin"] == pytest.approx(want["mounting_arcmin"])
+    assert found["nis_master_attitude_band"] == pytest.approx(want["nis_master_attitude_band"])
+    result = results.read(files / "result")
+    assert {"estimate_mounting", "estimate_gyro_bias", "innovation_master_attitude"} <= set(
+        result.figures
+    )
+    assert "Mounting" in result.report.read_text("utf-8")
+    assert [f.code for f in heard if f.severity == "error"] == []
+    assert "Aligned from" in done.notes[0]
+
+
+def refused(files, name=None, master="master.csv", slave="slave.csv"):
+    with pytest.raises((InputError, logs.LogError)) as caught:
+        align_pair(
+            str(name or files / "mine.toml"), files / master, files / slave, out=files / "refused"
+        )
+    assert not (files / "refused").exists()
+    return str(caught.value)
+
+
+def test_what_cannot_be_aligned_is_told_in_a_sentence(files):
+    told = refused(files, "transfer-alignment/s0")
+    assert "study 'attitude-matching'; what can is transfer-alignment, study 'product'" in told
+    assert "drive cannot be given a recorded master" in refused(files, "ins-gnss/drive")
+    assert "were master and slave exchanged" in refused(files, master="slave.csv")
+    text = (files / "slave.csv").read_text()
+    (files / "no_axis.csv").write_text(text.replace("dtheta_y_rad,", "yaw_rate,"))
+    told = refused(files, slave="no_axis.csv")
+    assert "lacks dtheta_y_deg or dtheta_y_rad; it has time_s, dtheta_x_rad" in told
+    (files / "degrees.csv").write_text(text.replace("_rad", "_deg"))
+    told = refused(files, slave="degrees.csv")
+    assert "the gyros do not turn as the attitudes of master.csv do" in told
+    assert "no common time" in refused(files, slave="late.csv")

@@ -139,8 +139,7 @@ def _turns(imu: ImuTable, master: Trajectory) -> tuple[np.ndarray, list[np.ndarr
         return None
     q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
     of_master = (q[:-1].inv() * q[1:]).as_rotvec()[inside]
-    steps = np.diff(signal.time_s, prepend=signal.time_s[0] - signal.step_s)
-    angle = np.cumsum(signal.gyro * steps[:, None], axis=0)
+    angle = _integral(imu, signal, signal.gyro)
 
     def by_gyros(lag: float) -> np.ndarray:
         at = [np.interp(time - lag, signal.time_s, a) for a in angle.T]
@@ -152,6 +151,15 @@ def _turns(imu: ImuTable, master: Trajectory) -> tuple[np.ndarray, list[np.ndarr
     if np.sqrt(np.mean(np.sum(of_master**2, axis=1))) < _LEAST_RATE * length:
         return None
     return of_master, [by_gyros(lag) for lag in _LAGS_S]
+
+
+def _integral(imu: ImuTable, signal: Signal, values: np.ndarray) -> np.ndarray:
+    """(n, 3) integral of rates up to each sample, from the first; those of increments are means."""
+    steps = np.diff(signal.time_s, prepend=signal.time_s[0])[:, None]
+    before = np.concatenate([values[:1], values[:-1]])
+    return np.cumsum(
+        steps * (values if imu.kind == "increment" else 0.5 * (before + values)), axis=0
+    )
 
 
 def _left(of_master: np.ndarray, of_gyros: np.ndarray) -> float:
@@ -267,7 +275,6 @@ def _forces(
     q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
     middle = q[:-1] * Rotation.from_rotvec(0.5 * (q[:-1].inv() * q[1:]).as_rotvec())
     f_n = np.diff(master.v_n[known], axis=0) / length[:, None] - [0.0, 0.0, G]
-    steps = np.diff(signal.time_s, prepend=signal.time_s[0] - signal.step_s)
-    gained = np.cumsum(signal.accel * steps[:, None], axis=0)
+    gained = _integral(imu, signal, signal.accel)
     at = np.stack([np.interp(time, signal.time_s, a) for a in gained.T], -1)
     return middle.inv().apply(f_n)[inside], (np.diff(at, axis=0) / length[:, None])[inside]
