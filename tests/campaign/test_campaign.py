@@ -9,6 +9,7 @@ from scipy import stats
 
 from robins.campaign import chunks, collect, monte_carlo, rms_with_bounds, simulate
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
+from robins.filters.rules import h_infinity
 from robins.sim.random import Component, stream
 from robins.systems.system import Case, Contender, Limit, Problem, SensorAxes, StateBlock
 
@@ -123,6 +124,20 @@ def test_a_diverged_run_is_counted_not_dropped(problem):
     assert s.diverged == 1
     assert s.runs == 4
     assert np.all(np.isinf(s.rms[5]))
+
+
+def test_a_filter_that_cannot_predict_has_no_error_to_show(problem):
+    """An H-infinity filter that does not exist must not look like a result."""
+    rule = h_infinity(0.5, jnp.eye(2))
+    none = problem._replace(
+        contenders={"hinf": Contender(kalman(taylor(), [rule]), _model(0.4), bounds=True)}
+    )
+    record = next(chunks(none, "hinf", 3))
+    first = np.argmax(np.isnan(record["error"]).any(axis=2), axis=1)
+    assert np.all(first > 0)
+    assert np.all(np.isnan(record["error"][:, first[0] :]))
+    assert np.all(np.isfinite(record["error"][:, : first[0]]))
+    assert collect([record], problem.blocks).diverged == 3
 
 
 def test_all_filters_see_the_same_numbers(problem):

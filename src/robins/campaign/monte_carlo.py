@@ -18,7 +18,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import Belief, Solution, Step, run
+from robins.filters import Belief, Code, Solution, Step, run
 from robins.filters.consistency import nees, normalised_sq
 from robins.manifold import State, local
 from robins.systems.system import Contender, Problem
@@ -34,7 +34,7 @@ def _kept(step: Step) -> Any:
         name: (i.innovation, i.sigma, i.nis, i.dof, i.code, i.notes)
         for name, i in step.info.items()
     }
-    return step.posterior, info
+    return step.posterior, info, step.prediction.code == int(Code.DONE)
 
 
 def _reported(contender: Contender, belief: Belief, truth: State) -> tuple[Array, Array]:
@@ -52,8 +52,10 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
     solution: Solution = run(
         contender.filter, contender.model, case.start, case.y, case.u, case.aux, keep=_kept
     )
-    posterior, info = solution.steps
+    posterior, info, moved = solution.steps
     error, factor = jax.vmap(partial(_reported, contender))(posterior, case.truth)
+    # A filter that could not predict is no longer at the time of the truth: it has diverged.
+    error = jnp.where((jnp.cumsum(~moved) > 0)[:, None], jnp.nan, error)
     of = {name: (slice(None), slice(first, last)) for name, first, last in blocks}
     return {
         "error": error,

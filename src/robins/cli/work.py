@@ -84,7 +84,8 @@ def _tell(done: Any, as_json: bool) -> None:
 
     from robins.report import table
 
-    Console().print(table(done.summary))
+    console = Console()
+    console.print(table(done.summary, console.width))
     for note in done.notes:
         click.echo(note)
     click.echo(f"\nResult: {done.path}")

@@ -15,6 +15,8 @@ from robins.report.series import Series
 from robins.report.style import Picture
 
 _START = 0.2  # of the time axis
+_TINTED = 4  # filters whose tints can be told apart
+_BEYOND = 4.0  # a stated sigma this many times any error does not set the scale
 _STEEP = 3.0  # a start this much higher than all that follows is cut off, and said so
 
 
@@ -59,6 +61,13 @@ def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = T
     return True
 
 
+def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
+    """The lines that the scale must hold: what a filter states may be beyond all errors."""
+    most = _BEYOND * np.nanmax(np.abs(np.where(np.isfinite(errors), errors, np.nan)), initial=0.0)
+    kept = [line for line in lines if not np.nanmedian(np.abs(line)) > most]
+    return kept or lines
+
+
 def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, series.Clock]:
     figure, grid = style.new(len(data.axes), 1, _rows(len(data.axes)), sharex=True)
     clock = series.clock(data.x)
@@ -74,7 +83,7 @@ def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, se
 
 
 def _or_bound(solution: xr.Dataset) -> str:
-    return " (H-infinity: √P, a bound, not a covariance)" if bound_names(solution) else ""
+    return "; of H-infinity a bound, not a covariance" if bound_names(solution) else ""
 
 
 def _keys(filters: list[str], solution: xr.Dataset, *more) -> list:
@@ -100,7 +109,10 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
                 _envelope(axes, sigma, i, k, clock, len(filters))
                 lines.append(3.0 * sigma.values[i, :, k])
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
-        _limit(axes, error.x, lines)
+        kept = _in_scale(lines, error.values[:, :, k])
+        if not _limit(axes, error.x, kept) and len(kept) < len(lines):
+            top = 1.25 * np.nanmax(np.abs(kept))
+            axes.set_ylim(-top, top)
     label = f"±3σ stated{_or_bound(solution)}"
     bounds = [style.key(label, color=style.GREY, linewidth=0.8)] if sigma is not None else []
     style.legend(figure, _keys(filters, solution, *bounds))
@@ -200,23 +212,26 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
             if stated is not None:
                 x, y = series.thin(stated.x / clock.seconds, stated.values[i, :, k], points=600)
                 axes.plot(x, y, color=style.dark(i), linewidth=0.9, zorder=3)
-                if runs:
+                if runs and len(filters) <= _TINTED:
                     # The mean square of N errors of variance sigma^2 is sigma^2 chi2(N)/N.
                     low, high = (np.sqrt(quantile(p, runs) / runs) for p in (0.025, 0.975))
                     band = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
                     axes.fill_between(x, low * y, high * y, **band)
                 lines.append(stated.values[i, :, k])
-        if not _limit(axes, rms.x, lines, centred=False):
-            axes.set_ylim(bottom=0.0)
+        kept = _in_scale(lines, rms.values[:, :, k])
+        if not _limit(axes, rms.x, kept, centred=False):
+            axes.set_ylim(0.0, None if len(kept) == len(lines) else 1.25 * np.nanmax(kept))
     label = f"σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = f"Root mean square error of the {name} over {runs or 'all'} runs."
     if stated is not None and runs:
-        caption += (
-            " If the stated sigma (thin) is true, the line stays in the tint 95\u00a0% of the time."
-        )
+        if len(filters) <= _TINTED:
+            caption += " If the stated sigma (thin) is true, the line stays in the tint"
+            caption += " 95\u00a0% of the time."
+        else:
+            caption += " Thin lines: the stated sigma."
         caption += bound_note(solution)
     caption += _frame_of(solution, f"rms_{block}")
     return Picture(f"rms_{block}", f"Scatter of the {name} over the runs", caption, figure)

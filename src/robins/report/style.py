@@ -21,6 +21,7 @@ WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of t
 # distinction onto paper without colours.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)))
+_ROWS = 2  # of a legend that every figure has room for
 TRUTH = "#222222"
 GREY = "#6B6B6B"
 OUTAGE = "#FBE9B0"
@@ -115,14 +116,26 @@ def outage_key() -> Patch:
 
 
 def legend(figure: Figure, keys: Sequence[Any]) -> None:
-    """One legend above all axes, where no data are; it reads row by row."""
+    """One legend above all axes, where no data are; it reads row by row.
+
+    A legend of many rows makes the figure taller, so that the axes keep their height.
+    """
     if not keys:
         return
-    widest = max(len(key.get_label()) for key in keys) * 0.066 + 0.55  # inches
-    columns = max(1, min(len(keys), int((WIDTH - 0.3) / widest)))
-    columns = -(-len(keys) // -(-len(keys) // columns))  # no last row of one
+    widths = np.array([len(key.get_label()) * 0.066 + 0.55 for key in keys])  # inches
+    columns = next(n for n in range(len(keys), 0, -1) if n == 1 or _width(widths, n) < WIDTH - 0.3)
+    rows = -(-len(keys) // columns)
+    columns = -(-len(keys) // rows)  # no last row of one
+    if rows > _ROWS:
+        width, height = figure.get_size_inches()
+        figure.set_size_inches(width, height + 0.19 * (rows - _ROWS))
     ordered = [key for column in range(columns) for key in keys[column::columns]]
     figure.legend(handles=ordered, loc="outside upper center", ncols=columns)
+
+
+def _width(widths: np.ndarray, columns: int) -> float:
+    """Width of a legend of so many columns, each as wide as its widest entry."""
+    return sum(widths[column::columns].max() for column in range(columns))
 
 
 def shade(axes: Axes, x: np.ndarray, mask: np.ndarray | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console, Group
@@ -11,22 +11,27 @@ from rich.text import Text
 
 from robins.report import numbers
 
+_GAP = 2  # columns between columns
 _COLOURS = {"reproduced": "green", "partly": "yellow", "not": "red"}
 
 
-def table(summary: Mapping[str, Any]) -> Group:
-    """Metrics by filter, claims with verdicts and refused samples, as something rich can print."""
+def table(summary: Mapping[str, Any], width: int = 100) -> Group:
+    """Metrics by filter, claims with verdicts and refused samples, as something rich can print.
+
+    Filters that have no room beside each other in so many columns come in tables of their own.
+    """
     parts: list[Any] = []
     filters = summary["filters"]
-    names = dict.fromkeys(name for values in filters.values() for name in values)
-    if names:
+    names = list(dict.fromkeys(name for values in filters.values() for name in values))
+    labels = [str(numbers.label(name)) for name in names]
+    cells = {f: [numbers.show(v.get(name)) for name in names] for f, v in filters.items()}
+    for group in _groups(cells, width - max(map(len, labels), default=0)) if names else ():
         metrics = _new("metric")
-        for name in filters:
+        for name in group:
             metrics.add_column(Text(name), justify="right")
-        for name in names:
-            cells = [numbers.show(values.get(name)) for values in filters.values()]
-            metrics.add_row(Text(str(numbers.label(name))), *map(Text, cells))
-        parts.append(metrics)
+        for row, label in enumerate(labels):
+            metrics.add_row(Text(label), *(Text(cells[name][row]) for name in group))
+        parts += [Text(), metrics] if parts else [metrics]
     if summary["claims"]:
         claims = _new("verdict", "claim")
         claims.add_column("found", justify="right")
@@ -47,16 +52,30 @@ def table(summary: Mapping[str, Any]) -> Group:
     return Group(*parts)
 
 
+def _groups(cells: Mapping[str, Sequence[str]], room: int) -> list[list[str]]:
+    """Filters whose columns fit into the room, one at least in each group."""
+    groups: list[list[str]] = []
+    left = 0
+    for name, column in cells.items():
+        wanted = max(len(name), *map(len, column)) + _GAP
+        if not groups or wanted > left:
+            groups.append([])
+            left = room
+        groups[-1].append(name)
+        left -= wanted
+    return groups
+
+
 def plain(summary: Mapping[str, Any], width: int = 100) -> str:
     """The same as plain text."""
     console = Console(width=width, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(table(summary))
+        console.print(table(summary, width))
     return capture.get()
 
 
 def _new(*columns: str) -> Table:
-    made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, _GAP, 0, 0))
     for column in columns:
         made.add_column(column)
     return made
