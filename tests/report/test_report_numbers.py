@@ -22,6 +22,7 @@ from robins.report import numbers
         ("peak_m_per_s2", "Peak", "m/s²"),
         ("nis_inside_percent", "NIS inside", "%"),
         ("anees", "ANEES", ""),
+        ("share_below_5_arcmin", "Share below 5 arcmin", ""),
         ("euler", "Euler angles", ""),
         ("accel_bias_rms_mg", "Accelerometer bias RMS", "mg"),
         ("step_us", "Step", "µs"),
@@ -125,3 +126,14 @@ def test_markup_in_names_is_printed_as_it_is(town):
 
 def test_an_empty_summary_prints_nothing(town):
     assert report.plain(town | {"filters": {}, "claims": [], "counts": {}}) == ""
+
+
+def test_filters_without_room_come_in_tables_of_their_own(town):
+    filters = {f"filter-{i}": {"a_m": 1.0, **({"b_m": 2.0} if i > 6 else {})} for i in range(9)}
+    text = report.plain(town | {"filters": filters, "claims": [], "counts": {}}, 60)
+    assert max(map(len, text.splitlines())) <= 60
+    heads = [line.split()[1:] for line in text.splitlines() if line.startswith("metric")]
+    assert len(heads) > 1
+    assert [name for head in heads for name in head] == list(filters)
+    # a metric that none of a group has takes no row there
+    assert sum(line.startswith("B") for line in text.splitlines()) == 1

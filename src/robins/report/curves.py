@@ -63,8 +63,13 @@ def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = T
 
 def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
     """The lines that the scale must hold: what a filter states may be beyond all errors."""
-    most = _BEYOND * np.nanmax(np.abs(np.where(np.isfinite(errors), errors, np.nan)), initial=0.0)
-    kept = [line for line in lines if not np.nanmedian(np.abs(line)) > most]
+    most = _BEYOND * np.abs(errors[np.isfinite(errors)]).max(initial=0.0)
+
+    def usual(line: np.ndarray) -> float:
+        known = np.abs(line[np.isfinite(line)])
+        return float(np.median(known)) if known.size else 0.0
+
+    kept = [line for line in lines if usual(line) <= most]
     return kept or lines
 
 

@@ -51,8 +51,8 @@ class Label(NamedTuple):
 
 
 def label(metric: str) -> Label:
-    """Words and unit of a metric's name."""
-    unit = _UNIT.search(metric)
+    """Words and unit of a metric's name; of a share the unit at its end is that of its limit."""
+    unit = None if metric.startswith("share_") else _UNIT.search(metric)
     text = words(metric[: unit.start()] if unit else metric) or metric
     told = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
     return Label(text[:1].upper() + text[1:], told)

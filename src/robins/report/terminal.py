@@ -29,8 +29,9 @@ def table(summary: Mapping[str, Any], width: int = 100) -> Group:
         metrics = _new("metric")
         for name in group:
             metrics.add_column(Text(name), justify="right")
-        for row, label in enumerate(labels):
-            metrics.add_row(Text(label), *(Text(cells[name][row]) for name in group))
+        for row, metric in enumerate(names):
+            if any(metric in filters[name] for name in group):
+                metrics.add_row(Text(labels[row]), *(Text(cells[name][row]) for name in group))
         parts += [Text(), metrics] if parts else [metrics]
     if summary["claims"]:
         claims = _new("verdict", "claim")
