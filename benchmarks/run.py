@@ -9,7 +9,14 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-ORDER = ["strapdown.py", "filters.py", "rules.py", "ins_gnss.py", "long_replay.py"]
+ORDER = [
+    "strapdown.py",
+    "filters.py",
+    "rules.py",
+    "ins_gnss.py",
+    "long_replay.py",
+    "transfer_alignment.py",
+]
 
 
 def main() -> int:
