@@ -114,7 +114,8 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
         raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
     c = problem.contenders[name]
     blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
-    found = _records(c.filter, blocks, c.model, Partial(c.case), c.reported, worlds)
+    case = c.case if isinstance(c.case, Partial) else Partial(c.case)  # whose numbers are data
+    found = _records(c.filter, blocks, c.model, case, c.reported, worlds)
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
 
 
