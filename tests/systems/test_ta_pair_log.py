@@ -61,7 +61,8 @@ RECORDING = Recording()
 
 @pytest.fixture(scope="module")
 def run():
-    return simulate_pair(PAIR, lay_out(PAIR), 5, jnp.asarray(0))
+    course = lay_out(PAIR)
+    return jax.jit(lambda k: simulate_pair(PAIR, course, 5, k))(0)
 
 
 @pytest.fixture(scope="module")
