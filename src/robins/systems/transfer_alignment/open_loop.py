@@ -19,7 +19,7 @@ from robins.ins.frames import swap
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, advance, rows, unpacked, vector
 from robins.manifold import retract
-from robins.rotation import Rotation, rotate
+from robins.rotation import Rotation, conjugate, multiply, rotate
 from robins.systems.transfer_alignment.velocity_attitude import Flight, dcm_enu
 
 _Q, _V, _V_DOWN, _LAT, _ALT = slice(0, 4), slice(4, 7), 6, 7, 9  # places in the vector of a step
@@ -87,6 +87,40 @@ def _flights(path: Float[Array, "n 10"], increments: Increments) -> Flight:
         f_enu=swap(jnp.sum(felt, 1) / jnp.sum(increments.dt, 1)[:, None]),
         C_nb=average(dcm_enu(path[:, _Q])),
     )
+
+
+def as_master_sees(loop: OpenLoop, master: Nav) -> tuple[Flight, Float[Array, "e 3 3"]]:
+    """The slave's flight and attitudes with what the master reports in place of what is off.
+
+    A model linearised there errs less than one about the slave's own idea, whose attitude is off by
+    degrees. Each interval is turned and shifted by the difference at its end, so that the slave's
+    samples still say what happened within it.
+
+    Args:
+        loop: what the slave computes.
+        master: as reported at each epoch, of a box aligned with the slave's; NaN where missing, and
+            there the slave's own idea stands.
+
+    Returns:
+        The flight over the intervals, and C from body RFU to ENU at the epochs.
+    """
+    own, flight = loop.nav, loop.flight
+    q = jnp.asarray(master.q_nb.wxyz)
+    there = jnp.all(jnp.isfinite(q), -1, keepdims=True)
+    turn = multiply(jnp.where(there, q, own.q_nb.wxyz), conjugate(own.q_nb.wxyz))
+    turn = dcm_enu(turn)
+
+    def off(own: Array, reported: Array) -> Array:
+        return jnp.where(jnp.isfinite(reported), own - reported, 0.0)
+
+    about = Flight(
+        lat_rad=flight.lat_rad - off(own.position.lat, master.position.lat),
+        alt_m=flight.alt_m,
+        v_enu=flight.v_enu - swap(off(own.v_n, master.v_n)),
+        f_enu=jnp.einsum("eij,ej->ei", turn, flight.f_enu),
+        C_nb=turn @ flight.C_nb,
+    )
+    return about, turn @ dcm_enu(own.q_nb.wxyz)
 
 
 def attitude_error_enu(q_computed: ArrayLike, q_true: ArrayLike) -> Float[Array, "*b 3"]:

@@ -9,7 +9,10 @@ off,
 
 computed minus true, in rad, m/s, m/s^2 and rad/s; C_computed = exp(-phi x) C_true. Measured is
 
-    Y = [VE, VN, heading, pitch, roll] of the slave minus those of the master.
+    Y = [VE, VN, heading, pitch, roll] of the slave minus those of the master,
+
+here as two sensors, for they have units of their own; updating with one after the other is
+updating with both.
 
 Left out, as by the patent: the accelerometer along z, which a bank turns into the horizontal, and
 mounting angles between the two units. Euler angles fail where the nose points up: see
@@ -37,7 +40,7 @@ LAT, LON, VE, VN, PHI_E, PHI_N, PHI_U, NABLA_X, NABLA_Y, EPS_X, EPS_Y, EPS_Z = r
 POSITION, VELOCITY, PHI = slice(0, 2), slice(2, 4), slice(4, 7)
 NABLA, EPS = slice(7, 9), slice(9, 12)
 
-SENSOR = "velocity_attitude"
+VELOCITY_SENSOR, ATTITUDE_SENSOR = "velocity", "attitude"
 STEEPEST_RAD = math.radians(85.0)
 
 
@@ -60,10 +63,10 @@ class Interval(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What the measurement is told of an epoch."""
+    """What the measurement of attitude is told of an epoch."""
 
-    C_nb: Array  # (3, 3) of the slave, as computed
-    sigma: Array  # (5,) m/s and rad
+    C_nb: Array  # (3, 3)
+    sigma: Array  # (3,) rad, of heading, pitch, roll
 
 
 def error_dynamics(flight: Flight) -> Float[Array, "12 12"]:
@@ -164,27 +167,45 @@ def _move_linear(x: Array, interval: Interval) -> tuple[Array, Array, Array]:
     return Phi @ x, Phi, interval.sigma
 
 
-def _read(x: Array, sight: Sight) -> Array:
-    return measurement_matrix(sight.C_nb) @ x
+def _read_velocity(x: Array, sigma: Array) -> Array:
+    return x[VELOCITY]
 
 
-def _read_linear(x: Array, sight: Sight) -> tuple[Array, Array]:
-    H = measurement_matrix(sight.C_nb)
+def _read_velocity_linear(x: Array, sigma: Array) -> tuple[Array, Array]:
+    return x[VELOCITY], jnp.eye(STATES)[VELOCITY]
+
+
+def _velocity_sigma(x: Array, sigma: Array) -> Array:
+    return sigma
+
+
+def _read_attitude(x: Array, sight: Sight) -> Array:
+    return measurement_matrix(sight.C_nb)[2:] @ x
+
+
+def _read_attitude_linear(x: Array, sight: Sight) -> tuple[Array, Array]:
+    H = measurement_matrix(sight.C_nb)[2:]
     return H @ x, H
 
 
-def _sight_sigma(x: Array, sight: Sight) -> Array:
+def _attitude_sigma(x: Array, sight: Sight) -> Array:
     return sight.sigma
 
 
 def velocity_attitude_model() -> Model:
-    """The model: u is an `Interval` of each step, the aux of its only sensor a `Sight`.
+    """The model.
 
-    Every call gives the same functions, so that what was compiled for one serves all; noise comes
-    with the data.
+    The motion takes an `Interval` for each step; the sensor "velocity" (VE, VN) its (2,) standard
+    deviations [m/s], "attitude" (heading, pitch, roll) a `Sight`. Every call gives the same
+    functions, so that what was compiled for one serves all.
     """
-    motion = Motion(_move, _noise, _move_linear)
-    return Model(motion, (Sensor(_read, _sight_sigma, 5, SENSOR, _read_linear),))
+    return Model(
+        Motion(_move, _noise, _move_linear),
+        (
+            Sensor(_read_velocity, _velocity_sigma, 2, VELOCITY_SENSOR, _read_velocity_linear),
+            Sensor(_read_attitude, _attitude_sigma, 3, ATTITUDE_SENSOR, _read_attitude_linear),
+        ),
+    )
 
 
 def process_sigma(gyro_noise: Any, accel_noise: Any, dt_s: Any) -> Float[Array, "12"]:
