@@ -325,16 +325,16 @@ def test_rules_stream_as_they_run():
 
 
 def test_normalised_is_what_the_update_will_say():
-    seen = []
-
     def look(memory, prior, o):
-        seen.append(normalised(o))
-        return memory, prior, o
+        return normalised(o), prior, o
 
+    start = Rule(before=look, init=lambda belief, dims: nothing)
+    nothing = normalised(taylor().observation(START, MODEL.sensors[0], jnp.zeros(Y.shape[1])))
     for way in (taylor(), unscented(), unscented(1.0, 0.0, -1.0)):
-        one = kalman(way, [Rule(before=look)])
-        _, info = one.update(one.init(START, MODEL.dims), MODEL.sensors[0], jnp.array(Y[0]))
-        judged = seen.pop()
+        one = kalman(way, [start])
+        state = one.init(START, MODEL.dims)
+        state, info = one.update(state, MODEL.sensors[0], jnp.array(Y[0]))
+        (judged,) = state.memory
         np.testing.assert_allclose(judged.nis, info.nis, rtol=1e-12)
         np.testing.assert_allclose(judged.factor, info.factor, rtol=1e-12, atol=1e-14)
         np.testing.assert_array_equal(judged.used, info.used)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Again, Filter, FilterState
+from robins.filters.kalman import Again, Filter, FilterState, compiled
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.trees import select
 
@@ -237,7 +237,9 @@ def delayed(
         rerun = None if again is None else once_more
         filter_.audit(_inner(start), _inner(final), rerun, time)
 
-    return Filter(init, predict, update, reset, audit if filter_.audit is not None else None)
+    return compiled(
+        Filter(init, predict, update, reset, audit if filter_.audit is not None else None)
+    )
 
 
 def _inner(state: FilterState) -> FilterState:

@@ -38,7 +38,7 @@ from robins.filters.channels import (
     updating,
 )
 from robins.filters.fusion import Criterion, check_criterion, information_sum, intersection_weights
-from robins.filters.kalman import Filter, FilterState
+from robins.filters.kalman import Filter, FilterState, compiled
 from robins.filters.model import Motion
 
 Feedback = Literal["own", "mean", "full"]
@@ -140,4 +140,6 @@ def _side_by_side(channels: Sequence[Channel], fuse: Fuse, feedback: Feedback, n
         members = tuple(c.filter.reset(m, belief) for c, m in pairs)
         return FilterState(belief, joined._replace(members=members))
 
-    return Filter(init, predict, updating(channels, fuse, name), reset, auditing(channels))
+    return compiled(
+        Filter(init, predict, updating(channels, fuse, name), reset, auditing(channels))
+    )

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Again, Filter, FilterState, Prediction
+from robins.filters.kalman import Again, Filter, FilterState, Prediction, compiled
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import equal, select
@@ -177,7 +177,7 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
                 m.filter_.audit(begin.memory.states[i], final.memory.states[i], once_more, time)
 
     audited = any(m.filter_.audit is not None for m in every)
-    return Filter(init, predict, update, reset, audit if audited else None)
+    return compiled(Filter(init, predict, update, reset, audit if audited else None))
 
 
 def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:

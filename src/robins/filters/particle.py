@@ -29,7 +29,14 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Filter, FilterState, Prediction, predicted_factor, updated
+from robins.filters.kalman import (
+    Filter,
+    FilterState,
+    Prediction,
+    compiled,
+    predicted_factor,
+    updated,
+)
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
@@ -209,7 +216,7 @@ def particle(
         )
         return FilterState(belief, cloud), info
 
-    return Filter(init, predict, update, reset)
+    return compiled(Filter(init, predict, update, reset))
 
 
 def reseed(state: FilterState, key: Any) -> FilterState:
