@@ -328,8 +328,9 @@ def test_normalised_is_what_the_update_will_say():
     def look(memory, prior, o):
         return normalised(o), prior, o
 
+    at_zero = taylor().observation(START, MODEL.sensors[0], jnp.zeros(Y.shape[1]), None)
+    nothing = normalised(at_zero)
     start = Rule(before=look, init=lambda belief, dims: nothing)
-    nothing = normalised(taylor().observation(START, MODEL.sensors[0], jnp.zeros(Y.shape[1])))
     for way in (taylor(), unscented(), unscented(1.0, 0.0, -1.0)):
         one = kalman(way, [start])
         state = one.init(START, MODEL.dims)

@@ -85,7 +85,7 @@ def test_a_filter_is_compiled_once_for_equal_shapes():
         if seed == 0:
             once = after
     assert 0 < once == after
-    run(EKF, m, s.start(), simulate(s, 2, T + 1)[1])
+    run(kalman(), m, s.start(), simulate(s, 2, T)[1])
     assert len(traced) > after  # the count does count
 
 
