@@ -236,3 +236,24 @@ def test_true_errors_are_computed_minus_true_in_the_frames_of_the_model():
     )
     expected = [0.1, 0.1, 2.0, 1.0, *phi_enu, 5.0, 4.0, 2.0, 1.0, -3.0]
     assert_allclose(x, expected, rtol=0, atol=1e-15)
+
+
+def test_the_flight_is_turned_and_shifted_to_what_the_master_reports():
+    start, blocks = turning(count=40)
+    e = np.array([0.02, -0.03, 0.05, 1.0, -2.0, 0.0, 30.0, 20.0, 0.0])
+    truth = navigate(open_loop.start_with_error(start, np.zeros(9)), blocks)
+    wrong = navigate(open_loop.start_with_error(start, e), blocks)
+    flight, C_nb = open_loop.as_master_sees(wrong, truth.nav)
+    assert_allclose(C_nb, va.dcm_enu(truth.nav.q_nb.wxyz), rtol=0, atol=1e-12)
+    # within an interval the difference hardly moves
+    assert_allclose(flight.C_nb, truth.flight.C_nb, rtol=0, atol=1e-5)
+    assert_allclose(flight.f_enu, truth.flight.f_enu, rtol=0, atol=1e-4)
+    assert_allclose(flight.v_enu[:, :2], truth.flight.v_enu[:, :2], rtol=0, atol=0.05)
+    assert_allclose(flight.lat_rad, truth.flight.lat_rad, rtol=0, atol=1e-7)
+
+    silent = jax.tree.map(lambda a: a.at[3].set(jnp.nan), truth.nav)
+    flight, C_nb = open_loop.as_master_sees(wrong, silent)
+    assert_allclose(C_nb[3], va.dcm_enu(wrong.nav.q_nb.wxyz)[3], rtol=0, atol=0)
+    assert_allclose(flight.f_enu[3], wrong.flight.f_enu[3], rtol=0, atol=0)
+    assert_allclose(flight.v_enu[3], wrong.flight.v_enu[3], rtol=0, atol=0)
+    assert_allclose(flight.lat_rad[3], wrong.flight.lat_rad[3], rtol=0, atol=0)

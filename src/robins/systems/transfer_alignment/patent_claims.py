@@ -37,7 +37,8 @@ CLAIMS = (
 )
 """Every claim a scenario of the study may state."""
 
-_BETTER = 0.95  # a ratio up to which one filter is better than the other, not only as good
+_BETTER = 0.95  # ratio up to which one filter is better than the other
+_FAIRLY = 0.98  # and up to which it is so in part; beyond, the two are as good
 _COMPARED = {
     "beats-kf": (ADAPTIVE, KALMAN),
     "beats-fixed": (ADAPTIVE, FIXED),
@@ -107,8 +108,8 @@ def _judged(claim: str, metrics: Mapping[str, dict[str, Any]]) -> tuple[str, flo
     ratio = rms[0] / rms[1]
     if suffers:
         band = [1.0 / _BETTER, None]
-        good, fair = ratio >= 1.0 / _BETTER, ratio > 1.0
+        good, fair = ratio >= 1.0 / _BETTER, ratio >= 1.0 / _FAIRLY
     else:
         band = [0.0, _BETTER]
-        good, fair = ratio <= _BETTER, ratio < 1.0
+        good, fair = ratio <= _BETTER, ratio <= _FAIRLY
     return "reproduced" if good else "partly" if fair else "not", ratio, band
