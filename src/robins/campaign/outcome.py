@@ -144,11 +144,20 @@ def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
 
 
 def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:
-    """Innovations of the first run, by sensor."""
-    sensors = next(iter(found.values())).first_run["innovation"]
+    """Innovations of the first run, by sensor; NaN for filters that use no such sensor."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for s in found.values():
+        for name, innovation in s.first_run["innovation"].items():
+            if shapes.setdefault(name, innovation.shape) != innovation.shape:
+                raise ValueError(
+                    f"sensor '{name}' has {innovation.shape[-1]} components in one filter and "
+                    f"{shapes[name][-1]} in another: sensors that differ need names of their own"
+                )
 
     def of(kind: str, sensor: str) -> np.ndarray:
-        return _stack(found, lambda s: s.first_run[kind][sensor])
+        shape = shapes[sensor] if kind.startswith("innovation") else shapes[sensor][:1]
+        rows = [s.first_run[kind].get(sensor) for s in found.values()]
+        return np.stack([np.full(shape, np.nan) if r is None else r.astype(float) for r in rows])
 
     return {
         k: Seen(
@@ -158,5 +167,5 @@ def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:
             of("dof", k),
             of("code", k) == int(Code.REFUSED),
         )
-        for k in sensors
+        for k in shapes
     }

@@ -11,6 +11,8 @@ from robins.systems.system import Study, System
 from robins.systems.transfer_alignment import (
     matching_claims,
     matching_parameters,
+    patent,
+    patent_claims,
     product_claims,
     product_filters,
 )
@@ -20,7 +22,11 @@ from robins.systems.transfer_alignment.pair_replay import ALIGNMENT, orientation
 from robins.systems.transfer_alignment.product_problem import Product, product_problem
 
 _HERE = Path(__file__).parent / "scenarios"
-_SCENARIOS = ("s0", "s0r", "s1", "s2", "s3", "aircraft", "ship", "vehicle", "replay")
+_SCENARIOS = (
+    *("s0", "s0r", "s1", "s2", "s3"),
+    *("a", "b", "c", "d", "e"),
+    *("aircraft", "ship", "vehicle", "replay"),
+)
 
 SYSTEM = System(
     name="transfer-alignment",
@@ -28,6 +34,9 @@ SYSTEM = System(
     studies={
         "attitude-matching": Study(
             Matching, matching_problem, matching_parameters.FILTERS, matching_claims.CLAIMS
+        ),
+        "velocity-attitude": Study(
+            patent.Patent, patent.patent_problem, patent.FILTERS, patent_claims.CLAIMS
         ),
         "product": Study(Product, product_problem, product_filters.FILTERS, product_claims.CLAIMS),
     },

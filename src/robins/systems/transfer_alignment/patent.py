@@ -47,9 +47,11 @@ from robins.systems.transfer_alignment.open_loop import (
     true_errors,
 )
 from robins.systems.transfer_alignment.pair import PairRun, simulate_pair
+from robins.systems.transfer_alignment.pair_answer import SENSORS as PRODUCT_SENSORS
 from robins.systems.transfer_alignment.pair_course import Course, lay_out
 from robins.systems.transfer_alignment.pair_parameters import Disturbance, PairParameters, Structure
 from robins.systems.transfer_alignment.patent_claims import patent_claims, patent_metrics
+from robins.systems.transfer_alignment.product_filters import product_contender
 
 ENU = ("east", "north", "up")
 RFU = ("right", "forward", "up")
@@ -80,7 +82,8 @@ ADAPTIVE: dict[str, dict[str, Any]] = {
     "hinf-patent-weights": {"weight": np.ones(va.STATES)},  # L = I, and R = I below
 }
 TOLD = {"kf": (), "kf-told-r": ("r",), "kf-told-q": ("q",), "kf-told-both": ("r", "q")}
-FILTERS = (*TOLD, *FIXED, *ADAPTIVE)
+PRODUCT = ("product",)  # of `product_filters`: closed loop, with states for the mounting
+FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
 
 class Told(Parameters):
@@ -293,6 +296,19 @@ def contender(given: Patent, name: str, epoch_s: np.ndarray, least: float) -> Co
     )
 
 
+def _of_pair(case: Callable[[PairRun], Case], world: World) -> Case:
+    return case(world.pair)
+
+
+def joined(given: Patent, name: str) -> Contender:
+    """A filter of the product model, told no more than the plain ones, that reports as they do."""
+    blocks = ("attitude", "velocity", "gyro_bias", "accel_bias")
+    made = product_contender(given, name, blocks=blocks, frame="ENU")
+    assert made.reported is not None
+    level = np.r_[0:3, 3:5, 6:9, 9:11]  # without the vertical channel
+    return made._replace(case=Partial(_of_pair, made.case), reported=made.reported[level])
+
+
 def patent_problem(given: Patent, filters: tuple[str, ...], seed: int) -> Problem:
     """The scenario as a problem for a campaign.
 
@@ -325,10 +341,13 @@ def patent_problem(given: Patent, filters: tuple[str, ...], seed: int) -> Proble
     least = least_gamma(given, course) if set(filters) & set(FIXED) else math.nan
     return Problem(
         simulate=partial(simulate, given, course, seed),
-        contenders={name: contender(given, name, epoch_s, least) for name in filters},
+        contenders={
+            name: joined(given, name) if name in PRODUCT else contender(given, name, epoch_s, least)
+            for name in filters
+        },
         epoch_s=epoch_s,
         blocks=BLOCKS,
-        sensors=SENSORS,
+        sensors=SENSORS | PRODUCT_SENSORS,
         context=_context(course),
         metrics=partial(patent_metrics, epoch_s),
         claims=partial(patent_claims, given.claims),
