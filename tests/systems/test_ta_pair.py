@@ -12,12 +12,8 @@ from robins.manifold import local, retract
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.scenario import ScenarioError
 from robins.systems.system import Scenario
-from robins.systems.transfer_alignment.pair import (
-    lay_out,
-    motion_of,
-    simulate_pair,
-    start_estimate,
-)
+from robins.systems.transfer_alignment.pair import simulate_pair, start_estimate
+from robins.systems.transfer_alignment.pair_course import lay_out, motion_of
 from robins.systems.transfer_alignment.pair_parameters import PairParameters
 
 ARCMIN, DEG, DEG_H = np.pi / 10800.0, np.pi / 180.0, np.pi / 648000.0

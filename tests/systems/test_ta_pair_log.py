@@ -12,7 +12,8 @@ from robins import logs, scenario
 from robins.ins.mechanise import Nav, nav_at
 from robins.manifold import local
 from robins.rotation import Rotation
-from robins.systems.transfer_alignment.pair import lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair import simulate_pair
+from robins.systems.transfer_alignment.pair_course import lay_out
 from robins.systems.transfer_alignment.pair_log import Recording, pair_dataset, pieces_of, recorded
 from robins.systems.transfer_alignment.pair_parameters import PairParameters
 

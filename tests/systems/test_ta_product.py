@@ -20,7 +20,8 @@ from robins.scenario import ScenarioError, load, parse
 from robins.sim.flexure import Flexure
 from robins.systems import transfer_alignment
 from robins.systems.transfer_alignment import product as p
-from robins.systems.transfer_alignment.pair import lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair import simulate_pair
+from robins.systems.transfer_alignment.pair_course import lay_out
 from robins.systems.transfer_alignment.product_claims import (
     CLAIMS,
     product_claims,

@@ -16,8 +16,9 @@ from robins.manifold import local
 from robins.results.solution import check
 from robins.rotation import Rotation
 from robins.systems.transfer_alignment import pair_replay
-from robins.systems.transfer_alignment.pair import lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_answer import remarks
+from robins.systems.transfer_alignment.pair_course import lay_out
 from robins.systems.transfer_alignment.pair_log import pieces_of, recorded
 from robins.systems.transfer_alignment.pair_replay import (
     Replay,

@@ -35,19 +35,8 @@ from robins.sim.disturbance import drift_step, outlier_factor, student_t, window
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream, unit
-from robins.systems.transfer_alignment.pair_course import SLACK_S, Course, lay_out, motion_of
+from robins.systems.transfer_alignment.pair_course import SLACK_S, Course
 from robins.systems.transfer_alignment.pair_parameters import PairParameters, Start
-
-__all__ = [
-    "Course",
-    "PairRun",
-    "SlaveTruth",
-    "error_model",
-    "lay_out",
-    "motion_of",
-    "simulate_pair",
-    "start_estimate",
-]
 
 # Streams folded into the keys of a run; part of the file format, as `Component` is.
 _NAVIGATION, _MOUNTING = 0, 1  # of the initial state

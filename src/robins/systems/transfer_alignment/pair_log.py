@@ -24,7 +24,8 @@ from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, as_trajectory, refuse_polar
 from robins.rotation import Rotation
 from robins.scenario import Parameters, Quantity, default
-from robins.systems.transfer_alignment.pair import PairRun, SlaveTruth, lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair import PairRun, SlaveTruth, simulate_pair
+from robins.systems.transfer_alignment.pair_course import lay_out
 from robins.systems.transfer_alignment.pair_parameters import PairParameters
 
 

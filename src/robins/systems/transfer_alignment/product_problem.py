@@ -19,8 +19,9 @@ from robins import units
 from robins.results import variable
 from robins.scenario import Quantity, default
 from robins.systems.system import Limit, Problem, Scenario
-from robins.systems.transfer_alignment.pair import Course, lay_out, simulate_pair
+from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_answer import BLOCKS, SENSORS
+from robins.systems.transfer_alignment.pair_course import Course, lay_out
 from robins.systems.transfer_alignment.pair_parameters import PairParameters
 from robins.systems.transfer_alignment.product import ATTITUDE, POSITION, VELOCITY, ProductState
 from robins.systems.transfer_alignment.product_claims import (
