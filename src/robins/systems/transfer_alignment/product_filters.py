@@ -32,9 +32,13 @@ from robins.systems.transfer_alignment.product import (
     lag_of,
     product_model,
 )
+from robins.systems.transfer_alignment.product_adaptive import adaptive
 
 _BLOCKS = ("attitude", "velocity", "position", "gyro_bias", "accel_bias", "mounting")
 _RIGID = 3 * len(_BLOCKS)  # components without flexure states
+# Nothing is known better than this (rad, m/s, m, rad/s, m/s^2, rad), so that covariances that begin
+# with zeros have full rank, as the Joseph form needs.
+_LEAST = np.repeat([1e-9, 1e-6, 1e-3, 1e-12, 1e-8, 1e-9], 3)
 OUTLIERS = 0.999  # share of right records that keep their weight
 
 
@@ -65,6 +69,7 @@ _KINDS: Mapping[str, _Kind] = {
     "product-joseph": _Kind("believed", lambda: kalman(taylor(), (huber(OUTLIERS),), "joseph")),
     "product-flexure": _Kind("always", lambda: kalman(taylor(), (huber(OUTLIERS),))),
     "product-ukf": _Kind("believed", lambda: kalman(unscented(), (huber(OUTLIERS),))),
+    "product-adaptive": _Kind("always", adaptive),
 }
 FILTERS = tuple(_KINDS)
 # What a structure may do of which nothing is known. Too short a time is safe, too long is not.
@@ -149,7 +154,9 @@ def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | Non
         three = zip(flexure.sigma_rad, flexure.tau_s, strict=True)
         steady = [transition(s, t, flexure.damping, 1e3 * t)[1] for s, t in three]
         parts += np.sqrt(np.sum(np.asarray(steady) ** 2, axis=2)).T.tolist()
-    return np.concatenate([np.asarray(p, dtype=float) for p in parts])
+    sigma = np.concatenate([np.asarray(p, dtype=float) for p in parts])
+    sigma[:_RIGID] = np.maximum(sigma[:_RIGID], _LEAST)
+    return sigma
 
 
 def _case(sigma: Array, delay_s: Array, run: PairRun) -> Case:
@@ -180,7 +187,7 @@ def _case_with_position(sigma: Array, delay_s: Array, run: PairRun) -> Case:
     return case._replace(y=y, aux={**case.aux, POSITION: case.aux[ATTITUDE]})
 
 
-def reported(n: int, blocks: Sequence[str] = tuple(_BLOCKS), frame: str = "NED") -> np.ndarray:
+def reported(n: int, blocks: Sequence[str] = _BLOCKS, frame: str = "NED") -> np.ndarray:
     """Rows (3 len(blocks), n) that take some blocks of the tangent error, in the order given.
 
     Args:
@@ -208,7 +215,7 @@ def product_contender(
     pair: PairParameters,
     name: str = "product",
     believed: Believed | None = None,
-    blocks: Sequence[str] = tuple(_BLOCKS),
+    blocks: Sequence[str] = _BLOCKS,
     frame: str = "NED",
 ) -> Contender:
     """A filter of the product model, for a problem that simulates a `PairRun`.
