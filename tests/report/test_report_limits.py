@@ -97,6 +97,15 @@ def test_bounds_are_never_called_covariances(aligned):
     assert "bound" not in curves.campaign(honest, "attitude").caption
 
 
+def test_a_filter_that_diverged_or_states_far_too_much_does_not_set_the_scale(aligned):
+    lost = aligned.copy(deep=True)
+    lost["rms_attitude"][1] = np.inf
+    lost["mean_sigma_attitude"][2] *= 1e3
+    for axes in curves.campaign(lost, "attitude").figure.axes:
+        most = np.rad2deg(60.0 * lost["rms_attitude"].values[[0, 2]].max())
+        assert axes.get_ylim()[1] <= 1.3 * most
+
+
 def test_the_band_is_that_of_the_filter_with_a_covariance(aligned):
     band = bands.band(aligned, "anees", "anees_dof")
     np.testing.assert_allclose(band.low[0], bands.quantile(0.025, 450.0) / 450.0)

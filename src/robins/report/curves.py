@@ -73,6 +73,12 @@ def _in_scale(lines: list[np.ndarray], errors: np.ndarray) -> list[np.ndarray]:
     return kept or lines
 
 
+def _top(lines: list[np.ndarray]) -> float:
+    """Half the height of axes that hold the lines, where they are finite."""
+    values = np.abs(np.stack(lines))
+    return 1.25 * float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
+
+
 def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, series.Clock]:
     figure, grid = style.new(len(data.axes), 1, _rows(len(data.axes)), sharex=True)
     clock = series.clock(data.x)
@@ -116,7 +122,7 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
         kept = _in_scale(lines, error.values[:, :, k])
         if not _limit(axes, error.x, kept) and len(kept) < len(lines):
-            top = 1.25 * np.nanmax(np.abs(kept))
+            top = _top(kept)
             axes.set_ylim(-top, top)
     label = f"±3σ stated{_or_bound(solution)}"
     bounds = [style.key(label, color=style.GREY, linewidth=0.8)] if sigma is not None else []
@@ -225,7 +231,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
                 lines.append(stated.values[i, :, k])
         kept = _in_scale(lines, rms.values[:, :, k])
         if not _limit(axes, rms.x, kept, centred=False):
-            axes.set_ylim(0.0, None if len(kept) == len(lines) else 1.25 * np.nanmax(kept))
+            axes.set_ylim(0.0, None if len(kept) == len(lines) else _top(kept))
     label = f"σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
     style.legend(figure, _keys(filters, solution, *more))
