@@ -362,3 +362,24 @@ def test_a_user_who_turns_64_bit_off_is_told():
     assert done.stderr.splitlines()[-1].startswith(
         "RuntimeError: robins computes in 64-bit floats, but JAX is set to 32-bit: remove"
     )
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted on Linux")
+@pytest.mark.parametrize(("given", "workers"), [(None, 1), ("3", 3)])
+def test_one_worker_thread_unless_the_user_asks_for_more(given, workers):
+    """Two workers of jaxlib can wait for each other for ever."""
+    code = (
+        "import pathlib, robins, jax.numpy as jnp; jnp.ones(2).block_until_ready();"
+        "names = [t.read_text() for t in pathlib.Path('/proc/self/task').glob('*/comm')];"
+        "print(sum(name.startswith('tf_XLAEigen') for name in names))"
+    )
+    kept = {k: v for k, v in os.environ.items() if k != "PJRT_NPROC"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=kept | ({"PJRT_NPROC": given} if given else {}),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert int(done.stdout) == workers

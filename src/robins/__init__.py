@@ -14,4 +14,10 @@ Conventions, everywhere unless a name says otherwise:
 - NaN in a measurement means missing, per component.
 """
 
+import os
+
 __version__ = "0.1.0"
+
+# Two batched QR factorisations at once, each waiting for the others' threads to do its share, stop
+# jaxlib 0.10 for ever; with one worker each does its own. Read when JAX makes its first array.
+os.environ.setdefault("PJRT_NPROC", "1")
