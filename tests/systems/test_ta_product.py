@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation as SciRotation
 from robins.campaign.statistics import collect
 from robins.earth import Geodetic
 from robins.filters import Code, kalman, run
-from robins.filters.linearise import Transition
 from robins.ins.increments import Increments
 from robins.ins.state import InsNoise, InsState
 from robins.manifold import local, retract
@@ -23,12 +22,6 @@ from robins.systems import transfer_alignment
 from robins.systems.transfer_alignment import product as p
 from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.product_adaptive import (
-    QUIET,
-    Hypothesis,
-    changes,
-    supposing,
-)
 from robins.systems.transfer_alignment.product_claims import (
     CLAIMS,
     product_claims,
@@ -457,57 +450,3 @@ def test_claims_hold_for_a_right_filter_only(scale, held):
     assert [c["id"] for c in claims] == [c["id"] for c in CLAIMS]
     assert {c["id"] for c in claims if c["verdict"] == "reproduced"} == held
     assert product_claims({"kf": {}}) == []
-
-
-# --------------------------------------------------------------------- hypotheses of the bank
-
-
-def transition_of(x):
-    """A transition as a filter sees it, with a spread and noise that are full."""
-    rng = np.random.default_rng(1)
-    noise = np.tril(rng.normal(size=(24, 24)))
-    noise[:3, 3:] = 0.0  # what makes attitude noise is the gyros' alone
-    noise[:3, :3] = 2.0 * np.eye(3)
-    spread, none = rng.normal(size=(24, 24)), np.zeros((24, 0))
-    return Transition(x, jnp.asarray(spread), jnp.asarray(none), jnp.asarray(noise))
-
-
-def covariance(t):
-    return np.asarray(t.noise @ t.noise.T)
-
-
-def test_hypotheses_multiply_the_noise_they_are_about():
-    x, _ = random_state(2)
-    plain = transition_of(x)
-    N = np.asarray(plain.noise)
-    _, quiet = supposing(QUIET, False).process((), plain)
-    np.testing.assert_array_equal(covariance(quiet), covariance(plain))
-
-    _, drifting = supposing(Hypothesis(gyro=20.0, walk=5.0, flexure=3.0), False).process((), plain)
-    by_gyro, by_rest, by_flexure = N[:, :3], N[:, 3:18], N[:, 18:]
-    expected = 400.0 * by_gyro @ by_gyro.T + by_rest @ by_rest.T + 9.0 * by_flexure @ by_flexure.T
-    walk = np.zeros((24, 24))
-    walk[9:12, 9:12] = (5.0 * 2.0) ** 2 * np.eye(3)  # gyro noise is 2 on each axis
-    np.testing.assert_allclose(covariance(drifting), expected + walk, rtol=1e-12, atol=1e-12)
-    assert drifting.spread is plain.spread
-
-
-def test_a_stiff_structure_has_no_flexure():
-    x, _ = random_state(2)
-    plain = transition_of(x)
-    _, stiff = supposing(QUIET, True).process((), plain)
-    assert not np.any(stiff.mean.flexure_rad)
-    assert not np.any(stiff.mean.flexure_rate_rad_s)
-    for part in ("spread", "noise"):
-        before, after = (np.asarray(getattr(t, part)) for t in (plain, stiff))
-        np.testing.assert_array_equal(after[:18, :24], before[:18])
-        assert np.max(np.abs(after[18:])) < 2e-3 * np.max(np.abs(before[18:]))
-
-
-def test_changes_are_probabilities_that_hardly_cross():
-    T = changes()
-    assert T.shape == (7, 7)
-    assert np.all(T >= 0.0)
-    np.testing.assert_allclose(T.sum(axis=1), 1.0, atol=1e-12)
-    np.testing.assert_allclose(T[:3, 3:].sum(axis=1), 1e-5)
-    np.testing.assert_allclose(T[3:, :3].sum(axis=1), 1e-5)
