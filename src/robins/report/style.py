@@ -123,7 +123,10 @@ def legend(figure: Figure, keys: Sequence[Any]) -> None:
     if not keys:
         return
     widths = np.array([len(key.get_label()) * 0.066 + 0.55 for key in keys])  # inches
-    columns = next(n for n in range(len(keys), 0, -1) if n == 1 or _width(widths, n) < WIDTH - 0.3)
+    columns = max(1, min(len(keys), int((WIDTH - 0.3) / widths.max())))
+    if len(keys) > _ROWS * columns:  # many entries: each column as wide as its own need
+        fits = (n for n in range(len(keys), 0, -1) if _width(widths, n) < WIDTH - 0.3)
+        columns = next(fits, 1)
     rows = -(-len(keys) // columns)
     columns = -(-len(keys) // rows)  # no last row of one
     if rows > _ROWS:
