@@ -303,9 +303,11 @@ def test_a_turn_is_not_taken_for_rest():
 @pytest.mark.parametrize("late_ns", [120_000_000, -80_000_000])
 def test_a_delay_of_the_master_is_measured(late_ns):
     late = dataclasses.replace(FLIGHT, time_ns=FLIGHT.time_ns + late_ns)
-    (found,) = [f for f in examine(a_pair(master=late)) if f.code == "master_late"]
-    # the made gyros hold over the sample that ends at their time: half of its 10 ms is theirs
-    assert found.value == pytest.approx(late_ns * 1e-9, abs=0.006)
+    # the made rates hold over the sample that ends at their time, which increments say exactly
+    turned, pushed = 0.01 * IMU.gyro, 0.01 * IMU.accel
+    imu = dataclasses.replace(IMU, gyro=turned, accel=pushed, kind="increment")
+    (found,) = [f for f in examine(a_pair(master=late, imu=imu)) if f.code == "master_late"]
+    assert found.value == pytest.approx(late_ns * 1e-9, abs=0.001)
     assert found.severity == "note"
 
 
