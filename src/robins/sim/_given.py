@@ -1,0 +1,98 @@
+"""What a simulated sensor is given, checked as far as it is known before the run is compiled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from robins import _float64  # noqa: F401
+
+
+def known(*values: Any) -> bool:
+    """Whether these are numbers by now, and not placeholders of `jit`, `vmap` or `grad`."""
+    return not any(isinstance(x, Tracer) for x in jax.tree_util.tree_leaves(values))
+
+
+def number(
+    name: str,
+    value: Any,
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    above: bool = False,
+    endless: bool = False,
+) -> None:
+    """Refuse what is not a number, or an array of numbers, from low to high.
+
+    Args:
+        name: for the message.
+        value: a traced one passes, for it has no value yet.
+        low: the least value.
+        high: the greatest.
+        above: low itself is refused too.
+        endless: infinity is a value.
+
+    Raises:
+        ValueError: the value is out of its range or not a number.
+    """
+    if not known(value):
+        return
+    x = np.asarray(value, float)
+    inside = (x > low if above else x >= low) & (x <= high) & (endless | np.isfinite(x))
+    if not np.all(inside):
+        bounds = f" {'above' if above else 'from'} {low:g}" if np.isfinite(low) else ""
+        bounds += f" to {high:g}" if np.isfinite(high) else ""
+        finite = "" if endless else "finite "
+        raise ValueError(f"{name} must be a {finite}number{bounds}, got {value}")
+
+
+def vector(name: str, value: Any, width: int, **bounds: Any) -> jax.Array:
+    """A number or ``width`` of them, checked as `number` does, as a vector.
+
+    Raises:
+        ValueError: another shape, or a value out of its range.
+    """
+    shape = np.shape(value)
+    if shape not in ((), (width,)):
+        raise ValueError(f"{name} must be a number or of shape ({width},), got shape {shape}")
+    number(name, value, **bounds)
+    return jnp.broadcast_to(jnp.asarray(value, float), (width,))
+
+
+def count_of(name: str, value: int) -> int:
+    """A number of samples, at least one.
+
+    Raises:
+        ValueError: fewer.
+    """
+    if value < 1:
+        raise ValueError(f"{name} is {value}; at least one is wanted")
+    return value
+
+
+def rows(name: str, value: Any, *shape: int) -> jax.Array:
+    """An array of the shape that the other arguments call for.
+
+    Raises:
+        ValueError: another shape.
+    """
+    x = jnp.asarray(value, float)
+    if x.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {x.shape}")
+    return x
+
+
+def presence(present: Any) -> jax.Array:
+    """Whether there is a sample at each epoch, (E,) bool.
+
+    Raises:
+        ValueError: not a list, or an empty one.
+    """
+    there = jnp.asarray(present, bool)
+    if there.ndim != 1 or len(there) < 1:
+        raise ValueError(f"present must have shape (E,), E at least one, got {there.shape}")
+    return there
