@@ -15,11 +15,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from robins import _float64, logs, report, results, scenario
+from robins import _float64, logs, report, results, scenario, units
 from robins.campaign import simulate
+from robins.campaign.bound import bound
 from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs import Finding
+from robins.report import bounds
 from robins.systems import SYSTEMS, Outcome, Study, System
 
 Progress = Callable[[float, str], None]
@@ -97,15 +99,12 @@ def _check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> t
 
 def _write(
     outcome: Outcome,
-    out: str | os.PathLike[str],
+    writer: results.ResultWriter,
+    tell: Progress,
     *,
     name: str,
-    text: str,
     seed: int,
-    runs: int,
-    command: str,
-    tell: Progress,
-    writer: results.ResultWriter,
+    runs: int = 1,
 ) -> Done:
     writer.save_summary(
         {
@@ -125,7 +124,7 @@ def _write(
         tell(0.85 + 0.15 * done / max(total, 1), what)
 
     report.add(writer, drawing, outcome.notes)
-    return Done(Path(out), {}, tuple(outcome.notes))
+    return Done(writer.path, {}, tuple(outcome.notes))
 
 
 def run_scenario(
@@ -169,18 +168,70 @@ def run_scenario(
         except ValueError as error:
             raise InputError(f"{name}: {error}") from error
         outcome = simulate(problem, count, progress=lambda s, w: tell(0.85 * s, w))
-        done = _write(
-            outcome,
-            out,
-            name=label,
-            text=text,
-            seed=seed,
-            runs=count,
-            command=command,
-            tell=tell,
-            writer=writer,
-        )
+        done = _write(outcome, writer, tell, name=label, seed=seed, runs=count)
     return _finished(done)
+
+
+def bound_scenario(
+    name: str,
+    *,
+    out: str | os.PathLike[str],
+    filter_name: str = "",
+    runs: int = 1,
+    seed: int = 0,
+    without: Sequence[str] = (),
+    at: Sequence[str] = (),
+    settings: Iterable[str] = (),
+    command: str = "",
+    progress: Progress | None = None,
+) -> tuple[Done, Any]:
+    """Tell what the sensors of a scenario allow at best, with the model of one of its filters.
+
+    Args:
+        name: "system/name" or the path of a TOML file.
+        out: the result folder.
+        filter_name: whose model; by default that of the scenario's first filter.
+        runs: over how many simulated trajectories to average.
+        seed: of the random streams.
+        without: sensors to leave out altogether.
+        at: times to tell, such as "200 s"; by default the quarters.
+        settings: "path=value" texts that change the scenario.
+        command: how to make the result again, for its report.
+        progress: called with the share done and what is being done.
+
+    Returns:
+        The finished result, and a table for a terminal.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError, robins.units.UnitError: what was asked for cannot
+            be computed.
+        robins.results.ResultError: the folder cannot be written.
+    """
+    _float64.require()
+    tell = progress or (lambda share, what: None)
+    system, label, text = find_scenario(name)
+    settings = tuple(settings)
+    study = _study_of(system, text, name)
+    parameters = scenario.parse(study.parameters, text, settings, source=name)
+    wanted = filter_name or next(iter(parameters.filters or study.filters))
+    chosen = _check_filters(label, study.filters, [wanted])
+    times = [units.parse(time, "time") for time in at]
+    with _writer(out, text, settings, command) as writer:
+        tell(0.0, "linearising along the truth")
+        try:
+            problem = study.problem(parameters, chosen, seed)
+            solution = bound(problem, wanted, runs, without)
+            epochs = bounds.epochs(solution, times)
+        except ValueError as error:
+            raise InputError(f"{name}: {error}") from error
+        outcome = Outcome(
+            solution,
+            {wanted: bounds.metrics(solution)},
+            files={"bound.csv": bounds.csv(solution).encode()},
+            notes=bounds.sentences(solution),
+        )
+        done = _write(outcome, writer, tell, name=label, seed=seed, runs=runs)
+    return _finished(done), bounds.table(solution, epochs)
 
 
 def replay_log(
@@ -242,17 +293,7 @@ def replay_log(
             )
         except ValueError as error:
             raise InputError(f"{dataset.name}: {error}") from error
-        done = _write(
-            outcome,
-            out,
-            name=f"{system}/{dataset.name}",
-            text=text,
-            seed=seed,
-            runs=1,
-            command=command,
-            tell=tell,
-            writer=writer,
-        )
+        done = _write(outcome, writer, tell, name=f"{system}/{dataset.name}", seed=seed)
     return _finished(done)
 
 
@@ -315,17 +356,7 @@ def align_pair(
             )
         except ValueError as error:
             raise InputError(f"{dataset.name}: {error}") from error
-        done = _write(
-            outcome,
-            out,
-            name=f"{system.name}/{dataset.name}",
-            text=text,
-            seed=seed,
-            runs=1,
-            command=command,
-            tell=tell,
-            writer=writer,
-        )
+        done = _write(outcome, writer, tell, name=f"{system.name}/{dataset.name}", seed=seed)
     return _finished(done)
 
 

@@ -21,6 +21,7 @@ Examples:
   robins list                                    what there is to run
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
+  robins bound ins-gnss/drive                    what can these sensors do at best?
   robins doctor imu.csv gnss.pos                 is my log fit to navigate?
   robins replay imu.csv gnss.pos --out walk      navigate it
   robins allan still.csv                         noise parameters of my IMU
@@ -109,6 +110,11 @@ def _choices(command: Callable) -> Callable:
     return command
 
 
+def _name(scenario: str) -> str:
+    """Of the result folder of a scenario."""
+    return Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
+
+
 _RUNS = _option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
 
 
@@ -161,9 +167,8 @@ def run(
     """
     from robins.cli import work
 
-    name = Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
     if master is None and slave is None:
-        work.simulate(scenario, out=out or Path("results") / name, **options)
+        work.simulate(scenario, out=out or Path("results") / _name(scenario), **options)
         return
     if master is None or slave is None:
         raise BadInput("--master and --slave belong together: give both files, or neither.")
@@ -173,6 +178,37 @@ def run(
     work.align(
         scenario, master, slave, out=out or Path("results") / slave.name.split(".")[0], **options
     )
+
+
+@app.command(
+    short_help="What the sensors of a scenario allow at best.",
+    epilog=_examples(
+        "robins bound ins-gnss/drive",
+        'robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"',
+        'robins bound transfer-alignment/s0 --filters kf-flexure --set slave.gyro_bias="10 deg/h"',
+    ),
+)
+@click.argument("scenario")
+@_option("--runs", type=click.IntRange(min=1), default=1, help="Trajectories to average over.")
+@_option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
+@_option("--at", multiple=True, metavar="TIME", help='Tell that time, "200 s"; may be repeated.')
+@_choices
+@_out
+@_json
+@_debug
+def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: Any) -> None:
+    """Covariance bound and observability of SCENARIO: no filter with this model can do better.
+
+    Needs no data: the model of a filter, by default the first of the scenario, is linearised about
+    the simulated truth. Tells the best sigma of each state over time, which states the sensors
+    see, what each sensor buys, and which directions are least observable.
+    """
+    from robins.cli.bound import tell_bound
+
+    if len(filters) > 1:
+        raise BadInput(f"--filters {','.join(filters)}: a bound is that of one model; name one.")
+    out = out or Path("results") / f"bound-{_name(scenario)}"
+    tell_bound(scenario, filter_name="".join(filters), out=out, **options)
 
 
 @app.command(

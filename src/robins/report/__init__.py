@@ -16,7 +16,7 @@ from typing import Any
 import xarray as xr
 
 from robins import results
-from robins.report import series
+from robins.report import bounds, series
 from robins.report.allan_curve import allan
 from robins.report.bars import comparison
 from robins.report.curves import campaign, errors, estimates, height
@@ -63,6 +63,10 @@ def _drawings(
         return last
     ds = solution
     drawings: list[Callable[[], Picture | None]] = [lambda: track(ds)]
+    for block in bounds.blocks(ds):
+        drawings.append(lambda block=block: bounds.sigmas(ds, block))
+    if "information" in ds:
+        drawings.append(lambda: bounds.information(ds))
     for block in series.find(ds, "error"):
         drawings.append(lambda block=block: errors(ds, block))
     for block in series.find(ds, "rms"):

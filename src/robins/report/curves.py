@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from robins.report import series, style
+from robins.report import bounds, series, style
 from robins.report.bands import quantile
 from robins.report.limits import bound_names, bound_note
 from robins.report.numbers import words
@@ -108,6 +108,7 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
     error = series.get(solution, "error", block)
     assert error is not None
     sigma = series.get(solution, "sigma", block)
+    best = bounds.beside(solution, block)
     filters = series.filters(solution)
     figure, stack, clock = _stacked(error, solution)
     for k, axes in enumerate(stack):
@@ -119,14 +120,17 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
             if sigma is not None:
                 _envelope(axes, sigma, i, k, clock, len(filters))
                 lines.append(3.0 * sigma.values[i, :, k])
+        if best is not None:
+            lines += [bounds.draw(axes, best, k, clock.seconds, times) for times in (3.0, -3.0)]
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
         kept = _in_scale(lines, error.values[:, :, k])
         if not _limit(axes, error.x, kept) and len(kept) < len(lines):
             top = _top(kept)
             axes.set_ylim(-top, top)
     label = f"±3σ stated{_or_bound(solution)}"
-    bounds = [style.key(label, color=style.GREY, linewidth=0.8)] if sigma is not None else []
-    style.legend(figure, _keys(filters, solution, *bounds))
+    more = [style.key(label, color=style.GREY, linewidth=0.8)] if sigma is not None else []
+    more += [bounds.key("±3σ ")] if best is not None else []
+    style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = "True minus estimated."
     if sigma is not None:
@@ -176,8 +180,8 @@ def estimates(solution: xr.Dataset, block: str) -> Picture:
         if turn is None and sigma is not None:
             _window(axes, found.values[:, :, k], 3.0 * sigma.values[:, :, k])
     thin_lines = sigma is not None and turn is None
-    bounds = [style.key("±3σ stated", color=style.GREY, linewidth=0.8)] if thin_lines else []
-    style.legend(figure, _keys(filters, solution, *bounds))
+    more = [style.key("±3σ stated", color=style.GREY, linewidth=0.8)] if thin_lines else []
+    style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = "Thin lines: three stated standard deviations to either side." if thin_lines else ""
     caption += _frame_of(solution, f"estimate_{block}")
@@ -211,6 +215,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     rms = series.get(solution, "rms", block)
     assert rms is not None
     stated = series.get(solution, "mean_sigma", block)
+    best = bounds.beside(solution, block)
     filters = series.filters(solution)
     runs = int(solution[f"rms_{block}"].attrs.get("runs", 0))
     figure, stack, clock = _stacked(rms, solution)
@@ -229,11 +234,14 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
                     band = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
                     axes.fill_between(x, low * y, high * y, **band)
                 lines.append(stated.values[i, :, k])
+        if best is not None:
+            lines.append(bounds.draw(axes, best, k, clock.seconds))
         kept = _in_scale(lines, rms.values[:, :, k])
         if not _limit(axes, rms.x, kept, centred=False):
             axes.set_ylim(0.0, None if len(kept) == len(lines) else _top(kept))
     label = f"σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
+    more += [bounds.key()] if best is not None else []
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = f"Root mean square error of the {name} over {runs or 'all'} runs."
@@ -244,6 +252,8 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
         else:
             caption += " Thin lines: the stated sigma."
         caption += bound_note(solution)
+    if best is not None:
+        caption += " No filter with this model can come below the covariance bound."
     caption += _frame_of(solution, f"rms_{block}")
     return Picture(f"rms_{block}", f"Scatter of the {name} over the runs", caption, figure)
 

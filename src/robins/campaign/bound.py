@@ -1,0 +1,186 @@
+"""The covariance bound of a problem: what its sensors allow, without any filter and any data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins.campaign.monte_carlo import worlds
+from robins.filters import Belief
+from robins.filters.bound import covariance_bound, used_sensors
+from robins.filters.observability import (
+    NOTHING,
+    bits,
+    observability,
+    spectrum,
+    unobservable,
+    worded,
+)
+from robins.results import variable
+from robins.systems.system import Contender, Problem
+
+FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
+_FEWEST, _MOST = 3, 6  # directions that are told
+
+
+def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = ()) -> xr.Dataset:
+    """The covariance bound for the model of a contender, along simulated true trajectories.
+
+    Args:
+        problem: what to simulate.
+        name: which contender's model and start to take; its filter plays no part.
+        runs: how many trajectories; variances are averaged over them.
+        without: sensors to leave out altogether.
+
+    Returns:
+        ``bound_BLOCK`` (time, axis_BLOCK), one standard deviation; ``bound_prior_BLOCK``
+        (axis_BLOCK) before the first step; ``bound_unaided_BLOCK`` with no sensor and
+        ``bound_without_BLOCK`` (sensor, time, axis_BLOCK) without one of them. Of the first run
+        ``information`` (state, time) in bits about the state at the beginning, see
+        `robins.filters.observability`; ``gramian_rank`` and ``gramian`` (direction), the least
+        eigenvalues, with a coordinate that says in words what each direction is made of. The
+        attribute ``filter`` is the name.
+
+    Raises:
+        ValueError: there is no such contender or sensor, or the bound is not finite.
+    """
+    if name not in problem.contenders:
+        raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
+    c = problem.contenders[name]
+    try:
+        use = used_sensors(c.model, without)
+    except KeyError as error:
+        raise ValueError(f"filter '{name}' has {error.args[0]}") from None
+    case = c.case if isinstance(c.case, Partial) else Partial(c.case)
+    names = [s.name for s in c.model.sensors]
+    one_less = use & ~np.eye(len(use), dtype=bool)
+    subsets = jnp.asarray(np.concatenate([[use], [np.zeros_like(use)], one_less]))
+    parts, observed = [], None
+    for batch, count in worlds(problem, runs):
+        found = _bounds(c.model, case, c.reported, subsets, batch)
+        parts.append([np.asarray(x)[:count] for x in found[:2]])
+        if observed is None:
+            one = jax.tree_util.tree_map(lambda x: x[0], batch)
+            observed = *_observed(c.model, case, jnp.asarray(use), one), found[2][0]
+    assert observed is not None
+    L, D, spoke = map(np.asarray, observed)
+    sigma, prior = (np.sqrt(np.mean(np.concatenate(p), axis=0)) for p in zip(*parts, strict=True))
+    if not (np.all(np.isfinite(sigma)) and np.all(np.isfinite(L))):
+        raise ValueError(
+            f"the bound of filter '{name}' is not finite: its model cannot be linearised along the "
+            "true states, or something in it grows without bound and is not seen"
+        )
+    shown = [i for i in range(len(names)) if spoke[i] and use[i]]
+    data, coords = _sigmas(problem, sigma, prior, [names[i] for i in shown], shown)
+    more, places = _information(*_states(problem, c, len(D)), L, D)
+    told = {"filter": name, "runs": runs, "without": ", ".join(without)}
+    return xr.Dataset(data | more, coords | places, told)
+
+
+def _start(case: Any) -> Belief:
+    """The belief a case begins with, also where it holds the state of a filter."""
+    return getattr(case.start, "belief", case.start)
+
+
+def _rows(reported: Any, factor: Array) -> Array:
+    """(..., r) variances of the reported components."""
+    mapped = factor if reported is None else jnp.asarray(reported, float) @ factor
+    return jnp.sum(mapped**2, axis=-1)
+
+
+@jax.jit
+def _bounds(model, case: Partial, reported, subsets, worlds):
+    """(runs, V, E, r) variances, (runs, r) of the prior, (runs, S) sensors that ever spoke."""
+
+    def one(world):
+        it = case(world)
+        start = _start(it)
+
+        def of(use):
+            y, u, aux = it.y, it.u, it.aux
+            return _rows(reported, covariance_bound(model, start, it.truth, y, u, aux, use).factor)
+
+        spoke = [_speaks(it.y[s.name]) if s.name in it.y else False for s in model.sensors]
+        return jax.vmap(of)(subsets), _rows(reported, start.factor), jnp.array(spoke)
+
+    return jax.lax.map(one, worlds)
+
+
+def _speaks(y: Any) -> Array:
+    found = [jnp.any(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(y)]
+    return jnp.any(jnp.stack(found))
+
+
+@jax.jit
+def _observed(model, case: Partial, use, world):
+    it = case(world)
+    start = _start(it)
+    return observability(model, start, it.truth, it.y, it.u, it.aux, use), start.sigma
+
+
+def _sigmas(problem: Problem, sigma: np.ndarray, prior: np.ndarray, names: list[str], shown: Any):
+    """Standard deviations by block, and their coordinates."""
+    time = variable("time", problem.epoch_s, "s", "time since the start")
+    data, coords = {}, {"time": time, "sensor": names}
+    for b in problem.blocks:
+        axis, words = f"axis_{b.name}", b.name.replace("_", " ")
+        coords[axis] = list(b.axes)
+        for kind, dims, values, text in (
+            ("", ("time", axis), sigma[0], f"covariance bound of {words}"),
+            ("prior_", (axis,), prior, f"prior sigma of {words}"),
+            ("unaided_", ("time", axis), sigma[1], f"bound of {words} with no sensor"),
+            ("without_", ("sensor", "time", axis), sigma[2:][shown], f"bound of {words} without"),
+        ):
+            data[f"bound_{kind}{b.name}"] = variable(
+                dims, values[..., b.where], b.units, text, b.frame, display_unit=b.display_unit
+            )
+    return data, coords
+
+
+def _states(problem: Problem, c: Contender, n: int) -> tuple[list[str], np.ndarray]:
+    """Names of the tangent components, and the sign with which they are reported.
+
+    A component takes the name of what reports it alone; others are numbered.
+    """
+    names, sign = [f"state {i + 1}" for i in range(n)], np.ones(n)
+    rows = np.eye(n) if c.reported is None else np.asarray(c.reported)
+    for b in problem.blocks:
+        for row, axis in zip(rows[b.where], b.axes, strict=True):
+            (at,) = np.nonzero(row)
+            if len(at) == 1:
+                names[at[0]] = f"{b.name.replace('_', ' ')} {axis}"
+                sign[at[0]] = np.sign(row[at[0]])
+    return names, sign
+
+
+def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarray):
+    """Bits by state and time, and the directions of which least is known, in words."""
+    (open_,) = np.nonzero(D > 0.0)  # what is known from the start has no information to gain
+    told = [names[i] for i in open_]
+    values, vectors = spectrum(L[-1][np.ix_(open_, open_)])
+    rank = int(np.sum(values >= NOTHING))
+    hidden = unobservable(values, vectors)
+    rest = vectors[:, hidden.shape[1] :]
+    most = min(max(_FEWEST, int(np.sum(values < FEW))), _MOST)
+    shown = (sign[open_, None] * np.concatenate([hidden, rest], axis=1))[:, :most]
+    words = [f"{i + 1}: {worded(v, told)}" for i, v in enumerate(shown.T)]
+    data: dict[str, Any] = {
+        "information": variable(
+            ("state", "time"), bits(L[:, open_]).T, "1", "information about the start [bit]"
+        ),
+        "gramian": variable(
+            "direction",
+            values[: len(words)],
+            "1",
+            "least eigenvalues of the observability Gramian, in units of the prior",
+        ),
+        "gramian_rank": variable((), rank, "1", "rank of the observability Gramian"),
+    }
+    return data, {"state": told, "direction": words}

@@ -1,0 +1,308 @@
+"""The covariance bound: as a line beside filters, and as tables and figures of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from robins import units
+from robins.report import series, style
+from robins.report.numbers import show, words
+from robins.report.style import Picture
+
+# Verdict on a component by what of its sigma the sensors leave, of that without any sensor.
+SEEN, HARDLY = 0.5, 0.95
+NOTHING = 1e-9  # eigenvalue of the Gramian that is rounding
+_LOOK = {"color": style.TRUTH, "linestyle": (0, (4, 2)), "linewidth": 0.8}
+_NONE = {"color": style.GREY, "linestyle": (0, (1, 1)), "linewidth": 0.8}
+_BEYOND = 30.0  # a line this many times above the bound with all sensors leaves the figure
+_COLUMNS = 500  # of the map of information
+_FULL = 10.0  # bits; a thousandth of the prior and less is one colour
+
+
+class Line(NamedTuple):
+    """A bound in the unit of figures."""
+
+    values: np.ndarray  # (..., time, axis), or (axis,) of the prior
+    unit: str
+    x: np.ndarray  # (time,) s
+
+
+def line(solution: xr.Dataset, block: str, kind: str = "") -> Line:
+    """The bound of a block, one standard deviation.
+
+    Args:
+        solution: from `robins.results`.
+        block: of the state.
+        kind: "" for all sensors, "prior_", "unaided_" or "without_".
+
+    Raises:
+        KeyError: the solution has no such bound.
+    """
+    array = solution[f"bound_{kind}{block}"]
+    unit = array.attrs.get("units", "1")
+    shown = array.attrs.get("display_unit", unit)
+    values = units.convert(np.asarray(array.values, float), unit, shown)
+    x = series.x_of(array, array.ndim - 2) if array.ndim > 1 else np.zeros(0)
+    return Line(values, "" if shown == "1" else shown, x)
+
+
+def beside(solution: xr.Dataset, block: str) -> Line | None:
+    """The bound to draw beside the filters; None if the solution has none."""
+    return line(solution, block) if f"bound_{block}" in solution else None
+
+
+def draw(axes: Axes, bound: Line, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
+    """Draw a multiple of the bound of an axis beside filters; returns it."""
+    y = times * bound.values[:, k]
+    x, thinned = series.thin(bound.x / seconds, y)
+    axes.plot(x, thinned, zorder=4, **_LOOK)
+    return y
+
+
+def key(times: str = "") -> Line2D:
+    """The entry of a legend for `draw`."""
+    return style.key(f"{times}covariance bound", **_LOOK)
+
+
+def blocks(solution: xr.Dataset) -> list[str]:
+    """Blocks of a solution that `robins bound` made."""
+    prefix = "bound_prior_"
+    return [str(v).removeprefix(prefix) for v in solution.data_vars if str(v).startswith(prefix)]
+
+
+def sensors(solution: xr.Dataset) -> list[str]:
+    """Sensors that were left out in turn."""
+    return series.coordinate(solution, "sensor") if "sensor" in solution.sizes else []
+
+
+@style.styled
+def sigmas(solution: xr.Dataset, block: str) -> Picture:
+    """The bound of a block over time, with all sensors, without each, and with none."""
+    every, without, unaided = (line(solution, block, k) for k in ("", "without_", "unaided_"))
+    names, labels = sensors(solution), series.coordinate(solution, f"axis_{block}")
+    figure, grid = style.new(len(labels), 1, 0.9 + 1.35 * len(labels), sharex=True)
+    clock = series.clock(every.x)
+    x = every.x / clock.seconds
+    for k, axes in enumerate(grid[:, 0]):
+        lines = [(unaided.values[:, k], _NONE)]
+        for i, one in enumerate(without.values, 1):
+            lines.append((one[:, k], {"color": style.colour(i), "linestyle": style.line(i)}))
+        lines.append((every.values[:, k], {"color": style.colour(0), "linewidth": 1.6}))
+        for y, look in lines:
+            axes.plot(*series.thin(x, np.where(y > 0.0, y, np.nan)), **look)
+        _scale(axes, every.values[:, k], without.values[..., k], unaided.values[:, k])
+        axes.set_ylabel(f"{labels[k]} [{every.unit}]" if every.unit else labels[k])
+        axes.margins(x=0.0)
+    grid[-1, 0].set_xlabel(clock.label)
+    figure.align_ylabels()
+    keys = [style.key("all sensors", color=style.colour(0), linewidth=1.6)]
+    for i, name in enumerate(names, 1):
+        look = {"color": style.colour(i), "linestyle": style.line(i)}
+        keys.append(style.key(f"without {words(name)}", **look))
+    style.legend(figure, [*keys, style.key("no sensor", **_NONE)])
+    caption = (
+        "One standard deviation that no filter with this model can beat. What a sensor buys is the "
+        "way between the line without it and the line with all. Lines that run away leave the "
+        "figure."
+    )
+    frame = solution[f"bound_{block}"].attrs.get("frame", "")
+    caption += f" Frame: {frame}." if frame else ""
+    return Picture(f"bound_{block}", f"Covariance bound of the {words(block)}", caption, figure)
+
+
+def _scale(axes: Axes, every: np.ndarray, without: np.ndarray, unaided: np.ndarray) -> None:
+    """A logarithmic axis of one decade or more that what diverges does not set."""
+    close = np.concatenate([every, without.ravel()])
+    both = np.concatenate([close, unaided])
+    low = float(np.min(both[both > 0.0], initial=np.inf))
+    if not np.isfinite(low):
+        return  # known exactly all the time
+    top = min(float(np.max(both)), _BEYOND * max(float(np.max(every)), low))
+    axes.set_yscale("log")
+    axes.set_ylim(min(0.8 * low, top / 10.0), 1.25 * top)
+    few = top < 100.0 * low
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+@style.styled
+def information(solution: xr.Dataset) -> Picture:
+    """What the measurements so far tell of each state at the start, by state and time."""
+    array = solution["information"]
+    names = series.coordinate(solution, "state")
+    time = series.x_of(array, 1)
+    pick = np.unique(np.linspace(0, len(time) - 1, _COLUMNS).astype(int))
+    clock = series.clock(time)
+    figure, grid = style.new(1, 1, 1.1 + 0.19 * len(names))
+    axes = grid[0, 0]
+    shown = axes.pcolormesh(
+        time[pick] / clock.seconds,
+        np.arange(len(names)),
+        np.minimum(np.asarray(array.values, float)[:, pick], _FULL),
+        shading="nearest",
+        cmap="viridis",
+        vmin=0.0,
+        vmax=_FULL,
+        rasterized=True,
+    )
+    axes.set_yticks(np.arange(len(names)), names)
+    axes.invert_yaxis()
+    axes.grid(visible=False)
+    axes.set_xlabel(clock.label)
+    figure.colorbar(shown, ax=axes, label="information [bit]", extend="max", pad=0.01)
+    caption = (
+        "About the state at the start, from the observability Gramian in units of the prior: each "
+        "bit halves the standard deviation, process noise left aside. A row that stays dark is a "
+        f"state that the sensors do not see. Rank {int(solution['gramian_rank'])} of {len(names)}."
+    )
+    return Picture("information", "Information by state and time", caption, figure)
+
+
+def epochs(solution: xr.Dataset, times_s: Sequence[float] = ()) -> list[int]:
+    """Numbers of the epochs at the times asked for; by default at the quarters.
+
+    Raises:
+        ValueError: a time is not among those of the solution.
+    """
+    time = np.asarray(solution["time"], float)
+    first, last = float(time[0]), float(time[-1])
+    step = float(np.max(np.diff(time), initial=0.0))
+    for t in times_s:
+        if not first - step <= t <= last + step:
+            raise ValueError(f"{t:g} s is not within the run, {first:g} s to {last:g} s")
+    wanted = sorted(times_s) or [first + share * (last - first) for share in (0.25, 0.5, 0.75, 1.0)]
+    return [int(np.argmin(np.abs(time - t))) for t in wanted]
+
+
+def metrics(solution: xr.Dataset) -> dict[str, list[float]]:
+    """The bound at the end by block, as metrics of a summary, whose names end in their unit."""
+    out = {}
+    for block in blocks(solution):
+        found = line(solution, block)
+        unit = "mps" if found.unit == "m/s" else found.unit.replace("/", "_per_").replace("^", "")
+        out["_".join(filter(None, (block, "bound", unit)))] = found.values[-1].tolist()
+    return out
+
+
+class Row(NamedTuple):
+    """What the sensors make of one component of the state, in the unit of figures."""
+
+    state: str
+    unit: str
+    prior: float
+    sigma: list[float]  # at the times asked for
+    unaided: float  # with no sensor, at the last of them
+    without: list[float]  # each sensor left out, at the last of them
+
+    @property
+    def left(self) -> float:
+        """Share of the prior left; may be above one where process noise is at work."""
+        return self.sigma[-1] / self.prior if self.prior > 0.0 else np.nan
+
+    @property
+    def verdict(self) -> str:
+        """Whether the sensors see it: "seen", "hardly seen", "not seen"; or "known" before."""
+        if self.unaided == 0.0:
+            return "known"
+        share = self.sigma[-1] / self.unaided
+        return "seen" if share <= SEEN else "hardly seen" if share <= HARDLY else "not seen"
+
+
+def rows(solution: xr.Dataset, at: Sequence[int]) -> list[Row]:
+    """One row a component, at the numbers of some epochs."""
+    out = []
+    for block in blocks(solution):
+        kinds = ("", "prior_", "unaided_", "without_")
+        every, prior, unaided, without = (line(solution, block, kind) for kind in kinds)
+        for k, axis in enumerate(series.coordinate(solution, f"axis_{block}")):
+            out.append(
+                Row(
+                    f"{words(block)} {axis}",
+                    every.unit,
+                    float(prior.values[k]),
+                    every.values[list(at), k].tolist(),
+                    float(unaided.values[at[-1], k]),
+                    without.values[:, at[-1], k].tolist(),
+                )
+            )
+    return out
+
+
+_STYLES = {"seen": "green", "hardly seen": "yellow", "not seen": "red", "known": ""}
+
+
+def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
+    """The rows as something rich can print, and below them what is least observable."""
+    time = np.asarray(solution["time"], float)
+    made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    made.add_column("sigma at best")
+    made.add_column("unit")
+    last = f"{time[at[-1]]:g} s"
+    for head in ("prior", *(f"{time[k]:g} s" for k in at), "of prior"):
+        made.add_column(head, justify="right")
+    made.add_column("verdict")
+    for head in (*(f"without {words(s)}" for s in sensors(solution)), "no sensor"):
+        made.add_column(head, justify="right")
+    for row in rows(solution, at):
+        share = "–" if np.isnan(row.left) else f"{100.0 * row.left:.3g} %"
+        made.add_row(
+            Text(row.state),
+            Text(row.unit),
+            *(_short(v) for v in (row.prior, *row.sigma)),
+            share,
+            Text(row.verdict, style=_STYLES[row.verdict]),
+            *(_short(v) for v in (*row.without, row.unaided)),
+        )
+    told = f"On the right, what sigma would be at {last} without one of the sensors, and with none."
+    return Group(made, Text(), Text(told), *(Text(s) for s in sentences(solution)))
+
+
+def _short(value: float) -> str:
+    return show(float(f"{value:.3g}"))
+
+
+def sentences(solution: xr.Dataset) -> list[str]:
+    """What is least observable, for readers."""
+    count = solution.sizes["state"]
+    told = [
+        f"The observability Gramian has rank {int(solution['gramian_rank'])} of {count}; the least "
+        "observable directions, in units of the prior, are:"
+    ]
+    directions = series.coordinate(solution, "direction")
+    for made_of, value in zip(directions, np.asarray(solution["gramian"]), strict=True):
+        much = (
+            f"the measurements weigh {show(float(value))} times the prior"
+            if value >= NOTHING
+            else "not seen"
+        )
+        told.append(f"{made_of}: {much}")
+    return told
+
+
+def csv(solution: xr.Dataset) -> str:
+    """The bound over time in SI units, one column a component; of all sensors and without each."""
+    heads, columns = ["time_s"], [np.asarray(solution["time"], float)]
+    kinds = [("bound", "", None), ("unaided", "unaided_", None)]
+    kinds += [(f"without_{s}", "without_", i) for i, s in enumerate(sensors(solution))]
+    for label, kind, i in kinds:
+        for block in blocks(solution):
+            array = solution[f"bound_{kind}{block}"]
+            values = np.asarray(array.values if i is None else array.values[i], float)
+            axes = series.coordinate(solution, f"axis_{block}")
+            unit = array.attrs["units"]
+            heads += [f"{label} {block} {axis} [{unit}]" for axis in axes]
+            columns += list(values.T)
+    lines = [",".join(heads)]
+    lines += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
+    return "\n".join(lines) + "\n"
