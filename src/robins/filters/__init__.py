@@ -6,6 +6,7 @@ from robins.filters.delayed import Late, delayed
 from robins.filters.distributed import distributed, intersecting
 from robins.filters.federated import federated
 from robins.filters.fusion import covariance_intersection, fuse, share
+from robins.filters.guarded import guarded
 from robins.filters.imm import imm, mode
 from robins.filters.iterated import iterated
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
@@ -69,6 +70,7 @@ __all__ = [
     "filter_step",
     "fuse",
     "gamma_min",
+    "guarded",
     "imm",
     "intersecting",
     "iterated",
