@@ -56,11 +56,11 @@ def vector(name: str, value: Any, width: int, **bounds: Any) -> jax.Array:
     Raises:
         ValueError: another shape, or a value out of its range.
     """
-    shape = np.shape(value)
-    if shape not in ((), (width,)):
-        raise ValueError(f"{name} must be a number or of shape ({width},), got shape {shape}")
+    x = jnp.asarray(value, float)
+    if x.shape not in ((), (width,)):
+        raise ValueError(f"{name} must be a number or of shape ({width},), got shape {x.shape}")
     number(name, value, **bounds)
-    return jnp.broadcast_to(jnp.asarray(value, float), (width,))
+    return jnp.broadcast_to(x, (width,))
 
 
 def count_of(name: str, value: int) -> int:

@@ -40,9 +40,8 @@ _ALONG, _ACROSS = 1, 2
 DRYDEN_LENGTH_M = 1750.0 * 0.3048
 VON_KARMAN_LENGTH_M = 2500.0 * 0.3048
 
-_A = math.sqrt(math.pi) * gamma(5.0 / 6.0) / gamma(1.0 / 3.0)  # 1.339 unrounded
-_LONGEST = 2**22  # samples of an embedding
-_ROUNDING = 1e-12  # of the greatest eigenvalue; a negative one this small is zero
+_A = gamma(1.0 / 3.0) / (math.sqrt(math.pi) * gamma(5.0 / 6.0))  # 1.339 unrounded
+_ROUNDING = 1e-13  # of an eigenvalue, as a share of the greatest
 
 
 def dryden(
@@ -91,13 +90,14 @@ def von_karman(
     """Von Karman turbulence [m/s] at 0, step, 2 step ...; arguments are those of `dryden`.
 
     These spectra are not rational, so no finite filter has them. White noise is shaped by FFT
-    instead, on a circle so much longer than the record that the covariance of the record is the
-    exact one (circulant embedding; Dietrich & Newsam 1997). A longer record of the same key is
-    another draw. Step, airspeed and length must be known when the run is compiled.
+    instead, round a circle at least twice as long as the record, so that the record has exactly
+    its covariance and no end meets the other (circulant embedding; Dietrich & Newsam 1997). A
+    longer record of the same key is another draw. Step, airspeed and length must be known when
+    the run is compiled.
 
     Raises:
         ValueError: as `dryden`; a step, airspeed or length that is traced; or a step so short
-            against the length that the circle would be too long.
+            that nothing but rounding is between two samples.
     """
     if not _given.known(step_s, airspeed_m_s, length_m):
         raise ValueError(
@@ -169,17 +169,19 @@ def _correlation(x, across):
 
 @lru_cache(maxsize=16)
 def _root_spectrum(count: int, step: float, across: bool) -> np.ndarray:
-    """Roots of the eigenvalues, from zero to the highest frequency, of the shortest circle."""
+    """Roots of the eigenvalues, from zero to the highest frequency, of a circle round the record.
+
+    No longer circle is needed to keep them positive: along, the correlation is convex, for which
+    that is a theorem (Dietrich & Newsam 1997); across, it is so for every step down to rounding.
+    """
     size = 4
     while size < 2 * (count - 1):
         size *= 2
-    while size <= _LONGEST:
-        half = _correlation(step * np.arange(size // 2 + 1), across)
-        eigenvalues = np.fft.rfft(np.concatenate([half, half[-2:0:-1]])).real
-        if eigenvalues.min() >= -_ROUNDING * eigenvalues.max():
-            return np.sqrt(np.maximum(eigenvalues, 0.0))
-        size *= 2
-    raise ValueError(
-        f"{count} samples at {step:.3g} of the scale length of von Karman turbulence need a circle "
-        f"of more than {_LONGEST} samples: draw at a longer step"
-    )
+    half = _correlation(step * np.arange(size // 2 + 1), across)
+    eigenvalues = np.fft.rfft(np.concatenate([half, half[-2:0:-1]])).real
+    if eigenvalues.min() < _ROUNDING * eigenvalues.max():
+        raise ValueError(
+            f"step_s is {step:.3g} of the time in which the scale length of von Karman turbulence "
+            "passes by: so short that the samples do not differ but by rounding"
+        )
+    return np.sqrt(eigenvalues)
