@@ -8,6 +8,9 @@
 - `disturbance`: heavy tails, outliers, steps of noise and drift (import it by its name).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
+- `wind`, `turbulence`: gusts and what they carry; Dryden and von Karman spectra.
+- `air_data`, `barometer`, `sar`, `star_tracker`: sensors of an airship.
+- `gauss_markov`: first-order Gauss-Markov processes, exact at any step.
 - `random`: streams of random numbers by seed, run and component.
 """
 

@@ -1,0 +1,110 @@
+"""The star sensor: its errors read back by SciPy's rotations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from robins.sim.random import Component, stream
+from robins.sim.star_tracker import observe_attitude, observe_euler
+
+COUNT = 4000
+KEY = stream(9, 1, Component.STAR_SENSOR)
+SIGMA = np.array([1e-4, 1e-4, 1e-3])  # boresight along the third axis
+TRUE = Rotation.random(COUNT, rng=np.random.default_rng(8))
+Q_NB = TRUE.as_quat(scalar_first=True)
+PRESENT = np.arange(COUNT) % 5 != 0
+MOUNT = Rotation.from_euler("ZYX", [0.4, -1.1, 2.0])
+Q_BS = MOUNT.as_quat(scalar_first=True)
+
+attitude, euler = jax.jit(observe_attitude), jax.jit(observe_euler)
+
+
+def errors_of(q):
+    """Rotation vectors from true to measured body axes, body axes."""
+    return (TRUE[PRESENT].inv() * Rotation.from_quat(q[PRESENT], scalar_first=True)).as_rotvec()
+
+
+def assert_normal(error, sigma):
+    n = len(error)
+    low, high = stats.chi2.ppf([1e-4, 1.0 - 1e-4], n) / n
+    ratio = np.mean(error**2, axis=0) / sigma**2
+    assert np.all((ratio > low) & (ratio < high))
+    assert np.abs(np.corrcoef(error.T)[~np.eye(3, dtype=bool)]).max() < 4.0 / n**0.5
+    for axis in range(3):
+        assert stats.kstest(error[:, axis] / sigma[axis], "norm").pvalue > 1e-3
+
+
+def test_the_error_is_a_turn_about_the_axes_of_the_body():
+    q = np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT))
+    assert np.all(np.isnan(q[~PRESENT]))
+    np.testing.assert_allclose(np.linalg.norm(q[PRESENT], axis=1), 1.0, rtol=1e-15)
+    assert_normal(errors_of(q), SIGMA)
+
+
+def test_or_about_the_axes_of_a_sensor_that_is_mounted_askew():
+    plain = errors_of(np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT)))
+    askew = errors_of(np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT, Q_BS)))
+    np.testing.assert_allclose(MOUNT.inv().apply(askew), plain, rtol=0.0, atol=1e-14)
+    # by the definition, one after the other
+    sensor = TRUE[PRESENT] * MOUNT
+    turned = sensor * Rotation.from_rotvec(plain) * MOUNT.inv()
+    np.testing.assert_allclose((TRUE[PRESENT].inv() * turned).as_rotvec(), askew, atol=1e-14)
+
+
+def test_angles_have_white_noise_each():
+    sigma = np.array([1e-4, 2e-4, 3e-4])
+    got = np.asarray(euler(KEY, Q_NB, sigma, PRESENT))
+    assert np.all(np.isnan(got[~PRESENT]))
+    heading, pitch, roll = TRUE.as_euler("ZYX").T
+    error = (got - np.stack([pitch, roll, heading], 1))[PRESENT]
+    assert_normal(np.mod(error + np.pi, 2.0 * np.pi) - np.pi, sigma)
+
+
+def test_heading_is_wrapped_where_north_passes_through_south():
+    q = Rotation.from_euler("ZYX", np.tile([np.pi - 1e-6, 0.1, -0.2], (200, 1)))
+    there = np.ones(200, bool)
+    got = np.asarray(observe_euler(KEY, q.as_quat(scalar_first=True), 1e-3, there))
+    assert np.all((got[:, 2] >= -np.pi) & (got[:, 2] < np.pi))
+    assert 50 < np.sum(got[:, 2] < 0.0) < 150
+    off = np.mod(got[:, 2] - (np.pi - 1e-6) + np.pi, 2.0 * np.pi) - np.pi
+    assert np.abs(off).max() < 5e-3
+
+
+def test_numbers_do_not_depend_on_sigma_or_presence():
+    there = np.ones(COUNT, bool)
+    some = np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT))
+    np.testing.assert_array_equal(
+        some[PRESENT], np.asarray(attitude(KEY, Q_NB, SIGMA, there))[PRESENT]
+    )
+    half = errors_of(np.asarray(attitude(KEY, Q_NB, 0.5 * SIGMA, there)))
+    np.testing.assert_allclose(half, 0.5 * errors_of(some), rtol=0.0, atol=1e-15)
+    exact = np.asarray(attitude(KEY, Q_NB, 0.0, there))
+    np.testing.assert_allclose(exact, Q_NB, rtol=0.0, atol=1e-16)
+    heading, pitch, roll = TRUE.as_euler("ZYX").T
+    angles = np.asarray(euler(KEY, Q_NB, 0.0, there))
+    np.testing.assert_allclose(angles, np.stack([pitch, roll, heading], 1), atol=1e-12)
+
+
+def test_it_has_gradients_without_noise():
+    def total(sigma):
+        return jnp.sum(observe_attitude(KEY, Q_NB[:3], sigma, jnp.ones(3, bool)))
+
+    assert np.isfinite(float(jax.grad(total)(0.0)))
+
+
+@pytest.mark.parametrize("observe", [observe_attitude, observe_euler])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((Q_NB, -1.0, PRESENT), "sigma_rad must be a finite number from 0, got -1.0"),
+        ((Q_NB, [1.0, 2.0], PRESENT), r"sigma_rad must be a number or of shape \(3,\)"),
+        ((Q_NB[:, :3], 1.0, PRESENT), r"q_nb must have shape \(4000, 4\)"),
+        ((Q_NB, 1.0, PRESENT[:7]), r"q_nb must have shape \(7, 4\)"),
+    ],
+)
+def test_what_cannot_be_is_refused(observe, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        observe(KEY, *arguments)
