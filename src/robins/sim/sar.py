@@ -66,7 +66,11 @@ def observe_sar(
     there = _given.presence(present)
     count = len(there)
     heading = _given.rows("heading_rad", heading_rad, count)
-    place = Geodetic(*(_given.rows(f"position.{k}", getattr(position, k), count) for k in _PLACE))
+    place = Geodetic(
+        _given.rows("position.lat", position.lat, count),
+        _given.rows("position.lon", position.lon, count),
+        _given.rows("position.alt", position.alt, count),
+    )
     sigma_m = _given.vector("sigma_m", model.sigma_m, 2, low=0.0)
     _given.number("heading_sigma_rad", model.heading_sigma_rad, 0.0)
     _given.number("outlier_share", model.outlier_share, 0.0, 1.0)
@@ -85,10 +89,8 @@ def observe_sar(
     def told(x):
         return jnp.where(there, x, jnp.nan)
 
-    return SarFix(Geodetic(told(seen.lat), told(seen.lon), jnp.full(count, jnp.nan)), told(heading))
-
-
-_PLACE = ("lat", "lon", "alt")
+    no_height = jnp.full_like(seen.alt, jnp.nan)
+    return SarFix(Geodetic(told(seen.lat), told(seen.lon), no_height), told(heading))
 
 
 def _directions(key, count):
