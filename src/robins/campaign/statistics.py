@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
-from robins.systems.system import Limit, StateBlock
+from robins.systems.system import Limit, Norm, StateBlock
 
 
 @dataclass
@@ -32,6 +32,8 @@ class Statistics:
     blocks: Sequence[StateBlock]
     count_from: int = 0  # first epoch that counts for per-run figures
     limits: Sequence[Limit] = ()
+    count_to: int | None = None  # epoch after the last that counts
+    norms: Sequence[Norm] = ()
     runs: int = 0
     diverged: int = 0
     n: int = 0  # tangent dimension of the filter's state, which may have more than is reported
@@ -47,6 +49,7 @@ class Statistics:
     _run_worst: list[np.ndarray] = field(default_factory=list)
     _within: dict[str, Any] = field(default_factory=dict)
     _settled: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    _norms: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.chunks` yields it."""
@@ -71,7 +74,12 @@ class Statistics:
             for kind, number in zip(kinds.tolist(), numbers.tolist(), strict=True):
                 tally[kind] = tally.get(kind, 0) + number
         self.n = int(record["dim"][0])
-        counted = error[:, self.count_from :]
+        counted = error[:, self.counted]
+        for norm in self.norms:
+            length = np.sqrt(np.sum(counted[:, :, list(norm.components)] ** 2, axis=2))
+            with np.errstate(invalid="ignore"):  # the spread of an infinite error
+                pair = np.stack([np.mean(length, axis=1), np.std(length, axis=1)], axis=1)
+            self._norms.setdefault(norm.name, []).append(pair)
         self._run_rms.append(np.sqrt(np.mean(counted**2, axis=1)))
         self._run_worst.append(np.max(np.abs(counted), axis=1))
         for limit in self.limits:
@@ -104,6 +112,15 @@ class Statistics:
         return np.sqrt(self._variance / self.runs)
 
     @property
+    def counted(self) -> slice:
+        """The epochs that count for figures pooled over time."""
+        return slice(self.count_from, self.count_to)
+
+    def norm(self, name: str) -> np.ndarray:
+        """(runs, 2) mean and standard deviation over time of a norm of the error, by run."""
+        return np.concatenate(self._norms[name])
+
+    @property
     def run_rms(self) -> np.ndarray:
         """(runs, r)."""
         return np.concatenate(self._run_rms)
@@ -128,8 +145,8 @@ class Statistics:
 
     def overall_ratio(self) -> np.ndarray:
         """(r,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
-        start = self.count_from
-        return np.sqrt(np.sum(self._square[start:], 0) / np.sum(self._variance[start:], 0))
+        at = self.counted
+        return np.sqrt(np.sum(self._square[at], 0) / np.sum(self._variance[at], 0))
 
     def ratio_bounds(self, level: float = 0.99) -> np.ndarray:
         """(r, 2) bounds of `overall_ratio` that hold for all states at once at this level.
@@ -137,7 +154,7 @@ class Statistics:
         Runs are independent, the epochs of one are not, so the spread between runs is what counts;
         the level is shared out over the states (Bonferroni).
         """
-        variance = np.mean(self._variance[self.count_from :] / self.runs, axis=0)
+        variance = np.mean(self._variance[self.counted] / self.runs, axis=0)
         squares = self.run_rms**2 / variance
         each = 1.0 - (1.0 - level) / squares.shape[1]
         return np.array([rms_with_bounds(column, each)[1:] for column in squares.T])
@@ -158,7 +175,7 @@ class Statistics:
     def anees_share_inside(self, level: float = 0.95) -> float:
         """Share of the epochs counted whose ANEES is inside its band."""
         low, high = self.anees_band(level)
-        value = self.anees()[self.count_from :]
+        value = self.anees()[self.counted]
         return float(np.mean((value >= low) & (value <= high)))
 
     def nis(self, sensor: str, level: float = 0.95) -> Verdict:

@@ -11,6 +11,7 @@ there are.
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -91,6 +92,26 @@ def ideal_increments(
     if trajectory.body == "RFU":
         gyro, accel = swap(gyro), swap(accel)
     return ImuTable(trajectory.time_ns, gyro, accel, "increment", trajectory.body)
+
+
+def increments_between(before: Nav, after: Nav, dt_s: Float[Array, "n"]) -> Increments:
+    """Ideal increments that lead from each state to the next; pure JAX, so it batches.
+
+    The inversion of one step of the mechanisation by three rounds of correction: exact to rounding
+    for turns of a few degrees. `ideal_increments` does so for a whole table, checks it, and makes
+    the samples of a sensor of it.
+
+    Args:
+        before: N states in NED/FRD, leading axis.
+        after: those `dt_s` later; positions are taken as they come.
+        dt_s: (N,).
+    """
+    def nearer(_, increments: Increments) -> Increments:
+        turn, push = _miss(before, after, increments)
+        return increments._replace(theta=increments.theta + turn, dv=increments.dv + push)
+
+    zero = jnp.zeros((*dt_s.shape, 3))
+    return jax.lax.fori_loop(0, 3, nearer, Increments(dt_s, zero, zero))
 
 
 def _doubled(a: np.ndarray) -> np.ndarray:

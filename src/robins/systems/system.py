@@ -80,6 +80,13 @@ class Limit(NamedTuple):
     value: float  # SI, of the largest component
 
 
+class Norm(NamedTuple):
+    """The length of some reported components of the error, such as the horizontal ones."""
+
+    name: str
+    components: tuple[int, ...]
+
+
 class Problem(NamedTuple):
     """A simulated scenario, ready to be run any number of times."""
 
@@ -96,6 +103,8 @@ class Problem(NamedTuple):
     shown: Callable[[Mapping[str, State]], dict[str, Any]] = lambda means: {}
     count_from: int = 0  # first epoch that counts for figures pooled over time
     limits: Sequence[Limit] = ()
+    count_to: int | None = None  # epoch after the last that counts; None: to the end
+    norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
 
 
 @dataclass(frozen=True)
