@@ -24,7 +24,7 @@ from robins.filters.observability import (
     worded,
 )
 from robins.results import variable
-from robins.systems.system import Contender, Problem
+from robins.systems.system import Problem, StateBlock
 
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
 _FEWEST, _MOST = 3, 6  # directions that are told
@@ -42,14 +42,15 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     Returns:
         ``bound_BLOCK`` (time, axis_BLOCK), one standard deviation; ``bound_prior_BLOCK``
         (axis_BLOCK) before the first step; ``bound_unaided_BLOCK`` with no sensor and
-        ``bound_without_BLOCK`` (sensor, time, axis_BLOCK) without one of them. Of the first run
-        ``information`` (state, time) in bits about the state at the beginning, see
-        `robins.filters.observability`; ``gramian_rank`` and ``gramian`` (direction), the least
-        eigenvalues, with a coordinate that says in words what each direction is made of. The
-        attribute ``filter`` is the name.
+        ``bound_without_BLOCK`` (sensor, time, axis_BLOCK) without one of them;
+        ``bound_left_BLOCK`` (axis_BLOCK), the share of the prior that the measurements leave of the
+        start, process noise aside. Of the first run ``information`` (state, time), the bits gained
+        about the start, see `robins.filters.observability`; ``gramian`` (direction), the least
+        eigenvalues, with a coordinate that says in words what each direction is made of; and
+        ``gramian_rank``. The attribute ``filter`` is the name.
 
     Raises:
-        ValueError: there is no such contender or sensor, or the bound is not finite.
+        ValueError: there is no such contender or sensor, none is left, or the bound is not finite.
     """
     if name not in problem.contenders:
         raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
@@ -78,10 +79,22 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
             "true states, or something in it grows without bound and is not seen"
         )
     shown = [i for i in range(len(names)) if spoke[i] and use[i]]
-    data, coords = _sigmas(problem, sigma, prior, [names[i] for i in shown], shown)
-    more, places = _information(*_states(problem, c, len(D)), L, D)
+    if not shown:
+        raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
+    rows = np.eye(len(D)) if c.reported is None else np.asarray(c.reported, float)
+    left = _left(rows, L[-1], D)
+    data, coords = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
+    more, places = _information(*_states(problem.blocks, rows), L, D)
     told = {"filter": name, "runs": runs, "without": ", ".join(without)}
     return xr.Dataset(data | more, coords | places, told)
+
+
+def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
+    """(r,) share of the prior that is left of what is reported of the start; NaN if known."""
+    begun = np.linalg.norm(rows * D, axis=1)
+    known = begun == 0.0
+    share = np.linalg.norm(rows @ (D[:, None] * L), axis=1) / np.where(known, 1.0, begun)
+    return np.where(known, np.nan, share)
 
 
 def _start(case: Any) -> Belief:
@@ -125,7 +138,14 @@ def _observed(model, case: Partial, use, world):
     return observability(model, start, it.truth, it.y, it.u, it.aux, use), start.sigma
 
 
-def _sigmas(problem: Problem, sigma: np.ndarray, prior: np.ndarray, names: list[str], shown: Any):
+def _sigmas(
+    problem: Problem,
+    sigma: np.ndarray,
+    prior: np.ndarray,
+    left: np.ndarray,
+    names: list[str],
+    shown: list[int],
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Standard deviations by block, and their coordinates."""
     time = variable("time", problem.epoch_s, "s", "time since the start")
     data, coords = {}, {"time": time, "sensor": names}
@@ -141,17 +161,19 @@ def _sigmas(problem: Problem, sigma: np.ndarray, prior: np.ndarray, names: list[
             data[f"bound_{kind}{b.name}"] = variable(
                 dims, values[..., b.where], b.units, text, b.frame, display_unit=b.display_unit
             )
+        text = f"share of the start's {words} that the measurements leave, process noise aside"
+        data[f"bound_left_{b.name}"] = variable((axis,), left[b.where], "1", text, b.frame)
     return data, coords
 
 
-def _states(problem: Problem, c: Contender, n: int) -> tuple[list[str], np.ndarray]:
+def _states(blocks: Sequence[StateBlock], rows: np.ndarray) -> tuple[list[str], np.ndarray]:
     """Names of the tangent components, and the sign with which they are reported.
 
     A component takes the name of what reports it alone; others are numbered.
     """
+    n = rows.shape[1]
     names, sign = [f"state {i + 1}" for i in range(n)], np.ones(n)
-    rows = np.eye(n) if c.reported is None else np.asarray(c.reported)
-    for b in problem.blocks:
+    for b in blocks:
         for row, axis in zip(rows[b.where], b.axes, strict=True):
             (at,) = np.nonzero(row)
             if len(at) == 1:
@@ -180,6 +202,7 @@ def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarra
             values[: len(words)],
             "1",
             "least eigenvalues of the observability Gramian, in units of the prior",
+            nothing=NOTHING,
         ),
         "gramian_rank": variable((), rank, "1", "rank of the observability Gramian"),
     }

@@ -38,8 +38,8 @@ from robins.filters.model import Model
 from robins.filters.observation import left_out
 from robins.manifold import State
 
-# An eigenvalue below this is rounding: the prior knows the direction a billion times better.
-NOTHING = 1e-9
+# An eigenvalue below this counts for nothing: the prior knows the direction a million times better.
+NOTHING = 1e-6
 
 
 def observability(

@@ -19,9 +19,9 @@ from robins.report import series, style
 from robins.report.numbers import show, words
 from robins.report.style import Picture
 
-# Verdict on a component by what of its sigma the sensors leave, of that without any sensor.
+# What the sensors may leave of a component that they see, and that they hardly see: of its sigma at
+# the start, process noise aside, and of what its sigma would be at the end with no sensor.
 SEEN, HARDLY = 0.5, 0.95
-NOTHING = 1e-9  # eigenvalue of the Gramian that is rounding
 _LOOK = {"color": style.TRUTH, "linestyle": (0, (4, 2)), "linewidth": 0.8}
 _NONE = {"color": style.GREY, "linestyle": (0, (1, 1)), "linewidth": 0.8}
 _BEYOND = 30.0  # a line this many times above the bound with all sensors leaves the figure
@@ -81,8 +81,9 @@ def blocks(solution: xr.Dataset) -> list[str]:
 
 
 def sensors(solution: xr.Dataset) -> list[str]:
-    """Sensors that were left out in turn."""
-    return series.coordinate(solution, "sensor") if "sensor" in solution.sizes else []
+    """Sensors whose worth is shown; of an only one it is that of all."""
+    names = series.coordinate(solution, "sensor")
+    return names if len(names) > 1 else []
 
 
 @style.styled
@@ -95,7 +96,7 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
     x = every.x / clock.seconds
     for k, axes in enumerate(grid[:, 0]):
         lines = [(unaided.values[:, k], _NONE)]
-        for i, one in enumerate(without.values, 1):
+        for i, one in enumerate(without.values[: len(names)], 1):
             lines.append((one[:, k], {"color": style.colour(i), "linestyle": style.line(i)}))
         lines.append((every.values[:, k], {"color": style.colour(0), "linewidth": 1.6}))
         for y, look in lines:
@@ -204,6 +205,7 @@ class Row(NamedTuple):
     sigma: list[float]  # at the times asked for
     unaided: float  # with no sensor, at the last of them
     without: list[float]  # each sensor left out, at the last of them
+    start: float  # share of the prior that is left of the start, process noise aside
 
     @property
     def left(self) -> float:
@@ -215,15 +217,16 @@ class Row(NamedTuple):
         """Whether the sensors see it: "seen", "hardly seen", "not seen"; or "known" before."""
         if self.unaided == 0.0:
             return "known"
-        share = self.sigma[-1] / self.unaided
+        share = np.fmax(self.sigma[-1] / self.unaided, self.start)
         return "seen" if share <= SEEN else "hardly seen" if share <= HARDLY else "not seen"
 
 
 def rows(solution: xr.Dataset, at: Sequence[int]) -> list[Row]:
     """One row a component, at the numbers of some epochs."""
-    out = []
+    out, names = [], sensors(solution)
     for block in blocks(solution):
         kinds = ("", "prior_", "unaided_", "without_")
+        start = np.asarray(solution[f"bound_left_{block}"], float)
         every, prior, unaided, without = (line(solution, block, kind) for kind in kinds)
         for k, axis in enumerate(series.coordinate(solution, f"axis_{block}")):
             out.append(
@@ -233,7 +236,8 @@ def rows(solution: xr.Dataset, at: Sequence[int]) -> list[Row]:
                     float(prior.values[k]),
                     every.values[list(at), k].tolist(),
                     float(unaided.values[at[-1], k]),
-                    without.values[:, at[-1], k].tolist(),
+                    without.values[: len(names), at[-1], k].tolist(),
+                    float(start[k]),
                 )
             )
     return out
@@ -246,8 +250,8 @@ def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
     """The rows as something rich can print, and below them what is least observable."""
     time = np.asarray(solution["time"], float)
     made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    made.add_column("sigma at best")
-    made.add_column("unit")
+    made.add_column("sigma at best", no_wrap=True)
+    made.add_column("unit", no_wrap=True)
     last = f"{time[at[-1]]:g} s"
     for head in ("prior", *(f"{time[k]:g} s" for k in at), "of prior"):
         made.add_column(head, justify="right")
@@ -279,14 +283,11 @@ def sentences(solution: xr.Dataset) -> list[str]:
         f"The observability Gramian has rank {int(solution['gramian_rank'])} of {count}; the least "
         "observable directions, in units of the prior, are:"
     ]
+    nothing = float(solution["gramian"].attrs["nothing"])
     directions = series.coordinate(solution, "direction")
     for made_of, value in zip(directions, np.asarray(solution["gramian"]), strict=True):
-        much = (
-            f"the measurements weigh {show(float(value))} times the prior"
-            if value >= NOTHING
-            else "not seen"
-        )
-        told.append(f"{made_of}: {much}")
+        weight = f"the measurements weigh {show(float(value))} times the prior"
+        told.append(f"{made_of}: {weight if value >= nothing else 'not seen'}")
     return told
 
 
