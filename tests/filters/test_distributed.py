@@ -8,7 +8,8 @@ from two_sensors import CHANNELS, ROWS, SYSTEMS, Y, added, centralised, correcte
 
 from robins.filters import Belief
 from robins.filters.distributed import distributed, intersecting
-from robins.filters.fusion import covariance_intersection
+from robins.filters.fusion import common_information_sum, covariance_intersection
+from robins.manifold import Angle
 
 # -------------------------------------------------------------------------- distributed, intersect
 
@@ -40,6 +41,65 @@ def test_distributed_fusion_is_a_sum_of_the_locals_information(feedback):
     central = np.linalg.det(centralised(SYSTEMS[0], Y[0, :steps])[1][-1])
     claimed = np.linalg.det(np.asarray(got[1][-1]))
     assert claimed < (0.3 if feedback == "full" else 1.0) * central
+
+
+# ------------------------------------------------------------------------- states of one local
+
+
+def dense_common(beliefs, common):
+    """Marginals of all added up; the rest by the conditional distribution in the first."""
+    c = slice(0, common)
+    x, P = added([(x[c], P[c, c]) for x, P in beliefs])
+    x1, P1 = beliefs[0]
+    G = P1[common:, c] @ np.linalg.inv(P1[c, c])
+    rest = P1[common:, common:] - G @ P1[c, common:]
+    mean = np.concatenate([x, x1[common:] + G @ (x - x1[c])])
+    return mean, np.block([[P, P @ G.T], [G @ P, G @ P @ G.T + rest]])
+
+
+@pytest.mark.parametrize("feedback", ["own", "mean"])
+def test_states_of_the_first_local_follow_what_is_common(feedback):
+    s, members, out = SYSTEMS[0], [(SYSTEMS[0].m0, SYSTEMS[0].P0)] * 2, []
+    for row in Y[0, :12]:
+        members = [(s.F @ x, s.F @ P @ s.F.T + s.Q) for x, P in members]
+        pairs = zip(members, ROWS.values(), strict=True)
+        members = [corrected(s, one, row, rows) for one, rows in pairs]
+        out.append(dense_common(members, 3))
+        if feedback == "mean":
+            members = [(out[-1][0], P) for _, P in members]
+    got = one_run(distributed(CHANNELS, feedback, common=3), 12)
+    for found, want in zip(got, zip(*out, strict=True), strict=True):
+        np.testing.assert_allclose(found, np.array(want), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("common", [1, 2, 4])
+def test_a_common_sum_on_a_manifold(common):
+    # An attitude of the first local beside positions that all have; angles on both sides of +-pi.
+    rng = np.random.default_rng(common)
+    roots = [np.tril(rng.normal(size=(5, 5))) + 2.0 * np.eye(5) for _ in range(3)]
+    x = [rng.normal(size=4) * 0.1 for _ in roots]
+    means = [
+        {"a": Angle(jnp.array(np.pi + a[0])), "b": jnp.array([*a[1:], 7.0 * i])}
+        for i, a in enumerate(x)
+    ]
+    beliefs = [Belief(m, jnp.asarray(S)) for m, S in zip(means, roots, strict=True)]
+    got = common_information_sum(beliefs, common)
+    dense = [
+        (np.array([*a, 7.0 * i]), S @ S.T) for i, (a, S) in enumerate(zip(x, roots, strict=True))
+    ]
+    mean, P = dense_common(dense, common)
+    np.testing.assert_allclose(got.covariance, P, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(got.mean["b"], mean[1:], rtol=1e-10, atol=1e-12)
+    assert float(got.mean["a"].local(Angle(jnp.array(np.pi + mean[0])))[0]) == pytest.approx(
+        0.0, abs=1e-12
+    )
+
+
+def test_common_components_there_must_be():
+    with pytest.raises(ValueError, match="at least one component"):
+        distributed(CHANNELS, common=0)
+    with pytest.raises(ValueError, match="5 components are common, the state has 4"):
+        one_run(distributed(CHANNELS, common=5), 2)
 
 
 def test_intersecting_filters_are_the_intersection_of_each_alone():

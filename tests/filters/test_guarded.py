@@ -109,8 +109,8 @@ WRONG = {
 
 @pytest.mark.parametrize("case", WRONG)
 def test_what_is_wrong_costs_five_percent_at_most(case):
-    *errors, sigma = WRONG[case]
-    got, plain, bold, said = both(sigma, SAR, held(TRUTH, *errors))
+    white, lasting, jump, sigma = WRONG[case]
+    got, plain, bold, said = both(sigma, SAR, held(TRUTH, white, lasting, jump))
     assert max(mean_error(bold, p) / mean_error(plain, p) for p in (P, V)) > 1.25
     for part in (P, V):
         assert mean_error(got, part) < 1.05 * mean_error(plain, part)
@@ -295,8 +295,9 @@ def test_angles_differ_the_short_way_and_a_run_is_differentiable():
 
 def test_reset_audit_and_notes_reach_both():
     one = guarded(kalman(rules=[igg3()]), kalman(rules=[gate()]), **GUARD)
-    seen = model(0.05).sensors[0], jnp.asarray(SAR[0, 0])
-    state, info = one.update(one.init(START, model(0.05).dims), *seen)
+    state, info = one.update(
+        one.init(START, model(0.05).dims), model(0.05).sensors[0], SAR[0, 0], None
+    )
     assert {"igg3.weight", "reference.gate.ratio"} <= set(info.notes)
     after = one.reset(state, START)
     for side in ("filter", "reference"):
@@ -311,6 +312,7 @@ def test_reset_audit_and_notes_reach_both():
     told = gate()._replace(audit=audit)
     two = guarded(kalman(rules=[told]), kalman(rules=[told]), **GUARD)
     state = two.init(START, model(0.05).dims)
+    assert two.audit is not None
     two.audit(state, state, lambda first: first, 5.0)
     assert [time for _, _, time, _ in heard] == [5.0, 5.0]
     assert set(heard[0][0]) == {"sar", "wind"}

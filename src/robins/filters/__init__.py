@@ -22,6 +22,7 @@ from robins.filters.linearise import (
     unscented,
     unscented_transform,
 )
+from robins.filters.master import at_master
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
@@ -60,6 +61,7 @@ __all__ = [
     "Step",
     "StepInfo",
     "Transition",
+    "at_master",
     "channel",
     "covariance_intersection",
     "cubature",

@@ -14,12 +14,17 @@ the three readings are ``feedback``:
 Locals with the same prior and process noise are not independent, so even the first is somewhat
 overconfident. The federated filter (`robins.filters.federated`) shares both out and is not;
 covariance intersection is safe whatever the correlation.
+
+States that only one local has (the errors of a wind that only its sensors see) cannot be fused:
+with ``common`` the first so many tangent components are, from the marginals of all locals, and the
+rest follows from what the first local makes of it.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -37,7 +42,13 @@ from robins.filters.channels import (
     starting,
     updating,
 )
-from robins.filters.fusion import Criterion, check_criterion, information_sum, intersection_weights
+from robins.filters.fusion import (
+    Criterion,
+    check_criterion,
+    common_information_sum,
+    information_sum,
+    intersection_weights,
+)
 from robins.filters.kalman import Filter, FilterState, compiled
 from robins.filters.model import Motion
 
@@ -50,7 +61,9 @@ FULL = (
 )
 
 
-def distributed(channels: Sequence[Channel], feedback: Feedback = "own") -> Filter:
+def distributed(
+    channels: Sequence[Channel], feedback: Feedback = "own", common: int | None = None
+) -> Filter:
     """Local filters with the whole prior and process noise, fused by an information sum (51).
 
     The belief of its state is the fused one. Locals have their prior and process noise in common,
@@ -64,16 +77,25 @@ def distributed(channels: Sequence[Channel], feedback: Feedback = "own") -> Filt
     Args:
         channels: from `channel`; every sensor of the model belongs to exactly one.
         feedback: "own", "mean" or "full" (module docstring).
+        common: how many tangent components, from the first on, are fused by (51); all by default.
+            The others belong to the first channel, and follow from its conditional distribution
+            given the common ones (`common_information_sum`). Locals are of one state, so the other
+            channels carry those components as well, but nothing of what they make of them is used.
 
     Raises:
-        ValueError: a sensor in two channels, an unknown feedback; at `init`, a sensor without a
-            channel.
+        ValueError: a sensor in two channels, an unknown feedback, no common component; at `init`, a
+            sensor without a channel, or a state with fewer components than are common.
     """
     if feedback not in ("own", "mean", "full"):
         raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
     if feedback == "full":
         warnings.warn(FULL, UserWarning, stacklevel=2)
-    return _side_by_side(channels, information_sum, feedback, "distributed")
+    if common is None:
+        return _side_by_side(channels, information_sum, feedback, "distributed")
+    if common < 1:
+        raise ValueError(f"distributed: at least one component must be common, got {common}")
+    summed = partial(common_information_sum, common=common)
+    return _side_by_side(channels, summed, feedback, "distributed", common)
 
 
 def intersecting(
@@ -105,13 +127,20 @@ def intersecting(
     return _side_by_side(channels, intersect, feedback, "intersecting")
 
 
-def _side_by_side(channels: Sequence[Channel], fuse: Fuse, feedback: Feedback, name: str) -> Filter:
+def _side_by_side(
+    channels: Sequence[Channel], fuse: Fuse, feedback: Feedback, name: str, common: int = 1
+) -> Filter:
     channels = tuple(channels)
     owners(channels)
     count = len(channels)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
         each = local_dims(channels, dims)
+        if belief.factor.shape[0] < common:
+            raise ValueError(
+                f"distributed: {common} components are common, the state has "
+                f"{belief.factor.shape[0]}"
+            )
         states = [c.filter.init(belief, d) for c, d in zip(channels, each, strict=True)]
         return starting(states, belief, jnp.ones((count, 1)), count)
 

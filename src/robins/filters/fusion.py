@@ -94,12 +94,44 @@ def information_sum(beliefs: Sequence[Belief], weights: Array | None = None) -> 
 
     A singular covariance gives infinities or NaN.
     """
-    n = beliefs[0].factor.shape[0]
+    first = beliefs[0]
+    aways = [manifold.local(first.mean, belief.mean) for belief in beliefs]
+    away, factor = _summed([belief.factor for belief in beliefs], aways, weights)
+    return Belief(manifold.retract(first.mean, away), factor)
+
+
+@partial(jax.jit, static_argnames="common")
+def common_information_sum(beliefs: Sequence[Belief], common: int) -> Belief:
+    """`information_sum` of the first ``common`` tangent components; the others follow the first.
+
+    The marginals x_ic, P_icc of all beliefs are summed. What else the first belief knows, x_w, goes
+    with its conditional distribution given the common components c, which is left as it is:
+
+        G = P_1wc P_1cc^-1,   x_w = x_1w + G (x_c - x_1c),   P_w = G P_c G' + (P_1ww - G P_1cw)
+
+    With a lower factor [[S_c, 0], [S_wc, S_w]] that is G = S_wc S_c^-1, and S_w stays.
+    """
+    first = beliefs[0]
+    aways = [manifold.local(first.mean, belief.mean)[:common] for belief in beliefs]
+    factors = [belief.factor[:common, :common] for belief in beliefs]
+    away, factor = _summed(factors, aways, None)
+    S = first.factor
+    G = linalg.solve_lower_transposed(S[:common, :common], S[common:, :common].T).T
+    top = jnp.concatenate([factor, jnp.zeros_like(S[:common, common:])], axis=1)
+    rest = jnp.concatenate([G @ factor, S[common:, common:]], axis=1)
+    mean = manifold.retract(first.mean, jnp.concatenate([away, G @ away]))
+    return Belief(mean, jnp.concatenate([top, rest]))
+
+
+def _summed(
+    factors: Sequence[Array], aways: Sequence[Array], weights: Array | None
+) -> tuple[Array, Array]:
+    """Deviation and factor of an information sum, from factors and deviations of its parts."""
+    n = factors[0].shape[0]
     columns = []
-    for i, belief in enumerate(beliefs):
-        away = manifold.local(beliefs[0].mean, belief.mean)
+    for i, (factor, away) in enumerate(zip(factors, aways, strict=True)):
         wide = jnp.concatenate([linalg.identity(n), away[:, None]], axis=1)
-        rows = linalg.solve_lower(belief.factor, wide)  # S^-1 and S^-1 times the deviation
+        rows = linalg.solve_lower(factor, wide)  # S^-1 and S^-1 times the deviation
         if weights is not None:
             rows = rows * jnp.sqrt(weights[i])
         # States in reverse, so that the triangle's inverse, turned back, is lower again.
@@ -107,8 +139,7 @@ def information_sum(beliefs: Sequence[Belief], weights: Array | None = None) -> 
     triangle = linalg.tria(*columns)
     wide = jnp.concatenate([linalg.identity(n), triangle[n, :n, None]], axis=1)
     solved = linalg.solve_lower_transposed(triangle[:n, :n], wide)
-    mean = manifold.retract(beliefs[0].mean, solved[::-1, n])
-    return Belief(mean, solved[::-1, n - 1 :: -1])
+    return solved[::-1, n], solved[::-1, n - 1 :: -1]
 
 
 # ------------------------------------------------------------------------------------------ share

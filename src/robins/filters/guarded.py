@@ -37,6 +37,7 @@ from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.channels import Joined
 from robins.filters.kalman import Again, Filter, FilterState, Prediction, compiled
+from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
 
@@ -288,14 +289,25 @@ def _taken_over(filter: Filter, mine: FilterState, other: FilterState) -> Filter
     belief would have it in every local, and so count it more than once.
     """
     state = filter.reset(mine, other.belief)
+    followed = _local_by_local(mine, other)
+    return state if followed is None else followed
+
+
+def _local_by_local(mine: FilterState, other: FilterState) -> FilterState | None:
+    """A joined filter, each local at the belief of the other's; None where that cannot be."""
     a, b = mine.memory, other.memory
+    if isinstance(a, Mastered):
+        joined = _local_by_local(a.joined, b.joined if isinstance(b, Mastered) else other)
+        if joined is None:
+            return None
+        return FilterState(joined.belief, a._replace(joined=joined))
     if not (isinstance(a, Joined) and isinstance(b, Joined)) or len(a.members) != len(b.members):
-        return state
+        return None
     pairs = list(zip(a.members, b.members, strict=True))
     if any(m.points != () or m.belief.factor.shape != o.belief.factor.shape for m, o in pairs):
-        return state
+        return None
     members = tuple(m._replace(belief=o.belief) for m, o in pairs)
-    return state._replace(memory=a._replace(members=members))
+    return mine._replace(belief=other.belief, memory=a._replace(members=members))
 
 
 def _check(
