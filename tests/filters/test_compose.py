@@ -22,6 +22,8 @@ from robins.filters.rules import (
     igg3,
     inequality,
     innovation_fading,
+    only,
+    projection,
     sage_husa,
     strong_tracking,
     student_t,
@@ -62,6 +64,8 @@ RULES = {
     "equality": equality(jnp.array([[1.0, 0.0, 1.0, 0.0]]), jnp.array([0.5])),
     "inequality": inequality(jnp.array([[1.0, 0.0, 0.0, 0.0]]), [-10.0], [10.0]),
     "consider": consider([3]),
+    "projection": projection("y"),
+    "gate only": only("y", gate()),
 }
 SILENT = {"consider"}  # says nothing that StepInfo does not say
 NAMES = list(RULES)

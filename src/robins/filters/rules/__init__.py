@@ -12,6 +12,8 @@ from robins.filters.rules.huber import huber
 from robins.filters.rules.igg3 import igg3
 from robins.filters.rules.inequality import inequality
 from robins.filters.rules.innovation_fading import innovation_fading
+from robins.filters.rules.only import only
+from robins.filters.rules.projection import projection
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.strong_tracking import strong_tracking
 from robins.filters.rules.student_t import student_t
@@ -31,7 +33,9 @@ __all__ = [
     "igg3",
     "inequality",
     "innovation_fading",
+    "only",
     "per_step",
+    "projection",
     "sage_husa",
     "strong_tracking",
     "student_t",

@@ -1,0 +1,116 @@
+"""Put the state on a constraint whose numbers come with the data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.constrain import Weight, metric_of, nearest
+from robins.filters.observation import Observation
+from robins.filters.rule import Rule
+
+
+def projection(
+    sensors: str | Sequence[str], weight: Weight = "covariance", project_covariance: bool = True
+) -> Rule:
+    """Measurements of the named sensors are constraints, and are met instead of weighed.
+
+    With the measurement linearised as d = D x + error, error ~ N(0, R_d), the Kalman update gives
+    way to the projection (Simon & Chia 2002, sec. II)
+
+        G = V D' (D V D')^-1,   x* = x - G (D x - d),   P* = (I - G D) P (I - G D)' + G R_d G'
+
+    with V = P, or W^-1. The gain takes the constraint for exact; its noise, and what the
+    linearisation leaves over, is counted in P* alone. `equality` is for a constraint whose numbers
+    are the same throughout a run; to weigh the measurement, leave the rule out.
+
+    Where R_d is zero P* is *singular*: nothing is uncertain across the constraint. Updates that
+    follow, predictions and sigma points are sound with ``form="sqrt"``; ``form="joseph"`` says
+    `Code.INDEFINITE`, and the information sum of `distributed` does not take the step, since there
+    is nothing to invert: give the sensor a noise far below what matters (1e-3 m/s), or apply it
+    ``at_master``. What was met already is left out. A weight other than "covariance" wants a prior
+    that is not singular: of a combination that is known exactly D is not seen.
+
+    It goes before rules that look at the posterior: what rules before it did to that is lost.
+
+    Notes: ``projection.residual``, the greatest component of d - D x.
+
+    Args:
+        sensors: a name, or several.
+        weight: metric W in which the state is moved least: "covariance" for P^-1, "identity", or a
+            positive definite (n, n) matrix in tangent coordinates.
+        project_covariance: False leaves P as it was: the mean is on the constraint, and the filter
+            does not know it. Better where the error of the constraint lasts from step to step.
+
+    Raises:
+        ValueError: no sensor is named, or the weight is none; by `init`, it is not of the state's
+            dimension, or a sensor has more components than the state.
+    """
+    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
+    if not names:
+        raise ValueError("projection: name at least one sensor whose measurements are constraints")
+    _check_weight(weight)
+
+    def init(belief: Belief, dims: Mapping[str, int]):
+        n = belief.factor.shape[0]
+        if not isinstance(weight, str) and np.shape(weight) != (n, n):
+            raise ValueError(f"projection weight is {np.shape(weight)}, the state needs ({n}, {n})")
+        for name, m in dims.items():
+            if name in names and m > n:
+                raise ValueError(f"sensor '{name}' has {m} components, the state only {n} to move")
+        return ()
+
+    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
+        if o.sensor not in names:
+            return memory, posterior, info
+        belief, gain, used = projected(o, weight, project_covariance)
+        notes = {**info.notes, "projection.residual": jnp.max(jnp.abs(o.residual))}
+        gain = jnp.where(used[None, :], gain, 0.0)
+        return memory, belief, info._replace(gain=gain, notes=notes)
+
+    return Rule(init=init, after=after, name="projection")
+
+
+def projected(
+    o: Observation, weight: Weight, project_covariance: bool = True
+) -> tuple[Belief, Array, Array]:
+    """The belief on the constraint that an observation is, the gain, and what was used."""
+    prior, S = o.prior, o.prior.factor
+    metric, root = metric_of(prior, weight)
+    spread = o.spread if root is None else _slope(o) @ metric.factor
+    nothing = linalg.zeros(len(o.residual), 0)
+    exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
+    mean, G, used = nearest(metric, exact)
+    factor = S
+    if project_covariance:
+        error = jnp.concatenate([o.excess, o.noise], axis=1)
+        factor = linalg.tria(S - G @ jnp.where(used[:, None], o.spread, 0.0), G @ error)
+        # Across an exact constraint nothing is left, not even rounding.
+        clean = jnp.any(used & ~jnp.any(error != 0.0, axis=1))
+        lost = linalg.lost_in_rounding(factor, prior.sigma)
+        factor = jnp.where(clean & lost, 0.0, factor)
+    some = jnp.any(used)
+    return Belief(mean, linalg.where(some, factor, S)), G, used
+
+
+def _slope(o: Observation) -> Array:
+    """D, of which the spread D S is known: D = D S S' (S S')^-1."""
+    solid, _ = linalg.guard(o.prior.factor)
+    return linalg.solve_spd(solid, o.prior.factor @ o.spread.T).T
+
+
+def _check_weight(weight: Weight) -> None:
+    if isinstance(weight, str):
+        if weight not in ("covariance", "identity"):
+            raise ValueError(
+                f"projection weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
+            )
+        return
+    root = np.asarray(linalg.factor(np.asarray(weight, float), "projection weight"))
+    if not np.all(np.diag(root) > 0.0):
+        raise ValueError("projection weight is not positive definite: each state wants a weight")
