@@ -14,11 +14,11 @@ from jaxtyping import Array
 
 from robins.campaign.monte_carlo import worlds
 from robins.filters import Belief
-from robins.filters.bound import covariance_bound, used_sensors
+from robins.filters.bound import bound_along, linearised, used_sensors
 from robins.filters.observability import (
     NOTHING,
     bits,
-    observability,
+    observability_along,
     spectrum,
     unobservable,
     worded,
@@ -63,16 +63,17 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     names = [s.name for s in c.model.sensors]
     one_less = use & ~np.eye(len(use), dtype=bool)
     subsets = jnp.asarray(np.concatenate([[use], [np.zeros_like(use)], one_less]))
-    parts, observed = [], None
+    squares, priors, first = 0.0, 0.0, None
     for batch, count in worlds(problem, runs):
-        found = _bounds(c.model, case, c.reported, subsets, batch)
-        parts.append([np.asarray(x)[:count] for x in found[:2]])
-        if observed is None:
-            one = jax.tree_util.tree_map(lambda x: x[0], batch)
-            observed = *_observed(c.model, case, jnp.asarray(use), one), found[2][0]
-    assert observed is not None
-    L, D, spoke = map(np.asarray, observed)
-    sigma, prior = (np.sqrt(np.mean(np.concatenate(p), axis=0)) for p in zip(*parts, strict=True))
+        for k in range(count):
+            world = jax.tree_util.tree_map(lambda x, k=k: x[k], batch)
+            square, prior, *seen = map(
+                np.asarray, _bound(c.model, case, c.reported, subsets, world)
+            )
+            squares, priors, first = squares + square, priors + prior, first or seen
+    assert first is not None
+    L, D, spoke = first
+    sigma, prior = np.sqrt(squares / runs), np.sqrt(priors / runs)
     if not (np.all(np.isfinite(sigma)) and np.all(np.isfinite(L))):
         raise ValueError(
             f"the bound of filter '{name}' is not finite: its model cannot be linearised along the "
@@ -109,33 +110,20 @@ def _rows(reported: Any, factor: Array) -> Array:
 
 
 @jax.jit
-def _bounds(model, case: Partial, reported, subsets, worlds):
-    """(runs, V, E, r) variances, (runs, r) of the prior, (runs, S) sensors that ever spoke."""
-
-    def one(world):
-        it = case(world)
-        start = _start(it)
-
-        def of(use):
-            y, u, aux = it.y, it.u, it.aux
-            return _rows(reported, covariance_bound(model, start, it.truth, y, u, aux, use).factor)
-
-        spoke = [_speaks(it.y[s.name]) if s.name in it.y else False for s in model.sensors]
-        return jax.vmap(of)(subsets), _rows(reported, start.factor), jnp.array(spoke)
-
-    return jax.lax.map(one, worlds)
-
-
-def _speaks(y: Any) -> Array:
-    found = [jnp.any(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(y)]
-    return jnp.any(jnp.stack(found))
-
-
-@jax.jit
-def _observed(model, case: Partial, use, world):
+def _bound(model, case: Partial, reported, subsets, world):
+    """Of a run: (V, E, r) variances with subsets of the sensors, the first of which is the one
+    that counts, and (r,) of the prior; L, D of the Gramian; (S,) which sensors ever spoke.
+    """
     it = case(world)
     start = _start(it)
-    return observability(model, start, it.truth, it.y, it.u, it.aux, use), start.sigma
+    line = linearised(model, start, it.truth, it.y, it.u, it.aux)
+
+    def of(use):
+        return _rows(reported, bound_along(line, start.factor, use).factor)
+
+    L = observability_along(line, start.sigma, subsets[0])
+    spoke = [jnp.array(False) if s is None else jnp.any(s.present) for s in line.sights]
+    return jax.vmap(of)(subsets), _rows(reported, start.factor), L, start.sigma, jnp.stack(spoke)
 
 
 def _sigmas(

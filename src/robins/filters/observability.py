@@ -30,10 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins import linalg, manifold
+from robins import linalg
 from robins.filters.belief import Belief
-from robins.filters.bound import Along, along, sights
-from robins.filters.linearise import taylor
+from robins.filters.bound import Linearised, linearised
 from robins.filters.model import Model
 from robins.filters.observation import left_out
 from robins.manifold import State
@@ -52,19 +51,17 @@ def observability(
     use: Any = None,
     window: int | None = None,
 ) -> Array:
-    """Factors L of (I + W)^-1 after every step of a run; one scan, ready for `jax.vmap`.
+    """Factors L of (I + W)^-1 after every step of a run; ready for `jax.vmap`.
 
     Args:
-        model: the motion and the sensors, linearised as in `covariance_bound`.
+        model: the motion and the sensors.
         start: belief before the first step; its standard deviations are the units.
-        truth: true states at the measurements, leading axis E.
-        y: by sensor name, leading axis E. Only what is NaN matters.
-        u: inputs of the motion, leading axis E.
-        aux: what sensors need besides the state, by sensor name, leading axis E.
-        use: (S,) bool, which sensors to use; all by default.
-        window: number of steps after which to begin anew, each window with the same units. By
-            default the whole run is one window. A direction that grows and is never seen overflows
-            after 700 of its time constants: give windows then.
+        truth: as `robins.filters.bound.linearised` takes it, and so y, u and aux.
+        y: by sensor name.
+        u: inputs of the motion.
+        aux: what sensors need besides the state.
+        use: which sensors to use, as `observability_along` takes it.
+        window: after how many steps to begin anew, as `observability_along` takes it.
 
     Returns:
         (E, n, n); `bits`, `gramian` and `spectrum` read it.
@@ -72,27 +69,45 @@ def observability(
     Raises:
         ValueError: lengths differ, or a window is shorter than a step.
     """
+    line = linearised(model, start, truth, y, u, aux)
+    return observability_along(line, start.sigma, use, window)
+
+
+def observability_along(
+    line: Linearised, sigma: Array, use: Any = None, window: int | None = None
+) -> Array:
+    """The same of a model that has been linearised; one scan.
+
+    Args:
+        line: from `robins.filters.bound.linearised`.
+        sigma: (n,) units of the states, their prior standard deviations.
+        use: (S,) bool, which sensors of the model to use, in its order; all by default.
+        window: number of steps after which to begin anew, each window with the same units. By
+            default the whole run is one window. A direction that grows and is never seen overflows
+            after 700 of its time constants: give windows then.
+
+    Raises:
+        ValueError: a window is shorter than a step.
+    """
     if window is not None and window < 1:
         raise ValueError(f"a window of {window} steps: at least one is wanted")
-    n = manifold.dim(start.mean)
-    way, unit = taylor(), linalg.identity(n)
-    D = jnp.diag(start.sigma)
-    use = None if use is None else jnp.asarray(use, bool)
-    rows = along(start, truth, y, u, aux)
+    unit, D = linalg.identity(sigma.shape[0]), jnp.diag(sigma)
+    use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
 
-    def step(carry: tuple[Array, Array], item: tuple[Array, Along]):
+    def step(carry: tuple[Array, Array], item: tuple[Array, Linearised]):
         fresh, row = item
         L, M = (jnp.where(fresh, a, b) for a, b in zip((unit, D), carry, strict=True))
-        M = way.transition(Belief(row.before, M), model.motion, row.u).spread
-        for look in sights(model, row, use):
-            spread, excess, noise, _, _ = left_out(look(Belief(row.truth, M)))
-            T = linalg.block_factor(spread, (excess, noise), unit)[2]
-            L, M = L @ T, M @ T
+        M = row.F @ M
+        for i, sight in enumerate(row.sights):
+            if sight is not None:
+                spread, excess, noise, _, _ = left_out(sight.seen_with(M, use[i]))
+                T = linalg.block_factor(spread, (excess, noise), unit)[2]
+                L, M = L @ T, M @ T
         return (L, M), L
 
-    number = jnp.arange(jax.tree_util.tree_leaves(rows.truth)[0].shape[0])
+    number = jnp.arange(line.F.shape[0])
     fresh = jnp.zeros(number.shape, bool) if window is None else number % window == 0
-    return jax.lax.scan(step, (unit, D), (fresh, rows))[1]
+    return jax.lax.scan(step, (unit, D), (fresh, line))[1]
 
 
 def bits(L: Any) -> np.ndarray:
