@@ -1,6 +1,7 @@
 """Filters: a way to linearise and a chain of rules. Knows no navigation, no sensor, no file."""
 
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
+from robins.filters.bound import Bound, bound_along, covariance_bound, linearised, used_sensors
 from robins.filters.channels import Channel, channel
 from robins.filters.delayed import Late, delayed
 from robins.filters.distributed import distributed, intersecting
@@ -24,6 +25,7 @@ from robins.filters.linearise import (
 )
 from robins.filters.master import at_master
 from robins.filters.model import Model, Motion, Sensor
+from robins.filters.observability import observability, observability_along
 from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
 from robins.filters.particle import particle, reseed
@@ -41,6 +43,7 @@ from robins.filters.worst_case import (
 __all__ = [
     "SENTENCES",
     "Belief",
+    "Bound",
     "Channel",
     "Code",
     "Filter",
@@ -62,7 +65,9 @@ __all__ = [
     "StepInfo",
     "Transition",
     "at_master",
+    "bound_along",
     "channel",
+    "covariance_bound",
     "covariance_intersection",
     "cubature",
     "delayed",
@@ -77,8 +82,11 @@ __all__ = [
     "intersecting",
     "iterated",
     "kalman",
+    "linearised",
     "mode",
     "normalised",
+    "observability",
+    "observability_along",
     "observability_shares",
     "particle",
     "reseed",
@@ -91,5 +99,6 @@ __all__ = [
     "taylor",
     "unscented",
     "unscented_transform",
+    "used_sensors",
     "worst_case_gain",
 ]

@@ -55,6 +55,12 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``rms_BLOCK``                           (filter, time, axis_BLOCK) over the runs of a campaign;
                                         attribute ``runs``
 ``mean_sigma_BLOCK``                    the same; root of the mean variance the filter states
+``bound_BLOCK``                         (time, axis_BLOCK) covariance bound, one standard deviation
+``bound_prior_BLOCK, bound_left_BLOCK`` (axis_BLOCK) and, as the bound, ``bound_unaided_BLOCK``,
+                                        ``bound_without_BLOCK`` (sensor, time, axis_BLOCK); of
+                                        `robins.campaign.bound`, as the next row
+``information``                         (state, time) bits; also ``gramian`` (direction) and
+                                        ``gramian_rank``
 ``anees``                               (filter, time); ``runs``, ``degrees_of_freedom`` or an
                                         array ``anees_dof`` of its shape, and ``normalised=1`` if
                                         it is divided by these
