@@ -130,7 +130,7 @@ def test_what_is_right_keeps_most_of_its_gain():
 
 # --------------------------------------------------------------------- the verdict, step by step
 
-LIMIT, PATIENCE, RATIO = 3.0, 2.0, 1.6
+LIMIT, PATIENCE, RATIO = 6.0, 2.0, 1.6
 
 
 def corrected(x, A, C, y, R):
@@ -149,9 +149,9 @@ def by_the_book(sar, wind, sigma):
         nonlocal c, trusted, g, looks, wait, trips
         p, d = np.diag(u[1]), c[0] - u[0]
         T, v = d**2 / p, np.maximum(1 - np.diag(c[1]) / p, 0.0)
-        T, v, w = ([a[:2].mean(), a[2:].mean()] * np.ones(2) for a in (T, v, w))
-        g = np.maximum(0.0, g + w * (T - RATIO * v - 0.1))
-        looks = looks + w
+        told = w * (T - RATIO * v - 0.1)
+        g = np.maximum(0.0, g + told.reshape(2, 2).sum(1))
+        looks = looks + w.reshape(2, 2).mean(1)
         wrong = np.any(g > LIMIT) or np.any(np.abs(d) > 6.0 * np.sqrt(p))
         if wrong:
             if trusted:

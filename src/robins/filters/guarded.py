@@ -16,7 +16,7 @@ difference is on average more than *twice* what it should be. So with
 the mean of T_i is v_i, or 2 v_i where nothing is gained, and evidence is summed up as Page (1954)
 has it for the quickest detection of a change:
 
-    g_i := max(0, g_i + w_i (T_i - ratio v_i - slack)),   1 < ratio < 2;   g_i > limit: wrong
+    g_i := max(0, g_i + w_i (T_i - ratio v_i - slack)),   g_i > limit: wrong
 
 The w_i make samples comparable: differences of consecutive steps are nearly the same number. A
 measurement of a *judge*, a sensor that both filters use, renews the share w_i = 1 - P+_u,ii/P-_u,ii
@@ -72,8 +72,8 @@ def guarded(
     assumption: str | Sequence[str],
     judges: str | Sequence[str],
     groups: Groups | None = None,
-    ratio: Number = 1.75,
-    limit: Number = 4.0,
+    ratio: Number = 2.0,
+    limit: Number = 8.0,
     patience: Number = 5.0,
     leap: Number = 6.0,
     trusted: bool = True,
@@ -90,7 +90,7 @@ def guarded(
     the time.
 
     What is guarded against is harm to the estimate, as far as the reference's covariance is honest:
-    where it is overconfident (NEES per state above one) so many times more makes the ratio right.
+    where it is overconfident (NEES per state above one) a ratio larger by that makes up for it.
 
     What an update says of itself is what the filter that is in charge says; a sensor of the
     assumption that is not trusted is refused. Notes: those of the filter, those of the reference as
@@ -102,10 +102,11 @@ def guarded(
         reference: does without; of the same state. Each may be a filter of filters.
         assumption: sensors that the reference does not use.
         judges: sensors that both use and that no one doubts.
-        groups: tangent components that are judged together, by their mean, such as
-            ``[(3, 4), (6, 7)]``; others are not watched. By default each component by itself.
-        ratio: how many times what it should be a squared difference may be: 2 is equal harm and
-            gain.
+        groups: tangent components that are judged together, by their sum, such as
+            ``[(3, 4), (6, 7)]``; others are not watched. Two axes tell twice as fast as one. By
+            default each component by itself.
+        ratio: how many times what it should be a squared difference may be on average: at 2 a
+            filter that is no better than its reference is still believed.
         limit: of the evidence. Small: quick; large: rarely wrong.
         patience: looks without a doubt before trust is given again.
         leap: deviations of the reference that no difference exceeds by chance; `inf` to leave out.
@@ -122,7 +123,7 @@ def guarded(
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
         if unknown := [name for name in (*assumed, *judging) if name not in dims]:
             raise ValueError(f"guarded: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
-        count = len(_shares(groups, belief.factor.shape[0]))
+        count = len(_members(groups, belief.factor.shape[0]))
         without = {name: m for name, m in dims.items() if name not in assumed}
         watch = Watch(
             filter.init(belief, dims),
@@ -139,11 +140,10 @@ def guarded(
         """The verdict after a step: evidence taken, trust lost or given."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
         renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
-        evidence, looks = watch.evidence, watch.looks
-        M = _shares(groups, len(square))
-        w = M @ renewed
-        excess = M @ square - ratio * (M @ gained) - SLACK
-        evidence, looks = jnp.maximum(evidence + w * excess, 0.0), looks + w
+        M = _members(groups, len(square))
+        told = M @ (renewed * (square - ratio * gained - SLACK))
+        evidence = jnp.maximum(watch.evidence + told, 0.0)
+        looks = watch.looks + M @ renewed / np.sum(M, axis=1)
         off = jnp.any(np.any(M > 0.0, axis=0) & (square > leap**2))
         wrong = failed | off | jnp.any(evidence > limit)
         doubted = wrong | (~watch.trusted & jnp.any(evidence > 0.5 * limit))
@@ -245,8 +245,8 @@ def _difference(mine: Belief, other: Belief) -> tuple[Array, Array]:
     return square, gained
 
 
-def _shares(groups: Groups | None, n: int) -> np.ndarray:
-    """(groups, n) the share of each component in the mean of its group.
+def _members(groups: Groups | None, n: int) -> np.ndarray:
+    """(groups, n) ones where a component belongs to a group.
 
     Raises:
         ValueError: the state has no such component.
@@ -257,7 +257,7 @@ def _shares(groups: Groups | None, n: int) -> np.ndarray:
     for row, members in zip(M, groups, strict=True):
         if any(not 0 <= i < n for i in members):
             raise ValueError(f"guarded: group {list(members)} is not of a state of {n} components")
-        row[list(members)] = 1.0 / len(members)
+        row[list(members)] = 1.0
     return M
 
 
