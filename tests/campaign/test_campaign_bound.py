@@ -1,14 +1,19 @@
 """The bound of a problem against its Kalman filter, on a problem small enough to know by heart."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from jaxtyping import Array
 
 from robins.campaign.bound import bound
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
+from robins.manifold import Angle
 from robins.results import solution as stored
+from robins.rotation import Rotation
 from robins.systems.system import Case, Contender, Problem, SensorAxes, StateBlock
 
 STEPS = 30
@@ -106,6 +111,37 @@ def test_states_and_directions_are_named_by_what_reports_them(found):
         [found.bound_left_place.item(), found.bound_left_speed.item()],
         rtol=1e-12,
     )
+
+
+class Ship(NamedTuple):
+    attitude: Rotation
+    wind_error: Array
+    rest: dict
+
+
+def test_states_that_nothing_reports_are_named_by_their_fields(problem):
+    state = Ship(Rotation.identity(), jnp.zeros(2), {"drift": Angle(jnp.zeros(()))})
+    start = Belief(state, jnp.eye(6))
+    still = Motion(lambda x, u: x, jnp.zeros(6))
+    course = Sensor(lambda x, a: x.wind_error[:1] - x.rest["drift"].local(Angle(0.0)), [1.0], 1)
+    case = Case(start, None, {"y": jnp.zeros((STEPS, 1))}, {}, along(state))
+    turned = np.eye(6)[:2]
+    ship = problem._replace(
+        simulate=lambda i: case,
+        contenders={"kf": Contender(kalman(), Model(still, (course,)), reported=turned)},
+    )
+    found = bound(ship, "kf")
+    assert list(found.state.values) == [
+        *("speed west", "place east", "attitude 3", "wind error 1", "wind error 2", "drift")
+    ]
+    assert int(found.gramian_rank) == 1
+    assert "50 % wind error 1 against 50 % drift" in [d[3:] for d in found.direction.values]
+    assert found.bound_left_speed.item() == pytest.approx(1.0, abs=1e-13)  # nothing tells of it
+
+
+def along(state):
+    """The same state all the time."""
+    return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (STEPS, *x.shape)), state)
 
 
 def test_the_dataset_can_be_stored(found):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from robins.filters.observability import (
     unobservable,
     worded,
 )
+from robins.manifold import State, dim, is_element
 from robins.results import variable
 from robins.systems.system import Problem, StateBlock
 
@@ -63,29 +64,29 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     names = [s.name for s in c.model.sensors]
     one_less = use & ~np.eye(len(use), dtype=bool)
     subsets = jnp.asarray(np.concatenate([[use], [np.zeros_like(use)], one_less]))
-    squares, priors, first = 0.0, 0.0, None
+    variance, prior, first = 0.0, 0.0, None
     for batch, count in worlds(problem, runs):
         for k in range(count):
             world = jax.tree_util.tree_map(lambda x, k=k: x[k], batch)
-            square, prior, *seen = map(
-                np.asarray, _bound(c.model, case, c.reported, subsets, world)
-            )
-            squares, priors, first = squares + square, priors + prior, first or seen
+            found = _bound(c.model, case, c.reported, subsets, world)
+            variance = variance + np.asarray(found.variance) / runs
+            prior = prior + np.asarray(found.prior) / runs
+            first = first or found
     assert first is not None
-    L, D, spoke = first
-    sigma, prior = np.sqrt(squares / runs), np.sqrt(priors / runs)
+    L, D = np.asarray(first.L), np.asarray(first.D)
+    sigma, prior = np.sqrt(variance), np.sqrt(prior)
     if not (np.all(np.isfinite(sigma)) and np.all(np.isfinite(L))):
         raise ValueError(
             f"the bound of filter '{name}' is not finite: its model cannot be linearised along the "
             "true states, or something in it grows without bound and is not seen"
         )
-    shown = [i for i in range(len(names)) if spoke[i] and use[i]]
+    shown = [i for i in range(len(names)) if first.spoke[i] and use[i]]
     if not shown:
         raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
     rows = np.eye(len(D)) if c.reported is None else np.asarray(c.reported, float)
     left = _left(rows, L[-1], D)
     data, coords = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
-    more, places = _information(*_states(problem.blocks, rows), L, D)
+    more, places = _information(*_states(problem.blocks, rows, first.mean), L, D)
     told = {"filter": name, "runs": runs, "without": ", ".join(without)}
     return xr.Dataset(data | more, coords | places, told)
 
@@ -109,11 +110,19 @@ def _rows(reported: Any, factor: Array) -> Array:
     return jnp.sum(mapped**2, axis=-1)
 
 
+class _Found(NamedTuple):
+    """What a run tells."""
+
+    variance: Array  # (V, E, r) by subset of the sensors
+    prior: Array  # (r,) variances
+    mean: State  # of the start
+    L: Array  # (E, n, n) of the Gramian, with the first subset
+    D: Array  # (n,) its units
+    spoke: Array  # (S,) which sensors ever measured anything
+
+
 @jax.jit
-def _bound(model, case: Partial, reported, subsets, world):
-    """Of a run: (V, E, r) variances with subsets of the sensors, the first of which is the one
-    that counts, and (r,) of the prior; L, D of the Gramian; (S,) which sensors ever spoke.
-    """
+def _bound(model, case: Partial, reported, subsets, world) -> _Found:
     it = case(world)
     start = _start(it)
     line = linearised(model, start, it.truth, it.y, it.u, it.aux)
@@ -123,7 +132,8 @@ def _bound(model, case: Partial, reported, subsets, world):
 
     L = observability_along(line, start.sigma, subsets[0])
     spoke = [jnp.array(False) if s is None else jnp.any(s.present) for s in line.sights]
-    return jax.vmap(of)(subsets), _rows(reported, start.factor), L, start.sigma, jnp.stack(spoke)
+    prior = _rows(reported, start.factor)
+    return _Found(jax.vmap(of)(subsets), prior, start.mean, L, start.sigma, jnp.stack(spoke))
 
 
 def _sigmas(
@@ -154,13 +164,14 @@ def _sigmas(
     return data, coords
 
 
-def _states(blocks: Sequence[StateBlock], rows: np.ndarray) -> tuple[list[str], np.ndarray]:
+def _states(
+    blocks: Sequence[StateBlock], rows: np.ndarray, mean: State
+) -> tuple[list[str], np.ndarray]:
     """Names of the tangent components, and the sign with which they are reported.
 
-    A component takes the name of what reports it alone; others are numbered.
+    A component takes the name of what reports it alone, others that of their place in the state.
     """
-    n = rows.shape[1]
-    names, sign = [f"state {i + 1}" for i in range(n)], np.ones(n)
+    names, sign = _named(mean), np.ones(rows.shape[1])
     for b in blocks:
         for row, axis in zip(rows[b.where], b.axes, strict=True):
             (at,) = np.nonzero(row)
@@ -168,6 +179,21 @@ def _states(blocks: Sequence[StateBlock], rows: np.ndarray) -> tuple[list[str], 
                 names[at[0]] = f"{b.name.replace('_', ' ')} {axis}"
                 sign[at[0]] = np.sign(row[at[0]])
     return names, sign
+
+
+def _named(mean: State) -> list[str]:
+    """Names of the tangent components by the fields of the state, or by their numbers."""
+    names: list[str] = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(mean, is_leaf=is_element)[0]:
+        size = dim(leaf)
+        field = getattr(path[-1], "name", getattr(path[-1], "key", None)) if path else None
+        for i in range(size):
+            number = f" {i + 1}" if size > 1 else ""
+            named = isinstance(field, str)
+            names.append(
+                f"{field.replace('_', ' ')}{number}" if named else f"state {len(names) + 1}"
+            )
+    return names
 
 
 def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarray):

@@ -163,7 +163,7 @@ def worded(vector: np.ndarray, names: Sequence[str], most: int = 4) -> str:
     The shares are squares of the components, in units of the prior; "with" joins states of one
     sign, "against" of opposite ones. States that have less than 1 % are left out.
     """
-    order = np.argsort(-np.abs(vector), kind="stable")[:most]
+    order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:most]  # ties keep their order
     text = ""
     for i in order:
         share = 100.0 * vector[i] ** 2 / float(np.sum(vector**2))
