@@ -1,6 +1,6 @@
 """Systems: one problem each, with model, scenarios, filters and claims; here is the registry."""
 
-from robins.systems import ins_gnss, transfer_alignment
+from robins.systems import airship, ins_gnss, transfer_alignment
 from robins.systems.system import (
     Case,
     Contender,
@@ -14,7 +14,9 @@ from robins.systems.system import (
     System,
 )
 
-SYSTEMS: dict[str, System] = {s.name: s for s in (ins_gnss.SYSTEM, transfer_alignment.SYSTEM)}
+SYSTEMS: dict[str, System] = {
+    s.name: s for s in (ins_gnss.SYSTEM, transfer_alignment.SYSTEM, airship.SYSTEM)
+}
 
 __all__ = [
     "SYSTEMS",

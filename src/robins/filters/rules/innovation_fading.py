@@ -27,9 +27,12 @@ class Memory(NamedTuple):
     windows: dict[str, Window]
     faded: Array  # () bool
     factor: Array  # () lambda of the last update
+    reach: Array  # (n,) standard deviations beyond which nothing is faded
 
 
-def innovation_fading(window: int = 10, limit: Number = 5.0) -> Rule:
+def innovation_fading(
+    window: int = 10, limit: Number = 5.0, reach: Number = float("inf")
+) -> Rule:
     """One fading factor from the mean innovation of a window (Mehra 1972, covariance matching).
 
     The form that robust adaptive filters of integrated navigation pair with robust weights
@@ -41,17 +44,22 @@ def innovation_fading(window: int = 10, limit: Number = 5.0) -> Rule:
 
     R is the noise as the rules before this one leave it: behind a robust weight w the terms are
     w_i e_i^2 / R_ii, so that an outlier does not fade. A component that is missing or refused is
-    left out of the sums, and its window does not move; until the window is full, the mean is of
-    what there is.
+    left out of the sums, and its window does not move; it does not count before its window is full.
 
     A step is faded once: by the first of its sensors whose lambda exceeds 1; those after it see the
     prior that this one has left.
+
+    One factor for all states also fades those that no sensor of the filter sees, and nothing brings
+    these back: in a filter of a star sensor the position doubts itself until nothing is linear any
+    more. So a step that would take any standard deviation beyond ``reach`` times what it was at the
+    start is not faded.
 
     Notes: ``innovation_fading.lambda``. limit = 1 is the Kalman filter, bit for bit.
 
     Args:
         window: samples in the mean.
         limit: greatest lambda.
+        reach: greatest standard deviation that fading leads to, over the one at the start.
 
     Raises:
         ValueError: a parameter is not of its range.
@@ -60,12 +68,16 @@ def innovation_fading(window: int = 10, limit: Number = 5.0) -> Rule:
         raise ValueError(f"innovation_fading window must be 1 sample or more, got {window}")
     if not 1.0 <= limit < float("inf"):
         raise ValueError(f"innovation_fading limit must be finite and not below 1, got {limit}")
+    if not reach >= 1.0:
+        raise ValueError(f"innovation_fading reach must be at least 1, got {reach}")
 
     def init(belief: Belief, dims) -> Memory:
         windows = {
             name: Window(jnp.zeros((window, m)), jnp.zeros(m, int)) for name, m in dims.items()
         }
-        return Memory(windows, jnp.zeros((), bool), jnp.ones(()))
+        # a state known exactly at the start has no scale to hold it to
+        scale = jnp.where(belief.sigma > 0.0, belief.sigma, jnp.inf)
+        return Memory(windows, jnp.zeros((), bool), jnp.ones(()), reach * scale)
 
     def process(memory: Memory, transition: Transition):
         return memory._replace(faded=jnp.zeros((), bool)), transition
@@ -78,13 +90,17 @@ def innovation_fading(window: int = 10, limit: Number = 5.0) -> Rule:
         rolled = jnp.concatenate([(ratio(e**2, R) - 1.0)[None, :], old.surplus[:-1]])
         surplus = jnp.where(here[None, :], rolled, old.surplus)
         filled = jnp.minimum(old.filled + here.astype(int), window)
-        mean = jnp.sum(surplus, axis=0) / jnp.maximum(filled, 1).astype(float)
-        unexplained = jnp.sum(jnp.where(here, mean, 0.0))
-        explained = jnp.sum(jnp.where(here, ratio(reading_variance(o), R), 0.0))
+        counts = here & (filled == window)
+        mean = jnp.sum(surplus, axis=0) / window
+        unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
+        explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
         factor = jnp.clip(ratio(unexplained, explained), 1.0, limit)
-        factor = jnp.where(memory.faded, 1.0, factor)
+        beyond = jnp.any(jnp.sqrt(factor) * prior.sigma > memory.reach)
+        factor = jnp.where(memory.faded | beyond, 1.0, factor)
         windows = {**memory.windows, o.sensor: Window(surplus, filled)}
-        memory = Memory(windows, memory.faded | (factor > 1.0), factor)
+        memory = memory._replace(
+            windows=windows, faded=memory.faded | (factor > 1.0), factor=factor
+        )
         return memory, prior._replace(factor=jnp.sqrt(factor) * prior.factor), o
 
     def after(memory: Memory, posterior: Belief, info: StepInfo, o: Observation):

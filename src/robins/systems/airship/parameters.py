@@ -1,0 +1,222 @@
+"""Parameters of an airship in the wind, with units.
+
+Vectors along the body are forward, right, down; along the Earth north, east, down. Directions are
+those towards which something goes, clockwise from north.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, default
+from robins.systems.system import Scenario
+
+Three = tuple[float, float, float]
+Draw = Literal["plus-sigma", "random-sign", "normal"]
+
+
+class Span(Parameters):
+    """A time from `begin` (included) to `end` (not)."""
+
+    begin: Annotated[float, Quantity("time", least="0 s")]
+    end: Annotated[float, Quantity("time", above="0 s")]
+
+    @pydantic.model_validator(mode="after")
+    def _in_order(self) -> Span:
+        if self.end <= self.begin:
+            raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
+        return self
+
+
+class Place(Parameters):
+    """Where the flight begins."""
+
+    latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
+    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
+    height: Annotated[float, Quantity("length", least="0 m", most="100 km")]
+
+
+class Hull(Parameters):
+    """How the airship moves: a velocity through the air, and how fast it is carried along."""
+
+    air_speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("10 m/s")
+    course: Annotated[float, Quantity("angle")] = default("90 deg")
+    response: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
+    # amplitudes of roll, pitch and heading, and the periods of their sines
+    sway_calm: Annotated[Three, Quantity("angle", least="0 deg")] = default("0.3 deg")
+    sway_gust: Annotated[Three, Quantity("angle", least="0 deg")] = default("2.3 deg")
+    sway_period: Annotated[Three, Quantity("time", above="0 s")] = default("60 s")
+
+
+class Gusts(Parameters):
+    """Gusts drawn anew every so often, each held until the next."""
+
+    speed: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
+    spread: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default("45 deg")
+    every: Annotated[float, Quantity("time", above="0 s")] = default("10 s")
+
+
+class Turbulence(Parameters):
+    """Continuous turbulence with a spectrum of its own; lengths along and across the wind."""
+
+    spectrum: Literal["dryden", "von-karman"]
+    sigma: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
+    length: Annotated[tuple[float, float], Quantity("length", above="0 m")] = default("533 m")
+    step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+
+
+class Wind(Parameters):
+    """Wind that always blows, and what comes on top within `span`."""
+
+    constant: Annotated[float, Quantity("speed", least="0 m/s")] = default("10 m/s")
+    towards: Annotated[float, Quantity("angle")] = default("90 deg")
+    span: Span = Span(begin=200.0, end=800.0)
+    gusts: Gusts | None = None
+    turbulence: Turbulence | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _steps_fit(self) -> Wind:
+        if self.gusts is not None and self.turbulence is not None:
+            steps = self.gusts.every / self.turbulence.step
+            if abs(steps - round(steps)) > 1e-9 or round(steps) < 1:
+                raise ValueError(
+                    f"gusts.every, {self.gusts.every:g} s, must be a multiple of turbulence.step"
+                )
+        return self
+
+
+class Imu(Parameters):
+    """The inertial unit; biases are constant in a run."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("100 Hz")
+    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")] = default("0.1 deg/h")
+    gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
+        "0.01 deg/sqrt(h)"
+    )
+    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")] = default("1 mg")
+    accel_noise: Annotated[Three, Quantity("velocity random walk", least="0 m/s/sqrt(s)")] = (
+        default("4.903325e-3 m/s/sqrt(s)")
+    )
+    draw: Draw = "random-sign"  # of the biases
+    # share of the acceleration by gusts that the accelerometers do not feel
+    unsensed: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.0
+
+
+class Sar(Parameters):
+    """Horizontal position and heading from a radar image matched with a map."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    position: Annotated[float, Quantity("length", above="0 m")] = default("25 m")  # each axis
+    heading: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
+    outlier_share: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.0
+    outlier_factor: Annotated[float, pydantic.Field(ge=1.0)] = 5.0
+    lost: tuple[Span, ...] = ()
+
+
+class Barometer(Parameters):
+    """Height from static pressure."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    height: Annotated[float, Quantity("length", above="0 m")] = default("20 m")
+    lost: tuple[Span, ...] = ()
+
+
+class Star(Parameters):
+    """Pitch, roll and heading from stars, once an epoch or several times."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("2 Hz")
+    attitude: Annotated[float, Quantity("angle", above="0 arcsec")] = default("20 arcsec")
+    lost: tuple[Span, ...] = ()
+
+
+class AirData(Parameters):
+    """Velocity through the air, and what is thought to be the wind: both err."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    noise: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")  # each axis
+    wind_error: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")
+    wind_time: Annotated[float, Quantity("time", above="0 s")] = default("50 s")
+    lost: tuple[Span, ...] = ()
+
+
+class Start(Parameters):
+    """What is not known at the start, in north, east, down; one standard deviation."""
+
+    attitude: Annotated[Three, Quantity("angle", least="0 deg")]
+    velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0.1 m/s")
+    position: Annotated[Three, Quantity("length", least="0 m")]
+    draw: Draw = "plus-sigma"
+
+
+class Believed(Parameters):
+    """Noise that the filters of nine states believe in, for want of states for the biases."""
+
+    gyro_noise: Annotated[float, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
+        "0.01 deg/sqrt(h)"
+    )
+    accel_noise: Annotated[float, Quantity("velocity random walk", above="0 m/s/sqrt(s)")] = (
+        default("0.07 m/s/sqrt(s)")
+    )
+
+
+FILTERS = (
+    *("ekf", "aekf", "ukf", "raukf"),
+    *("cukf-hard", "cukf-soft", "cukf-wind-states", "cukf-exact", "cukf-printed", "cukf-robust"),
+    *("cukf-master", "cukf-identity", "cukf-unprojected", "cukf-wind-known", "cukf-sideslip"),
+    *("cukf-hard-gated", "cukf-soft-gated", "cukf-wind-known-gated", "cukf-sideslip-gated"),
+    "ukf-printed-h",
+    *("centralised", "federated", "intersection"),
+    *("distributed-mean", "distributed-full"),
+    "product",
+)
+"""Every filter of the study."""
+
+COMPARED = ("ekf", "aekf", "ukf", "raukf", "cukf-wind-states", "cukf-robust", "product")
+"""Those that a scenario compares unless it says otherwise."""
+
+
+class Airship(Scenario, Parameters):
+    """An airship in the wind, navigated by SINS, stars, radar, barometer and air data."""
+
+    system: Literal["airship"] = "airship"
+    title: str = "Airship in the wind"
+    runs: Annotated[int, pydantic.Field(ge=1)] = 20
+    filters: tuple[str, ...] = COMPARED
+    claims: tuple[str, ...] = ()  # ids of those the scenario checks
+    duration: Annotated[float, Quantity("time", above="0 s")] = default("1000 s")
+    epoch: Annotated[float, Quantity("time", above="0 s")] = default("1 s")  # step of the filters
+    counted: Span = Span(begin=200.0, end=800.0)  # figures pooled over time are of this span
+    place: Place
+    hull: Hull = pydantic.Field(default_factory=Hull)
+    wind: Wind = pydantic.Field(default_factory=Wind)
+    imu: Imu = pydantic.Field(default_factory=Imu)
+    sar: Sar = pydantic.Field(default_factory=Sar)
+    barometer: Barometer = pydantic.Field(default_factory=Barometer)
+    star: Star = pydantic.Field(default_factory=Star)
+    air_data: AirData = pydantic.Field(default_factory=AirData)
+    start: Start
+    believed: Believed = pydantic.Field(default_factory=Believed)
+
+    @pydantic.model_validator(mode="after")
+    def _rates_fit(self) -> Airship:
+        """All that is measured falls on epochs, or on even parts of one."""
+        for name, among in (("imu", self.star.rate), ("star", 1.0 / self.epoch)):
+            ratio = getattr(self, name).rate / among
+            if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+                of = "star.rate" if name == "imu" else "that of the epochs"
+                raise ValueError(f"{name}.rate must be a multiple of {of}, {among:g} Hz")
+        for name in ("sar", "barometer", "air_data"):
+            ratio = 1.0 / (self.epoch * getattr(self, name).rate)
+            if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+                raise ValueError(
+                    f"{name}.rate must divide that of the epochs, {1.0 / self.epoch:g} Hz: it is "
+                    "read at the end of one"
+                )
+        if self.counted.end > self.duration:
+            raise ValueError(
+                f"counted.end is {self.counted.end:g} s, after the end of the run at "
+                f"{self.duration:g} s"
+            )
+        return self
