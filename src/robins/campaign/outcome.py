@@ -33,9 +33,7 @@ def simulate(
     tell = progress if progress is not None else (lambda share, what: None)
     names = list(problem.contenders)
     p = problem
-    found = {
-        n: Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms) for n in names
-    }
+    found = {n: Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms) for n in names}
     done = 0
     for batch, count in worlds(problem, runs, chunk):
         for i, name in enumerate(names):

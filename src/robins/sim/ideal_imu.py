@@ -106,6 +106,7 @@ def increments_between(before: Nav, after: Nav, dt_s: Float[Array, "n"]) -> Incr
         after: those `dt_s` later; positions are taken as they come.
         dt_s: (N,).
     """
+
     def nearer(_, increments: Increments) -> Increments:
         turn, push = _miss(before, after, increments)
         return increments._replace(theta=increments.theta + turn, dv=increments.dv + push)

@@ -312,8 +312,9 @@ def as_case(
     if states == "product":
         zero = jnp.zeros(3)
         gyro, accel = (jnp.tile(b, (count, 1)) for b in (world.gyro_bias, world.accel_bias))
-        start = WindIns(InsState(*start, zero, zero), jnp.zeros(2))
-        truth = WindIns(InsState(*truth, gyro, accel), world.wind_error)
+        start = WindIns(InsState(start.q_nb, start.v_n, start.position, zero, zero), jnp.zeros(2))
+        own = InsState(truth.q_nb, truth.v_n, truth.position, gyro, accel)
+        truth = WindIns(own, world.wind_error)
     p = world.sar_position
     away = jnp.stack([p.lat, p.lon], 1) - n.origin
     thought, air_b = air_and_wind(given, n, world)
