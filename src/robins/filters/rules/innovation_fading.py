@@ -27,12 +27,10 @@ class Memory(NamedTuple):
     windows: dict[str, Window]
     faded: Array  # () bool
     factor: Array  # () lambda of the last update
-    reach: Array  # (n,) standard deviations beyond which nothing is faded
+    start: Array  # (n,) standard deviations at the start, which `reach` is counted in
 
 
-def innovation_fading(
-    window: int = 10, limit: Number = 5.0, reach: Number = float("inf")
-) -> Rule:
+def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = float("inf")) -> Rule:
     """One fading factor from the mean innovation of a window (Mehra 1972, covariance matching).
 
     The form that robust adaptive filters of integrated navigation pair with robust weights
@@ -75,9 +73,7 @@ def innovation_fading(
         windows = {
             name: Window(jnp.zeros((window, m)), jnp.zeros(m, int)) for name, m in dims.items()
         }
-        # a state known exactly at the start has no scale to hold it to
-        scale = jnp.where(belief.sigma > 0.0, belief.sigma, jnp.inf)
-        return Memory(windows, jnp.zeros((), bool), jnp.ones(()), reach * scale)
+        return Memory(windows, jnp.zeros((), bool), jnp.ones(()), belief.sigma)
 
     def process(memory: Memory, transition: Transition):
         return memory._replace(faded=jnp.zeros((), bool)), transition
@@ -95,7 +91,10 @@ def innovation_fading(
         unexplained = jnp.sum(jnp.where(counts, mean, 0.0))
         explained = jnp.sum(jnp.where(counts, ratio(reading_variance(o), R), 0.0))
         factor = jnp.clip(ratio(unexplained, explained), 1.0, limit)
-        beyond = jnp.any(jnp.sqrt(factor) * prior.sigma > memory.reach)
+        # a state known exactly at the start has no scale to hold it to
+        scaled = memory.start > 0.0
+        most = reach * jnp.where(scaled, memory.start, 1.0)
+        beyond = jnp.any(scaled & (jnp.sqrt(factor) * prior.sigma > most))
         factor = jnp.where(memory.faded | beyond, 1.0, factor)
         windows = {**memory.windows, o.sensor: Window(surplus, filled)}
         memory = memory._replace(
