@@ -54,8 +54,10 @@ def dense_innovation_fading(window, limit):
             R = SYSTEM.R[np.ix_(here, here)]
             for i, one, r in zip(here, e, np.diag(R), strict=True):
                 seen[i] = [*seen[i], one**2 / r][-window:]
-            above = sum(np.mean(seen[i]) - 1 for i in here)
-            factor = above / np.sum(np.diag(H @ P @ H.T) / np.diag(R))
+            full = [len(seen[i]) == window for i in here]
+            above = sum(np.mean(seen[i]) - 1 for i in here[full])
+            explained = np.sum((np.diag(H @ P @ H.T) / np.diag(R))[full])
+            factor = above / explained if any(full) else 1.0
             factor = 1.0 if faded else min(max(factor, 1.0), limit)
             faded = faded or factor > 1.0
             P = factor * P
@@ -112,8 +114,9 @@ def test_the_factor_by_hand():
         assert float(memory.factor) == pytest.approx(times_, rel=1e-14)
         return float(memory.factor), memory._replace(faded=jnp.array(False))
 
+    # one sample does not fill a window of two
     first, memory = factor(memory, seen([6.0, 4.0]))
-    assert first == pytest.approx((36 / 4 - 1 + 16 / 2 - 1) / (5.25 / 4 + 2 / 2), rel=1e-14)
+    assert first == 1.0
     # the second component is refused: only the first counts, over its two samples
     second, memory = factor(memory, seen([4.0, 1e6], accepted=(True, False)))
     assert second == pytest.approx(((36 + 16) / 2 / 4 - 1) / (5.25 / 4), rel=1e-14)
