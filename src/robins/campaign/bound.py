@@ -91,6 +91,26 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     return xr.Dataset(data | more, coords | places, told)
 
 
+def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
+    """(E, r) standard deviations of the reported components, no lower than any filter gets.
+
+    Args:
+        problem: whose components they are.
+        name: the contender whose model and start are believed.
+        world: one run, as the problem simulates it.
+    """
+    c = problem.contenders[name]
+    case = c.case if isinstance(c.case, Partial) else Partial(c.case)
+    return np.sqrt(np.asarray(_variances(c.model, case, c.reported, world)))
+
+
+@jax.jit
+def _variances(model, case: Partial, reported, world) -> Array:
+    it = case(world)
+    line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
+    return _rows(reported, bound_along(line, _start(it).factor).factor)
+
+
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
     """(r,) share of the prior that is left of what is reported of the start; NaN if known."""
     begun = np.linalg.norm(rows * D, axis=1)

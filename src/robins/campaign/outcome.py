@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 import xarray as xr
 
+from robins.campaign.bound import bound_sigma
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
 from robins.filters import Code
@@ -34,8 +36,13 @@ def simulate(
     names = list(problem.contenders)
     p = problem
     found = {n: Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms) for n in names}
-    done = 0
+    done, bound = 0, None
     for batch, count in worlds(problem, runs, chunk):
+        of = problem.bound_of
+        if bound is None and of is not None and of in problem.contenders:
+            tell(0.0, "covariance bound")
+            first = jax.tree_util.tree_map(lambda x: x[0], batch)
+            bound = bound_sigma(problem, of, first)
         for i, name in enumerate(names):
             verb = "compiling, " if done == 0 else ""
             share = (done + count * i / len(names)) / runs
@@ -44,12 +51,26 @@ def simulate(
         done += count
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
     metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
+    if bound is not None:
+        for name, s in found.items():
+            metrics[name] |= _over_bound(problem, s, bound)
     return Outcome(
-        solution=campaign_solution(problem, found),
+        solution=campaign_solution(problem, found, bound),
         metrics=metrics,
         claims=problem.claims(metrics),
         counts=_counts(found),
     )
+
+
+def _over_bound(problem: Problem, s: Statistics, bound: np.ndarray) -> dict[str, float]:
+    """RMS error of each block over the covariance bound, pooled over the epochs that count."""
+    rms, least = s.rms[s.counted], bound[s.counted]
+    return {
+        f"{b.name}_over_bound": float(
+            np.sqrt(np.sum(rms[:, b.where] ** 2) / np.sum(least[:, b.where] ** 2))
+        )
+        for b in problem.blocks
+    }
 
 
 def _counts(found: dict[str, Statistics]) -> dict[str, int]:
@@ -69,8 +90,16 @@ def _stack(found: dict[str, Statistics], pick: Callable[[Statistics], Any]) -> n
     return np.stack([np.asarray(pick(s), dtype=float) for s in found.values()])
 
 
-def campaign_solution(problem: Problem, found: dict[str, Statistics]) -> xr.Dataset:
-    """Statistics of all filters over time, and the first run as an example."""
+def campaign_solution(
+    problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None = None
+) -> xr.Dataset:
+    """Statistics of all filters over time, and the first run as an example.
+
+    Args:
+        problem: that was run.
+        found: by filter.
+        bound: (E, r) covariance bound of the reported components, where there is one.
+    """
     ft = ("filter", "time")
     runs = next(iter(found.values())).runs
     data: dict[str, Any] = {str(k): v for k, v in problem.context.data_vars.items()}
@@ -96,6 +125,15 @@ def campaign_solution(problem: Problem, found: dict[str, Statistics]) -> xr.Data
         add("sigma", f"stated sigma of {words}, first run", lambda s: s.first_run["sigma"])
         add("rms", f"RMS error of {words}", lambda s: s.rms, runs=runs)
         add("mean_sigma", f"stated sigma of {words}", lambda s: s.sigma, runs=runs)
+        if bound is not None:
+            data[f"bound_{b.name}"] = variable(
+                ("time", axis),
+                bound[:, b.where],
+                b.units,
+                f"covariance bound of {words}",
+                b.frame,
+                display_unit=b.display_unit,
+            )
     # what an H-infinity filter states is no covariance, so no chi-square test applies to it
     bound = np.array([problem.contenders[name].bounds for name in found])
     data["bounds"] = variable("filter", bound.astype(np.int8), "1", "states bounds, not sigmas")

@@ -12,7 +12,7 @@ _PARTS = {
     **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
     **{u: u for u in ("h", "mg")},
     **{"ug": "µg", "us": "µs", "s2": "s²", "hz": "Hz", "percent": "%"},
-    "mps": "m/s",
+    **{"mps": "m/s", "m_s": "m/s"},
     **{"sqrt_h": "√h", "sqrt_s": "√s", "sqrt_hz": "√Hz"},
 }
 _PART = "|".join(sorted(_PARTS, key=len, reverse=True))
@@ -33,6 +33,7 @@ _CAPITALS = {
         "kf",
         "ekf",
         "ukf",
+        "sar",
     ),
     *("rtk", "2d", "3d", "nhc", "zupt", "lmi"),
 }

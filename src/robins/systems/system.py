@@ -104,6 +104,7 @@ class Problem(NamedTuple):
     count_from: int = 0  # first epoch that counts for figures pooled over time
     limits: Sequence[Limit] = ()
     count_to: int | None = None  # epoch after the last that counts; None: to the end
+    bound_of: str | None = None  # the contender whose model's covariance bound is drawn in
     norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
 
 

@@ -64,6 +64,7 @@ def airship_problem(given: Airship, filters: tuple[str, ...], seed: int) -> Prob
         count_from=first,
         count_to=last,
         norms=NORMS,
+        bound_of="product",
     )
 
 
