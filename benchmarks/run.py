@@ -16,6 +16,7 @@ ORDER = [
     "ins_gnss.py",
     "long_replay.py",
     "transfer_alignment.py",
+    "airship.py",
 ]
 
 

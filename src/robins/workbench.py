@@ -42,7 +42,7 @@ class Done:
 
 def _hint(word: str, among: Iterable[str]) -> str:
     near = difflib.get_close_matches(word, list(among), 1)
-    return f"; did you mean '{near[0]}'?" if near else ""
+    return f"; did you mean '{near[0]}'?" if near else "."
 
 
 def find_scenario(name: str) -> tuple[System, str, str]:
@@ -61,7 +61,7 @@ def find_scenario(name: str) -> tuple[System, str, str]:
         return system, name, path.read_text()
     if not name.endswith(".toml"):
         raise InputError(
-            f"no scenario '{name}'{_hint(name, packaged)}. `robins list` names those there are; "
+            f"no scenario '{name}'{_hint(name, packaged)} `robins list` names those there are; "
             "a path must end in .toml"
         )
     text = scenario.read_text(name)
@@ -92,7 +92,7 @@ def _check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> t
     for name in wanted:
         if name not in known:
             raise InputError(
-                f"no filter '{name}' in {where}{_hint(name, known)}. It has {', '.join(known)}"
+                f"no filter '{name}' in {where}{_hint(name, known)} It has {', '.join(known)}"
             )
     return tuple(dict.fromkeys(wanted))
 

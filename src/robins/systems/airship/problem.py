@@ -27,7 +27,7 @@ NORMS = (Norm("horizontal", (6, 7)), Norm("velocity", (3, 4)))
 
 _LEVEL = ("north", "east")
 SENSORS = {
-    SAR: SensorAxes("m", "NED", (*_LEVEL, "heading", "up")),
+    SAR: SensorAxes("m or rad", "NED", (*_LEVEL, "heading", "up")),
     STAR: SensorAxes("rad", "Euler", ("pitch", "roll", "heading")),
     STAR_EARLY: SensorAxes("rad", "Euler", ("pitch", "roll", "heading")),
     WIND: SensorAxes("m/s", "NED", _LEVEL),
