@@ -46,6 +46,7 @@ from robins.filters.rules import (
 from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
 from robins.manifold import Angle, retract
+from robins.systems.airship.error_form import Fed, error_states, feedback
 from robins.systems.airship.measurement_rows import (
     error_from_tangent,
     printed_air_speed_error,
@@ -76,7 +77,7 @@ from robins.systems.airship.parameters import FILTERS, Airship
 from robins.systems.airship.world import Course, World, start_sigma
 from robins.systems.system import Case, Contender
 
-States = Literal["nine", "wind", "product"]
+States = Literal["nine", "errors", "wind", "product"]
 Given = Literal["measured", "exact", "constant", "sideslip"]  # of air data and wind
 Firm = Literal["exact", "white", "noise"]  # how firmly the constraint is believed
 
@@ -186,6 +187,7 @@ KINDS: dict[str, Kind] = {
     ),
     "ukf-printed-h": Kind(lambda: _two(lambda: kalman(taylor())), PLAIN, printed="rows"),
     "centralised": Kind(ukf, PLAIN),
+    "centralised-errors": Kind(lambda: ukf(feedback()), PLAIN, "errors"),
     "federated": Kind(
         lambda: federated(
             [channel(SENSORS_1, ukf()), channel(SENSORS_2, ukf())],
@@ -284,6 +286,8 @@ def believed_model(given: Airship, course: Course, kind: Kind):
     wind = WindNoise(jnp.asarray(a.wind_error), jnp.asarray(a.wind_time))
     if kind.states == "nine":
         return nine_states(b.gyro_noise, b.accel_noise, looks)
+    if kind.states == "errors":
+        return error_states(b.gyro_noise, b.accel_noise, course.metres_per_radian, looks)
     if kind.states == "wind":
         return wind_states(b.gyro_noise, b.accel_noise, wind, looks)
     imu = given.imu
@@ -314,9 +318,11 @@ def as_case(
     world: World,
 ) -> Case:
     """What a filter takes of a run; pure."""
-    start = retract(world.start, -world.initial_error)
+    start: Any = retract(world.start, -world.initial_error)
     truth: Any = world.truth
     count = world.wind.shape[0]
+    if states == "errors":
+        start, truth = Fed(start, jnp.zeros(9)), Fed(truth, jnp.zeros((count, 9)))
     if states == "wind":
         start, truth = WindNav(start, jnp.zeros(2)), WindNav(truth, world.wind_error)
     if states == "product":
@@ -375,10 +381,13 @@ def contender(given: Airship, course: Course, name: str) -> Contender:
     """
     filter_, kind = make_filter(name), KINDS[name]
     wind = given.wind.constant * np.array([np.cos(given.wind.towards), np.sin(given.wind.towards)])
-    sigma = [start_sigma(given)]
+    sigma, rows = [start_sigma(given)], None
+    if kind.states == "errors":
+        rows = reported_errors(course.metres_per_radian)
+        sigma = [np.abs(np.linalg.inv(rows) @ reported(COMMON)) @ sigma[0]]
     if kind.states == "product":
         sigma += [np.asarray(given.imu.gyro_bias), np.asarray(given.imu.accel_bias)]
-    if kind.states != "nine":
+    if kind.states in ("wind", "product"):
         sigma.append(np.full(2, given.air_data.wind_error))
     origin = course.start.position
     numbers = Numbers(
@@ -393,7 +402,7 @@ def contender(given: Airship, course: Course, name: str) -> Contender:
         filter=filter_,
         model=believed_model(given, course, kind),
         case=Partial(_case(kind.states, kind.given, kind.sensors, printed), numbers),
-        reported=reported(len(numbers.sigma)),
+        reported=reported(len(numbers.sigma)) if rows is None else rows,
     )
 
 
@@ -414,3 +423,9 @@ def reported(n: int) -> np.ndarray:
     for i in range(3):
         out[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = enu
     return out
+
+
+def reported_errors(metres_per_radian: np.ndarray) -> np.ndarray:
+    """(9, 9) the same of `Fed`: errors of velocity and position are the other way round."""
+    north, east = metres_per_radian
+    return np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -east, -north, -1.0])

@@ -167,7 +167,7 @@ FILTERS = (
     *("cukf-master", "cukf-identity", "cukf-unprojected", "cukf-wind-known", "cukf-sideslip"),
     *("cukf-hard-gated", "cukf-soft-gated", "cukf-wind-known-gated", "cukf-sideslip-gated"),
     "ukf-printed-h",
-    *("centralised", "federated", "intersection"),
+    *("centralised", "centralised-errors", "federated", "intersection"),
     *("distributed-mean", "distributed-full"),
     "product",
 )
