@@ -84,6 +84,10 @@ Firm = Literal["exact", "white", "noise"]  # how firmly the constraint is believ
 FLOOR = 1e-3  # m/s, of a constraint taken for exact: (51) needs covariances that have an inverse
 COMMON = 9  # states that all local filters have
 
+# The metric W = I of the paper, whose D has columns of velocity alone. Those of attitude weigh 10 m/s
+# a radian: left to I, they would take nearly all of the correction (244 m).
+LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
+
 SENSORS_1, SENSORS_2 = (SAR,), (STAR,)
 CONSTRAINED_1, CONSTRAINED_2 = (SAR, WIND), (STAR, WIND_OF_STAR)
 
@@ -171,7 +175,7 @@ KINDS: dict[str, Kind] = {
         printed="constraint",
     ),
     "cukf-master": Kind(lambda: at_master(_two(ukf), (WIND,)), FIRST, firm="white"),
-    "cukf-identity": Kind(lambda: _constrained(projection((WIND, WIND_OF_STAR), "identity")), BOTH),
+    "cukf-identity": Kind(lambda: _constrained(projection((WIND, WIND_OF_STAR), LEVEL)), BOTH),
     "cukf-unprojected": Kind(
         lambda: _constrained(projection((WIND, WIND_OF_STAR), project_covariance=False)), BOTH
     ),
