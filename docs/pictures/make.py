@@ -7,14 +7,18 @@ from pathlib import Path
 from robins.workbench import run_scenario
 
 HERE = Path(__file__).parent
-PICTURES = {"drive_position.png": "error_position.png", "drive_track.png": "track.png"}
+DRIVE = {"drive_position.png": "error_position.png", "drive_track.png": "track.png"}
+AIRSHIP = {"airship_position.png": "error_position.png", "airship_velocity.png": "rms_velocity.png"}
+SHOWN = ("ukf", "raukf", "cukf-wind-states", "product")
 
 
 def main():
     with tempfile.TemporaryDirectory() as name:
-        done = run_scenario("ins-gnss/drive", out=Path(name) / "drive")
-        for picture, figure in PICTURES.items():
-            shutil.copyfile(done.path / "figures" / figure, HERE / picture)
+        drive = run_scenario("ins-gnss/drive", out=Path(name) / "drive")
+        airship = run_scenario("airship/s1", out=Path(name) / "airship", filters=SHOWN)
+        for done, pictures in ((drive, DRIVE), (airship, AIRSHIP)):
+            for picture, figure in pictures.items():
+                shutil.copyfile(done.path / "figures" / figure, HERE / picture)
 
 
 if __name__ == "__main__":

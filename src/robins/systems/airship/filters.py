@@ -84,8 +84,8 @@ Firm = Literal["exact", "white", "noise"]  # how firmly the constraint is believ
 FLOOR = 1e-3  # m/s, of a constraint taken for exact: (51) needs covariances that have an inverse
 COMMON = 9  # states that all local filters have
 
-# The metric W = I of the paper, whose D has columns of velocity alone. Those of attitude weigh 10 m/s
-# a radian: left to I, they would take nearly all of the correction (244 m).
+# The metric W = I of the paper, whose D has columns of velocity alone. Those of attitude weigh 10
+# m/s a radian: under a plain I they would take nearly all of the correction (244 m).
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 SENSORS_1, SENSORS_2 = (SAR,), (STAR,)
