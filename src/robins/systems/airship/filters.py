@@ -111,9 +111,12 @@ def ukf(*rules: Rule) -> Filter:
 def robust() -> Filter:
     """A local filter of RAUKF: equivalent weights, then fading by what they leave.
 
-    The stars show no position, which the fading of their filter would blow up without end.
+    Judged are radar and stars, not the wind, whose errors have states. The stars show no position,
+    which the fading of their filter would blow up without end.
     """
-    return ukf(igg3(1.5, 4.0, 1e-4, patience=None), innovation_fading(10, 5.0, reach=1e3))
+    weights = igg3(1.5, 4.0, 1e-4, patience=None)
+    fading = innovation_fading(10, 5.0, reach=1e3)
+    return ukf(only((SAR, STAR), weights), only((SAR, STAR), fading))
 
 
 def _two(
