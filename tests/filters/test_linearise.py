@@ -132,6 +132,17 @@ def test_weights_without_points_are_refused(alpha, kappa):
         sigma_weights(3, alpha, 2.0, kappa)
 
 
+def test_points_closer_together_than_rounding_allows_are_refused():
+    n, eps = 9, np.finfo(float).eps
+    border = np.sqrt(1e3 * eps)  # n + lambda = alpha^2 n is 1000 eps n
+    assert sigma_weights(n, 1.01 * border, 2.0, 0.0).reach > 0.0
+    for alpha in (0.99 * border, 1e-9, 1e-200):
+        with pytest.raises(
+            ValueError, match=r"too close together: n \+ lambda = .* n = 9 vanishes"
+        ):
+            sigma_weights(n, alpha, 2.0, 0.0)
+
+
 def test_gaussian_moments_of_a_square():
     # x ~ N(m, s^2): x^2 has mean m^2 + s^2 and variance 4 m^2 s^2 + 2 s^4; beta = 2 finds both.
     m, s = 1.3, 0.4

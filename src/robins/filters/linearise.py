@@ -36,6 +36,7 @@ from robins.filters.observation import Observation, innovation
 from robins.manifold import State
 
 Number = float | int  # where types are checked an int is no float
+NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # (n + lambda) / n of sigma points
 
 
 class Transition(NamedTuple):
@@ -174,7 +175,8 @@ def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights
     """The one place where sigma weights are made.
 
     Raises:
-        ValueError: n + kappa or alpha is not positive, so that no points exist.
+        ValueError: n + kappa or alpha is not positive, so that no points exist; or they would lie
+            so close together that their differences are rounding.
     """
     if not (alpha > 0.0 and n + kappa > 0.0):
         raise ValueError(
@@ -182,6 +184,11 @@ def sigma_weights(n: int, alpha: Number, beta: Number, kappa: Number) -> Weights
             f"n = {n}, kappa = {kappa}"
         )
     c_sq = alpha**2 * (n + kappa)
+    if c_sq < NARROWEST * n:
+        raise ValueError(
+            f"sigma points with alpha = {alpha} are too close together: n + lambda = {c_sq:.1e} of "
+            f"n = {n} vanishes in rounding; take alpha from 1e-3 to 1"
+        )
     w = 1.0 / (2.0 * c_sq)
     wm0 = 1.0 - n / c_sq
     ring = jnp.full(2 * n, w)

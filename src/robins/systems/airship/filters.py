@@ -298,9 +298,8 @@ def believed_model(given: Airship, course: Course, kind: Kind):
     if kind.states == "wind":
         return wind_states(b.gyro_noise, b.accel_noise, wind, looks)
     imu = given.imu
-    return product_states(
-        InsNoise(jnp.asarray(imu.gyro_noise), jnp.asarray(imu.accel_noise)), wind, looks
-    )
+    shaken = b.accel_noise_factor * jnp.asarray(imu.accel_noise)
+    return product_states(InsNoise(jnp.asarray(imu.gyro_noise), shaken), wind, looks)
 
 
 # ------------------------------------------------------------------------------ what it is given

@@ -151,7 +151,11 @@ class Start(Parameters):
 
 
 class Believed(Parameters):
-    """Noise that the filters of nine states believe in, for want of states for the biases."""
+    """Noise that the filters of nine states believe in, for want of states for the biases.
+
+    The product believes the noise of the inertial unit, times `accel_noise_factor` where the hull
+    bends or the unit sits off the centre.
+    """
 
     gyro_noise: Annotated[float, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
         "0.01 deg/sqrt(h)"
@@ -159,6 +163,7 @@ class Believed(Parameters):
     accel_noise: Annotated[float, Quantity("velocity random walk", above="0 m/s/sqrt(s)")] = (
         default("0.07 m/s/sqrt(s)")
     )
+    accel_noise_factor: Annotated[float, pydantic.Field(ge=1.0)] = 1.0
 
 
 FILTERS = (
