@@ -1,0 +1,116 @@
+"""Flights of the airship's scenarios, and what its filters make of them; each computed once."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import scenario
+from robins.campaign import worlds
+from robins.filters import Code, run
+from robins.filters.consistency import nees
+from robins.manifold import local
+from robins.systems.airship import SYSTEM
+from robins.systems.airship.parameters import FILTERS, Airship
+from robins.systems.airship.problem import airship_problem
+from robins.systems.airship.world import World
+from robins.systems.system import Problem
+
+RUNS = 20
+UNWARNED = tuple(name for name in FILTERS if name != "distributed-full")
+TO_THE_END = ('imu.rate="10 Hz"', 'duration="800 s"')  # of what counts: 200 to 800 s
+QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, ten times as fast to run
+
+
+class Flights(NamedTuple):
+    """Runs of a scenario."""
+
+    problem: Problem
+    batch: World  # leading axis: runs
+
+
+class Found(NamedTuple):
+    """Errors of a filter: true minus estimated attitude, velocity, position in ENU."""
+
+    error: np.ndarray  # (runs, E, 9)
+    nees: np.ndarray  # (runs, E) over all states of the filter, by their number
+    counted: slice
+
+    def mean(self, first: int) -> float:
+        """Of the length of two level components from this one on; over runs and time."""
+        level = self.error[:, self.counted, first : first + 2]
+        return float(np.mean(np.linalg.norm(level, axis=2)))
+
+    @property
+    def position_m(self) -> float:
+        """Mean horizontal error."""
+        return self.mean(6)
+
+    @property
+    def velocity_m_s(self) -> float:
+        """Mean error of horizontal velocity."""
+        return self.mean(3)
+
+    @property
+    def nees_per_dim(self) -> float:
+        """One for a filter that knows how wrong it is."""
+        return float(np.mean(self.nees[:, self.counted]))
+
+    def horizontal_rms_m(self, epoch: int) -> float:
+        """Over the runs, at the end of an epoch."""
+        return float(np.sqrt(np.mean(np.sum(self.error[:, epoch, 6:8] ** 2, axis=1))))
+
+
+def parsed(name: str, settings: tuple[str, ...] = TO_THE_END) -> Airship:
+    """Parameters of a packaged scenario, changed."""
+    return scenario.parse(Airship, SYSTEM.scenarios[name].read_text(), settings, source=name)
+
+
+@cache
+def flights(name: str, settings: tuple[str, ...] = TO_THE_END, runs: int = RUNS) -> Flights:
+    """Runs of a packaged scenario."""
+    problem = airship_problem(parsed(name, settings), UNWARNED, seed=0)
+    ((batch, _),) = worlds(problem, runs)
+    return Flights(problem, batch)
+
+
+def without_radar(batch: World, begin: int, end: int) -> World:
+    """Neither radar nor barometer at the ends of these epochs."""
+    gone = np.zeros(batch.height.shape[1], bool)
+    gone[begin:end] = True
+    told = {"sar_position": batch.sar_position, "sar_heading": batch.sar_heading}
+    hidden = jax.tree.map(lambda x: jnp.where(gone[None], jnp.nan, x), told)
+    return batch._replace(**hidden, height=jnp.where(gone[None], jnp.nan, batch.height))
+
+
+@cache
+def _program(filter_: Any, quick: bool):
+    def one(model, case, reported, world):
+        it = case(world)
+        steps = run(
+            filter_, model, it.start, it.y, it.u, it.aux, keep=lambda s: (s.posterior, s.prediction)
+        ).steps
+        posterior, prediction = steps
+
+        def judged(belief, truth):
+            size = float(belief.factor.shape[-1])
+            return reported @ local(belief.mean, truth), nees(belief, truth) / size
+
+        error, square = jax.vmap(judged)(posterior, it.truth)
+        stuck = jnp.cumsum(prediction.code != int(Code.DONE)) > 0
+        return jnp.where(stuck[:, None], jnp.nan, error), square
+
+    mapped = jax.vmap(one, in_axes=(None, None, None, 0))
+    return jax.jit(mapped, compiler_options=QUICK if quick else None)
+
+
+def found(flights: Flights, name: str, batch: World | None = None, quick: bool = False) -> Found:
+    """What a filter makes of flights, or of the same flights altered."""
+    p = flights.problem
+    c = p.contenders[name]
+    program = _program(c.filter, quick)
+    which = flights.batch if batch is None else batch
+    error, square = program(c.model, c.case, jnp.asarray(c.reported), which)
+    return Found(np.asarray(error), np.asarray(square), slice(p.count_from, p.count_to))
