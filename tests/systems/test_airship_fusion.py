@@ -43,7 +43,7 @@ def test_locals_with_the_same_prior_are_overconfident(matched):
 
 
 def test_intersection_is_cautious(matched):
-    assert found(matched, "intersection").nees_per_dim < 0.85
+    assert found(matched, "intersection", quick=True).nees_per_dim < 0.85
 
 
 def test_the_covariance_fed_back_is_counted_again_and_again(matched):
