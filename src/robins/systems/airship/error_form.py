@@ -49,21 +49,6 @@ class Fed:
         """The SINS less its errors."""
         return corrected(self.sins, self.x)
 
-    @property
-    def q_nb(self) -> Rotation:
-        """Attitude."""
-        return self.nav.q_nb
-
-    @property
-    def v_n(self) -> Array:
-        """(3,) m/s NED."""
-        return self.nav.v_n
-
-    @property
-    def position(self) -> Geodetic:
-        """Position."""
-        return self.nav.position
-
 
 def _step(fed: Fed, block: Increments) -> Fed:
     """The SINS over the block, and its errors by (40) about the middle of it."""

@@ -25,7 +25,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import _float64  # noqa: F401
-from robins.earth import Geodetic, earth_rate_n, transport_rate_n
+from robins.earth import earth_rate_n, transport_rate_n
 from robins.filters import Model, Motion, Sensor
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, step
@@ -45,21 +45,6 @@ class WindNav(NamedTuple):
     nav: Nav
     wind_error: Array  # (2,) m/s north east, thought minus true
 
-    @property
-    def q_nb(self) -> Rotation:
-        """Attitude."""
-        return self.nav.q_nb
-
-    @property
-    def v_n(self) -> Array:
-        """(3,) m/s."""
-        return self.nav.v_n
-
-    @property
-    def position(self) -> Geodetic:
-        """Position."""
-        return self.nav.position
-
 
 class WindIns(NamedTuple):
     """Navigation state, biases of the inertial unit and the error of the wind: seventeen."""
@@ -68,19 +53,9 @@ class WindIns(NamedTuple):
     wind_error: Array  # (2,) m/s north east, thought minus true
 
     @property
-    def q_nb(self) -> Rotation:
-        """Attitude."""
-        return self.ins.q_nb
-
-    @property
-    def v_n(self) -> Array:
-        """(3,) m/s."""
-        return self.ins.v_n
-
-    @property
-    def position(self) -> Geodetic:
-        """Position."""
-        return self.ins.position
+    def nav(self) -> Nav:
+        """Attitude, velocity and position alone."""
+        return self.ins.nav
 
 
 class WindNoise(NamedTuple):
@@ -196,31 +171,36 @@ def _noise_ins(noise: InsNoise, wind: WindNoise, x: WindIns, block: Increments) 
 # --------------------------------------------------------------------------------- the sensors
 
 
+def navigation(x: Any) -> Nav:
+    """Attitude, velocity and position of any state of this study."""
+    return x if isinstance(x, Nav) else x.nav
+
+
 def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
     """Horizontal position from the datum [m, north east], heading, and height [m] (1,)."""
-    p = x.position
+    q_nb, _, p = navigation(x)
     away = jnp.stack([p.lat - datum.lat, p.lon - datum.lon])
-    return away * datum.metres, Angle(x.q_nb.as_euler()[2]), jnp.reshape(p.alt, (1,))
+    return away * datum.metres, Angle(q_nb.as_euler()[2]), jnp.reshape(p.alt, (1,))
 
 
 def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
     """Pitch, roll, heading."""
-    roll, pitch, heading = x.q_nb.as_euler()
+    roll, pitch, heading = navigation(x).q_nb.as_euler()
     return Angle(pitch), Angle(roll), Angle(heading)
 
 
-def read_early(x: Any, early: Early) -> tuple[Angle, ...]:
+def read_early(x: WindIns, early: Early) -> tuple[Angle, ...]:
     """Pitch, roll, heading at each of the early sights, one after the other.
 
     The body is taken back by what the gyros felt since, and the navigation frame by its turn:
     q(t - age) = exp(omega_in age) q(t) exp(-turned).
     """
-    p, out = x.position, ()
-    omega = earth_rate_n(p.lat) + transport_rate_n(p.lat, p.alt, x.v_n)
+    (q_nb, v_n, p), out = x.nav, ()
+    omega = earth_rate_n(p.lat) + transport_rate_n(p.lat, p.alt, v_n)
     turned, age = jnp.asarray(early.turned_b), jnp.asarray(early.age_s)
     for j in range(age.shape[0]):
         turn = turned[j] - age[j] * x.ins.gyro_bias
-        q = Rotation.from_rotvec(omega * age[j]) @ x.q_nb @ Rotation.from_rotvec(-turn)
+        q = Rotation.from_rotvec(omega * age[j]) @ q_nb @ Rotation.from_rotvec(-turn)
         roll, pitch, heading = q.as_euler()
         out = (*out, Angle(pitch), Angle(roll), Angle(heading))
     return out
@@ -228,8 +208,8 @@ def read_early(x: Any, early: Early) -> tuple[Angle, ...]:
 
 def read_wind(x: Any, air: Air) -> Array:
     """(2,) m/s north east, what should be thought to be the wind."""
-    through = x.q_nb.apply(jnp.asarray(air.v_air_b))
-    thought = (x.v_n - through)[:2]
+    q_nb, v_n, _ = navigation(x)
+    thought = (v_n - q_nb.apply(jnp.asarray(air.v_air_b)))[:2]
     return thought + x.wind_error if hasattr(x, "wind_error") else thought
 
 
