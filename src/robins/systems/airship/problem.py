@@ -9,7 +9,7 @@ import xarray as xr
 
 from robins.results import variable
 from robins.systems.airship.claims import airship_claims, airship_metrics, published
-from robins.systems.airship.filters import contender
+from robins.systems.airship.contender import contender
 from robins.systems.airship.model import SAR, STAR, STAR_EARLY, WIND, WIND_OF_STAR
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, lay_out, simulate
