@@ -191,8 +191,11 @@ def test_slower_sensors_read_at_the_end_of_their_own_intervals():
 
 
 def test_heading_south_is_as_good_as_heading_east(windy):
-    """The heading then swings across +-180 deg."""
-    south = flights("s1", (*SHORT, *GUSTS, 'hull.course="180 deg"', 'wind.towards="180 deg"'), RUNS)
+    """The heading then swings across +-180 deg, and here the longitude of fixes does as well."""
+    course = ('hull.course="180 deg"', 'wind.towards="180 deg"', 'place.longitude="180 deg"')
+    south = flights("s1", (*SHORT, *GUSTS, *course), RUNS)
+    fixes = np.asarray(south.batch.sar_position.lon)
+    assert np.nanmin(fixes) < -3.1 < 3.1 < np.nanmax(fixes)
     heading = np.asarray(south.batch.euler[..., 2])
     assert np.any(heading > 3.1)
     assert np.any(heading < -3.1)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from robins.filters import Belief
 from robins.ins.frames import swap
 from robins.ins.state import InsState
-from robins.manifold import Angle, retract
+from robins.manifold import Angle, retract, wrap
 from robins.systems.airship.believed import believed_model, wind_sigma
 from robins.systems.airship.error_form import Fed
 from robins.systems.airship.filters import COMMON, KINDS, Given, States, make_filter
@@ -66,7 +66,7 @@ def as_case(
         own = InsState(truth.q_nb, truth.v_n, truth.position, gyro, accel)
         truth = WindIns(own, world.wind_error)
     p = world.sar_position
-    away = jnp.stack([p.lat, p.lon], 1) - n.origin[None]
+    away = jnp.stack([p.lat - n.origin[0], wrap(p.lon - n.origin[1])], 1)
     thought, air_b = air_and_wind(given, n, world)
     y: dict[str, Any] = {
         SAR: (away * n.metres[None], Angle(world.sar_heading), world.height[:, None]),

@@ -30,7 +30,7 @@ from robins.filters import Model, Motion, Sensor
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, step
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
-from robins.manifold import Angle
+from robins.manifold import Angle, wrap
 from robins.rotation import Rotation
 
 SAR = "sar_barometer"  # of the paper's first local filter: one vector
@@ -179,7 +179,7 @@ def navigation(x: Any) -> Nav:
 def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
     """Horizontal position from the datum [m, north east], heading, and height [m] (1,)."""
     q_nb, _, p = navigation(x)
-    away = jnp.stack([p.lat - datum.lat, p.lon - datum.lon])
+    away = jnp.stack([p.lat - datum.lat, wrap(p.lon - datum.lon)])
     return away * datum.metres, Angle(q_nb.as_euler()[2]), jnp.reshape(p.alt, (1,))
 
 
