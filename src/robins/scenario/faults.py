@@ -27,7 +27,9 @@ def faults(
         elif error["type"] == "missing":
             missing[dotted(path)] = f"{dotted(path)}: required, but not given"
         else:
-            wrong.append(f"{dotted(path)} = {_shown(value)}: {_reason(error)}")
+            # What is wrong with the whole names its keys itself.
+            where = f"{dotted(path)} = {_shown(value)}: " if path else ""
+            wrong.append(where + _reason(error))
     lines = []
     for path, loc in unknown:
         meant, line = _unknown_key(cls, path, loc)
