@@ -1,4 +1,4 @@
-"""What a run starts from: tables of IMU samples, GNSS fixes or a master INS, and any known truth.
+"""What a run starts from: tables of samples, fixes or a master INS, and any known truth.
 
 Readers of real logs and simulators both produce a `Dataset`; nothing downstream knows which. The
 tables are NumPy, float64, time in integer nanoseconds, SI and radians, and each states its frames.
@@ -83,6 +83,36 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
+class MagTable:
+    """Magnetic field as a three-axis magnetometer reads it; NaN where a component is missing."""
+
+    time_ns: np.ndarray  # (N,) int64
+    field_t: np.ndarray  # (N, 3) tesla, body axes, as recorded: hard and soft iron are in it
+    body: BodyFrame = "FRD"
+    source: str = ""
+    rows: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True)
+class AttitudeTable:
+    """Attitude over time, without a place on Earth, as motion capture gives it."""
+
+    time_ns: np.ndarray  # (K,) int64
+    q_nb: np.ndarray  # (K, 4) scalar first, body to nav; NaN rows where there was no fix
+    nav: NavFrame = "NED"
+    body: BodyFrame = "FRD"
+    moving: np.ndarray | None = None  # (K,) bool, phases that count where an author marked them
+    source: str = ""
+    rows: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True)
 class Dataset:
     """Everything a run starts from."""
 
@@ -91,5 +121,7 @@ class Dataset:
     gnss: GnssTable | None = None
     truth: Trajectory | None = None
     master: Trajectory | None = None  # another INS on the vehicle, to align the IMU to
+    mag: MagTable | None = None
+    attitude: AttitudeTable | None = None  # true attitude, where nothing else is known
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
     meta: dict[str, Any] = field(default_factory=dict)
