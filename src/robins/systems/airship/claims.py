@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
+
+from robins.systems.claims import Claim, listed, ratio, verdicts
 
 AEKF, UKF, RAUKF, CUKF = "aekf", "ukf", "raukf", "cukf-wind-states"
 
@@ -53,18 +56,6 @@ def airship_metrics(epoch_s: np.ndarray, at_s: Sequence[float], statistics: Any)
     return out
 
 
-class _Claim(NamedTuple):
-    text: str
-    needs: tuple[str, ...]
-    value: Callable[[Mapping[str, dict[str, Any]]], float]
-    band: tuple[float | None, float | None]  # in which it is reproduced
-    partly: tuple[float | None, float | None] | None = None
-
-
-def _ratio(ours: str, theirs: str, metric: str = METRICS[0]) -> Callable[..., float]:
-    return lambda metrics: metrics[ours][metric] / metrics[theirs][metric]
-
-
 def _worst_ratio(ours: str, others: Sequence[str]) -> Callable[..., float]:
     """Of position and velocity, against the best of the others."""
 
@@ -76,32 +67,32 @@ def _worst_ratio(ours: str, others: Sequence[str]) -> Callable[..., float]:
     return value
 
 
-_CLAIMS: dict[str, _Claim] = {
-    "aekf-worse": _Claim(
+_CLAIMS: dict[str, Claim] = {
+    "aekf-worse": Claim(
         "The robust adaptive UKF is more accurate than the adaptive EKF; value: ratio of the mean "
         "horizontal errors, RAUKF to AEKF",
         (RAUKF, AEKF),
-        _ratio(RAUKF, AEKF),
+        ratio(RAUKF, AEKF, METRICS[0]),
         (0.0, 0.98),
         (0.0, 1.0),
     ),
-    "ekf-is-why": _Claim(
+    "ekf-is-why": Claim(
         "The EKF family is worse because it linearises; value: mean horizontal error of the EKF "
         "over that of the UKF",
         ("ekf", UKF),
-        _ratio("ekf", UKF),
+        ratio("ekf", UKF, METRICS[0]),
         (1.05, None),
         (1.01, None),
     ),
-    "equal-in-calm": _Claim(
+    "equal-in-calm": Claim(
         "Without wind the constrained UKF is as accurate as RAUKF; value: ratio of the mean "
         "velocity errors, CUKF to RAUKF",
         (CUKF, RAUKF),
-        _ratio(CUKF, RAUKF, METRICS[2]),
+        ratio(CUKF, RAUKF, METRICS[2]),
         (0.9, 1.1),
         (0.8, 1.25),
     ),
-    "best-in-wind": _Claim(
+    "best-in-wind": Claim(
         "In wind the constrained UKF is more accurate than AEKF and RAUKF; value: the larger of "
         "its ratios of mean position and velocity error to the better of the two",
         (CUKF, AEKF, RAUKF),
@@ -109,7 +100,7 @@ _CLAIMS: dict[str, _Claim] = {
         (0.0, 0.98),
         (0.0, 1.0),
     ),
-    "absolute": _Claim(
+    "absolute": Claim(
         "The constrained UKF navigates to 2.02 m and 0.151 m/s in wind (Table 1); value: mean "
         "horizontal error [m] of the one with wind states",
         (CUKF,),
@@ -117,7 +108,7 @@ _CLAIMS: dict[str, _Claim] = {
         (0.0, 2.02 * 1.15),
         (0.0, 2.02 * 1.5),
     ),
-    "at-the-bound": _Claim(
+    "at-the-bound": Claim(
         "With states for biases and wind the filter is as good as its sensors allow (ours); value: "
         "the larger of its RMS position and velocity errors over the covariance bound",
         ("product",),
@@ -126,51 +117,19 @@ _CLAIMS: dict[str, _Claim] = {
         ),
         (0.0, 1.15),
     ),
-    "survives-loss": _Claim(
+    "survives-loss": Claim(
         "Without radar and barometer the wind keeps the position (not in the paper: the case in "
         "which the constraint earns its place); value: horizontal RMS at the end of the loss, "
         "CUKF with wind states over UKF",
         (CUKF, UKF),
-        _ratio(CUKF, UKF, "horizontal_rms_at_699_s_m"),
+        ratio(CUKF, UKF, "horizontal_rms_at_699_s_m"),
         (0.0, 0.3),
         (0.0, 0.7),
     ),
 }
 
-CLAIMS = tuple({"id": key, "text": claim.text} for key, claim in _CLAIMS.items())
+CLAIMS = listed(_CLAIMS)
 """Every claim a scenario of the study may state."""
 
-
-def airship_claims(
-    stated: Sequence[str], metrics: Mapping[str, dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Verdicts of the claims that a scenario states, where their filters were run.
-
-    Args:
-        stated: ids of claims.
-        metrics: by filter.
-    """
-    out = []
-    for key in stated:
-        claim = _CLAIMS[key]
-        if any(name not in metrics for name in claim.needs):
-            continue
-        value = claim.value(metrics)
-        verdict = "reproduced" if _inside(value, claim.band) else "not"
-        if verdict == "not" and claim.partly is not None and _inside(value, claim.partly):
-            verdict = "partly"
-        out.append(
-            {
-                "id": key,
-                "text": claim.text,
-                "verdict": verdict,
-                "value": value,
-                "band": list(claim.band),
-            }
-        )
-    return out
-
-
-def _inside(value: float, band: tuple[float | None, float | None]) -> bool:
-    low, high = band
-    return (low is None or value >= low) and (high is None or value <= high)
+airship_claims = partial(verdicts, _CLAIMS)
+"""Verdicts of the claims that a scenario states: ``(ids, metrics by filter)``."""
