@@ -25,7 +25,7 @@ from robins.filters.observability import (
 )
 from robins.manifold import State, dim, is_element
 from robins.results import variable
-from robins.systems.system import Problem, StateBlock
+from robins.systems.system import Case, Problem, StateBlock
 
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
 _FEWEST, _MOST = 3, 6  # directions that are told
@@ -83,7 +83,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     shown = [i for i in range(len(names)) if first.spoke[i] and use[i]]
     if not shown:
         raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
-    rows = np.eye(len(D)) if c.reported is None else np.asarray(c.reported, float)
+    rows = np.eye(len(D)) if first.rows is None else np.asarray(first.rows)
     left = _left(rows, L[-1], D)
     data, coords = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
     more, places = _information(*_states(problem.blocks, rows, first.mean), L, D)
@@ -108,7 +108,7 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
 def _variances(model, case: Partial, reported, world) -> Array:
     it = case(world)
     line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
-    return _rows(reported, bound_along(line, _start(it).factor).factor)
+    return _reported(_rows(reported, it), bound_along(line, _start(it).factor).factor)
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
@@ -124,9 +124,16 @@ def _start(case: Any) -> Belief:
     return getattr(case.start, "belief", case.start)
 
 
-def _rows(reported: Any, factor: Array) -> Array:
+def _rows(reported: Any, case: Case) -> Array | None:
+    """What makes of a tangent error what is reported, (r, n) or (E, r, n); None: all of it is."""
+    if case.rows is not None:
+        return case.rows
+    return None if reported is None else jnp.asarray(reported, float)
+
+
+def _reported(rows: Array | None, factor: Array) -> Array:
     """(..., r) variances of the reported components."""
-    mapped = factor if reported is None else jnp.asarray(reported, float) @ factor
+    mapped = factor if rows is None else rows @ factor
     return jnp.sum(mapped**2, axis=-1)
 
 
@@ -139,6 +146,7 @@ class _Found(NamedTuple):
     L: Array  # (E, n, n) of the Gramian, with the first subset
     D: Array  # (n,) its units
     spoke: Array  # (S,) which sensors ever measured anything
+    rows: Array | None  # (r, n) what is reported of the start
 
 
 @jax.jit
@@ -147,13 +155,17 @@ def _bound(model, case: Partial, reported, subsets, world) -> _Found:
     start = _start(it)
     line = linearised(model, start, it.truth, it.y, it.u, it.aux)
 
+    rows = _rows(reported, it)
+    first = None if rows is None else rows if rows.ndim == 2 else rows[0]
+
     def of(use):
-        return _rows(reported, bound_along(line, start.factor, use).factor)
+        return _reported(rows, bound_along(line, start.factor, use).factor)
 
     L = observability_along(line, start.sigma, subsets[0])
     spoke = [jnp.array(False) if s is None else jnp.any(s.present) for s in line.sights]
-    prior = _rows(reported, start.factor)
-    return _Found(jax.vmap(of)(subsets), prior, start.mean, L, start.sigma, jnp.stack(spoke))
+    prior = _reported(first, start.factor)
+    heard = jnp.stack(spoke)
+    return _Found(jax.vmap(of)(subsets), prior, start.mean, L, start.sigma, heard, first)
 
 
 def _sigmas(

@@ -21,7 +21,7 @@ from jaxtyping import Array
 from robins.filters import Belief, Code, Solution, Step, run
 from robins.filters.consistency import nees, normalised_sq
 from robins.manifold import State, local
-from robins.systems.system import Contender, Problem
+from robins.systems.system import Case, Contender, Problem
 
 CHUNK = 64  # runs; large enough to fill a core's vectors, small enough for the cache
 
@@ -37,13 +37,21 @@ def _kept(step: Step) -> Any:
     return step.posterior, info, step.prediction.code == int(Code.DONE)
 
 
-def _reported(contender: Contender, belief: Belief, truth: State) -> tuple[Array, Array]:
+def _reported(belief: Belief, truth: State, rows: Array | None) -> tuple[Array, Array]:
     """Error and factor of what the filters of a problem report alike."""
     error, factor = local(belief.mean, truth), belief.factor
-    if contender.reported is not None:
-        rows = jnp.asarray(contender.reported, float)
-        error, factor = rows @ error, rows @ factor
-    return error, factor
+    return (error, factor) if rows is None else (rows @ error, rows @ factor)
+
+
+def reported_rows(contender: Contender, case: Case) -> tuple[Array | None, int | None]:
+    """Rows that make of a tangent error what is reported, and their axis of time if they have one.
+
+    None: all of the error is reported.
+    """
+    if case.rows is not None:
+        return case.rows, 0
+    fixed = contender.reported
+    return (None if fixed is None else jnp.asarray(fixed, float)), None
 
 
 def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]:
@@ -53,7 +61,8 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
         contender.filter, contender.model, case.start, case.y, case.u, case.aux, keep=_kept
     )
     posterior, info, moved = solution.steps
-    error, factor = jax.vmap(partial(_reported, contender))(posterior, case.truth)
+    rows, along = reported_rows(contender, case)
+    error, factor = jax.vmap(_reported, (0, 0, along))(posterior, case.truth, rows)
     # A filter that could not predict is no longer at the time of the truth: it has diverged.
     error = jnp.where((jnp.cumsum(~moved) > 0)[:, None], jnp.nan, error)
     of = {name: (slice(None), slice(first, last)) for name, first, last in blocks}

@@ -35,7 +35,10 @@ def simulate(
     tell = progress if progress is not None else (lambda share, what: None)
     names = list(problem.contenders)
     p = problem
-    found = {n: Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms) for n in names}
+    found = {
+        n: Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms, p.windows)
+        for n in names
+    }
     done, bound = 0, None
     for batch, count in worlds(problem, runs, chunk):
         of = problem.bound_of

@@ -34,6 +34,7 @@ class Statistics:
     limits: Sequence[Limit] = ()
     count_to: int | None = None  # epoch after the last that counts
     norms: Sequence[Norm] = ()
+    windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept
     runs: int = 0
     diverged: int = 0
     n: int = 0  # tangent dimension of the filter's state, which may have more than is reported
@@ -50,6 +51,7 @@ class Statistics:
     _within: dict[str, Any] = field(default_factory=dict)
     _settled: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _norms: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    _peaks: list[np.ndarray] = field(default_factory=list)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.chunks` yields it."""
@@ -82,6 +84,9 @@ class Statistics:
             self._norms.setdefault(norm.name, []).append(pair)
         self._run_rms.append(np.sqrt(np.mean(counted**2, axis=1)))
         self._run_worst.append(np.max(np.abs(counted), axis=1))
+        if self.windows:
+            worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
+            self._peaks.append(np.stack(worst, axis=1))
         for limit in self.limits:
             where = next(b.where for b in self.blocks if b.name == limit.block)
             over = np.max(np.abs(error[:, :, where]), axis=2) > limit.value
@@ -119,6 +124,11 @@ class Statistics:
     def norm(self, name: str) -> np.ndarray:
         """(runs, 2) mean and standard deviation over time of a norm of the error, by run."""
         return np.concatenate(self._norms[name])
+
+    @property
+    def peaks(self) -> np.ndarray:
+        """(runs, windows, r) largest error of each run in each window."""
+        return np.concatenate(self._peaks)
 
     @property
     def run_rms(self) -> np.ndarray:

@@ -50,6 +50,9 @@ class Case(NamedTuple):
     y: Mapping[str, Any]
     aux: Mapping[str, Any]
     truth: State  # leading axis E
+    # (E, r, n) reported = rows @ tangent error, where what is reported turns with the time; it
+    # takes the place of the contender's
+    rows: Array | None = None
 
 
 def as_simulated(world: Any) -> Case:
@@ -106,6 +109,7 @@ class Problem(NamedTuple):
     count_to: int | None = None  # epoch after the last that counts; None: to the end
     bound_of: str | None = None  # the contender whose model's covariance bound is drawn in
     norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
+    windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
 
 
 @dataclass(frozen=True)
