@@ -3,8 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_nine_axis import broad_bytes
 
-from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.logs import FORMATS, LogError, Mounting, load_dataset, open_log
 from robins.logs.registry import recognise
 
@@ -55,6 +56,7 @@ SAMPLES = {
     "euroc-truth": (EUROC_TRUTH, Trajectory),
     "named-imu": (NAMED_IMU, ImuTable),
     "named-path": (NAMED_PATH, Trajectory),
+    "broad-npz": (broad_bytes(), Dataset),
 }
 
 
@@ -63,11 +65,11 @@ def test_there_is_a_sample_of_every_format():
 
 
 @pytest.mark.parametrize("name", SAMPLES)
-@pytest.mark.parametrize("pack", [str.encode, lambda s: lzma.compress(s.encode())], ids=["", "xz"])
+@pytest.mark.parametrize("pack", [bytes, lzma.compress], ids=["", "xz"])
 def test_every_format_is_recognised_by_content_alone(tmp_path, name, pack):
-    text, kind = SAMPLES[name]
+    content, kind = SAMPLES[name]
     path = tmp_path / "no_telling_name"
-    path.write_bytes(pack(text))
+    path.write_bytes(pack(content.encode() if isinstance(content, str) else content))
     assert recognise(path).name == name
     assert isinstance(open_log(path, findings=[]), kind)
 

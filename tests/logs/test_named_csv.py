@@ -205,10 +205,10 @@ def test_quaternions_that_are_none(tmp_path):
     header = HEADER.split(",roll")[0] + ",q_w,q_x,q_y,q_z\n"
     row = "{t},48,11,0,1,2,3,{w},0,0.6,0\n"
     told = refusal(tmp_path, header + "".join(row.format(t=t, w=2) for t in range(3)))
-    assert "the quaternions have not the length 1, as in 3 of 3 rows" in told
+    assert "is not of unit length, as in 3 of 3 rows" in told
     path = tmp_path / "m.csv"
     path.write_text(header + "".join(row.format(t=t, w=7 if t == 1 else 0.8) for t in range(4)))
-    with pytest.warns(LogWarning, match="the quaternion has length"):
+    with pytest.warns(LogWarning, match="the quaternion q_w .. q_z has length"):
         table = open_log(path)
     assert np.isnan(table.q_nb).all(axis=1).tolist() == [False, True, False, False]
     np.testing.assert_allclose(table.q_nb[0], [0.8, 0, 0.6, 0], rtol=1e-15)

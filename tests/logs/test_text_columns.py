@@ -130,7 +130,7 @@ def test_refusals_name_line_field_value_and_mend(write, data, message):
     ("data", "message"),
     [
         (b"PK\x03\x04....", r"log.csv: is a zip archive, not a text log; unpack it first"),
-        (b"ULog\x01\x12\x35", r"log.csv: is a PX4 ULog, not a text log; export the IMU"),
+        (b"ULog\x01\x12\x35", r"log.csv: is a PX4 ULog, not a text log; leave the format"),
         (b"#ROSBAG V2.0\n", r"log.csv: is a ROS bag, not a text log; export"),
     ],
 )

@@ -8,6 +8,7 @@
 - `write_named`: what this room reads best; `write_kfgins_imu`, `write_pyins`, ...: for others.
 """
 
+from robins.logs.broad import read_broad
 from robins.logs.clean import clean
 from robins.logs.doctor import examine
 from robins.logs.euroc import read_euroc_imu, read_euroc_truth, write_euroc_imu
@@ -43,6 +44,7 @@ __all__ = [
     "load_dataset",
     "load_pair",
     "open_log",
+    "read_broad",
     "read_euroc_imu",
     "read_euroc_truth",
     "read_gnss_imu",

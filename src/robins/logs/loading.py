@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
-from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
+from robins.dataset import Dataset, ImuTable, Trajectory
 from robins.logs.findings import Finding, LogError
 from robins.logs.mounting import Mounting
-from robins.logs.registry import FORMATS, Table, open_log
-from robins.logs.text import peek
+from robins.logs.registry import fitting, open_log
+from robins.logs.tables import Table, kind_of, tables_of
+
+# What lies along the axes of the sensor, so that a mounting turns it.
+_ON_BOARD = ("imu", "mag", "attitude")
 
 
 def load_dataset(
@@ -20,20 +24,22 @@ def load_dataset(
     mounting: Mounting | None = None,
     formats: Mapping[str, str] | None = None,
 ) -> Dataset:
-    """Read IMU, and where given GNSS and truth, as they are in the files; see `clean`.
+    """Read IMU, and whatever else there is, as it is in the files; see `clean`.
 
     Args:
-        paths: one IMU log, at most one GNSS log and one trajectory (the truth), in any order.
-        name: of the dataset; by default the IMU file's name.
-        mounting: turns the IMU's axes to forward-right-down and says where the antenna is.
+        paths: in any order; one IMU table in all, and at most one of each other kind. A path in a
+            file of its own is the truth.
+        name: of the dataset; by default the name of the file with the IMU.
+        mounting: turns the sensor's axes to forward-right-down and says where the antenna is.
         formats: path -> name of its format, for files that are not recognised by content.
 
     Returns:
-        The dataset. ``meta["files"]`` maps imu, gnss, truth to paths, ``meta["findings"]`` lists
-        what the readers left out, ``meta["lever_arm_b_m"]`` is that of the mounting.
+        The dataset. ``meta["files"]`` maps imu, gnss, truth, mag, attitude to paths,
+        ``meta["findings"]`` lists what the readers left out, ``meta["lever_arm_b_m"]`` is that of
+        the mounting.
 
     Raises:
-        LogError: as `open_log`; no IMU log, or two files of one kind.
+        LogError: as `open_log`; no IMU log, or two tables of one kind.
     """
     paths = [os.fspath(p) for p in paths]
     if unknown := set(formats or {}) - set(paths):
@@ -41,34 +47,32 @@ def load_dataset(
             ", ".join(sorted(unknown)), "a format is given, but not the file", "check its path"
         )
     findings: list[Finding] = []
-    imu: ImuTable | None = None
-    gnss: GnssTable | None = None
-    truth: Trajectory | None = None
+    held: dict[str, Any] = {}
+    meta: dict[str, Any] = {}
     for path in paths:
-        table = open_log(path, (formats or {}).get(path), findings)
-        earlier: Table | None
-        if isinstance(table, ImuTable):
-            earlier, imu = imu, table
-        elif isinstance(table, GnssTable):
-            earlier, gnss = gnss, table
-        else:
-            earlier, truth = truth, table
-        if earlier is not None:
-            raise LogError(
-                path, f"is a second file of the kind of {earlier.source}", "give one of the two"
-            )
-    if imu is None:
+        opened = open_log(path, (formats or {}).get(path), findings)
+        if isinstance(opened, Dataset):
+            meta |= opened.meta
+        for table in tables_of(opened):
+            kind = kind_of(table)
+            if kind in held:
+                raise LogError(
+                    path,
+                    f"is a second file of the kind of {held[kind].source} ({kind})",
+                    "give one of the two",
+                )
+            held[kind] = table
+    if "imu" not in held:
         raise LogError(
             ", ".join(paths) or "(no file)", "no IMU log among the files", "give one IMU log"
         )
-    files = {"imu": imu, "gnss": gnss, "truth": truth}
+    turned = {k: mounting.turn(t) if mounting and k in _ON_BOARD else t for k, t in held.items()}
     return Dataset(
-        name=name or Path(imu.source).name.split(".")[0],
-        imu=mounting.turn(imu) if mounting else imu,
-        gnss=gnss,
-        truth=truth,
+        name=name or Path(held["imu"].source).name.split(".")[0],
+        **turned,
         meta={
-            "files": {kind: table.source for kind, table in files.items() if table is not None},
+            **meta,
+            "files": {kind: table.source for kind, table in held.items()},
             "findings": findings,
             "lever_arm_b_m": mounting.lever_arm_b_m if mounting else (0.0, 0.0, 0.0),
         },
@@ -107,11 +111,15 @@ def load_pair(
     )
 
 
-def _open_as(path: str | os.PathLike[str], kind: str, findings: list[Finding]) -> Table:
+def _open_as(
+    path: str | os.PathLike[str], kind: str, findings: list[Finding]
+) -> Table | Dataset | None:
     """A file that holds several kinds of columns is read for the kind that is wanted."""
-    head = peek(path)
-    fitting = [f.name for f in FORMATS if f.holds == kind and f.recognise(head)]
-    return open_log(path, fitting[0] if len(fitting) == 1 else None, findings)
+    names = [f.name for f in fitting(path)[1] if f.holds == kind]
+    opened = open_log(path, names[0] if len(names) == 1 else None, findings)
+    if isinstance(opened, Dataset):
+        return opened.imu if kind == "imu" else opened.truth
+    return opened
 
 
 def _exchanged(path: str | os.PathLike[str], what: str, option: str) -> LogError:

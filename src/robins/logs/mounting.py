@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
-from robins.dataset import ImuTable
+from robins.dataset import AttitudeTable, ImuTable, MagTable
+
+OnBoard = TypeVar("OnBoard", ImuTable, MagTable, AttitudeTable)
 
 
 @dataclass(frozen=True)
@@ -32,19 +36,33 @@ class Mounting:
         Raises:
             ValueError: an angle is not finite.
         """
-        angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
-        if not np.all(np.isfinite(angles)):
-            raise ValueError(f"the angles of {self} must be finite")
-        C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*angles))).T
+        C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*self._angles()))).T
         # Turns by right angles only exchange axes, so a rounding of 1e-16 must not mix them.
         whole = np.round(C_bs)
         return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
 
-    def turn(self, imu: ImuTable) -> ImuTable:
-        """The same samples along body axes, forward-right-down."""
+    def _angles(self) -> np.ndarray:
+        angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
+        if not np.all(np.isfinite(angles)):
+            raise ValueError(f"the angles of {self} must be finite")
+        return angles
+
+    def turn(self, table: OnBoard) -> OnBoard:
+        """The same samples, field or attitude along body axes, forward-right-down.
+
+        An attitude sensor to navigation becomes body to navigation: q_nb = q_ns q_sb.
+        """
+        if isinstance(table, AttitudeTable):
+            if not any((self.roll_deg, self.pitch_deg, self.yaw_deg)):
+                return dataclasses.replace(table, body="FRD")
+            q_sb = rotation.from_euler(*self._angles())
+            q_nb = np.asarray(rotation.multiply(jnp.asarray(table.q_nb), q_sb))
+            return dataclasses.replace(table, q_nb=q_nb, body="FRD")
         C_bs = self.dcm_bs()
-        gyro, accel = (_turned(C_bs, v) for v in (imu.gyro, imu.accel))
-        return dataclasses.replace(imu, gyro=gyro, accel=accel, body="FRD")
+        if isinstance(table, MagTable):
+            return dataclasses.replace(table, field_t=_turned(C_bs, table.field_t), body="FRD")
+        gyro, accel = (_turned(C_bs, v) for v in (table.gyro, table.accel))
+        return dataclasses.replace(table, gyro=gyro, accel=accel, body="FRD")
 
 
 def _turned(C_bs: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ from robins.ins.frames import swap, swap_q
 from robins.logs.findings import Finding, LogError, report
 from robins.logs.text import COMMENTS, Columns, Head, Layout, peek, read_columns
 from robins.logs.timebase import stamps_to_ns
+from robins.logs.unit_length import unit_quaternions
 from robins.logs.writing import rows_of_numbers, write_lines
 
 _DEG = np.pi / 180.0
@@ -71,7 +72,6 @@ _COLUMNS = {
 # Beyond these an angle is in another unit or another column; a heading may be unwrapped a little.
 _LIMIT_DEG = {"lat": 90.0, "lon": 400.0, "roll": 400.0, "pitch": 90.0, "heading": 400.0}
 _FRAMES: dict[str, tuple[NavFrame, BodyFrame]] = {"NED": ("NED", "FRD"), "ENU": ("ENU", "RFU")}
-_UNIT_LENGTH = 1e-3  # how far from one a quaternion may be by its decimals
 
 
 class _Header(NamedTuple):
@@ -123,7 +123,7 @@ def read_named_path(
     v_n = table.stack(_VELOCITY)
     for stem in (*_PLACE, *_EULER):
         _within_limits(table, stem, findings)
-    attitude = _quaternions(table, findings) if "q_w" in table.values else _from_euler(table)
+    attitude = _recorded(table, findings) if "q_w" in table.values else _from_euler(table)
     if nav == "ENU":
         v_n = swap(v_n)
     return Trajectory(
@@ -295,43 +295,9 @@ def _from_euler(table: _Table) -> np.ndarray:
     return np.asarray(swap_q(q))
 
 
-def _quaternions(table: _Table, findings: list[Finding] | None) -> np.ndarray:
-    """Unit quaternions; what is not one is taken as missing.
-
-    Raises:
-        LogError: more than half are not of unit length.
-    """
+def _recorded(table: _Table, findings: list[Finding] | None) -> np.ndarray:
     q = table.stack(_QUATERNION)
-    length = np.linalg.norm(q, axis=-1)
-    with np.errstate(invalid="ignore"):
-        wrong = np.abs(length - 1.0) > _UNIT_LENGTH
-    wrong &= np.isfinite(length)
-    if wrong.any():
-        k = int(np.argmax(wrong))
-        count = f"{wrong.sum()} of {np.isfinite(length).sum()} rows"
-        if 2 * wrong.sum() > np.isfinite(length).sum():
-            raise LogError(
-                table.file,
-                f"the quaternions have not the length 1, as in {count}",
-                "are q_w, q_x, q_y, q_z the right columns?",
-                where=f"line {table.rows[k]}",
-                field="length",
-                value=float(length[k]),
-            )
-        q[wrong] = np.nan
-        report(
-            findings,
-            Finding(
-                "warning",
-                "quaternion_length",
-                table.file,
-                f"line {table.rows[k]}",
-                float(length[k]),
-                f"{Path(table.file).name} line {table.rows[k]}: the quaternion has length "
-                f"{length[k]:g}, not 1 ({count}). Such attitudes are taken as missing.",
-            ),
-        )
-    return q / np.where(wrong, 1.0, length)[:, None]
+    return unit_quaternions(table.file, "q_w .. q_z", q, table.rows, findings)
 
 
 def write_named(path: str | os.PathLike[str], table: ImuTable | Trajectory) -> None:

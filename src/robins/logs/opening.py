@@ -20,7 +20,7 @@ _FOREIGN = {
     b"PK\x03\x04": ("a zip archive", "unpack it first"),
     b"BZh": ("a bzip2 file", "unpack it first"),
     b"\x28\xb5\x2f\xfd": ("a zstd file", "unpack it first"),
-    b"ULog": ("a PX4 ULog", "export the IMU and GNSS topics to CSV"),
+    b"ULog": ("a PX4 ULog", "leave the format to be recognised"),
     b"#ROSBAG": ("a ROS bag", "export the IMU and GNSS topics to CSV"),
     b"SQLite": ("an SQLite file (a ROS 2 bag?)", "export the IMU and GNSS topics to CSV"),
     b"\x89MCAP": ("an MCAP file", "export the IMU and GNSS topics to CSV"),
@@ -60,11 +60,13 @@ class Source:
     Iterate once. Afterwards `cut` tells whether a compressed stream ended before its end mark.
 
     Raises:
-        LogError: the file cannot be opened or read, is damaged, or is another kind of file.
+        LogError: the file cannot be opened or read, is damaged, or (unless `binary`) is of a kind
+            that holds no text.
     """
 
-    def __init__(self, path: str | os.PathLike[str]):
+    def __init__(self, path: str | os.PathLike[str], binary: bool = False):
         self.path = Path(path)
+        self.binary = binary
         self.cut = False
 
     def __iter__(self) -> Iterator[bytes]:
@@ -73,7 +75,7 @@ class Source:
                 head = file.read(8)
                 file.seek(0)
                 for magic, (what, mend) in _FOREIGN.items():
-                    if head.startswith(magic):
+                    if head.startswith(magic) and not self.binary:
                         raise LogError(str(self.path), f"is {what}, not a text log", mend)
                 if head.startswith((_XZ, _GZIP)):
                     yield from self._expand(file, head.startswith(_XZ))
@@ -110,3 +112,36 @@ class Source:
                 if decoder.eof:
                     decoder, between = new(), True
         self.cut = not between
+
+
+def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:
+    """The first bytes of a file, decompressed.
+
+    Raises:
+        LogError: as `Source`.
+    """
+    start = b""
+    for block in Source(path, binary=True):
+        start += block[:size]
+        if len(start) >= size:
+            break
+    return start[:size]
+
+
+def whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
+    """All bytes of a file, decompressed, and whether a compressed stream ended early.
+
+    Raises:
+        LogError: as `Source`; or there are more bytes than the limit.
+    """
+    source, parts, size = Source(path, binary=True), [], 0
+    for block in source:
+        parts.append(block)
+        size += len(block)
+        if size > limit:
+            raise LogError(
+                str(path),
+                f"holds more than {limit >> 20} MiB",
+                "cut the recording into parts",
+            )
+    return b"".join(parts), source.cut

@@ -8,22 +8,23 @@ import re
 from collections.abc import Callable
 from typing import NamedTuple
 
-from robins.dataset import GnssTable, ImuTable, Trajectory
-from robins.logs import euroc, gnss_imu, kfgins, named_csv, pyins_csv, rtklib
+from robins.dataset import Dataset
+from robins.logs import broad, euroc, gnss_imu, kfgins, named_csv, pyins_csv, rtklib
 from robins.logs.findings import Finding, LogError
+from robins.logs.opening import beginning
+from robins.logs.tables import Table
 from robins.logs.text import Head, peek
-
-Table = ImuTable | GnssTable | Trajectory
 
 
 class Format(NamedTuple):
     """One kind of file."""
 
     name: str
-    holds: str  # "imu", "gnss" or "trajectory"
+    holds: str  # "imu", "gnss", "trajectory", or "several" tables, which make a `Dataset`
     about: str
     recognise: Callable[[Head], bool]
-    read: Callable[..., Table]
+    read: Callable[..., Table | Dataset]
+    binary: bool = False
 
 
 def _numbers(head: Head, delimiter: str | None, lines: int = 20) -> list[list[float]]:
@@ -179,7 +180,28 @@ FORMATS: tuple[Format, ...] = (
         _is_named("trajectory"),
         named_csv.read_named_path,
     ),
+    Format(
+        "broad-npz",
+        "several",
+        "NumPy archive of BROAD: imu_gyr, imu_acc, imu_mag, opt_quat, movement, sampling_rate",
+        broad.is_archive,
+        broad.read_broad,
+        binary=True,
+    ),
 )
+
+
+def fitting(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
+    """How a file begins, and the formats that its beginning fits.
+
+    Raises:
+        LogError: the file is empty, cannot be opened, or is neither text nor of a known kind.
+    """
+    head = Head(os.fspath(path), [], beginning(path))
+    if found := [f for f in FORMATS if f.binary and f.recognise(head)]:
+        return head, found
+    head = peek(path)
+    return head, [f for f in FORMATS if not f.binary and f.recognise(head)]
 
 
 def recognise(path: str | os.PathLike[str]) -> Format:
@@ -188,16 +210,15 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     Raises:
         LogError: no format fits, or several do; the sentence lists the candidates.
     """
-    head = peek(path)
-    fitting = [f for f in FORMATS if f.recognise(head)]
-    if len(fitting) == 1:
-        return fitting[0]
-    candidates = fitting or FORMATS
+    head, found = fitting(path)
+    if len(found) == 1:
+        return found[0]
+    candidates = found or FORMATS
     shown = (head.data(1) or [(1, head.lines[0])])[0]
     commas = re.search(r"\d,\d+(;|\s)\s*[-+\d]", shown[1])
     raise LogError(
         head.file,
-        f"{'several formats fit' if fitting else 'no known format fits'} "
+        f"{'several formats fit' if found else 'no known format fits'} "
         f"({shown[1][:60]!r}); candidates: "
         + ", ".join(f"{f.name} ({f.about})" for f in candidates),
         "write numbers with a decimal point, not a comma"
@@ -211,7 +232,7 @@ def open_log(
     path: str | os.PathLike[str],
     format: str | None = None,
     findings: list[Finding] | None = None,
-) -> Table:
+) -> Table | Dataset:
     """Read a log.
 
     Args:
@@ -221,7 +242,8 @@ def open_log(
             `LogWarning`.
 
     Returns:
-        An `ImuTable` along the axes of the sensor, a `GnssTable` or a `Trajectory`.
+        An `ImuTable` along the axes of the sensor, a `GnssTable` or a `Trajectory`; a `Dataset` if
+        the file holds several tables.
 
     Raises:
         LogError: unknown format, unreadable file, a line or number that is not what it should be.

@@ -55,10 +55,11 @@ class Columns(NamedTuple):
 
 
 class Head(NamedTuple):
-    """The first whole lines of a file, to recognise its format by."""
+    """The first whole lines of a file, to recognise its format by; a binary one has none."""
 
     file: str
     lines: list[str]
+    start: bytes = b""  # the first bytes of a binary file
 
     def data(self, count: int = 50) -> list[tuple[int, str]]:
         """Line numbers and text of the first lines that are neither blank nor comments."""

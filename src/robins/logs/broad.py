@@ -1,0 +1,165 @@
+"""Trials of BROAD, the orientation benchmark of Laidig et al. (2021): NumPy archives (``.npz``).
+
+Each holds a nine-axis IMU and the attitude that cameras saw:
+
+- ``imu_gyr`` (n, 3) rad/s, ``imu_acc`` (n, 3) specific force in m/s^2, ``imu_mag`` (n, 3) uT;
+- ``opt_quat`` (n, 4), scalar first, sensor to east-north-up, NaN where the cameras lost it;
+- ``movement`` (n,), the phases that count; ``sampling_rate`` in Hz.
+
+There are no stamps: row k is k over the rate after the start. All of it is along the axes of the
+sensor, which has no front and no top. The tables say "FRD" because a body has to have a name; it
+stands for the sensor's own axes, of samples and of the attitude alike, so nothing is turned.
+"""
+
+from __future__ import annotations
+
+import io
+import lzma
+import os
+import struct
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
+from robins.logs.findings import Finding, LogError
+from robins.logs.opening import whole
+from robins.logs.text import Head
+from robins.logs.unit_length import unit_quaternions
+from robins.units import to_si
+
+_COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}
+_NAMES = (*_COLUMNS, "movement", "sampling_rate")
+_LARGEST = 1 << 30  # bytes of one array, 18 hours at 500 Hz
+_RATES_HZ = (0.1, 1e5)
+_HEADER = 30  # bytes before the name of an archive's first member
+
+
+def is_archive(head: Head) -> bool:
+    """Whether a file begins as NumPy archives do, whole or cut."""
+    length = int.from_bytes(head.start[26:28], "little")
+    name = head.start[_HEADER : _HEADER + length]
+    return head.start.startswith(b"PK\x03\x04") and name.endswith(b".npy")
+
+
+def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+    """Read a trial: inertial samples, magnetic field and true attitude, all along sensor axes.
+
+    Args:
+        path: the archive.
+        findings: receives what is doubted; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: the archive is cut or damaged, or an array is missing or is not what it should be.
+            Nothing is read from a damaged one: its index comes last.
+    """
+    file = str(path)
+    arrays = _members(file)
+    rate = _rate(file, arrays["sampling_rate"])
+    tables = {name: _rows_of(file, name, arrays[name], width) for name, width in _COLUMNS.items()}
+    n = len(tables["imu_gyr"])
+    for name, rows in (*tables.items(), ("movement", arrays["movement"])):
+        if rows.shape[:1] != (n,):
+            raise _misfit(file, name, rows, f"({n}, ...) as imu_gyr has")
+    movement = arrays["movement"]
+    if movement.ndim != 1 or movement.dtype.kind != "b":
+        raise _misfit(file, "movement", movement, f"({n},) of bool")
+    time_ns = np.round(np.arange(n) * (1e9 / rate)).astype(np.int64)
+    return Dataset(
+        name=Path(file).name.split(".")[0],
+        imu=ImuTable(time_ns, tables["imu_gyr"], tables["imu_acc"], "rate", source=file),
+        mag=MagTable(time_ns, to_si(tables["imu_mag"], "uT"), source=file),
+        attitude=AttitudeTable(
+            time_ns,
+            unit_quaternions(file, "opt_quat", tables["opt_quat"], None, findings),
+            nav="ENU",
+            moving=movement.copy(),
+            source=file,
+        ),
+    )
+
+
+def _members(file: str) -> dict[str, np.ndarray]:
+    """The arrays by name, each checked against its checksum before it is looked at."""
+    data, _ = whole(file, _LARGEST)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            held = {name.removesuffix(".npy") for name in archive.namelist()}
+            if lacking := [name for name in _NAMES if name not in held]:
+                raise LogError(
+                    file,
+                    f"has no array {', '.join(lacking)}; it has {', '.join(sorted(held))}",
+                    "name the arrays as BROAD does",
+                )
+            return {name: _array(file, archive, name) for name in _NAMES}
+    # What zipfile and zlib raise on damage depends on where the damage is.
+    except (
+        *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError),
+        *(NotImplementedError, RuntimeError, UnicodeDecodeError, OverflowError, IndexError),
+    ) as error:
+        raise LogError(
+            file,
+            f"is cut short or damaged after {len(data)} bytes: {error}",
+            "fetch it again; nothing of it was used, for no number in it can be trusted",
+        ) from error
+
+
+def _array(file: str, archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    member = archive.getinfo(f"{name}.npy")
+    if member.file_size > _LARGEST:
+        raise LogError(
+            file,
+            f"would take {member.file_size >> 20} MiB, more than {_LARGEST >> 20} MiB",
+            "cut the recording into parts",
+            field=name,
+        )
+    data = io.BytesIO(archive.read(member))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # NumPy warns of arrays that Python 2 wrote
+            array: Any = np.lib.format.read_array(data, allow_pickle=False)
+    except (ValueError, UserWarning) as error:
+        raise LogError(
+            file, f"is no plain array ({error})", "save it as numbers, without pickle", field=name
+        ) from error
+    if data.read(1):
+        raise LogError(
+            file, "holds more than its header says", "save it again with numpy.savez", field=name
+        )
+    return array
+
+
+def _rate(file: str, value: np.ndarray) -> float:
+    if value.shape not in ((), (1,)) or value.dtype.kind not in "fiu":
+        raise _misfit(file, "sampling_rate", value, "() of a real number")
+    rate = float(value.reshape(()))
+    if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+        raise LogError(
+            file,
+            f"is not between {_RATES_HZ[0]:g} and {_RATES_HZ[1]:g} Hz, and time is made from it",
+            "give samples a second",
+            field="sampling_rate",
+            value=rate,
+        )
+    return rate
+
+
+def _rows_of(file: str, name: str, array: np.ndarray, width: int) -> np.ndarray:
+    if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
+        raise _misfit(file, name, array, f"(n, {width}) of real numbers")
+    if not len(array):
+        raise LogError(file, "has no rows", "record it again", field=name)
+    return np.ascontiguousarray(array, np.float64)
+
+
+def _misfit(file: str, name: str, array: np.ndarray, wanted: str) -> LogError:
+    return LogError(
+        file,
+        f"is {array.dtype} of shape {array.shape} where {wanted} is needed",
+        "save the arrays as BROAD does",
+        field=name,
+    )

@@ -1,0 +1,29 @@
+"""The kinds of tables, as the modules of this room name and hand them on."""
+
+from __future__ import annotations
+
+from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+
+Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable
+
+KINDS: dict[type, str] = {
+    ImuTable: "imu",
+    GnssTable: "gnss",
+    Trajectory: "truth",
+    MagTable: "mag",
+    AttitudeTable: "attitude",
+}
+"""The field of a `Dataset` in which a table lies; a path that is no truth is its ``master``."""
+
+
+def kind_of(table: Table) -> str:
+    """The field of a `Dataset` for a table of this type."""
+    return KINDS[type(table)]
+
+
+def tables_of(opened: Table | Dataset) -> list[Table]:
+    """What a reader returned, as a list; of a dataset all tables but the master's."""
+    if not isinstance(opened, Dataset):
+        return [opened]
+    tables = [getattr(opened, kind) for kind in KINDS.values()]
+    return [table for table in tables if table is not None]

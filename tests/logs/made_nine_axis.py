@@ -1,0 +1,78 @@
+"""A nine-axis sensor that tumbles in a steady field, and files that hold what it saw."""
+
+import io
+
+import numpy as np
+
+from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
+
+HZ = 100.0
+FIELD_ENU_UT = np.array([0.9, 20.5, -44.1])  # Berlin, about
+AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
+
+
+def turn(t):
+    """Angle turned about AXIS [rad]: rest for 5 s, then to and fro, with no step in the rate."""
+    s = np.maximum(t - 5.0, 0.0)
+    return 2.5 * s**2 / (s**2 + 4.0) * np.sin(1.1 * s)
+
+
+def matrices(angle):
+    """(n, 3, 3) rotations sensor to ENU about AXIS, by Rodrigues' formula."""
+    x, y, z = AXIS
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return (
+        np.eye(3)
+        + np.sin(angle)[:, None, None] * K
+        + (1.0 - np.cos(angle))[:, None, None] * (K @ K)
+    )
+
+
+def tumble(seconds=40.0, seed=3):
+    """Arrays as BROAD names them."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds * HZ)) / HZ
+    angle = turn(t)
+    C_ns = matrices(angle)
+    rate = (turn(t + 1e-5) - turn(t - 1e-5)) / 2e-5
+    q = np.concatenate([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * AXIS], axis=1)
+    q[-50:-30] = np.nan
+
+    def seen(vector, sigma):
+        exact = np.einsum("nji,j->ni", C_ns, vector)
+        return exact + sigma * rng.standard_normal(exact.shape)
+
+    return {
+        "imu_gyr": (rate[:, None] * AXIS + 2e-3 * rng.standard_normal((len(t), 3))),
+        "imu_acc": seen([0.0, 0.0, 9.81], 0.02),
+        "imu_mag": seen(FIELD_ENU_UT, 0.3),
+        "opt_quat": q,
+        "opt_pos": np.zeros((len(t), 3)),
+        "movement": t > 6.0,
+        "sampling_rate": np.array(HZ),
+    }
+
+
+def archive(arrays):
+    """The arrays as a compressed NumPy archive."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def broad_bytes(seconds=3.0):
+    """A short trial as a file."""
+    return archive(tumble(seconds))
+
+
+def tumble_dataset(seconds=40.0):
+    """The same as tables, put together without a reader."""
+    a = tumble(seconds)
+    time_ns = np.round(np.arange(len(a["imu_gyr"])) / HZ * 1e9).astype(np.int64)
+    name = "tumble.npz"
+    return Dataset(
+        "tumble",
+        ImuTable(time_ns, a["imu_gyr"], a["imu_acc"], "rate", source=name),
+        mag=MagTable(time_ns, a["imu_mag"] * 1e-6, source=name),
+        attitude=AttitudeTable(time_ns, a["opt_quat"], "ENU", moving=a["movement"], source=name),
+    )
