@@ -10,6 +10,8 @@
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
 - `wind`, `turbulence`: gusts and what they carry; Dryden and von Karman spectra.
 - `air_data`, `barometer`, `sar`, `star_tracker`: sensors of an airship.
+- `ballistic`, `free_body`: a rocket after burnout, the way it flies and the way it turns.
+- `mems_gyro`, `magnetometer`: its sensors.
 - `gauss_markov`: first-order Gauss-Markov processes, exact at any step.
 - `random`: streams of random numbers by seed, run and component.
 """
