@@ -19,11 +19,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.dataset import BodyFrame, GnssTable, ImuTable, NavFrame, Trajectory
+from robins.dataset import (
+    AttitudeTable,
+    BodyFrame,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    NavFrame,
+    Trajectory,
+)
 from robins.manifold import wrap
 from robins.rotation import multiply, to_euler
 
-Table = TypeVar("Table", ImuTable, GnssTable, Trajectory)
+Table = TypeVar("Table", ImuTable, GnssTable, Trajectory, MagTable, AttitudeTable)
 
 _ORDER = np.array([1, 0, 2])
 _ORDER_Q = np.array([0, 2, 1, 3])
@@ -54,8 +62,8 @@ def to_ned_frd(table: Table) -> Table:
 def to_enu_rfu(table: Table) -> Table:
     """The same table in ENU/RFU.
 
-    Exact, and there and back gives the same bits. Only a trajectory that mixes the conventions
-    (NED with RFU, say) rounds: turning one side of a quaternion takes a square root of two.
+    Exact, and there and back gives the same bits. Only attitudes that mix the conventions (NED with
+    RFU, say) round: turning one side of a quaternion takes a square root of two.
     """
     return _to(table, "ENU", "RFU")
 
@@ -75,23 +83,34 @@ def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
             sigma_v=None if table.sigma_v is None else table.sigma_v[..., _ORDER],
             nav=nav,
         )
+    if isinstance(table, MagTable):
+        if table.body == body:
+            return table
+        return replace(table, field_t=swap(table.field_t), body=body)
     turn_nav, turn_body = table.nav != nav, table.body != body
-    q = table.q_nb
-    if turn_nav and turn_body:
-        q = swap_q(q)
-    elif turn_nav:
-        q = np.asarray(multiply(jnp.asarray(_HALF_TURN), jnp.asarray(q)))
-    elif turn_body:
-        q = np.asarray(multiply(jnp.asarray(q), jnp.asarray(-_HALF_TURN)))
+    q_nb = _turned(table.q_nb, turn_nav, turn_body)
+    if isinstance(table, AttitudeTable):
+        return replace(table, q_nb=q_nb, nav=nav, body=body)
     omega = table.omega_ib_b
     return replace(
         table,
         v_n=swap(table.v_n) if turn_nav else table.v_n,
-        q_nb=q,
+        q_nb=q_nb,
         nav=nav,
         body=body,
         omega_ib_b=swap(omega) if turn_body and omega is not None else omega,
     )
+
+
+def _turned(q, turn_nav: bool, turn_body: bool):
+    """Attitudes with the axes of one side, of both, or of none exchanged."""
+    if turn_nav and turn_body:
+        return swap_q(q)
+    if turn_nav:
+        return np.asarray(multiply(jnp.asarray(_HALF_TURN), jnp.asarray(q)))
+    if turn_body:
+        return np.asarray(multiply(jnp.asarray(q), jnp.asarray(-_HALF_TURN)))
+    return q
 
 
 def euler_enu_rfu(q_nb) -> tuple[Array, Array, Array]:

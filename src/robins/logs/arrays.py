@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs.findings import LogError
 
 # Columns and the number of components of each; None: one number a row.
@@ -64,6 +64,27 @@ def checked_gnss(gnss: GnssTable) -> GnssTable:
 def checked_truth(truth: Trajectory) -> Trajectory:
     """As `checked_imu`."""
     return dataclasses.replace(truth, **_checked(truth, _TRUTH, integers=("rows",)))
+
+
+def checked_mag(mag: MagTable) -> MagTable:
+    """As `checked_imu`."""
+    return dataclasses.replace(mag, **_checked(mag, {"field_t": 3}, integers=("rows",)))
+
+
+def checked_attitude(attitude: AttitudeTable) -> AttitudeTable:
+    """As `checked_imu`; ``moving`` is of bool."""
+    arrays = _checked(attitude, {"q_nb": 4}, integers=("rows",))
+    if attitude.moving is not None:
+        moving = np.asarray(attitude.moving)
+        if moving.dtype.kind != "b":
+            raise LogError(
+                _name(attitude),
+                f"is {moving.dtype}, not bool",
+                "give True and False",
+                field="moving",
+            )
+        arrays["moving"] = _shaped(attitude, "moving", moving, (len(arrays["time_ns"]),))
+    return dataclasses.replace(attitude, **arrays)
 
 
 def _name(table: Any) -> str:

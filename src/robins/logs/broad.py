@@ -96,14 +96,16 @@ def _members(file: str) -> dict[str, np.ndarray]:
                     "name the arrays as BROAD does",
                 )
             return {name: _array(file, archive, name) for name in _NAMES}
+    except LogError:
+        raise
     # What zipfile and zlib raise on damage depends on where the damage is.
     except (
         *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError),
-        *(NotImplementedError, RuntimeError, UnicodeDecodeError, OverflowError, IndexError),
+        *(NotImplementedError, RuntimeError, ValueError, OverflowError, IndexError),
     ) as error:
         raise LogError(
             file,
-            f"is cut short or damaged after {len(data)} bytes: {error}",
+            f"is cut short or damaged after {len(data)} bytes: {error or type(error).__name__}",
             "fetch it again; nothing of it was used, for no number in it can be trusted",
         ) from error
 

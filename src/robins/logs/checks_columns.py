@@ -71,7 +71,7 @@ def _missing(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> 
     )
 
 
-def _longest_run(same: np.ndarray) -> tuple[int, int]:
+def longest_run(same: np.ndarray) -> tuple[int, int]:
     """First index and length of the longest stretch of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
     starts, lengths = edges[::2], np.diff(edges)[::2]
@@ -82,7 +82,7 @@ def _longest_run(same: np.ndarray) -> tuple[int, int]:
 
 
 def _stuck(imu: ImuTable, name: str, column: np.ndarray, step_s: float) -> Iterator[Finding]:
-    start, length = _longest_run(np.diff(column) == 0.0)
+    start, length = longest_run(np.diff(column) == 0.0)
     if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
         yield finding(
             imu,
@@ -106,7 +106,7 @@ def _saturated(
     fine = len(np.unique(values)) > _COARSE
     spread = np.subtract(*np.percentile(values, [95, 5])) / 3.3 + 1e-300
     for extreme in (float(values.max()), float(values.min())):
-        start, length = _longest_run(column == extreme)
+        start, length = longest_run(column == extreme)
         far = abs(extreme - middle) > 4.0 * spread
         if length < (_SATURATED_RUN if far else _SATURATED_LONG) or not (far or fine):
             continue

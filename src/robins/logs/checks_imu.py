@@ -27,8 +27,13 @@ UNITS = {
 }
 
 
-def check_imu(imu: ImuTable) -> Iterator[Finding]:
-    """All findings about the IMU's units and axes that need no other sensor."""
+def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
+    """All findings about the IMU's units and axes that need no other sensor.
+
+    Args:
+        imu: the table.
+        in_vehicle: a vehicle has a top, so gravity must lie along z; a sensor by itself has none.
+    """
     signal = signal_of(imu)
     if signal is None:
         yield finding(
@@ -42,7 +47,7 @@ def check_imu(imu: ImuTable) -> Iterator[Finding]:
     windows = windows_of(signal)
     of_force = list(_gravity(imu, signal, windows))
     yield from of_force
-    yield from _up(imu, windows)
+    yield from _up(imu, windows) if in_vehicle else _free(imu, windows)
     if not any(f.code in ("rates_as_increments", "increments_as_rates") for f in of_force):
         yield from _rates(imu, signal, windows)
 
@@ -160,10 +165,29 @@ def _near(measured: float, expected: float) -> bool:
     return abs(measured / expected - 1.0) < _BIASED
 
 
+def _direction(windows: Windows) -> np.ndarray:
+    """(3,) of the specific force when it is calm."""
+    force = windows.accel[windows.calm]
+    return np.median(force / np.linalg.norm(force, axis=-1, keepdims=True), axis=0)
+
+
+def _free(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
+    x, y, z = _direction(windows)
+    if (z if imu.body == "FRD" else -z) > -0.7:
+        yield finding(
+            imu,
+            "note",
+            "sensor_axes",
+            float(z),
+            f"at rest the specific force lies along ({x:+.2f}, {y:+.2f}, {z:+.2f}) of x, y, z. The "
+            "axes are those of the sensor, and attitude will be that of the sensor; for roll, "
+            "pitch and heading of a vehicle give a mounting.",
+        )
+
+
 def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
     """The sign of gravity along z: specific force at rest points up."""
-    force = windows.accel[windows.calm]
-    direction = np.median(force / np.linalg.norm(force, axis=-1, keepdims=True), axis=0)
+    direction = _direction(windows)
     down = direction[2] if imu.body == "FRD" else -direction[2]
     axes = "forward-right-down" if imu.body == "FRD" else "right-forward-up"
     sign = "-" if imu.body == "FRD" else "+"

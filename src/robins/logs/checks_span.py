@@ -6,15 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.dataset import ImuTable
 from robins.logs.findings import Finding
 from robins.logs.quiet import finding, name_of
+from robins.logs.tables import Table
 from robins.logs.timebase import GPS_EPOCH_S, WEEK_S
 
 _LEAP = 18.0
 
 
-def check_span(imu: ImuTable, other: GnssTable | Trajectory) -> Iterator[Finding]:
+def check_span(imu: ImuTable, other: Table) -> Iterator[Finding]:
     """Findings about how another table's time lies against the IMU's."""
     if not len(imu) or not len(other):
         return
@@ -52,7 +53,7 @@ def check_span(imu: ImuTable, other: GnssTable | Trajectory) -> Iterator[Finding
         )
 
 
-def _span(table: ImuTable | GnssTable | Trajectory) -> tuple[float, float]:
+def _span(table: Table) -> tuple[float, float]:
     """Start and end [s], without the few stamps that a damaged clock put far away."""
     ns = np.sort(table.time_ns)
     trim = len(ns) // 100

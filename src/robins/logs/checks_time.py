@@ -6,12 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs.findings import Finding
 from robins.logs.ordering import increasing
 from robins.logs.quiet import finding, place, usual_step_s
-
-Table = ImuTable | GnssTable | Trajectory
+from robins.logs.tables import Table
 
 # Steps a clock makes, in seconds, and what makes them.
 _WRAPS = {
@@ -28,11 +27,22 @@ _STEPS = {
     3600.0: "a change of time zone or of daylight saving",
 }
 _GAP = 2.5  # usual steps
+_SLOWEST_IMU_S = 0.25
+_WHY_GAPS = {
+    GnssTable: "The receiver had no solution there; the run goes on by inertia alone",
+    MagTable: "The logger lost data; heading is held by the gyros meanwhile",
+    AttitudeTable: "Nothing is compared there",
+}
 _BLIP = 3  # refused samples that count as a slip, not as a clock set anew
 
 
-def check_time(table: Table) -> Iterator[Finding]:
-    """All findings about the stamps of one table."""
+def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
+    """All findings about the stamps of one table.
+
+    Args:
+        table: any table.
+        unit_known: the format says in which unit its stamps are, so slow ones are just that.
+    """
     if len(table) < 2:
         yield finding(table, "error", "too_short", len(table), _SHORT.format(n=len(table)))
         return
@@ -40,7 +50,7 @@ def check_time(table: Table) -> Iterator[Finding]:
     if not np.isfinite(usual):
         yield finding(table, "error", "time_stands", 0.0, _STANDS)
         return
-    yield from _unit(table, usual)
+    yield from _slow(table, usual) if unit_known else _unit(table, usual)
     keep = increasing(table.time_ns)
     yield from _duplicates(table)
     yield from _order(table, keep, usual)
@@ -52,9 +62,30 @@ _SHORT = "only {n} sample(s). Nothing can be run on that; is it the right file?"
 _STANDS = "time never goes forward. The time column is constant or another one; name the format."
 
 
+def _slow(table: Table, usual: float) -> Iterator[Finding]:
+    """Stamps whose unit is beyond doubt: inertial samples too far apart to navigate by."""
+    if isinstance(table, ImuTable) and usual > _SLOWEST_IMU_S:
+        yield finding(
+            table,
+            "warning",
+            "time_slow",
+            usual,
+            f"inertial samples are {usual:.4g} s apart. The log was thinned out or its logger is "
+            "slow; how the sensor moved between them is lost, so expect little of a run: log at "
+            "50 Hz or more.",
+        )
+
+
+def _limits_s(table: Table) -> tuple[float, float]:
+    """The longest and the shortest step that such a sensor makes."""
+    if isinstance(table, ImuTable):
+        return _SLOWEST_IMU_S, 2e-5
+    return (2.0, 2e-5) if isinstance(table, MagTable | AttitudeTable) else (45.0, 5e-3)
+
+
 def _unit(table: Table, usual: float) -> Iterator[Finding]:
     """A rate no such sensor has tells the unit of time."""
-    slowest, fastest = (0.25, 2e-5) if isinstance(table, ImuTable) else (45.0, 5e-3)
+    slowest, fastest = _limits_s(table)
     for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if usual > slowest and fastest < usual * factor < slowest:
             yield finding(
@@ -174,16 +205,15 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         return
     worst = max(gaps, key=lambda k: step[k])
     total = sum(step[k] for k in gaps)
-    gnss = isinstance(table, GnssTable)
+    harmless = not isinstance(table, ImuTable | Trajectory)
     cause = (
-        "The receiver had no solution there; the run goes on by inertia alone"
-        if gnss
-        else "The logger lost data (buffer, card or cable too slow); a run must bridge it blindly, "
+        _WHY_GAPS.get(type(table))
+        or "The logger lost data (buffer, card or cable too slow); a run must bridge it blindly, "
         "and after about a second its heading and position are no longer worth much"
     )
     yield finding(
         table,
-        "note" if gnss or total < 0.05 else "warning",
+        "note" if harmless or total < 0.05 else "warning",
         "gap_long" if step[worst] >= 1.0 else "gap_short",
         float(step[worst]),
         f"no sample for {step[worst]:.6g} s before this one, where {usual:.6g} s is usual "

@@ -9,14 +9,16 @@ Denormal numbers and huge but possible ones pass; outliers are the business of f
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
+from robins.logs.clean_mag import clean_attitude, clean_mag
 from robins.logs.findings import LogError
-from robins.logs.ordering import increasing, reasons
+from robins.logs.ordering import increasing, reasons, rows_where
 
 # Far beyond any vehicle, so that only nonsense is caught: 1e4 rad/s are 95 000 turns a minute.
 GYRO_LIMIT = 1e4  # rad/s, or rad for increments
@@ -34,11 +36,12 @@ def clean(dataset: Dataset) -> Dataset:
     Counts, in samples, begin with the table's name: ``imu_nan``, ``imu_inf``, ``imu_absurd`` (a
     magnitude no vehicle has), ``imu_duplicate``, ``imu_backward`` and ``imu_ahead`` (time stamps
     out of order); ``gnss_...`` likewise and ``gnss_sigma`` (zero or negative); ``truth_...``,
-    ``master_...``.
+    ``master_...``, ``mag_...``, ``attitude_...``.
     Counts already in the dataset are added to.
 
     A fix that lacks a component keeps the others: the component becomes NaN, its sigma, if that was
     not a positive number, a 1 that nobody uses. A fix with no component left is refused whole.
+    Magnetic field and attitude keep their rows, NaN where something is missing.
 
     ``meta["imu_gaps"]`` lists (start_ns, end_ns) between which IMU samples are missing.
 
@@ -47,19 +50,13 @@ def clean(dataset: Dataset) -> Dataset:
             component whose sigma is never positive.
     """
     imu, counts, gaps = clean_imu(dataset.imu)
-    gnss = truth = master = None
-    if dataset.gnss is not None:
-        gnss, more = clean_gnss(dataset.gnss)
-        counts |= more
-    if dataset.truth is not None:
-        truth, more = clean_truth(dataset.truth)
-        counts |= more
-    if dataset.master is not None:
-        master, more = clean_master(dataset.master)
-        counts |= more
+    tables: dict[str, Any] = {"imu": imu}
+    for kind, cleaner in _CLEANERS.items():
+        if (table := getattr(dataset, kind)) is not None:
+            tables[kind], more = cleaner(table)
+            counts |= more
     total = {k: dataset.counts.get(k, 0) + counts.get(k, 0) for k in dataset.counts | counts}
     meta = {**dataset.meta, "imu_gaps": gaps}
-    tables = {"imu": imu, "gnss": gnss, "truth": truth, "master": master}
     return dataclasses.replace(dataset, **tables, counts=total, meta=meta)
 
 
@@ -77,7 +74,7 @@ def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, 
             "the doctor tells what is wrong with them",
         )
     gaps = _gaps(imu, keep)
-    return _rows(imu, keep), {f"imu_{k}": n for k, n in counts.items()}, gaps
+    return rows_where(imu, keep), {f"imu_{k}": n for k, n in counts.items()}, gaps
 
 
 def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
@@ -87,7 +84,7 @@ def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     values = np.hstack([position, truth.v_n, truth.q_nb])
     limit = np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M, *[SPEED_LIMIT] * 3, *[1.001] * 4])
     keep, counts = _whole_rows(truth.time_ns, values, limit)
-    return _rows(truth, keep), {f"truth_{k}": n for k, n in counts.items()}
+    return rows_where(truth, keep), {f"truth_{k}": n for k, n in counts.items()}
 
 
 def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
@@ -125,7 +122,7 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     counts |= reasons(master.time_ns[have], in_order[have])
     lat, lon, alt = kept.pop("position").T
     table = dataclasses.replace(master, lat_rad=lat, lon_rad=lon, alt_m=alt, **kept)
-    return _rows(table, in_order), {f"master_{k}": n for k, n in counts.items()}
+    return rows_where(table, in_order), {f"master_{k}": n for k, n in counts.items()}
 
 
 def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
@@ -155,7 +152,7 @@ def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
         v_n=v_n,
         sigma_v=sigma_v,
     )
-    return _rows(table, in_order), {f"gnss_{k}": n for k, n in counts.items()}
+    return rows_where(table, in_order), {f"gnss_{k}": n for k, n in counts.items()}
 
 
 def _whole_rows(
@@ -205,17 +202,6 @@ def _components(
     )
 
 
-def _rows(table: Any, keep: np.ndarray) -> Any:
-    """The table with only some of its rows."""
-    n = len(table.time_ns)
-    arrays = {
-        f.name: getattr(table, f.name)[keep]
-        for f in dataclasses.fields(table)
-        if isinstance(getattr(table, f.name), np.ndarray) and len(getattr(table, f.name)) == n
-    }
-    return dataclasses.replace(table, **arrays)
-
-
 def _gaps(imu: ImuTable, keep: np.ndarray) -> list[tuple[int, int]]:
     """Where samples are missing between two kept ones.
 
@@ -231,3 +217,12 @@ def _gaps(imu: ImuTable, keep: np.ndarray) -> list[tuple[int, int]]:
     backward = (after >= 0) & (imu.time_ns[refused] < time_ns[np.maximum(after, 0)])
     long |= np.bincount(after[backward], minlength=len(kept))[:-1] > 2
     return [(int(time_ns[k]), int(time_ns[k + 1])) for k in np.flatnonzero(long)]
+
+
+_CLEANERS: dict[str, Callable[[Any], tuple[Any, dict[str, int]]]] = {
+    "gnss": clean_gnss,
+    "truth": clean_truth,
+    "master": clean_master,
+    "mag": clean_mag,
+    "attitude": clean_attitude,
+}

@@ -6,15 +6,22 @@ a healthy log has none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
-from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
+from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.logs.arrays import (
+    checked_attitude,
+    checked_gnss,
+    checked_imu,
+    checked_mag,
+    checked_truth,
+)
 from robins.logs.checks_columns import check_columns
 from robins.logs.checks_gnss import check_gnss
 from robins.logs.checks_imu import check_imu
+from robins.logs.checks_mag import check_mag
 from robins.logs.checks_master import BY_REST, check_master
 from robins.logs.checks_motion import check_motion
 from robins.logs.checks_span import check_span
@@ -22,24 +29,27 @@ from robins.logs.checks_time import check_time
 from robins.logs.checks_turning import check_turning
 from robins.logs.checks_velocity import check_velocity
 from robins.logs.findings import Finding, by_severity
-
-Table = ImuTable | GnssTable | Trajectory
+from robins.logs.tables import Table, tables_of
 
 # After these, checks that build on what they found wrong would only repeat it in other words.
 _NO_PLACE = {"position_unit", "no_fix_as_zero", "gnss_missing"}
 _SPOILT = {
-    *("no_overlap", "rates_as_increments", "increments_as_rates", "time_unit"),
+    *("no_overlap", "rates_as_increments", "increments_as_rates", "time_unit", "time_slow"),
     *("position_unit", "no_fix_as_zero"),
     *("velocity_axes", "velocity_unit", "velocity_sign"),
 }
 
 
-def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
+Subject = Dataset | Table | Sequence[Table | Dataset]
+
+
+def examine(subject: Subject) -> list[Finding]:
     """Judge a dataset, or tables by themselves.
 
     Args:
         subject: as it was read, before `clean`, so that everything is seen. A dataset brings the
-            findings of its readers along (``meta["findings"]``).
+            findings of its readers along (``meta["findings"]``) and the names of files that say in
+            which unit their stamps are (``meta["time_unit_known"]``).
 
     Returns:
         Errors first, then warnings, then notes; empty for a log without a flaw.
@@ -48,32 +58,41 @@ def examine(subject: Dataset | Table | Sequence[Table]) -> list[Finding]:
         LogError: arrays that are no tables: other lengths, types, shapes.
     """
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
-        return by_severity(_examined(*_tables(subject), _master_of(subject)))
+        return by_severity(_examined(*_tables(subject), *_context(subject)))
 
 
-def _master_of(subject: Dataset | Table | Sequence[Table]) -> Trajectory | None:
-    return subject.master if isinstance(subject, Dataset) else None
+def _context(subject: Subject) -> tuple[Trajectory | None, frozenset[str]]:
+    """The master to align to, if any, and the files whose unit of time is beyond doubt."""
+    if isinstance(subject, Dataset):
+        return subject.master, frozenset(subject.meta.get("time_unit_known", ()))
+    parts = subject if isinstance(subject, Sequence) else ()
+    return None, frozenset().union(*(_context(p)[1] for p in parts if isinstance(p, Dataset)))
 
 
 def _examined(
-    tables: list[Table], findings: list[Finding], master: Trajectory | None
+    tables: list[Table],
+    findings: list[Finding],
+    master: Trajectory | None,
+    unit_known: frozenset[str],
 ) -> list[Finding]:
     imu = gnss = None
+    kinds = {type(table) for table in tables}
+    # What shall tell only how the sensor itself is turned may lie any way.
+    in_vehicle = not kinds & {MagTable, AttitudeTable} or bool(kinds & {GnssTable, Trajectory})
     for table in tables:
+        findings += check_time(_CHECKED[type(table)](table), table.source in unit_known)
         if isinstance(table, ImuTable):
             imu = checked_imu(table)
-            findings += check_time(imu)
             findings += check_columns(imu)
-            findings += check_imu(imu)
+            findings += check_imu(imu, in_vehicle)
         elif isinstance(table, GnssTable):
             gnss = checked_gnss(table)
-            findings += check_time(gnss)
             of_place = list(check_gnss(gnss))
             findings += of_place
             if not any(f.severity == "error" and f.code in _NO_PLACE for f in of_place):
                 findings += check_velocity(gnss)
-        else:
-            findings += check_time(checked_truth(table))
+        elif isinstance(table, MagTable):
+            findings += check_mag(checked_mag(table))
     if imu is not None:
         for table in tables:
             if table is not imu and not isinstance(table, ImuTable):
@@ -93,10 +112,20 @@ def _examined(
     return findings
 
 
-def _tables(subject: Dataset | Table | Sequence[Table]) -> tuple[list[Table], list[Finding]]:
+_CHECKED: dict[type, Callable[..., Table]] = {
+    ImuTable: checked_imu,
+    GnssTable: checked_gnss,
+    Trajectory: checked_truth,
+    MagTable: checked_mag,
+    AttitudeTable: checked_attitude,
+}
+
+
+def _tables(subject: Subject) -> tuple[list[Table], list[Finding]]:
     if isinstance(subject, Dataset):
-        tables = [subject.imu, subject.gnss, subject.truth, subject.master]
-        return [t for t in tables if t is not None], list(subject.meta.get("findings", []))
-    if isinstance(subject, ImuTable | GnssTable | Trajectory):
+        tables = tables_of(subject) + ([subject.master] if subject.master is not None else [])
+        return tables, list(subject.meta.get("findings", []))
+    if not isinstance(subject, Sequence):
         return [subject], []
-    return list(subject), []
+    parts = [_tables(part) for part in subject]
+    return [t for tables, _ in parts for t in tables], [f for _, told in parts for f in told]

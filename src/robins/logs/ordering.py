@@ -8,7 +8,9 @@ costs a second; a recorder that restarts its clock costs the shorter of the two 
 
 from __future__ import annotations
 
+import dataclasses
 from bisect import bisect_left
+from typing import Any
 
 import numpy as np
 
@@ -65,3 +67,14 @@ def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
         "backward": int(np.sum((at >= 0) & (times < before))),
         "ahead": int(np.sum((at < 0) | (times > before))),
     }
+
+
+def rows_where(table: Any, keep: np.ndarray) -> Any:
+    """A table of `robins.dataset` with only some of its rows, (n,) bool."""
+    n = len(table.time_ns)
+    arrays = {
+        f.name: getattr(table, f.name)[keep]
+        for f in dataclasses.fields(table)
+        if isinstance(getattr(table, f.name), np.ndarray) and len(getattr(table, f.name)) == n
+    }
+    return dataclasses.replace(table, **arrays)

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.logs.findings import Finding, Severity
 from robins.logs.ordering import increasing
+from robins.logs.tables import Table
 
 _WINDOW_S = 1.0
 _NONSENSE = 1e9
@@ -17,12 +18,18 @@ _REST = 0.01  # relative scatter of |specific force| in a window at rest
 _STEADY = 0.003  # relative change of the specific force from one window at rest to the next
 
 
-def name_of(table: ImuTable | GnssTable | Trajectory) -> str:
-    """How sentences call a table: its file without the folder, or its type."""
-    return Path(table.source).name if table.source else type(table).__name__
+def name_of(table: Table) -> str:
+    """How sentences call a table: its file without the folder, or its type.
+
+    A magnetometer comes out of the file of its IMU, so the part of the file is said too.
+    """
+    if not table.source:
+        return type(table).__name__
+    part = {MagTable: " (magnetic field)", AttitudeTable: " (attitude)"}
+    return Path(table.source).name + part.get(type(table), "")
 
 
-def place(table: ImuTable | GnssTable | Trajectory, row: int) -> str:
+def place(table: Table, row: int) -> str:
     """Where a row is: its line in the file if known, else its time since the first row."""
     rows = getattr(table, "rows", None)
     if rows is not None:
@@ -32,7 +39,7 @@ def place(table: ImuTable | GnssTable | Trajectory, row: int) -> str:
 
 
 def finding(
-    table: ImuTable | GnssTable | Trajectory,
+    table: Table,
     severity: Severity,
     code: str,
     value: float | int | str,

@@ -1,0 +1,245 @@
+"""The doctor on a magnetometer: unit, missing, zero, stuck, stopped and repeated values, iron.
+
+The Earth's field is 20 to 70 uT strong everywhere on the ground, so its size tells the unit, and a
+size that changes with the direction tells of iron or magnets that turn with the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from robins.dataset import MagTable
+from robins.logs.checks_columns import longest_run
+from robins.logs.findings import Finding, Severity
+from robins.logs.quiet import finding, usual_step_s
+
+EARTH_T = (20e-6, 70e-6)
+_FEW = 10  # samples below which nothing is judged
+_STUCK_S, _STUCK_SAMPLES = 2.0, 100
+_STOP_T = 80e-6  # no magnetometer has a range as small as the Earth's field
+_STOPPED = 3  # different readings in a row at the same extreme
+_REPEATED = 0.2  # share of rows that repeat the one before
+_SPREAD = 0.25  # of the size, between its 5th and 95th percentile
+_FAR = 0.3  # of the usual size: how far off a disturbed sample is
+_TURNED = 0.02  # smallest spread of directions by which a centre is found
+
+# By what power of ten the numbers are too large, and what makes them so.
+_SHIFTS: dict[int, tuple[Severity, str, str]] = {
+    9: ("error", "The numbers are probably in nT", "multiply by 1e-9 for tesla"),
+    7: ("error", "The numbers are probably in milligauss", "multiply by 1e-7 for tesla"),
+    6: ("error", "The numbers are probably in uT", "multiply by 1e-6 for tesla"),
+    4: ("error", "The numbers are probably in gauss", "multiply by 1e-4 for tesla"),
+    3: ("error", "They are probably in nT where uT is said, or uT where mT", "divide by 1000"),
+    2: ("error", "They are probably in uT where gauss is said", "divide by 100"),
+    1: ("warning", "They may be in mG where uT is said, or a magnet is near", "divide by 10"),
+    -1: ("warning", "They may be in uT where mG is said, or it is shielded", "multiply by 10"),
+    -2: ("error", "They are probably in gauss where uT is said", "multiply by 100"),
+    -3: (
+        "error",
+        "They are probably in uT where nT is said, or mT where uT is",
+        "multiply by 1000",
+    ),
+}
+
+
+def check_mag(mag: MagTable) -> Iterator[Finding]:
+    """All findings about a table of magnetic field by itself, its stamps left out."""
+    good = np.asarray(np.isfinite(mag.field_t).all(axis=1))
+    if not good.all():
+        yield _missing(mag, good)
+    if np.count_nonzero(good) < _FEW:
+        return
+    zero = good & (mag.field_t == 0.0).all(axis=1)
+    if zero.any():
+        yield _zero(mag, np.asarray(zero))
+    rows = np.flatnonzero(good & ~zero)
+    if len(rows) < _FEW:
+        return
+    field = mag.field_t[rows]
+    size = np.linalg.norm(field, axis=1)
+    dead = [axis for axis, column in zip("xyz", field.T, strict=True) if np.ptp(column) == 0.0]
+    if dead:
+        yield _dead(mag, dead, field[0])
+    of_unit = list(_unit(mag, float(np.median(size))))
+    yield from of_unit
+    fresh = np.concatenate([[True], np.diff(field, axis=0).any(axis=1)])
+    yield from _stuck(mag, rows, fresh)
+    yield from _repeated(mag, fresh)
+    if not of_unit:
+        yield from _stopped(mag, rows, fresh)
+        if not dead:
+            yield from _iron(mag, rows, field, size)
+
+
+def _missing(mag: MagTable, good: np.ndarray) -> Finding:
+    first, bad = int(np.argmin(good)), int(np.count_nonzero(~good))
+    lacking = [a for a, c in zip("xyz", mag.field_t.T, strict=True) if not np.isfinite(c).any()]
+    whole = f"; of {', '.join(f'field_{a}' for a in lacking)} there is nothing at all"
+    return finding(
+        mag,
+        "warning",
+        "field_missing",
+        bad,
+        f"{bad} of {len(mag)} samples ({bad / len(mag):.1%}) of the magnetic field are not numbers"
+        f"{whole if lacking else ', this one first'}. What is missing is not used; heading is held "
+        "by the gyros meanwhile.",
+        first,
+    )
+
+
+def _zero(mag: MagTable, zero: np.ndarray) -> Finding:
+    count = int(np.count_nonzero(zero))
+    everywhere = count == len(mag)
+    return finding(
+        mag,
+        "error" if everywhere else "warning",
+        "field_zero",
+        count,
+        f"the magnetic field is exactly 0 0 0 in {count} of {len(mag)} samples"
+        f"{'' if everywhere else ', this one first'}. The sensor was not connected or not yet "
+        "measuring; write nan there, for a field of zero has no direction.",
+        int(np.argmax(zero)),
+    )
+
+
+def _dead(mag: MagTable, axes: list[str], field: np.ndarray) -> Finding:
+    value = float(field["xyz".index(axes[0])])
+    return finding(
+        mag,
+        "error",
+        "field_stuck",
+        value,
+        f"field_{', field_'.join(axes)} never changes ({value * 1e6:.4g} uT in every sample). A "
+        "real sensor always has noise: the axis is dead, or this is another column.",
+    )
+
+
+def _unit(mag: MagTable, size: float) -> Iterator[Finding]:
+    shown = f"the magnetic field is {size * 1e6:.4g} uT strong where the Earth's is 20 to 70"
+    for shift, (severity, cause, mend) in _SHIFTS.items():
+        if EARTH_T[0] <= size / 10.0**shift <= EARTH_T[1]:
+            yield finding(mag, severity, "field_unit", size, f"{shown}. {cause}: {mend}.")
+            return
+    # Iron in the casing of a cheap sensor is often stronger than the Earth's field.
+    if not EARTH_T[0] / 2 <= size <= 10 * EARTH_T[1]:
+        yield finding(
+            mag,
+            "error",
+            "field_unit",
+            size,
+            f"{shown}, and no usual unit makes it that. These are counts of a converter, or other "
+            "columns.",
+        )
+
+
+def _stuck(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Finding]:
+    start, length = longest_run(~fresh)
+    step_s = usual_step_s(mag.time_ns)
+    if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
+        yield finding(
+            mag,
+            "warning",
+            "field_stuck_for_a_while",
+            length,
+            f"the magnetic field does not change at all for {length + 1} samples "
+            f"({length * step_s:.1f} s) from here. The sensor or its bus hung; a filter would take "
+            "this for a perfect measurement, so write nan there.",
+            int(rows[max(start - 1, 0)]),
+        )
+
+
+def _repeated(mag: MagTable, fresh: np.ndarray) -> Iterator[Finding]:
+    share = 1.0 - float(fresh.mean())
+    if share > _REPEATED and fresh.sum() > _FEW:
+        rate = 1.0 / usual_step_s(mag.time_ns)
+        yield finding(
+            mag,
+            "note",
+            "field_repeated",
+            share,
+            f"{share:.0%} of the samples of the magnetic field repeat the one before: the sensor "
+            f"measures about {rate * (1.0 - share):.3g} times a second, the log has {rate:.4g} "
+            "rows a second. The noise of one row is that of fewer measurements than it seems.",
+        )
+
+
+def _stopped(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Finding]:
+    """An extreme beyond the Earth's field, met by several different readings in a row."""
+    readings = np.flatnonzero(fresh)
+    field = mag.field_t[rows[readings]]
+    for axis, column in zip("xyz", field.T, strict=True):
+        for extreme in (float(column.max()), float(column.min())):
+            start, length = longest_run(column == extreme)
+            if abs(extreme) < _STOP_T or length < _STOPPED:
+                continue
+            total = int(np.count_nonzero(column == extreme))
+            yield finding(
+                mag,
+                "warning",
+                "field_saturated",
+                extreme,
+                f"field_{axis} stops at {extreme * 1e6:.6g} uT in {total} readings, {length} in a "
+                "row here, while the others go on. The sensor is saturated by a magnet or iron; "
+                "what it shows there has neither size nor direction of the field.",
+                int(rows[readings[start]]),
+            )
+
+
+def _iron(
+    mag: MagTable, rows: np.ndarray, field: np.ndarray, size: np.ndarray
+) -> Iterator[Finding]:
+    """A size that changes: hard iron if another centre steadies it, else soft iron or places."""
+    usual = float(np.median(size))
+    low, high = np.percentile(size, [5, 95])
+    off = np.abs(size / usual - 1.0) > _FAR
+    shown = f"between {low * 1e6:.3g} and {high * 1e6:.3g} uT (of 90 % of the samples)"
+    centre = _centre(field / usual)
+    if centre is not None:
+        left = np.linalg.norm(field / usual - centre, axis=1)
+        steadied = left.std() / left.mean() < 0.5 * size.std() / size.mean()
+        if steadied and np.linalg.norm(centre) > 0.1:
+            offset = ", ".join(f"{c:+.1f}" for c in centre * usual * 1e6)
+            yield finding(
+                mag,
+                "warning",
+                "field_offset",
+                float(np.linalg.norm(centre)) * usual,
+                f"the size of the magnetic field changes while the sensor turns, {shown}, and it "
+                f"hardly would without an offset of ({offset}) uT. That is hard iron: run "
+                "`robins calibrate` on a log in which the sensor is turned all about, or heading "
+                "errs by several degrees.",
+            )
+            return
+    if (high - low) / usual > _SPREAD:
+        yield finding(
+            mag,
+            "warning",
+            "field_varies",
+            float((high - low) / usual),
+            f"the size of the magnetic field changes {shown}. That is hard or soft iron that turns "
+            "with the sensor, for which run `robins calibrate`; or it was carried past steel and "
+            "magnets, against which only a filter helps that refuses such samples.",
+        )
+    elif off.any():
+        yield finding(
+            mag,
+            "note",
+            "field_disturbed",
+            float(off.mean()),
+            f"the magnetic field is {_FAR:.0%} weaker or stronger than usual in "
+            f"{np.count_nonzero(off)} samples ({off.mean():.1%}), this one first. Steel or a "
+            "magnet was near; a filter should not take its heading from them.",
+            int(rows[np.argmax(off)]),
+        )
+
+
+def _centre(field: np.ndarray) -> np.ndarray | None:
+    """Centre of the sphere through (n, 3) points, by least squares; None if they hardly turn."""
+    direction = field / np.linalg.norm(field, axis=1, keepdims=True)
+    if np.linalg.eigvalsh(np.cov(direction.T))[0] < _TURNED:
+        return None
+    # |m - c|^2 = r^2 is linear in c and in r^2 - |c|^2.
+    known = np.column_stack([2.0 * field, np.ones(len(field))])
+    return np.linalg.lstsq(known, np.sum(field * field, axis=1), rcond=None)[0][:3]

@@ -1,0 +1,63 @@
+"""Magnetic field and attitude made safe: what is no number goes missing, rows stay in place.
+
+A magnetometer may miss samples for as long as it likes, and cameras lose a sensor behind a hand;
+the rows remain, NaN, so that both still run beside the inertial samples. Only rows whose stamps are
+out of order are refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from robins.dataset import AttitudeTable, MagTable
+from robins.logs.arrays import checked_attitude, checked_mag
+from robins.logs.ordering import increasing, reasons, rows_where
+from robins.logs.unit_length import TOLERANCE
+
+FIELD_LIMIT_T = 1.0  # beyond any magnetometer that finds north
+
+
+def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
+    """Clean one table of magnetic field, component by component.
+
+    Returns:
+        The table, and counts: rows with a component that is NaN (``mag_nan``), infinite
+        (``mag_inf``) or larger than `FIELD_LIMIT_T` (``mag_absurd``), which are or become NaN; and
+        rows refused as ``mag_duplicate``, ``mag_backward``, ``mag_ahead``.
+
+    Raises:
+        LogError: arrays that are no table.
+    """
+    mag = checked_mag(mag)
+    nan, inf = np.isnan(mag.field_t), np.isinf(mag.field_t)
+    absurd = (np.abs(mag.field_t) > FIELD_LIMIT_T) & ~inf
+    field_t = np.where(inf | absurd, np.nan, mag.field_t)
+    keep = increasing(mag.time_ns)
+    counts = {"nan": nan, "inf": inf, "absurd": absurd}
+    told = {reason: int(rows.any(axis=1).sum()) for reason, rows in counts.items()}
+    told |= reasons(mag.time_ns, keep)
+    table = rows_where(dataclasses.replace(mag, field_t=field_t), keep)
+    return table, {f"mag_{reason}": n for reason, n in told.items()}
+
+
+def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, int]]:
+    """Clean one table of attitude; an attitude is one thing, so it is missing whole.
+
+    Counts as `clean_mag`; ``attitude_absurd`` are quaternions that are not of unit length.
+
+    Raises:
+        LogError: arrays that are no table.
+    """
+    attitude = checked_attitude(attitude)
+    q_nb = attitude.q_nb
+    nan, inf = np.isnan(q_nb).any(axis=1), np.isinf(q_nb).any(axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        wrong = ~(np.abs(np.linalg.norm(q_nb, axis=1) - 1.0) < TOLERANCE) & ~nan & ~inf
+    bad = nan | inf | wrong
+    keep = increasing(attitude.time_ns)
+    told = {"nan": int((nan & ~inf).sum()), "inf": int(inf.sum()), "absurd": int(wrong.sum())}
+    told |= reasons(attitude.time_ns, keep)
+    blank = dataclasses.replace(attitude, q_nb=np.where(bad[:, None], np.nan, q_nb))
+    return rows_where(blank, keep), {f"attitude_{reason}": n for reason, n in told.items()}
