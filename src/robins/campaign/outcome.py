@@ -62,6 +62,7 @@ def simulate(
         metrics=metrics,
         claims=problem.claims(metrics),
         counts=_counts(found),
+        notes=list(problem.notes),
     )
 
 

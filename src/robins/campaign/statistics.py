@@ -52,6 +52,7 @@ class Statistics:
     _settled: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _norms: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _peaks: list[np.ndarray] = field(default_factory=list)
+    _norm_peaks: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.chunks` yields it."""
@@ -78,10 +79,14 @@ class Statistics:
         self.n = int(record["dim"][0])
         counted = error[:, self.counted]
         for norm in self.norms:
-            length = np.sqrt(np.sum(counted[:, :, list(norm.components)] ** 2, axis=2))
+            whole = np.sqrt(np.sum(error[:, :, list(norm.components)] ** 2, axis=2))
+            length = whole[:, self.counted]
             with np.errstate(invalid="ignore"):  # the spread of an infinite error
                 pair = np.stack([np.mean(length, axis=1), np.std(length, axis=1)], axis=1)
             self._norms.setdefault(norm.name, []).append(pair)
+            if self.windows:
+                worst = [np.max(whole[:, span], axis=1) for span in self.windows]
+                self._norm_peaks.setdefault(norm.name, []).append(np.stack(worst, axis=1))
         self._run_rms.append(np.sqrt(np.mean(counted**2, axis=1)))
         self._run_worst.append(np.max(np.abs(counted), axis=1))
         if self.windows:
@@ -129,6 +134,10 @@ class Statistics:
     def peaks(self) -> np.ndarray:
         """(runs, windows, r) largest error of each run in each window."""
         return np.concatenate(self._peaks)
+
+    def norm_peaks(self, name: str) -> np.ndarray:
+        """(runs, windows) the same of a norm."""
+        return np.concatenate(self._norm_peaks[name])
 
     @property
     def run_rms(self) -> np.ndarray:

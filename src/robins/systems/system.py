@@ -110,6 +110,7 @@ class Problem(NamedTuple):
     bound_of: str | None = None  # the contender whose model's covariance bound is drawn in
     norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
     windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
+    notes: Sequence[str] = ()  # sentences for the reader of the report
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""Test-bed A: roll, pitch, yaw and rates of a spinning body, as the paper states the problem.
+
+    p' = -e2 p ,   q' = e1 p r - e3 q ,   r' = -e1 p q - e3 r
+    roll'  = p + (q sin roll + r cos roll) tan pitch
+    pitch' = q cos roll - r sin roll
+    yaw'   = (q sin roll + r cos roll) / cos pitch
+
+The paper does not print its state equation; this is the free axisymmetric body that a sounding
+rocket is above the air. It is singular at a pitch of 90 deg. "Magnetic attitude", three angles from
+one vector, cannot be measured: it is kept because the paper's filters are fed with it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins.filters import Model, Motion, Sensor
+from robins.manifold import Angle
+from robins.rotation import from_euler, from_rotvec, multiply, to_euler
+
+GYRO, MAGNETIC = "gyro", "magnetic"  # sensors
+
+
+class AngleState(NamedTuple):
+    """Attitude as angles, and rates [rad/s] of the body against inertial space."""
+
+    roll: Angle
+    pitch: Angle
+    yaw: Angle
+    omega_b: Any  # (3,)
+
+
+class Coefficients(NamedTuple):
+    """Of the motion: e1 (no unit), e2, e3 [1/s], a factor of the kinematic rows, the step [s]."""
+
+    e1: Any
+    e2: Any
+    e3: Any
+    kinematic: Any
+    step_s: Any
+
+
+def angle_state(q_nb: Array, omega_b: Array) -> AngleState:
+    """The state, or a run of them, of an attitude and its rates."""
+    return AngleState(*(Angle(a) for a in to_euler(q_nb)), omega_b)
+
+
+def slope(c: Coefficients, x: Array) -> Array:
+    """(6,) time derivative of (roll, pitch, yaw, p, q, r); module docstring."""
+    roll, pitch, _, p, q, r = x
+    sin, cos = jnp.sin(roll), jnp.cos(roll)
+    across = q * sin + r * cos
+    angles = jnp.stack(
+        [p + across * jnp.tan(pitch), q * cos - r * sin, across / jnp.cos(pitch)]
+    )
+    rates = jnp.stack([-c.e2 * p, c.e1 * p * r - c.e3 * q, -c.e1 * p * q - c.e3 * r])
+    return jnp.concatenate([c.kinematic * angles, rates])
+
+
+def step(c: Coefficients, state: AngleState, u: Any) -> AngleState:
+    """One step of the motion by Runge and Kutta's classic rule."""
+    x = jnp.concatenate([jnp.stack([a.rad for a in state[:3]]), state.omega_b])
+    h = c.step_s
+    k1 = slope(c, x)
+    k2 = slope(c, x + 0.5 * h * k1)
+    k3 = slope(c, x + 0.5 * h * k2)
+    k4 = slope(c, x + h * k3)
+    moved = h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    angles = (a.retract(moved[i : i + 1]) for i, a in enumerate(state[:3]))
+    return AngleState(*angles, state.omega_b + moved[3:])
+
+
+def stand_still(step_s: Any, state: AngleState, u: Any) -> AngleState:
+    """No motion at all: what is believed next is only what is measured next."""
+    return state
+
+
+def reckon(step_s: Any, state: AngleState, theta_b: Array) -> AngleState:
+    """Turn by the angles [rad] that the gyro reports of a step; its mean rate is that believed."""
+    q = multiply(from_euler(*(a.rad for a in state[:3])), from_rotvec(theta_b))
+    return angle_state(q, theta_b / step_s)
+
+
+def read_rate(state: AngleState, aux: Any) -> Array:
+    """What the gyro reads as a rate."""
+    return state.omega_b
+
+
+def read_angles(state: AngleState, aux: Any) -> tuple[Angle, Angle, Angle]:
+    """Roll, pitch, yaw: what the "magnetic attitude" reads, or a gyro that has been integrated."""
+    return state[:3]
+
+
+def rate_sensor(sigma_rad_s: Array) -> Sensor:
+    """The gyro; sigma (3,)."""
+    return Sensor(read_rate, sigma_rad_s, 3, GYRO)
+
+
+def angle_sensor(name: str, sigma_rad: Array) -> Sensor:
+    """Three angles; sigma (3,)."""
+    return Sensor(read_angles, sigma_rad, 3, name)
+
+
+def body_model(c: Coefficients, noise: Array, sensors: tuple[Sensor, ...]) -> Model:
+    """The spinning body; noise (6,) of a step."""
+    return Model(Motion(Partial(step, c), noise), sensors)
+
+
+def reckoned_model(step_s: Array, noise: Array) -> Model:
+    """Dead reckoning: the gyro as the input of the motion, and no sensor."""
+    return Model(Motion(Partial(reckon, step_s), noise), ())
+
+
+def unmoved_model(step_s: Array, noise: Array, sensor: Sensor) -> Model:
+    """A sensor taken at its word: noise far above its own forgets what was before."""
+    return Model(Motion(Partial(stand_still, step_s), noise), (sensor,))

@@ -1,0 +1,159 @@
+"""The filters that are compared, by study, and what each is made of.
+
+The paper's filter is "federated-vector-stukf": two local unscented filters, for gyro and
+magnetometer, each with strong tracking in its simplified (lumped) form; shares by the observability
+of each state; information shared as A^-1/2 P A^-1/2 ("half"), with a reset at every step. It is no
+upper bound (`robins.filters.federated`), hence the warning that is silenced here: the study is
+about it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.filters import Filter, Rule, channel, federated, kalman, taylor, unscented
+from robins.filters.rules import discriminator, gate, huber, strong_tracking
+from robins.systems.rocket.angles import GYRO, MAGNETIC
+from robins.systems.rocket.parameters import ANGLE_FILTERS, FIELD_FILTERS
+
+PROBABILITY = 0.999  # of the chi-square tests
+PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a loss of track to be borne
+
+Shares = tuple[tuple[float, ...], ...]  # of the two local filters, one for each state
+
+
+def ukf(*rules: Rule) -> Filter:
+    """Unscented filter with the sigma points of the study."""
+    return kalman(unscented(alpha=0.5, beta=2.0, kappa=0.0), rules)
+
+
+def simplified(beta: float = 1.0) -> Rule:
+    """Strong tracking as the paper prints it."""
+    return strong_tracking(0.95, beta, "lumped", "classic", limit=1e3)
+
+
+def telling(robust: str = "huber") -> Rule:
+    """Outliers told from model errors, fading only what the channel sees."""
+    return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust)
+
+
+def patient() -> Rule:
+    """A gate that gives in when it has refused for too long, and says so."""
+    return gate(PROBABILITY, PATIENCE, "inflate")
+
+
+def _two(
+    sharing: str, shares: str | Shares, rules: Callable[[], Sequence[Rule]] = tuple
+) -> Filter:
+    """A local filter for the gyro, one for the magnetometer; reset at every step."""
+    channels = [channel((name,), ukf(*rules())) for name in (GYRO, MAGNETIC)]
+    given = shares if isinstance(shares, str) else np.asarray(shares)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
+        return federated(
+            channels,
+            "fusion-reset",
+            sharing,
+            given,
+            linearise=unscented(alpha=0.5, beta=2.0, kappa=0.0),
+        )
+
+
+class Kind(NamedTuple):
+    """A filter of the study "magnetic-attitude"."""
+
+    make: Callable[[Shares], Filter]
+    sensors: tuple[str, ...] = (GYRO, MAGNETIC)
+    motion: str = "body"  # or "reckoned" by the gyro, or "unmoved"
+
+
+def _one(*rules: Rule) -> Callable[[Shares], Filter]:
+    return lambda shares: ukf(*rules)
+
+
+KINDS: dict[str, Kind] = {
+    "gyro": Kind(lambda shares: kalman(taylor()), (), "reckoned"),
+    "magnetic-raw": Kind(lambda shares: kalman(taylor()), (MAGNETIC,), "unmoved"),
+    "magnetometer": Kind(_one(), (MAGNETIC,)),
+    "gyro-ukf": Kind(_one(), (GYRO,)),
+    "ukf": Kind(_one()),
+    "federated-scalar-ukf": Kind(lambda shares: _two("scalar", "equal")),
+    "federated-vector-ukf": Kind(lambda shares: _two("half", shares)),
+    "federated-root": Kind(lambda shares: _two("root", shares)),
+    "stukf": Kind(_one(simplified())),
+    "federated-scalar-stukf": Kind(lambda shares: _two("scalar", "equal", lambda: [simplified()])),
+    "federated-vector-stukf": Kind(lambda shares: _two("half", shares, lambda: [simplified()])),
+    "federated-vector-multiple": Kind(
+        lambda shares: _two(
+            "half", shares, lambda: [strong_tracking(0.95, 1.0, "multiple", "classic", limit=1e3)]
+        )
+    ),
+    "federated-vector-weakened": Kind(
+        lambda shares: _two("half", shares, lambda: [simplified(beta=4.0)])
+    ),
+    "huber": Kind(_one(huber(PROBABILITY))),
+    "gate": Kind(_one(patient())),
+    "discriminator": Kind(_one(telling())),
+    "federated-root-discriminator": Kind(lambda shares: _two("root", shares, lambda: [telling()])),
+}
+
+
+class FieldKind(NamedTuple):
+    """A filter of the study "field-vector"."""
+
+    make: Callable[[], Filter]
+    sees: str = "field"  # or "nothing", or "snapshot": the field taken at its word
+    scaled: bool = False  # scale factors of the gyro are states
+
+
+FIELD_KINDS: dict[str, FieldKind] = {
+    "gyro": FieldKind(lambda: kalman(taylor()), "nothing"),
+    "magnetometer": FieldKind(lambda: kalman(taylor()), "snapshot"),
+    "usque": FieldKind(ukf),
+    "huber": FieldKind(lambda: ukf(huber(PROBABILITY))),
+    "gate": FieldKind(lambda: ukf(patient())),
+    "discriminator": FieldKind(lambda: ukf(telling())),
+    "discriminator-gate": FieldKind(lambda: ukf(telling("gate"))),
+    "strong-tracking": FieldKind(lambda: ukf(simplified())),
+    "strong-tracking-projected": FieldKind(
+        lambda: ukf(strong_tracking(0.95, 1.0, "projected", "classic", limit=1e3))
+    ),
+    "gate-scale-factor": FieldKind(lambda: ukf(patient()), scaled=True),
+    "usque-scale-factor": FieldKind(ukf, scaled=True),
+}
+
+assert set(KINDS) == set(ANGLE_FILTERS)
+assert set(FIELD_KINDS) == set(FIELD_FILTERS)
+
+
+@cache
+def make_filter(name: str, shares: Shares) -> Filter:
+    """A filter of "magnetic-attitude"; the same object each time, so that it compiles once.
+
+    Args:
+        name: of the filter.
+        shares: (2, 6) of gyro and magnetometer in each state, for those that share by state.
+
+    Raises:
+        ValueError: there is no filter of this name.
+    """
+    if name not in KINDS:
+        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(KINDS)}")
+    return KINDS[name].make(shares)
+
+
+@cache
+def make_field_filter(name: str) -> Filter:
+    """A filter of "field-vector"; the same object each time, so that it compiles once.
+
+    Raises:
+        ValueError: there is no filter of this name.
+    """
+    if name not in FIELD_KINDS:
+        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(FIELD_KINDS)}")
+    return FIELD_KINDS[name].make()

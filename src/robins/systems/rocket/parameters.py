@@ -1,0 +1,205 @@
+"""Parameters of a spinning rocket in free flight, with units.
+
+Two studies share the flight, the body, the gyro and the disturbances of the magnetometer: in
+"magnetic-attitude" the magnetometer reports three angles, as the paper has it; in "field-vector" it
+reports the field, and the gyro drives the motion.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, default
+from robins.systems.system import Scenario
+
+Three = tuple[float, float, float]
+
+
+class Span(Parameters):
+    """A time from `begin` (included) to `end` (not)."""
+
+    begin: Annotated[float, Quantity("time", least="0 s")]
+    end: Annotated[float, Quantity("time", above="0 s")]
+
+    @pydantic.model_validator(mode="after")
+    def _in_order(self) -> Span:
+        if self.end <= self.begin:
+            raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
+        return self
+
+
+class Launch(Parameters):
+    """Where free flight begins, when, and how fast, relative to inertial space."""
+
+    latitude: Annotated[float, Quantity("angle", least="-90 deg", most="90 deg")]
+    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
+    height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
+    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    elevation: Annotated[float, Quantity("angle", above="0 deg", most="90 deg")]
+    azimuth: Annotated[float, Quantity("angle")] = default("0 deg")
+    year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2026.0
+
+
+class Body(Parameters):
+    """A body symmetric about its x axis, that spins and cones; white torque over inertia."""
+
+    spin: Annotated[float, Quantity("angle rate", above="0 deg/s")]
+    cone: Annotated[float, Quantity("angle", least="0 deg", below="80 deg")]  # half angle
+    elevation: Annotated[float, Quantity("angle", least="-90 deg", most="90 deg")]  # of momentum
+    azimuth: Annotated[float, Quantity("angle")]
+    e1: Annotated[float, pydantic.Field(ge=-1.0, lt=1.0)]  # 1 - Ix/It
+    # times 1/e2 in which the spin decays, and 1/e3 in which the rates across do; none: never
+    spin_decay: Annotated[float, Quantity("time", above="0 s")] | None = None
+    cone_decay: Annotated[float, Quantity("time", above="0 s")] | None = None
+    torque: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")]
+
+
+class Gyro(Parameters):
+    """A MEMS triad: constant, slow and white errors; sigma of the white one is of a sample."""
+
+    white: Annotated[float, Quantity("angle rate", above="0 deg/s")]
+    bias: Annotated[float, Quantity("angle rate", least="0 deg/h")] = default("5 deg/h")
+    drift: Annotated[float, Quantity("angle rate", least="0 deg/h")] = default("5 deg/h")
+    drift_time: Annotated[float, Quantity("time", above="0 s")] = default("300 s")
+    scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")
+    # of the attitude that the gyro is integrated to, where that is what is read of it
+    attitude_noise: Annotated[float, Quantity("angle", above="0 deg")] = default("0.5 deg")
+    lost: tuple[Span, ...] = ()
+
+
+class Disturbance(Parameters):
+    """The magnetometer is wrong by an angle, for a while, again and again."""
+
+    angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
+    every: Annotated[float, Quantity("time", above="0 s")] = default("30 s")
+    length: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+
+    @pydantic.model_validator(mode="after")
+    def _pauses(self) -> Disturbance:
+        if self.length >= self.every:
+            raise ValueError(
+                f"length ({self.length:g} s) must be below every ({self.every:g} s), or the "
+                "magnetometer is never right"
+            )
+        return self
+
+
+class Magnetometer(Parameters):
+    """White noise and disturbances, as angles; hard and soft iron stay uncalibrated errors."""
+
+    noise: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
+    disturbance: Disturbance | None = None
+    lost: tuple[Span, ...] = ()
+
+
+class Start(Parameters):
+    """How the estimate begins: its error, and what it believes of it, one sigma."""
+
+    attitude_error: Annotated[Three, Quantity("angle")] = default("0 deg")
+    attitude: Annotated[float, Quantity("angle", above="0 deg")] = default("2 deg")
+    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("1 deg/s")
+
+
+class Flight(Scenario, Parameters):
+    """What the two studies share."""
+
+    system: Literal["rocket"] = "rocket"
+    claims: tuple[str, ...] = ()  # ids of those the scenario checks
+    duration: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
+    step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+    counted_from: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
+    quiet_after: Annotated[float, Quantity("time", least="0 s")] = default("10 s")
+    launch: Launch
+    body: Body
+    gyro: Gyro
+    magnetometer: Magnetometer = pydantic.Field(default_factory=Magnetometer)
+    start: Start = pydantic.Field(default_factory=Start)
+
+    @pydantic.model_validator(mode="after")
+    def _long_enough(self) -> Flight:
+        if self.counted_from >= self.duration:
+            raise ValueError(
+                f"counted_from ({self.counted_from:g} s) must be before the end of the flight at "
+                f"{self.duration:g} s"
+            )
+        if self.duration < 2.0 * self.step:
+            raise ValueError(
+                f"duration ({self.duration:g} s) must hold two steps of {self.step:g} s at least"
+            )
+        burst = self.magnetometer.disturbance
+        if burst is not None and burst.length < self.step * (1.0 - 1e-9):
+            raise ValueError(
+                f"magnetometer.disturbance.length ({burst.length:g} s) is shorter than a step of "
+                f"{self.step:g} s: it would miss every sample"
+            )
+        return self
+
+
+class Believed(Parameters):
+    """What the filters believe of the motion: the paper's equation is wrong by some per cent."""
+
+    error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
+    wrong: Literal["rates", "all"] = "all"  # only e1, e2, e3, or the kinematic rows too
+    attitude_noise: Annotated[float, Quantity("angle", above="0 deg")] = default("1e-5 rad")
+    rate_noise: Annotated[float, Quantity("rate random walk", above="0 deg/s/sqrt(s)")] = default(
+        "0.02 deg/s/sqrt(s)"
+    )
+    noise_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the variances of both
+
+
+ANGLE_FILTERS = (
+    *("gyro", "magnetic-raw", "magnetometer", "gyro-ukf"),
+    *("ukf", "federated-scalar-ukf", "federated-vector-ukf", "federated-root"),
+    *("stukf", "federated-scalar-stukf", "federated-vector-stukf"),
+    *("federated-vector-multiple", "federated-vector-weakened"),
+    *("huber", "gate", "discriminator", "federated-root-discriminator"),
+)
+"""Every filter of the study "magnetic-attitude"."""
+
+ANGLES_COMPARED = (
+    *("gyro", "magnetic-raw", "magnetometer", "ukf", "federated-scalar-ukf"),
+    *("federated-vector-stukf", "federated-root", "huber", "gate", "discriminator"),
+)
+"""Those that a scenario compares unless it says otherwise."""
+
+
+class MagneticAttitude(Flight, Parameters):
+    """Test-bed A: attitude angles "measured" by the magnetometer, the formulation of the paper."""
+
+    study: Literal["magnetic-attitude"] = "magnetic-attitude"
+    title: str = "Rocket, magnetic attitude"
+    filters: tuple[str, ...] = ANGLES_COMPARED
+    gyro_reads: Literal["rate", "attitude"] = "rate"
+    believed: Believed = pydantic.Field(default_factory=Believed)
+
+
+FIELD_FILTERS = (
+    *("gyro", "magnetometer", "usque", "huber", "gate", "discriminator", "discriminator-gate"),
+    *("strong-tracking", "strong-tracking-projected", "gate-scale-factor", "usque-scale-factor"),
+)
+"""Every filter of the study "field-vector"."""
+
+FIELD_COMPARED = (
+    *("gyro", "magnetometer", "usque", "huber", "gate", "discriminator"),
+    *("strong-tracking", "gate-scale-factor"),
+)
+"""Those that a scenario compares unless it says otherwise."""
+
+
+class FieldVector(Flight, Parameters):
+    """Test-bed B: attitude on SO(3), driven by the gyro, corrected by the measured field."""
+
+    study: Literal["field-vector"] = "field-vector"
+    title: str = "Rocket, field vector"
+    filters: tuple[str, ...] = FIELD_COMPARED
+    scale_factor_sigma: Annotated[float, Quantity("ratio", above="0")] = default("1000 ppm")
+
+    @pydantic.model_validator(mode="after")
+    def _gyro_is_there(self) -> FieldVector:
+        if self.gyro.lost:
+            raise ValueError(
+                "gyro.lost is for the study 'magnetic-attitude': here the gyro drives the motion"
+            )
+        return self
