@@ -26,10 +26,13 @@ from robins.logs.loading import load_dataset, load_pair
 from robins.logs.local import Origin
 from robins.logs.mounting import Mounting
 from robins.logs.named_csv import read_named_imu, read_named_path, write_named
+from robins.logs.phone import read_phone
 from robins.logs.pyins_csv import read_pyins, write_pyins
 from robins.logs.registry import FORMATS, Format, open_log
 from robins.logs.rtklib import read_rtklib
 from robins.logs.tum import write_tum
+from robins.logs.ulog import read_ulog
+from robins.logs.xio import read_xio
 
 __all__ = [
     "FORMATS",
@@ -53,8 +56,11 @@ __all__ = [
     "read_kfgins_nav",
     "read_named_imu",
     "read_named_path",
+    "read_phone",
     "read_pyins",
     "read_rtklib",
+    "read_ulog",
+    "read_xio",
     "write_euroc_imu",
     "write_kfgins_gnss",
     "write_kfgins_imu",

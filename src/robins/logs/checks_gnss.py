@@ -41,9 +41,11 @@ def _missing(gnss: GnssTable) -> Iterator[Finding]:
         bad = ~(np.abs(column) <= limit)
         if bad.any():
             k = int(np.argmax(bad))
+            # Phones know speed and bearing, but no vertical velocity, and need none.
+            never = name.startswith("velocity") and bool(np.isnan(column).all())
             yield finding(
                 gnss,
-                "error" if bad.all() else "warning",
+                "note" if never else "error" if bad.all() else "warning",
                 "gnss_missing",
                 int(bad.sum()),
                 f"{name} is {column[k]:g} here, missing or impossible in {bad.sum()} of "

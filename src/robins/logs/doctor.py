@@ -80,7 +80,8 @@ def _examined(
     # What shall tell only how the sensor itself is turned may lie any way.
     in_vehicle = not kinds & {MagTable, AttitudeTable} or bool(kinds & {GnssTable, Trajectory})
     for table in tables:
-        findings += check_time(_CHECKED[type(table)](table), table.source in unit_known)
+        if not _stamped_as(table, imu):  # said once is enough
+            findings += check_time(_CHECKED[type(table)](table), table.source in unit_known)
         if isinstance(table, ImuTable):
             imu = checked_imu(table)
             findings += check_columns(imu)
@@ -110,6 +111,15 @@ def _examined(
             findings = [f for f in findings if f.code != "gyro_unit"]
         findings += of_motion
     return findings
+
+
+def _stamped_as(table: Table, imu: ImuTable | None) -> bool:
+    """Whether a table out of the file of the IMU has the same stamps."""
+    return imu is not None and table.source == imu.source and _same(table.time_ns, imu.time_ns)
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    return np.shape(one) == np.shape(other) and bool(np.all(np.asarray(one) == other))
 
 
 _CHECKED: dict[type, Callable[..., Table]] = {

@@ -35,8 +35,8 @@ def load_dataset(
 
     Returns:
         The dataset. ``meta["files"]`` maps imu, gnss, truth, mag, attitude to paths,
-        ``meta["findings"]`` lists what the readers left out, ``meta["lever_arm_b_m"]`` is that of
-        the mounting.
+        ``meta["findings"]`` lists what the readers left out, ``meta["time_unit_known"]`` the files
+        that say in which unit their stamps are, ``meta["lever_arm_b_m"]`` is that of the mounting.
 
     Raises:
         LogError: as `open_log`; no IMU log, or two tables of one kind.
@@ -48,11 +48,11 @@ def load_dataset(
         )
     findings: list[Finding] = []
     held: dict[str, Any] = {}
-    meta: dict[str, Any] = {}
+    known: list[str] = []
     for path in paths:
         opened = open_log(path, (formats or {}).get(path), findings)
         if isinstance(opened, Dataset):
-            meta |= opened.meta
+            known += opened.meta.get("time_unit_known", ())
         for table in tables_of(opened):
             kind = kind_of(table)
             if kind in held:
@@ -71,9 +71,9 @@ def load_dataset(
         name=name or Path(held["imu"].source).name.split(".")[0],
         **turned,
         meta={
-            **meta,
             "files": {kind: table.source for kind, table in held.items()},
             "findings": findings,
+            "time_unit_known": tuple(known),
             "lever_arm_b_m": mounting.lever_arm_b_m if mounting else (0.0, 0.0, 0.0),
         },
     )

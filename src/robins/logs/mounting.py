@@ -11,6 +11,7 @@ import numpy as np
 
 from robins import rotation
 from robins.dataset import AttitudeTable, ImuTable, MagTable
+from robins.ins.frames import to_ned_frd
 
 OnBoard = TypeVar("OnBoard", ImuTable, MagTable, AttitudeTable)
 
@@ -50,8 +51,11 @@ class Mounting:
     def turn(self, table: OnBoard) -> OnBoard:
         """The same samples, field or attitude along body axes, forward-right-down.
 
-        An attitude sensor to navigation becomes body to navigation: q_nb = q_ns q_sb.
+        An attitude sensor to navigation becomes body to navigation: q_nb = q_ns q_sb. What lies
+        along right-forward-up is first named forward-right-down.
         """
+        if table.body != "FRD":
+            table = _relabelled(table)
         if isinstance(table, AttitudeTable):
             if not any((self.roll_deg, self.pitch_deg, self.yaw_deg)):
                 return dataclasses.replace(table, body="FRD")
@@ -63,6 +67,13 @@ class Mounting:
             return dataclasses.replace(table, field_t=_turned(C_bs, table.field_t), body="FRD")
         gyro, accel = (_turned(C_bs, v) for v in (table.gyro, table.accel))
         return dataclasses.replace(table, gyro=gyro, accel=accel, body="FRD")
+
+
+def _relabelled(table: OnBoard) -> OnBoard:
+    """In forward-right-down, the navigation axes of an attitude as they are."""
+    if isinstance(table, AttitudeTable) and table.nav == "ENU":
+        return dataclasses.replace(to_ned_frd(dataclasses.replace(table, nav="NED")), nav="ENU")
+    return to_ned_frd(table)
 
 
 def _turned(C_bs: np.ndarray, vectors: np.ndarray) -> np.ndarray:

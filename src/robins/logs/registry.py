@@ -9,7 +9,18 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from robins.dataset import Dataset
-from robins.logs import broad, euroc, gnss_imu, kfgins, named_csv, pyins_csv, rtklib
+from robins.logs import (
+    broad,
+    euroc,
+    gnss_imu,
+    kfgins,
+    named_csv,
+    phone,
+    pyins_csv,
+    rtklib,
+    ulog,
+    xio,
+)
 from robins.logs.findings import Finding, LogError
 from robins.logs.opening import beginning
 from robins.logs.tables import Table
@@ -181,11 +192,33 @@ FORMATS: tuple[Format, ...] = (
         named_csv.read_named_path,
     ),
     Format(
+        "xio-csv",
+        "several",
+        "CSV of x-io and Fusion: Time (s), Gyroscope X (deg/s) .. Magnetometer Z (uT)",
+        xio.is_xio,
+        xio.read_xio,
+    ),
+    Format(
+        "phone-csv",
+        "several",
+        "CSV of a phone, as of strapdown-rs: time, latitude, acc_x, gyro_x, mag_x, ..",
+        phone.is_phone,
+        phone.read_phone,
+    ),
+    Format(
         "broad-npz",
         "several",
         "NumPy archive of BROAD: imu_gyr, imu_acc, imu_mag, opt_quat, movement, sampling_rate",
         broad.is_archive,
         broad.read_broad,
+        binary=True,
+    ),
+    Format(
+        "px4-ulog",
+        "several",
+        "PX4 ULog: sensor_combined, vehicle_magnetometer, vehicle_gps_position",
+        ulog.is_ulog,
+        ulog.read_ulog,
         binary=True,
     ),
 )

@@ -1,0 +1,169 @@
+"""Drives recorded by a phone, as strapdown-rs keeps them: CSV with named columns, UTC dates.
+
+Columns come in any order: ``time`` (``2025-06-11 20:34:27+00:00``), ``latitude longitude`` [deg],
+``altitude`` [m], ``speed`` [m/s] and ``bearing`` [deg], their accuracies, ``acc_x`` .. [m/s^2],
+``gyro_x`` .. [rad/s], ``mag_x`` .. [uT]. An empty cell is missing; a line is a sample only of what
+it has a number of.
+
+The axes are Android's: x to the right of the screen, y to its upper edge, z out of it towards who
+looks at it. A phone that lies flat, upper edge ahead, is right-forward-up, and that is what the
+tables say; in a holder it stands otherwise, for which give a `Mounting`.
+
+Android states the radius within which the place is with 68 %, so one sigma along north and east is
+that over 1.51. The altitude is taken as above the ellipsoid, as Android gives it; phones of another
+make give it above the sea.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.logs.findings import Finding, LogError
+from robins.logs.text import Columns, Head, Layout, peek, read_columns
+from robins.logs.timebase import calendar_to_ns
+from robins.units import to_si
+
+_GYRO, _ACCEL, _MAG = (tuple(f"{s}_{axis}" for axis in "xyz") for s in ("gyro", "acc", "mag"))
+_PLACE = ("latitude", "longitude", "altitude", "horizontalAccuracy", "verticalAccuracy")
+_VELOCITY = ("speed", "bearing", "speedAccuracy", "bearingAccuracy")
+_NEEDED = ("time", *_GYRO, *_ACCEL, *_MAG, *_PLACE, *_VELOCITY)
+_STAMP = re.compile(
+    r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d:\d\d:\d\d(?:\.\d{1,9})?)(?:Z|([+-])(\d\d):?(\d\d))", re.ASCII
+)
+_RADIUS_68 = float(np.sqrt(-2.0 * np.log(1.0 - 0.68)))  # in sigmas of one axis
+_SINGLE = 5  # RTKLIB's Q of a fix without corrections
+
+
+def _header(head: Head) -> tuple[int, list[str]]:
+    line, text = (head.data(1) or [(1, "")])[0]
+    return line, [name.strip().strip('"') for name in text.split(",")]
+
+
+def is_phone(head: Head) -> bool:
+    """Whether a header names the columns of such a drive."""
+    names = _header(head)[1]
+    return names[0] == "time" and {"acc_x", "gyro_x", "horizontalAccuracy"} <= set(names)
+
+
+def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+    """Read inertial samples, magnetic field and fixes.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: a column is missing or is not numbers, a stamp is no date, or nothing was
+            recorded of one of the sensors.
+    """
+    file, head = str(path), peek(path)
+    line, names = _header(head)
+    if lacking := [name for name in _NEEDED if name not in names]:
+        raise LogError(
+            file,
+            f"the header lacks {', '.join(lacking)}",
+            "is it of another format?",
+            where=f"line {line}",
+        )
+    if twice := sorted({name for name in _NEEDED if names.count(name) > 1}):
+        raise LogError(
+            file, f"the header names {', '.join(twice)} twice", "keep one", where=f"line {line}"
+        )
+    if names[0] != "time":
+        raise LogError(
+            file, "the first column is not the time", "put it first", where=f"line {line}"
+        )
+    columns = read_columns(path, Layout(tuple(names), ",", skip=line), findings)
+    place = {name: k - 1 for k, name in enumerate(names)}
+
+    def stack(*wanted: str) -> np.ndarray:
+        return columns.values[:, [place[name] for name in wanted]]
+
+    time_ns = _stamps(file, columns)
+    have = {
+        "inertial samples": np.isfinite(stack(*_GYRO, *_ACCEL)).any(axis=1),
+        "magnetic field": np.isfinite(stack(*_MAG)).any(axis=1),
+        "fixes": np.isfinite(stack("latitude", "longitude")).any(axis=1),
+    }
+    for what, lines in have.items():
+        if not lines.any():
+            raise LogError(file, f"no line has {what}", "record that sensor as well")
+    imu, mag, gnss = have.values()
+    return Dataset(
+        name=Path(file).name.split(".")[0],
+        imu=ImuTable(
+            time_ns[imu],
+            stack(*_GYRO)[imu],
+            stack(*_ACCEL)[imu],
+            "rate",
+            body="RFU",
+            source=file,
+            rows=columns.rows[imu],
+        ),
+        mag=MagTable(
+            time_ns[mag],
+            to_si(stack(*_MAG)[mag], "uT"),
+            body="RFU",
+            source=file,
+            rows=columns.rows[mag],
+        ),
+        gnss=_fixes(
+            file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], columns.rows[gnss]
+        ),
+        meta={"time_unit_known": (file,)},
+    )
+
+
+def _fixes(
+    file: str, time_ns: np.ndarray, place: np.ndarray, velocity: np.ndarray, rows: np.ndarray
+) -> GnssTable:
+    lat_deg, lon_deg, alt_m, radius_m, sigma_alt_m = place.T
+    speed, bearing_deg, sigma_speed, sigma_bearing_deg = velocity.T
+    bearing = np.deg2rad(bearing_deg)
+    # A bearing that is 180 deg unsure says nothing: the error is at most twice the speed.
+    across = speed * np.minimum(np.deg2rad(sigma_bearing_deg), 2.0)
+    sigma = np.hypot(sigma_speed, across)
+    missing = np.full(len(speed), np.nan)
+    sigma_m = radius_m / _RADIUS_68
+    return GnssTable(
+        time_ns=time_ns,
+        lat_rad=np.deg2rad(lat_deg),
+        lon_rad=np.deg2rad(lon_deg),
+        alt_m=alt_m.copy(),
+        sigma_m=np.stack([sigma_m, sigma_m, sigma_alt_m], axis=-1),
+        v_n=np.stack([speed * np.cos(bearing), speed * np.sin(bearing), missing], axis=-1),
+        sigma_v=np.stack([sigma, sigma, missing], axis=-1),
+        quality=np.full(len(speed), _SINGLE, np.int64),
+        source=file,
+        rows=rows,
+    )
+
+
+def _stamps(file: str, columns: Columns) -> np.ndarray:
+    """Dates with their offset from UTC as nanoseconds since 1970 in GPS time."""
+    out = np.zeros(len(columns.rows), np.int64)
+    for k, raw in enumerate(columns.texts[:, 0]):
+        text = raw.decode("utf-8", "replace").strip().strip('"')
+        match = _STAMP.fullmatch(text)
+        try:
+            if match is None:
+                raise ValueError(text)
+            year, month, day, clock, sign, hours, minutes = match.groups()
+            utc_ns = calendar_to_ns(f"{year}/{month}/{day}", clock, utc=True)
+        except ValueError as error:
+            raise LogError(
+                file,
+                "is not a date and time with its offset from UTC",
+                "write it like 2025-06-11 20:34:27+00:00",
+                where=f"line {columns.rows[k]}",
+                field="time",
+                value=text,
+            ) from error
+        ahead_s = (3600 * int(hours) + 60 * int(minutes)) if sign else 0
+        out[k] = utc_ns - (-ahead_s if sign == "-" else ahead_s) * 1_000_000_000
+    return out

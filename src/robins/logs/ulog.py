@@ -1,0 +1,236 @@
+"""PX4 flight logs (ULog, ``.ulg``), decoded by the package pyulog of the extra ``logs``.
+
+Read are, from the first instance of each topic:
+
+- ``sensor_combined``: rates [rad/s] and specific force [m/s^2], forward-right-down;
+- ``vehicle_magnetometer``, else ``sensor_mag``: magnetic field [gauss];
+- ``vehicle_gps_position``, else ``sensor_gps``: fixes. Their ``eph`` is taken for north and for
+  east, as PX4's own filter does; components that the receiver calls invalid are missing.
+
+What PX4 estimated itself (``vehicle_attitude`` and the like) is no truth and is left alone. Stamps
+are microseconds since power-up. A ULog has no checksums: its framing is checked from the first byte
+to the last, a number that was altered within it cannot be noticed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.logs.findings import Finding, LogError, report
+from robins.logs.opening import whole
+from robins.logs.text import Head
+from robins.units import to_si
+
+MAGIC = b"ULog\x01\x12\x35"
+_START = 16  # bytes before the first message
+_HEADER = struct.Struct("<HB")  # size of what follows, type
+_TYPES = frozenset(b"BFIMPQARDLCSO")
+_LARGEST = 1 << 30  # bytes of a file
+_IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
+_GNSS = ("vehicle_gps_position", "sensor_gps")
+_NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
+_QUALITY = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}  # PX4's fix_type -> RTKLIB's Q
+
+
+class Topic(NamedTuple):
+    """What was logged of one topic."""
+
+    name: str
+    fields: dict[str, np.ndarray]
+
+
+def is_ulog(head: Head) -> bool:
+    """Whether a file begins as ULogs do."""
+    return head.start.startswith(MAGIC)
+
+
+def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> Dataset:
+    """Read inertial samples, and field and fixes where they were logged.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out; without it that is issued as `LogWarning`.
+
+    Raises:
+        LogError: pyulog is not installed; the log is damaged, or holds no inertial samples.
+    """
+    file = str(path)
+    data, cut = whole(path, _LARGEST)
+    if not data.startswith(MAGIC):
+        raise LogError(file, "is no ULog", "leave the format to be recognised", where="byte 0")
+    sound = _sound(data)
+    if sound < len(data) or cut:
+        report(findings, _ends_early(file, sound, len(data)))
+    log = _decode(file, data[:sound])
+    imu = _first(file, log, _IMU, findings)
+    if imu is None:
+        held = ", ".join(sorted({item.name for item in log.data_list})) or "nothing"
+        raise LogError(
+            file, f"has no samples of {_IMU[0]}; it holds {held}", "log that topic and fly again"
+        )
+    time_ns = _stamps(file, imu)
+    mag, gnss = (_first(file, log, topics, findings) for topics in (_MAG, _GNSS))
+    return Dataset(
+        name=Path(file).name.split(".")[0],
+        imu=ImuTable(
+            time_ns,
+            _triad(file, imu, "gyro_rad[{}]", "012"),
+            _triad(file, imu, "accelerometer_m_s2[{}]", "012"),
+            "rate",
+            source=file,
+        ),
+        mag=None if mag is None else _field(file, mag),
+        gnss=None if gnss is None else _fixes(file, gnss),
+        meta={"time_unit_known": (file,)},
+    )
+
+
+def _sound(data: bytes) -> int:
+    """Up to which byte the messages follow each other without a break."""
+    at = _START
+    while at + _HEADER.size <= len(data):
+        size, kind = _HEADER.unpack_from(data, at)
+        if kind not in _TYPES or size == 0 or at + _HEADER.size + size > len(data):
+            break
+        at += _HEADER.size + size
+    return min(at, len(data))
+
+
+def _decode(file: str, data: bytes) -> Any:
+    try:
+        from pyulog import ULog
+    except ImportError as error:
+        raise LogError(
+            file,
+            "is a PX4 ULog, and the package that reads it is not installed",
+            "install it with: pip install 'robins[logs]'",
+        ) from error
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(told):  # it prints what it doubts
+            log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
+    except Exception as error:  # what it raises on damage depends on where the damage is
+        raise _damaged(file, f"{type(error).__name__}: {error}") from error
+    if log.file_corruption:
+        raise _damaged(file, " ".join(told.getvalue().split()) or "messages contradict each other")
+    return log
+
+
+def _damaged(file: str, why: str) -> LogError:
+    return LogError(
+        file,
+        f"is damaged ({why})",
+        "fetch it again; nothing of it was used, for no number in it can be trusted",
+    )
+
+
+def _first(
+    file: str, log: Any, topics: tuple[str, ...], findings: list[Finding] | None
+) -> Topic | None:
+    """The first instance of the first of these topics that was logged."""
+    for name in topics:
+        found = sorted((d for d in log.data_list if d.name == name), key=lambda d: d.multi_id)
+        if len(found) > 1:
+            report(
+                findings,
+                Finding(
+                    "note",
+                    "several_instances",
+                    file,
+                    "",
+                    len(found),
+                    f"{Path(file).name}: {name} was logged of {len(found)} sensors; the first, "
+                    f"number {found[0].multi_id}, is read and the others are left alone.",
+                ),
+            )
+        if found:
+            return Topic(name, dict(found[0].data))
+    return None
+
+
+def _column(file: str, topic: Topic, name: str) -> np.ndarray:
+    if name in topic.fields:
+        return np.asarray(topic.fields[name], np.float64)
+    raise LogError(
+        file,
+        f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
+        "this version of PX4 is not known; export the topic to CSV",
+        field=topic.name,
+    )
+
+
+def _triad(file: str, topic: Topic, pattern: str, parts: str) -> np.ndarray:
+    return np.stack([_column(file, topic, pattern.format(part)) for part in parts], axis=-1)
+
+
+def _stamps(file: str, topic: Topic) -> np.ndarray:
+    """When it was measured, or else logged [ns]."""
+    sample = topic.fields.get("timestamp_sample")
+    stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
+    if stamps is None or stamps.dtype.kind != "u" or np.any(stamps > np.uint64(2**63 // 1000)):
+        raise LogError(
+            file,
+            "are no microseconds since power-up",
+            "fetch it again",
+            field=f"stamps of {topic.name}",
+        )
+    return stamps.astype(np.int64) * 1000
+
+
+def _field(file: str, topic: Topic) -> MagTable:
+    pattern, parts = ("{}", "xyz") if topic.name == "sensor_mag" else ("magnetometer_ga[{}]", "012")
+    field_t = to_si(_triad(file, topic, pattern, parts), "G")
+    return MagTable(_stamps(file, topic), field_t, source=file)
+
+
+def _fixes(file: str, topic: Topic) -> GnssTable:
+    """Older versions log integers of 1e-7 deg and mm, newer ones degrees and metres."""
+
+    def either(new: str, old: str, scale: float) -> np.ndarray:
+        return (
+            _column(file, topic, new) if new in topic.fields else _column(file, topic, old) * scale
+        )
+
+    fix = _column(file, topic, "fix_type")
+    lat_deg = either("latitude_deg", "lat", 1e-7)
+    lon_deg = either("longitude_deg", "lon", 1e-7)
+    alt_m = either("altitude_ellipsoid_m", "alt_ellipsoid", 1e-3)
+    eph, epv, speed = (_column(file, topic, name) for name in ("eph", "epv", "s_variance_m_s"))
+    v_n = _triad(file, topic, "vel_{}_m_s", "ned")
+    v_n[(fix < _FLAT_FIX) | (_column(file, topic, "vel_ned_valid") == 0)] = np.nan
+
+    def known(values: np.ndarray, least: int) -> np.ndarray:
+        return np.where(fix >= least, values, np.nan)
+
+    return GnssTable(
+        time_ns=_stamps(file, topic),
+        lat_rad=np.deg2rad(known(lat_deg, _NO_FIX)),
+        lon_rad=np.deg2rad(known(lon_deg, _NO_FIX)),
+        alt_m=known(alt_m, _FLAT_FIX),
+        sigma_m=np.stack([eph, eph, epv], axis=-1),
+        v_n=v_n,
+        sigma_v=np.repeat(speed[:, None], 3, axis=1),
+        quality=np.array([_QUALITY.get(int(k), 0) for k in fix], np.int64),
+        source=file,
+    )
+
+
+def _ends_early(file: str, sound: int, size: int) -> Finding:
+    return Finding(
+        "warning",
+        "ends_early",
+        file,
+        f"byte {sound}",
+        sound,
+        f"{Path(file).name} breaks off at byte {sound} of {size}: what follows is half a message, "
+        "or none. The recording or the copy was interrupted, or a crash report is appended; all "
+        "before it was read.",
+    )
