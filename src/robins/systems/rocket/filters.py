@@ -12,12 +12,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from robins.filters import Filter, Rule, channel, federated, kalman, taylor, unscented
-from robins.filters.rules import discriminator, gate, huber, strong_tracking
+from robins.filters.fusion import Sharing
+from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.parameters import ANGLE_FILTERS, FIELD_FILTERS
 
@@ -37,8 +38,15 @@ def simplified(beta: float = 1.0) -> Rule:
     return strong_tracking(0.95, beta, "lumped", "classic", limit=1e3)
 
 
-def telling(robust: str = "huber") -> Rule:
-    """Outliers told from model errors, fading only what the channel sees."""
+def telling(sensor: str) -> Rule:
+    """Outliers told from model errors; faded are the states that the sensor reads."""
+    seen = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0) if sensor == GYRO else (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    rule = discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", weights=seen)
+    return only((sensor,), rule)
+
+
+def telling_projected(robust: Literal["huber", "gate"]) -> Rule:
+    """The same for one vector, that sees none of the states whole."""
     return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust)
 
 
@@ -48,10 +56,10 @@ def patient() -> Rule:
 
 
 def _two(
-    sharing: str, shares: str | Shares, rules: Callable[[], Sequence[Rule]] = tuple
+    sharing: Sharing, shares: str | Shares, rules: Callable[[str], Sequence[Rule]] = lambda name: ()
 ) -> Filter:
     """A local filter for the gyro, one for the magnetometer; reset at every step."""
-    channels = [channel((name,), ukf(*rules())) for name in (GYRO, MAGNETIC)]
+    channels = [channel((name,), ukf(*rules(name))) for name in (GYRO, MAGNETIC)]
     given = shares if isinstance(shares, str) else np.asarray(shares)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
@@ -86,20 +94,22 @@ KINDS: dict[str, Kind] = {
     "federated-vector-ukf": Kind(lambda shares: _two("half", shares)),
     "federated-root": Kind(lambda shares: _two("root", shares)),
     "stukf": Kind(_one(simplified())),
-    "federated-scalar-stukf": Kind(lambda shares: _two("scalar", "equal", lambda: [simplified()])),
-    "federated-vector-stukf": Kind(lambda shares: _two("half", shares, lambda: [simplified()])),
+    "federated-scalar-stukf": Kind(lambda shares: _two("scalar", "equal", lambda name: [simplified()])),
+    "federated-vector-stukf": Kind(lambda shares: _two("half", shares, lambda name: [simplified()])),
     "federated-vector-multiple": Kind(
         lambda shares: _two(
-            "half", shares, lambda: [strong_tracking(0.95, 1.0, "multiple", "classic", limit=1e3)]
+            "half",
+            shares,
+            lambda name: [strong_tracking(0.95, 1.0, "multiple", "classic", limit=1e3)],
         )
     ),
     "federated-vector-weakened": Kind(
-        lambda shares: _two("half", shares, lambda: [simplified(beta=4.0)])
+        lambda shares: _two("half", shares, lambda name: [simplified(beta=4.0)])
     ),
     "huber": Kind(_one(huber(PROBABILITY))),
     "gate": Kind(_one(patient())),
-    "discriminator": Kind(_one(telling())),
-    "federated-root-discriminator": Kind(lambda shares: _two("root", shares, lambda: [telling()])),
+    "discriminator": Kind(_one(telling(GYRO), telling(MAGNETIC))),
+    "federated-root-discriminator": Kind(lambda shares: _two("root", shares, lambda name: [telling(name)])),
 }
 
 
@@ -117,8 +127,8 @@ FIELD_KINDS: dict[str, FieldKind] = {
     "usque": FieldKind(ukf),
     "huber": FieldKind(lambda: ukf(huber(PROBABILITY))),
     "gate": FieldKind(lambda: ukf(patient())),
-    "discriminator": FieldKind(lambda: ukf(telling())),
-    "discriminator-gate": FieldKind(lambda: ukf(telling("gate"))),
+    "discriminator": FieldKind(lambda: ukf(telling_projected("huber"))),
+    "discriminator-gate": FieldKind(lambda: ukf(telling_projected("gate"))),
     "strong-tracking": FieldKind(lambda: ukf(simplified())),
     "strong-tracking-projected": FieldKind(
         lambda: ukf(strong_tracking(0.95, 1.0, "projected", "classic", limit=1e3))
