@@ -12,7 +12,7 @@ import xarray as xr
 from robins import report, results
 from robins.cli.frame import BadInput, command_line, only_json
 from robins.cli.progress import Progress
-from robins.dataset import ImuTable
+from robins.dataset import Dataset, ImuTable
 from robins.ins import allan
 from robins.logs import open_log
 from robins.logs.clean import clean_imu
@@ -48,7 +48,8 @@ def still(path: Path) -> Still:
         BadInput: it holds no inertial samples.
     """
     findings: list[Any] = []
-    table = open_log(path, None, findings)
+    opened = open_log(path, None, findings)
+    table = opened.imu if isinstance(opened, Dataset) else opened
     if not isinstance(table, ImuTable):
         raise BadInput(f"{path}: holds no inertial samples; give the log of an IMU.")
     cleaned, counts, _ = clean_imu(table)

@@ -9,12 +9,9 @@ from typing import Any
 
 from robins.dataset import Dataset, ImuTable, Trajectory
 from robins.logs.findings import Finding, LogError
-from robins.logs.mounting import Mounting
+from robins.logs.mounting import Mounting, turned
 from robins.logs.registry import fitting, open_log
 from robins.logs.tables import Table, kind_of, tables_of
-
-# What lies along the axes of the sensor, so that a mounting turns it.
-_ON_BOARD = ("imu", "mag", "attitude")
 
 
 def load_dataset(
@@ -66,10 +63,9 @@ def load_dataset(
         raise LogError(
             ", ".join(paths) or "(no file)", "no IMU log among the files", "give one IMU log"
         )
-    turned = {k: mounting.turn(t) if mounting and k in _ON_BOARD else t for k, t in held.items()}
     return Dataset(
         name=name or Path(held["imu"].source).name.split(".")[0],
-        **turned,
+        **{kind: turned(table, mounting) for kind, table in held.items()},
         meta={
             "files": {kind: table.source for kind, table in held.items()},
             "findings": findings,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
-from robins.dataset import AttitudeTable, ImuTable, MagTable
+from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.ins.frames import to_ned_frd
 
-OnBoard = TypeVar("OnBoard", ImuTable, MagTable, AttitudeTable)
+OnBoard = TypeVar("OnBoard", bound=ImuTable | MagTable | AttitudeTable)
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,21 @@ class Mounting:
             return dataclasses.replace(table, field_t=_turned(C_bs, table.field_t), body="FRD")
         gyro, accel = (_turned(C_bs, v) for v in (table.gyro, table.accel))
         return dataclasses.replace(table, gyro=gyro, accel=accel, body="FRD")
+
+
+def turned(opened: Any, mounting: Mounting | None) -> Any:
+    """A table or dataset with all that lies along sensor axes turned to the body's.
+
+    Fixes and paths stay as they are, and so does everything where there is no mounting.
+    """
+    if mounting is None:
+        return opened
+    if isinstance(opened, Dataset):
+        on_board = {k: turned(getattr(opened, k), mounting) for k in ("imu", "mag", "attitude")}
+        return dataclasses.replace(opened, **on_board)
+    if isinstance(opened, ImuTable | MagTable | AttitudeTable):
+        return mounting.turn(opened)
+    return opened
 
 
 def _relabelled(table: OnBoard) -> OnBoard:
