@@ -78,25 +78,32 @@ def ballistic(
     _given.number("azimuth_rad", azimuth_rad)
     _given.number("time_s", time, 0.0)
 
-    c_ln = dcm_en(lat_rad, lon_rad)
-    r0 = ecef_from_geodetic(lat_rad, lon_rad, alt_m)
-    v0 = c_ln @ _velocity(speed_m_s, elevation_rad, azimuth_rad)
+    launch = (lat_rad, lon_rad, alt_m, speed_m_s, elevation_rad, azimuth_rad)
+    path, r0, v0 = _path(*(jnp.asarray(x, float) for x in launch), time)
     _refuse_no_return(r0, v0, time)
+    return path
 
+
+@jax.jit
+def _path(lat, lon, alt, speed, elevation, azimuth, time) -> tuple[BallisticPath, Array, Array]:
+    """The flight, and inertial position and velocity it begins with."""
+    c_il = dcm_en(lat, lon)
+    r0 = ecef_from_geodetic(lat, lon, alt)
+    v0 = c_il @ _velocity(speed, elevation, azimuth)
     r_i, v_i = _fly(r0, v0, time)
     turn = jnp.zeros((len(time), 3)).at[:, 2].set(OMEGA_E * time)
     q_ie = from_rotvec(turn)
-    lat, lon, alt = geodetic_from_ecef(rotate(conjugate(q_ie), r_i))
-    q_il = multiply(q_ie, from_dcm(dcm_en(lat, lon)))
-    q_local = normalise(multiply(conjugate(from_dcm(c_ln)), q_il))
-    return BallisticPath(time, r_i, v_i, lat, lon, alt, q_local)
+    here = geodetic_from_ecef(rotate(conjugate(q_ie), r_i))
+    q_il = multiply(q_ie, from_dcm(dcm_en(*here[:2])))
+    q_local = normalise(multiply(conjugate(from_dcm(c_il)), q_il))
+    return BallisticPath(time, r_i, v_i, *here, q_local), r0, v0
 
 
-def _velocity(speed_m_s, elevation_rad, azimuth_rad) -> Float[Array, "3"]:
+def _velocity(speed, elevation, azimuth) -> Float[Array, "3"]:
     """North, east, down [m/s]."""
-    speed, up, way = (jnp.asarray(x, float) for x in (speed_m_s, elevation_rad, azimuth_rad))
-    level = speed * jnp.cos(up)
-    return jnp.stack([level * jnp.cos(way), level * jnp.sin(way), -speed * jnp.sin(up)])
+    level = speed * jnp.cos(elevation)
+    rest = (level * jnp.cos(azimuth), level * jnp.sin(azimuth), -speed * jnp.sin(elevation))
+    return jnp.stack(rest)
 
 
 def _orbit(r0: Float[Array, "3"], v0: Float[Array, "3"]) -> tuple[Array, Array, Array]:
@@ -142,18 +149,21 @@ def _fly(r0, v0, time):
 def _refuse_no_return(r0, v0, time) -> None:
     if not _given.known(r0, v0, time):
         return
-    speed, escape = float(jnp.sqrt(v0 @ v0)), float(jnp.sqrt(2.0 * GM / jnp.sqrt(r0 @ r0)))
+    r0, v0 = np.asarray(r0), np.asarray(v0)
+    radius, speed = np.linalg.norm(r0), np.linalg.norm(v0)
+    escape = np.sqrt(2.0 * GM / radius)
     if speed >= escape:
         raise ValueError(
             f"speed_m_s is {speed:g}; from {escape:g} m/s on a vehicle does not come back"
         )
-    _, a, e_sin = (float(x) for x in _orbit(r0, v0))
-    e_cos = 1.0 - float(jnp.sqrt(r0 @ r0)) / a
+    a = 1.0 / (2.0 / radius - speed**2 / GM)
+    e_sin, e_cos = (r0 @ v0) / np.sqrt(GM * a), 1.0 - radius / a
     # From the eccentric anomaly E0 the same radius comes again at 2 pi - E0.
     start = np.arctan2(e_sin, e_cos)
     back = 2.0 * (np.pi - start + e_sin) / np.sqrt(GM / a**3)
-    if float(jnp.max(time)) > back * (1.0 + 1e-9):
+    last = float(np.max(time))
+    if last > back * (1.0 + 1e-9):
         raise ValueError(
-            f"time_s goes to {float(jnp.max(time)):g} s, but after {back:.6g} s the vehicle is "
+            f"time_s goes to {last:g} s, but after {back:.6g} s the vehicle is "
             "back at the radius of its launch: end the flight there"
         )
