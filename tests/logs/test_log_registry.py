@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_nine_axis import broad_bytes
+from made_ulog import flight
 
 from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.logs import FORMATS, LogError, Mounting, load_dataset, open_log
@@ -44,6 +45,16 @@ NAMED_PATH = (
     "time_ms,lat_deg,lon_deg,height_m,v_north_m_s,v_east_m_s,v_down_m_s,q_w,q_x,q_y,q_z\n"
     "100,48,11,500,1,2,0,1,0,0,0\n"
 )
+XIO = (
+    "Time (s),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer X (g),"
+    "Accelerometer Y (g),Accelerometer Z (g),Magnetometer X (uT),Magnetometer Y (uT),"
+    "Magnetometer Z (uT)\n0.01,0,0,0,0,0,1,15,1,-41\n"
+)
+PHONE = (
+    "time,bearingAccuracy,speedAccuracy,verticalAccuracy,horizontalAccuracy,speed,bearing,altitude,"
+    "longitude,latitude,acc_z,acc_y,acc_x,gyro_z,gyro_y,gyro_x,mag_z,mag_y,mag_x\n"
+    "2025-06-11 20:34:27+00:00,9,1,3,5,2,30,23,-75.1,39.9,9.8,0,0,0,0,0,-40,20,1\n"
+)
 SAMPLES = {
     "gnss-imu": (GNSS_IMU, ImuTable),
     "rtklib-pos": (RTKLIB, GnssTable),
@@ -56,7 +67,10 @@ SAMPLES = {
     "euroc-truth": (EUROC_TRUTH, Trajectory),
     "named-imu": (NAMED_IMU, ImuTable),
     "named-path": (NAMED_PATH, Trajectory),
+    "xio-csv": (XIO, Dataset),
+    "phone-csv": (PHONE, Dataset),
     "broad-npz": (broad_bytes(), Dataset),
+    "px4-ulog": (flight(0.1)[0], Dataset),
 }
 
 
@@ -67,6 +81,8 @@ def test_there_is_a_sample_of_every_format():
 @pytest.mark.parametrize("name", SAMPLES)
 @pytest.mark.parametrize("pack", [bytes, lzma.compress], ids=["", "xz"])
 def test_every_format_is_recognised_by_content_alone(tmp_path, name, pack):
+    if name == "px4-ulog":
+        pytest.importorskip("pyulog", reason="the extra `logs` is not installed")
     content, kind = SAMPLES[name]
     path = tmp_path / "no_telling_name"
     path.write_bytes(pack(content.encode() if isinstance(content, str) else content))

@@ -157,7 +157,7 @@ def _read(path: str | os.PathLike[str], kind: str, findings: list[Finding] | Non
     file, head = str(path), peek(path)
     header = _header(head)
     names = _names(file, header, kind)
-    layout = Layout(tuple(header.names), ",", skip=header.line)
+    layout = Layout(tuple(header.names), ",", skip=header.line, all_named=True)
     columns: Columns = read_columns(path, layout, findings)
     time = header.names[0]
     time_ns = stamps_to_ns(file, time, columns.texts[:, 0], columns.rows, _TIMES[time])

@@ -78,7 +78,7 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
         raise LogError(
             file, "the first column is not the time", "put it first", where=f"line {line}"
         )
-    columns = read_columns(path, Layout(tuple(names), ",", skip=line), findings)
+    columns = read_columns(path, Layout(tuple(names), ",", skip=line, all_named=True), findings)
     place = {name: k - 1 for k, name in enumerate(names)}
 
     def stack(*wanted: str) -> np.ndarray:

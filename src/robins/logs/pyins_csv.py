@@ -68,7 +68,7 @@ def read_pyins(
             "name the columns as pyins does",
             where="line 1",
         )
-    columns = read_columns(path, Layout(("time", *names), ",", skip=1), findings)
+    columns = read_columns(path, Layout(("time", *names), ",", skip=1, all_named=True), findings)
     time_ns = stamps_to_ns(file, "time", columns.texts[:, 0], columns.rows)
 
     def take(wanted: tuple[str, ...]) -> np.ndarray:

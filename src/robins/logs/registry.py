@@ -248,7 +248,7 @@ def recognise(path: str | os.PathLike[str]) -> Format:
         return found[0]
     candidates = found or FORMATS
     shown = (head.data(1) or [(1, head.lines[0])])[0]
-    commas = re.search(r"\d,\d+(;|\s)\s*[-+\d]", shown[1])
+    commas = any(re.search(r"\d,\d+(;|\s)\s*[-+\d]", text) for _, text in head.data(2))
     raise LogError(
         head.file,
         f"{'several formats fit' if found else 'no known format fits'} "

@@ -44,6 +44,7 @@ class Layout(NamedTuple):
     delimiter: str | None  # None: blanks
     texts: int = 1
     skip: int = 0  # header lines
+    all_named: bool = False  # no columns follow those named: more fields are decimal commas
 
 
 class Columns(NamedTuple):
@@ -190,11 +191,13 @@ def _width(head: Head, layout: Layout) -> tuple[int, tuple[int, str] | None]:
     widths = [len(_fields(text.encode(), layout.delimiter)) for _, text in data[:2]]
     cut = len(widths) == 2 and widths[0] < widths[1]
     width = max(widths)
-    if width < len(layout.names):
+    if width < len(layout.names) or (layout.all_named and width > len(layout.names)):
         raise LogError(
             head.file,
             f"{width} fields where {len(layout.names)} are needed: {', '.join(layout.names)}",
-            "is it of another format, or separated by other characters?",
+            "is it of another format, or separated by other characters?"
+            if width < len(layout.names)
+            else "write numbers with a decimal point, not a comma; or name all columns",
             where=f"line {data[-1][0] if cut else data[0][0]}",
         )
     return width, (data[0] if cut else None)

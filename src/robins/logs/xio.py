@@ -76,7 +76,7 @@ def read_xio(
             value=names[0],
         )
     found = _columns(file, line, names[1:])
-    columns = read_columns(path, Layout(tuple(names), ",", skip=line), findings)
+    columns = read_columns(path, Layout(tuple(names), ",", skip=line, all_named=True), findings)
     time_ns = stamps_to_ns(
         file, names[0], columns.texts[:, 0], columns.rows, exponent=_DECIMALS[time[1]]
     )
