@@ -1,7 +1,8 @@
-"""The Earth: ellipsoid, normal gravity, rates of the local frame, positions as states.
+"""The Earth: ellipsoid, gravity, rates of the local frame, magnetic field, positions as states.
 
 - `wgs84`: constants and functions of the WGS-84 ellipsoid.
 - `geodetic`: `Geodetic`, latitude, longitude and height with `retract` and `local` in metres.
+- `magnetic`: the field of the WMM2020 and WMM2025 (import it by its name).
 """
 
 from robins.earth.geodetic import Geodetic
