@@ -17,6 +17,7 @@ ORDER = [
     "long_replay.py",
     "transfer_alignment.py",
     "airship.py",
+    "magnetic.py",
 ]
 
 
