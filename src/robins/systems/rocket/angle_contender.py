@@ -60,7 +60,7 @@ def believed_model(given: MagneticAttitude, kind: Kind) -> Model:
     if kind.motion != "body":
         sensor = of_gyro if kind.motion == "reckoned" else of_magnet
         return unmoved_model(jnp.asarray(step), jnp.repeat(jnp.array(FORGETS), 3), sensor)
-    noise = np.array([b.attitude_noise, b.rate_noise * np.sqrt(step)]) * np.sqrt(b.noise_factor)
+    noise = np.array([b.attitude_noise, b.rate_noise]) * np.sqrt(step)
     return body_model(coefficients(given), jnp.repeat(jnp.asarray(noise), 3), sensors)
 
 

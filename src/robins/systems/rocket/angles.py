@@ -54,9 +54,7 @@ def slope(c: Coefficients, x: Array) -> Array:
     roll, pitch, _, p, q, r = x
     sin, cos = jnp.sin(roll), jnp.cos(roll)
     across = q * sin + r * cos
-    angles = jnp.stack(
-        [p + across * jnp.tan(pitch), q * cos - r * sin, across / jnp.cos(pitch)]
-    )
+    angles = jnp.stack([p + across * jnp.tan(pitch), q * cos - r * sin, across / jnp.cos(pitch)])
     rates = jnp.stack([-c.e2 * p, c.e1 * p * r - c.e3 * q, -c.e1 * p * q - c.e3 * r])
     return jnp.concatenate([c.kinematic * angles, rates])
 

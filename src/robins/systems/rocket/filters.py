@@ -94,8 +94,12 @@ KINDS: dict[str, Kind] = {
     "federated-vector-ukf": Kind(lambda shares: _two("half", shares)),
     "federated-root": Kind(lambda shares: _two("root", shares)),
     "stukf": Kind(_one(simplified())),
-    "federated-scalar-stukf": Kind(lambda shares: _two("scalar", "equal", lambda name: [simplified()])),
-    "federated-vector-stukf": Kind(lambda shares: _two("half", shares, lambda name: [simplified()])),
+    "federated-scalar-stukf": Kind(
+        lambda shares: _two("scalar", "equal", lambda name: [simplified()])
+    ),
+    "federated-vector-stukf": Kind(
+        lambda shares: _two("half", shares, lambda name: [simplified()])
+    ),
     "federated-vector-multiple": Kind(
         lambda shares: _two(
             "half",
@@ -109,7 +113,9 @@ KINDS: dict[str, Kind] = {
     "huber": Kind(_one(huber(PROBABILITY))),
     "gate": Kind(_one(patient())),
     "discriminator": Kind(_one(telling(GYRO), telling(MAGNETIC))),
-    "federated-root-discriminator": Kind(lambda shares: _two("root", shares, lambda name: [telling(name)])),
+    "federated-root-discriminator": Kind(
+        lambda shares: _two("root", shares, lambda name: [telling(name)])
+    ),
 }
 
 

@@ -30,8 +30,8 @@ def common_metrics(course: Course, statistics: Any) -> dict[str, Any]:
     """Of both studies: components 0 to 2 are the attitude's.
 
     ``attitude_rms_deg`` is the RMS error of an axis, pooled over the three, ``quiet_rms_deg`` the
-    same long after disturbances, ``burst_peak_deg`` the mean over axes, disturbances and runs of the
-    largest error soon after one.
+    same long after disturbances, ``burst_peak_deg`` the mean over axes, disturbances and runs of
+    the largest error soon after one.
     """
     out: dict[str, Any] = {"attitude_rms_deg": _pooled_deg(statistics.rms[statistics.counted, :3])}
     quiet = _quiet(course, statistics.counted)
@@ -53,7 +53,9 @@ def angle_metrics(course: Course, statistics: Any) -> dict[str, Any]:
     """
     out = common_metrics(course, statistics)
     rms = _rms_deg(statistics.rms[statistics.counted])
-    out |= dict(zip(("roll_rms_deg", "pitch_rms_deg", "yaw_rms_deg"), map(float, rms), strict=False))
+    out |= dict(
+        zip(("roll_rms_deg", "pitch_rms_deg", "yaw_rms_deg"), map(float, rms), strict=False)
+    )
     names = ("p_rms_deg_s", "q_rms_deg_s", "r_rms_deg_s")
     out |= dict(zip(names, map(float, rms[3:]), strict=True))
     below = np.degrees(np.sqrt(np.mean(statistics.rms[:, :3] ** 2, axis=1))) < 0.5

@@ -142,11 +142,12 @@ class Believed(Parameters):
 
     error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
     wrong: Literal["rates", "all"] = "all"  # only e1, e2, e3, or the kinematic rows too
-    attitude_noise: Annotated[float, Quantity("angle", above="0 deg")] = default("1e-5 rad")
+    attitude_noise: Annotated[float, Quantity("angle random walk", above="0 deg/sqrt(s)")] = (
+        default("3.16227766e-5 rad/sqrt(s)")
+    )
     rate_noise: Annotated[float, Quantity("rate random walk", above="0 deg/s/sqrt(s)")] = default(
         "0.02 deg/s/sqrt(s)"
     )
-    noise_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the variances of both
 
 
 ANGLE_FILTERS = (

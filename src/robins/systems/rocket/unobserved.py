@@ -1,7 +1,7 @@
 """What a run of field vectors leaves open: the direction about which the attitude is least known.
 
-A constant turn phi of the attitude, seen in n, moves the field that is read by B x phi, so K vectors
-with an angle noise sigma bring the information
+A constant turn phi of the attitude, seen in n, moves the field that is read by B x phi, so K
+vectors with an angle noise sigma bring the information
 
     Y = 1/sigma^2 sum_k (I - b_k b_k') ,    b_k = B_k / |B_k|
 

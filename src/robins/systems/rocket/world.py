@@ -17,8 +17,12 @@ from robins.manifold import wrap
 from robins.rotation import conjugate, from_euler, multiply, rotate, to_euler, to_rotvec
 from robins.sim.ballistic import ballistic
 from robins.sim.free_body import FreeBody, coning_start, free_body
-from robins.sim.magnetometer import angle_bursts, field_bursts, observe_field
-from robins.sim.magnetometer import observe_magnetic_attitude
+from robins.sim.magnetometer import (
+    angle_bursts,
+    field_bursts,
+    observe_field,
+    observe_magnetic_attitude,
+)
 from robins.sim.mems_gyro import MemsGyro, delta_angles, integrate_angles
 from robins.sim.random import Component, stream
 from robins.systems.rocket.parameters import Flight, Span
