@@ -46,7 +46,8 @@ class Coefficients(NamedTuple):
 
 def angle_state(q_nb: Array, omega_b: Array) -> AngleState:
     """The state, or a run of them, of an attitude and its rates."""
-    return AngleState(*(Angle(a) for a in to_euler(q_nb)), omega_b)
+    roll, pitch, yaw = to_euler(q_nb)
+    return AngleState(Angle(roll), Angle(pitch), Angle(yaw), omega_b)
 
 
 def slope(c: Coefficients, x: Array) -> Array:
@@ -68,8 +69,8 @@ def step(c: Coefficients, state: AngleState, u: Any) -> AngleState:
     k3 = slope(c, x + 0.5 * h * k2)
     k4 = slope(c, x + h * k3)
     moved = h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    angles = (a.retract(moved[i : i + 1]) for i, a in enumerate(state[:3]))
-    return AngleState(*angles, state.omega_b + moved[3:])
+    roll, pitch, yaw = (a.retract(moved[i : i + 1]) for i, a in enumerate(state[:3]))
+    return AngleState(roll, pitch, yaw, state.omega_b + moved[3:])
 
 
 def stand_still(step_s: Any, state: AngleState, u: Any) -> AngleState:

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.interpolate import CubicSpline
 
 from robins.earth.magnetic import field_along, wmm_for
 from robins.manifold import wrap
@@ -27,7 +26,6 @@ from robins.sim.mems_gyro import MemsGyro, delta_angles, integrate_angles
 from robins.sim.random import Component, stream
 from robins.systems.rocket.parameters import Flight, Span
 
-KNOT_S = 1.0  # the field is evaluated so often and interpolated between
 PEAK_S = 3.0  # after the beginning of a disturbance, in which its largest error is looked for
 _SECONDS_A_YEAR = 365.25 * 86400.0
 # Streams folded into the keys of a run.
@@ -39,8 +37,6 @@ class Course(NamedTuple):
 
     time_s: np.ndarray  # (E,) at the end of each step
     field_n: np.ndarray  # (E, 3) T, launch north-east-down, which is inertial
-    lat_rad: np.ndarray  # (E,)
-    lon_rad: np.ndarray  # (E,)
     alt_m: np.ndarray  # (E,)
     seen: np.ndarray  # (E,) bool, whether the magnetometer measures
     felt: np.ndarray  # (E,) bool, whether the gyro does
@@ -73,8 +69,6 @@ def lay_out(given: Flight) -> Course:
     count = math.floor(given.duration / given.step + 1e-9)
     time = given.step * np.arange(1, count + 1)
     launch = given.launch
-    knots = np.arange(0.0, time[-1] + KNOT_S, KNOT_S)
-    knots = np.append(knots[knots < time[-1]], time[-1])
     path = ballistic(
         launch.latitude,
         launch.longitude,
@@ -82,27 +76,18 @@ def lay_out(given: Flight) -> Course:
         launch.speed,
         launch.elevation,
         launch.azimuth,
-        knots,
+        time,
     )
-    year = launch.year + knots / _SECONDS_A_YEAR
-    local = field_along(wmm_for(launch.year), path.lat_rad, path.lon_rad, path.alt_m, year)
-    at_knots = np.asarray(rotate(path.q_local, jnp.asarray(local)))
-    lat, alt = (np.interp(time, knots, np.asarray(x)) for x in (path.lat_rad, path.alt_m))
-    lon = np.interp(time, knots, np.unwrap(np.asarray(path.lon_rad)))
-    burst = given.magnetometer.disturbance
-    begun = [] if burst is None else np.arange(burst.every, time[-1], burst.every)
-    since = np.full(count, np.inf)  # the end of the last disturbance
-    for begin in begun:
-        ended = begin + burst.length
-        since = np.where(time >= begin - 1e-9, np.maximum(time - ended, 0.0), since)
-    first = np.searchsorted(time, np.asarray(begun) - 1e-9)
+    year = launch.year + time / _SECONDS_A_YEAR
+    place = path.lat_rad, path.lon_rad, path.alt_m
+    local = field_along(wmm_for(launch.year), *place, year, time)
+    begun, since = _disturbed(given, time)
+    first = np.searchsorted(time, begun - 1e-9)
     width = round(PEAK_S / given.step)
     return Course(
         time_s=time,
-        field_n=smooth(knots, at_knots, time),
-        lat_rad=lat,
-        lon_rad=np.asarray(wrap(lon)),
-        alt_m=alt,
+        field_n=np.asarray(rotate(path.q_local, jnp.asarray(local))),
+        alt_m=np.asarray(path.alt_m),
         seen=_there(time, given.magnetometer.lost),
         felt=_there(time, given.gyro.lost),
         bursts=tuple(slice(k, k + width) for k in first if k + width <= count),
@@ -110,9 +95,16 @@ def lay_out(given: Flight) -> Course:
     )
 
 
-def smooth(knots: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """A vector over time between its knots, by cubic splines."""
-    return CubicSpline(knots, values)(time)
+def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """When disturbances begin, and (E,) the time since the end of the last; infinite before one."""
+    burst, since = given.magnetometer.disturbance, np.full(len(time_s), np.inf)
+    if burst is None:
+        return np.zeros(0), since
+    begun = np.arange(burst.every, time_s[-1], burst.every)
+    for begin in begun:
+        after = np.maximum(time_s - begin - burst.length, 0.0)
+        since = np.where(time_s >= begin - 1e-9, after, since)
+    return begun, since
 
 
 def _there(time_s: np.ndarray, lost: tuple[Span, ...]) -> np.ndarray:
