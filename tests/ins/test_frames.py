@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robins import rotation
-from robins.dataset import GnssTable, ImuTable, Trajectory
+from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.ins import frames
 
 T = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -66,13 +66,15 @@ def tables():
     yield GnssTable(time, zero, zero, zero, np.abs(V), V, np.abs(V[::-1]))
     yield GnssTable(time, zero, zero, zero, np.abs(V))
     yield trajectory()
+    yield MagTable(time, V)
+    yield AttitudeTable(time, Q, moving=V[:, 0] > 0.0)
 
 
 @pytest.mark.parametrize("table", list(tables()), ids=lambda t: type(t).__name__)
 def test_tables_go_there_and_back_without_rounding(table):
     there = frames.to_enu_rfu(table)
     back = frames.to_ned_frd(there)
-    assert frames.to_enu_rfu(there) is there or isinstance(table, Trajectory)
+    assert frames.to_enu_rfu(there) is there or isinstance(table, Trajectory | AttitudeTable)
     for name, value in vars(table).items():
         np.testing.assert_array_equal(getattr(back, name), value, err_msg=name)
     for name in ("nav", "body"):
@@ -85,6 +87,19 @@ def test_sigmas_keep_their_sign():
     assert (there.sigma_m > 0).all()
     assert (there.sigma_v > 0).all()
     np.testing.assert_array_equal(there.sigma_m[:, 0], np.abs(V)[:, 1])
+
+
+def test_a_field_is_relabelled_with_its_axes():
+    there = frames.to_enu_rfu(MagTable(np.arange(len(V)), V))
+    np.testing.assert_array_equal(there.field_t, V[:, [1, 0, 2]] * [1, 1, -1])
+
+
+@pytest.mark.parametrize(("nav", "body"), [("ENU", "FRD"), ("NED", "RFU")])
+def test_mixed_attitudes_are_those_of_a_trajectory(nav, body):
+    mixed = replace(trajectory(), nav=nav, body=body)
+    bare = AttitudeTable(mixed.time_ns, mixed.q_nb, nav=nav, body=body)
+    for turn in (frames.to_ned_frd, frames.to_enu_rfu):
+        np.testing.assert_array_equal(turn(bare).q_nb, turn(mixed).q_nb)
 
 
 @pytest.mark.parametrize(("nav", "body"), [("ENU", "FRD"), ("NED", "RFU")])

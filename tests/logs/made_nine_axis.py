@@ -11,15 +11,16 @@ FIELD_ENU_UT = np.array([0.9, 20.5, -44.1])  # Berlin, about
 AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
 
 
-def turn(t):
-    """Angle turned about AXIS [rad]: rest for 5 s, then to and fro, with no step in the rate."""
+def angles(t):
+    """Turned about the vertical, and about AXIS of the sensor [rad]: rest for 5 s, then both."""
     s = np.maximum(t - 5.0, 0.0)
-    return 2.5 * s**2 / (s**2 + 4.0) * np.sin(1.1 * s)
+    begin = s**2 / (s**2 + 4.0)  # no step in the rate
+    return 2.0 * begin * np.sin(0.4 * s), 2.5 * begin * np.sin(1.1 * s)
 
 
-def matrices(angle):
-    """(n, 3, 3) rotations sensor to ENU about AXIS, by Rodrigues' formula."""
-    x, y, z = AXIS
+def matrices(axis, angle):
+    """(n, 3, 3) rotations about an axis, by Rodrigues' formula."""
+    x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return (
         np.eye(3)
@@ -32,10 +33,17 @@ def tumble(seconds=40.0, seed=3):
     """Arrays as BROAD names them."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(seconds * HZ)) / HZ
-    angle = turn(t)
-    C_ns = matrices(angle)
-    rate = (turn(t + 1e-5) - turn(t - 1e-5)) / 2e-5
-    q = np.concatenate([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * AXIS], axis=1)
+    heading, angle = angles(t)
+    about_axis = matrices(AXIS, angle)
+    C_ns = matrices([0.0, 0.0, 1.0], heading) @ about_axis
+    rates = [
+        (after - before) / 2e-5
+        for before, after in zip(angles(t - 1e-5), angles(t + 1e-5), strict=True)
+    ]
+    rate = about_axis[:, 2, :] * rates[0][:, None] + AXIS * rates[1][:, None]
+    c, s = np.cos(heading / 2), np.sin(heading / 2)
+    w, (x, y, z) = np.cos(angle / 2), AXIS[:, None] * np.sin(angle / 2)
+    q = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=1)
     q[-50:-30] = np.nan
 
     def seen(vector, sigma):
@@ -43,7 +51,7 @@ def tumble(seconds=40.0, seed=3):
         return exact + sigma * rng.standard_normal(exact.shape)
 
     return {
-        "imu_gyr": (rate[:, None] * AXIS + 2e-3 * rng.standard_normal((len(t), 3))),
+        "imu_gyr": rate + 2e-3 * rng.standard_normal((len(t), 3)),
         "imu_acc": seen([0.0, 0.0, 9.81], 0.02),
         "imu_mag": seen(FIELD_ENU_UT, 0.3),
         "opt_quat": q,

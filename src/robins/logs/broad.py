@@ -155,7 +155,8 @@ def _rows_of(file: str, name: str, array: np.ndarray, width: int) -> np.ndarray:
         raise _misfit(file, name, array, f"(n, {width}) of real numbers")
     if not len(array):
         raise LogError(file, "has no rows", "record it again", field=name)
-    return np.ascontiguousarray(array, np.float64)
+    with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
+        return np.ascontiguousarray(array, np.float64)
 
 
 def _misfit(file: str, name: str, array: np.ndarray, wanted: str) -> LogError:

@@ -38,7 +38,7 @@ _SHIFTS: dict[int, tuple[Severity, str, str]] = {
     -2: ("error", "They are probably in gauss where uT is said", "multiply by 100"),
     -3: (
         "error",
-        "They are probably in uT where nT is said, or mT where uT is",
+        "They are probably in uT where nT is said, or mT where uT",
         "multiply by 1000",
     ),
 }

@@ -158,7 +158,8 @@ def _first(
 
 def _column(file: str, topic: Topic, name: str) -> np.ndarray:
     if name in topic.fields:
-        return np.asarray(topic.fields[name], np.float64)
+        with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
+            return np.asarray(topic.fields[name], np.float64)
     raise LogError(
         file,
         f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
