@@ -1,0 +1,208 @@
+"""A magnetometer: the field in its own axes, with iron about it, disturbances and noise.
+
+What `observe_field` makes of the Earth's field B at the attitude q_nb is
+
+    z = clip(round(M (C_sb (C_bn (T B + d_n) + d_b)) + h + v))
+
+with T a turn of the field, d_n a field added in navigation axes (a magnet in the room), d_b one
+added in body axes (a magnet taken along for a while), C_sb the mounting, M the soft iron, scale
+factors and oblique axes, h the hard iron and v white noise. `ins.magnetometer_calibration` finds
+M and h from turning the sensor about.
+
+`observe_magnetic_attitude` is the "magnetic attitude" of papers that let a magnetometer report
+roll, pitch and heading. No such sensor exists: one vector tells two angles, and the third has to
+come from elsewhere, so that its error is not independent of whatever told it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.manifold import wrap
+from robins.rotation import conjugate, from_rotvec, normalise, rotate
+from robins.sim import _given
+
+_ROUNDING_S = 1e-6  # a sample this near to the edge of a burst is on it
+
+
+def observe_field(
+    key: Array,
+    q_nb: Any,
+    field_n: Any,
+    sigma_t: Any,
+    present: Any,
+    *,
+    turn: Any = None,
+    added_n_t: Any = None,
+    added_b_t: Any = None,
+    q_bs: Any = None,
+    soft_iron: Any = None,
+    hard_iron_t: Any = None,
+    range_t: Any = None,
+    quantum_t: Any = None,
+) -> Float[Array, "epochs 3"]:
+    """Measured field [T] in sensor axes, which are the body's unless ``q_bs`` is given.
+
+    The normal numbers do not depend on anything but the key. Pure JAX, so it maps over keys.
+
+    Args:
+        key: of the run, `Component.MAGNETOMETER` of `robins.sim.random.stream`.
+        q_nb: (E, 4) true attitude, scalar first.
+        field_n: (E, 3) or (3,) true field [T] in navigation axes.
+        sigma_t: of white noise [T]: a number, (3,) one for each axis, or (E,) one for each epoch.
+        present: (E,) bool, whether there is a sample; NaN where not.
+        turn: (E, 3) rad, see `field_bursts`: the field is turned by the length of the vector about
+            the part of it that is perpendicular to the field, navigation axes.
+        added_n_t: (E, 3) or (3,) field [T] added in navigation axes.
+        added_b_t: (E, 3) or (3,) field [T] added in body axes.
+        q_bs: (4,) from sensor axes to body axes.
+        soft_iron: (3, 3) matrix M, sensor axes; None: the identity.
+        hard_iron_t: (3,) offset h [T], sensor axes.
+        range_t: full scale [T], at which each axis saturates.
+        quantum_t: one digit of the output [T], to which each axis is rounded.
+
+    Raises:
+        ValueError: shapes that do not fit together, a negative sigma, a range or quantum that is
+            not positive.
+    """
+    there = _given.presence(present)
+    count = len(there)
+    q = _given.rows("q_nb", q_nb, count, 4)
+    field = _vectors("field_n", field_n, count)
+    if turn is not None:
+        field = _turned(field, _given.rows("turn", turn, count, 3))
+    if added_n_t is not None:
+        field = field + _vectors("added_n_t", added_n_t, count)
+    z = rotate(conjugate(q), field)
+    if added_b_t is not None:
+        z = z + _vectors("added_b_t", added_b_t, count)
+    if q_bs is not None:
+        z = rotate(conjugate(normalise(_given.rows("q_bs", q_bs, 4))), z)
+    if soft_iron is not None:
+        z = z @ _given.rows("soft_iron", soft_iron, 3, 3).T
+    if hard_iron_t is not None:
+        z = z + _given.rows("hard_iron_t", hard_iron_t, 3)[None]
+    z = z + _sigma(sigma_t, count) * jax.random.normal(key, (count, 3))
+    if quantum_t is not None:
+        _given.number("quantum_t", quantum_t, 0.0, above=True)
+        z = quantum_t * jnp.round(z / quantum_t)
+    if range_t is not None:
+        _given.number("range_t", range_t, 0.0, above=True)
+        z = jnp.clip(z, -range_t, range_t)
+    return jnp.where(there[:, None], z, jnp.nan)
+
+
+def observe_magnetic_attitude(
+    key: Array, euler_rad: Any, sigma_rad: Any, disturbance_rad: Any = None, present: Any = None
+) -> Float[Array, "epochs 3"]:
+    """Roll, pitch, heading [rad] as papers have a magnetometer measure them; it cannot.
+
+    Each angle has white noise and the disturbance added and is wrapped to [-pi, pi).
+
+    Args:
+        key: of the run, `Component.MAGNETOMETER` of `robins.sim.random.stream`.
+        euler_rad: (E, 3) true roll, pitch, heading.
+        sigma_rad: standard deviation, a number or one for each angle.
+        disturbance_rad: (E, 3) added, e.g. of `angle_bursts`.
+        present: (E,) bool, whether there is a sample; NaN where not. None: always.
+
+    Raises:
+        ValueError: shapes that do not fit together, or a negative sigma.
+    """
+    count = len(jnp.asarray(euler_rad, float))
+    true = _given.rows("euler_rad", euler_rad, count, 3)
+    there = _given.presence(jnp.ones(count, bool) if present is None else present)
+    if len(there) != count:
+        raise ValueError(f"present must have shape ({count},), got {there.shape}")
+    sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
+    measured = true + sigma[None] * jax.random.normal(key, (count, 3))
+    if disturbance_rad is not None:
+        measured = measured + _given.rows("disturbance_rad", disturbance_rad, count, 3)
+    return jnp.where(there[:, None], wrap(measured), jnp.nan)
+
+
+def angle_bursts(
+    key: Array, time_s: Any, size_rad: Any, every_s: Any, length_s: Any, first_s: Any = None
+) -> Float[Array, "epochs 3"]:
+    """Disturbance of three angles [rad]: of that size, its sign drawn for each angle and burst.
+
+    Zero between the bursts. A burst takes the samples from its beginning on, up to but not at its
+    end; one of a sampling interval is one sample.
+
+    Args:
+        key: of the run.
+        time_s: (E,) times of the samples.
+        size_rad: of the disturbance, a number or one for each angle.
+        every_s: from the beginning of a burst to that of the next; infinity: there is one.
+        length_s: of a burst; infinity: it lasts.
+        first_s: when the first begins; None: after ``every_s``.
+
+    Raises:
+        ValueError: a period or length that is not positive.
+    """
+    active, number = _bursts(time_s, every_s, length_s, first_s)
+    size = _given.vector("size_rad", size_rad, 3)
+    signs = jax.vmap(lambda k: jax.random.rademacher(jax.random.fold_in(key, k), (3,), float))
+    return jnp.where(active[:, None], size[None] * signs(number), 0.0)
+
+
+def field_bursts(
+    key: Array, time_s: Any, size_rad: Any, every_s: Any, length_s: Any, first_s: Any = None
+) -> Float[Array, "epochs 3"]:
+    """Turns of the field [rad] as `observe_field` takes them: one axis, drawn, for each burst.
+
+    The vectors have the length ``size_rad`` and any direction; of it only the part perpendicular
+    to the field counts, which is uniform on its circle. Other arguments are as in `angle_bursts`.
+
+    Raises:
+        ValueError: a period or length that is not positive.
+    """
+    active, number = _bursts(time_s, every_s, length_s, first_s)
+    _given.number("size_rad", size_rad)
+    drawn = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(key, k), (3,)))(number)
+    length = jnp.sqrt(jnp.sum(drawn * drawn, 1, keepdims=True))
+    return jnp.where(active[:, None], size_rad * drawn / length, 0.0)
+
+
+def _bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
+    """Whether each sample is in a burst, and the number of the last burst begun."""
+    time = jnp.asarray(time_s, float)
+    if time.ndim != 1:
+        raise ValueError(f"time_s must have shape (E,), got {time.shape}")
+    _given.number("every_s", every_s, 0.0, above=True, endless=True)
+    _given.number("length_s", length_s, 0.0, above=True, endless=True)
+    since = time - (every_s if first_s is None else first_s) + _ROUNDING_S
+    number = jnp.maximum(jnp.floor(since / every_s), 0.0)
+    begun = jnp.where(number > 0.0, number, 1.0) * every_s  # never 0 times infinity
+    phase = since - jnp.where(number > 0.0, begun, 0.0)
+    return (phase >= 0.0) & (phase < length_s), number.astype(jnp.uint32)
+
+
+def _turned(field: Array, turn: Array) -> Array:
+    size_sq = jnp.sum(field * field, -1, keepdims=True)
+    along = jnp.sum(turn * field, -1, keepdims=True) / jnp.where(size_sq > 0.0, size_sq, 1.0)
+    across = turn - along * field
+    across_sq, turn_sq = (jnp.sum(v * v, -1, keepdims=True) for v in (across, turn))
+    # Along the field there is no axis; and where there is no turn, the root has no derivative.
+    turns = across_sq > 0.0
+    ratio = jnp.sqrt(jnp.where(turns, turn_sq, 1.0) / jnp.where(turns, across_sq, 1.0))
+    return rotate(from_rotvec(jnp.where(turns, ratio * across, 0.0)), field)
+
+
+def _vectors(name: str, value: Any, count: int) -> Array:
+    x = jnp.asarray(value, float)
+    return jnp.broadcast_to(x, (count, 3)) if x.shape == (3,) else _given.rows(name, x, count, 3)
+
+
+def _sigma(sigma_t: Any, count: int) -> Array:
+    """(E, 3) or (1, 3)."""
+    sigma = jnp.asarray(sigma_t, float)
+    if sigma.shape in ((), (3,)):
+        return _given.vector("sigma_t", sigma_t, 3, low=0.0)[None]
+    _given.number("sigma_t", sigma_t, 0.0)
+    return jnp.broadcast_to(_given.rows("sigma_t", sigma, count)[:, None], (count, 3))
