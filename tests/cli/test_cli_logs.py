@@ -93,6 +93,52 @@ def test_the_mounting_of_a_configuration_is_heeded(robins, upside_down, monkeypa
     assert robins("doctor", "unit.toml").status == 2
 
 
+@pytest.fixture
+def nine_axis():
+    """A tumbling sensor's field beside a still IMU, as an archive of BROAD."""
+    table = a_still_imu(seconds=20.0, gravity=9.81)
+    rng = np.random.default_rng(2)
+    n = len(table)
+    np.savez(
+        "trial.npz",
+        imu_gyr=table.gyro,
+        imu_acc=table.accel,
+        imu_mag=np.array([1.0, 20.0, -44.0]) + 0.3 * rng.normal(size=(n, 3)),
+        opt_quat=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        movement=np.zeros(n, bool),
+        sampling_rate=RATE_HZ,
+    )
+    return Path("trial.npz")
+
+
+def test_what_a_log_holds_is_shown_before_it_is_judged(robins, still_log, nine_axis):
+    answer = robins("doctor", still_log)
+    assert answer.out.startswith("inertial samples 6000 rows at 100 Hz, 60.0 s  (still.csv)\n")
+    answer = robins("doctor", nine_axis)
+    assert answer.status == 0
+    kinds = [line.split("  ")[0] for line in answer.out.splitlines()[:3]]
+    assert [k.split(" 2000")[0].strip() for k in kinds] == [
+        "inertial samples",
+        "magnetic field",
+        "true attitude",
+    ]
+    # There are no fixes to find a place with, but a field to find north with.
+    assert answer.out.endswith("robins replay trial.npz --system marg\n")
+    told = json.loads(robins("doctor", nine_axis, "--json").out)
+    assert [(t["kind"], t["samples"], t["file"]) for t in told["tables"]] == [
+        (kind, 2000, "trial.npz") for kind in ("imu", "mag", "attitude")
+    ]
+    assert told["tables"][1]["rate_hz"] == pytest.approx(100.0)
+    assert told["tables"][1]["span_s"] == pytest.approx(19.99)
+
+
+def test_the_noise_of_an_imu_is_found_beside_its_magnetometer(robins, nine_axis):
+    answer = robins("allan", nine_axis, "--terms", "N", "--json", "--out", "noise")
+    assert answer.status == 0
+    density = json.loads(answer.out)["filters"]["x"]["gyro_angle_random_walk_deg_per_sqrt_h"]
+    assert density == pytest.approx(0.3, rel=0.1)
+
+
 @pytest.mark.parametrize("command", ["doctor", "allan"])
 def test_a_file_that_is_no_log_is_refused_in_a_line(robins, command):
     Path("poem.txt").write_text("roses are red\n")
