@@ -11,7 +11,7 @@ an eigenvalue of zero. It is what a perfect gyro would allow: a real one lets ol
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
     mean = mean / np.linalg.norm(mean)
     direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean >= 0.0 else -1.0)
 
-    def between(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def between(x: np.ndarray, y: np.ndarray) -> Any:
         return np.arctan2(np.linalg.norm(np.cross(x, y), axis=-1), np.sum(x * y, axis=-1))
 
     return Unobserved(

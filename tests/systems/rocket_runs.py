@@ -1,0 +1,124 @@
+"""Flights of the rocket's scenarios, and what its filters make of them; each computed once."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins import scenario
+from robins.campaign import worlds
+from robins.filters import run
+from robins.filters.consistency import normalised_sq
+from robins.manifold import local
+from robins.systems.rocket import SYSTEM
+from robins.systems.rocket.world import PEAK_S, World
+from robins.systems.system import Problem
+
+RUNS = 20
+QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run
+SHORT = ('duration="150 s"',)  # of the angles; of the field it takes the whole flight
+
+
+class Flights(NamedTuple):
+    """Runs of a scenario."""
+
+    problem: Problem
+    batch: World  # leading axis: runs
+    every_s: float  # of the disturbances, infinite if there are none
+    length_s: float
+
+
+class Found(NamedTuple):
+    """Errors of a filter as they are reported, in degrees."""
+
+    error: np.ndarray  # (runs, E, r)
+    nees: np.ndarray  # (runs, E) of the attitude, by its three components
+    time_s: np.ndarray  # (E,)
+    every_s: float  # of the disturbances, infinite if there are none
+    length_s: float
+
+    def rms(self, where: np.ndarray, of: slice = slice(0, 3)) -> float:
+        return float(np.sqrt(np.mean(self.error[:, where, of] ** 2)))
+
+    @property
+    def counted(self) -> np.ndarray:
+        return self.time_s > 30.0 + 1e-9
+
+    @property
+    def attitude(self) -> float:
+        return self.rms(self.counted)
+
+    @property
+    def quiet(self) -> float:
+        since = np.mod(self.time_s + 1e-9, self.every_s) - self.length_s
+        return self.rms(self.counted & (since > 10.0))
+
+    @property
+    def peak(self) -> float:
+        begun = np.arange(self.every_s, self.time_s[-1] - PEAK_S, self.every_s)
+        size = np.abs(self.error[..., :3])
+        soon = [
+            np.max(size[:, (self.time_s > t - 1e-6) & (self.time_s < t + PEAK_S)], axis=1)
+            for t in begun
+        ]
+        return float(np.mean(soon))
+
+    @property
+    def about(self) -> float:
+        return self.rms(self.counted, slice(3, 4))
+
+    @property
+    def across(self) -> float:
+        return float(np.sqrt(2.0) * self.rms(self.counted, slice(4, 6)))
+
+    @property
+    def nees_per_dim(self) -> float:
+        return float(np.mean(self.nees[:, self.counted]))
+
+
+def parsed(name: str, settings: tuple[str, ...] = ()) -> Any:
+    """Parameters of a packaged scenario, changed, and the study it is of."""
+    text = SYSTEM.scenarios[name].read_text()
+    study = SYSTEM.studies[scenario.mapping_of(text)["study"]]
+    return scenario.parse(study.parameters, text, settings, source=name), study
+
+
+@cache
+def flights(name: str, settings: tuple[str, ...] = (), runs: int = RUNS) -> Flights:
+    """Runs of a packaged scenario, with every filter of its study."""
+    given, study = parsed(name, settings)
+    problem = study.problem(given, study.filters, 1)
+    ((batch, _),) = worlds(problem, runs)
+    burst = given.magnetometer.disturbance
+    return Flights(
+        problem, batch, *((np.inf, 0.0) if burst is None else (burst.every, burst.length))
+    )
+
+
+@cache
+def _program(filter_: Any):
+    def one(model, case, world):
+        it = case(world)
+        steps = run(filter_, model, it.start, it.y, it.u, it.aux, keep=lambda s: s.posterior).steps
+
+        def judged(belief, truth, rows):
+            error, factor = local(belief.mean, truth), belief.factor
+            if rows is not None:
+                error, factor = rows @ error, rows @ factor
+            return error, normalised_sq(error[:3], factor[:3]) / 3.0
+
+        along = None if it.rows is None else 0
+        return jax.vmap(judged, (0, 0, along))(steps, it.truth, it.rows)
+
+    mapped = jax.vmap(one, in_axes=(None, None, 0))
+    return jax.jit(mapped, compiler_options=QUICK)
+
+
+def found(flown: Flights, name: str) -> Found:
+    """What a filter makes of flights."""
+    p = flown.problem
+    c = p.contenders[name]
+    error, square = _program(c.filter)(c.model, c.case, flown.batch)
+    every, length = flown.every_s, flown.length_s
+    return Found(np.degrees(np.asarray(error)), np.asarray(square), p.epoch_s, every, length)
