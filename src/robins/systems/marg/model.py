@@ -1,0 +1,253 @@
+"""Orientation from gyro, accelerometer and magnetometer: the motion and the sensors.
+
+A step is a block of samples, integrated beforehand (`Block`). What is peculiar to it:
+
+- the accelerometer is integrated, not looked at: it carries the velocity, and gravity shows in that
+  a velocity and a place which do not run away leave no room for a tilt error. A swing of the hand
+  then pulls the attitude no more than its mean does;
+- scale factors and misalignments of the gyros are nine states. They are what a good MEMS gyro drifts
+  by when it is turned about, and tilt, which the accelerometer sees well, tells of them;
+- the magnetometer gives a heading and no tilt. North is where the field pointed at the start. How
+  the field of other places is turned against that is a state, `declination`, which does not change
+  while the unit lies still: reading the same place again tells nothing new.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.tree_util import Partial
+from jaxtyping import Array, ArrayLike
+
+from robins import rotation
+from robins.filters import Model, Motion, Sensor
+from robins.manifold import Angle
+from robins.rotation import Rotation, skew
+
+TRAVEL, REST_RATE, MAGNETOMETER = "travel", "rest_rate", "magnetometer"
+
+
+class MargState(NamedTuple):
+    """The state; 27 tangent components in this order."""
+
+    q_nb: Rotation  # body to north-east-down, north that of the field at the start
+    v_n: Array  # (3,) m/s
+    p_n: Array  # (3,) m, from the middle of where the unit moves about
+    gyro_bias: Array  # (3,) rad/s
+    gyro_gain: Array  # (3, 3) true rate = (I + gain) read rate - bias
+    accel_bias: Array  # (3,) m/s^2
+    declination: Array  # () rad, of the field here and now, clockwise from north
+    field: Array  # (2,) T, strength along the horizontal and down
+
+
+TILT, HEADING = slice(0, 2), 2
+DECLINATION, FIELD = 24, slice(25, 27)
+DIM = 27
+
+
+class Block(NamedTuple):
+    """Input of a step: what the raw samples of a block integrate to, in body axes at its start."""
+
+    dt_s: ArrayLike  # ()
+    turn: ArrayLike  # (4,) quaternion, body axes at the end to those at the start
+    dv: ArrayLike  # (3,) m/s, integral of specific force
+    turn_time: ArrayLike  # (3, 3) s, integral of the rotation R(t)
+    turn_rates: ArrayLike  # (3, 9) rad, integral of R_ij(t) times the k-th rate, at 3 j + k
+    angle: ArrayLike  # () rad, turned in all
+    still: ArrayLike  # () 1 where the unit lies still, else 0
+    lost_turn: ArrayLike  # () rad, spread of what was not sampled
+    lost_dv: ArrayLike  # () m/s, the same of the velocity
+
+
+class Noise(NamedTuple):
+    """Process noise of a second."""
+
+    gyro: ArrayLike  # rad/sqrt(s)
+    turn_error: ArrayLike  # rad per rad turned
+    accel: ArrayLike  # m/s/sqrt(s)
+    gyro_bias_still: ArrayLike  # rad/s/sqrt(s)
+    gyro_bias_moving: ArrayLike  # rad/s/sqrt(s)
+    accel_bias: ArrayLike  # m/s^2/sqrt(s)
+    declination: ArrayLike  # rad, of the stationary Gauss-Markov process
+    declination_time: ArrayLike  # s
+    field: ArrayLike  # T/sqrt(s)
+    gravity: ArrayLike  # m/s^2
+
+
+class Seen(NamedTuple):
+    """How sure what is known of the motion is."""
+
+    velocity: ArrayLike  # m/s, moving
+    place: ArrayLike  # m, moving
+    velocity_still: ArrayLike  # m/s
+    rate_still: ArrayLike  # rad/s
+    field: ArrayLike  # T
+
+
+def correction(x: MargState, block: Block) -> Array:
+    """(3,) rad, what bias and gain add to the turn of a block, in body axes at its start."""
+    gain = jnp.asarray(block.turn_rates) @ x.gyro_gain.reshape(9)
+    return gain - jnp.asarray(block.turn_time) @ x.gyro_bias
+
+
+def persistence(noise: Noise, block: Block) -> Array:
+    """Share of the declination that a block leaves: all of it while the unit lies still."""
+    moving_s = jnp.asarray(block.dt_s) * (1.0 - jnp.asarray(block.still))
+    return jnp.exp(-moving_s / noise.declination_time)
+
+
+def _velocity_gain(x: MargState, block: Block) -> Array:
+    """(3,) m/s, navigation axes, without gravity. The turn was at fault by half on the way."""
+    dv = jnp.asarray(block.dv)
+    dv = dv + jnp.cross(0.5 * correction(x, block), dv)
+    return x.q_nb.apply(dv - jnp.asarray(block.turn_time) @ x.accel_bias)
+
+
+def advance(noise: Noise, x: MargState, block: Block) -> MargState:
+    """The state after a block."""
+    dt = jnp.asarray(block.dt_s)
+    gained = _velocity_gain(x, block) + jnp.array([0.0, 0.0, 1.0]) * noise.gravity * dt
+    turned = rotation.multiply(rotation.from_rotvec(correction(x, block)), jnp.asarray(block.turn))
+    return x._replace(
+        q_nb=Rotation(rotation.normalise(rotation.multiply(x.q_nb.wxyz, turned))),
+        v_n=x.v_n + gained,
+        p_n=x.p_n + (x.v_n + 0.5 * gained) * dt,
+        declination=x.declination * persistence(noise, block),
+    )
+
+
+def _sigma(noise: Noise, x: MargState, block: Block) -> Array:
+    dt, moving = jnp.asarray(block.dt_s), 1.0 - jnp.asarray(block.still)
+    root = jnp.sqrt(dt)
+    kept = persistence(noise, block)
+    angle = noise.turn_error * jnp.asarray(block.angle)
+    turn = jnp.sqrt((noise.gyro * root) ** 2 + angle**2 + jnp.asarray(block.lost_turn) ** 2)
+    push = jnp.sqrt((noise.accel * root) ** 2 + jnp.asarray(block.lost_dv) ** 2)
+    walk = jnp.where(moving > 0.0, noise.gyro_bias_moving, noise.gyro_bias_still) * root
+    # sqrt(1 - kept^2), with a finite derivative where nothing is lost
+    lost = -jnp.expm1(2.0 * jnp.log(kept))
+    drift = jnp.where(lost > 0.0, jnp.sqrt(jnp.where(lost > 0.0, lost, 1.0)), 0.0)
+    parts = [
+        jnp.broadcast_to(turn, (3,)),
+        jnp.broadcast_to(push, (3,)),
+        jnp.zeros(3),
+        jnp.broadcast_to(walk, (3,)),
+        jnp.zeros(9),
+        jnp.broadcast_to(noise.accel_bias * root, (3,)),
+        (noise.declination * drift)[None],
+        jnp.broadcast_to(noise.field * root, (2,)),
+    ]
+    return jnp.concatenate(parts)
+
+
+def advance_linear(noise: Noise, x: MargState, block: Block):
+    """`advance`, its Jacobian (27, 27) between tangent spaces, and the noise (27,)."""
+    dt, dv = jnp.asarray(block.dt_s), jnp.asarray(block.dv)
+    rate_map = jnp.concatenate(
+        [-jnp.asarray(block.turn_time), jnp.asarray(block.turn_rates)], axis=1
+    )
+    R = x.q_nb.as_dcm()
+    # the left Jacobian of a small rotation, to first order (Sola 2017, eq. 145)
+    turn = R @ (jnp.eye(3) + 0.5 * skew(correction(x, block))) @ rate_map
+    push = -0.5 * R @ skew(dv) @ rate_map
+    tilt = -skew(_velocity_gain(x, block))
+    lean = -R @ jnp.asarray(block.turn_time)
+    F = jnp.eye(DIM)
+    F = F.at[0:3, 9:21].set(turn)
+    for rows, share in ((slice(3, 6), 1.0), (slice(6, 9), 0.5 * dt)):
+        F = F.at[rows, 0:3].set(share * tilt)
+        F = F.at[rows, 9:21].set(share * push)
+        F = F.at[rows, 21:24].set(share * lean)
+    F = F.at[6:9, 3:6].set(dt * jnp.eye(3))
+    F = F.at[DECLINATION, DECLINATION].set(persistence(noise, block))
+    return advance(noise, x, block), F, _sigma(noise, x, block)
+
+
+def _read_travel(x: MargState, still: Any):
+    return jnp.concatenate([x.v_n, x.p_n])
+
+
+def _travel_linear(x: MargState, still: Any):
+    return _read_travel(x, still), jnp.eye(6, DIM, 3)
+
+
+def _travel_sigma(seen: Seen, x: MargState, still: Any):
+    velocity = jnp.where(still > 0.0, seen.velocity_still, seen.velocity)
+    place = jnp.asarray(seen.place)
+    return jnp.concatenate([jnp.broadcast_to(velocity, (3,)), jnp.broadcast_to(place, (3,))])
+
+
+def _read_rest_rate(x: MargState, rate_b: Any):
+    """What the unit, lying still, would seem to turn by."""
+    return rate_b + x.gyro_gain @ rate_b - x.gyro_bias
+
+
+def _rest_rate_linear(x: MargState, rate_b: Any):
+    gain = jnp.kron(jnp.eye(3), rate_b[None, :])
+    H = jnp.zeros((3, DIM)).at[:, 9:12].set(-jnp.eye(3)).at[:, 12:21].set(gain)
+    return _read_rest_rate(x, rate_b), H
+
+
+def _rest_rate_sigma(seen: Seen, x: MargState, rate_b: Any):
+    return jnp.broadcast_to(jnp.asarray(seen.rate_still), (3,))
+
+
+def _level(x: MargState, field_b: Any):
+    """Strength along the horizontal, safe at zero, and the field in navigation axes."""
+    m = x.q_nb.apply(field_b)
+    square = m[0] ** 2 + m[1] ** 2
+    return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0), m
+
+
+def _read_magnetometer(x: MargState, field_b: Any):
+    strength, m = _level(x, field_b)
+    there = strength > 0.0
+    azimuth = jnp.arctan2(jnp.where(there, m[1], 0.0), jnp.where(there, m[0], 1.0))
+    return Angle(azimuth - x.declination), jnp.stack([strength, m[2]]) - x.field
+
+
+def _magnetometer_linear(x: MargState, field_b: Any):
+    H = jnp.zeros((3, DIM)).at[0, HEADING].set(1.0).at[0, DECLINATION].set(-1.0)
+    return _read_magnetometer(x, field_b), H.at[1:, FIELD].set(-jnp.eye(2))
+
+
+def _magnetometer_sigma(seen: Seen, x: MargState, field_b: Any):
+    strength, _ = _level(x, field_b)
+    # A field that points down has no azimuth: half a turn is as little as can be known.
+    azimuth = jnp.pi * jnp.tanh(seen.field / jnp.maximum(strength, 1e-3 * seen.field) / jnp.pi)
+    return jnp.stack([azimuth, jnp.asarray(seen.field), jnp.asarray(seen.field)])
+
+
+def marg_model(noise: Noise, seen: Seen, magnetometer: bool = True) -> Model:
+    """Gyro and accelerometer carry the state; travel, rest and the magnetometer hold it.
+
+    The Jacobian of the magnetometer has no columns of tilt: a disturbed field cannot tilt the
+    attitude, at the price of the little it could tell of tilt.
+
+    Args:
+        noise: of the motion.
+        seen: of the sensors.
+        magnetometer: whether there is one.
+
+    Returns:
+        A model with sensors, in order: "travel" ((6,) zeros; NaN where nothing is claimed; aux 1
+        at rest, else 0), "rest_rate" ((3,) zeros at rest, else NaN; aux (3,) mean rate read) and
+        "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T]). The measurement
+        is zero and the reading what the state makes of aux: the innovation is minus the reading.
+    """
+    sensors = [
+        Sensor(_read_travel, Partial(_travel_sigma, seen), 6, TRAVEL, _travel_linear),
+        Sensor(_read_rest_rate, Partial(_rest_rate_sigma, seen), 3, REST_RATE, _rest_rate_linear),
+    ]
+    if magnetometer:
+        sigma = Partial(_magnetometer_sigma, seen)
+        sensors.append(
+            Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear)
+        )
+    motion = Motion(
+        step=Partial(advance, noise),
+        noise=Partial(_sigma, noise),
+        linear=Partial(advance_linear, noise),
+    )
+    return Model(motion, tuple(sensors))

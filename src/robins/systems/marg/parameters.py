@@ -1,0 +1,141 @@
+"""Parameters of a replay of gyro, accelerometer and magnetometer, with units.
+
+The defaults are those of a cheap MEMS unit that is held in a hand or strapped to a limb or a small
+machine. Nothing in them is of one unit or one log.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, default
+
+Three = tuple[float, float, float]
+Matrix = tuple[Three, Three, Three]
+Field = Annotated[Three, Quantity("magnetic field")]
+
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Gyro(Parameters):
+    """The gyros: true rate = (I + gain) (what is read) - bias."""
+
+    noise: Annotated[float, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
+        "0.01 deg/s/sqrt(Hz)"
+    )
+    bias: Annotated[float, Quantity("angle rate", least="0 deg/s")] = default("1 deg/s")
+    bias_walk: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")] = default(
+        "0.0006 deg/s/sqrt(s)"
+    )
+    # vibration and warmth of the hand move a bias faster than rest does
+    bias_walk_moving: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")] = (
+        default("0.01 deg/s/sqrt(s)")
+    )
+    # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
+    gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("5000 ppm")
+    # what nine numbers do not explain, as a share of the angle turned
+    turn_error: Annotated[float, pydantic.Field(ge=0.0)] = 0.002
+    range: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2000 deg/s")
+
+
+class Accelerometer(Parameters):
+    """The accelerometers."""
+
+    noise: Annotated[float, Quantity("velocity random walk", above="0 m/s/sqrt(h)")] = default(
+        "0.02 m/s/sqrt(s)"
+    )
+    bias: Annotated[float, Quantity("acceleration", least="0 mg")] = default("0.05 m/s^2")
+    bias_walk: Annotated[float, Quantity("acceleration random walk", least="0 mg/sqrt(s)")] = (
+        default("0.0001 m/s^2/sqrt(s)")
+    )
+    range: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("157 m/s^2")
+    gravity: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("9.81 m/s^2")
+
+
+class Magnetometer(Parameters):
+    """The magnetometer and the field about it.
+
+    A reading is first calibrated: matrix (reading - offset). The field of a room bends from place
+    to place; `noise` is how far a reading is from the field that the filter carries along, and
+    `declination` how far the mean of such bends over many places can be from zero.
+    """
+
+    offset: Field = default("0 uT")
+    matrix: Matrix = IDENTITY
+    noise: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("2.5 uT")
+    declination: Annotated[float, Quantity("angle", above="0 deg")] = default("6 deg")
+    declination_time: Annotated[float, Quantity("time", above="0 s")] = default("60 s")
+    # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
+    field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
+    # magnitudes outside are no field of the Earth: not used, counted
+    least: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("8 uT")
+    most: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("200 uT")
+    gate: Annotated[float, pydantic.Field(gt=0.0, lt=1.0)] = 0.99
+    # so many seconds of motion in one and the same other field make that field the reference
+    patience: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
+
+
+class Travel(Parameters):
+    """What is known of the motion: it does not run away.
+
+    Seen once in `every`, velocity and place are zero with these spreads. For a vehicle give its
+    speed, and a large place.
+    """
+
+    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.5 m/s")
+    place: Annotated[float, Quantity("length", above="0 m")] = default("0.3 m")
+    every: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+    weight: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.9999  # Huber's; 1: never less
+
+
+class Rest(Parameters):
+    """When the unit lies still, and what that says."""
+
+    detect: bool = True
+    after: Annotated[float, Quantity("time", above="0 s")] = default("1.5 s")
+    quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2 deg/s")
+    quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.5 m/s^2")
+    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.03 deg/s")
+    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.01 m/s")
+
+
+class Start(Parameters):
+    """How well the first attitude is known, when it is found at rest and when not."""
+
+    still: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    moving: Annotated[float, Quantity("time", above="0 s")] = default("3 s")
+    tilt: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
+    heading: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
+    tilt_moving: Annotated[float, Quantity("angle", above="0 deg")] = default("5 deg")
+    heading_moving: Annotated[float, Quantity("angle", above="0 deg")] = default("30 deg")
+
+
+class Update(Parameters):
+    """How the filter steps."""
+
+    # a sample is the mean over the interval it ends, or the value at an instant
+    samples: Literal["means", "instants"] = "means"
+    block: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+    # an interval between samples longer than this many usual ones is a gap
+    gap: Annotated[float, pydantic.Field(gt=1.0)] = 3.0
+    gap_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("60 deg/s")
+    gap_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("3 m/s^2")
+
+
+class Replay(Parameters):
+    """A recorded nine-axis log: what cannot be read from the files themselves."""
+
+    system: Literal["marg"] = "marg"
+    title: str = "Orientation from gyro, accelerometer and magnetometer"
+    use_magnetometer: Literal["always", "undisturbed", "never"] = "undisturbed"
+    orientation: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of mount
+    gyro: Gyro = pydantic.Field(default_factory=Gyro)
+    accelerometer: Accelerometer = pydantic.Field(default_factory=Accelerometer)
+    magnetometer: Magnetometer = pydantic.Field(default_factory=Magnetometer)
+    travel: Travel = pydantic.Field(default_factory=Travel)
+    rest: Rest = pydantic.Field(default_factory=Rest)
+    start: Start = pydantic.Field(default_factory=Start)
+    update: Update = pydantic.Field(default_factory=Update)
+    filters: tuple[str, ...] = ("marg", "marg-smoothed")
