@@ -203,6 +203,60 @@ def test_a_vehicle_has_a_top_and_a_sensor_has_none(data):
     assert not [f for f in examine([upright, data.mag]) if f.code == "sensor_axes"]
 
 
+PERMUTED = {
+    "(field_y, field_x, -field_z)": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],  # its own inverse
+    "(field_y, field_z, field_x)": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+    "(field_x, -field_y, -field_z)": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]],  # but for all signs
+}
+
+
+@pytest.mark.parametrize("columns", PERMUTED)
+def test_axes_other_than_those_of_the_gyros(data, columns):
+    """Also where iron in the casing adds as much as the Earth."""
+    field_t = data.mag.field_t @ np.array(PERMUTED[columns], float).T
+    for offset in (0.0, np.array([40e-6, -30e-6, 20e-6])):
+        f = the(changed(data, field_t=field_t + offset), "field_axes")
+        assert f.severity == "error"
+        assert f"with the columns {columns}, or all three of these reversed" in f.sentence
+        assert f.value > 1.0
+    assert "field_axes" not in found(changed(data, field_t=-data.mag.field_t))
+    assert "field_axes" not in found(changed(data, field_t=data.mag.field_t + offset))
+
+
+def test_axes_are_not_judged_without_turning_or_with_wrong_gyros(data):
+    wrong = np.array(PERMUTED["(field_y, field_z, field_x)"], float).T
+    still = {
+        kind: dataclasses.replace(
+            getattr(data, kind),
+            **{
+                f.name: getattr(getattr(data, kind), f.name)[:500]
+                for f in dataclasses.fields(getattr(data, kind))
+                if isinstance(getattr(getattr(data, kind), f.name), np.ndarray)
+            },
+        )
+        for kind in ("imu", "mag", "attitude")
+    }
+    rest = dataclasses.replace(data, **still)
+    assert found(changed(rest, field_t=rest.mag.field_t @ wrong)) == []
+    degrees = dataclasses.replace(data.imu, gyro=np.rad2deg(data.imu.gyro))
+    turned = changed(dataclasses.replace(data, imu=degrees), field_t=data.mag.field_t @ wrong)
+    assert "gyro_unit" in found(turned, "error")
+    assert "field_axes" not in found(turned)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["broad_07_undisturbed_fast_rotation_B.npz", "broad_33_disturbed_attached_magnet_2cm.npz"],
+)
+def test_axes_of_real_sensors_exchanged_on_purpose(data_dir, name):
+    """Even with a magnet beside the sensor."""
+    trial = load_dataset([data_dir / name])
+    for columns, matrix in PERMUTED.items():
+        field_t = trial.mag.field_t @ np.array(matrix, float).T
+        (f,) = [f for f in examine(changed(trial, field_t=field_t)) if f.code == "field_axes"]
+        assert columns in f.sentence
+
+
 @pytest.mark.parametrize(
     ("name", "codes"),
     [

@@ -22,6 +22,7 @@ from robins.logs.checks_columns import check_columns
 from robins.logs.checks_gnss import check_gnss
 from robins.logs.checks_imu import check_imu
 from robins.logs.checks_mag import check_mag
+from robins.logs.checks_mag_axes import check_mag_axes
 from robins.logs.checks_master import BY_REST, check_master
 from robins.logs.checks_motion import check_motion
 from robins.logs.checks_span import check_span
@@ -38,7 +39,8 @@ _SPOILT = {
     *("position_unit", "no_fix_as_zero"),
     *("velocity_axes", "velocity_unit", "velocity_sign"),
 }
-
+# What makes gyros and magnetometer differ without any axis being wrong.
+_TURNS = {"gyro_unit", "gyro_axes", "gyro_reversed", "left_handed", "field_unit", "field_stuck"}
 
 Subject = Dataset | Table | Sequence[Table | Dataset]
 
@@ -75,7 +77,7 @@ def _examined(
     master: Trajectory | None,
     unit_known: frozenset[str],
 ) -> list[Finding]:
-    imu = gnss = None
+    imu = gnss = mag = None
     kinds = {type(table) for table in tables}
     # What shall tell only how the sensor itself is turned may lie any way.
     in_vehicle = not kinds & {MagTable, AttitudeTable} or bool(kinds & {GnssTable, Trajectory})
@@ -93,7 +95,8 @@ def _examined(
             if not any(f.severity == "error" and f.code in _NO_PLACE for f in of_place):
                 findings += check_velocity(gnss)
         elif isinstance(table, MagTable):
-            findings += check_mag(checked_mag(table))
+            mag = checked_mag(table)
+            findings += check_mag(mag)
     if imu is not None:
         for table in tables:
             if table is not imu and not isinstance(table, ImuTable):
@@ -110,6 +113,8 @@ def _examined(
         if any(f.code == "gyro_unit" for f in of_motion):  # with proof; once is enough
             findings = [f for f in findings if f.code != "gyro_unit"]
         findings += of_motion
+        if mag is not None and not _TURNS & {f.code for f in findings}:
+            findings += check_mag_axes(imu, mag)
     return findings
 
 

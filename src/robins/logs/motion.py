@@ -73,7 +73,7 @@ def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -
     for start in starts:
         if _has_gap(gnss_s, start) or _has_gap(signal.time_s, start):
             continue
-        change = np.diff(_at(start + np.arange(STRETCH_S + 1), gnss_s, v_n), axis=0)
+        change = np.diff(at(start + np.arange(STRETCH_S + 1), gnss_s, v_n), axis=0)
         power = float(np.mean(np.sum((change - change.mean(axis=0)) ** 2, axis=1)))
         if power > max(0.2**2, (3.0 * noise) ** 2):
             lively.append((power, start))
@@ -108,7 +108,7 @@ def _sums_on_grid(signal: Signal) -> tuple[np.ndarray, np.ndarray, float]:
     """Integrals of rate and specific force up to each grid time, and the last of these times."""
     grid = np.arange(0.0, signal.time_s[-1], 1.0 / _RATE_HZ)
     turn, push = (
-        _at(grid, signal.time_s, _integral(signal.time_s, x)) for x in (signal.gyro, signal.accel)
+        at(grid, signal.time_s, integral(signal.time_s, x)) for x in (signal.gyro, signal.accel)
     )
     return turn, push, float(grid[-1])
 
@@ -150,7 +150,7 @@ def travel_in_body(pair: Pair) -> np.ndarray:
         view = _view(pair, start, _NO_LAG)
         sums, C = _sum_unturned(view.turn, view.push)
         R, _, _ = _kabsch(sums, view.wanted)
-        v_n = _at(start + np.arange(STRETCH_S), pair.gnss_s, pair.v_n)
+        v_n = at(start + np.arange(STRETCH_S), pair.gnss_s, pair.v_n)
         v_b = np.einsum("kji,lj,kl->ki", C[0], R[0], v_n)  # C^T R^T v
         out.append(v_b[np.linalg.norm(v_n, axis=-1) > 0.5])
     return np.concatenate(out)
@@ -168,7 +168,7 @@ class _View(NamedTuple):
 
 def _view(pair: Pair, start: float, lags_s: np.ndarray) -> _View:
     seconds = start + np.arange(STRETCH_S + 1)
-    wanted = np.diff(_at(seconds, pair.gnss_s, pair.v_n), axis=0) - [0.0, 0.0, GRAVITY]
+    wanted = np.diff(at(seconds, pair.gnss_s, pair.v_n), axis=0) - [0.0, 0.0, GRAVITY]
     middle = wanted.mean(axis=0) if pair.power == "change" else 0.0
     power = float(np.sum((wanted - middle) ** 2))
     fine = np.arange(STRETCH_S * _RATE_HZ + 1) / _RATE_HZ + start
@@ -219,12 +219,14 @@ def _sums_without(view: _View, bias: np.ndarray) -> np.ndarray:
     return sums.reshape(*bias.shape[:2], STRETCH_S, 3)
 
 
-def _integral(time_s: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def integral(time_s: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """(n, 3) sum of a rate (n, 3) from the first sample up to each, by the trapezoidal rule."""
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time_s)[:, None]
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
-def _at(when: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+def at(when: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Columns of values (n, 3) interpolated linearly, held at the ends."""
     return np.stack([np.interp(when, time_s, column) for column in values.T], axis=-1)
 
 
@@ -240,8 +242,8 @@ def _sum_unturned(turn: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.nd
     """Velocity increments (h, seconds, 3) in the axes of the first moment, and C (h, seconds, 3, 3)
     from the axes at the start of each second to those.
     """
-    whole = _rotations(turn)
-    push = np.einsum("hkij,hkj->hki", _rotations(0.5 * turn), push)
+    whole = rotations(turn)
+    push = np.einsum("hkij,hkj->hki", rotations(0.5 * turn), push)
     C = np.broadcast_to(np.eye(3), (len(turn), 3, 3))
     out = np.zeros((len(turn), STRETCH_S, 3))
     attitudes = []
@@ -253,8 +255,8 @@ def _sum_unturned(turn: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.nd
     return out, np.stack(attitudes, axis=1)
 
 
-def _rotations(phi: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula for many rotation vectors."""
+def rotations(phi: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) matrices of rotation vectors (..., 3), by Rodrigues' formula."""
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(phi, -1, 0)
     o = np.zeros_like(x)
