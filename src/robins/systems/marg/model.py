@@ -5,8 +5,8 @@ A step is a block of samples, integrated beforehand (`Block`). What is peculiar 
 - the accelerometer is integrated, not looked at: it carries the velocity, and gravity shows in that
   a velocity and a place which do not run away leave no room for a tilt error. A swing of the hand
   then pulls the attitude no more than its mean does;
-- scale factors and misalignments of the gyros are nine states. They are what a good MEMS gyro drifts
-  by when it is turned about, and tilt, which the accelerometer sees well, tells of them;
+- scale factors and misalignments of the gyros are nine states. They are what a good MEMS gyro
+  drifts by when it is turned about, and tilt, which the accelerometer sees well, tells of them;
 - the magnetometer gives a heading and no tilt. North is where the field pointed at the start. How
   the field of other places is turned against that is a state, `declination`, which does not change
   while the unit lies still: reading the same place again tells nothing new.
@@ -242,9 +242,7 @@ def marg_model(noise: Noise, seen: Seen, magnetometer: bool = True) -> Model:
     ]
     if magnetometer:
         sigma = Partial(_magnetometer_sigma, seen)
-        sensors.append(
-            Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear)
-        )
+        sensors.append(Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear))
     motion = Motion(
         step=Partial(advance, noise),
         noise=Partial(_sigma, noise),

@@ -20,6 +20,7 @@ from robins.systems.marg.model import MAGNETOMETER, REST_RATE, TRAVEL, Block, Ma
 from robins.systems.marg.parameters import Accelerometer, Gyro, Magnetometer, Replay
 from robins.systems.marg.rest import still_samples
 
+_PACK = 512  # blocks are filled up to a multiple of this, so that logs alike compile once
 _FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
 
 
@@ -30,13 +31,13 @@ class Prepared(NamedTuple):
     time_ns: np.ndarray  # (N,) int64
     samples: Samples
     used: int  # N - 1, samples that are not padding
-    epoch_s: np.ndarray  # (K,) ends of the blocks
+    epoch_s: np.ndarray  # (B,) ends of the blocks that are not padding, B <= K
     start: Belief
     look: FirstLook
     u: Block
     y: dict[str, Any]
     aux: dict[str, Any]
-    still: np.ndarray  # (K,) bool
+    still: np.ndarray  # (B,) bool
     counts: dict[str, int]
 
 
@@ -49,12 +50,16 @@ def whole_samples(
         ValueError: fewer than two samples are left.
     """
     finite = np.all(np.isfinite(imu.gyro), axis=1) & np.all(np.isfinite(imu.accel), axis=1)
-    kept = imu if np.all(finite) else replace(
-        imu,
-        time_ns=imu.time_ns[finite],
-        gyro=imu.gyro[finite],
-        accel=imu.accel[finite],
-        rows=None if imu.rows is None else imu.rows[finite],
+    kept = (
+        imu
+        if np.all(finite)
+        else replace(
+            imu,
+            time_ns=imu.time_ns[finite],
+            gyro=imu.gyro[finite],
+            accel=imu.accel[finite],
+            rows=None if imu.rows is None else imu.rows[finite],
+        )
     )
     if len(kept) < 2:
         raise ValueError(f"orientation needs two whole inertial samples; this log has {len(kept)}")
@@ -136,7 +141,8 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
 
     usual = float(np.median(dt))
     n = max(1, round(p.update.block / usual))
-    blocks = -(-len(dt) // n)
+    whole = -(-len(dt) // n)
+    blocks = -(-whole // _PACK) * _PACK
     samples = Samples(
         _filled(dt, blocks, n, 0.0),
         _filled(theta, blocks, n, 0.0),
@@ -166,7 +172,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     look = first_look(dt, theta, dv, field, p.start, p.accelerometer)
     y, aux = _measurements(integrals, u, still, parameters)
     time_s = (imu.time_ns - imu.time_ns[0]) * 1e-9
-    ends = np.minimum((np.arange(blocks) + 1) * n, len(dt))
+    ends = np.minimum((np.arange(whole) + 1) * n, len(dt))
     return Prepared(
         time_s=time_s,
         time_ns=np.asarray(imu.time_ns),
@@ -178,7 +184,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         u=u,
         y=y,
         aux=aux,
-        still=still,
+        still=still[:whole],
         counts=counts,
     )
 
@@ -217,8 +223,9 @@ def _measurements(
     """What is known at the end of each block; NaN where nothing is."""
     p, time = parameters, np.asarray(integrals.dt_s)
     blocks, clock = len(time), np.cumsum(time)
-    known = every(clock, np.ones(blocks, dtype=bool), p.travel.every)
+    known = every(clock, time > 0.0, p.travel.every)
     travel = np.full((blocks, 6), np.nan)
+    still = still & (time > 0.0)
     travel[still, :3] = 0.0
     travel[known] = 0.0
     # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
@@ -244,7 +251,8 @@ def _mean_rate(u: Block) -> np.ndarray:
     """(K, 3) rad/s, mean over each block, from its rotation; meant for rest."""
     q = np.asarray(u.turn)
     vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])
-    return vector / np.asarray(u.dt_s)[:, None]
+    dt = np.asarray(u.dt_s)[:, None]
+    return np.where(dt > 0.0, vector / np.where(dt > 0.0, dt, 1.0), 0.0)
 
 
 def every(clock_s: np.ndarray, able: np.ndarray, interval_s: float) -> np.ndarray:

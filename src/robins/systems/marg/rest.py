@@ -29,7 +29,7 @@ def still_samples(
         (N,) bool.
     """
     step = float(np.median(dt_s)) if len(dt_s) else 0.0
-    if not rest.detect or step <= 0.0 or _MEMORY_S < _FEWEST * step:
+    if not rest.detect or step <= 0.0 or _FEWEST * step > _MEMORY_S:
         return np.zeros(len(dt_s), dtype=bool)
     mean_rate, mean_force = _running_mean(rate_b, step), _running_mean(force_b, step)
     quiet = np.linalg.norm(rate_b - mean_rate, axis=1) < rest.quiet_rate

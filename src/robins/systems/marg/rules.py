@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import jax.numpy as jnp
 
@@ -48,6 +49,7 @@ def undisturbed(probability: float, patience: int, declination: float, field_t: 
     return rules.only(MAGNETOMETER, inner._replace(before=before, name="undisturbed"))
 
 
+@lru_cache(maxsize=16)
 def marg_filter(
     gate: float | None = 0.99,
     patience: int = 20,
@@ -55,7 +57,7 @@ def marg_filter(
     declination: float = 0.1,
     field_t: float = 1e-4,
 ) -> Filter:
-    """The filter of `marg_model`.
+    """The filter of `marg_model`; the same object for the same arguments, so compiled once.
 
     Args:
         gate: share of right magnetometer readings that pass; None believes every reading, and is

@@ -63,7 +63,9 @@ def filter_of(parameters: Replay) -> Filter:
 
 
 SENSORS = {
-    TRAVEL: SensorAxes("m/s, m", "NED", tuple(f"{w} {a}" for w in ("velocity", "place") for a in NED)),
+    TRAVEL: SensorAxes(
+        "m/s, m", "NED", tuple(f"{w} {a}" for w in ("velocity", "place") for a in NED)
+    ),
     REST_RATE: SensorAxes("rad/s", "body", XYZ),
     MAGNETOMETER: SensorAxes("rad, T", "NED", ("azimuth", "horizontal", "down")),
 }

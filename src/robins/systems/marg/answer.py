@@ -1,0 +1,240 @@
+"""What a replay found: time series with units, figures of merit, sentences."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from robins.dataset import Dataset
+from robins.filters import Code
+from robins.filters.consistency import grand_mean_nis
+from robins.results import variable
+from robins.rotation import to_euler
+from robins.systems.marg.accuracy import orientation_errors, rms_deg, truth_at
+from robins.systems.marg.model import MAGNETOMETER, MargState
+from robins.systems.marg.prepare import Prepared
+from robins.systems.marg.setup import BLOCKS, SENSORS
+from robins.systems.tables import Seen, innovation_tables
+
+
+class Update(NamedTuple):
+    """What a run keeps of the updates of one sensor; leading axis B blocks."""
+
+    innovation: np.ndarray  # (B, m)
+    sigma: np.ndarray  # (B, m)
+    nis: np.ndarray  # (B,)
+    dof: np.ndarray  # (B,)
+    code: np.ndarray  # (B,)
+
+
+class Answer(NamedTuple):
+    """What one filter says; B blocks, N samples."""
+
+    mean: MargState  # leading axis B
+    sigma: np.ndarray  # (B, n)
+    q_nb: np.ndarray  # (N, 4) at every sample
+    updates: dict[str, Update]  # empty for a smoother
+    log_likelihood: float
+
+
+def metrics(dataset: Dataset, log: Prepared, answer: Answer) -> dict[str, Any]:
+    """Figures of merit of one filter; errors only where the log has a true attitude."""
+    out: dict[str, Any] = {}
+    if dataset.attitude is not None:
+        q_true, counts = truth_at(dataset.attitude, log.time_ns)
+        e = orientation_errors(answer.q_nb[counts], q_true[counts])
+        out |= {
+            "total_rmse_deg": rms_deg(e.total),
+            "heading_rmse_deg": rms_deg(e.heading),
+            "inclination_rmse_deg": rms_deg(e.inclination),
+            "total_max_deg": float(np.degrees(np.max(e.total, initial=0.0))),
+            "samples_compared": int(np.sum(counts)),
+        }
+        heading, _, moving = _errors_at_epochs(dataset, log, answer)
+        ratio = heading[moving] / answer.sigma[moving, 2]
+        # one where the stated spread of the heading is right
+        out["heading_nees"] = float(np.mean(ratio**2)) if ratio.size else float("nan")
+    out["rest_share"] = float(np.mean(log.still))
+    for sensor, update in answer.updates.items():
+        used = update.dof * (update.code != int(Code.REFUSED))
+        refused = int(np.sum(update.code == int(Code.REFUSED)))
+        out[f"refused_{sensor}"] = refused
+        if np.sum(used) == 0:
+            continue
+        verdict = grand_mean_nis(update.nis, used)
+        out[f"nis_{sensor}"] = verdict.value
+        out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+    if answer.updates:
+        out["log_likelihood"] = answer.log_likelihood
+    return out
+
+
+def _epoch_rows(log: Prepared) -> np.ndarray:
+    """(B,) the sample at which each block ends."""
+    n = log.samples.dt_s.shape[1]
+    return np.minimum((np.arange(len(log.epoch_s)) + 1) * n, log.used)
+
+
+def _errors_at_epochs(dataset: Dataset, log: Prepared, answer: Answer):
+    """Heading and tilt [rad], true minus estimated, at the ends of blocks, and where they count."""
+    assert dataset.attitude is not None
+    rows = _epoch_rows(log)
+    q_true, counts = truth_at(dataset.attitude, log.time_ns[rows])
+    q = answer.q_nb[rows]
+    heading = -orientation_errors(q, q_true).heading
+    # How the true vertical leans against the estimated one, along estimated north and east.
+    down = _down_in_body(q_true)
+    lean = np.stack([np.sum(axis * down, axis=1) for axis in _level_axes(q)], axis=1)
+    tilt = np.stack([lean[:, 1], -lean[:, 0]], axis=1)
+    return heading, tilt, counts
+
+
+def _down_in_body(q: np.ndarray) -> np.ndarray:
+    w, x, y, z = q.T
+    return np.stack(
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1
+    )
+
+
+def _level_axes(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """North and east in body axes."""
+    w, x, y, z = q.T
+    north = [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)]
+    east = [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)]
+    return np.stack(north, axis=1), np.stack(east, axis=1)
+
+
+def solution(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> xr.Dataset:
+    """Time series of every filter, labelled as `robins.results` lists them."""
+    ft = ("filter", "time")
+    coords: dict[str, Any] = {
+        "filter": list(answers),
+        "time": variable("time", log.epoch_s, "s", "time since the first sample"),
+    }
+    data: dict[str, Any] = {
+        "rest": variable("time", log.still.astype(np.int8), "1", "unit lies still")
+    }
+    for block in BLOCKS:
+        axis, words = f"axis_{block.name}", block.name.replace("_", " ")
+        coords[axis] = list(block.axes)
+        labels = (block.units, block.frame)
+        data[f"sigma_{block.name}"] = variable(
+            (*ft, axis),
+            np.stack([a.sigma[:, block.where] for a in answers.values()]),
+            labels[0],
+            f"standard deviation of {words}",
+            labels[1],
+            display_unit=block.display_unit,
+        )
+        if block.name != "attitude":
+            data[f"estimate_{block.name}"] = variable(
+                (*ft, axis),
+                np.stack([_estimate(a, block.name) for a in answers.values()]),
+                labels[0],
+                f"estimated {words}",
+                labels[1],
+                display_unit=block.display_unit,
+            )
+    coords["axis_euler"] = ["roll", "pitch", "heading"]
+    euler = [np.stack(to_euler(a.mean.q_nb.wxyz), axis=-1) for a in answers.values()]
+    data["estimate_euler"] = variable(
+        (*ft, "axis_euler"),
+        np.stack(euler),
+        "rad",
+        "estimated roll, pitch, heading",
+        "body to NED",
+        display_unit="deg",
+    )
+    if dataset.attitude is not None:
+        data |= _error_tables(dataset, log, answers)
+        coords |= {"axis_heading": ["heading"], "axis_inclination": ["north", "east"]}
+    data["magnetic_disturbance"] = variable(
+        ft,
+        np.stack([_disturbed(a, len(log.epoch_s)) for a in answers.values()]),
+        "1",
+        "magnetometer refused",
+    )
+    more, places = innovation_tables(_seen(answers), SENSORS, log.epoch_s)
+    return xr.Dataset(data | more, coords | places)
+
+
+def _error_tables(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> dict[str, Any]:
+    found = [_errors_at_epochs(dataset, log, a) for a in answers.values()]
+    rows = {
+        "heading": ([h[:, None] for h, _, _ in found], slice(2, 3), "true minus estimated heading"),
+        "inclination": ([t for _, t, _ in found], slice(0, 2), "tilt of true against estimated"),
+    }
+    out = {}
+    for name, (values, where, words) in rows.items():
+        dims = ("filter", "time", f"axis_{name}")
+        sigma = np.stack([a.sigma[:, where] for a in answers.values()])
+        for kind, table, text in (
+            ("error", np.stack(values), words),
+            ("sigma", sigma, f"standard deviation of {name}"),
+        ):
+            out[f"{kind}_{name}"] = variable(dims, table, "rad", text, "NED", display_unit="deg")
+    return out
+
+
+def _estimate(answer: Answer, block: str) -> np.ndarray:
+    value = np.asarray(getattr(answer.mean, {"velocity": "v_n"}.get(block, block)))
+    return value.reshape(len(value), -1)
+
+
+def _disturbed(answer: Answer, blocks: int) -> np.ndarray:
+    if MAGNETOMETER not in answer.updates:
+        return np.zeros(blocks, dtype=np.int8)
+    return (answer.updates[MAGNETOMETER].code == int(Code.REFUSED)).astype(np.int8)
+
+
+def _seen(answers: dict[str, Answer]) -> dict[str, Seen]:
+    """Innovations by sensor; a smoother has none, so its rows are NaN."""
+    causal = [a.updates for a in answers.values() if a.updates]
+    if not causal:
+        return {}
+
+    def of(sensor: str, pick) -> np.ndarray:
+        shape = np.shape(pick(causal[0][sensor]))
+        blank = np.full(shape, np.nan)
+        rows = [
+            np.asarray(pick(a.updates[sensor]), dtype=float) if a.updates else blank
+            for a in answers.values()
+        ]
+        return np.stack(rows)
+
+    return {
+        name: Seen(
+            of(name, lambda u: u.innovation),
+            of(name, lambda u: u.sigma),
+            of(name, lambda u: u.nis),
+            of(name, lambda u: u.dof),
+            of(name, lambda u: u.code == int(Code.REFUSED)),
+        )
+        for name in causal[0]
+    }
+
+
+def sentences(log: Prepared, answers: dict[str, Answer]) -> list[str]:
+    """What a reader of the report should know."""
+    out = [log.look.sentence]
+    c = log.counts
+    out.append(
+        f"At rest for {100.0 * float(np.mean(log.still)):.0f} % of the log; "
+        f"{c['imu_missing']} inertial samples missing, {c['imu_saturated']} at the end of their "
+        f"range, {c['imu_gaps']} gaps; {c['field_missing']} field readings missing, "
+        f"{c['field_implausible']} no field of the Earth; {c['blocks_in_free_fall']} blocks in "
+        f"free fall."
+    )
+    for name, answer in answers.items():
+        update = answer.updates.get(MAGNETOMETER)
+        if update is None or not np.any(update.dof + (update.code == int(Code.REFUSED))):
+            continue
+        asked = int(np.sum((update.dof > 0) | (update.code == int(Code.REFUSED))))
+        refused = int(np.sum(update.code == int(Code.REFUSED)))
+        out.append(
+            f"{name}: the field was disturbed at {refused} of {asked} looks; heading then came "
+            "from the gyros."
+        )
+    return out

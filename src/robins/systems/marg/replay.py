@@ -1,0 +1,126 @@
+"""Replay a nine-axis log: align, filter, smooth, and see how far it is from the truth if known."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins.dataset import Dataset
+from robins.filters import Belief, Code, Filter, Model, StepInfo, rts_smoother, run
+from robins.filters.run import Step
+from robins.systems.marg.answer import Answer, Update, metrics, sentences, solution
+from robins.systems.marg.blocks import causal_attitudes, smoothed_attitudes
+from robins.systems.marg.parameters import Replay
+from robins.systems.marg.prepare import Prepared, prepare
+from robins.systems.marg.setup import CAUSAL, SMOOTHED, filter_of, model_of
+from robins.systems.system import Outcome, Progress
+
+
+class Light(NamedTuple):
+    """What is kept of a step where nothing is smoothed."""
+
+    mean: Any
+    sigma: Any
+    info: Any  # by sensor, an `Update`
+    failed: Any  # () the prediction was not taken
+
+
+def _update(info: StepInfo) -> Update:
+    return Update(info.innovation, info.sigma, info.nis, info.dof, info.code)
+
+
+def light(step: Step) -> Light:
+    """Keep the posterior's mean and standard deviations and how the updates went."""
+    return Light(
+        step.posterior.mean,
+        step.posterior.sigma,
+        {name: _update(info) for name, info in step.info.items()},
+        step.prediction.code != int(Code.DONE),
+    )
+
+
+@jax.jit
+def _light_of(steps: Step) -> Light:
+    return jax.vmap(light)(steps)
+
+
+def orient(
+    log: Prepared, filter_: Filter, model: Model, wanted: tuple[str, ...]
+) -> tuple[dict[str, Answer], int]:
+    """Run the filter over a log once, and its smoother if that is wanted.
+
+    Args:
+        log: from `prepare`.
+        filter_: from `setup.filter_of`, or any other of the same model.
+        model: from `setup.model_of`.
+        wanted: names out of "marg" and "marg-smoothed".
+
+    Returns:
+        Answers by name, and the number of steps that could not be taken.
+    """
+    smooth = SMOOTHED in wanted
+    arguments = (filter_, model, log.start, log.y, log.u, log.aux)
+    found = run(*arguments) if smooth else run(*arguments, keep=light)
+    kept = _light_of(found.steps) if smooth else found.steps
+    blocks = len(log.epoch_s)
+    kept, likelihood = _cut(kept, blocks), float(found.log_likelihood)
+    out = {}
+    if CAUSAL in wanted:
+        mean = found.steps.posterior.mean if smooth else found.steps.mean
+        q = causal_attitudes(log.start.mean, mean, log.samples)
+        q_nb = _by_sample(log, q, log.look.q_nb)
+        out[CAUSAL] = Answer(kept.mean, np.asarray(kept.sigma), q_nb, kept.info, likelihood)
+    if smooth:
+        belief: Belief = rts_smoother(found)
+        q, first = smoothed_attitudes(belief.mean, log.samples)
+        sigma = np.asarray(belief.sigma)[:blocks]
+        q_nb = _by_sample(log, q, first)
+        out[SMOOTHED] = Answer(_cut(belief.mean, blocks), sigma, q_nb, {}, likelihood)
+    return {name: out[name] for name in wanted}, int(np.sum(kept.failed))
+
+
+def _cut(tree: Any, blocks: int) -> Any:
+    """Without the padding, as NumPy."""
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:blocks], tree)
+
+
+def _by_sample(log: Prepared, q: Any, first: Any) -> np.ndarray:
+    rows = np.asarray(q).reshape(-1, 4)[: log.used]
+    return np.concatenate([np.asarray(first)[None], rows])
+
+
+def replay(
+    dataset: Dataset,
+    parameters: Replay,
+    filters: tuple[str, ...] = (),
+    progress: Progress | None = None,
+) -> Outcome:
+    """Find the orientation over a log and say how good it is.
+
+    Args:
+        dataset: inertial samples; magnetic field and true attitude where there are.
+        parameters: what the files do not say.
+        filters: "marg" and "marg-smoothed"; by default those of the parameters.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        ValueError: the log cannot be used; the sentence says why.
+    """
+    tell = progress if progress is not None else (lambda share, what: None)
+    wanted = tuple(dict.fromkeys(tuple(filters) or parameters.filters))
+    tell(0.0, "integrating blocks")
+    log = prepare(dataset, parameters)
+    tell(0.2, "filtering")
+    answers, failed = orient(log, filter_of(parameters), model_of(parameters), wanted)
+    tell(0.9, "measuring")
+    notes = sentences(log, answers)
+    if dataset.mag is None:
+        notes.append("There is no magnetometer in this log: the heading is that of the gyros.")
+    return Outcome(
+        solution=solution(dataset, log, answers),
+        metrics={name: metrics(dataset, log, answer) for name, answer in answers.items()},
+        counts=dict(dataset.counts) | log.counts | {"steps_not_taken": failed},
+        notes=notes,
+    )
