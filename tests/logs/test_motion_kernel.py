@@ -16,7 +16,7 @@ RNG = np.random.default_rng(6)
 def test_rotations_against_scipy():
     phi = RNG.normal(size=(4, 5, 3)) * np.logspace(-9, 0.5, 5)[:, None]
     expected = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix().reshape(4, 5, 3, 3)
-    np.testing.assert_allclose(motion._rotations(phi), expected, atol=1e-15)
+    np.testing.assert_allclose(motion.rotations(phi), expected, atol=1e-15)
 
 
 def test_best_rotation_against_scipy():
