@@ -1,5 +1,6 @@
 """What the rocket's filters make of bad samples, lost sensors and scenarios that cannot be."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,12 +15,14 @@ from robins.filters.rules.discriminator import Verdict
 from robins.rotation import Rotation
 from robins.scenario import ScenarioError
 from robins.systems.rocket import SYSTEM
+from robins.systems.rocket.angle_contender import angle_contender
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.field import FIELD, FieldState
 from robins.systems.rocket.field_contender import plausible
 from robins.systems.rocket.filters import PATIENCE
 from robins.systems.rocket.parameters import FieldVector, MagneticAttitude
-from robins.systems.rocket.problem import angle_problem, field_problem
+from robins.systems.rocket.problem import field_problem
+from robins.systems.rocket.world import lay_out, simulate
 
 DEG = np.pi / 180.0
 AT = 150  # the sample that is bad, or the first of them
@@ -46,9 +49,8 @@ def seen_of(step):
     return Seen(step.posterior, step.prediction.belief, info, step.prediction.code)
 
 
-def found(problem, name, worlds):
-    """What a filter makes of many worlds, leading axis."""
-    c = problem.contenders[name]
+def found(c, worlds):
+    """What a contender makes of many worlds, leading axis."""
 
     def one(world):
         it = c.case(world)
@@ -116,7 +118,7 @@ def of_the_field():
     spinning = field_problem(parsed(FieldVector, "b4", *along), (), 0)
     worlds.append(jax.jit(spinning.simulate)(0))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
-    gated = found(problem, "gate", stacked)
+    gated = found(problem.contenders["gate"], stacked)
     return Flight(problem, world, cases, gated, spinning, worlds[-1])
 
 
@@ -263,14 +265,16 @@ def test_a_covariance_that_is_none_cannot_be_believed(change, words):
 
 LOST = {"gyro": (True, False), "magnetometer": (False, True), "both": (True, True)}
 TAKEN = slice(80, 150)
+SHARES = ((0.7, 0.3, 0.5, 0.8, 0.4, 0.2), (0.3, 0.7, 0.5, 0.2, 0.6, 0.8))  # of gyro, magnetometer
 
 
 @pytest.fixture(scope="module", name="dropped")
 def of_lost_sensors():
     """The two filters that are one, with each sensor lost for 7 s, and with both."""
-    problem = angle_problem(parsed(MagneticAttitude, "a8"), ("ukf", "federated-root"), 0)
-    world = jax.jit(problem.simulate)(0)
-    time = np.arange(len(problem.epoch_s))
+    given = parsed(MagneticAttitude, "a8")
+    course = lay_out(given)
+    world = jax.jit(partial(simulate, given, course, 0))(0)
+    time = np.arange(len(course.time_s))
     gone = np.array([(time >= TAKEN.start) & (time < TAKEN.stop)])
 
     def without(no_gyro, no_magnet):
@@ -278,7 +282,8 @@ def of_lost_sensors():
         return world._replace(rate=hide(world.rate, no_gyro), angles=hide(world.angles, no_magnet))
 
     worlds = jax.tree.map(lambda *x: jnp.stack(x), *(without(*one) for one in LOST.values()))
-    return {name: found(problem, name, worlds) for name in problem.contenders}
+    names = ("ukf", "federated-root")
+    return {name: found(angle_contender(given, name, SHARES), worlds) for name in names}
 
 
 @pytest.mark.parametrize("case", LOST)
