@@ -232,14 +232,20 @@ def solve_spd(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n
     return solve_lower_transposed(L, solve_lower(L, B))
 
 
-def guard(factor: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], Bool[Array, "n"]]:
+def guard(
+    factor: Float[Array, "n k"], size: Float[Array, "n"] | None = None
+) -> tuple[Float[Array, "n n"], Bool[Array, "n"]]:
     """Lower factor of a perhaps singular covariance, safe to solve with.
 
     A row that depends on those above it carries no information of its own. It is left out: its
     pivot is infinite, so that solving gives exactly zero there, which is the limit of a
     pseudo-inverse; the second result says which rows are independent.
+
+    Args:
+        factor: (n, k), its rows with scales of their own.
+        size: (n,) of what each row was summed from, where that was larger than the row.
     """
-    independent = independent_rows(factor)
+    independent = independent_rows(factor, size)
     kept = jnp.where(independent[:, None], factor, 0.0)
     # A column of its own for a row left out, so that it stays uncorrelated with the rest.
     L = tria(kept, jnp.diag(jnp.where(independent, 0.0, 1.0)))

@@ -28,6 +28,8 @@ class White(NamedTuple):
     spread: Array  # (m, n) R^-1/2 H S
     left_over: Array  # () trace of what the linearisation leaves over
     counts: Array  # (m,) bool: used, and with noise of its own; the others are zero
+    seen: Array  # (m, n) H S in the sensor's units
+    size: Array  # (m,) of what those were summed from
 
     @property
     def predicted(self) -> Array:
@@ -51,7 +53,8 @@ def whitened(o: Observation) -> White:
     columns = [o.residual[:, None], away[:, None], o.spread, o.excess]
     white = linalg.solve_lower(root, jnp.concatenate(columns, axis=1))
     left_over = jnp.sum(white[:, n + 2 :] ** 2) - jnp.sum(white[:, 1] ** 2)
-    return White(white[:, 0], white[:, 2 : n + 2], left_over, counts)
+    seen = jnp.where(counts[:, None], o.spread, 0.0)
+    return White(white[:, 0], white[:, 2 : n + 2], left_over, counts, seen, o.size)
 
 
 def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
@@ -120,13 +123,14 @@ def seen_by(spread: Array, S: Array) -> Array:
     return jax.lax.cond(jnp.all(pivots > _SOLID * sigma), solid, singular)
 
 
-def _where_seen(S: Array, spread: Array, factor: Array) -> Array:
+def _where_seen(S: Array, white: White, factor: Array) -> Array:
     """Factor of P + (lambda - 1) P H' (H P H')^+ H P: H P H' grows by lambda and nothing else does.
 
-    The added part is S T'T S' with T the orthonormal rows that span those of H S.
+    The added part is S T'T S' with T the orthonormal rows that span those of H S. A vector has
+    three components and shows two directions: what rounding leaves of the third is none.
     """
-    root, _ = linalg.guard(spread)
-    T = linalg.solve_lower(root, spread)
+    root, _ = linalg.guard(white.seen, white.size)
+    T = linalg.solve_lower(root, white.seen)
     return linalg.tria(S + (jnp.sqrt(factor) - 1.0) * ((S @ T.T) @ T))
 
 
@@ -148,7 +152,7 @@ def faded(
     """
     if form == "projected":
         factor = ratio(N, white.predicted, limit)
-        wider = jax.lax.cond(factor > 1.0, lambda: _where_seen(S, white.spread, factor), lambda: S)
+        wider = jax.lax.cond(factor > 1.0, lambda: _where_seen(S, white, factor), lambda: S)
         return wider, factor
     if form == "lumped" or weights is None:
         factor = ratio(N, white.predicted, limit)

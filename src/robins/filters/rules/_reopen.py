@@ -26,6 +26,6 @@ def reopened(prior: Belief, o: Observation, doubted: Array, root: Array) -> Beli
         root: (m, k) root of D; its other rows do not count.
     """
     spread = jnp.where(doubted[:, None], o.spread, 0.0)
-    solid, _ = linalg.guard(spread)
+    solid, _ = linalg.guard(spread, o.size)
     G_root = prior.factor @ (spread.T @ linalg.solve_spd(solid, root))
     return prior._replace(factor=linalg.tria(prior.factor, G_root))
