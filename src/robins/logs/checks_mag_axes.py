@@ -16,14 +16,11 @@ import numpy as np
 from robins.dataset import ImuTable, MagTable
 from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding
-from robins.logs.motion import at, integral, rotations, signed_permutations
+from robins.logs.motion import at, signed_permutations
 from robins.logs.ordering import increasing
-from robins.logs.quiet import Signal, finding, signal_of
+from robins.logs.quiet import finding, signal_of
+from robins.logs.steps import steps_of
 
-_FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine ones, and compared over 0.2 s
-_STEPS = 1500  # of those that turn most
-_LEAST = 50  # steps below which nothing is judged
-_TURNED = 0.1  # rad, of a step that tells something
 _WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change left unexplained
 
 
@@ -33,12 +30,13 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
     if signal is None or mag.body != imu.body:
         return
     time_s, field = _readings(mag, int(imu.time_ns[signal.rows[0]]))
-    pairs = _pairs(signal, time_s, field) if len(field) > _LEAST else None
-    if pairs is None:
+    steps = steps_of(signal, time_s)
+    if steps is None:
         return
     maps = signed_permutations()
     maps = maps[np.linalg.det(maps) > 0.0]
-    left = _left_over(*pairs, maps)
+    before, after = (at(when, time_s, field) for when in (steps.begin_s, steps.end_s))
+    left = _left_over(before, after, np.swapaxes(steps.C, 1, 2), maps)
     k = int(np.argmin(left))
     if left[0] < _WRONG or left[k] > min(_RIGHT, _BETTER * left[0]):
         return
@@ -64,38 +62,6 @@ def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
     field = field[fresh]
     size = np.median(np.linalg.norm(field, axis=1)) if len(field) else 1.0
     return (mag.time_ns[rows[fresh]] - start_ns) * 1e-9, field / size
-
-
-def _pairs(
-    signal: Signal, time_s: np.ndarray, field: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Field before and after each step that turns, and (n, 3, 3) how the gyros say it turns."""
-    begin, end = max(time_s[0], 0.0), min(time_s[-1], signal.time_s[-1])
-    count = int((end - begin) / (_FINE_S * _PER_STEP))
-    if count < _LEAST:
-        return None
-    grid = begin + _FINE_S * np.arange(count * _PER_STEP + 1)
-    fine = np.diff(at(grid, signal.time_s, integral(signal.time_s, signal.gyro)), axis=0)
-    fine = fine.reshape(count, _PER_STEP, 3)
-    m = at(grid[::_PER_STEP], time_s, field)
-    known = _recorded(grid[::_PER_STEP], time_s) & _recorded(grid[::_PER_STEP], signal.time_s)
-    most = np.linalg.norm(fine.sum(axis=1), axis=1) * known
-    chosen = np.sort(np.argsort(most)[-_STEPS:])
-    chosen = chosen[most[chosen] > _TURNED]
-    if len(chosen) < _LEAST:
-        return None
-    C = np.broadcast_to(np.eye(3), (len(chosen), 3, 3))
-    for k in range(_PER_STEP):
-        C = C @ rotations(fine[chosen, k])
-    return m[chosen], m[chosen + 1], np.swapaxes(C, 1, 2)
-
-
-def _recorded(grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """(len(grid) - 1,) whether there is no gap in the samples around each step."""
-    step = grid[1] - grid[0]
-    before = np.searchsorted(time_s, grid[:-1], side="right") - 1
-    after = np.searchsorted(time_s, grid[1:], side="left")
-    return time_s[np.minimum(after, len(time_s) - 1)] - time_s[np.maximum(before, 0)] < 2.0 * step
 
 
 def _left_over(

@@ -18,6 +18,7 @@ from robins.logs.arrays import (
     checked_mag,
     checked_truth,
 )
+from robins.logs.checks_attitude import check_attitude
 from robins.logs.checks_columns import check_columns
 from robins.logs.checks_gnss import check_gnss
 from robins.logs.checks_imu import check_imu
@@ -39,8 +40,9 @@ _SPOILT = {
     *("position_unit", "no_fix_as_zero"),
     *("velocity_axes", "velocity_unit", "velocity_sign"),
 }
-# What makes gyros and magnetometer differ without any axis being wrong.
-_TURNS = {"gyro_unit", "gyro_axes", "gyro_reversed", "left_handed", "field_unit", "field_stuck"}
+# With these, what is compared with the gyros would be blamed for them.
+_GYROS_WRONG = {"gyro_unit", "gyro_axes", "gyro_reversed", "left_handed"}
+_NO_FIELD = {"field_unit", "field_stuck"}
 
 Subject = Dataset | Table | Sequence[Table | Dataset]
 
@@ -77,7 +79,7 @@ def _examined(
     master: Trajectory | None,
     unit_known: frozenset[str],
 ) -> list[Finding]:
-    imu = gnss = mag = None
+    imu = gnss = mag = attitude = None
     kinds = {type(table) for table in tables}
     # What shall tell only how the sensor itself is turned may lie any way.
     in_vehicle = not kinds & {MagTable, AttitudeTable} or bool(kinds & {GnssTable, Trajectory})
@@ -97,6 +99,8 @@ def _examined(
         elif isinstance(table, MagTable):
             mag = checked_mag(table)
             findings += check_mag(mag)
+        elif isinstance(table, AttitudeTable):
+            attitude = checked_attitude(table)
     if imu is not None:
         for table in tables:
             if table is not imu and not isinstance(table, ImuTable):
@@ -113,8 +117,11 @@ def _examined(
         if any(f.code == "gyro_unit" for f in of_motion):  # with proof; once is enough
             findings = [f for f in findings if f.code != "gyro_unit"]
         findings += of_motion
-        if mag is not None and not _TURNS & {f.code for f in findings}:
+        gyros_wrong = bool(_GYROS_WRONG & {f.code for f in findings})
+        if mag is not None and not gyros_wrong and not any(f.code in _NO_FIELD for f in findings):
             findings += check_mag_axes(imu, mag)
+        if attitude is not None and not gyros_wrong:
+            findings += check_attitude(imu, attitude)
     return findings
 
 
