@@ -8,7 +8,7 @@ import pytest
 from made_nine_axis import HZ, archive, broad_bytes, tumble
 
 from robins.dataset import Dataset, ImuTable
-from robins.logs import LogError, LogWarning, load_dataset, open_log, read_broad
+from robins.logs import LogError, LogWarning, load_dataset, load_pair, open_log, read_broad
 
 TRIALS = {
     "broad_01_undisturbed_slow_rotation_A": (56940, 162),
@@ -214,6 +214,20 @@ def test_two_trials_make_no_dataset(tmp_path):
     assert data.meta["files"] == dict.fromkeys(("imu", "mag", "attitude"), str(paths[0]))
     assert data.gnss is None
     assert data.truth is None
+
+
+def test_of_a_trial_only_the_samples_are_those_of_a_slave(tmp_path):
+    master, slave = tmp_path / "master.csv", tmp_path / "slave.npz"
+    master.write_text(
+        "time_s,lat_deg,lon_deg,height_m,v_north_m_s,v_east_m_s,v_down_m_s,roll_deg,pitch_deg,"
+        "heading_deg\n0,48,11,500,1,2,3,0,0,30\n1,48,11,500,1,2,3,0,0,30\n"
+    )
+    slave.write_bytes(broad_bytes(1.0))
+    pair = load_pair(master, slave)
+    assert len(pair.imu) == 100
+    assert pair.mag is None
+    with pytest.raises(LogError, match="holds no path of a master INS; give --master the right"):
+        load_pair(slave, slave)
 
 
 @pytest.mark.parametrize("name", TRIALS)
