@@ -23,6 +23,8 @@ from robins.systems.rocket.field import (
     FieldState,
     GyroNoise,
     ScaledState,
+    Turn,
+    bridged,
     observed,
     propagate,
     propagated,
@@ -92,7 +94,7 @@ def a_state(scaled: bool):
 @pytest.mark.parametrize("size", [1e-5, 0.3, 2.5])
 def test_the_jacobian_of_the_motion_is_its_derivative(scaled, size):
     noise = GyroNoise(*map(jnp.asarray, (1e-3, 1e-6, DT)))
-    theta = size * jnp.array([0.8, -0.5, 0.33])
+    theta = Turn(size * jnp.array([0.8, -0.5, 0.33]))
     x = a_state(scaled)
     mean, F, _ = propagated(noise, x, theta)
     np.testing.assert_allclose(local(mean, propagate(noise, x, theta)), 0.0, atol=1e-15)
@@ -149,9 +151,31 @@ def test_a_turn_of_the_body_shows_in_the_field_with_the_right_sign():
     moved = propagate(
         GyroNoise(0.0, 0.0, 1.0),
         FieldState(Rotation.identity(), jnp.array([0.0, 0.0, 0.1])),
-        jnp.array([0.0, 0.0, 90.0 * DEG + 0.1]),
+        Turn(jnp.array([0.0, 0.0, 90.0 * DEG + 0.1])),
     )
     np.testing.assert_allclose(to_euler(moved.q_nb.wxyz)[2], 90.0 * DEG, atol=1e-14)
+
+
+def test_a_lost_sample_of_the_gyro_is_held_and_doubted():
+    theta = jnp.array([[jnp.nan] * 3, [0.1, 0.0, 0.02], [jnp.nan, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    found = bridged(theta)
+    held = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.02], [0.1, 0.0, 0.02], [0.2, 0.0, 0.0]]
+    np.testing.assert_allclose(found.theta_b, held)
+    np.testing.assert_allclose(found.doubt, [1.0, 0.0, 0.1 * np.hypot(0.1, 0.02), 0.0])
+
+
+def test_doubt_adds_to_the_noise_of_the_gyro():
+    g = GyroNoise(*map(jnp.asarray, (3e-3, 1e-6, DT)))
+    _, _, noise = propagated(g, a_state(False), Turn(jnp.zeros(3), jnp.asarray(4e-3)))
+    np.testing.assert_allclose(noise, [5e-3] * 3 + [1e-6] * 3, rtol=1e-12)
+
+
+def test_an_axis_at_full_scale_has_no_direction():
+    expected = jnp.tile(jnp.array([[20e-6, 0.0, 40e-6]]), (2, 1))
+    read = jnp.array([[20e-6, 0.0, 40e-6], [30e-6, 0.0, 30e-6]])
+    assert np.isfinite(np.asarray(plausible(read, expected))).all()
+    kept = np.isfinite(np.asarray(plausible(read, expected, 40e-6))).all(axis=1)
+    np.testing.assert_array_equal(kept, [False, True])
 
 
 class TestUnobserved:

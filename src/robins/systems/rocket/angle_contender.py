@@ -24,7 +24,7 @@ from robins.systems.rocket.angles import (
     reckoned_model,
     unmoved_model,
 )
-from robins.systems.rocket.filters import KINDS, Kind, Shares, make_filter
+from robins.systems.rocket.filters import BY_STATE, KINDS, Kind, Shares, make_filter
 from robins.systems.rocket.parameters import MagneticAttitude
 from robins.systems.rocket.world import World, body_of, wrong_by
 from robins.systems.system import Case, Contender
@@ -64,8 +64,13 @@ def believed_model(given: MagneticAttitude, kind: Kind) -> Model:
     return body_model(coefficients(given), jnp.repeat(jnp.asarray(noise), 3), sensors)
 
 
-def shares_of(given: MagneticAttitude) -> Shares:
-    """(2, 6) shares of gyro and magnetometer by how well each sees each state at the start."""
+def shares_of(given: MagneticAttitude, filters: tuple[str, ...]) -> Shares:
+    """(2, 6) shares of gyro and magnetometer by how well each sees each state at the start.
+
+    Halves where none of the filters asks.
+    """
+    if not set(filters) & set(BY_STATE):
+        return ((0.5,) * 6,) * 2
     b = given.body
     q, omega = coning_start(b.spin, b.cone, b.elevation, b.azimuth, body_of(given))
     mean = angle_state(wrong_by(q, given.start.attitude_error), omega)

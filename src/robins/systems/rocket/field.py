@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array
@@ -23,6 +24,9 @@ from robins.filters import Model, Motion, Sensor
 from robins.rotation import Rotation, conjugate, from_rotvec, multiply, normalise, rotate, to_dcm
 
 FIELD = "field"  # the sensor
+
+# Of a turn that is held over a lost sample of the gyro: what a coning body may have changed.
+HELD_DOUBT = 0.1
 
 
 class FieldState(NamedTuple):
@@ -40,6 +44,13 @@ class ScaledState(NamedTuple):
     scale: Any  # (3,) relative
 
 
+class Turn(NamedTuple):
+    """Input of a step: what the gyro reports, and how much more it is doubted than its noise."""
+
+    theta_b: Any  # (3,) rad
+    doubt: Any = 0.0  # rad, one sigma, each axis
+
+
 class GyroNoise(NamedTuple):
     """White noise of a step [rad], growth of the bias in a step [rad/s], and the step [s]."""
 
@@ -55,16 +66,32 @@ def turned(x: Any, theta_b: Array, step_s: Any) -> Array:
     return theta / (1.0 + x.scale) if isinstance(x, ScaledState) else theta
 
 
-def propagate(g: GyroNoise, x: Any, theta_b: Array) -> Any:
+def bridged(theta_b: Array) -> Turn:
+    """Angles (E, 3) of a gyro with lost samples, NaN: the last turn is held there, and doubted.
+
+    Before the first sample nothing is known: no turn, doubted by a radian.
+    """
+
+    def hold(last, theta):
+        there = jnp.all(jnp.isfinite(theta))
+        now = jnp.where(there, theta, last)
+        size = jnp.sqrt(jnp.sum(now**2))
+        known = jnp.where(size > 0.0, HELD_DOUBT * size, 1.0)
+        return now, Turn(now, jnp.where(there, 0.0, known))
+
+    return jax.lax.scan(hold, jnp.zeros(3), theta_b)[1]
+
+
+def propagate(g: GyroNoise, x: Any, u: Turn) -> Any:
     """Turn by what the gyro reports of a step."""
-    q = normalise(multiply(x.q_nb.wxyz, from_rotvec(turned(x, theta_b, g.step_s))))
+    q = normalise(multiply(x.q_nb.wxyz, from_rotvec(turned(x, u.theta_b, g.step_s))))
     return x._replace(q_nb=Rotation(q))
 
 
-def propagated(g: GyroNoise, x: Any, theta_b: Array):
+def propagated(g: GyroNoise, x: Any, u: Turn):
     """`propagate` with its Jacobian and noise; tangent of the attitude in n."""
-    theta = turned(x, theta_b, g.step_s)
-    after = propagate(g, x, theta_b)
+    theta = turned(x, u.theta_b, g.step_s)
+    after = propagate(g, x, u)
     # exp(R J_r(theta) d theta) on the left: a step turns little, but coning bodies turn fast
     C = to_dcm(x.q_nb.wxyz) @ _left_jacobian(theta)
     gain = jnp.ones(3) / (1.0 + x.scale) if isinstance(x, ScaledState) else jnp.ones(3)
@@ -73,7 +100,7 @@ def propagated(g: GyroNoise, x: Any, theta_b: Array):
         parts.append(-C * (gain * theta)[None, :])
     n = 3 * len(parts)
     F = jnp.eye(n).at[:3].set(jnp.concatenate(parts, axis=1))
-    return after, F, noise_of(g, x, theta_b)
+    return after, F, noise_of(g, x, u)
 
 
 def _left_jacobian(theta: Array) -> Array:
@@ -90,10 +117,11 @@ def _left_jacobian(theta: Array) -> Array:
     return jnp.eye(3) + one * K + two * K @ K
 
 
-def noise_of(g: GyroNoise, x: Any, theta_b: Array) -> Array:
+def noise_of(g: GyroNoise, x: Any, u: Turn) -> Array:
     """(n,) of a step: alike on all axes, so the same in body and navigation axes."""
     rest = [jnp.zeros(3)] if isinstance(x, ScaledState) else []
-    return jnp.concatenate([jnp.full(3, g.angle), jnp.full(3, g.bias), *rest])
+    angle = jnp.sqrt(g.angle**2 + u.doubt**2)
+    return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), *rest])
 
 
 def read_field(x: Any, field_n: Array) -> Array:

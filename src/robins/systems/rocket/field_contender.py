@@ -12,7 +12,14 @@ from jaxtyping import Array
 
 from robins.filters import Belief, Model
 from robins.rotation import Rotation, to_dcm
-from robins.systems.rocket.field import FIELD, FieldState, GyroNoise, ScaledState, field_model
+from robins.systems.rocket.field import (
+    FIELD,
+    FieldState,
+    GyroNoise,
+    ScaledState,
+    bridged,
+    field_model,
+)
 from robins.systems.rocket.filters import FIELD_KINDS, FieldKind, make_field_filter
 from robins.systems.rocket.parameters import FieldVector
 from robins.systems.rocket.world import Course, World
@@ -30,14 +37,16 @@ class Numbers(NamedTuple):
     field_n: Array  # (E, 3) T
 
 
-def plausible(field_b: Array, expected_n: Array) -> Array:
+def plausible(field_b: Array, expected_n: Array, full_scale_t: float | None = None) -> Array:
     """Fields (..., 3) with NaN for those that no magnetometer in order would read.
 
     A field of no size, or of less than 0.3 or more than 3 times the expected one, has no direction
-    that could be believed; a saturated one is among them, or close to it.
+    that could be believed; nor has one with an axis at full scale, where that is known.
     """
     size, expected = (jnp.sqrt(jnp.sum(x**2, axis=-1)) for x in (field_b, expected_n))
     fits = (size >= _LEAST * expected) & (size <= _MOST * expected)
+    if full_scale_t is not None:
+        fits = fits & jnp.all(jnp.abs(field_b) < full_scale_t, axis=-1)
     return jnp.where(fits[..., None], field_b, jnp.nan)
 
 
@@ -75,7 +84,7 @@ def rows_of(q_nb: Array, field_n: Array, n: int) -> Array:
     return rows.at[:, :6, :3].set(attitude).at[:, 6:, 3:6].set(bias)
 
 
-def as_case(scaled: bool, sees: bool, n: Numbers, world: World) -> Case:
+def as_case(scaled: bool, sees: bool, scale_t: float | None, n: Numbers, world: World) -> Case:
     """What a filter takes of a run; pure."""
     count = len(n.field_n)
     start, zero = Rotation(world.start_q_nb), jnp.zeros(3)
@@ -85,8 +94,8 @@ def as_case(scaled: bool, sees: bool, n: Numbers, world: World) -> Case:
     truth = ScaledState(true, bias, scale) if scaled else FieldState(true, bias)
     return Case(
         start=Belief(state, jnp.diag(n.sigma)),
-        u=world.theta,
-        y={FIELD: plausible(world.field_b, n.field_n)} if sees else {},
+        u=bridged(world.theta),
+        y={FIELD: plausible(world.field_b, n.field_n, scale_t)} if sees else {},
         aux={FIELD: n.field_n} if sees else {},
         truth=truth,
         rows=rows_of(world.q_nb, n.field_n, 9 if scaled else 6),
@@ -94,11 +103,11 @@ def as_case(scaled: bool, sees: bool, n: Numbers, world: World) -> Case:
 
 
 @cache
-def _case(scaled: bool, sees: bool):
+def _case(scaled: bool, sees: bool, full_scale_t: float | None):
     """The same function for the same choice, so that what was compiled serves again."""
 
     def case(numbers: Numbers, world: World) -> Case:
-        return as_case(scaled, sees, numbers, world)
+        return as_case(scaled, sees, full_scale_t, numbers, world)
 
     return case
 
@@ -114,5 +123,7 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     return Contender(
         filter=filter_,
         model=believed_model(given, kind),
-        case=Partial(_case(kind.scaled, kind.sees != "nothing"), numbers),
+        case=Partial(
+            _case(kind.scaled, kind.sees != "nothing", given.magnetometer.full_scale), numbers
+        ),
     )

@@ -143,6 +143,9 @@ FIELD_KINDS: dict[str, FieldKind] = {
     "usque-scale-factor": FieldKind(ukf, scaled=True),
 }
 
+BY_STATE = tuple(name for name in KINDS if name.startswith(("federated-vector", "federated-root")))
+"""Filters that share information by the observability of each state."""
+
 assert set(KINDS) == set(ANGLE_FILTERS)
 assert set(FIELD_KINDS) == set(FIELD_FILTERS)
 

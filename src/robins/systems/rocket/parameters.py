@@ -87,9 +87,15 @@ class Disturbance(Parameters):
 
 
 class Magnetometer(Parameters):
-    """White noise and disturbances, as angles; hard and soft iron stay uncalibrated errors."""
+    """White noise and disturbances, as angles.
+
+    In "field-vector" hard iron is what a calibration left over, and an axis saturates at full
+    scale.
+    """
 
     noise: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
+    hard_iron: Annotated[Three, Quantity("magnetic field")] = default("0 uT")
+    full_scale: Annotated[float, Quantity("magnetic field", above="0 uT")] | None = None
     disturbance: Disturbance | None = None
     lost: tuple[Span, ...] = ()
 
@@ -196,11 +202,3 @@ class FieldVector(Flight, Parameters):
     title: str = "Rocket, field vector"
     filters: tuple[str, ...] = FIELD_COMPARED
     scale_factor_sigma: Annotated[float, Quantity("ratio", above="0")] = default("1000 ppm")
-
-    @pydantic.model_validator(mode="after")
-    def _gyro_is_there(self) -> FieldVector:
-        if self.gyro.lost:
-            raise ValueError(
-                "gyro.lost is for the study 'magnetic-attitude': here the gyro drives the motion"
-            )
-        return self

@@ -43,7 +43,7 @@ def angle_problem(given: MagneticAttitude, filters: tuple[str, ...], seed: int) 
         ValueError: the flight ends on the ground or leaves the life of the magnetic model, or a
             filter is unknown.
     """
-    course, shares = lay_out(given), shares_of(given)
+    course, shares = lay_out(given), shares_of(given, filters)
     rate = SensorAxes("rad/s", "FRD", ("p", "q", "r"))
     return _problem(
         given,

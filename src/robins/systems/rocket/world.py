@@ -53,7 +53,7 @@ class World(NamedTuple):
     start_omega_b: Array  # (3,)
     bias: Array  # (E, 3) constant and slow error of the gyro in each step [rad/s]
     scale: Array  # (3,)
-    theta: Array  # (E, 3) angles of the gyro [rad]
+    theta: Array  # (E, 3) what the gyro turned by in each step [rad]
     rate: Array  # (E, 3) rate at the end of each step [rad/s]
     integrated: Array  # (E, 3) roll, pitch, yaw that the gyro has been integrated to [rad]
     angles: Array  # (E, 3) "magnetic attitude" [rad]
@@ -160,12 +160,19 @@ def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
         start_omega_b=omega[0] + given.start.rate * jax.random.normal(begin, (3,)),
         bias=bias,
         scale=errors.scale_factor,
-        theta=theta,
+        theta=jnp.where(felt, theta, jnp.nan),
         rate=jnp.where(felt, rate, jnp.nan),
         integrated=jnp.where(felt, wrap(drifted + given.gyro.attitude_noise * white), jnp.nan),
         angles=observe_magnetic_attitude(angles, euler, magnet.noise, wrong, seen),
         field_b=observe_field(
-            vector, q[1:], field_n, size * math.sin(magnet.noise), seen, turn=turn
+            vector,
+            q[1:],
+            field_n,
+            size * math.sin(magnet.noise),
+            seen,
+            turn=turn,
+            hard_iron_t=jnp.asarray(magnet.hard_iron),
+            range_t=magnet.full_scale,
         ),
     )
 
