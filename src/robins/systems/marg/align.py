@@ -31,12 +31,11 @@ def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
     Without a field, or with one along the vertical, some heading.
     """
     down = -force_b / np.linalg.norm(force_b)
-    for guess in ([] if field_b is None else [field_b]) + [np.eye(3)[np.argmin(np.abs(down))]]:
-        east = np.cross(down, guess)
-        length = np.linalg.norm(east)
-        if length > 1e-3 * np.linalg.norm(guess):
-            break
-    east = east / length
+    north = np.eye(3)[np.argmin(np.abs(down))] if field_b is None else field_b
+    east = np.cross(down, north)
+    if np.linalg.norm(east) <= 1e-3 * np.linalg.norm(north):
+        east = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])
+    east = east / np.linalg.norm(east)
     rows = np.stack([np.cross(east, down), east, down])
     q = np.roll(SciRotation.from_matrix(rows).as_quat(), 1)
     return q if q[0] >= 0.0 else -q

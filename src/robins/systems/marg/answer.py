@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -22,11 +23,11 @@ from robins.systems.tables import Seen, innovation_tables
 class Update(NamedTuple):
     """What a run keeps of the updates of one sensor; leading axis B blocks."""
 
-    innovation: np.ndarray  # (B, m)
-    sigma: np.ndarray  # (B, m)
-    nis: np.ndarray  # (B,)
-    dof: np.ndarray  # (B,)
-    code: np.ndarray  # (B,)
+    innovation: Any  # (B, m)
+    sigma: Any  # (B, m)
+    nis: Any  # (B,)
+    dof: Any  # (B,)
+    code: Any  # (B,)
 
 
 class Answer(NamedTuple):
@@ -138,7 +139,7 @@ def solution(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> xr.
                 display_unit=block.display_unit,
             )
     coords["axis_euler"] = ["roll", "pitch", "heading"]
-    euler = [np.stack(to_euler(a.mean.q_nb.wxyz), axis=-1) for a in answers.values()]
+    euler = [np.stack(to_euler(jnp.asarray(a.mean.q_nb.wxyz)), axis=-1) for a in answers.values()]
     data["estimate_euler"] = variable(
         (*ft, "axis_euler"),
         np.stack(euler),

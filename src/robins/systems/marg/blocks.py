@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,10 @@ from robins.systems.marg.model import MargState
 class Samples(NamedTuple):
     """Increments in blocks of n; a block that is not full ends in increments of no length."""
 
-    dt_s: Array  # (K, n)
-    theta: Array  # (K, n, 3) rad, rotation vector of each interval
-    dv: Array  # (K, n, 3) m/s
-    field_b: Array  # (K, n, 3) T at the end of each interval; NaN where there is none
+    dt_s: Any  # (K, n)
+    theta: Any  # (K, n, 3) rad, rotation vector of each interval
+    dv: Any  # (K, n, 3) m/s
+    field_b: Any  # (K, n, 3) T at the end of each interval; NaN where there is none
 
 
 class Integrals(NamedTuple):
@@ -43,7 +43,7 @@ def _of_block(samples: Samples) -> Integrals:
         q = rotation.multiply(q, rotation.from_rotvec(theta))
         there = jnp.all(jnp.isfinite(field_b))
         field = jnp.where(there, rotation.rotate(q, jnp.where(there, field_b, 0.0)), 0.0)
-        rates = (half[:, :, None] * theta).reshape(3, 9)
+        rates = (half[:, :, None] * theta[None, None, :]).reshape(3, 9)
         angle = jnp.sqrt(jnp.sum(theta * theta))
         return q, (pushed, half * dt, rates, angle, field, there.astype(float))
 
@@ -111,6 +111,6 @@ def smoothed_attitudes(
     q = rotation.multiply(start[:, None, :], turned)
     missed = rotation.to_rotvec(rotation.multiply(q_end, rotation.conjugate(q[:, -1])))
     n = samples.dt_s.shape[1]
-    share = (jnp.arange(n) + 1.0) / n
+    share = jnp.arange(1.0, n + 1.0) / float(n)
     mend = rotation.from_rotvec(share[None, :, None] * missed[:, None, :])
     return rotation.normalise(rotation.multiply(mend, q)), rotation.normalise(start[0])

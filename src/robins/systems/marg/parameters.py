@@ -36,7 +36,7 @@ class Gyro(Parameters):
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("5000 ppm")
     # what nine numbers do not explain, as a share of the angle turned
-    turn_error: Annotated[float, pydantic.Field(ge=0.0)] = 0.002
+    turn_error: Annotated[float, pydantic.Field(ge=0.0)] = 0.001
     range: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2000 deg/s")
 
 

@@ -116,7 +116,7 @@ def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> 
     return out
 
 
-def _filled(values: np.ndarray, blocks: int, n: int, blank: float) -> np.ndarray:
+def _filled(values: np.ndarray, blocks: int, n: int, blank: Any) -> np.ndarray:
     rest = blocks * n - len(values)
     pad = np.full((rest, *values.shape[1:]), blank)
     return np.concatenate([values, pad]).reshape(blocks, n, *values.shape[1:])
