@@ -1,6 +1,6 @@
 """Systems: one problem each, with model, scenarios, filters and claims; here is the registry."""
 
-from robins.systems import airship, ins_gnss, rocket, transfer_alignment
+from robins.systems import airship, ins_gnss, marg, rocket, transfer_alignment
 from robins.systems.system import (
     Case,
     Contender,
@@ -15,7 +15,14 @@ from robins.systems.system import (
 )
 
 SYSTEMS: dict[str, System] = {
-    s.name: s for s in (ins_gnss.SYSTEM, transfer_alignment.SYSTEM, airship.SYSTEM, rocket.SYSTEM)
+    s.name: s
+    for s in (
+        ins_gnss.SYSTEM,
+        transfer_alignment.SYSTEM,
+        airship.SYSTEM,
+        rocket.SYSTEM,
+        marg.SYSTEM,
+    )
 }
 
 __all__ = [
