@@ -7,6 +7,7 @@
 - `errors`: the error dynamics F and G.
 - `imu_errors`, `imu_grades`: what is wrong with gyros and accelerometers, from data sheets.
 - `allan`: Allan deviation with bounds, and the noises fitted to it (import it by its name).
+- `magnetometer_calibration`: hard and soft iron from turning about (import it by its name).
 - `alignment`: attitude at rest, from gravity, Earth rate or velocity.
 """
 

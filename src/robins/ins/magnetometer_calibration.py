@@ -1,0 +1,335 @@
+"""Hard and soft iron of a magnetometer from samples taken while it was turned about.
+
+Wherever the sensor points, the Earth's field has the same size F, so what it should read lies on a
+sphere and what it does read, ``z = A b + h + noise``, on an ellipsoid. `calibrate` finds
+
+    b = W (z - h),   W symmetric, |b| = F
+
+The size alone cannot tell a rotation of the sensor's axes, so that of A stays: W is the symmetric
+root ``(A A')^(-1/2)`` (Renaudin, Afzal & Lachapelle 2010, "Complete triaxis magnetometer
+calibration in the magnetic domain"). Unless F is given W has determinant one and F is estimated.
+
+The fit starts from the ellipsoid of least squares in its coefficients, which cannot become another
+quadric (Li & Griffiths 2004, "Least squares ellipsoid specific fitting"), and then minimises
+Huber's loss of the distance of each sample to the ellipsoid, to first order
+``(|W (z - h)| - F) / |W u|`` with u the direction of b, less what curvature makes of noise: with
+normal noise, equal on the three axes, that is maximum likelihood, and single disturbed samples
+hardly count. Fields that are disturbed in the same way for long do: turn the sensor well away from
+iron.
+
+Where the directions do not tell an ellipsoid, a sphere is fitted, the hard iron alone, which needs
+fewer of them; a turn about one axis tells neither and is refused.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+FEWEST = 50  # samples
+MOST = 20_000  # that are looked at, spread evenly over the log; neighbours tell hardly more
+_ENDS = (0.2, 99.8)  # per cent between which the samples' extent is taken, against single spikes
+_SIDE, _SHARE = 0.15, 20  # cubes of that part of the extent count for so many samples at most
+_HUBER = 1.345  # of the noise; the estimates of normal noise keep 95 % of their efficiency
+_VAGUE = 0.1  # of the field, one sigma: what is known no better is not known
+_STRETCHED = 2.0  # axes of the ellipsoid; more is no soft iron but a field that changed
+_SPHERE = np.vstack([np.eye(4, 9)[:3], [[0, 0, 0, 1, 1, 1, 0, 0, 0]]]).T  # (9, 4) free directions
+_FLAT = 0.08  # of the extent along the widest axis; less along the narrowest is a plane
+_REACH = np.deg2rad(30.0)  # of a sample, for the share of directions that are covered
+_PASSES, _SETTLED = 200, 1e-8  # of the extent; far below what any log can tell
+_NO_ELLIPSOID = (
+    "the samples lie on no ellipsoid: the field was not the same while the sensor was turned, or "
+    "it was turned too little; turn it away from iron, so that each of its axes points up and down "
+    "once"
+)
+_PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # the six numbers of a symmetric matrix
+
+
+class CalibrationError(ValueError):
+    """Samples from which no calibration follows; the message says why and what to do."""
+
+
+class Calibration(NamedTuple):
+    """What `calibrate` found. Sigmas are of the noise and allow for its correlation in time.
+
+    Fields that differ from place to place, as they do indoors, come on top: there two logs differ
+    by more than the sigmas say.
+    """
+
+    offset_t: np.ndarray  # (3,) h, hard iron
+    matrix: np.ndarray  # (3, 3) W, symmetric
+    soft_iron: bool  # whether W was found; else it is a multiple of the identity
+    field_t: float  # F, size of the field
+    offset_sigma_t: np.ndarray  # (3,)
+    matrix_sigma: np.ndarray  # (3, 3)
+    covariance: np.ndarray  # (9, 9) of h [T], then W: 00, 11, 22, 12, 02, 01
+    noise_t: float  # of a sample along one axis, one sigma, robust
+    before_t: float  # RMS of the size of the samples about its mean, each direction alike
+    after_t: float  # RMS of the size of the calibrated samples about F
+    outliers: float  # share of samples further than 5 sigma from the ellipsoid
+    independent: float  # samples that would tell as much if their noise were independent
+    covered: float  # share of all directions within 30 deg of one of a sample
+    gap: np.ndarray  # (3,) direction of the field, sensor axes, that is furthest from any sample
+    gap_rad: float  # how far
+
+
+def calibrated(field_t: Any, offset_t: Any, matrix: Any) -> np.ndarray:
+    """Field (..., 3) [T] without hard and soft iron, ``W (z - h)``."""
+    z, h, W = (np.asarray(v, float) for v in (field_t, offset_t, matrix))
+    return (z - h) @ W.T
+
+
+def calibrate(
+    field_t: Any, strength_t: float | None = None, soft_iron: bool | None = None
+) -> Calibration:
+    """Hard and soft iron of a magnetometer that was turned about all its axes.
+
+    Args:
+        field_t: (N, 3) samples [T] in sensor axes, in order of time; rows with NaN are left out.
+        strength_t: size of the field at the place [T], e.g. of `robins.earth.magnetic`; it sets the
+            scale of the result. None: the scale is kept on average, ``det W = 1``.
+        soft_iron: whether to look for it; None: if the directions tell it.
+
+    Raises:
+        CalibrationError: too few samples; they lie in a plane or a part of the ellipsoid so small
+            that it does not tell what is looked for; a strength that is not positive.
+    """
+    z = np.asarray(field_t, float)
+    if z.ndim != 2 or z.shape[1] != 3:
+        raise CalibrationError(f"field_t must have shape (N, 3), got {z.shape}")
+    if strength_t is not None and not (np.isfinite(strength_t) and strength_t > 0.0):
+        raise CalibrationError(f"strength_t must be a positive field in tesla, got {strength_t}")
+    z = z[np.all(np.isfinite(z), axis=1)]
+    if len(z) < FEWEST:
+        raise CalibrationError(
+            f"there are {len(z)} samples of the field; a calibration needs at least {FEWEST}, "
+            "taken while the sensor is turned about all its axes"
+        )
+    low, high = np.percentile(z, _ENDS, axis=0)
+    centre, size = (low + high) / 2.0, float((high - low).max()) / 2.0
+    if not size > 0.0:
+        raise CalibrationError("all samples of the field are equal: turn the sensor about")
+    unit = _evened(((z - centre) / size)[:: -(-len(z) // MOST)])
+    _refuse_flat(unit)
+    if soft_iron is not False:
+        try:
+            fitted = _refined(unit, *_direct_ellipsoid(unit), free=np.eye(9))
+            return _told(unit, *fitted, np.eye(9), centre, size, strength_t)
+        except CalibrationError:
+            if soft_iron:
+                raise
+    fitted = _refined(unit, *_direct_sphere(unit), free=_SPHERE)
+    return _told(unit, *fitted, _SPHERE, centre, size, strength_t)
+
+
+def _evened(z: np.ndarray) -> np.ndarray:
+    """Samples in order of time, of each little cube no more than a share, evenly over its own.
+
+    A sensor that rests, as most do before and after they are turned, would else outweigh all turns
+    by samples whose common error is not noise.
+    """
+    cube = np.unique(np.floor(z / _SIDE).astype(np.int64), axis=0, return_inverse=True)[1]
+    order = np.argsort(cube.reshape(-1), kind="stable")
+    counts = np.bincount(cube.reshape(-1))
+    rank = np.arange(len(z)) - np.repeat(np.cumsum(counts) - counts, counts)
+    every = np.repeat(-(-counts // _SHARE), counts)
+    return z[np.sort(order[rank % every == 0])]
+
+
+def _refuse_flat(z: np.ndarray) -> None:
+    extent = np.linalg.svd(z - z.mean(axis=0), compute_uv=False)
+    if extent[2] < _FLAT * extent[0]:
+        raise CalibrationError(
+            f"the samples lie in a plane (their extent across it is {extent[2] / extent[0]:.2g} of "
+            "that along it): the sensor was turned about one axis only; turn it about two more, so "
+            "that each of its axes points up and down once"
+        )
+
+
+def _direct_ellipsoid(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and matrix W with ``|W (z - centre)| = 1`` after Li & Griffiths (2004), k = 4."""
+    x, y, w = z.T
+    squares = np.stack([x * x, y * y, w * w, 2 * y * w, 2 * x * w, 2 * x * y])
+    D = np.concatenate([squares, 2.0 * z.T, np.ones((1, len(z)))])
+    S = D @ D.T / len(z)
+    C = np.zeros((6, 6))  # inverse of the matrix of 4 J - I^2, which is positive for ellipsoids
+    C[:3, :3] = np.array([[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]])
+    C[3:, 3:] = -0.25 * np.eye(3)
+    lower = np.linalg.solve(S[6:, 6:], S[6:, :6])
+    values, vectors = np.linalg.eig(C @ (S[:6, :6] - S[:6, 6:] @ lower))
+    v = np.real(vectors[:, np.argmax(np.real(values))])
+    q = np.concatenate([v, -lower @ v])
+    A = np.array([[q[0], q[5], q[4]], [q[5], q[1], q[3]], [q[4], q[3], q[2]]])
+    centre = -np.linalg.solve(A, q[6:9])
+    level = centre @ A @ centre - q[9]
+    spread, axes = np.linalg.eigh(A / level)
+    if not np.all(spread > 0.0):
+        raise CalibrationError(_NO_ELLIPSOID)
+    return centre, (axes * np.sqrt(spread)) @ axes.T
+
+
+def _direct_sphere(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and W = I / radius of the sphere of ``|z|^2 = 2 z . c + k``, least squares."""
+    design = np.column_stack([2.0 * z, np.ones(len(z))])
+    *c, k = np.linalg.lstsq(design, np.sum(z * z, axis=1), rcond=None)[0]
+    centre = np.array(c)
+    return centre, np.eye(3) / np.sqrt(k + centre @ centre)
+
+
+def _refined(
+    z: np.ndarray, offset: np.ndarray, W: np.ndarray, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least Huber loss of the distances, by Gauss-Newton steps on reweighted squares.
+
+    Steps are combinations of the columns of ``free`` (9, K).
+    """
+    noise = _robust_sigma(_distances(z, offset, W, 0.0))
+    for _ in range(_PASSES):
+        distance = _distances(z, offset, W, noise)
+        noise = min(noise, _robust_sigma(distance))  # growing, it would follow a worse fit
+        clip = _HUBER * noise
+        share = np.sqrt(clip / np.maximum(np.abs(distance), clip))
+        J = (_jacobian(z, offset, W, distance) * share[:, None]) @ free
+        step = -free @ np.linalg.lstsq(J.T @ J, J.T @ (distance * share), rcond=None)[0]
+        offset, W = _unpacked(_packed(offset, W) + step)
+        axes = np.linalg.eigvalsh(W)
+        if not (np.all(np.isfinite(step)) and 0.0 < axes[2] < _STRETCHED * axes[0]):
+            raise CalibrationError(_NO_ELLIPSOID)
+        if np.abs(step).max() < _SETTLED:
+            return offset, W
+    raise CalibrationError(_NO_ELLIPSOID)
+
+
+def _distances(z: np.ndarray, offset: np.ndarray, W: np.ndarray, noise: float) -> np.ndarray:
+    """Distance (N,) of each sample to the ellipsoid, to first order, outwards.
+
+    Noise along a surface that is curved carries outwards, on average by half its variance times
+    the sum of the curvatures; that is taken off, or it would bend ellipsoids of which a part is
+    seen.
+    """
+    b = (z - offset) @ W
+    size = np.linalg.norm(b, axis=1)
+    slope = np.linalg.norm(b @ W, axis=1) / size
+    curvature = (np.sum(W * W) - slope**2) / (size * slope)
+    return (size - 1.0) / slope - 0.5 * noise**2 * curvature
+
+
+def _jacobian(z: np.ndarray, offset: np.ndarray, W: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(N, 9) of the distances by offset and the six numbers of W.
+
+    Taken at the nearest points of the ellipsoid: at the samples it would have their noise in it,
+    and the products of both would not vanish on average.
+    """
+    y = z - offset
+    normal = y @ W @ W
+    y = y - distance[:, None] * normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    b = y @ W
+    u = b / np.linalg.norm(b, axis=1, keepdims=True)
+    by_offset = -u @ W
+    by_matrix = [u[:, i] * y[:, j] + (i != j) * u[:, j] * y[:, i] for i, j in _PAIRS]
+    return np.column_stack([by_offset, *by_matrix]) / np.linalg.norm(by_offset, axis=1)[:, None]
+
+
+def _packed(offset: np.ndarray, W: np.ndarray) -> np.ndarray:
+    return np.concatenate([offset, [W[i, j] for i, j in _PAIRS]])
+
+
+def _unpacked(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    W = np.empty((3, 3))
+    for (i, j), value in zip(_PAIRS, p[3:], strict=True):
+        W[i, j] = W[j, i] = value
+    return p[:3], W
+
+
+def _robust_sigma(x: np.ndarray) -> float:
+    return max(1.4826 * float(np.median(np.abs(x - np.median(x)))), 1e-12)
+
+
+def _correlation(x: np.ndarray) -> float:
+    """Samples for which one independent one counts: ``1 + 2 sum rho_k`` up to the first rho < 0."""
+    x = x - x.mean()
+    size = 1 << (2 * len(x) - 1).bit_length()
+    rho = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: len(x) // 4]
+    if not rho[0] > 0.0:
+        return 1.0
+    negative = np.flatnonzero(rho < 0.0)
+    last = negative[0] if negative.size else len(rho)
+    return 1.0 + 2.0 * float(rho[1:last].sum() / rho[0])
+
+
+def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
+    """The result in tesla, its covariance and how well the directions are covered."""
+    noise = _robust_sigma(_distances(unit, offset, W, 0.0))
+    distance = _distances(unit, offset, W, noise)
+    clip = _HUBER * noise
+    influence = np.clip(distance, -clip, clip)
+    inside = np.mean(np.abs(distance) <= clip)
+    correlated = _correlation(influence)
+    J = _jacobian(unit, offset, W, distance) @ free
+    # Of an estimate with influence psi: E psi^2 / (E psi')^2, times the correlation (Huber 1981).
+    spread = np.mean(influence**2) / inside**2 * correlated
+    covariance = spread * free @ np.linalg.inv(J.T @ J) @ free.T
+
+    field = strength_t / size if strength_t else np.linalg.det(W) ** (-1.0 / 3.0)
+    # (h, W') -> (h, F W'): with F = det^(-1/3) its change is -F tr(W'^-1 dW') / 3.
+    scale = np.diag([1.0] * 3 + [field] * 6)
+    if strength_t is None:
+        inverse = np.linalg.inv(W)
+        by_entry = np.array([inverse[i, j] * (1.0 if i == j else 2.0) for i, j in _PAIRS])
+        scale[3:, 3:] -= field / 3.0 * np.outer(_packed(offset, W)[3:], by_entry)
+    scale[:3] *= size
+    covariance = scale @ covariance @ scale.T
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # zero, but for rounding, if held
+    offset_t, matrix, field_t = centre + size * offset, field * W, field * size
+    _refuse_uncertain(sigma, field_t)
+    z = centre + size * unit
+    b = calibrated(z, offset_t, matrix)
+    after = np.linalg.norm(b, axis=1)
+    covered, gap, gap_rad = _coverage(b / after[:, None])
+    return Calibration(
+        offset_t=offset_t,
+        matrix=matrix,
+        soft_iron=free.shape[1] == 9,
+        field_t=field_t,
+        offset_sigma_t=sigma[:3],
+        matrix_sigma=_unpacked(sigma)[1],
+        covariance=covariance,
+        noise_t=noise * size,
+        before_t=float(np.std(np.linalg.norm(z, axis=1))),
+        after_t=float(np.sqrt(np.mean((after - field_t) ** 2))),
+        outliers=float(np.mean(np.abs(distance) > 5.0 * noise)),
+        independent=len(unit) / correlated,
+        covered=covered,
+        gap=gap,
+        gap_rad=gap_rad,
+    )
+
+
+def _refuse_uncertain(sigma: np.ndarray, field_t: float) -> None:
+    worst = max(sigma[:3].max() / field_t, sigma[3:].max())
+    if not worst < _VAGUE:
+        raise CalibrationError(
+            f"the samples do not tell the ellipsoid (one sigma is {worst:.0%} of the field): too "
+            "few directions, or a field that changed meanwhile; turn the sensor away from iron, so "
+            "that each of its axes points up and down once"
+        )
+
+
+def _coverage(directions: np.ndarray) -> tuple[float, np.ndarray, float]:
+    """Share of the sphere near a sample; the direction furthest from any, and how far [rad]."""
+    tree = KDTree(directions)
+    grid = _sphere(1000)
+    chord, _ = tree.query(grid)
+    angle = 2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))
+    furthest = int(np.argmax(angle))
+    return float(np.mean(angle <= _REACH)), grid[furthest], float(angle[furthest])
+
+
+def _sphere(count: int) -> np.ndarray:
+    """Directions (count, 3) spread evenly, on a spiral of the golden angle."""
+    k = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    across = np.sqrt(1.0 - z * z)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
