@@ -159,6 +159,9 @@ def campaign_solution(
     data |= _notes(found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
+    if clash := sorted(set(coords) & set(places)):
+        names = ", ".join(name.removeprefix("axis_") for name in clash)
+        raise ValueError(f"{names}: a block and a sensor cannot have one name, for it names axes")
     return xr.Dataset(data | more, coords | places)
 
 

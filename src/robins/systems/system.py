@@ -40,6 +40,7 @@ class SensorAxes(NamedTuple):
     units: str
     frame: str
     axes: tuple[str, ...]
+    display_unit: str = ""  # of figures, where it is another
 
 
 class Case(NamedTuple):

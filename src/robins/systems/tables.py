@@ -38,7 +38,8 @@ def innovation_tables(
         if not np.any(spoke):
             continue
         time, axis, words = f"{sensor}_time", f"axis_{sensor}", sensor.replace("_", " ")
-        units, frame, labels = axes[sensor]
+        units, frame, labels, shown = axes[sensor]
+        display = {"display_unit": shown} if shown else {}
         coords[time] = variable(time, epoch_s[spoke], "s", f"time of {words}")
         coords[axis] = list(labels)
         ft, fta = ("filter", time), ("filter", time, axis)
@@ -50,5 +51,6 @@ def innovation_tables(
             f"refused_{sensor}": (ft, s.refused, "1", f"{words} refused by a rule"),
         }
         for name, (dims, values, *words_) in rows.items():
-            data[name] = variable(dims, values[:, spoke], *words_)
+            attrs = display if len(dims) == 3 else {}
+            data[name] = variable(dims, values[:, spoke], *words_, **attrs)
     return data, coords

@@ -23,7 +23,7 @@ from robins import linalg
 from robins.filters import Model, Motion, Sensor
 from robins.rotation import Rotation, conjugate, from_rotvec, multiply, normalise, rotate, to_dcm
 
-FIELD = "field"  # the sensor
+FIELD, SNAPSHOT = "field", "snapshot"  # the sensor; the same taken at its word
 
 # Of a turn that is held over a lost sample of the gyro: what a coning body may have changed.
 HELD_DOUBT = 0.1
@@ -143,14 +143,14 @@ def field_noise(sine: Array, x: Any, field_n: Array) -> Array:
     return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
 
 
-def field_model(gyro: GyroNoise, sine: Array, *, sees_field: bool = True) -> Model:
+def field_model(gyro: GyroNoise, sine: Array, sensor: str = FIELD) -> Model:
     """Attitude and gyro errors.
 
     Args:
         gyro: its noise.
         sine: of the standard deviation of the field's direction.
-        sees_field: False leaves dead reckoning.
+        sensor: name of the magnetometer; "" leaves dead reckoning.
     """
     motion = Motion(Partial(propagate, gyro), Partial(noise_of, gyro), Partial(propagated, gyro))
-    sensor = Sensor(read_field, Partial(field_noise, sine), 3, FIELD, observed)
-    return Model(motion, (sensor,) if sees_field else ())
+    field = Sensor(read_field, Partial(field_noise, sine), 3, sensor, observed)
+    return Model(motion, (field,) if sensor else ())

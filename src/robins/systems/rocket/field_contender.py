@@ -13,7 +13,7 @@ from jaxtyping import Array
 from robins.filters import Belief, Model
 from robins.rotation import Rotation, to_dcm
 from robins.systems.rocket.field import (
-    FIELD,
+    SNAPSHOT,
     FieldState,
     GyroNoise,
     ScaledState,
@@ -55,15 +55,15 @@ def believed_model(given: FieldVector, kind: FieldKind) -> Model:
     g, step = given.gyro, given.step
     # a drift of correlation time tau walks away from where it is by this in a step
     walk = g.drift * math.sqrt(2.0 * step / g.drift_time)
-    angle = FORGETS if kind.sees == "snapshot" else g.white * step
+    angle = FORGETS if kind.sees == SNAPSHOT else g.white * step
     noise = GyroNoise(*map(jnp.asarray, (angle, walk, step)))
     sine = jnp.asarray(math.sin(given.magnetometer.noise))
-    return field_model(noise, sine, sees_field=kind.sees != "nothing")
+    return field_model(noise, sine, kind.sees)
 
 
 def initial_sigma(given: FieldVector, kind: FieldKind) -> Array:
     """(n,) of attitude, bias and scale factors."""
-    bias = math.hypot(given.gyro.bias, given.gyro.drift) if kind.sees != "snapshot" else 0.0
+    bias = math.hypot(given.gyro.bias, given.gyro.drift) if kind.sees != SNAPSHOT else 0.0
     sizes = [given.start.attitude, bias, *([given.scale_factor_sigma] if kind.scaled else [])]
     return jnp.repeat(jnp.array(sizes), 3)
 
@@ -84,7 +84,7 @@ def rows_of(q_nb: Array, field_n: Array, n: int) -> Array:
     return rows.at[:, :6, :3].set(attitude).at[:, 6:, 3:6].set(bias)
 
 
-def as_case(scaled: bool, sees: bool, scale_t: float | None, n: Numbers, world: World) -> Case:
+def as_case(scaled: bool, sees: str, scale_t: float | None, n: Numbers, world: World) -> Case:
     """What a filter takes of a run; pure."""
     count = len(n.field_n)
     start, zero = Rotation(world.start_q_nb), jnp.zeros(3)
@@ -95,15 +95,15 @@ def as_case(scaled: bool, sees: bool, scale_t: float | None, n: Numbers, world: 
     return Case(
         start=Belief(state, jnp.diag(n.sigma)),
         u=bridged(world.theta),
-        y={FIELD: plausible(world.field_b, n.field_n, scale_t)} if sees else {},
-        aux={FIELD: n.field_n} if sees else {},
+        y={sees: plausible(world.field_b, n.field_n, scale_t)} if sees else {},
+        aux={sees: n.field_n} if sees else {},
         truth=truth,
         rows=rows_of(world.q_nb, n.field_n, 9 if scaled else 6),
     )
 
 
 @cache
-def _case(scaled: bool, sees: bool, full_scale_t: float | None):
+def _case(scaled: bool, sees: str, full_scale_t: float | None):
     """The same function for the same choice, so that what was compiled serves again."""
 
     def case(numbers: Numbers, world: World) -> Case:
@@ -123,7 +123,5 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     return Contender(
         filter=filter_,
         model=believed_model(given, kind),
-        case=Partial(
-            _case(kind.scaled, kind.sees != "nothing", given.magnetometer.full_scale), numbers
-        ),
+        case=Partial(_case(kind.scaled, kind.sees, given.magnetometer.full_scale), numbers),
     )

@@ -20,6 +20,7 @@ from robins.filters import Filter, Rule, channel, federated, kalman, taylor, uns
 from robins.filters.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.systems.rocket.angles import GYRO, MAGNETIC
+from robins.systems.rocket.field import FIELD, SNAPSHOT
 from robins.systems.rocket.parameters import ANGLE_FILTERS, FIELD_FILTERS
 
 PROBABILITY = 0.999  # of the chi-square tests
@@ -123,13 +124,13 @@ class FieldKind(NamedTuple):
     """A filter of the study "field-vector"."""
 
     make: Callable[[], Filter]
-    sees: str = "field"  # or "nothing", or "snapshot": the field taken at its word
+    sees: str = FIELD  # or SNAPSHOT, the field taken at its word; or ""
     scaled: bool = False  # scale factors of the gyro are states
 
 
 FIELD_KINDS: dict[str, FieldKind] = {
-    "gyro": FieldKind(lambda: kalman(taylor()), "nothing"),
-    "magnetometer": FieldKind(lambda: kalman(taylor()), "snapshot"),
+    "gyro": FieldKind(lambda: kalman(taylor()), ""),
+    "magnetometer": FieldKind(lambda: kalman(taylor()), SNAPSHOT),
     "usque": FieldKind(ukf),
     "huber": FieldKind(lambda: ukf(huber(PROBABILITY))),
     "gate": FieldKind(lambda: ukf(patient())),

@@ -12,7 +12,7 @@ from robins.results import variable
 from robins.systems.rocket.angle_contender import angle_contender, shares_of
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.claims import rocket_claims
-from robins.systems.rocket.field import FIELD
+from robins.systems.rocket.field import FIELD, SNAPSHOT
 from robins.systems.rocket.field_contender import field_contender
 from robins.systems.rocket.metrics import angle_metrics, field_metrics
 from robins.systems.rocket.parameters import FieldVector, Flight, MagneticAttitude
@@ -22,7 +22,7 @@ from robins.systems.system import Norm, Problem, SensorAxes, StateBlock
 
 BODY = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
-ANGLES = SensorAxes("rad", "launch NED", EULER)
+ANGLES = SensorAxes("rad", "launch NED", EULER, "deg")
 ACROSS = Norm("across_field", (4, 5))
 
 ANGLE_BLOCKS = (
@@ -31,7 +31,7 @@ ANGLE_BLOCKS = (
 )
 FIELD_BLOCKS = (
     StateBlock("attitude", slice(0, 3), "rad", "deg", "FRD", BODY),
-    StateBlock("field", slice(3, 6), "rad", "deg", "field", ("about", "level", "upright")),
+    StateBlock("field_attitude", slice(3, 6), "rad", "deg", "field", ("about", "level", "upright")),
     StateBlock("gyro_bias", slice(6, 9), "rad/s", "deg/h", "FRD", BODY),
 )
 
@@ -44,7 +44,7 @@ def angle_problem(given: MagneticAttitude, filters: tuple[str, ...], seed: int) 
             filter is unknown.
     """
     course, shares = lay_out(given), shares_of(given, filters)
-    rate = SensorAxes("rad/s", "FRD", ("p", "q", "r"))
+    rate = SensorAxes("rad/s", "FRD", ("p", "q", "r"), "deg/s")
     return _problem(
         given,
         course,
@@ -70,7 +70,7 @@ def field_problem(given: FieldVector, filters: tuple[str, ...], seed: int) -> Pr
         seed,
         contenders={name: field_contender(given, course, name) for name in filters},
         blocks=FIELD_BLOCKS,
-        sensors={FIELD: SensorAxes("T", "FRD", BODY)},
+        sensors={name: SensorAxes("T", "FRD", BODY, "uT") for name in (FIELD, SNAPSHOT)},
         metrics=partial(field_metrics, course),
         norms=(ACROSS,),
     )
