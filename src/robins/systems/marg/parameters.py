@@ -72,7 +72,7 @@ class Magnetometer(Parameters):
     # magnitudes outside are no field of the Earth: not used, counted
     least: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("8 uT")
     most: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("200 uT")
-    gate: Annotated[float, pydantic.Field(gt=0.0, lt=1.0)] = 0.99
+    gate: Annotated[float, pydantic.Field(gt=0.0, lt=1.0)] = 0.95
     # so many seconds of motion in one and the same other field make that field the reference
     patience: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
 

@@ -12,31 +12,33 @@ from robins.filters import Belief, Filter, kalman, rules
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.trees import select
-from robins.systems.marg.model import DECLINATION, FIELD, HEADING, MAGNETOMETER, REST_RATE, TRAVEL
+from robins.systems.marg.model import DECLINATION, FIELD, MAGNETOMETER, REST_RATE, TRAVEL
 
 
-def doubted(prior: Belief, declination: float, field_t: float) -> Belief:
-    """Belief that has forgotten heading, declination and field, and keeps all else."""
-    forgotten = jnp.zeros(prior.factor.shape[0])
-    forgotten = forgotten.at[HEADING].set(math.pi).at[DECLINATION].set(declination)
+def doubted(prior: Belief, field_t: float) -> Belief:
+    """Belief that knows nothing of the field any more, and all else as before.
+
+    The heading too: the gyros know it better than a field that has changed. That the declination of
+    a place is small on the long run then leads the heading to the new field in some minutes.
+    """
+    forgotten = jnp.zeros(prior.factor.shape[0]).at[DECLINATION].set(math.pi)
     forgotten = forgotten.at[FIELD].set(field_t)
     S = jnp.where(forgotten[:, None] > 0.0, 0.0, prior.factor)
     mean = prior.mean._replace(declination=jnp.zeros_like(prior.mean.declination))
     return Belief(mean, linalg.tria(S, jnp.diag(forgotten)))
 
 
-def undisturbed(probability: float, patience: int, declination: float, field_t: float) -> Rule:
+def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
     """Refuse a magnetic field that is not the one known, until it has proved to be the field.
 
     A chi-square gate on azimuth, strength and vertical component together. Refusals that agree with
     each other while the unit moves, ``patience`` in a row, are the field of a new place, or the
-    first was disturbed: heading, declination and field are then forgotten and taken from it. What
-    sits on the unit turns with it and does not agree.
+    first was disturbed: what was known of the field is then forgotten and learned from it
+    (`doubted`). What sits on the unit turns with it and does not agree.
 
     Args:
         probability: share of right measurements that pass.
         patience: refusals in a row.
-        declination: rad, spread of the declination after forgetting.
         field_t: T, spread of strength and vertical component after forgetting.
     """
     inner = rules.gate(probability, patience, "reinitialise")
@@ -44,17 +46,16 @@ def undisturbed(probability: float, patience: int, declination: float, field_t: 
     def before(memory, prior: Belief, o: Observation):
         memory, reopened, o = inner.before(memory, prior, o)
         new = memory[o.sensor].recovered
-        return memory, select(new, doubted(prior, declination, field_t), Belief(*reopened)), o
+        return memory, select(new, doubted(prior, field_t), Belief(*reopened)), o
 
     return rules.only(MAGNETOMETER, inner._replace(before=before, name="undisturbed"))
 
 
 @lru_cache(maxsize=16)
 def marg_filter(
-    gate: float | None = 0.99,
+    gate: float | None = 0.95,
     patience: int = 20,
     weight: float = 0.9999,
-    declination: float = 0.1,
     field_t: float = 1e-4,
 ) -> Filter:
     """The filter of `marg_model`; the same object for the same arguments, so compiled once.
@@ -64,7 +65,6 @@ def marg_filter(
             for a model without a magnetometer too.
         patience: readings refused in a row before a field that stays is taken up.
         weight: share of travel that keeps its weight (`rules.huber`).
-        declination: rad, spread of the declination in a new field.
         field_t: T, spread of strength and vertical component of a new field.
     """
     chain = [
@@ -72,5 +72,5 @@ def marg_filter(
         rules.only(REST_RATE, rules.gate(0.9999, 100, "inflate")),
     ]
     if gate is not None:
-        chain.append(undisturbed(gate, patience, declination, field_t))
+        chain.append(undisturbed(gate, patience, field_t))
     return kalman(rules=chain)

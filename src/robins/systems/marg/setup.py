@@ -57,8 +57,7 @@ def filter_of(parameters: Replay) -> Filter:
         gate=m.gate if parameters.use_magnetometer == "undisturbed" else None,
         patience=max(1, round(m.patience / parameters.travel.every)),
         weight=parameters.travel.weight,
-        declination=m.declination,
-        field_t=m.noise,
+        field_t=m.most,
     )
 
 
