@@ -25,6 +25,7 @@ Examples:
   robins doctor imu.csv gnss.pos                 is my log fit to navigate?
   robins replay imu.csv gnss.pos --out walk      navigate it
   robins allan still.csv                         noise parameters of my IMU
+  robins calibrate turned.csv                    hard and soft iron of my magnetometer
 
 Every command that computes writes a folder with a summary, the time series, figures and a page
 report.html to open in a browser. With --json a command prints one JSON object for scripts.
@@ -278,6 +279,36 @@ def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
 
     name = f"allan-{log.name.split('.')[0]}"
     stability(log, terms, out or Path("results") / name, as_json)
+
+
+@app.command(
+    short_help="Hard and soft iron of a turned magnetometer.",
+    epilog=_examples(
+        "robins calibrate turned.csv",
+        'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
+    ),
+)
+@click.argument("log", nargs=-1, required=True, type=_LOGS)
+@_option("--field", metavar="FIELD", help='Its size at the place, "48.5 uT"; sets the scale.')
+@_option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
+@_option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
+@_out
+@_json
+@_debug
+def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
+    """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
+
+    Finds the offset and the matrix of ``matrix (measured - offset)``, whose size is that of the
+    Earth's field wherever the sensor points. A .toml file among LOG... tells how the sensor is
+    mounted, as for `robins replay`, which takes the calibration.toml of the result.
+    """
+    from robins.cli.calibrate import magnetometer
+
+    files = [path for path in log if path.suffix != ".toml"]
+    if not files:
+        raise BadInput(f"{log[0]}: is a configuration; give the log beside it.")
+    name = f"calibrate-{files[0].name.split('.')[0]}"
+    magnetometer(log, files[0], out=out or Path("results") / name, **options)
 
 
 @app.command("list", short_help="Name the scenarios, systems, filters and claims.")

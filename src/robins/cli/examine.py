@@ -45,7 +45,7 @@ def examined(log: Sequence[Path]) -> Examined:
     files = [path for path in log if path.suffix != ".toml"]
     if not files:
         raise BadInput(f"{log[0]}: is a configuration; give the files of the log beside it.")
-    mounting = _mounting([path for path in log if path.suffix == ".toml"])
+    mounting = mounting_of([path for path in log if path.suffix == ".toml"])
     findings: list[Any] = []
     opened = []
     for path in files:
@@ -69,7 +69,7 @@ def _described(table: Any) -> dict[str, Any]:
     }
 
 
-def _mounting(configurations: Sequence[Path]) -> Any:
+def mounting_of(configurations: Sequence[Path]) -> Any:
     """How the sensor sits in the vehicle, as a replay would read it from the same file."""
     if not configurations:
         return None

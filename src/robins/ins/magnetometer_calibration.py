@@ -281,7 +281,8 @@ def _told(unit, offset, W, free, centre, size, strength_t) -> Calibration:
         scale[3:, 3:] -= field / 3.0 * np.outer(_packed(offset, W)[3:], by_entry)
     scale[:3] *= size
     covariance = scale @ covariance @ scale.T
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # zero, but for rounding, if held
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    sigma[3:][sigma[3:] < 1e-12] = 0.0  # held, but for rounding
     offset_t, matrix, field_t = centre + size * offset, field * W, field * size
     _refuse_uncertain(sigma, field_t)
     z = centre + size * unit

@@ -16,7 +16,7 @@ from typing import Any
 import xarray as xr
 
 from robins import results
-from robins.report import bounds, series
+from robins.report import bounds, iron, series
 from robins.report.allan_curve import allan
 from robins.report.bars import comparison
 from robins.report.curves import campaign, errors, estimates, height
@@ -89,6 +89,8 @@ def _drawings(
             drawings.append(lambda name=name: consistency(ds, name))
     for sensor in series.find(ds, "allan"):
         drawings.append(lambda sensor=sensor: allan(ds, sensor))
+    if "field_calibrated" in ds:
+        drawings += [lambda: iron.planes(ds), lambda: iron.size(ds)]
     return drawings + last
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 _PARTS = {
     **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
     **{u: u for u in ("h", "mg")},
-    **{"ug": "µg", "us": "µs", "s2": "s²", "hz": "Hz", "percent": "%"},
+    **{"ug": "µg", "ut": "µT", "us": "µs", "s2": "s²", "hz": "Hz", "percent": "%"},
     **{"mps": "m/s", "m_s": "m/s"},
     **{"sqrt_h": "√h", "sqrt_s": "√s", "sqrt_hz": "√Hz"},
 }

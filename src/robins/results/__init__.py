@@ -66,6 +66,8 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
                                         it is divided by these
 ``bounds``                              (filter) nonzero where what the filter states are bounds,
                                         not standard deviations
+``field_measured, field_calibrated``    (time, axis) of a magnetometer; the second with the
+                                        attribute ``strength``, the size it should have [T]
 ``within_LIMIT``                        (filter, time) share of the runs within a limit; ``runs``
 ``note_RULE_NOTE``                      (filter, time) what a rule noted in the first run
 ``allan_SENSOR``                        (tau, axis_SENSOR) Allan deviation over averaging time
