@@ -21,12 +21,14 @@ with a scenario is one `ScenarioError` with one line a fault: path, value, what 
 from robins.scenario.errors import ScenarioError
 from robins.scenario.parameters import Parameters, Quantity, default
 from robins.scenario.reading import load, parse, validate
+from robins.scenario.span import Span
 from robins.scenario.text import hash_of, mapping_of, override, read_text, text_of
 
 __all__ = [
     "Parameters",
     "Quantity",
     "ScenarioError",
+    "Span",
     "default",
     "hash_of",
     "load",

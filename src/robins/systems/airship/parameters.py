@@ -10,24 +10,11 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Parameters, Quantity, Span, default
 from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
 Draw = Literal["plus-sigma", "random-sign", "normal"]
-
-
-class Span(Parameters):
-    """A time from `begin` (included) to `end` (not)."""
-
-    begin: Annotated[float, Quantity("time", least="0 s")]
-    end: Annotated[float, Quantity("time", above="0 s")]
-
-    @pydantic.model_validator(mode="after")
-    def _in_order(self) -> Span:
-        if self.end <= self.begin:
-            raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
-        return self
 
 
 class Place(Parameters):

@@ -136,7 +136,7 @@ def _present(
     every = round(1.0 / (step_s * sensor.rate))
     there = (np.arange(1, len(time_s) + 1) % every) == 0
     for span in sensor.lost:
-        there &= ~((time_s >= span.begin - 1e-9) & (time_s < span.end - 1e-9))
+        there &= ~span.holds(time_s)
     return there
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array
 from robins.earth.magnetic import field_along, wmm_for
 from robins.manifold import wrap
 from robins.rotation import conjugate, from_euler, multiply, rotate, to_euler, to_rotvec
+from robins.scenario import Span
 from robins.sim.ballistic import ballistic
 from robins.sim.free_body import FreeBody, coning_start, free_body
 from robins.sim.magnetometer import (
@@ -24,7 +25,7 @@ from robins.sim.magnetometer import (
 )
 from robins.sim.mems_gyro import MemsGyro, delta_angles, integrate_angles
 from robins.sim.random import Component, stream
-from robins.systems.rocket.parameters import Flight, Span
+from robins.systems.rocket.parameters import Flight
 
 PEAK_S = 3.0  # after the beginning of a disturbance, in which its largest error is looked for
 _SECONDS_A_YEAR = 365.25 * 86400.0
@@ -110,7 +111,7 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _there(time_s: np.ndarray, lost: tuple[Span, ...]) -> np.ndarray:
     there = np.ones(len(time_s), dtype=bool)
     for span in lost:
-        there &= ~((time_s >= span.begin - 1e-9) & (time_s < span.end - 1e-9))
+        there &= ~span.holds(time_s)
     return there
 
 
