@@ -1,12 +1,10 @@
 """Real trials of BROAD, one default for all: no worse than VQF was measured to be."""
 
-import jax
 import numpy as np
 import pytest
 
 from robins import logs
-from robins.filters import OnlineFilter
-from robins.systems.marg import Replay, filter_of, model_of, prepare, replay
+from robins.systems.marg import Replay, replay
 
 VQF_DEG, VQF_OFFLINE_DEG = 2.56, 2.21  # mean total RMSE of these six, measured with its own code
 MADGWICK_DEG = 4.9  # published, with its one best parameter
@@ -44,9 +42,9 @@ def test_states_stay_finite_and_say_how_sure_they_are(found):
     for outcome in found:
         assert outcome.counts["steps_not_taken"] == 0
         assert np.all(np.isfinite(outcome.solution["estimate_euler"].values))
-        inclination = outcome.solution.sel(filter="marg")
-        ratio = (inclination["error_inclination"] / inclination["sigma_inclination"]).values
-        assert np.nanmean(np.abs(ratio) < 3.0) > 0.9
+        one = outcome.solution.sel(filter="marg")
+        ratio = np.abs(one["error_inclination"] / one["sigma_inclination"]).values
+        assert np.mean(ratio[np.isfinite(ratio)] < 3.0) > 0.9
     assert np.mean(of(found, "marg", "heading_nees")) < 2.0
     # noise that lasts is stated larger than it scatters, never smaller
     for sensor in ("travel", "rest_rate", "magnetometer"):
@@ -59,16 +57,3 @@ def test_magnets_are_noticed(trials, found):
     assert refused["33"] > 40  # a magnet on the sensor for a minute
     assert refused["28"] >= 5  # one passed by
     assert refused["01"] <= 2
-
-
-def test_a_live_filter_gives_the_numbers_of_the_replay(trials, found):
-    parameters = Replay()
-    log = prepare(trials[0], parameters)
-    online = OnlineFilter(filter_of(parameters), model_of(parameters), log.start)
-    row = lambda tree, k: jax.tree_util.tree_map(lambda a: a[k], tree)  # noqa: E731
-    for k in range(30):
-        online.predict(row(log.u, k))
-        for sensor, values in log.y.items():
-            online.update(row(values, k), sensor, row(log.aux[sensor], k))
-    sigma = found[0].solution["sigma_attitude"].sel(filter="marg").values[29]
-    np.testing.assert_allclose(np.asarray(online.belief.sigma)[:3], sigma, rtol=1e-6)

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 from marg_logs import GRAVITY, RATE_HZ, hand, log_of, scalar_first, with_field, with_imu
 from scipy.spatial.transform import Rotation
 
+from robins.filters import OnlineFilter
 from robins.systems.marg import Replay, filter_of, model_of, orient, prepare, replay
 from robins.systems.marg.model import MAGNETOMETER
 from robins.systems.marg.prepare import at_samples, every
@@ -236,6 +238,19 @@ def test_a_causal_replay_alone_gives_the_same(moved):
     euler = np.degrees(np.abs(alone["marg"].sigma[:, :3]))
     both = np.degrees(outcome.solution["sigma_attitude"].sel(filter="marg").values)
     np.testing.assert_allclose(euler, both, rtol=1e-9)
+
+
+def test_a_live_filter_gives_the_numbers_of_the_replay(moved):
+    dataset, outcome = moved
+    log = prepare(dataset, PARAMETERS)
+    online = OnlineFilter(filter_of(PARAMETERS), model_of(PARAMETERS), log.start)
+    row = lambda tree, k: jax.tree_util.tree_map(lambda a: a[k], tree)  # noqa: E731
+    for k in range(120):
+        online.predict(row(log.u, k))
+        for sensor, values in log.y.items():
+            online.update(row(values, k), sensor, row(log.aux[sensor], k))
+    sigma = outcome.solution["sigma_attitude"].sel(filter="marg").values[119]
+    np.testing.assert_allclose(np.asarray(online.belief.sigma)[:3], sigma, rtol=1e-6)
 
 
 def test_too_short_a_log_is_refused():

@@ -69,7 +69,7 @@ def marg_filter(
     """
     chain = [
         rules.only(TRAVEL, rules.huber(weight)),
-        rules.only(REST_RATE, rules.gate(0.9999, 100, "inflate")),
+        rules.only(REST_RATE, rules.gate(0.9999, 100)),
     ]
     if gate is not None:
         chain.append(undisturbed(gate, patience, field_t))
