@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.systems.marg.parameters import Accelerometer, Start
 
-_STILL_RATE = np.radians(5.0)  # rad/s, mean length of the rate
+_STILL_RATE = np.radians(8.0)  # rad/s, mean length of the rate
 _STILL_SPREAD = np.radians(1.0)  # rad/s, mean length of its changes
 _STILL_FORCE = 0.5  # m/s^2
 

@@ -97,6 +97,8 @@ class Rest(Parameters):
     after: Annotated[float, Quantity("time", above="0 s")] = default("1.5 s")
     quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2 deg/s")
     quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.5 m/s^2")
+    # a mean rate above this is no bias but a turn
+    most_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("4 deg/s")
     rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.03 deg/s")
     velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.01 m/s")
 

@@ -34,7 +34,7 @@ def still_samples(
     mean_rate, mean_force = _running_mean(rate_b, step), _running_mean(force_b, step)
     quiet = np.linalg.norm(rate_b - mean_rate, axis=1) < rest.quiet_rate
     quiet &= np.linalg.norm(force_b - mean_force, axis=1) < rest.quiet_accel
-    quiet &= np.all(np.abs(mean_rate) < rest.quiet_rate, axis=1)
+    quiet &= np.all(np.abs(mean_rate) < rest.most_rate, axis=1)
     quiet &= dt_s < rest.after
     time = np.cumsum(dt_s)
     # time at which the quiet spell that holds now began
