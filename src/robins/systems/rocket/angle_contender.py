@@ -24,7 +24,7 @@ from robins.systems.rocket.angles import (
     reckoned_model,
     unmoved_model,
 )
-from robins.systems.rocket.filters import BY_STATE, KINDS, Kind, Shares, make_filter
+from robins.systems.rocket.filters import BY_STATE, KINDS, Kind, Sight, make_filter
 from robins.systems.rocket.parameters import MagneticAttitude
 from robins.systems.rocket.world import World, body_of, wrong_by
 from robins.systems.system import Case, Contender
@@ -64,20 +64,20 @@ def believed_model(given: MagneticAttitude, kind: Kind) -> Model:
     return body_model(coefficients(given), jnp.repeat(jnp.asarray(noise), 3), sensors)
 
 
-def shares_of(given: MagneticAttitude, filters: tuple[str, ...]) -> Shares:
-    """(2, 6) shares of gyro and magnetometer by how well each sees each state at the start.
+def sight_of(given: MagneticAttitude, filters: tuple[str, ...]) -> Sight:
+    """What filters must know of their sensors.
 
-    Halves where none of the filters asks.
+    Shares are by how well each sees each state at the start; halves where no filter asks for them.
     """
     if not set(filters) & set(BY_STATE):
-        return ((0.5,) * 6,) * 2
+        return Sight(gyro_reads=given.gyro_reads)
     b = given.body
     q, omega = coning_start(b.spin, b.cone, b.elevation, b.azimuth, body_of(given))
     mean = angle_state(wrong_by(q, given.start.attitude_error), omega)
     belief = Belief(mean, jnp.diag(initial_sigma(given)))
     channels = [channel((name,), kalman()) for name in (GYRO, MAGNETIC)]
     found = observability_shares(believed_model(given, KINDS["ukf"]), belief, channels)
-    return tuple(tuple(float(x) for x in row) for row in found)
+    return Sight(tuple(tuple(float(x) for x in row) for row in found), given.gyro_reads)
 
 
 def initial_sigma(given: MagneticAttitude) -> Array:
@@ -117,13 +117,13 @@ def _case(reads: str, reckoned: bool, sensors: tuple[str, ...]):
     return case
 
 
-def angle_contender(given: MagneticAttitude, name: str, shares: Shares) -> Contender:
+def angle_contender(given: MagneticAttitude, name: str, sight: Sight) -> Contender:
     """A filter with its model and its data.
 
     Raises:
         ValueError: there is no filter of this name.
     """
-    filter_, kind = make_filter(name, shares), KINDS[name]
+    filter_, kind = make_filter(name, sight), KINDS[name]
     return Contender(
         filter=filter_,
         model=believed_model(given, kind),

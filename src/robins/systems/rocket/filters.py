@@ -28,6 +28,15 @@ PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a loss of track
 
 Shares = tuple[tuple[float, ...], ...]  # of the two local filters, one for each state
 
+ANGLES_SEEN, RATES_SEEN = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+
+
+class Sight(NamedTuple):
+    """What a filter of "magnetic-attitude" must know of its sensors."""
+
+    shares: Shares = ((0.5,) * 6,) * 2  # of gyro and magnetometer, for those that share by state
+    gyro_reads: Literal["rate", "attitude"] = "rate"
+
 
 def ukf(*rules: Rule) -> Filter:
     """Unscented filter with the sigma points of the study."""
@@ -39,9 +48,10 @@ def simplified(beta: float = 1.0) -> Rule:
     return strong_tracking(0.95, beta, "lumped", "classic", limit=1e3)
 
 
-def telling(sensor: str) -> Rule:
+def telling(sensor: str, sight: Sight) -> Rule:
     """Outliers told from model errors; faded are the states that the sensor reads."""
-    seen = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0) if sensor == GYRO else (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    rates = sensor == GYRO and sight.gyro_reads == "rate"
+    seen = RATES_SEEN if rates else ANGLES_SEEN
     rule = discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", weights=seen)
     return only((sensor,), rule)
 
@@ -76,46 +86,46 @@ def _two(
 class Kind(NamedTuple):
     """A filter of the study "magnetic-attitude"."""
 
-    make: Callable[[Shares], Filter]
+    make: Callable[[Sight], Filter]
     sensors: tuple[str, ...] = (GYRO, MAGNETIC)
     motion: str = "body"  # or "reckoned" by the gyro, or "unmoved"
 
 
-def _one(*rules: Rule) -> Callable[[Shares], Filter]:
-    return lambda shares: ukf(*rules)
+def _one(*rules: Rule) -> Callable[[Sight], Filter]:
+    return lambda sight: ukf(*rules)
 
 
 KINDS: dict[str, Kind] = {
-    "gyro": Kind(lambda shares: kalman(taylor()), (), "reckoned"),
-    "magnetic-raw": Kind(lambda shares: kalman(taylor()), (MAGNETIC,), "unmoved"),
+    "gyro": Kind(lambda sight: kalman(taylor()), (), "reckoned"),
+    "magnetic-raw": Kind(lambda sight: kalman(taylor()), (MAGNETIC,), "unmoved"),
     "magnetometer": Kind(_one(), (MAGNETIC,)),
     "gyro-ukf": Kind(_one(), (GYRO,)),
     "ukf": Kind(_one()),
-    "federated-scalar-ukf": Kind(lambda shares: _two("scalar", "equal")),
-    "federated-vector-ukf": Kind(lambda shares: _two("half", shares)),
-    "federated-root": Kind(lambda shares: _two("root", shares)),
+    "federated-scalar-ukf": Kind(lambda sight: _two("scalar", "equal")),
+    "federated-vector-ukf": Kind(lambda sight: _two("half", sight.shares)),
+    "federated-root": Kind(lambda sight: _two("root", sight.shares)),
     "stukf": Kind(_one(simplified())),
     "federated-scalar-stukf": Kind(
-        lambda shares: _two("scalar", "equal", lambda name: [simplified()])
+        lambda sight: _two("scalar", "equal", lambda name: [simplified()])
     ),
     "federated-vector-stukf": Kind(
-        lambda shares: _two("half", shares, lambda name: [simplified()])
+        lambda sight: _two("half", sight.shares, lambda name: [simplified()])
     ),
     "federated-vector-multiple": Kind(
-        lambda shares: _two(
+        lambda sight: _two(
             "half",
-            shares,
+            sight.shares,
             lambda name: [strong_tracking(0.95, 1.0, "multiple", "classic", limit=1e3)],
         )
     ),
     "federated-vector-weakened": Kind(
-        lambda shares: _two("half", shares, lambda name: [simplified(beta=4.0)])
+        lambda sight: _two("half", sight.shares, lambda name: [simplified(beta=4.0)])
     ),
     "huber": Kind(_one(huber(PROBABILITY))),
     "gate": Kind(_one(patient())),
-    "discriminator": Kind(_one(telling(GYRO), telling(MAGNETIC))),
+    "discriminator": Kind(lambda sight: ukf(telling(GYRO, sight), telling(MAGNETIC, sight))),
     "federated-root-discriminator": Kind(
-        lambda shares: _two("root", shares, lambda name: [telling(name)])
+        lambda sight: _two("root", sight.shares, lambda name: [telling(name, sight)])
     ),
 }
 
@@ -152,19 +162,15 @@ assert set(FIELD_KINDS) == set(FIELD_FILTERS)
 
 
 @cache
-def make_filter(name: str, shares: Shares) -> Filter:
+def make_filter(name: str, sight: Sight) -> Filter:
     """A filter of "magnetic-attitude"; the same object each time, so that it compiles once.
-
-    Args:
-        name: of the filter.
-        shares: (2, 6) of gyro and magnetometer in each state, for those that share by state.
 
     Raises:
         ValueError: there is no filter of this name.
     """
     if name not in KINDS:
         raise ValueError(f"no filter '{name}' in this study; it has {', '.join(KINDS)}")
-    return KINDS[name].make(shares)
+    return KINDS[name].make(sight)
 
 
 @cache

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from robins.results import variable
-from robins.systems.rocket.angle_contender import angle_contender, shares_of
+from robins.systems.rocket.angle_contender import angle_contender, sight_of
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.claims import rocket_claims
 from robins.systems.rocket.field import FIELD, SNAPSHOT
@@ -43,13 +43,13 @@ def angle_problem(given: MagneticAttitude, filters: tuple[str, ...], seed: int) 
         ValueError: the flight ends on the ground or leaves the life of the magnetic model, or a
             filter is unknown.
     """
-    course, shares = lay_out(given), shares_of(given, filters)
+    course, sight = lay_out(given), sight_of(given, filters)
     rate = SensorAxes("rad/s", "FRD", ("p", "q", "r"), "deg/s")
     return _problem(
         given,
         course,
         seed,
-        contenders={name: angle_contender(given, name, shares) for name in filters},
+        contenders={name: angle_contender(given, name, sight) for name in filters},
         blocks=ANGLE_BLOCKS,
         sensors={GYRO: rate if given.gyro_reads == "rate" else ANGLES, MAGNETIC: ANGLES},
         metrics=partial(angle_metrics, course),
