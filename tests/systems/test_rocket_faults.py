@@ -20,7 +20,7 @@ from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.field import FIELD, FieldState
 from robins.systems.rocket.field import Turn as Turned
 from robins.systems.rocket.field_contender import plausible
-from robins.systems.rocket.filters import PATIENCE
+from robins.systems.rocket.filters import PATIENCE, Sight
 from robins.systems.rocket.parameters import FieldVector, MagneticAttitude
 from robins.systems.rocket.problem import field_problem
 from robins.systems.rocket.world import lay_out, simulate
@@ -300,7 +300,7 @@ def of_lost_sensors():
 
     worlds = jax.tree.map(lambda *x: jnp.stack(x), *(without(*one) for one in LOST.values()))
     names = ("ukf", "federated-root")
-    return {name: found(angle_contender(given, name, SHARES), worlds) for name in names}
+    return {name: found(angle_contender(given, name, Sight(SHARES)), worlds) for name in names}
 
 
 @pytest.mark.parametrize("case", LOST)
