@@ -1,10 +1,14 @@
 """The rocket's two models against other computations: the simulation, differences, closed forms."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from robins import scenario
+from robins.earth.magnetic import field_along, wmm_for
 from robins.manifold import local, retract
 from robins.rotation import (
     Rotation,
@@ -18,6 +22,7 @@ from robins.rotation import (
     to_rotvec,
 )
 from robins.sim.free_body import FreeBody, coning_start, free_body
+from robins.systems.rocket import SYSTEM
 from robins.systems.rocket.angles import Coefficients, angle_state, reckon, step
 from robins.systems.rocket.field import (
     FieldState,
@@ -31,7 +36,9 @@ from robins.systems.rocket.field import (
     read_field,
 )
 from robins.systems.rocket.field_contender import plausible, rows_of
+from robins.systems.rocket.parameters import FieldVector
 from robins.systems.rocket.unobserved import sentence, unobserved
+from robins.systems.rocket.world import lay_out, simulate
 
 BODY = FreeBody(0.70, 1.0 / 3000.0, 1.0 / 400.0)
 DT = 0.1
@@ -176,6 +183,24 @@ def test_an_axis_at_full_scale_has_no_direction():
     assert np.isfinite(np.asarray(plausible(read, expected))).all()
     kept = np.isfinite(np.asarray(plausible(read, expected, 40e-6))).all(axis=1)
     np.testing.assert_array_equal(kept, [False, True])
+
+
+def test_a_flight_has_the_field_of_its_path_the_iron_and_the_limit_of_its_sensor():
+    text = SYSTEM.scenarios["b4"].read_text()
+    short = ('duration="4 s"', 'counted_from="1 s"')
+    iron = ('magnetometer.hard_iron=["3 uT", "-2 uT", "1 uT"]', 'magnetometer.full_scale="36 uT"')
+    plain, given = (
+        scenario.parse(FieldVector, text, (*short, *more), source="b4") for more in ((), iron)
+    )
+    course = lay_out(given)
+    start = field_along(wmm_for(2026.0), 40.0 * DEG, 10.0 * DEG, 0.0, 2026.0)
+    # in 0.1 s and 264 m of height the field of the launch has hardly changed
+    np.testing.assert_allclose(course.field_n[0], start, rtol=2e-3, atol=2e-8)
+    assert course.alt_m[-1] > 10e3
+    one, other = (jax.jit(partial(simulate, p, course, 0))(0) for p in (plain, given))
+    shifted = np.asarray(one.field_b) + np.array([3e-6, -2e-6, 1e-6])
+    np.testing.assert_allclose(other.field_b, np.clip(shifted, -36e-6, 36e-6), atol=1e-18)
+    assert np.any(np.abs(shifted) > 36e-6)
 
 
 class TestUnobserved:

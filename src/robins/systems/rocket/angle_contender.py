@@ -24,6 +24,7 @@ from robins.systems.rocket.angles import (
     reckoned_model,
     unmoved_model,
 )
+from robins.systems.rocket.field import bridged
 from robins.systems.rocket.filters import BY_STATE, KINDS, Kind, Sight, make_filter
 from robins.systems.rocket.parameters import MagneticAttitude
 from robins.systems.rocket.world import World, body_of, wrong_by
@@ -95,7 +96,7 @@ def as_case(reads: str, reckoned: bool, sensors: tuple[str, ...], n: Numbers, wo
         sensors = (GYRO,)
     return Case(
         start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(n.sigma)),
-        u=world.theta,
+        u=bridged(world.theta).theta_b,
         y={name: rows[name] for name in sensors},
         aux={},
         truth=angle_state(world.q_nb, world.omega_b),
