@@ -110,5 +110,5 @@ class StepInfo(NamedTuple):
 
     @property
     def sigma(self) -> Array:
-        """(..., m) standard deviation of each innovation component."""
-        return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))
+        """(..., m) standard deviation of each innovation component; NaN where it was not used."""
+        return jnp.where(self.used, jnp.sqrt(jnp.sum(self.factor**2, axis=-1)), jnp.nan)

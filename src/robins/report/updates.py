@@ -54,7 +54,8 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
                     axes.plot(*series.thin(x, sign * reach), **look)
         _compress(axes, shown)
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
-        axes.set_ylabel(f"{label} [{data.unit}]" if data.unit else label)
+        # components of several units say their own
+        axes.set_ylabel(f"{label} [{data.unit}]" if data.unit and "[" not in label else label)
     keys: list[Any] = [_dot(filters[i], i) for i in present]
     if sigma is not None:
         keys.append(style.key("±3σ expected", color=style.GREY, linewidth=0.8))

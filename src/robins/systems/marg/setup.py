@@ -61,12 +61,11 @@ def filter_of(parameters: Replay) -> Filter:
     )
 
 
+TRAVELLED = (("velocity", "m/s"), ("place", "m"))
 SENSORS = {
-    TRAVEL: SensorAxes(
-        "m/s, m", "NED", tuple(f"{w} {a}" for w in ("velocity", "place") for a in NED)
-    ),
+    TRAVEL: SensorAxes("m/s, m", "NED", tuple(f"{w} {a} [{u}]" for w, u in TRAVELLED for a in NED)),
     REST_RATE: SensorAxes("rad/s", "body", XYZ),
-    MAGNETOMETER: SensorAxes("rad, T", "NED", ("azimuth", "horizontal", "down")),
+    MAGNETOMETER: SensorAxes("rad, T", "NED", ("azimuth [rad]", "horizontal [T]", "down [T]")),
 }
 
 BLOCKS = (
