@@ -146,6 +146,8 @@ def _statistic(
     assert data is not None
     values, x = data.values[..., 0], data.x / clock.seconds
     limits = band(solution, name, degrees_from)
+    if limits is not None:  # without a degree of freedom nothing was used, and zero says nothing
+        values = np.where(np.isfinite(limits.high), values, np.nan)
     filters = series.filters(solution)
     joined = _is_smooth(solution, name)
     for i in range(len(filters)):
