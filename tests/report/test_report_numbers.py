@@ -15,6 +15,7 @@ from robins.report import numbers
         ("attitude_rms_arcmin", "Attitude RMS", "arcmin"),
         ("velocity_rms_m_per_s", "Velocity RMS", "m/s"),
         ("velocity_rms_mps", "Velocity RMS", "m/s"),
+        ("p_rms_deg_s", "P RMS", "deg/s"),
         ("gyro_bias_rms_deg_per_h", "Gyro bias RMS", "deg/h"),
         ("angle_random_walk_deg_per_sqrt_h", "Angle random walk", "deg/√h"),
         ("rate_random_walk_deg_per_h_per_sqrt_h", "Rate random walk", "deg/h/√h"),

@@ -70,15 +70,11 @@ def lay_out(given: Flight) -> Course:
     count = math.floor(given.duration / given.step + 1e-9)
     time = given.step * np.arange(1, count + 1)
     launch = given.launch
-    path = ballistic(
-        launch.latitude,
-        launch.longitude,
-        launch.height,
-        launch.speed,
-        launch.elevation,
-        launch.azimuth,
-        time,
-    )
+    where = launch.latitude, launch.longitude, launch.height
+    try:
+        path = ballistic(*where, launch.speed, launch.elevation, launch.azimuth, time)
+    except ValueError as error:
+        raise ValueError(f"launch and duration do not fit together: {error}") from error
     year = launch.year + time / _SECONDS_A_YEAR
     place = path.lat_rad, path.lon_rad, path.alt_m
     local = field_along(wmm_for(launch.year), *place, year, time)
