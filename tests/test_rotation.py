@@ -281,3 +281,19 @@ def test_value_type_agrees_with_its_functions():
     np.testing.assert_allclose(Rotation.from_dcm(a.as_dcm()).wxyz, a.wxyz, atol=4 * EPS)
     np.testing.assert_allclose(b.as_rotvec(), [0, 0, 1], atol=EPS)
     np.testing.assert_allclose(a.as_euler(), (0.1, 0.2, 0.3), atol=4 * EPS)
+
+
+# -------------------------------------------------------------------------- errors in body axes
+
+
+def test_body_rotation_errs_on_the_right():
+    C = Scipy.random(5, random_state=3)
+    delta = 0.3 * directions(5, seed=1)
+    q = rot.BodyRotation(jnp.asarray(C.as_quat(scalar_first=True)))
+    moved = jax.vmap(lambda a, d: a.retract(d))(q, jnp.asarray(delta))
+    expected = C * Scipy.from_rotvec(delta)  # right: the error is turned before C
+    np.testing.assert_allclose(rot.to_dcm(moved.wxyz), expected.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(q.local(moved), delta, atol=1e-15)
+    # seen in the frame that is mapped to, the same error is C delta
+    left = Rotation(q.wxyz).local(Rotation(moved.wxyz))
+    np.testing.assert_allclose(left, C.apply(delta), atol=1e-15)

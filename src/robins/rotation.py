@@ -263,3 +263,22 @@ class Rotation:
     def local(self, other: Rotation) -> Float[Array, "*b 3"]:
         """The delta for which ``self.retract(delta) == other``."""
         return to_rotvec(multiply(other.wxyz, conjugate(self.wxyz)))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BodyRotation(Rotation):
+    """A rotation whose error is seen in the frame it maps *from*: ``C exp(delta x)``.
+
+    For ``q_ib`` of a spacecraft this is the attitude error in body axes, the error state of the
+    multiplicative extended Kalman filter (Lefferts, Markley & Shuster 1982). Composing and
+    inverting give plain rotations.
+    """
+
+    def retract(self, delta: Float[Array, "*b 3"]) -> BodyRotation:
+        """``C exp(delta x)``, renormalised so that rounding cannot accumulate."""
+        return BodyRotation(normalise(multiply(self.wxyz, from_rotvec(delta))))
+
+    def local(self, other: Rotation) -> Float[Array, "*b 3"]:
+        """The delta for which ``self.retract(delta) == other``."""
+        return to_rotvec(multiply(conjugate(self.wxyz), other.wxyz))
