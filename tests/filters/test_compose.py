@@ -12,6 +12,7 @@ from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor, u
 from robins.filters.rules import (
     adaptive_h_infinity,
     consider,
+    constant_gain,
     correntropy,
     discriminator,
     equality,
@@ -65,6 +66,7 @@ RULES = {
     "inequality": inequality(jnp.array([[1.0, 0.0, 0.0, 0.0]]), [-10.0], [10.0]),
     "consider": consider([3]),
     "projection": projection("y"),
+    "constant_gain": constant_gain({"y": 0.3 * SEEN.T}),
     "gate only": only("y", gate()),
 }
 SILENT = {"consider"}  # says nothing that StepInfo does not say

@@ -3,6 +3,7 @@
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
 from robins.filters.bound import Bound, bound_along, covariance_bound, linearised, used_sensors
 from robins.filters.channels import Channel, channel
+from robins.filters.closed_loop import Closed, Loop, Reading, run_closed
 from robins.filters.delayed import Late, delayed
 from robins.filters.distributed import distributed, intersecting
 from robins.filters.federated import federated
@@ -45,11 +46,13 @@ __all__ = [
     "Belief",
     "Bound",
     "Channel",
+    "Closed",
     "Code",
     "Filter",
     "FilterState",
     "Late",
     "Linearisation",
+    "Loop",
     "Model",
     "Motion",
     "Normalised",
@@ -57,6 +60,7 @@ __all__ = [
     "OnlineFilter",
     "Points",
     "Prediction",
+    "Reading",
     "Reuse",
     "Rule",
     "Sensor",
@@ -92,6 +96,7 @@ __all__ = [
     "reseed",
     "rts_smoother",
     "run",
+    "run_closed",
     "share",
     "sigma_points",
     "sigma_weights",

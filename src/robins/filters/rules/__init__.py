@@ -2,6 +2,7 @@
 
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
 from robins.filters.rules.consider import consider
+from robins.filters.rules.constant_gain import constant_gain, with_gains
 from robins.filters.rules.correntropy import correntropy
 from robins.filters.rules.discriminator import discriminator
 from robins.filters.rules.equality import equality
@@ -23,6 +24,7 @@ __all__ = [
     "Infeasible",
     "adaptive_h_infinity",
     "consider",
+    "constant_gain",
     "correntropy",
     "discriminator",
     "equality",
@@ -40,5 +42,6 @@ __all__ = [
     "strong_tracking",
     "student_t",
     "variational_bayes",
+    "with_gains",
     "with_gamma",
 ]

@@ -1,0 +1,142 @@
+"""A filter in the loop that its own estimate closes: the vehicle moves as the estimate tells it.
+
+`run` goes over measurements that are there beforehand. Where a controller acts on the estimate,
+what is measured next depends on the filter, so vehicle, controller, sensors and filter step
+together, in one scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.kalman import Filter, FilterState
+from robins.filters.model import Model, Sensor
+from robins.filters.run import Step
+
+
+class Reading(NamedTuple):
+    """What the world answers in a step."""
+
+    u: Any  # input of the filter's motion
+    y: Mapping[str, Any]  # measurements at the end of the step by sensor; NaN is missing
+    truth: Any  # true state at the end of the step, of the structure of the filter's
+    aux: Mapping[str, Any] = {}
+    rows: Any = None  # (r, n) reported = rows @ tangent error; None: all of it
+    outputs: Any = ()  # what else is to be kept of the world, such as the pointing error
+
+
+class Loop(NamedTuple):
+    """The world around a filter.
+
+    Attributes:
+        react: ``(world, belief, row) -> (world, Reading)``, pure: how the world goes on through one
+            step when this is believed at its beginning. Data belongs into a
+            ``jax.tree_util.Partial``.
+        world: its state before the first step, a pytree of arrays.
+        rows: what drives the steps from outside, a pytree with leading axis T.
+        due: (T,) bool by sensor, when there can be a measurement. Where there cannot, the update is
+            not computed at all, which is most of the time of a slow sensor; sensors that are not
+            named are always due. Keep it out of what is batched, or both ways are computed.
+    """
+
+    react: Callable[[Any, Belief, Any], tuple[Any, Reading]]
+    world: Any
+    rows: Any
+    due: Mapping[str, Any] = {}
+
+
+def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: Any):
+    """The state as it is, and the information of an update that had nothing to use."""
+    like = jax.eval_shape(lambda s, z, a: filter_.update(s, sensor, z, a)[1], state, y, aux)
+    blank: StepInfo = jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    m = sensor.dim
+    return state, blank._replace(
+        innovation=jnp.full(m, jnp.nan), factor=jnp.eye(m), code=jnp.asarray(int(Code.MISSING))
+    )
+
+
+@partial(jax.jit, static_argnames=("filter_", "keep"))
+def _scan(filter_, model, state, loop: Loop, keep):
+    def body(carry, given):
+        state, world = carry
+        row, due = given
+        world, reading = loop.react(world, state.belief, row)
+        state, prediction = filter_.predict(state, model.motion, reading.u)
+        info = {}
+        for sensor in model.sensors:
+            if sensor.name in reading.y:
+                args = (state, reading.y[sensor.name], reading.aux.get(sensor.name))
+                taken = partial(_update, filter_, sensor)
+                if sensor.name in due:
+                    spared = partial(_without, filter_, sensor)
+                    state, info[sensor.name] = jax.lax.cond(due[sensor.name], taken, spared, *args)
+                else:
+                    state, info[sensor.name] = taken(*args)
+        step = Step(prediction, state.belief, info)
+        return (state, world), (keep(step), reading)
+
+    (state, world), (steps, readings) = jax.lax.scan(
+        body, (state, loop.world), (loop.rows, dict(loop.due))
+    )
+    return steps, readings, state, world
+
+
+def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: Any):
+    return filter_.update(state, sensor, y, aux)
+
+
+def _everything(step: Step) -> Step:
+    return step
+
+
+class Closed(NamedTuple):
+    """A run in closed loop; fields but the last two have a leading axis of T steps."""
+
+    steps: Any  # what `keep` chose of each `robins.filters.Step`
+    readings: Reading  # what the world answered, truth and outputs included
+    final: FilterState
+    world: Any  # state of the world at the end
+
+
+def run_closed(
+    filter_: Filter,
+    model: Model,
+    start: Belief | FilterState,
+    loop: Loop,
+    keep: Callable[[Step], Any] = _everything,
+) -> Closed:
+    """Run a filter in a loop: for each step the world reacts to what is believed, then the filter
+    predicts with what the world answered and updates with each sensor.
+
+    With the readings as its data, `run` gives the same estimates, to rounding.
+
+    Args:
+        filter_: from `kalman` and its kin.
+        model: the motion and the sensors.
+        start: belief before the first step, or a state of the filter.
+        loop: the world.
+        keep: what to keep of each step.
+
+    Raises:
+        ValueError: ``due`` names no sensor of the model, or is not as long as the rows.
+    """
+    steps = {jnp.shape(x)[0] for x in jax.tree_util.tree_leaves((loop.rows, loop.due))}
+    if len(steps) != 1:
+        raise ValueError(f"rows and due of a loop must have one length, got {sorted(steps)}")
+    if unknown := set(loop.due) - set(model.dims):
+        raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
+    state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
+    as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
+    state, world, rows, due = (as_arrays(x) for x in (state, loop.world, loop.rows, loop.due))
+    loop = Loop(_as_partial(loop.react), world, rows, due)
+    return Closed(*_scan(filter_, model, state, loop, keep))
+
+
+def _as_partial(react: Any) -> jax.tree_util.Partial:
+    return react if isinstance(react, jax.tree_util.Partial) else jax.tree_util.Partial(react)

@@ -1,0 +1,108 @@
+"""Update with a gain that was designed beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.kalman import FilterState
+from robins.filters.observation import Observation, left_out
+from robins.filters.rule import Rule
+from robins.filters.trees import select
+
+
+class Fixed(NamedTuple):
+    """Memory of the rule. Gains are data: exchange them in a state, and nothing compiles anew."""
+
+    gains: dict[str, Array]  # (n, m) by sensor
+    prior: Belief  # of the last update
+
+
+def constant_gain(gains: Mapping[str, Any]) -> Rule:
+    """Update the mean with a constant gain, and state the covariance that this gain truly has.
+
+        x+ = x- + K (y - h(x-)),   P+ = (I - K H) P- (I - K H)' + K (Omega + R) K'
+
+    The gain of a steady-state design (`robins.filters.synthesis`), in current form. The second line
+    holds for any gain (Joseph's form; Brown & Hwang 2012, eq. 4.2.11), so the stated sigma is that
+    of this filter in this model, not of the best one, and grows while the sensor is lost. Columns
+    of components that are missing or refused are left out. Put it last, so that rules that fade the
+    prior come before it; sensors without a gain are updated as ever.
+
+    Notes: ``constant_gain.moved``, the largest component that the update moved the mean by.
+
+    Args:
+        gains: (n, m) by name of the sensor, tangent spaces of state and measurement.
+
+    Raises:
+        ValueError: no gain, one with entries that are not finite; by `init`, a sensor that the
+            model does not have or a gain that does not fit.
+    """
+    if not gains:
+        raise ValueError("constant_gain: give at least one gain, {'sensor': (n, m) array}")
+    given = {name: jnp.asarray(value, float) for name, value in gains.items()}
+    for name, K in given.items():
+        if not bool(jnp.all(jnp.isfinite(K))):
+            raise ValueError(f"constant_gain: the gain of '{name}' has entries that are not finite")
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> Fixed:
+        n = belief.factor.shape[0]
+        for name, K in given.items():
+            if name not in dims:
+                raise ValueError(f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
+            if K.shape != (n, dims[name]):
+                raise ValueError(
+                    f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "
+                    f"({n}, {dims[name]})"
+                )
+        return Fixed(given, belief)
+
+    def before(memory: Fixed, prior: Belief, o: Observation):
+        return memory._replace(prior=prior), prior, o
+
+    def after(memory: Fixed, posterior: Belief, info: StepInfo, o: Observation):
+        if o.sensor not in memory.gains:
+            return memory, posterior, info
+        spread, excess, noise, deficit, used = left_out(o)
+        used = used & info.used
+        K = jnp.where(used[None, :], memory.gains[o.sensor], 0.0)
+        S = memory.prior.factor
+        moved = K @ jnp.where(used, o.residual, 0.0)
+        factor = linalg.tria(S - K @ spread, K @ excess, K @ noise)
+        if deficit is not None:
+            factor = linalg.downdate(factor, K @ deficit)
+        belief = Belief(manifold.retract(memory.prior.mean, moved), factor)
+        belief = select(jnp.any(used), belief, posterior)
+        notes = info.notes | {"constant_gain.moved": jnp.max(jnp.abs(moved))}
+        return memory, belief, info._replace(gain=K, notes=notes)
+
+    return Rule(init=init, before=before, after=after, name="constant_gain")
+
+
+def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:
+    """A filter state that goes on with other gains of the same shapes.
+
+    Gains are data here: they may be traced or batched, and nothing compiles anew.
+
+    Raises:
+        ValueError: the filter has no `constant_gain` rule, or names or shapes are others.
+    """
+    if not any(isinstance(one, Fixed) for one in state.memory):
+        raise ValueError("this filter has no constant_gain rule whose gains could be exchanged")
+
+    def exchanged(memory: Fixed) -> Fixed:
+        new = {name: jnp.asarray(K, float) for name, K in gains.items()}
+        shapes = [{k: v.shape for k, v in of.items()} for of in (new, memory.gains)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"gains have shapes {shapes[0]}, the filter was begun with {shapes[1]}"
+            )
+        return memory._replace(gains=new)
+
+    held = tuple(exchanged(one) if isinstance(one, Fixed) else one for one in state.memory)
+    return state._replace(memory=held)

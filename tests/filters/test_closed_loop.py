@@ -1,0 +1,170 @@
+"""A filter in the loop: the same as a run over what the world answered, and the world answers."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from robins.filters import (
+    Belief,
+    Code,
+    Loop,
+    Model,
+    Motion,
+    Reading,
+    Sensor,
+    kalman,
+    run,
+    run_closed,
+)
+from robins.filters.rules import constant_gain, gate, with_gains
+
+DT, STEPS, EVERY = 0.1, 200, 5
+F = jnp.array([[1.0, DT], [0.0, 1.0]])
+G = jnp.array([0.5 * DT * DT, DT])
+MODEL = Model(
+    Motion(lambda x, u: F @ x + G * u, jnp.array([0.0, 0.02])),
+    (Sensor(lambda x, aux: x[:1], jnp.array([0.3]), 1, "seen"),),
+)
+START = Belief.of(jnp.array([0.0, 0.0]), np.diag([1.0, 0.25]))
+
+
+class Row(NamedTuple):
+    push: jax.Array  # () noise of the motion
+    noise: jax.Array  # (1,) of the sensor
+
+
+def react(target, x, belief, row):
+    """A cart that is steered to the target by what is believed of it."""
+    u = -0.5 * (belief.mean[0] - target) - 1.0 * belief.mean[1]
+    x = F @ x + G * u + jnp.stack([0.0 * row.push, 0.02 * row.push])
+    return x, Reading(u, {"seen": x[:1] + 0.3 * row.noise}, x, outputs={"push": u})
+
+
+def loop(target=3.0, due=True):
+    rng = np.random.default_rng(4)
+    rows = Row(rng.normal(size=STEPS), rng.normal(size=(STEPS, 1)))
+    when = {"seen": np.arange(1, STEPS + 1) % EVERY == 0} if due else {}
+    return Loop(jax.tree_util.Partial(react, target), jnp.array([1.0, 0.0]), rows, when)
+
+
+@pytest.fixture(scope="module")
+def closed():
+    return run_closed(kalman(), MODEL, START, loop())
+
+
+def test_equals_a_run_over_what_the_world_answered(closed):
+    due = np.arange(1, STEPS + 1) % EVERY == 0
+    y = jnp.where(jnp.asarray(due)[:, None], closed.readings.y["seen"], jnp.nan)
+    again = run(kalman(), MODEL, START, y, closed.readings.u)
+    np.testing.assert_allclose(closed.steps.posterior.mean, again.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(closed.steps.posterior.covariance, again.covariance, atol=1e-13)
+    info, other = closed.steps.info["seen"], again.steps.info["seen"]
+    for name in ("innovation", "nis", "dof", "used", "code", "factor", "gain"):
+        np.testing.assert_allclose(
+            getattr(info, name), getattr(other, name), atol=1e-12, err_msg=name
+        )
+    assert np.sum(info.code == Code.DONE) == STEPS // EVERY
+
+
+def test_the_estimate_steers(closed):
+    assert abs(closed.readings.truth[-1, 0] - 3.0) < 0.5
+    assert abs(closed.world[0] - closed.readings.truth[-1, 0]) == 0.0
+    elsewhere = run_closed(kalman(), MODEL, START, loop(target=-3.0))
+    assert abs(elsewhere.readings.truth[-1, 0] + 3.0) < 0.5
+    # by hand, in NumPy
+    x, rows = np.array([1.0, 0.0]), loop().rows
+    believed = np.concatenate([[START.mean], closed.steps.posterior.mean[:-1]])
+    for k in range(STEPS):
+        u = -0.5 * (believed[k, 0] - 3.0) - believed[k, 1]
+        x = np.asarray(F) @ x + np.asarray(G) * u + [0.0, 0.02 * rows.push[k]]
+        np.testing.assert_allclose(closed.readings.truth[k], x, atol=1e-12)
+        np.testing.assert_allclose(closed.readings.outputs["push"][k], u, atol=1e-12)
+
+
+def test_runs_batch():
+    targets = jnp.array([3.0, -3.0])
+    batch = jax.vmap(lambda t: run_closed(kalman(), MODEL, START, loop(t)).readings.truth)(targets)
+    alone = run_closed(kalman(), MODEL, START, loop(-3.0)).readings.truth
+    np.testing.assert_allclose(batch[1], alone, atol=1e-12)
+
+
+def test_what_does_not_fit_is_named():
+    with pytest.raises(ValueError, match=r"no sensor \['heard'\]; this model has \['seen'\]"):
+        run_closed(kalman(), MODEL, START, loop()._replace(due={"heard": np.ones(STEPS, bool)}))
+    with pytest.raises(ValueError, match="must have one length, got"):
+        run_closed(kalman(), MODEL, START, loop()._replace(due={"seen": np.ones(3, bool)}))
+
+
+# ------------------------------------------------------------------------------ a constant gain
+
+GAIN = np.array([[0.2], [0.07]])
+
+
+def test_a_constant_gain_states_its_own_covariance():
+    y = np.random.default_rng(1).normal(size=(30, 1))
+    y[7] = np.nan
+    fixed = kalman(rules=[constant_gain({"seen": GAIN})])
+    found = run(fixed, MODEL, START, y, np.zeros(30))
+    x, P = np.zeros(2), np.diag([1.0, 0.25])
+    Q, H, A = np.diag([0.0, 0.02**2]), np.array([[1.0, 0.0]]), np.asarray(F)
+    for k in range(30):
+        x, P = A @ x, A @ P @ A.T + Q
+        if np.isfinite(y[k, 0]):
+            x = x + GAIN @ (y[k] - H @ x)
+            I_KH = np.eye(2) - GAIN @ H
+            P = I_KH @ P @ I_KH.T + 0.09 * GAIN @ GAIN.T
+        np.testing.assert_allclose(found.mean[k], x, atol=1e-13)
+        np.testing.assert_allclose(found.covariance[k], P, atol=1e-13)
+    np.testing.assert_allclose(found.steps.info["seen"].gain[8], GAIN)
+
+
+def test_a_steady_kalman_gain_is_the_kalman_filter():
+    y = np.random.default_rng(2).normal(size=(500, 1))
+    best = run(kalman(), MODEL, START, y, np.zeros(500))
+    steady = np.asarray(best.steps.info["seen"].gain[-1])
+    begun = kalman(rules=[constant_gain({"seen": steady})])
+    same = run(begun, MODEL, START, y, np.zeros(500))
+    np.testing.assert_allclose(same.mean[-1], best.mean[-1], atol=1e-6)
+    np.testing.assert_allclose(same.covariance[-1], best.covariance[-1], rtol=1e-6)
+
+
+def test_a_gate_before_it_refuses():
+    y = np.zeros((3, 1))
+    y[1] = 50.0
+    guarded = kalman(rules=[gate(), constant_gain({"seen": GAIN})])
+    found = run(guarded, MODEL, START, y, np.zeros(3))
+    assert found.steps.info["seen"].code.tolist() == [Code.DONE, Code.REFUSED, Code.DONE]
+    assert np.max(np.abs(found.mean)) == 0.0
+
+
+def test_gains_are_data():
+    y = np.ones((5, 1))
+    rule = kalman(rules=[constant_gain({"seen": np.zeros((2, 1))})])
+    begun = rule.init(START, MODEL.dims)
+    solve = jax.jit(
+        lambda K: run(rule, MODEL, with_gains(begun, {"seen": K}), y, np.zeros(5)).mean[-1]
+    )
+    direct = run(kalman(rules=[constant_gain({"seen": GAIN})]), MODEL, START, y, np.zeros(5))
+    np.testing.assert_allclose(solve(jnp.asarray(GAIN)), direct.mean[-1], atol=1e-14)
+    assert np.max(np.abs(solve(jnp.zeros((2, 1))))) == 0.0
+    with pytest.raises(ValueError, match="the filter was begun with"):
+        with_gains(begun, {"seen": np.zeros((3, 1))})
+    with pytest.raises(ValueError, match="no constant_gain rule"):
+        with_gains(kalman().init(START, MODEL.dims), {"seen": GAIN})
+
+
+@pytest.mark.parametrize(
+    ("gains", "words"),
+    [
+        ({}, "give at least one gain"),
+        ({"seen": [[np.nan], [0.0]]}, "gain of 'seen' has entries that are not finite"),
+        ({"heard": GAIN}, r"no sensor 'heard'; this model has \['seen'\]"),
+        ({"seen": np.zeros((3, 1))}, r"is \(3, 1\), state and sensor need \(2, 1\)"),
+    ],
+)
+def test_gains_that_do_not_fit(gains, words):
+    with pytest.raises(ValueError, match=words):
+        kalman(rules=[constant_gain(gains)]).init(START, MODEL.dims)
