@@ -1,0 +1,160 @@
+"""A designed filter, with its true norms: nothing a solver says is believed without them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis.norms import (
+    Number,
+    h2_norm,
+    hinf_norm,
+    peak_gain,
+    spectral_radius,
+)
+from robins.filters.synthesis.plant import Plant, error_system
+
+_BOUND = 1e-3  # by how much, relatively, a solver's bound may lie below the true H2 norm
+_GAMMA = 1e-6  # by how much the true H-infinity norm may exceed gamma
+_AGREE = 1e-6  # and differ from the sweep
+
+
+class NotCertified(ValueError):
+    """The true norms of a filter are not what its design promised."""
+
+
+class Unreachable(ValueError):
+    """No filter of the form asked for meets gamma; the message names the least one can have.
+
+    Attributes:
+        least: that gamma, nan where it is not known.
+    """
+
+    def __init__(self, message: str, least: Number = np.nan):
+        super().__init__(message)
+        self.least = float(least)
+
+
+class Design(NamedTuple):
+    """A filter with constant gains.
+
+    Norms are those of the error z - z^, in the units of the plant.
+    """
+
+    method: str  # how it was found
+    gamma: float  # bound on the H-infinity norm that was asked for; inf for none
+    gain: np.ndarray  # (n, m) K of the observer; Bh of a full-order filter
+    order: Literal["observer", "full"]
+    filter: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # (Ah, Bh, Gh) where order is "full"
+    bound: float  # what the solver promised for the H2 norm; nan where it promised nothing
+    h2: float  # true, by the Gramian
+    hinf: float  # true, by bisection
+    hinf_sweep: float  # the same, by a sweep of the frequency
+    radius: float  # spectral radius of the error, or of plant and full-order filter together
+    lambda_: float  # by how much n was made noise; nan where no Riccati equation was solved
+    status: str  # the solver's own words
+    seconds: float  # time the design took; nan where it was not measured
+
+
+def certify(
+    plant: Plant,
+    K: Any,
+    *,
+    method: str,
+    gamma: Number = np.inf,
+    bound: Number = np.nan,
+    lambda_: Number = np.nan,
+    status: str = "",
+    seconds: Number = np.nan,
+) -> Design:
+    """The design of an observer gain, if its true norms are what was asked and promised.
+
+    Args:
+        plant: what it was designed for.
+        K: (n, m) gain.
+        method: as in `Design`; so the rest.
+        gamma: as in `Design`.
+        bound: as in `Design`.
+        lambda_: as in `Design`.
+        status: as in `Design`.
+        seconds: as in `Design`.
+
+    Raises:
+        NotCertified: the error does not decay, H2 > bound (1 + 1e-3), Hinf > gamma (1 + 1e-6), or
+            the two computations of Hinf differ by more than 1e-6.
+        ValueError: K is not (n, m) or not finite.
+    """
+    error = error_system(plant, K)
+    design = Design(
+        method, float(gamma), np.array(K, float), "observer", None, float(bound),
+        h2_norm(error.A, error.Bw, error.L),
+        hinf_norm(error.A, error.Bn, error.L),
+        peak_gain(error.A, error.Bn, error.L),
+        spectral_radius(error.A), float(lambda_), status, float(seconds),
+    )  # fmt: skip
+    return _checked(design)
+
+
+def certify_full(
+    plant: Plant,
+    filter_: tuple[Any, Any, Any],
+    *,
+    method: str,
+    gamma: Number = np.inf,
+    bound: Number = np.nan,
+    status: str = "",
+    seconds: Number = np.nan,
+) -> Design:
+    """The same for a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^.
+
+    Its error depends on the state of the plant, which must therefore decay by itself.
+
+    Args:
+        plant: what it was designed for.
+        filter_: Ah (n, n), Bh (n, m), Gh (r, n).
+        method: as in `Design`; so the rest.
+        gamma: as in `Design`.
+        bound: as in `Design`.
+        status: as in `Design`.
+        seconds: as in `Design`.
+
+    Raises:
+        NotCertified: as `certify`.
+    """
+    Ah, Bh, Gh = (np.array(matrix, float) for matrix in filter_)
+    zero = np.zeros((len(plant.A), len(Ah)))
+    A = np.block([[plant.A, zero], [Bh @ plant.C, Ah]])
+    Bw = np.vstack([plant.Bw, Bh @ plant.Dw])
+    Bn = np.vstack([plant.Bn, Bh @ plant.Dn])
+    C = np.hstack([plant.L, -Gh])
+    design = Design(
+        method, float(gamma), Bh, "full", (Ah, Bh, Gh), float(bound),
+        h2_norm(A, Bw, C), hinf_norm(A, Bn, C), peak_gain(A, Bn, C),
+        spectral_radius(A), np.nan, status, float(seconds),
+    )  # fmt: skip
+    return _checked(design)
+
+
+def _checked(design: Design) -> Design:
+    """Raise if a promise is broken, naming which."""
+    told = f"{design.method}: the answer is not certified"
+    said = f" (the solver said {design.status!r})" if design.status else ""
+    if not design.radius < 1.0:
+        raise NotCertified(
+            f"{told}: its error does not decay, spectral radius {design.radius:.9g}{said}"
+        )
+    if design.h2 > design.bound * (1.0 + _BOUND):
+        raise NotCertified(
+            f"{told}: true H2 norm {design.h2:.6g} above the promised {design.bound:.6g}{said}"
+        )
+    if design.hinf > design.gamma * (1.0 + _GAMMA):
+        raise NotCertified(
+            f"{told}: true H-infinity norm {design.hinf:.9g} above gamma {design.gamma:.9g}{said}"
+        )
+    if abs(design.hinf - design.hinf_sweep) > _AGREE * design.hinf:
+        raise NotCertified(
+            f"{told}: H-infinity norm {design.hinf:.9g} by bisection but {design.hinf_sweep:.9g} "
+            f"by a sweep of the frequency{said}"
+        )
+    return design

@@ -1,0 +1,219 @@
+"""The plant of a filter design: a linear system with white noise and a modelling error.
+
+    x(k+1) = A x + Bw w + Bn n,     y = C x + Dw w + Dn n,     z = L x
+
+w is white noise of unit covariance, n any signal of finite energy (a modelling error), z what the
+filter is to estimate. A gain K makes the observer ``x^(k+1) = A x^ + K (y - C x^)``, whose error
+e = x - x^ obeys
+
+    e(k+1) = (A - K C) e + (Bw - K Dw) w + (Bn - K Dn) n.
+
+Numbers may have any unit; what is computed from a plant does not depend on those of its states.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_MARGINAL = 1e-7  # eigenvalues of a defective block at 1 may be computed as far inside the circle
+_UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matrix that counts as 0
+
+
+class Plant(NamedTuple):
+    """Matrices of a plant, float64; made by `plant` or `current_form`, which check them."""
+
+    A: np.ndarray  # (n, n)
+    Bw: np.ndarray  # (n, p) noise
+    Bn: np.ndarray  # (n, q) modelling error
+    C: np.ndarray  # (m, n)
+    Dw: np.ndarray  # (m, p)
+    Dn: np.ndarray  # (m, q)
+    L: np.ndarray  # (r, n) rows whose error counts
+
+
+class ErrorSystem(NamedTuple):
+    """How the error of an observer moves: e(k+1) = A e + Bw w + Bn n, z - z^ = L e."""
+
+    A: np.ndarray  # (n, n)
+    Bw: np.ndarray  # (n, p)
+    Bn: np.ndarray  # (n, q)
+    L: np.ndarray  # (r, n)
+
+
+def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: Any = None) -> Plant:
+    """A plant whose gain K predicts: x^(k+1) = A x^ + K (y - C x^).
+
+    Args:
+        A: (n, n) transition.
+        Bw: (n, p) how the noise w moves the state.
+        Bn: (n, q) how the modelling error n moves the state.
+        C: (m, n) what is measured.
+        Dw: (m, p) how w enters the measurement; nothing by default.
+        Dn: (m, q) how n enters the measurement; nothing by default.
+        L: (r, n) what is estimated; the whole state by default.
+
+    Raises:
+        TypeError: a block is not made of real numbers.
+        ValueError: a block is no matrix, has the wrong shape or is not finite, or a mode that does
+            not decay by itself is not seen in y. The message names the block or the mode.
+    """
+    A, Bw, Bn, C = (
+        _matrix(value, name) for value, name in zip((A, Bw, Bn, C), _ASKED, strict=True)
+    )
+    n, m = A.shape[0], C.shape[0]
+    if A.shape[1] != n or n == 0:
+        raise ValueError(f"A is {A.shape}: the transition of a state must be square")
+    if m == 0:
+        raise ValueError(f"C is {C.shape}: nothing is measured")
+    if C.shape[1] != n:
+        raise ValueError(f"C is {C.shape}, must be ({m}, {n}): A says that x has {n} components")
+    for block, name in ((Bw, "Bw"), (Bn, "Bn")):
+        if block.shape[0] != n:
+            shape = f"({n}, {block.shape[1]})"
+            raise ValueError(
+                f"{name} is {block.shape}, must be {shape}: A says that x has {n} components"
+            )
+    Dw = _feedthrough(Dw, "Dw", m, Bw, "w")
+    Dn = _feedthrough(Dn, "Dn", m, Bn, "n")
+    L = np.eye(n) if L is None else _matrix(L, "L")
+    if L.shape[1] != n or L.shape[0] == 0:
+        raise ValueError(
+            f"L is {L.shape}, must have one row for each number to be estimated and {n} columns: "
+            f"A says that x has {n} components"
+        )
+    _refuse_undetectable(A, C)
+    return Plant(A, Bw, Bn, C, Dw, Dn, L)
+
+
+def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: Any = None) -> Plant:
+    """A plant whose gain K corrects: x^ = x- + K (y - C x-), x- = A x^, as navigation filters do.
+
+    The error after the correction obeys e(k+1) = (I - K C)(A e + Bw w + Bn n) - K (Dv v + Dn n),
+    which is the error of a predictor for the plant with C A in the place of C, noise [w, v],
+    Bw = [Bw, 0], Dw = [C Bw, Dv] and Dn = C Bn + Dn. So every design takes it as it is, and the K
+    it finds is the gain of the correction. (The gain of the predictor would be A K.)
+
+    Args:
+        A: (n, n) transition from one measurement to the next.
+        Bw: (n, p) process noise over that time.
+        Bn: (n, q) modelling error over that time.
+        C: (m, n) what is measured.
+        Dv: (m, v) factor of the measurement's noise, independent of w.
+        L: (r, n) what is estimated; the whole state by default.
+        Dn: (m, q) how n enters the measurement itself; nothing by default.
+
+    Raises:
+        TypeError: as `plant`.
+        ValueError: as `plant`, the blocks named as they are given here.
+    """
+    given = plant(A, Bw, Bn, C, None, Dn, L)
+    Dv = _matrix(Dv, "Dv")
+    n, m = len(given.A), len(given.C)
+    if Dv.shape[0] != m:
+        raise ValueError(
+            f"Dv is {Dv.shape}, must be ({m}, {Dv.shape[1]}): C says that y has {m} components"
+        )
+    made = Plant(
+        given.A,
+        np.hstack([given.Bw, np.zeros((n, Dv.shape[1]))]),
+        given.Bn,
+        given.C @ given.A,
+        np.hstack([given.C @ given.Bw, Dv]),
+        given.C @ given.Bn + given.Dn,
+        given.L,
+    )
+    _refuse_undetectable(made.A, made.C)
+    return made
+
+
+def error_system(plant: Plant, K: Any) -> ErrorSystem:
+    """The error of the observer with gain K: A - K C, Bw - K Dw, Bn - K Dn and L.
+
+    Raises:
+        TypeError: K is not made of real numbers.
+        ValueError: K is not (n, m) or not finite.
+    """
+    K = _matrix(K, "K")
+    n, m = len(plant.A), len(plant.C)
+    if K.shape != (n, m):
+        raise ValueError(f"K is {K.shape}, must be ({n}, {m}): x has {n} components and y has {m}")
+    return ErrorSystem(
+        plant.A - K @ plant.C, plant.Bw - K @ plant.Dw, plant.Bn - K @ plant.Dn, plant.L
+    )
+
+
+_ASKED = ("A", "Bw", "Bn", "C")
+
+
+def _matrix(value: Any, name: str) -> np.ndarray:
+    try:
+        numbers = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} is no matrix: its rows differ in length") from error
+    if numbers.dtype.kind not in "iuf":
+        raise TypeError(f"{name} holds {numbers.dtype}, real numbers are wanted")
+    if numbers.ndim != 2:
+        raise ValueError(f"{name} has shape {numbers.shape}, a matrix (rows of numbers) is wanted")
+    numbers = numbers.astype(float)
+    if not np.isfinite(numbers).all():
+        row, column = np.argwhere(~np.isfinite(numbers))[0]
+        raise ValueError(f"{name}[{row}, {column}] is {numbers[row, column]}, not a finite number")
+    return numbers
+
+
+def _feedthrough(D: Any, name: str, m: int, B: np.ndarray, signal: str) -> np.ndarray:
+    wanted = (m, B.shape[1])
+    if D is None:
+        return np.zeros(wanted)
+    D = _matrix(D, name)
+    if D.shape == wanted:
+        return D
+    why = f"C says that y has {m} components and B{signal} that {signal} has {wanted[1]}"
+    mend = ""
+    if D.shape[0] == m:
+        mend = (
+            f". If {signal} has parts of its own in y, give them columns: B{signal} = [B{signal}, "
+            f"0] and {name} = [0, {name}]"
+        )
+    raise ValueError(f"{name} is {D.shape}, must be {wanted}: {why}{mend}")
+
+
+def _refuse_undetectable(A: np.ndarray, C: np.ndarray) -> None:
+    """Raise if a mode with |eigenvalue| >= 1 is not seen in y (Popov-Belevitch-Hautus)."""
+    values = np.linalg.eigvals(A)
+    size = np.linalg.norm(C, axis=1, keepdims=True)
+    rows = C / np.where(size > 0.0, size, 1.0)
+    for value in values[np.abs(values) >= 1.0 - _MARGINAL]:
+        # The eigenvalues of a defective block scatter, their mean is accurate.
+        cluster = values[np.abs(values - value) < 1e-5 * np.abs(value)]
+        for eigenvalue in (value, cluster.mean()):
+            if (direction := _unseen(A, rows, eigenvalue)) is not None:
+                k = int(np.argmax(np.abs(direction)))
+                raise ValueError(
+                    f"(A, C) is not detectable: the mode of A at {_written(eigenvalue)} does not "
+                    f"decay by itself and is not seen in y = C x (it lies mostly along state {k}, "
+                    "counted from 0). Measure it, or leave it out of the state"
+                )
+
+
+def _unseen(A: np.ndarray, C: np.ndarray, eigenvalue: complex) -> np.ndarray | None:
+    """Direction x with A x = eigenvalue x and C x = 0, or None.
+
+    Columns are scaled to length one, so that the unit of a state does not decide.
+    """
+    test = np.vstack([A - eigenvalue * np.eye(len(A)), C])
+    size = np.linalg.norm(test, axis=0)
+    scale = np.where(size > 1e-13 * np.abs(eigenvalue), size, 1.0)
+    _, singular, right = np.linalg.svd(test / scale)
+    if singular[-1] > _UNSEEN:
+        return None
+    direction = right[-1].conj() / scale
+    return direction / np.linalg.norm(direction)
+
+
+def _written(eigenvalue: complex) -> str:
+    if abs(eigenvalue.imag) < 1e-9 * abs(eigenvalue):
+        return f"{eigenvalue.real:.6g}"
+    return f"{eigenvalue.real:.6g} {eigenvalue.imag:+.6g}i"
