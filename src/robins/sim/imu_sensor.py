@@ -279,10 +279,7 @@ def _report(triad: _Triad, state: _TriadState, normals, elapsed_s, dt, true, dv)
         clipped = jnp.abs(out) > limit
         out = jnp.clip(out, -limit, limit)
     if residue is not None:
-        due = out + residue
-        quantum = jnp.where(errors.quantum > 0.0, errors.quantum, 1.0)
-        out = jnp.where(errors.quantum > 0.0, jnp.round(due / quantum) * quantum, due)
-        residue = due - out
+        out, residue = quantise(out, residue, errors.quantum)
     bias = jnp.zeros(3) if now is None else now
     return _TriadState(markov, walk, residue), out, (bias, clipped)
 
@@ -342,6 +339,23 @@ def walk_step(
     strength, dt = jnp.asarray(strength, float), jnp.asarray(dt_s, float)
     end = bias + strength * jnp.sqrt(dt) * normal
     return end, 0.5 * dt * (bias + end), strength**2 * dt**3 / 12.0
+
+
+def quantise(
+    increment: Float[Array, "*b"], residue: Float[Array, "*b"], quantum: ArrayLike
+) -> tuple[Array, Array]:
+    """Whole counts of an increment, and what is left of it for the next one.
+
+    Args:
+        increment: of the interval.
+        residue: left by the interval before.
+        quantum: of a count; where zero, all is reported.
+    """
+    size = jnp.asarray(quantum, float)
+    due = increment + residue
+    some = jnp.where(size > 0.0, size, 1.0)
+    out = jnp.where(size > 0.0, jnp.round(due / some) * some, due)
+    return out, due - out
 
 
 def _less_tanh(u):
