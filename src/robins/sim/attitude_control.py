@@ -1,0 +1,145 @@
+"""Attitude control by wheels, and the unloading of their momentum by magnetorquers.
+
+The control law is quaternion feedback with the known torques fed forward (Wie 2008, "Space Vehicle
+Dynamics and Control", sec. 7.3). With theta_e the rotation vector of q_ref^-1 q, and w_e the rate
+against the reference,
+
+    u = J (alpha_r - wn^2 theta_e - 2 zeta wn w_e) + w x (J w + W h),
+
+everything in body axes, where alpha_r is the derivative of the reference's rate as the body sees
+it. If all of it is known, an error about one axis obeys theta'' + 2 zeta wn theta' + wn^2 theta = 0
+exactly, however the reference moves.
+
+The wheels give what is left after the magnetorquers, ``tau = pinv(W) (u - m x B)``, the least in
+norm; the magnetorquers are given ``m = k (h x B)/B^2``, whose torque is -k times the part of the
+wheels' momentum h across the field (Wertz 1978, sec. 19.3): the wheels pass h to the Earth.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.rotation import conjugate, multiply, rotate, to_rotvec
+from robins.sim import _given
+
+
+class Controller(NamedTuple):
+    """What the controller knows and its gains; `controller` makes one of checked numbers."""
+
+    inertia_b: Any  # (3, 3) kg m2
+    wn: Any  # rad/s, natural frequency of the attitude loop
+    zeta: Any  # its damping
+    desaturation_k: Any  # 1/s
+
+
+def controller(
+    inertia_b: Any, wn: float = 0.12, zeta: float = 0.9, desaturation_k: float = 2e-3
+) -> Controller:
+    """A controller of checked numbers.
+
+    Raises:
+        ValueError: an inertia that is not of shape (3, 3) and finite, or a gain that is negative.
+    """
+    J = _given.rows("inertia_b", inertia_b, 3, 3)
+    _given.number("inertia_b", J)
+    _given.number("wn", wn, 0.0, above=True)
+    _given.number("zeta", zeta, 0.0)
+    _given.number("desaturation_k", desaturation_k, 0.0)
+    gains = (jnp.asarray(x, float) for x in (wn, zeta, desaturation_k))
+    return Controller(J, *gains)
+
+
+def torque(
+    controller: Controller,
+    q_est: Float[Array, "4"],
+    omega_est_b: Float[Array, "3"],
+    q_ref: Float[Array, "4"],
+    omega_ref_b: Float[Array, "3"],
+    alpha_ref_b: Float[Array, "3"],
+    wheel_momentum_b: Float[Array, "3"],
+) -> Float[Array, "3"]:
+    """The torque [N m] wanted on the body, body axes.
+
+    Args:
+        controller: gains and inertia.
+        q_est: estimated attitude, body to inertial.
+        omega_est_b: estimated omega_ib_b [rad/s].
+        q_ref: wanted attitude.
+        omega_ref_b: wanted rate, in the wanted body axes.
+        alpha_ref_b: its derivative, in the wanted body axes.
+        wheel_momentum_b: W h, from the speeds of the wheels [N m s].
+    """
+    J, wn = controller.inertia_b, controller.wn
+    error = multiply(conjugate(q_ref), q_est)  # from the body axes to the wanted ones
+    back = conjugate(error)
+    omega_ref = rotate(back, omega_ref_b)
+    omega_error = omega_est_b - omega_ref
+    alpha_ref = rotate(back, alpha_ref_b) - jnp.cross(omega_error, omega_ref)
+    wanted = alpha_ref - wn**2 * to_rotvec(error) - 2.0 * controller.zeta * wn * omega_error
+    momentum = _times(J, omega_est_b) + wheel_momentum_b
+    return _times(J, wanted) + jnp.cross(omega_est_b, momentum)
+
+
+def allocate(pinv: Float[Array, "w 3"], torque_b: Float[Array, "3"]) -> Float[Array, "w"]:
+    """Torques of the wheels [N m] that make up ``torque_b``, what the magnetorquers leave."""
+    return _times(pinv, torque_b)
+
+
+def allocation_matrix(wheel_axes_b: Any, works: Any = 1.0) -> np.ndarray:
+    """The matrix (W, 3) that shares a torque among the wheels that work, least in norm.
+
+    Args:
+        wheel_axes_b: (3, W) unit columns.
+        works: (W,) 1, or 0 for a wheel that is lost and is given nothing.
+
+    Raises:
+        ValueError: what works does not turn the body about three independent axes.
+    """
+    axes = np.asarray(wheel_axes_b, float)
+    if axes.ndim != 2 or axes.shape[0] != 3:
+        raise ValueError(f"wheel_axes_b must have shape (3, W), got {axes.shape}")
+    there = np.asarray(_given.vector("works", works, axes.shape[1], low=0.0, high=1.0))
+    left = axes * there
+    rank = np.linalg.matrix_rank(left, tol=1e-6) if left.size else 0
+    if rank < 3:
+        working = np.flatnonzero(there).tolist()
+        raise ValueError(
+            f"wheels {working} of {axes.shape[1]} give torque about {rank} independent axes, and "
+            "three are needed: a body with fewer cannot be held by wheels alone"
+        )
+    return np.linalg.pinv(left)
+
+
+def desaturation_dipole(
+    k: Any,
+    momentum_b: Float[Array, "3"],
+    field_b_t: Float[Array, "3"],
+    limit_a_m2: Float[Array, "3"],
+) -> Float[Array, "3"]:
+    """Dipole [A m2] whose torque takes from the wheels their momentum across the field.
+
+    Past a limit all of it is scaled, so that the torque stays opposite to the momentum. None in no
+    field.
+
+    Args:
+        k: rate of the unloading [1/s].
+        momentum_b: W h, momentum of the wheels in body axes [N m s].
+        field_b_t: magnetic field in body axes.
+        limit_a_m2: most dipole of each axis.
+    """
+    size = jnp.sum(field_b_t * field_b_t)
+    there = size > 0.0
+    dipole = k * jnp.cross(momentum_b, field_b_t) / jnp.where(there, size, 1.0)
+    asked = jnp.abs(dipole)
+    over = asked > limit_a_m2
+    share = jnp.where(over, limit_a_m2 / jnp.where(over, asked, 1.0), 1.0)
+    return jnp.min(share) * dipole
+
+
+def _times(m, v) -> Array:
+    return jnp.sum(m * v[None, :], -1)

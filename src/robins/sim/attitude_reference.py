@@ -1,0 +1,136 @@
+"""Where a spacecraft is to point: attitudes with their exact rates and angular accelerations.
+
+A reference is a motion of reference axes d, to which the body axes b are to be brought: q_id, and
+omega_id and its derivative in the axes d. Turning about one axis after another keeps all three
+exact, for with q_ie = q_id exp(a x) about a fixed unit axis x of d,
+
+    omega_ie = R' omega_id + a' x,    alpha_ie = R' alpha_id - a' x  x  R' omega_id + a'' x.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from robins import _float64  # noqa: F401
+from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, normalise, rotate
+from robins.sim import _given
+from robins.sim.orbit import Orbit
+
+
+class Reference(NamedTuple):
+    """The attitude wanted at each epoch."""
+
+    q_ib: Any  # (E, 4) wanted body to inertial, scalar first, without jumps of sign
+    omega_b: Any  # (E, 3) rate against inertial [rad/s], in the wanted body axes
+    alpha_b: Any  # (E, 3) its derivative [rad/s^2], in the wanted body axes
+
+
+def nadir(orbit: Orbit) -> Reference:
+    """Towards the Earth's centre: x forward, y against the orbit's normal, z down.
+
+    The rate is that of any two-body orbit, -|r x v|/r^2 about y.
+    """
+    r, v = orbit.r_i_m, orbit.v_i_m_s
+    r_sq = jnp.sum(r * r, -1)
+    normal = jnp.cross(r, v)
+    area = jnp.sqrt(jnp.sum(normal * normal, -1))
+    z = -r / jnp.sqrt(r_sq)[:, None]
+    y = -normal / area[:, None]
+    q = from_dcm(jnp.stack([jnp.cross(y, z), y, z], -1))
+    none = jnp.zeros_like(area)
+    rate = -area / r_sq
+    change = -2.0 * rate * jnp.sum(r * v, -1) / r_sq
+    return Reference(
+        _without_jumps(q),
+        jnp.stack([none, rate, none], -1),
+        jnp.stack([none, change, none], -1),
+    )
+
+
+def inertial(q_ib: Any, time_s: Any) -> Reference:
+    """One attitude at all times.
+
+    Raises:
+        ValueError: not a unit quaternion.
+    """
+    q = _given.rows("q_ib", q_ib, 4)
+    _given.number("q_ib must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
+    still = jnp.zeros((len(time_s), 3))
+    return Reference(jnp.tile(normalise(q), (len(time_s), 1)), still, still)
+
+
+def slews(
+    base: Reference,
+    amplitude_rad: Any,
+    period_s: Any,
+    time_s: Any,
+    phase_rad: Any = 0.0,
+    fade_in_s: float = 0.0,
+) -> Reference:
+    """Sinusoidal turns about x, then the new y, then the new z, on top of a reference.
+
+    The angles are ``amplitude sin(2 pi t/period + phase)``, t from the first epoch. With
+    ``fade_in_s`` they start at zero, and so do their first two derivatives: they are multiplied by
+    the polynomial 10 s^3 - 15 s^4 + 6 s^5, s = t/fade_in up to 1.
+
+    Args:
+        base: what they are on top of.
+        amplitude_rad: (3,) or one number.
+        period_s: (3,) or one number, positive.
+        time_s: (E,) times of the epochs of the base.
+        phase_rad: (3,) or one number.
+        fade_in_s: how long they take to grow; 0: they are there at once, with their rates.
+
+    Raises:
+        ValueError: a number out of its range, or times that do not fit the base.
+    """
+    amplitude = _given.vector("amplitude_rad", amplitude_rad, 3)
+    period = _given.vector("period_s", period_s, 3, low=0.0, above=True)
+    phase = _given.vector("phase_rad", phase_rad, 3)
+    _given.number("fade_in_s", fade_in_s, 0.0)
+    time = _given.rows("time_s", time_s, base.q_ib.shape[0])
+    t = (time - time[0])[:, None]
+    turns = (2.0 * jnp.pi / period)[None]
+    sin, cos = jnp.sin(turns * t + phase[None]), jnp.cos(turns * t + phase[None])
+    s, s1, s2 = _fade_in(t, fade_in_s)
+    angle = s * sin
+    rate = s1 * sin + s * turns * cos
+    acceleration = s2 * sin + 2.0 * s1 * turns * cos - s * turns**2 * sin
+    for k in range(3):
+        axis = amplitude[k] * jnp.eye(3)[k][None]
+        base = _turned(base, *(x[:, k : k + 1] * axis for x in (angle, rate, acceleration)))
+    return base
+
+
+def _fade_in(t: Array, length_s: float) -> tuple[Any, Any, Any]:
+    """A factor that grows from 0 to 1, and its first two derivatives."""
+    if length_s == 0.0:
+        return 1.0, 0.0, 0.0
+    x = jnp.clip(t / length_s, 0.0, 1.0)
+    return (
+        x**3 * (10.0 - 15.0 * x + 6.0 * x**2),
+        30.0 * x**2 * (1.0 - x) ** 2 / length_s,
+        60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / length_s**2,
+    )
+
+
+def _turned(base: Reference, angle: Array, rate: Array, acceleration: Array) -> Reference:
+    """On top of a reference, a turn about a fixed axis; all three (E, 3) along it."""
+    turn = from_rotvec(angle)
+    back = conjugate(turn)
+    omega = rotate(back, base.omega_b)
+    return Reference(
+        normalise(multiply(base.q_ib, turn)),
+        omega + rate,
+        rotate(back, base.alpha_b) - jnp.cross(rate, omega) + acceleration,
+    )
+
+
+def _without_jumps(q: Float[Array, "epochs 4"]) -> Float[Array, "epochs 4"]:
+    """Each quaternion of the sign that is nearer to the one before."""
+    jumps: Bool[Array, " steps"] = jnp.sum(q[1:] * q[:-1], -1) < 0.0
+    sign = jnp.cumprod(jnp.where(jumps, -1.0, 1.0))
+    return jnp.concatenate([q[:1], sign[:, None] * q[1:]])

@@ -1,0 +1,258 @@
+"""A rigid spacecraft with reaction wheels and magnetorquers.
+
+With J the inertia, the columns of W the axes of the wheels, h their momenta along these and w the
+rate omega_ib_b, the body carries the angular momentum J w + W h, and
+
+    J w' = T + W tau - w x (J w + W h),    h' = -tau,    q' = 1/2 q (0, w),
+    T = 3 mu/r^5 (r_b x J r_b) + (m_residual + m) x B_b + disturbance
+
+(Wertz 1978, "Spacecraft Attitude Determination and Control", sec. 16.2 and 17.1). The state is not
+w but the total angular momentum in *inertial* axes, H = R(q) (J w + W h), of which
+
+    H' = R(q) T,    w = J^-1 (R(q)^T H - W h):
+
+the torque of the wheels has gone from it, and nothing that they do can change H by a bit.
+
+A step turns by Cayley's map, q = q0 (1, g)/sqrt(1 + g^2), whose rate is a polynomial,
+``g' = (w + g x w + g (g w))/2``; (g, H) is integrated by the classical Runge-Kutta method of order
+four (a Munthe-Kaas method: Hairer, Lubich & Wanner 2006, "Geometric Numerical Integration", sec.
+IV.8). So |q| = 1 without a projection, and the order is four in q and in H, while place, field and
+commands stay the same over a step. A step must turn by much less than half a turn.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.earth.wgs84 import GM
+from robins.rotation import conjugate, normalise, rotate
+from robins.sim import _given
+from robins.sim import _unrolled as u
+
+
+class Spacecraft(NamedTuple):
+    """What a spacecraft is built of; `spacecraft` makes one of checked numbers."""
+
+    inertia_b: Any  # (3, 3) kg m2, of all, wheels that do not spin included
+    wheel_axes_b: Any  # (3, W) unit columns
+    wheel_torque_limit: Any  # (W,) N m
+    wheel_momentum_limit: Any  # (W,) N m s
+    dipole_limit_a_m2: Any  # (3,) of the magnetorquers
+    residual_dipole_b: Any  # (3,) A m2, of everything else on board
+    wheel_works: Any  # (W,) 1, or 0 for a wheel that is lost
+
+
+class CraftState(NamedTuple):
+    """How it moves."""
+
+    q_ib: Any  # (4,) body to inertial, scalar first
+    momentum_i: Any  # (3,) N m s, total angular momentum in inertial axes
+    wheel_h: Any  # (W,) N m s, momenta of the wheels along their axes
+
+
+def spacecraft(
+    inertia_b: Any,
+    wheel_axes_b: Any,
+    wheel_torque_limit: Any,
+    wheel_momentum_limit: Any,
+    dipole_limit_a_m2: Any,
+    residual_dipole_b: Any = 0.0,
+    wheel_works: Any = 1.0,
+) -> Spacecraft:
+    """A spacecraft of checked numbers; one number stands for all wheels or axes.
+
+    Args:
+        inertia_b: (3, 3) moments of inertia [kg m2].
+        wheel_axes_b: (3, W) unit columns; W = 0 for a craft without wheels.
+        wheel_torque_limit: (W,) most torque of a wheel, either way [N m].
+        wheel_momentum_limit: (W,) most momentum of a wheel, either way [N m s].
+        dipole_limit_a_m2: (3,) most dipole of the magnetorquer of each axis, either way.
+        residual_dipole_b: (3,) dipole of everything else on board [A m2].
+        wheel_works: (W,) 1, or 0 for a wheel that gives no torque.
+
+    Raises:
+        ValueError: no rigid body has this inertia, an axis is not of unit length, or a number or
+            shape is out of its range.
+    """
+    axes = np.asarray(wheel_axes_b, float)
+    if axes.ndim != 2 or axes.shape[0] != 3:
+        raise ValueError(
+            f"wheel_axes_b has shape {axes.shape}: it must be (3, W), a column for each wheel"
+        )
+    length = np.sqrt(np.sum(axes**2, 0))
+    for k in np.flatnonzero(~(np.abs(length - 1.0) <= 1e-9)):
+        raise ValueError(
+            f"wheel_axes_b: the column of wheel {k}, {axes[:, k]}, has length {length[k]:.9g}; "
+            "axes have length one"
+        )
+    wheels = axes.shape[1]
+    works = _given.vector("wheel_works", wheel_works, wheels, low=0.0, high=1.0)
+    if not np.all(np.isin(works, (0.0, 1.0))):
+        raise ValueError(f"wheel_works must be 0 or 1 for each wheel, got {wheel_works}")
+    return Spacecraft(
+        jnp.asarray(_inertia(inertia_b)),
+        jnp.asarray(axes),
+        _given.vector("wheel_torque_limit", wheel_torque_limit, wheels, low=0.0),
+        _given.vector("wheel_momentum_limit", wheel_momentum_limit, wheels, low=0.0),
+        _given.vector("dipole_limit_a_m2", dipole_limit_a_m2, 3, low=0.0),
+        _given.vector("residual_dipole_b", residual_dipole_b, 3),
+        works,
+    )
+
+
+def _inertia(inertia_b: Any) -> np.ndarray:
+    J = np.asarray(inertia_b, float)
+    if J.shape != (3, 3) or not np.all(np.isfinite(J)):
+        raise ValueError(f"inertia_b must be a finite matrix (3, 3), got\n{J}")
+    if not np.allclose(J, J.T, rtol=0.0, atol=1e-12 * np.max(np.abs(J))):
+        raise ValueError(f"inertia_b must be symmetric, got\n{J}")
+    J = 0.5 * (J + J.T)
+    low, middle, high = moments = np.linalg.eigvalsh(J)
+    if low <= 0.0:
+        raise ValueError(f"inertia_b must be positive definite; its principal moments: {moments}")
+    if low + middle < high * (1.0 - 1e-12):
+        raise ValueError(
+            f"inertia_b has principal moments {moments}: in a rigid body none is greater than the "
+            "sum of the others; are the products of inertia of the right sign?"
+        )
+    return J
+
+
+def craft_state(craft: Spacecraft, q_ib: Any, omega_b: Any, wheel_h: Any = 0.0) -> CraftState:
+    """The state of given attitude, rate omega_ib_b [rad/s] and momenta of the wheels [N m s].
+
+    Raises:
+        ValueError: shapes that do not fit, or a quaternion that is not of unit length.
+    """
+    q, omega = _given.rows("q_ib", q_ib, 4), _given.rows("omega_b", omega_b, 3)
+    _given.number("q_ib must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
+    _given.number("omega_b", omega)
+    h = _given.vector("wheel_h", wheel_h, craft.wheel_axes_b.shape[1])
+    q = normalise(q)
+    total = _times(craft.inertia_b, omega) + wheel_momentum_b(craft, h)
+    return CraftState(q, rotate(q, total), h)
+
+
+def wheel_momentum_b(craft: Spacecraft, wheel_h: Float[Array, "w"]) -> Float[Array, "3"]:
+    """W h, the momentum of all wheels in body axes [N m s]."""
+    return _times(craft.wheel_axes_b, wheel_h)
+
+
+def rate_b(craft: Spacecraft, state: CraftState) -> Float[Array, "3"]:
+    """The rate omega_ib_b [rad/s]."""
+    total = rotate(conjugate(state.q_ib), state.momentum_i)
+    left = u.scalars(total - wheel_momentum_b(craft, state.wheel_h))
+    return jnp.stack(u.apply(u.symmetric_inverse(u.matrix(craft.inertia_b)), left))
+
+
+def gravity_gradient(inertia_b: Float[Array, "3 3"], r_b_m: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Torque [N m] of gravity on a body at r_b from the Earth's centre, 3 mu/r^5 (r_b x J r_b).
+
+    Far from the Earth and for a body small beside its distance (Wertz 1978, eq. 17-31). None at
+    r_b = 0, which stands for no Earth.
+    """
+    return jnp.stack(_gravity_gradient(u.matrix(inertia_b), u.scalars(r_b_m)))
+
+
+def _gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
+    sq = u.dot(r, r)
+    none = sq == 0.0
+    safe = jnp.where(none, 1.0, sq)
+    strength = jnp.where(none, 0.0, 3.0 * GM / (safe * safe * jnp.sqrt(safe)))
+    return u.times(strength, u.cross(r, u.apply(J, r)))
+
+
+def advance(
+    craft: Spacecraft,
+    state: CraftState,
+    wheel_torque: Float[Array, "w"],
+    dipole_b: Float[Array, "3"],
+    r_i_m: Float[Array, "3"],
+    field_i_t: Float[Array, "3"],
+    disturbance_b: Float[Array, "3"],
+    dt_s: Any,
+) -> CraftState:
+    """The state a step later.
+
+    A wheel gives no more than its torque limit, none if it is lost, and none towards a momentum
+    limit it has reached; it comes to stop at the limit exactly, by the constant torque that brings
+    it there in this step. The magnetorquers give no more than their limit in each axis.
+
+    Args:
+        craft: what it is built of.
+        state: at the beginning.
+        wheel_torque: (W,) asked of the wheels, on the body, over the step [N m].
+        dipole_b: (3,) asked of the magnetorquers over the step [A m2].
+        r_i_m: (3,) place from the Earth's centre, inertial axes; of the middle of the step, or
+            near it. Zeros: no gravity gradient.
+        field_i_t: (3,) magnetic field there, inertial axes.
+        disturbance_b: (3,) any other torque [N m], body axes.
+        dt_s: length of the step.
+    """
+    h0, h1 = state.wheel_h, _wheels_after(craft, state.wheel_h, wheel_torque, dt_s)
+    W = u.matrix(craft.wheel_axes_b)
+    held, gained = u.apply(W, u.scalars(h0)), u.apply(W, u.scalars(h1 - h0))
+    J = u.matrix(craft.inertia_b)
+    J_inv = u.symmetric_inverse(J)
+    limit = craft.dipole_limit_a_m2
+    dipole = u.scalars(craft.residual_dipole_b + jnp.clip(dipole_b, -limit, limit))
+    other = u.scalars(disturbance_b)
+
+    # Within the step everything is seen in the axes 0 that the body has at its beginning.
+    C = u.dcm(u.scalars(state.q_ib))
+    to_0 = u.transposed(C)
+    start = [u.apply(to_0, u.scalars(v)) for v in (state.momentum_i, r_i_m, field_i_t)]
+    total, place, field = (u.scalars(v) for v in _compute_now(*(jnp.stack(v) for v in start)))
+
+    def slope(y, share):
+        """Rates of (g, H - H0) in axes 0, a share of the step after its beginning."""
+        g, added = u.scalars(y)[:3], u.scalars(y)[3:]
+        wheels = u.plus(held, u.times(share, gained))
+        omega = u.apply(J_inv, u.minus(_turned(g, u.plus(total, added), -1.0), wheels))
+        torque = u.plus(
+            _gravity_gradient(J, _turned(g, place, -1.0)),
+            u.cross(dipole, _turned(g, field, -1.0)),
+            other,
+        )
+        along = u.plus(omega, u.cross(g, omega), u.times(u.dot(g, omega), g))
+        (rate,) = _compute_now(jnp.stack([*u.times(0.5, along), *_turned(g, torque, 1.0)]))
+        return rate
+
+    k1 = slope(jnp.zeros(6), 0.0)
+    k2 = slope(0.5 * dt_s * k1, 0.5)
+    k3 = slope(0.5 * dt_s * k2, 0.5)
+    k4 = slope(dt_s * k3, 1.0)
+    step = u.scalars(dt_s / 6.0 * (k1 + 2.0 * (k2 + k3) + k4))
+    q = jnp.stack(u.product(u.scalars(state.q_ib), (1.0, *step[:3])))
+    momentum = state.momentum_i + jnp.stack(u.apply(C, step[3:]))
+    return CraftState(q / jnp.sqrt(jnp.sum(q * q)), momentum, h1)
+
+
+def _wheels_after(craft: Spacecraft, h, torque, dt_s) -> Array:
+    most = craft.wheel_torque_limit
+    # A wheel that was given more than its limit may lose it, but is not torn back to it.
+    room = jnp.maximum(craft.wheel_momentum_limit, jnp.abs(h))
+    given = craft.wheel_works * jnp.clip(torque, -most, most)
+    return jnp.clip(h - dt_s * given, -room, room)
+
+
+def _turned(g: u.Three, v: u.Three, sign: float) -> u.Three:
+    """``R(q) v``, or its inverse for a sign of -1, of the quaternion (1, g)/sqrt(1 + g^2)."""
+    across = u.times(sign, u.cross(g, v))
+    twice = 2.0 / (1.0 + u.dot(g, g))
+    return u.plus(v, u.times(twice, u.plus(across, u.times(sign, u.cross(g, across)))))
+
+
+def _compute_now(*arrays: Array) -> list[Array]:
+    """Keep XLA from computing these once more for each component of what follows from them."""
+    return jax.lax.optimization_barrier(list(arrays))
+
+
+def _times(m, v) -> Array:
+    return jnp.sum(m * v[None, :], -1)
