@@ -5,6 +5,7 @@ to the error of the estimate while the H-infinity norm from n to it stays below 
 every answer carries its true norms.
 """
 
+from robins.filters.synthesis.closed_form import Isotropic, closed_form, isotropic
 from robins.filters.synthesis.design import (
     Design,
     NotCertified,
@@ -20,20 +21,35 @@ from robins.filters.synthesis.plant import (
     error_system,
     plant,
 )
+from robins.filters.synthesis.riccati import (
+    inflated_gain,
+    kalman_design,
+    kalman_gain,
+    least_riccati_gamma,
+    riccati,
+)
 
 __all__ = [
     "Design",
     "ErrorSystem",
+    "Isotropic",
     "NotCertified",
     "Plant",
     "Unreachable",
     "certify",
     "certify_full",
+    "closed_form",
     "current_form",
     "error_system",
     "h2_norm",
     "hinf_norm",
+    "inflated_gain",
+    "isotropic",
+    "kalman_design",
+    "kalman_gain",
+    "least_riccati_gamma",
     "peak_gain",
     "plant",
+    "riccati",
     "spectral_radius",
 ]

@@ -30,12 +30,12 @@ def gramian(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     added, so that the result is as accurate in a state with small numbers as in one with large.
     """
     power, P = A, B @ B.T
-    for _ in range(_SQUARINGS):
+    for squaring in range(_SQUARINGS):
         more = power @ P @ power.T
         P = P + more
         power = power @ power
-        diagonal = np.diagonal(P)
-        if not np.any(np.diagonal(more) > 1e-17 * diagonal):
+        grows = np.any(np.diagonal(more) > 1e-17 * np.diagonal(P))
+        if not grows and 2**squaring >= len(A):  # what takes n steps to be seen may still come
             break
     return 0.5 * (P + P.T)
 

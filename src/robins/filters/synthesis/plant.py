@@ -59,9 +59,8 @@ def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: A
         ValueError: a block is no matrix, has the wrong shape or is not finite, or a mode that does
             not decay by itself is not seen in y. The message names the block or the mode.
     """
-    A, Bw, Bn, C = (
-        _matrix(value, name) for value, name in zip((A, Bw, Bn, C), _ASKED, strict=True)
-    )
+    named = ((A, "A"), (Bw, "Bw"), (Bn, "Bn"), (C, "C"))
+    A, Bw, Bn, C = (_matrix(value, name) for value, name in named)
     n, m = A.shape[0], C.shape[0]
     if A.shape[1] != n or n == 0:
         raise ValueError(f"A is {A.shape}: the transition of a state must be square")
@@ -142,9 +141,6 @@ def error_system(plant: Plant, K: Any) -> ErrorSystem:
     return ErrorSystem(
         plant.A - K @ plant.C, plant.Bw - K @ plant.Dw, plant.Bn - K @ plant.Dn, plant.L
     )
-
-
-_ASKED = ("A", "Bw", "Bn", "C")
 
 
 def _matrix(value: Any, name: str) -> np.ndarray:

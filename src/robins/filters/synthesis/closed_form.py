@@ -1,0 +1,137 @@
+"""The design of a plant whose error is one number: a scaled rotation, measured whole.
+
+With A = rho U, U orthogonal, C = I, noise of variance sw^2 in every state and ss^2 in every
+measurement, a gain K = k U leaves the error e(k+1) = f U e + ..., f = rho - k, and
+
+    |T_we|_2^2 = |L|_F^2 (sw^2 + k^2 ss^2) / (1 - f^2),    |T_ne|_inf = l b / (1 - f),   0 <= f < 1
+
+b the greatest singular value of Bn and l that of L, whose rows must be orthogonal and of one
+length. (The second is reached where Bn drives an invariant direction of U at full strength, as the
+angular rate does in a quaternion; else it is a bound.) No norm of a matrix, no equation to iterate:
+the attitude quaternion of a turning body is of this kind, at every instant anew, with rho = 1.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis.design import Design, Unreachable, certify
+from robins.filters.synthesis.norms import Number
+from robins.filters.synthesis.plant import Plant
+from robins.filters.synthesis.riccati import check_gamma
+
+METHOD = "closed-form"
+
+_SAME = 1e-9  # relative; what differs by less counts as equal
+
+
+class Isotropic(NamedTuple):
+    """A plant of this kind."""
+
+    rho: float  # size of A
+    U: np.ndarray  # (n, n) orthogonal
+    sw: float  # standard deviation of the noise of each state
+    ss: float  # and of each measurement
+    b: float  # greatest singular value of Bn
+    weight: float  # that of L
+    size: float  # |L|_F
+
+    def kalman(self) -> float:
+        """K of the Kalman filter, rho p / (p + ss^2), p the variance after a prediction."""
+        sw2, ss2 = self.sw**2, self.ss**2
+        half = 0.5 * (sw2 - ss2 * (1.0 - self.rho**2))
+        root = np.hypot(half, self.sw * self.ss)
+        # The form of the positive root that subtracts nothing.
+        p = half + root if half > 0.0 else (sw2 * ss2 / (root - half) if root > half else 0.0)
+        return float(self.rho * p / (p + ss2)) if p + ss2 > 0.0 else self.rho
+
+    def gain(self, gamma: Number) -> float:
+        """Least k that meets gamma, but no less than the Kalman filter's.
+
+        Raises:
+            Unreachable: k would exceed rho; gamma is below l b.
+        """
+        k = max(self.kalman(), self.rho - 1.0 + self.weight * self.b / gamma)
+        if k > self.rho * (1.0 + 1e-12):
+            least = self.weight * self.b
+            raise Unreachable(
+                f"no gain k <= rho = {self.rho:.6g} meets gamma {gamma:.6g}: the least gamma of "
+                f"this form is {least:.6g}, at k = rho",
+                least,
+            )
+        return min(k, self.rho)
+
+    def h2(self, k: Number) -> float:
+        """H2 norm of the gain k."""
+        f = self.rho - k
+        return float(self.size * np.sqrt((self.sw**2 + k**2 * self.ss**2) / (1.0 - f**2)))
+
+    def hinf(self, k: Number) -> float:
+        """H-infinity norm of the gain k, or a bound: see the module."""
+        return float(self.weight * self.b / (1.0 - abs(self.rho - k)))
+
+
+def isotropic(plant: Plant) -> Isotropic:
+    """See that a plant is of this kind.
+
+    Raises:
+        ValueError: it is not; the message says which block.
+    """
+    n = len(plant.A)
+    size = float(np.linalg.norm(plant.A, ord=2))
+    if size == 0.0:
+        raise ValueError("no closed form: A is zero")
+    spread = plant.Bw @ plant.Bw.T
+    noise = plant.Dw @ plant.Dw.T
+    sw2, ss2 = np.trace(spread) / n, np.trace(noise) / len(noise)
+    each = plant.L.T @ plant.L
+    eye = np.eye(n)
+    demands = (
+        (_same(plant.A @ plant.A.T / size**2, eye), "A is no multiple of an orthogonal matrix"),
+        (plant.C.shape == (n, n) and _same(plant.C, eye), "C is not the identity"),
+        (_same(spread, sw2 * eye), "Bw Bw' is no multiple of the identity"),
+        (_same(noise, ss2 * eye), "Dw Dw' is no multiple of the identity"),
+        (np.abs(plant.Bw @ plant.Dw.T).max() <= _SAME * np.sqrt(sw2 * ss2), "w is in both x and y"),
+        (not np.any(plant.Dn), "n enters the measurement"),
+        (_same(each, np.trace(each) / n * eye), "L'L is no multiple of the identity"),
+    )
+    for met, why in demands:
+        if not met:
+            raise ValueError(f"no closed form: {why}")
+    return Isotropic(
+        size,
+        plant.A / size,
+        float(np.sqrt(sw2)),
+        float(np.sqrt(ss2)),
+        float(np.linalg.norm(plant.Bn, ord=2)) if plant.Bn.size else 0.0,
+        float(np.linalg.norm(plant.L, ord=2)),
+        float(np.linalg.norm(plant.L)),
+    )
+
+
+def closed_form(plant: Plant, gamma: Number) -> Design:
+    """The gain k U that meets gamma with the least H2 norm, certified as every other.
+
+    Args:
+        plant: A a multiple of an orthogonal matrix, C the identity, noises isotropic and apart.
+        gamma: bound on the H-infinity norm; inf is the Kalman filter.
+
+    Raises:
+        Unreachable: gamma is below the least of this form, which the message names.
+        ValueError: the plant is not of this kind, or gamma is not positive.
+    """
+    check_gamma(gamma)
+    began = time.perf_counter()
+    scalar = isotropic(plant)
+    k = scalar.gain(gamma)
+    seconds = time.perf_counter() - began
+    return certify(
+        plant, k * scalar.U, method=METHOD, gamma=gamma, bound=scalar.h2(k), seconds=seconds
+    )
+
+
+def _same(matrix: np.ndarray, wanted: np.ndarray) -> bool:
+    return bool(np.abs(matrix - wanted).max() <= _SAME * np.abs(wanted).max())

@@ -1,0 +1,243 @@
+"""Gains from Riccati equations: the Kalman filter, and the one that takes n for noise."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from robins.filters.synthesis.design import Design, Unreachable, certify
+from robins.filters.synthesis.norms import Levels, Number, gramian, hinf_norm, spectral_radius
+from robins.filters.synthesis.plant import Plant, error_system
+
+METHOD = "riccati"
+
+_DECADES = np.arange(-2.0, 12.1, 0.25)  # of lambda, about the one that makes n as large as w
+_RTOL = 1e-10  # of lambda
+_STEPS = 12  # of Newton's iteration at most; it converges quadratically
+
+
+def kalman_gain(plant: Plant) -> np.ndarray:
+    """Gain (n, m) of the steady Kalman filter, the least H2 norm there is; n counts for nothing.
+
+    The Riccati equation is the one with cross terms, E[Bw w (Dw w)'] = Bw Dw'.
+
+    Raises:
+        ValueError: there is no steady state (a mode on the unit circle is not driven by w), or a
+            combination of measurements is free of noise and known beforehand.
+    """
+    return _gain(plant, 0.0)
+
+
+def kalman_design(plant: Plant) -> Design:
+    """The steady Kalman filter as a design.
+
+    Raises:
+        ValueError: as `kalman_gain`.
+    """
+    began = time.perf_counter()
+    K = kalman_gain(plant)
+    seconds = time.perf_counter() - began
+    return certify(plant, K, method="kalman", lambda_=0.0, seconds=seconds)
+
+
+def inflated_gain(plant: Plant, lambda_: Number) -> np.ndarray:
+    """Kalman gain (n, m) for the noise [w, sqrt(lambda) n].
+
+    Raises:
+        ValueError: lambda is negative; or as `kalman_gain`.
+    """
+    if not 0.0 <= lambda_ < np.inf:
+        raise ValueError(f"lambda must be a number from 0 on, got {lambda_}")
+    return _gain(plant, float(lambda_))
+
+
+def riccati(plant: Plant, gamma: Number) -> Design:
+    """The Kalman filter for noise [w, sqrt(lambda) n], with the least lambda that meets gamma.
+
+    The modelling error n is taken for white noise, ever more of it until the true H-infinity norm
+    from n to the error is gamma. No semidefinite programme is solved, and run with its own
+    covariance it is the ordinary Kalman filter with Q + lambda Bn Bn' (`channel_inflation`), start
+    and outages included. Where n and y see the same states it is as good as any gain; where n
+    drives a state that is not measured a better one can exist, and gamma can be out of reach.
+
+    Args:
+        plant: what is filtered.
+        gamma: bound on the H-infinity norm; inf is the Kalman filter.
+
+    Raises:
+        Unreachable: no lambda meets gamma; the message names the least gamma that one can.
+        ValueError: gamma is not positive; or as `kalman_gain`.
+    """
+    check_gamma(gamma)
+    began = time.perf_counter()
+    K, lambda_ = _search(plant, float(gamma))
+    seconds = time.perf_counter() - began
+    return certify(plant, K, method=METHOD, gamma=gamma, lambda_=lambda_, seconds=seconds)
+
+
+def least_riccati_gamma(plant: Plant) -> float:
+    """Least H-infinity norm of the Kalman gains for noise [w, sqrt(lambda) n], over all lambda.
+
+    Raises:
+        ValueError: as `kalman_gain`.
+    """
+    return _least(plant)[1]
+
+
+def check_gamma(gamma: Number) -> None:
+    """Raise a ValueError unless gamma is a positive number or inf."""
+    if not gamma > 0.0:
+        raise ValueError(f"gamma must be positive, or inf for no bound; got {gamma}")
+
+
+def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
+    """The gain for the least lambda that meets gamma, and that lambda."""
+
+    def meets(K: np.ndarray) -> bool:
+        e = error_system(plant, K)
+        if spectral_radius(e.A) >= 1.0:
+            return False
+        return not Levels.of(e.A, e.Bn, e.L, np.zeros((len(e.L), e.Bn.shape[1]))).reached(gamma)
+
+    K = _gain(plant, 0.0)
+    if np.isinf(gamma) or meets(K):
+        return K, 0.0
+    grid, below = _grid(plant, K), 0.0
+    for above in grid:
+        if (K := _attempt(plant, above)) is not None and meets(K):
+            return _bisect(plant, meets, below, above, K)
+        below = above
+    above, least = _least(plant)
+    if least <= gamma:
+        below = max(grid[grid < above], default=0.0)
+        K = _gain(plant, above)
+        return _bisect(plant, meets, below, above, K)
+    raise Unreachable(
+        f"the Riccati equation cannot reach gamma {gamma:.6g} for any lambda: the least is "
+        f"{least:.6g}. Raise gamma, or take the observer form of the LMI",
+        least,
+    )
+
+
+def _bisect(
+    plant: Plant,
+    meets: Callable[[np.ndarray], bool],
+    below: float,
+    above: float,
+    K: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    while above - below > _RTOL * above:
+        middle = 0.5 * (below + above)
+        if not below < middle < above:
+            break
+        gain = _attempt(plant, middle)
+        if gain is not None and meets(gain):
+            above, K = middle, gain
+        else:
+            below = middle
+    return K, above
+
+
+def _least(plant: Plant) -> tuple[float, float]:
+    """The lambda of the least H-infinity norm, and that norm."""
+
+    def norm(lambda_: float) -> float:
+        K = _attempt(plant, lambda_)
+        if K is None:
+            return np.inf
+        e = error_system(plant, K)
+        return hinf_norm(e.A, e.Bn, e.L)
+
+    grid = np.concatenate([[0.0], _grid(plant, _gain(plant, 0.0))])
+    norms = [norm(value) for value in grid]
+    best = int(np.argmin(norms))
+    found = grid[best], norms[best]
+    if 1 < best < len(grid) - 1:
+        ends = np.log(grid[best - 1]), np.log(grid[best + 1])
+        fine = scipy.optimize.minimize_scalar(
+            lambda exponent: norm(float(np.exp(exponent))),
+            bounds=ends, method="bounded", options={"xatol": 1e-9},
+        )  # fmt: skip
+        if fine.fun < found[1]:
+            found = float(np.exp(fine.x)), float(fine.fun)
+    return float(found[0]), float(found[1])
+
+
+def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
+    """Values of lambda about the one that makes n as large as w in some state or output."""
+    e = error_system(plant, K)
+    P = gramian(e.A, e.Bw)
+    S = plant.C @ P @ plant.C.T + plant.Dw @ plant.Dw.T
+    noise = np.concatenate([np.diagonal(P), np.diagonal(S)])[:, None]
+    error = np.vstack([plant.Bn, plant.Dn]) ** 2
+    seen = (noise > 0.0) & (error > 0.0)
+    share = np.where(seen, error / np.where(noise > 0.0, noise, 1.0), 0.0)
+    largest = float(np.max(share, initial=0.0))
+    return 10.0**_DECADES / (largest or 1.0)
+
+
+def _attempt(plant: Plant, lambda_: float) -> np.ndarray | None:
+    try:
+        return _gain(plant, lambda_)
+    except ValueError:
+        return None
+
+
+def _gain(plant: Plant, lambda_: float) -> np.ndarray:
+    A, C = plant.A, plant.C
+    B = np.hstack([plant.Bw, np.sqrt(lambda_) * plant.Bn])
+    D = np.hstack([plant.Dw, np.sqrt(lambda_) * plant.Dn])
+    state = _sizes(B)
+    output = _sizes(np.hstack([D, C @ B]))
+    A_, B_ = A * state / state[:, None], B / state[:, None]
+    C_, D_ = C * state / output[:, None], D / output[:, None]
+    advice = "a mode of A on the unit circle is not driven by w: give it noise in Bw"
+    try:
+        P = scipy.linalg.solve_discrete_are(A_.T, C_.T, B_ @ B_.T, D_ @ D_.T, s=B_ @ D_.T)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(f"the Kalman filter has no steady state: {advice} ({error})") from error
+    K = _update(A_, B_, C_, D_, P)
+    if not (radius := spectral_radius(A_ - K @ C_)) < 1.0:
+        raise ValueError(
+            f"the Kalman filter has no steady state, its error decays by {radius:.9g}: {advice}"
+        )
+    return _polished(A_, B_, C_, D_, K) * state[:, None] / output
+
+
+def _polished(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, K: np.ndarray
+) -> np.ndarray:
+    """Newton's iteration (Hewer 1971) from a stabilising gain, to the last digits."""
+    change = np.inf
+    for _ in range(_STEPS):
+        better = _update(A, B, C, D, gramian(A - K @ C, B - K @ D))
+        smaller = float(np.max(np.abs(better - K)))
+        if not smaller < change or spectral_radius(A - better @ C) >= 1.0:
+            break
+        K, change = better, smaller
+        if change <= 1e-15 * float(np.max(np.abs(K))):
+            break
+    return K
+
+
+def _update(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, P: np.ndarray
+) -> np.ndarray:
+    """K = (A P C' + B D') (C P C' + D D')^-1."""
+    S = C @ P @ C.T + D @ D.T
+    try:
+        return scipy.linalg.solve(S, C @ P @ A.T + D @ B.T, assume_a="pos").T
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            "some combination of measurements is known beforehand and free of noise: give each "
+            "noise of its own in Dw"
+        ) from error
+
+
+def _sizes(rows: np.ndarray) -> np.ndarray:
+    size = np.linalg.norm(rows, axis=1)
+    return np.where(size > 1e-150, size, 1.0)
