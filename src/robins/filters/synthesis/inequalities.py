@@ -1,0 +1,123 @@
+"""The linear matrix inequalities of filter designs, in the symbols of their equations.
+
+For a channel of white noise w and one of a modelling error n, as docs/filters/mixed.md numbers
+them. A function takes the module `cvxpy` (an optional package, which nobody else imports), the
+plant's matrices by name and what the inequalities are wanted for, and returns the unknowns by
+symbol and the matrices that must be positive semidefinite. Gains K are those of an observer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+Aim = Literal["h2", "mixed", "least"]
+"""Least Trace(H) for w alone, least Trace(H) with a gain of at most 1 from n, least gain from n."""
+
+Inequalities = tuple[dict[str, Any], list[Any]]
+
+
+def common(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
+    """(9) and (10): one Lyapunov matrix X for both channels; K = X^-1 Y."""
+    X = cp.Variable(plant["A"].shape, symmetric=True, name="X")
+    Y = cp.Variable(plant["C"].T.shape, name="Y")
+    unknowns, noise, error = {"X": X, "Y": Y}, [], []
+    if aim != "least":
+        unknowns["H"] = _trace_matrix(cp, plant)
+        noise = [_noise(cp, plant, unknowns["H"], X, X, Y)]
+    if aim == "h2":
+        noise += [_energy(cp, plant, X, X, X, Y)]
+    else:
+        unknowns |= _bound(cp, aim)
+        error = [_gain(cp, plant, unknowns.get("g2", 1.0), X, X, X, Y)]
+    return unknowns, noise + error
+
+
+def slack(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
+    """The same with a Lyapunov matrix for each channel, X2 and Xi, joined by G; K = G^-1 Y."""
+    A = plant["A"]
+    G = cp.Variable(A.shape, name="G")
+    Y = cp.Variable(plant["C"].T.shape, name="Y")
+    unknowns, noise, error = {"G": G, "Y": Y}, [], []
+    if aim != "least":
+        H, X2 = _trace_matrix(cp, plant), cp.Variable(A.shape, symmetric=True, name="X2")
+        unknowns |= {"H": H, "X2": X2}
+        corner = G + G.T - X2
+        noise = [_noise(cp, plant, H, corner, G, Y), _energy(cp, plant, corner, X2, G, Y)]
+    if aim != "h2":
+        Xi = cp.Variable(A.shape, symmetric=True, name="Xi")
+        unknowns |= {"Xi": Xi} | _bound(cp, aim)
+        error = [_gain(cp, plant, unknowns.get("g2", 1.0), G + G.T - Xi, Xi, G, Y)]
+    return unknowns, noise + error
+
+
+def full(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
+    """(6) and (7): a filter with matrices of its own, which (8) makes of R, P, S, Q and U."""
+    A, Bw, Bn, C, Dw, Dn, L = (plant[name] for name in ("A", "Bw", "Bn", "C", "Dw", "Dn", "L"))
+    R, P = (cp.Variable(A.shape, symmetric=True, name=name) for name in "RP")
+    S, Q = cp.Variable(A.shape, name="S"), cp.Variable(C.T.shape, name="Q")
+    U = cp.Variable(L.shape, name="U")
+    unknowns, moved = {"R": R, "P": P, "S": S, "Q": Q, "U": U} | _bound(cp, aim), P @ A + Q @ C
+    error = _symmetric(
+        cp,
+        [R, R, R @ A, R @ A, R @ Bn, 0],
+        [P, moved + S, moved, P @ Bn + Q @ Dn, 0],
+        [R, R, 0, (L - U).T],
+        [P, 0, L.T],
+        [unknowns.get("g2", 1.0) * np.eye(Bn.shape[1]), 0],
+        [np.eye(L.shape[0])],
+    )
+    if aim == "least":
+        return unknowns, [error]
+    H = unknowns["H"] = _trace_matrix(cp, plant)
+    return unknowns, [_symmetric(cp, [H, (R @ Bw).T, (P @ Bw + Q @ Dw).T], [R, R], [P]), error]
+
+
+def _trace_matrix(cp: Any, plant: dict[str, Any]) -> Any:
+    """H, whose trace bounds the squared H2 norm."""
+    p = plant["Bw"].shape[1]
+    return cp.Variable((p, p), symmetric=True, name="H")
+
+
+def _bound(cp: Any, aim: Aim) -> dict[str, Any]:
+    """The squared gain from n, where it is sought."""
+    return {"g2": cp.Variable(name="g2")} if aim == "least" else {}
+
+
+def _noise(cp: Any, plant: dict[str, Any], H: Any, corner: Any, X: Any, Y: Any) -> Any:
+    """(9)."""
+    return _symmetric(cp, [H, (X @ plant["Bw"] - Y @ plant["Dw"]).T], [corner])
+
+
+def _energy(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any) -> Any:
+    """(10) without the row and the column of n."""
+    L = plant["L"]
+    return _symmetric(
+        cp, [corner, G @ plant["A"] - Y @ plant["C"], 0], [X, L.T], [np.eye(L.shape[0])]
+    )
+
+
+def _gain(cp: Any, plant: dict[str, Any], g2: Any, corner: Any, X: Any, G: Any, Y: Any) -> Any:
+    """(10)."""
+    L, Bn = plant["L"], plant["Bn"]
+    error, disturbed = G @ plant["A"] - Y @ plant["C"], G @ Bn - Y @ plant["Dn"]
+    return _symmetric(
+        cp,
+        [corner, error, disturbed, 0],
+        [X, 0, L.T],
+        [g2 * np.eye(Bn.shape[1]), 0],
+        [np.eye(L.shape[0])],
+    )
+
+
+def _symmetric(cp: Any, *rows: Sequence[Any]) -> Any:
+    """A matrix of blocks from those on and above its diagonal; 0 stands for a zero block."""
+    size = [row[0].shape[0] for row in rows]
+    whole: list[list[Any]] = [[None] * len(rows) for _ in rows]
+    for i, row in enumerate(rows):
+        for j, block in enumerate(row, start=i):
+            entry = np.zeros((size[i], size[j])) if isinstance(block, int) else block
+            whole[i][j], whole[j][i] = entry, entry if i == j else entry.T
+    return cp.bmat(whole)

@@ -1,0 +1,109 @@
+"""Semidefinite programs of filter designs, built once a shape and solved for many plants.
+
+For a small design cvxpy spends most of its time on turning expressions into the solver's form. Here
+the plant's matrices are parameters of a problem that obeys the rules of disciplined *parametrised*
+programming, so that this happens once; another plant of the same shape only fills in numbers.
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from threading import Lock
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis import inequalities
+from robins.filters.synthesis.inequalities import Aim
+from robins.filters.synthesis.plant import Plant
+
+Form = Literal["common", "slack", "full"]
+
+_LOCK = Lock()  # a program's parameters belong to one solve at a time
+
+
+class MissingExtra(ImportError):
+    """A design by LMI was asked for without the packages that solve one."""
+
+
+class Answer(NamedTuple):
+    """What a solver returned; nothing of it is checked."""
+
+    status: str  # the solver's own word
+    value: float  # Trace(H), or the least squared gain; nan without a solution
+    unknowns: dict[str, np.ndarray]  # by the symbols of the equations; empty without a solution
+
+
+class Program(NamedTuple):
+    """A problem, the parameters to fill in and the unknowns to read."""
+
+    problem: Any
+    parameters: dict[str, Any]
+    unknowns: dict[str, Any]
+
+
+def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
+    """Solve a design's program for one plant, whose numbers should be of order one.
+
+    Args:
+        plant: scaled such that the gain from n to z may be 1 (`robins.filters.synthesis.scaling`).
+        form: "common" for (9) and (10), "slack" for their slack form, "full" for (6) and (7).
+        aim: what is minimised, under which channels.
+
+    Raises:
+        MissingExtra: cvxpy or Clarabel is not installed.
+    """
+    cp = packages()
+    with _LOCK:
+        program = build(form, aim, *_shape(plant))
+        for name, parameter in program.parameters.items():
+            parameter.value = getattr(plant, name)
+        try:
+            # An answer that may be inaccurate says so in its status, and true norms decide.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                program.problem.solve(solver=cp.CLARABEL)
+        except cp.SolverError:
+            return Answer("solver_error", np.nan, {})
+        found = {name: unknown.value for name, unknown in program.unknowns.items()}
+        status = str(program.problem.status)
+        if any(value is None or not np.isfinite(value).all() for value in found.values()):
+            return Answer(status, np.nan, {})
+        return Answer(status, float(program.problem.value), found)
+
+
+@lru_cache(maxsize=64)
+def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Program:
+    """The program for n states, p and q components of w and n, m measurements and r outputs."""
+    cp = packages()
+    sizes = {"A": (n, n), "Bw": (n, p), "Bn": (n, q), "C": (m, n)}
+    sizes |= {"Dw": (m, p), "Dn": (m, q), "L": (r, n)}
+    parameters = {name: cp.Parameter(size, name=name) for name, size in sizes.items()}
+    unknowns, matrices = getattr(inequalities, form)(cp, parameters, aim)
+    cost = unknowns["g2"] if aim == "least" else cp.trace(unknowns["H"])
+    problem = cp.Problem(cp.Minimize(cost), [matrix >> 0 for matrix in matrices])
+    used = {p.name() for p in problem.parameters()}
+    return Program(problem, {k: v for k, v in parameters.items() if k in used}, unknowns)
+
+
+def packages() -> ModuleType:
+    """The module cvxpy, which takes a second to import and is optional.
+
+    Raises:
+        MissingExtra: it or Clarabel is not installed.
+    """
+    try:
+        import clarabel  # noqa: F401
+        import cvxpy
+    except ImportError as error:
+        raise MissingExtra(
+            f"designs by LMI need cvxpy and Clarabel ({error}): pip install 'robins[lmi]'. The "
+            "Riccati designs (robins.filters.synthesis.riccati) do without"
+        ) from error
+    return cvxpy
+
+
+def _shape(plant: Plant) -> tuple[int, int, int, int, int]:
+    return (*plant.Bw.shape, plant.Bn.shape[1], len(plant.C), len(plant.L))

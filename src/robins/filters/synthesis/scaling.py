@@ -1,0 +1,99 @@
+"""Units in which a plant's numbers are of order one, and the way back.
+
+Interior-point solvers stop at absolute tolerances, so a plant in radians, or with an angle in
+arcseconds beside a bias a thousand times smaller, gets a wrong answer without a word. The states
+are scaled as Osborne balances a matrix (*On pre-conditioning of matrices*, J. ACM 7, 1960): what
+enters a state is made as large as what leaves it. That result does not depend on the units given.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis.plant import Plant
+
+_SWEEPS = 20
+_SETTLED = 1e-2  # relative change of the scales that is not worth another sweep
+
+
+class Scales(NamedTuple):
+    """How large a one of each scaled channel is in units of the plant, x = diag(x) x'.
+
+    w and n are scalars, since their norms count all components alike; so is z.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    w: float
+    n: float
+    z: float
+
+    def plant(self, plant: Plant) -> Plant:
+        """The plant of the scaled channels."""
+        x, y = self.x, self.y
+        return Plant(
+            A=plant.A / x[:, None] * x,
+            Bw=plant.Bw / x[:, None] * self.w,
+            Bn=plant.Bn / x[:, None] * self.n,
+            C=plant.C / y[:, None] * x,
+            Dw=plant.Dw / y[:, None] * self.w,
+            Dn=plant.Dn / y[:, None] * self.n,
+            L=plant.L / self.z * x,
+        )
+
+    def gain(self, K: np.ndarray) -> np.ndarray:
+        """A gain (n, m) in units of the plant."""
+        return self.x[:, None] * K / self.y
+
+    def h2(self, value: float) -> float:
+        """An H2 norm in units of the plant."""
+        return value * self.z / self.w
+
+    def hinf(self, value: float) -> float:
+        """An H-infinity norm in units of the plant."""
+        return value * self.z / self.n
+
+
+def balanced(plant: Plant, gamma: float | None = None) -> Scales:
+    """Scales under which states, measurements, noise and output are of order one.
+
+    Args:
+        plant: in any units.
+        gamma: bound on the gain from n to z that is to become 1; without one, n is scaled to
+            order one itself.
+    """
+    x, y, w, n, z = np.ones(len(plant.A)), np.ones(len(plant.C)), 1.0, 1.0, 1.0
+    for _ in range(_SWEEPS):
+        scaled = Scales(x, y, w, n, z).plant(plant)
+        coupling = scaled.A - np.diag(np.diag(scaled.A))
+        enters = _norms(coupling, scaled.Bw, scaled.Bn)
+        leaves = _norms(coupling.T, scaled.C.T, scaled.L.T)
+        both = (enters > 0.0) & (leaves > 0.0)
+        change = np.sqrt(np.divide(enters, leaves, out=np.ones_like(x), where=both))
+        x = x * change
+        y = y * _or_one(_norms(scaled.C, scaled.Dw, scaled.Dn))
+        scaled = Scales(x, y, w, n, z).plant(plant)
+        w = w / float(_or_one(_mean(scaled.Bw, scaled.Dw)))
+        z = z * float(_or_one(_mean(scaled.L)))
+        n = n / float(_or_one(_mean(scaled.Bn, scaled.Dn))) if gamma is None else z / gamma
+        if np.max(np.abs(change - 1.0)) < _SETTLED:
+            break
+    return Scales(x, y, w, n, z)
+
+
+def _norms(*blocks: np.ndarray) -> np.ndarray:
+    """Norms of the rows of blocks side by side."""
+    return np.sqrt(sum(np.sum(block**2, axis=1) for block in blocks))
+
+
+def _mean(*blocks: np.ndarray) -> np.ndarray:
+    """Root mean square norm of the rows that are not zero."""
+    squares = np.concatenate([np.sum(block**2, axis=1) for block in blocks])
+    return np.sqrt(squares.sum() / max(1, np.count_nonzero(squares)))
+
+
+def _or_one(norms: np.ndarray) -> np.ndarray:
+    """Norms with one in place of zero, for what is not there needs no scale."""
+    return np.where(norms > 0.0, norms, 1.0)
