@@ -41,8 +41,8 @@ def times(s: Any, a: Three) -> Three:
 
 def dot(a: Three, b: Three) -> Any:
     """Scalar product, of any length."""
-    first, *rest = (x * y for x, y in zip(a, b, strict=True))
-    return sum(rest, first)
+    products = [x * y for x, y in zip(a, b, strict=True)]
+    return sum(products[1:], products[0]) if products else 0.0
 
 
 def cross(a: Three, b: Three) -> Three:
