@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,8 +13,8 @@ import xarray as xr
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.campaign.monte_carlo import worlds
-from robins.filters import Belief
+from robins.campaign.monte_carlo import solved, worlds
+from robins.filters import Belief, Filter, Model, Step
 from robins.filters.bound import bound_along, linearised, used_sensors
 from robins.filters.observability import (
     NOTHING,
@@ -36,7 +37,8 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
 
     Args:
         problem: what to simulate.
-        name: which contender's model and start to take; its filter plays no part.
+        name: which contender's model and start to take; its filter plays no part, but for steering
+            the vehicle where the problem is a closed loop.
         runs: how many trajectories; variances are averaged over them.
         without: sensors to leave out altogether.
 
@@ -68,7 +70,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     for batch, count in worlds(problem, runs):
         for k in range(count):
             world = jax.tree_util.tree_map(lambda x, k=k: x[k], batch)
-            found = _bound(c.model, case, c.reported, subsets, world)
+            found = _bound(c.filter, c.model, case, c.reported, subsets, world)
             variance = variance + np.asarray(found.variance) / runs
             prior = prior + np.asarray(found.prior) / runs
             first = first or found
@@ -101,12 +103,22 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
     """
     c = problem.contenders[name]
     case = c.case if isinstance(c.case, Partial) else Partial(c.case)
-    return np.sqrt(np.asarray(_variances(c.model, case, c.reported, world)))
+    return np.sqrt(np.asarray(_variances(c.filter, c.model, case, c.reported, world)))
 
 
-@jax.jit
-def _variances(model, case: Partial, reported, world) -> Array:
+def _nothing(step: Step) -> tuple[()]:
+    return ()
+
+
+def _case(filter_: Filter, model: Model, case: Partial, world: Any) -> Case:
+    """The case of a run. In closed loop it takes the filter to know where the vehicle went."""
     it = case(world)
+    return it if it.loop is None else solved(filter_, model, it, _nothing)[1]
+
+
+@partial(jax.jit, static_argnames="filter_")
+def _variances(filter_, model, case: Partial, reported, world) -> Array:
+    it = _case(filter_, model, case, world)
     line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
     return _reported(_rows(reported, it), bound_along(line, _start(it).factor).factor)
 
@@ -149,9 +161,9 @@ class _Found(NamedTuple):
     rows: Array | None  # (r, n) what is reported of the start
 
 
-@jax.jit
-def _bound(model, case: Partial, reported, subsets, world) -> _Found:
-    it = case(world)
+@partial(jax.jit, static_argnames="filter_")
+def _bound(filter_, model, case: Partial, reported, subsets, world) -> _Found:
+    it = _case(filter_, model, case, world)
     start = _start(it)
     line = linearised(model, start, it.truth, it.y, it.u, it.aux)
 

@@ -14,7 +14,7 @@ from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
 from robins.filters import Code
 from robins.results import variable
-from robins.systems.system import Outcome, Problem
+from robins.systems.system import Outcome, Output, Problem
 from robins.systems.tables import Seen, innovation_tables
 
 
@@ -156,6 +156,9 @@ def campaign_solution(
             f"runs with {limit.block.replace('_', ' ')} within {limit.name.replace('_', ' ')}",
             runs=runs,
         )
+    for output in problem.outputs:
+        more, places = _output(output, found)
+        data, coords = data | more, coords | places
     data |= _notes(found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
@@ -163,6 +166,21 @@ def campaign_solution(
         names = ", ".join(name.removeprefix("axis_") for name in clash)
         raise ValueError(f"{names}: a block and a sensor cannot have one name, for it names axes")
     return xr.Dataset(data | more, coords | places)
+
+
+def _output(o: Output, found: dict[str, Statistics]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays and coordinates of an output: the first run, and the RMS where it is an error."""
+    dims, words = ("filter", "time", f"axis_{o.name}"), o.name.replace("_", " ")
+    told = {"display_unit": o.display_unit, "comment": o.text}
+    first = _stack(found, lambda s: s.first_run["outputs"][o.name])
+    kind = "error" if o.is_error else "value"
+    data = {f"{kind}_{o.name}": variable(dims, first, o.units, words, o.frame, **told)}
+    if o.is_error:
+        rms = _stack(found, lambda s: s.output_rms(o.name))
+        runs = next(iter(found.values())).runs
+        told |= {"runs": runs}
+        data[f"rms_{o.name}"] = variable(dims, rms, o.units, f"RMS {words}", o.frame, **told)
+    return data, {f"axis_{o.name}": list(o.axes)}
 
 
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:

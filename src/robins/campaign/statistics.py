@@ -53,6 +53,8 @@ class Statistics:
     _norms: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _peaks: list[np.ndarray] = field(default_factory=list)
     _norm_peaks: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    _output_square: dict[str, Any] = field(default_factory=dict)
+    _run_output_rms: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.chunks` yields it."""
@@ -76,6 +78,11 @@ class Statistics:
             tally = self._codes.setdefault(name, {})
             for kind, number in zip(kinds.tolist(), numbers.tolist(), strict=True):
                 tally[kind] = tally.get(kind, 0) + number
+        for name, value in record["outputs"].items():
+            value = np.where(bad[:, None, None], np.inf, value)
+            self._output_square[name] = self._output_square.get(name, 0.0) + np.sum(value**2, 0)
+            squares = np.mean(value[:, self.counted] ** 2, axis=1)
+            self._run_output_rms.setdefault(name, []).append(np.sqrt(squares))
         self.n = int(record["dim"][0])
         counted = error[:, self.counted]
         for norm in self.norms:
@@ -138,6 +145,14 @@ class Statistics:
     def norm_peaks(self, name: str) -> np.ndarray:
         """(runs, windows) the same of a norm."""
         return np.concatenate(self._norm_peaks[name])
+
+    def output_rms(self, name: str) -> np.ndarray:
+        """(E, k) root mean square of an output over the runs."""
+        return np.sqrt(self._output_square[name] / self.runs)
+
+    def run_output_rms(self, name: str) -> np.ndarray:
+        """(runs, k) root mean square of an output over the epochs counted."""
+        return np.concatenate(self._run_output_rms[name])
 
     @property
     def run_rms(self) -> np.ndarray:

@@ -80,6 +80,8 @@ def _drawings(
         # Beside its error an estimate tells something new only where it should settle on a value.
         if f"error_{block}" not in ds or "bias" in block or "scale" in block:
             drawings.append(lambda block=block: estimates(ds, block))
+    for name in series.find(ds, "value"):
+        drawings.append(lambda name=name: estimates(ds, name, "value"))
     if "alt_m" in ds:
         drawings.append(lambda: height(ds))
     for sensor in series.find(ds, "innovation"):

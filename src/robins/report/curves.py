@@ -132,7 +132,7 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
     more += [bounds.key("±3σ ")] if best is not None else []
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
-    caption = "True minus estimated."
+    caption = solution[f"error_{block}"].attrs.get("comment", "True minus estimated.")
     if sigma is not None:
         caption += (
             " A filter that knows its own accuracy keeps 99.7\u00a0% of it between the thin lines."
@@ -161,9 +161,12 @@ def _envelope(
 
 
 @style.styled
-def estimates(solution: xr.Dataset, block: str) -> Picture:
-    """Estimates of a block of the state, within three sigma: biases, or a path without truth."""
-    found = series.get(solution, "estimate", block)
+def estimates(solution: xr.Dataset, block: str, kind: str = "estimate") -> Picture:
+    """Estimates of a block of the state, within three sigma: biases, or a path without truth.
+
+    Or values, of what a vehicle does beside what is estimated of it.
+    """
+    found = series.get(solution, kind, block)
     assert found is not None
     sigma = series.get(solution, "sigma", block)
     filters = series.filters(solution)
@@ -184,8 +187,10 @@ def estimates(solution: xr.Dataset, block: str) -> Picture:
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = "Thin lines: three stated standard deviations to either side." if thin_lines else ""
-    caption += _frame_of(solution, f"estimate_{block}")
-    return Picture(f"estimate_{block}", f"Estimated {name}", caption, figure)
+    caption += solution[f"{kind}_{block}"].attrs.get("comment", "")
+    caption += _frame_of(solution, f"{kind}_{block}")
+    title = f"Estimated {name}" if kind == "estimate" else name.capitalize()
+    return Picture(f"{kind}_{block}", title, caption.strip(), figure)
 
 
 def _broken(y: np.ndarray, turn: float | None) -> np.ndarray:

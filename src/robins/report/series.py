@@ -11,7 +11,7 @@ import xarray as xr
 from robins import units
 
 _PREFIXES = (
-    *("estimate", "error", "mean_sigma", "sigma", "rms", "within"),
+    *("estimate", "value", "error", "mean_sigma", "sigma", "rms", "within"),
     *("innovation_sigma", "innovation", "nis_dof", "nis", "refused"),
     *("allan_low", "allan_high", "allan_fit", "allan_slope", "allan"),
 )

@@ -45,6 +45,9 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``outage``                              (time) nonzero where aids were withheld
 ``estimate_BLOCK``                      (filter, time, axis_BLOCK)
 ``error_BLOCK``                         the same; true minus estimated, where a truth exists
+``value_NAME``                          (filter, time, axis_NAME) what the vehicle does beside what
+                                        is estimated of it; attribute ``comment``, a caption, as of
+                                        ``error_NAME`` where it is an error of the vehicle
 ``sigma_BLOCK``                         the same; one standard deviation the filter states
 ``innovation_SENSOR``                   (filter, update time, axis_SENSOR); NaN where missing
 ``innovation_sigma_SENSOR``             the same; one standard deviation the filter expects

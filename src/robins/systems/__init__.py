@@ -1,11 +1,12 @@
 """Systems: one problem each, with model, scenarios, filters and claims; here is the registry."""
 
-from robins.systems import airship, ins_gnss, marg, rocket, transfer_alignment
+from robins.systems import airship, ins_gnss, marg, rocket, satellite, transfer_alignment
 from robins.systems.system import (
     Case,
     Contender,
     Limit,
     Outcome,
+    Output,
     Problem,
     Progress,
     SensorAxes,
@@ -21,6 +22,7 @@ SYSTEMS: dict[str, System] = {
         transfer_alignment.SYSTEM,
         airship.SYSTEM,
         rocket.SYSTEM,
+        satellite.SYSTEM,
         marg.SYSTEM,
     )
 }
@@ -31,6 +33,7 @@ __all__ = [
     "Contender",
     "Limit",
     "Outcome",
+    "Output",
     "Problem",
     "Progress",
     "SensorAxes",

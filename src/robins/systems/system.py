@@ -16,7 +16,7 @@ import pydantic
 import xarray as xr
 from jaxtyping import Array
 
-from robins.filters import Belief, Filter, Model
+from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
 from robins.scenario import Parameters
 
@@ -44,16 +44,21 @@ class SensorAxes(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One simulated run: what a filter is given, and what it should find."""
+    """One simulated run: what a filter is given, and what it should find.
+
+    In closed loop the loop gives all of this but the start.
+    """
 
     start: Belief
     u: Any  # input of the motion, leading axis E epochs
     y: Mapping[str, Any]
     aux: Mapping[str, Any]
-    truth: State  # leading axis E
+    truth: State | None  # leading axis E
     # (E, r, n) reported = rows @ tangent error, where what is reported turns with the time; it
     # takes the place of the contender's
     rows: Array | None = None
+    outputs: Mapping[str, Array] = {}  # (E, k) what else is known of the run, by name
+    loop: Loop | None = None
 
 
 def as_simulated(world: Any) -> Case:
@@ -84,6 +89,18 @@ class Limit(NamedTuple):
     value: float  # SI, of the largest component
 
 
+class Output(NamedTuple):
+    """What a vehicle does beside what is estimated of it: where it points, what its wheels hold."""
+
+    name: str
+    units: str  # SI
+    display_unit: str
+    frame: str
+    axes: tuple[str, ...]
+    text: str  # a sentence for the caption of its figure
+    is_error: bool = False  # it should be zero, so its RMS over the runs says something
+
+
 class Norm(NamedTuple):
     """The length of some reported components of the error, such as the horizontal ones."""
 
@@ -112,6 +129,7 @@ class Problem(NamedTuple):
     norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
     windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
     notes: Sequence[str] = ()  # sentences for the reader of the report
+    outputs: Sequence[Output] = ()  # of its cases
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,24 @@
+"""A small satellite that steers by its estimate: star sensor, gyro of multi-source noise, wheels.
+
+After the patent of a mixed H2/H-infinity filter and its test platform: that filter in the readings
+that can work, what it is compared with, and what should be used instead.
+"""
+
+from pathlib import Path
+
+from robins.systems.satellite.claims import CLAIMS
+from robins.systems.satellite.filters import FILTERS
+from robins.systems.satellite.parameters import AttitudeLoop
+from robins.systems.satellite.problem import attitude_problem
+from robins.systems.system import Study, System
+
+_HERE = Path(__file__).parent / "scenarios"
+
+SYSTEM = System(
+    name="satellite",
+    summary="a satellite's attitude in closed loop: gyro, star sensor, mixed H2/H-infinity",
+    studies={"attitude-loop": Study(AttitudeLoop, attitude_problem, FILTERS, CLAIMS)},
+    scenarios={name: _HERE / f"{name}.toml" for name in ("s1", "s2", "s3", "s4")},
+)
+
+__all__ = ["SYSTEM"]

@@ -1,0 +1,108 @@
+"""Each filter with the model it believes in, in the loop."""
+
+from __future__ import annotations
+
+import math
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins.filters import Loop
+from robins.filters.rules import with_gains
+from robins.systems.satellite import design, model
+from robins.systems.satellite.course import Course
+from robins.systems.satellite.filters import KINDS, Kind, make_filter
+from robins.systems.satellite.nodes import STAR, Given, Row, begin, react
+from robins.systems.satellite.parameters import AttitudeLoop
+from robins.systems.satellite.world import World
+from robins.systems.system import Case, Contender
+
+_DIMS = {STAR: 3}
+
+
+class Numbers(NamedTuple):
+    """Data of a contender, so that contenders that differ in these alone compile once."""
+
+    course: Any  # `Step` with leading axis E
+    seen: Array  # (E,) bool
+    due: Array  # (E,) bool
+    craft: Any
+    control: Any
+    pinv: Array
+    step_s: Array
+    quantum_rad: Array
+    attitude_rad: Array  # believed at the start
+    bias_rad_s: Array
+    gain: Array  # (6, 3); zeros where there is none
+
+
+def believed_walk(given: AttitudeLoop, kind: Kind) -> float:
+    """Random walk of the gyro's rate that a filter believes in [rad/s/sqrt(s)]."""
+    g = given.gyro
+    true = model.equivalent_walk(g.rate_walk, g.markov, g.markov_time)
+    return true if kind.drift is None else given.believed.drift * math.sqrt(kind.drift) * true
+
+
+@cache
+def _case(additive: bool, body: str):
+    """The same function for the same choice, so that what was compiled serves again."""
+    reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
+
+    def case(n: Numbers, world: World) -> Case:
+        given = Given(n.craft, n.control, n.pinv, n.step_s, n.quantum_rad, world.gyro_matrix)
+        rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error, n.seen)
+        start = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
+        if body.startswith("fixed"):
+            start = with_gains(make_filter(body).init(start, _DIMS), {STAR: n.gain})
+        loop = Loop(Partial(reacts, given), begin(given, world.craft), rows, {STAR: n.due})
+        return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
+
+    return case
+
+
+def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
+    """A filter with its model and its data.
+
+    Raises:
+        ValueError: there is no filter of this name.
+    """
+    if name not in KINDS:
+        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(KINDS)}")
+    kind = KINDS[name]
+    walk = believed_walk(given, kind)
+    noise = model.noise_of(given.gyro.random_walk, walk, given.step)
+    believed = design.believed(given, walk)
+    gain, facts = np.zeros((6, 3)), {}
+    if kind.recipe is not None:
+        facts = dict(design.facts(believed, kind.recipe))
+        if kind.body.startswith("fixed"):
+            gain = design.gain(believed, kind.recipe)
+        else:
+            more = design.inflation(believed, kind.recipe) * math.sqrt(
+                given.step / given.star.period
+            )
+            noise = noise._replace(factor=jnp.concatenate([noise.factor, more], axis=1))
+    numbers = Numbers(
+        course=course.steps,
+        seen=jnp.asarray(course.seen),
+        due=jnp.asarray(course.due),
+        craft=course.craft,
+        control=course.control,
+        pinv=jnp.asarray(course.pinv),
+        step_s=jnp.asarray(given.step),
+        quantum_rad=jnp.asarray(given.gyro.quantum),
+        attitude_rad=jnp.asarray(given.believed.attitude),
+        bias_rad_s=jnp.asarray(given.believed.bias),
+        gain=jnp.asarray(gain),
+    )
+    additive = kind.body == "quaternion"
+    return Contender(
+        filter=make_filter(kind.body),
+        model=model.model(noise, given.star.noise, additive),
+        case=Partial(_case(additive, kind.body), numbers),
+        facts=facts,
+    )

@@ -1,0 +1,122 @@
+"""What is the same in all runs: orbit, field, reference, when there are star frames."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins.sim.attitude_control import Controller, allocation_matrix, controller
+from robins.sim.attitude_reference import Reference, inertial, nadir, slews
+from robins.sim.orbit import circular_orbit, field_along_orbit
+from robins.sim.spacecraft import Spacecraft, spacecraft
+from robins.systems.satellite.parameters import AttitudeLoop, Body, Wheels
+
+
+class Step(NamedTuple):
+    """What acts in a step, from outside; with leading axis E in a course."""
+
+    ref_q_ib: Array  # (4,) wanted attitude at its beginning
+    ref_omega_b: Array  # (3,) its rate
+    ref_alpha_b: Array  # (3,) and angular acceleration
+    ref_end_q_ib: Array  # (4,) wanted attitude at its end
+    r_i_m: Array  # (3,) place in the middle of it
+    field_i_t: Array  # (3,) magnetic field there
+    disturbance_b: Array  # (3,) N m
+
+
+class Course(NamedTuple):
+    """The same in all runs; E steps."""
+
+    time_s: np.ndarray  # (E,) at the end of each step
+    steps: Step
+    due: np.ndarray  # (E,) bool, whether a step ends with a star frame
+    seen: np.ndarray  # (E,) bool, and the sensor is not lost
+    craft: Spacecraft
+    control: Controller
+    pinv: np.ndarray  # (W, 3) from torques of the body to those of the wheels
+
+
+def inertia(body: Body) -> np.ndarray:
+    """(3, 3) kg m^2."""
+    xy, xz, yz = body.products
+    off = np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
+    return np.diag(body.moments) + off
+
+
+def wheel_axes(wheels: Wheels) -> np.ndarray:
+    """(3, W) unit columns."""
+    axes = np.array(wheels.axes, float).T.reshape(3, len(wheels.axes))
+    return axes / np.linalg.norm(axes, axis=0)
+
+
+def lay_out(given: AttitudeLoop) -> Course:
+    """Orbit, field and reference.
+
+    Raises:
+        ValueError: a body that cannot be, wheels that do not turn it about three axes, or a date
+            outside of the life of the magnetic model.
+    """
+    dt, o = given.step, given.orbit
+    count = math.floor(given.duration / dt + 1e-9)
+    edges = dt * np.arange(count + 1)
+    where = o.altitude, o.inclination, o.node, o.latitude_argument
+    middle = circular_orbit(*where, edges[:-1] + 0.5 * dt)
+    field = field_along_orbit(middle, o.field, decimal_year=o.year)
+    base = nadir(circular_orbit(*where, edges))
+    if given.points == "inertial":
+        base = inertial(base.q_ib[0], edges)
+    wanted = _turned(given, base, edges)
+    frame = round(given.star.period / dt)
+    due = np.arange(1, count + 1) % frame == 0
+    time = edges[1:]
+    seen = due.copy()
+    for span in given.star.lost:
+        seen &= ~span.holds(time)
+    body, wheels, axes = inertia(given.body), given.wheels, wheel_axes(given.wheels)
+    works = np.ones(len(wheels.axes))
+    works[list(wheels.lost)] = 0.0
+    return Course(
+        time_s=time,
+        steps=Step(
+            wanted.q_ib[:-1],
+            wanted.omega_b[:-1],
+            wanted.alpha_b[:-1],
+            wanted.q_ib[1:],
+            middle.r_i_m,
+            field,
+            jnp.asarray(_disturbance(given, np.asarray(middle.time_s))),
+        ),
+        due=due,
+        seen=seen,
+        craft=spacecraft(
+            body,
+            axes,
+            wheels.torque,
+            wheels.momentum,
+            given.control.dipole,
+            given.body.dipole,
+            works,
+        ),
+        control=controller(
+            body, given.control.frequency, given.control.damping, given.control.unloading
+        ),
+        pinv=allocation_matrix(axes, works if wheels.loss_known else 1.0),
+    )
+
+
+def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Reference:
+    if (slew := given.slew) is None:
+        return base
+    return slews(base, slew.angle, slew.period, time_s, fade_in_s=slew.grows)
+
+
+def _disturbance(given: AttitudeLoop, time_s: np.ndarray) -> np.ndarray:
+    """(E, 3) N m, a sine of the orbital period about each axis, a third of a turn apart."""
+    turn = circular_orbit(given.orbit.altitude, 0.0, 0.0, 0.0, np.zeros(1))
+    rate = np.linalg.norm(turn.v_i_m_s[0]) / np.linalg.norm(turn.r_i_m[0])
+    phase = 2.0 * np.pi / 3.0 * np.arange(3.0)
+    return given.body.disturbance * np.sin(rate * time_s[:, None] + phase)

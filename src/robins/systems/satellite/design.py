@@ -1,0 +1,120 @@
+"""Constant gains of the filters, designed axis by axis.
+
+Per axis and from star frame to star frame (period Ts) the error of attitude and bias is
+
+    A = [1 -Ts; 0 1],   Q as of the gyro over Ts,   y = dtheta + star noise,   z = dtheta,
+
+and the modelling error n is a rate, Bn = [Ts; 0], or a drift of the bias, Bn = [-Ts^2/2; Ts].
+Between frames the filter moves with the gyro, so one design serves at any rate of rotation. Numbers
+are in arcsec and s inside: in radians variances are of 1e-10, and a solver's tolerances are not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis import Design, Plant, current_form
+from robins.filters.synthesis.riccati import kalman_design, riccati
+from robins.systems.satellite.model import walk_covariance
+from robins.systems.satellite.parameters import AttitudeLoop
+
+_ARCSEC = math.pi / 648000.0
+Way = Literal["raw", "h2", "lmi", "riccati"]
+Enters = Literal["rate", "bias"]
+
+
+class Recipe(NamedTuple):
+    """How the gain of an axis is found."""
+
+    way: Way
+    share: float = 1.0  # gamma over the H-infinity norm that the Kalman filter of the axis has
+    enters: Enters = "rate"  # where n does
+
+
+class Believed(NamedTuple):
+    """What is believed of gyro and star sensor, SI; hashable, for gains are kept."""
+
+    random_walk: float
+    rate_walk: float
+    period_s: float
+    star_rad: tuple[float, float, float]
+
+
+def axis_plant(b: Believed, star_rad: float, enters: Enters) -> Plant:
+    """Of one axis, in current form, arcsec and s."""
+    T = b.period_s
+    Q = walk_covariance(b.random_walk / _ARCSEC, b.rate_walk / _ARCSEC, T)
+    Bn = {"rate": [[T], [0.0]], "bias": [[-0.5 * T**2], [T]]}[enters]
+    return current_form(
+        np.array([[1.0, -T], [0.0, 1.0]]),
+        np.linalg.cholesky(Q),
+        np.array(Bn),
+        np.array([[1.0, 0.0]]),
+        np.array([[star_rad / _ARCSEC]]),
+        L=np.array([[1.0, 0.0]]),
+    )
+
+
+@cache
+def axis_design(b: Believed, star_rad: float, recipe: Recipe) -> Design:
+    """Gain and certified norms of one axis.
+
+    Raises:
+        robins.filters.synthesis.programs.MissingExtra: a design by LMI without the extra "lmi".
+        robins.filters.synthesis.Unreachable: no gain of this way has such a worst case.
+    """
+    plant = axis_plant(b, star_rad, recipe.enters)
+    best = kalman_design(plant)
+    if recipe.way == "h2":
+        return best
+    gamma = recipe.share * best.hinf
+    if recipe.way == "riccati":
+        return riccati(plant, gamma)
+    from robins.filters.synthesis.lmi import observer
+
+    return observer(plant, gamma, "common")
+
+
+def gain(b: Believed, recipe: Recipe) -> np.ndarray:
+    """(6, 3) gain of attitude and bias [1, 1/s] on what the star sensor reads."""
+    K = np.zeros((6, 3))
+    for i, star_rad in enumerate(b.star_rad):
+        one = np.array([1.0, 0.0])
+        if recipe.way != "raw":
+            one = axis_design(b, star_rad, recipe).gain[:, 0]
+        K[i, i], K[3 + i, i] = one
+    return K
+
+
+def inflation(b: Believed, recipe: Recipe) -> np.ndarray:
+    """(6, 3) factor of the noise per frame that makes a Kalman filter of these gains, SI.
+
+    sqrt(lambda) Bn of each axis, for a Riccati design.
+    """
+    B = np.zeros((6, 3))
+    for i, star_rad in enumerate(b.star_rad):
+        lambda_ = axis_design(b, star_rad, recipe).lambda_
+        column = axis_plant(b, star_rad, recipe.enters).Bn[:, 0]
+        B[[i, 3 + i], i] = math.sqrt(lambda_) * column * _ARCSEC
+    return B
+
+
+def facts(b: Believed, recipe: Recipe) -> Mapping[str, Any]:
+    """Certified norms of the three axes, for the metrics of a filter."""
+    if recipe.way == "raw":
+        return {}
+    designs = [axis_design(b, star_rad, recipe) for star_rad in b.star_rad]
+    return {
+        "predicted_rms_arcsec": float(np.sqrt(sum(d.h2**2 for d in designs))),
+        **{f"worst_case_{a}_s": float(d.hinf) for a, d in zip("xyz", designs, strict=True)},
+    }
+
+
+def believed(given: AttitudeLoop, walk: float) -> Believed:
+    """From the parameters, with a believed random walk of the rate."""
+    return Believed(given.gyro.random_walk, walk, given.star.period, given.star.noise)

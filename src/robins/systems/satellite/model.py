@@ -1,0 +1,175 @@
+"""The states of the filters and what they believe of gyro and star sensor.
+
+The attitude q_ib maps body to inertial, its error is seen in the body: q = q^ exp(dtheta). Over a
+sample of length T the gyro reports theta, and of attitude and bias b
+
+    q+ = q exp(theta - T b),    dtheta+ = exp(-[theta - T b]x) dtheta - T J dbias,
+
+J the right Jacobian of the exponential map, here of angles so small that it is the identity to a
+part in a thousand of T dbias. Noise of a sample (spec of a rate-integrating gyro: Farrenkopf 1978;
+Markley & Crassidis 2014, eq. 6.93) is exact at rest:
+
+    Q = [arw^2 T + rrw^2 T^3/3   -rrw^2 T^2/2]
+        [                *          rrw^2 T  ]
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins import linalg
+from robins.filters import Belief, Model, Motion, Sensor
+from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, to_dcm
+from robins.systems.satellite.nodes import STAR, Kind
+
+
+class AttitudeState(NamedTuple):
+    """State of a multiplicative filter."""
+
+    attitude: BodyRotation
+    gyro_bias: Array  # (3,) rad/s
+
+
+class QuaternionState(NamedTuple):
+    """State of a filter that adds to the components of the quaternion."""
+
+    q_ib: Array  # (4,)
+    gyro_bias: Array  # (3,) rad/s
+
+
+class Noise(NamedTuple):
+    """What is believed of the gyro, for a sample of length T."""
+
+    step_s: Array  # ()
+    factor: Array  # (6, 6) of Q, attitude and bias
+
+
+def equivalent_walk(rate_walk: Any, markov: Any, markov_time: Any) -> Any:
+    """Random walk of the rate that stands for itself and a Markov drift, sqrt(rrw^2 + 2 s^2/tau).
+
+    A Markov process of correlation time tau walks away from where it is like that at first.
+    """
+    return math.sqrt(rate_walk**2 + 2.0 * markov**2 / markov_time)
+
+
+def walk_covariance(random_walk: float, rate_walk: float, step_s: float) -> np.ndarray:
+    """(2, 2) Q of an axis: angle, rate."""
+    a, r, T = random_walk**2, rate_walk**2, step_s
+    return np.array([[a * T + r * T**3 / 3.0, -r * T**2 / 2.0], [-r * T**2 / 2.0, r * T]])
+
+
+def noise_of(random_walk: float, rate_walk: float, step_s: float) -> Noise:
+    """The same as a factor for three axes."""
+    one = np.linalg.cholesky(walk_covariance(random_walk, rate_walk, step_s))
+    return Noise(jnp.asarray(step_s), jnp.asarray(np.kron(one, np.eye(3))))
+
+
+def _turn(x: Any, theta: Array, noise: Noise) -> Array:
+    return theta - noise.step_s * x.gyro_bias
+
+
+# --------------------------------------------------------------------------------- multiplicative
+
+
+def _move(noise: Noise, x: AttitudeState, theta: Array) -> AttitudeState:
+    turn = from_rotvec(_turn(x, theta, noise))
+    return AttitudeState(BodyRotation(normalise(multiply(x.attitude.wxyz, turn))), x.gyro_bias)
+
+
+def _linear(noise: Noise, x: AttitudeState, theta: Array):
+    moved, T = _move(noise, x, theta), noise.step_s
+    turn = _turn(x, theta, noise)
+    back = to_dcm(conjugate(from_rotvec(turn)))
+    # the right Jacobian to first order of the turn: I - [turn]x/2
+    J = jnp.eye(3) - 0.5 * _skew(turn)
+    top = jnp.concatenate([back, -T * J], axis=1)
+    low = jnp.concatenate([jnp.zeros((3, 3)), jnp.eye(3)], axis=1)
+    return moved, jnp.concatenate([top, low]), noise.factor
+
+
+def _skew(v: Array) -> Array:
+    x, y, z = v[0], v[1], v[2]
+    none = jnp.zeros(())
+    return jnp.stack([none, -z, y, z, none, -x, -y, x, none]).reshape(3, 3)
+
+
+def _read(x: AttitudeState, aux: Any) -> BodyRotation:
+    return x.attitude
+
+
+def _read_linear(x: AttitudeState, aux: Any):
+    return x.attitude, jnp.eye(3, 6)
+
+
+# --------------------------------------------------------------------------------------- additive
+
+
+def xi(q: Array) -> Array:
+    """(4, 3) with q' = Xi(q) w/2 (Lefferts, Markley & Shuster 1982)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
+
+
+def _move_additive(noise: Noise, x: QuaternionState, theta: Array) -> QuaternionState:
+    q = normalise(x.q_ib)
+    return QuaternionState(multiply(q, from_rotvec(_turn(x, theta, noise))), x.gyro_bias)
+
+
+def _noise_additive(noise: Noise, x: QuaternionState, theta: Array) -> Array:
+    top = 0.5 * xi(normalise(x.q_ib)) @ noise.factor[:3]
+    return jnp.concatenate([top, noise.factor[3:]])
+
+
+def _read_additive(x: QuaternionState, aux: Any) -> BodyRotation:
+    return BodyRotation(normalise(x.q_ib))
+
+
+def _none(q_ib: Array) -> None:
+    return None
+
+
+def _rows_additive(q_ib: Array) -> Array:
+    """(6, 7) attitude error in body axes and error of the bias, from those of the components."""
+    rows = jnp.zeros((6, 7))
+    return rows.at[:3, :4].set(2.0 * xi(q_ib).T).at[3:, 4:].set(jnp.eye(3))
+
+
+MULTIPLICATIVE = Kind(
+    attitude=lambda x: x.attitude.wxyz,
+    bias=lambda x: x.gyro_bias,
+    state=lambda q, b: AttitudeState(BodyRotation(q), b),
+    rows=_none,
+)
+ADDITIVE = Kind(
+    attitude=lambda x: normalise(x.q_ib),
+    bias=lambda x: x.gyro_bias,
+    state=QuaternionState,
+    rows=_rows_additive,
+)
+
+
+def model(noise: Noise, star_rad: Any, additive: bool = False) -> Model:
+    """Motion and star sensor."""
+    sigma = jnp.asarray(star_rad, float)
+    if additive:
+        moves = Motion(Partial(_move_additive, noise), Partial(_noise_additive, noise))
+        return Model(moves, (Sensor(_read_additive, sigma, 3, STAR),))
+    moves = Motion(Partial(_move, noise), noise.factor, Partial(_linear, noise))
+    return Model(moves, (Sensor(_read, sigma, 3, STAR, _read_linear),))
+
+
+def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = False) -> Belief:
+    """What filters believe at first: no bias, and these sigmas."""
+    sizes = jnp.repeat(jnp.stack([jnp.asarray(attitude_rad), jnp.asarray(bias_rad_s)]), 3)
+    if not additive:
+        return Belief(AttitudeState(BodyRotation(q_ib), jnp.zeros(3)), jnp.diag(sizes))
+    # sigma alike about all axes and nothing uncertain along q: P = sigma^2 Xi Xi'/4
+    attitude = linalg.tria(0.5 * sizes[0] * xi(q_ib))
+    factor = jnp.zeros((7, 7)).at[:4, :4].set(attitude).at[4:, 4:].set(jnp.diag(sizes[3:]))
+    return Belief(QuaternionState(q_ib, jnp.zeros(3)), factor)

@@ -1,0 +1,144 @@
+"""The parts of the loop, each a pure function of what reaches it.
+
+    belief, gyro --acm--> torque, dipole --plant--> attitude --gyro, star--> samples
+
+Each is what a process of the test bench runs, and `react` strings them together for a run inside
+one program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from robins.filters import Belief, Reading
+from robins.rotation import BodyRotation, conjugate, multiply, rotate, to_rotvec
+from robins.sim.attitude_control import Controller, allocate, desaturation_dipole, torque
+from robins.sim.gyro import read_gyro
+from robins.sim.spacecraft import CraftState, Spacecraft, advance, rate_b, wheel_momentum_b
+from robins.sim.star_sensor import read_star
+from robins.systems.satellite.course import Step
+
+STAR = "star"
+
+
+class Command(NamedTuple):
+    """What control asks of the actuators."""
+
+    wheel_torque: Array  # (W,) N m
+    dipole_b: Array  # (3,) A m^2
+
+
+class Given(NamedTuple):
+    """Numbers of the loop that stay the same."""
+
+    craft: Spacecraft
+    control: Controller
+    pinv: Array  # (W, 3)
+    step_s: Array  # ()
+    quantum_rad: Array  # () of the gyro
+    gyro_matrix: Array  # (3, 3)
+
+
+class Row(NamedTuple):
+    """What drives a step from outside."""
+
+    course: Step
+    gyro_angle: Array  # (3,) rad
+    gyro_bias: Array  # (3,) rad/s
+    star_error: Array  # (3,) rad
+    seen: Array  # () bool
+
+
+class Vehicle(NamedTuple):
+    """State of the vehicle with its gyro."""
+
+    craft: CraftState
+    residue: Array  # (3,) rad, what the gyro has not reported yet
+    theta: Array  # (3,) rad, what it reported last
+
+
+def acm(
+    given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Step
+) -> Command:
+    """Attitude control: from the estimate, the last sample of the gyro and the wheels' speeds.
+
+    The rate is that of the gyro less the estimated bias; the field is that of its model, turned
+    into body axes by the estimate.
+    """
+    held = wheel_momentum_b(given.craft, wheel_h)
+    field_b = rotate(conjugate(q_ib), row.field_i_t)
+    omega = theta / given.step_s - bias
+    wanted = torque(
+        given.control, q_ib, omega, row.ref_q_ib, row.ref_omega_b, row.ref_alpha_b, held
+    )
+    k, limit = given.control.desaturation_k, given.craft.dipole_limit_a_m2
+    dipole = desaturation_dipole(k, held, field_b, limit)
+    return Command(allocate(given.pinv, wanted - jnp.cross(dipole, field_b)), dipole)
+
+
+def plant(given: Given, state: CraftState, command: Command, row: Step) -> CraftState:
+    """The craft one step on."""
+    return advance(
+        given.craft,
+        state,
+        command.wheel_torque,
+        command.dipole_b,
+        row.r_i_m,
+        row.field_i_t,
+        row.disturbance_b,
+        given.step_s,
+    )
+
+
+def gyro(given: Given, before: Array, after: Array, residue: Array, row: Row):
+    """What the gyro reports of a turn (3,), and what is left for the next sample."""
+    turned = to_rotvec(multiply(conjugate(before), after))
+    return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
+
+
+def star(q_ib: Array, row: Row) -> Array:
+    """What the star sensor reports; NaN without a frame."""
+    return jnp.where(row.seen, read_star(q_ib, row.star_error), jnp.nan)
+
+
+def pointing_error(q_ref_ib: Array, q_ib: Array) -> Array:
+    """Rotation vector from where the craft should point to where it does, reference axes."""
+    return to_rotvec(multiply(conjugate(q_ref_ib), q_ib))
+
+
+def begin(given: Given, craft: CraftState) -> Vehicle:
+    """The vehicle before its first step; its gyro has reported the rate that it has."""
+    return Vehicle(craft, jnp.zeros(3), given.step_s * rate_b(given.craft, craft))
+
+
+class Kind(NamedTuple):
+    """How a filter's state is read and its truth is written."""
+
+    attitude: Callable[[Any], Array]  # mean -> q_ib
+    bias: Callable[[Any], Array]
+    state: Callable[[Array, Array], Any]  # q_ib, bias -> state
+    rows: Callable[[Array], Any]  # q_ib -> rows that are reported, or None
+
+
+def react(kind: Kind, given: Given, v: Vehicle, belief: Belief, row: Row):
+    """The loop one step on: control acts on what is believed, sensors see what comes of it."""
+    q, bias = kind.attitude(belief.mean), kind.bias(belief.mean)
+    command = acm(given, q, bias, v.theta, v.craft.wheel_h, row.course)
+    craft = plant(given, v.craft, command, row.course)
+    theta, residue = gyro(given, v.craft.q_ib, craft.q_ib, v.residue, row)
+    outputs = {
+        "pointing": pointing_error(row.course.ref_end_q_ib, craft.q_ib),
+        "wheel_momentum": craft.wheel_h,
+    }
+    reading = Reading(
+        u=theta,
+        y={STAR: BodyRotation(star(craft.q_ib, row))},
+        truth=kind.state(craft.q_ib, row.gyro_bias),
+        rows=kind.rows(craft.q_ib),
+        outputs=outputs,
+    )
+    return Vehicle(craft, residue, theta), reading

@@ -1,0 +1,159 @@
+"""Parameters of a small satellite that steers by its estimate, with units."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Quantity, Span, default
+from robins.systems.system import Scenario
+
+Three = tuple[float, float, float]
+_TILTED = (3.0**-0.5, 3.0**-0.5, 3.0**-0.5)
+
+
+class Orbit(Parameters):
+    """A circular orbit, and the model of the magnetic field along it."""
+
+    altitude: Annotated[float, Quantity("length", least="100 km")] = default("500 km")
+    inclination: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "97.4 deg"
+    )
+    node: Annotated[float, Quantity("angle")] = default("0 deg")
+    latitude_argument: Annotated[float, Quantity("angle")] = default("0 deg")
+    field: Literal["dipole", "wmm"] = "dipole"
+    year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2025.0
+
+
+class Body(Parameters):
+    """Inertia and what disturbs it; products are the elements xy, xz, yz of the matrix."""
+
+    moments: Annotated[Three, Quantity("moment of inertia", above="0 kg m^2")] = default(
+        ["1.9 kg m^2", "2.1 kg m^2", "2.4 kg m^2"]  # type: ignore[arg-type]
+    )
+    products: Annotated[Three, Quantity("moment of inertia")] = default(
+        ["0.02 kg m^2", "-0.03 kg m^2", "0.01 kg m^2"]  # type: ignore[arg-type]
+    )
+    dipole: Annotated[Three, Quantity("magnetic moment")] = default(
+        ["0.05 A m^2", "-0.03 A m^2", "0.04 A m^2"]  # type: ignore[arg-type]
+    )
+    # amplitude of a torque on each axis that goes with the orbit, a third of a turn apart
+    disturbance: Annotated[float, Quantity("torque", least="0 N m")] = default("1 uN m")
+
+
+class Wheels(Parameters):
+    """Reaction wheels, numbered from 0; those in ``lost`` give no torque, and control knows."""
+
+    axes: tuple[Three, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), _TILTED)
+    torque: Annotated[float, Quantity("torque", above="0 N m")] = default("5 mN m")
+    momentum: Annotated[float, Quantity("angular momentum", above="0 N m s")] = default("0.1 N m s")
+    start: Annotated[float, Quantity("angular momentum")] = default("0 N m s")  # each of them
+    lost: tuple[pydantic.NonNegativeInt, ...] = ()
+    loss_known: bool = True  # whether torques are shared out among the others
+
+    @pydantic.model_validator(mode="after")
+    def _sound(self) -> Wheels:
+        for i, axis in enumerate(self.axes):
+            if sum(x * x for x in axis) == 0.0:
+                raise ValueError(f"axes: wheel {i} has none: give a vector other than zero")
+        if beyond := [i for i in self.lost if i >= len(self.axes)]:
+            raise ValueError(f"lost: there is no wheel {beyond[0]}, only 0 to {len(self.axes) - 1}")
+        if abs(self.start) > self.momentum:
+            raise ValueError(
+                f"start ({self.start:g} N m s) is beyond what a wheel holds, {self.momentum:g} N m s"
+            )
+        return self
+
+
+class Control(Parameters):
+    """Attitude control by wheels, their unloading by magnetorquers."""
+
+    frequency: Annotated[float, Quantity("angle rate", above="0 rad/s")] = default("0.12 rad/s")
+    damping: Annotated[float, pydantic.Field(gt=0.0)] = 0.9
+    dipole: Annotated[float, Quantity("magnetic moment", least="0 A m^2")] = default("5 A m^2")
+    unloading: Annotated[float, Quantity("inverse time", least="0 1/s")] = default("0.002 1/s")
+
+
+class Slew(Parameters):
+    """Sinusoidal turns about the body axes on top of the reference, growing from rest."""
+
+    angle: Annotated[Three, Quantity("angle", most="90 deg")]
+    period: Annotated[Three, Quantity("time", above="0 s")]
+    grows: Annotated[float, Quantity("time", least="0 s")] = default("100 s")
+
+
+class Gyro(Parameters):
+    """A gyro triad whose noise has several sources; each is drawn anew in each run."""
+
+    random_walk: Annotated[float, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
+        "1.2 arcsec/sqrt(s)"
+    )
+    rate_walk: Annotated[float, Quantity("rate random walk", least="0 arcsec/s/sqrt(s)")] = default(
+        "0.005 arcsec/s/sqrt(s)"
+    )
+    markov: Annotated[float, Quantity("angle rate", least="0 arcsec/s")] = default("0.3 arcsec/s")
+    markov_time: Annotated[float, Quantity("time", above="0 s")] = default("300 s")
+    bias: Annotated[float, Quantity("angle rate", least="0 arcsec/s")] = default("3 arcsec/s")
+    ramp: Annotated[float, Quantity("angular acceleration", least="0 rad/s^2")] = default(
+        "9.6962736e-10 rad/s^2"  # 2e-4 arcsec/s^2
+    )
+    scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")  # one sigma
+    misalignment: Annotated[float, Quantity("angle", least="0 deg")] = default("0 arcsec")  # same
+    quantum: Annotated[float, Quantity("angle", least="0 deg")] = default("0.05 arcsec")
+
+
+class Star(Parameters):
+    """A star sensor, its boresight z; the low-frequency error is a sine of drawn phase."""
+
+    period: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    noise: Annotated[Three, Quantity("angle", above="0 deg")] = default(
+        ["10 arcsec", "10 arcsec", "40 arcsec"]  # type: ignore[arg-type]
+    )
+    low_frequency: Annotated[float, Quantity("angle", least="0 deg")] = default("0 arcsec")
+    low_frequency_period: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
+    lost: tuple[Span, ...] = ()
+
+
+class Believed(Parameters):
+    """What filters believe; ``drift`` is the believed over the true slow drift of the gyro."""
+
+    drift: Annotated[float, Quantity("ratio", above="0")] = default("1")
+    attitude: Annotated[float, Quantity("angle", above="0 deg")] = default("60 arcsec")
+    bias: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("3 arcsec/s")
+
+
+class AttitudeLoop(Scenario, Parameters):
+    """A satellite in closed loop."""
+
+    system: Literal["satellite"] = "satellite"
+    study: Literal["attitude-loop"] = "attitude-loop"
+    title: str = "Satellite attitude"
+    claims: tuple[str, ...] = ()  # ids of those the scenario checks
+    duration: Annotated[float, Quantity("time", above="0 s")] = default("1500 s")
+    step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+    counted_from: Annotated[float, Quantity("time", least="0 s")] = default("500 s")
+    points: Literal["nadir", "inertial"] = "nadir"
+    slew: Slew | None = None
+    orbit: Orbit = pydantic.Field(default_factory=Orbit)
+    body: Body = pydantic.Field(default_factory=Body)
+    wheels: Wheels = pydantic.Field(default_factory=Wheels)
+    control: Control = pydantic.Field(default_factory=Control)
+    gyro: Gyro = pydantic.Field(default_factory=Gyro)
+    star: Star = pydantic.Field(default_factory=Star)
+    believed: Believed = pydantic.Field(default_factory=Believed)
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> AttitudeLoop:
+        if self.counted_from >= self.duration:
+            raise ValueError(
+                f"counted_from ({self.counted_from:g} s) must be before the end at "
+                f"{self.duration:g} s"
+            )
+        ratio = self.star.period / self.step
+        if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
+            raise ValueError(
+                f"star.period ({self.star.period:g} s) must be a multiple of step "
+                f"({self.step:g} s): a frame comes with a sample of the gyro"
+            )
+        return self

@@ -1,0 +1,80 @@
+"""The satellite as a problem for a campaign."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import xarray as xr
+
+from robins.results import variable
+from robins.systems.satellite.claims import satellite_claims
+from robins.systems.satellite.contender import contender
+from robins.systems.satellite.course import Course, lay_out
+from robins.systems.satellite.metrics import attitude_metrics
+from robins.systems.satellite.nodes import STAR
+from robins.systems.satellite.parameters import AttitudeLoop
+from robins.systems.satellite.world import simulate
+from robins.systems.system import Output, Problem, SensorAxes, StateBlock
+
+AXES = ("x", "y", "z (boresight)")
+BLOCKS = (
+    StateBlock("attitude", slice(0, 3), "rad", "arcsec", "body", AXES),
+    StateBlock("gyro_bias", slice(3, 6), "rad/s", "arcsec/s", "body", AXES),
+)
+
+
+def attitude_problem(given: AttitudeLoop, filters: tuple[str, ...], seed: int) -> Problem:
+    """The closed loop with each of the filters.
+
+    Raises:
+        ValueError: a body that cannot be, too few wheels, a filter that is unknown, or a design
+            that does not exist.
+        ImportError: a design by LMI without the extra "lmi".
+    """
+    course = lay_out(given)
+    return Problem(
+        simulate=partial(simulate, given, course, seed),
+        contenders={name: contender(given, course, name) for name in filters},
+        epoch_s=course.time_s,
+        blocks=BLOCKS,
+        sensors={STAR: SensorAxes("rad", "body", AXES, "arcsec")},
+        context=_context(course),
+        metrics=attitude_metrics,
+        claims=partial(satellite_claims, given.claims),
+        count_from=int(np.searchsorted(course.time_s, given.counted_from + 1e-9)),
+        outputs=_outputs(given),
+    )
+
+
+def _outputs(given: AttitudeLoop) -> tuple[Output, ...]:
+    wheels = tuple(f"wheel {i}" for i in range(len(given.wheels.axes)))
+    return (
+        Output(
+            "pointing",
+            "rad",
+            "arcsec",
+            "reference",
+            ("x", "y", "z"),
+            "Where the craft points against where it should.",
+            is_error=True,
+        ),
+        Output(
+            "wheel_momentum",
+            "N m s",
+            "N m s",
+            "wheel axes",
+            wheels,
+            f"Momentum of the wheels, first run; each holds {given.wheels.momentum:g} N m s.",
+        ),
+    )
+
+
+def _context(course: Course) -> xr.Dataset:
+    """The wanted rate, and when the star sensor is lost."""
+    lost = (course.due & ~course.seen).astype(np.int8)
+    data = {}
+    if np.any(lost):
+        data["outage"] = variable("time", lost, "1", "star sensor lost")
+    time = variable("time", course.time_s, "s", "time since the start")
+    return xr.Dataset(data, {"time": time})
