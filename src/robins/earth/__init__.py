@@ -3,6 +3,7 @@
 - `wgs84`: constants and functions of the WGS-84 ellipsoid.
 - `geodetic`: `Geodetic`, latitude, longitude and height with `retract` and `local` in metres.
 - `magnetic`: the field of the WMM2020 and WMM2025 (import it by its name).
+- `star_catalogue`, `star_index`: stars, and those near a direction (import them by their names).
 """
 
 from robins.earth.geodetic import Geodetic
