@@ -9,8 +9,10 @@ exact, for with q_ie = q_id exp(a x) about a fixed unit axis x of d,
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -33,7 +35,11 @@ def nadir(orbit: Orbit) -> Reference:
 
     The rate is that of any two-body orbit, -|r x v|/r^2 about y.
     """
-    r, v = orbit.r_i_m, orbit.v_i_m_s
+    return _nadir(orbit.r_i_m, orbit.v_i_m_s)
+
+
+@jax.jit
+def _nadir(r, v) -> Reference:
     r_sq = jnp.sum(r * r, -1)
     normal = jnp.cross(r, v)
     area = jnp.sqrt(jnp.sum(normal * normal, -1))
@@ -92,7 +98,13 @@ def slews(
     phase = _given.vector("phase_rad", phase_rad, 3)
     _given.number("fade_in_s", fade_in_s, 0.0)
     time = _given.rows("time_s", time_s, base.q_ib.shape[0])
-    t = (time - time[0])[:, None]
+    _given.number("time_s", time)
+    return _slewing(base, amplitude, period, time - time[0], phase, float(fade_in_s))
+
+
+@functools.partial(jax.jit, static_argnums=5)
+def _slewing(base: Reference, amplitude, period, time, phase, fade_in_s: float) -> Reference:
+    t = time[:, None]
     turns = (2.0 * jnp.pi / period)[None]
     sin, cos = jnp.sin(turns * t + phase[None]), jnp.cos(turns * t + phase[None])
     s, s1, s2 = _fade_in(t, fade_in_s)

@@ -8,8 +8,9 @@ That is enough for torques and fields of an attitude study; it is not an ephemer
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -22,9 +23,8 @@ from robins.sim import _given
 
 LOWEST_M = 100e3  # below it nothing goes round
 
-# Of the IGRF-14, 2025.0, degree one [T]: a dipole through the Earth's centre, its axis 9.2 deg from
-# the Earth's (Alken et al. 2021, "International Geomagnetic Reference Field: the thirteenth
-# generation", for the form).
+# Degree one of the IGRF-14 for 2025.0 [T]: a dipole at the Earth's centre, its axis 9.2 deg from the
+# Earth's.
 _DIPOLE_E = (-1410.3e-9, 4545.5e-9, -29350.0e-9)  # g11, h11, g10
 
 
@@ -37,7 +37,7 @@ class Orbit(NamedTuple):
 
 
 def circular_orbit(
-    alt_m: float, incl_rad: float, raan_rad: float, arg_lat_rad: float, time_s: Any
+    alt_m: Any, incl_rad: Any, raan_rad: Any, arg_lat_rad: Any, time_s: Any
 ) -> Orbit:
     """A circular two-body orbit.
 
@@ -59,20 +59,20 @@ def circular_orbit(
     if time.ndim != 1:
         raise ValueError(f"time_s must have shape (E,), got {time.shape}")
     _given.number("time_s", time)
-    radius = A_M + jnp.asarray(alt_m, float)
+    elements = (jnp.asarray(x, float) for x in (alt_m, incl_rad, raan_rad, arg_lat_rad))
+    return Orbit(time, *_circular(*elements, time))
+
+
+@jax.jit
+def _circular(alt, incl, raan, arg_lat, time) -> tuple[Array, Array]:
+    radius = A_M + alt
     turns = jnp.sqrt(GM / radius**3)
-    angle = arg_lat_rad + turns * time
-    node = jnp.stack([jnp.cos(raan_rad), jnp.sin(raan_rad), jnp.zeros(())])
-    across = jnp.stack(
-        [
-            -jnp.sin(raan_rad) * jnp.cos(incl_rad),
-            jnp.cos(raan_rad) * jnp.cos(incl_rad),
-            jnp.sin(incl_rad),
-        ]
-    )
-    cos, sin = jnp.cos(angle)[:, None], jnp.sin(angle)[:, None]
-    return Orbit(
-        time,
+    node = jnp.stack([jnp.cos(raan), jnp.sin(raan), jnp.zeros(())])
+    level = jnp.cos(incl)
+    across = jnp.stack([-jnp.sin(raan) * level, jnp.cos(raan) * level, jnp.sin(incl)])
+    angle = (arg_lat + turns * time)[:, None]
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return (
         radius * (cos * node[None] + sin * across[None]),
         radius * turns * (cos * across[None] - sin * node[None]),
     )
@@ -89,18 +89,23 @@ def dipole_field_i(r_i_m: Float[Array, "*b 3"], earth_angle_rad: ArrayLike) -> F
         earth_angle_rad: (...) how far the Earth has turned against i.
     """
     angle = jnp.broadcast_to(jnp.asarray(earth_angle_rad, float), r_i_m.shape[:-1])
+    return _dipole(r_i_m, angle)
+
+
+@jax.jit
+def _dipole(r, angle) -> Array:
     x, y, z = _DIPOLE_E
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     m = jnp.stack([x * cos - y * sin, x * sin + y * cos, jnp.full_like(angle, z)], -1)
-    distance = jnp.sqrt(jnp.sum(r_i_m * r_i_m, -1, keepdims=True))
-    up = r_i_m / distance
+    distance = jnp.sqrt(jnp.sum(r * r, -1, keepdims=True))
+    up = r / distance
     return (RADIUS_M / distance) ** 3 * (3.0 * jnp.sum(m * up, -1, keepdims=True) * up - m)
 
 
 def field_along_orbit(
     orbit: Orbit,
-    model: Literal["dipole", "wmm"] = "dipole",
-    earth_angle_rad: float = 0.0,
+    model: str = "dipole",
+    earth_angle_rad: Any = 0.0,
     decimal_year: float = 2025.0,
     knot_s: float = 10.0,
 ) -> Float[Array, "epochs 3"]:
@@ -122,12 +127,21 @@ def field_along_orbit(
         return dipole_field_i(orbit.r_i_m, angle)
     if model != "wmm":
         raise ValueError(f"the field models of an orbit are 'dipole' and 'wmm', not {model!r}")
-    lat, lon, alt = geodetic_from_ecef(_about_z(-angle, orbit.r_i_m))
+    lat, lon, alt = _geodetic(orbit.r_i_m, angle)
     b_n = field_along(
         wmm_for(decimal_year), lat, lon, alt, decimal_year, orbit.time_s, knot_s=knot_s
     )
-    b_e = jnp.sum(dcm_en(lat, lon) * jnp.asarray(b_n)[:, None, :], -1)
-    return _about_z(angle, b_e)
+    return _to_inertial(lat, lon, jnp.asarray(b_n), angle)
+
+
+@jax.jit
+def _geodetic(r, angle) -> tuple[Array, Array, Array]:
+    return geodetic_from_ecef(_about_z(-angle, r))
+
+
+@jax.jit
+def _to_inertial(lat, lon, b_n, angle) -> Array:
+    return _about_z(angle, jnp.sum(dcm_en(lat, lon) * b_n[:, None, :], -1))
 
 
 def _about_z(angle: Array, v: Array) -> Array:
