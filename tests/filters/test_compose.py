@@ -11,6 +11,7 @@ import pytest
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor, unscented
 from robins.filters.rules import (
     adaptive_h_infinity,
+    channel_inflation,
     consider,
     constant_gain,
     correntropy,
@@ -67,6 +68,7 @@ RULES = {
     "consider": consider([3]),
     "projection": projection("y"),
     "constant_gain": constant_gain({"y": 0.3 * SEEN.T}),
+    "channel_inflation": channel_inflation(0.5, SEEN.T),
     "gate only": only("y", gate()),
 }
 SILENT = {"consider"}  # says nothing that StepInfo does not say

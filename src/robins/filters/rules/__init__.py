@@ -1,6 +1,7 @@
 """Rules: one published adaptation a file; each composes with every way to linearise."""
 
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
+from robins.filters.rules.channel_inflation import channel_inflation
 from robins.filters.rules.consider import consider
 from robins.filters.rules.constant_gain import constant_gain, with_gains
 from robins.filters.rules.correntropy import correntropy
@@ -23,6 +24,7 @@ from robins.filters.rules.variational_bayes import variational_bayes
 __all__ = [
     "Infeasible",
     "adaptive_h_infinity",
+    "channel_inflation",
     "consider",
     "constant_gain",
     "correntropy",
