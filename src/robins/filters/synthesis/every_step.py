@@ -48,7 +48,8 @@ class EveryStep:
     def __init__(self, gamma: Number, form: ObserverForm = "common"):
         check_gamma(gamma)
         check_form(form)
-        self.gamma, self.form = float(gamma), form
+        self.gamma = float(gamma)
+        self.form: ObserverForm = form
         self._scales: Scales | None = None
         warnings.warn(
             "LMIs for the plant frozen at each sample guarantee nothing for a plant that varies: "
