@@ -23,8 +23,7 @@ from robins.sim import _given
 
 LOWEST_M = 100e3  # below it nothing goes round
 
-# Degree one of the IGRF-14 for 2025.0 [T]: a dipole at the Earth's centre, its axis 9.2 deg from the
-# Earth's.
+# Degree one of the IGRF-14 for 2025.0 [T]: a dipole at the centre, 9.2 deg from the Earth's axis.
 _DIPOLE_E = (-1410.3e-9, 4545.5e-9, -29350.0e-9)  # g11, h11, g10
 
 
