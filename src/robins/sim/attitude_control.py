@@ -112,7 +112,7 @@ def allocation_matrix(wheel_axes_b: Any, works: Any = 1.0) -> np.ndarray:
             f"wheels {working} of {axes.shape[1]} give torque about {rank} independent axes, and "
             "three are needed: a body with fewer cannot be held by wheels alone"
         )
-    return np.linalg.pinv(left)
+    return np.linalg.pinv(left) * there[:, None]  # exactly nothing for a lost wheel
 
 
 def desaturation_dipole(
