@@ -114,7 +114,7 @@ def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: A
         raise ValueError(
             f"Dv is {Dv.shape}, must be ({m}, {Dv.shape[1]}): C says that y has {m} components"
         )
-    made = Plant(
+    return Plant(
         given.A,
         np.hstack([given.Bw, np.zeros((n, Dv.shape[1]))]),
         given.Bn,
@@ -123,8 +123,6 @@ def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: A
         given.C @ given.Bn + given.Dn,
         given.L,
     )
-    _refuse_undetectable(made.A, made.C)
-    return made
 
 
 def error_system(plant: Plant, K: Any) -> ErrorSystem:
@@ -183,7 +181,7 @@ def _refuse_undetectable(A: np.ndarray, C: np.ndarray) -> None:
     rows = C / np.where(size > 0.0, size, 1.0)
     for value in values[np.abs(values) >= 1.0 - _MARGINAL]:
         # The eigenvalues of a defective block scatter, their mean is accurate.
-        cluster = values[np.abs(values - value) < 1e-5 * np.abs(value)]
+        cluster = values[np.abs(values - value) < 1e-4 * np.abs(value)]
         for eigenvalue in (value, cluster.mean()):
             if (direction := _unseen(A, rows, complex(eigenvalue))) is not None:
                 k = int(np.argmax(np.abs(direction)))
