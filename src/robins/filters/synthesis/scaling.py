@@ -75,9 +75,9 @@ def balanced(plant: Plant, gamma: float | None = None) -> Scales:
         x = x * change
         y = y * _or_one(_norms(scaled.C, scaled.Dw, scaled.Dn))
         scaled = Scales(x, y, w, n, z).plant(plant)
-        w = w / float(_or_one(_mean(scaled.Bw, scaled.Dw)))
-        z = z * float(_or_one(_mean(scaled.L)))
-        n = n / float(_or_one(_mean(scaled.Bn, scaled.Dn))) if gamma is None else z / gamma
+        w = w / _size(scaled.Bw, scaled.Dw)
+        z = z * _size(scaled.L)
+        n = n / _size(scaled.Bn, scaled.Dn) if gamma is None else z / gamma
         if np.max(np.abs(change - 1.0)) < _SETTLED:
             break
     return Scales(x, y, w, n, z)
@@ -88,12 +88,13 @@ def _norms(*blocks: np.ndarray) -> np.ndarray:
     return np.sqrt(sum(np.sum(block**2, axis=1) for block in blocks))
 
 
-def _mean(*blocks: np.ndarray) -> np.ndarray:
-    """Root mean square norm of the rows that are not zero."""
-    squares = np.concatenate([np.sum(block**2, axis=1) for block in blocks])
-    return np.sqrt(squares.sum() / max(1, np.count_nonzero(squares)))
-
-
 def _or_one(norms: np.ndarray) -> np.ndarray:
     """Norms with one in place of zero, for what is not there needs no scale."""
     return np.where(norms > 0.0, norms, 1.0)
+
+
+def _size(*blocks: np.ndarray) -> float:
+    """Root mean square norm of the rows that are not zero; one where all are."""
+    squares = np.concatenate([np.sum(block**2, axis=1) for block in blocks])
+    rows = np.count_nonzero(squares)
+    return float(np.sqrt(squares.sum() / rows)) if rows else 1.0
