@@ -110,8 +110,8 @@ def test_the_shapes_of_the_document_are_refused_with_the_mend():
     with pytest.raises(ValueError, match="own in y") as caught:
         plant(eye, eye, Bn, eye, None, eye)
     assert str(caught.value) == (
-        "Dn is (4, 4), must be (4, 3): C says that y has 4 components and Bn that n has 3. If n has "
-        "parts of its own in y, give them columns: Bn = [Bn, 0] and Dn = [0, Dn]"
+        "Dn is (4, 4), must be (4, 3): C says that y has 4 components and Bn that n has 3. If n "
+        "has parts of its own in y, give them columns: Bn = [Bn, 0] and Dn = [0, Dn]"
     )
     split = plant(eye, eye, np.hstack([Bn, 0 * eye]), eye, None, np.hstack([0 * Bn, eye]))
     assert split.Dn.shape == (4, 7)
@@ -145,7 +145,7 @@ def test_modes_of_a_chain_and_of_a_rotation():
     for step in (1.0, 1e-6):
         chain = np.array([[1.0, -step], [0.0, 1.0]])
         assert isinstance(plant(chain, np.eye(2), np.eye(2), [[1e-9, 0.0]]), Plant)
-        with pytest.raises(ValueError, match="at 1 .* along state 0"):
+        with pytest.raises(ValueError, match=r"at 1 .* along state 0"):
             plant(chain, np.eye(2), np.eye(2), [[0.0, 1.0]])
     turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
     assert isinstance(plant(turn, np.eye(2), np.eye(2), [[1.0, 0.0]]), Plant)

@@ -2,7 +2,7 @@
 
 The H2 norm is the root mean square of z for white u of unit covariance, the H-infinity norm the
 greatest energy gain from u to z. The latter is computed twice, in ways that err differently:
-`hinf_norm` asks an eigenvalue problem where a singular value of the frequency response crosses a
+`hinf_norm` asks an eigenvalue problem whether a singular value of the frequency response crosses a
 level, `peak_gain` sweeps the frequency. All are inf for a system that is not stable.
 """
 
@@ -56,34 +56,35 @@ def hinf_norm(
     D: np.ndarray | None = None,
     rtol: Number = 1e-11,
 ) -> float:
-    """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by bisection.
+    """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by level tests.
 
-    The circle is mapped to the imaginary axis; a level g is reached where the Hamiltonian matrix of
-    the level has an eigenvalue on that axis (Boyd, Balakrishnan & Kabamba 1989). The Hankel
-    singular values s bound the norm, max(s_1, |D|) <= norm <= |D| + 2 sum(s), and start it.
+    The circle is mapped to the imaginary axis; a level is reached where the Hamiltonian matrix of
+    the level has an eigenvalue on that axis (Boyd, Balakrishnan & Kabamba 1989). A level that is
+    reached is raised to the highest response between such eigenvalues (Bruinsma & Steinbuch 1990),
+    which is a bisection that halves the error quadratically; the one that is not reached is the
+    answer. The Hankel singular values s bound the norm, max(s_1, |D|) <= norm <= |D| + 2 sum(s).
 
     Args:
         A: (n, n).
         B: (n, q).
         C: (r, n).
         D: (r, q), zero by default.
-        rtol: relative width of the last bracket; its upper end, which is not reached, is returned.
+        rtol: relative distance of the level that is not reached from a response that is.
 
     Returns:
-        The norm; inf unless A is stable.
+        The norm, from above; inf unless A is stable.
     """
     if spectral_radius(A) >= 1.0:
         return np.inf
     D = np.zeros((len(C), B.shape[1])) if D is None else D
-    level = Levels.of(A, B, C, D)
-    lower, upper = level.lower, level.upper
-    while upper - lower > rtol * upper:
-        middle = 0.5 * (lower + upper)
-        if level.reached(middle):
-            lower = middle
-        else:
-            upper = middle
-    return upper
+    levels = Levels.of(A, B, C, D)
+    lower = levels.lower
+    while lower > 0.0 and lower < levels.upper:
+        above = lower * (1.0 + rtol)
+        if (highest := levels.highest(above)) < above:
+            return above
+        lower = highest
+    return lower
 
 
 class Levels(NamedTuple):
@@ -115,8 +116,8 @@ class Levels(NamedTuple):
         direct = _largest(D)
 
         turns = np.exp(1j * np.pi * np.arange(8) / 4.0)
-        distance = [np.linalg.svd(A + t * np.eye(n), compute_uv=False)[-1] for t in turns]
-        turn = turns[int(np.argmax(distance))]
+        distance = np.linalg.svd(A + turns[:, None, None] * np.eye(n), compute_uv=False)[:, -1]
+        turn = turns[np.argmax(distance)]
         inverse = np.linalg.inv(A / turn + np.eye(n))
         B = B / turn
         return cls(
@@ -129,13 +130,18 @@ class Levels(NamedTuple):
         )
 
     def reached(self, gain: Number) -> bool:
-        """Whether a singular value of the frequency response is as large as this at some s = jw.
+        """Whether some singular value of the frequency response is as large as this."""
+        return self.highest(gain) >= gain
 
-        Eigenvalues near the axis are only believed where the response itself reaches the level.
+    def highest(self, gain: Number) -> float:
+        """Highest response found where a singular value crosses this level and between; else 0.
+
+        Below the level if it is not reached anywhere: eigenvalues near the axis are only believed
+        for what the response is there.
         """
         A, B, C, D = self.A, self.B, self.C, self.D
-        if gain <= _largest(D):
-            return True
+        if gain <= (far := _largest(D)):
+            return far
         R = gain**2 * np.eye(B.shape[1]) - D.conj().T @ D
         shift = np.linalg.solve(R, D.conj().T @ C)
         corner = A + B @ shift
@@ -144,11 +150,10 @@ class Levels(NamedTuple):
         found = np.linalg.eigvals(np.vstack([top, np.hstack([below, -corner.conj().T])]))
         near = found[np.abs(found.real) <= _AXIS * max(1.0, np.max(np.abs(found)))]
         if near.size == 0:
-            return False
-        w = near.imag
-        # The response is flat where it touches the level, so what lies between is looked at too.
-        w = np.concatenate([w, 0.5 * (np.sort(w)[1:] + np.sort(w)[:-1])])
-        return bool(np.max(_gains(A, B, C, D, 1j * w)) >= gain)
+            return 0.0
+        w = np.sort(near.imag)
+        w = np.concatenate([w, 0.5 * (w[1:] + w[:-1])])
+        return float(np.max(_gains(A, B, C, D, 1j * w)))
 
 
 def peak_gain(

@@ -182,11 +182,11 @@ def _refuse_undetectable(A: np.ndarray, C: np.ndarray) -> None:
     for value in values[np.abs(values) >= 1.0 - _MARGINAL]:
         # The eigenvalues of a defective block scatter, their mean is accurate.
         cluster = values[np.abs(values - value) < 1e-4 * np.abs(value)]
-        for eigenvalue in (value, cluster.mean()):
-            if (direction := _unseen(A, rows, complex(eigenvalue))) is not None:
+        for eigenvalue in (complex(value), complex(cluster.mean())):
+            if (direction := _unseen(A, rows, eigenvalue)) is not None:
                 k = int(np.argmax(np.abs(direction)))
                 raise ValueError(
-                    f"(A, C) is not detectable: the mode of A at {_written(complex(eigenvalue))} does not "
+                    f"(A, C) is not detectable: the mode of A at {_written(eigenvalue)} does not "
                     f"decay by itself and is not seen in y = C x (it lies mostly along state {k}, "
                     "counted from 0). Measure it, or leave it out of the state"
                 )

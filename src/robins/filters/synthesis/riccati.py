@@ -17,7 +17,7 @@ METHOD = "riccati"
 
 _DECADES = np.arange(-2.0, 12.1, 0.25)  # of lambda, about the one that makes n as large as w
 _RTOL = 1e-10  # of lambda
-_STEPS = 12  # of Newton's iteration at most; it converges quadratically
+_STEPS = 60  # of Newton's iteration at most; it converges quadratically once it is near
 
 
 def kalman_gain(plant: Plant) -> np.ndarray:
@@ -108,14 +108,14 @@ def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
         return K, 0.0
     grid, below = _grid(plant, K), 0.0
     for above in grid:
-        if (K := _attempt(plant, above)) is not None and meets(K):
+        K = _gain(plant, above, K)
+        if meets(K):
             return _bisect(plant, meets, below, above, K)
         below = above
     above, least = _least(plant)
     if least <= gamma:
         below = max(grid[grid < above], default=0.0)
-        K = _gain(plant, above)
-        return _bisect(plant, meets, below, above, K)
+        return _bisect(plant, meets, below, above, _gain(plant, above))
     raise Unreachable(
         f"the Riccati equation cannot reach gamma {gamma:.6g} for any lambda: the least is "
         f"{least:.6g}. Raise gamma, or take the observer form of the LMI",
@@ -134,8 +134,8 @@ def _bisect(
         middle = 0.5 * (below + above)
         if not below < middle < above:
             break
-        gain = _attempt(plant, middle)
-        if gain is not None and meets(gain):
+        gain = _gain(plant, middle, K)
+        if meets(gain):
             above, K = middle, gain
         else:
             below = middle
@@ -145,25 +145,25 @@ def _bisect(
 def _least(plant: Plant) -> tuple[float, float]:
     """The lambda of the least H-infinity norm, and that norm."""
 
-    def norm(lambda_: float) -> float:
-        K = _attempt(plant, lambda_)
-        if K is None:
-            return np.inf
+    def norm(K: np.ndarray) -> float:
         e = error_system(plant, K)
         return hinf_norm(e.A, e.Bn, e.L)
 
-    grid = np.concatenate([[0.0], _grid(plant, _gain(plant, 0.0))])
-    norms = [norm(value) for value in grid]
+    gains = [_gain(plant, 0.0)]
+    grid = np.concatenate([[0.0], _grid(plant, gains[0])])
+    for value in grid[1:]:
+        gains.append(_gain(plant, float(value), gains[-1]))
+    norms = [norm(K) for K in gains]
     best = int(np.argmin(norms))
     found = grid[best], norms[best]
     if 1 < best < len(grid) - 1:
         ends = np.log(grid[best - 1]), np.log(grid[best + 1])
         fine = scipy.optimize.minimize_scalar(
-            lambda exponent: norm(float(np.exp(exponent))),
+            lambda exponent: norm(_gain(plant, float(np.exp(exponent)), gains[best])),
             bounds=ends, method="bounded", options={"xatol": 1e-9},
         )  # fmt: skip
         if fine.fun < found[1]:
-            found = float(np.exp(fine.x)), float(fine.fun)
+            found = np.exp(fine.x), fine.fun
     return float(found[0]), float(found[1])
 
 
@@ -180,32 +180,30 @@ def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
     return 10.0**_DECADES / (largest or 1.0)
 
 
-def _attempt(plant: Plant, lambda_: float) -> np.ndarray | None:
-    try:
-        return _gain(plant, lambda_)
-    except ValueError:
-        return None
-
-
-def _gain(plant: Plant, lambda_: float) -> np.ndarray:
+def _gain(plant: Plant, lambda_: float, near: np.ndarray | None = None) -> np.ndarray:
+    """Kalman gain for noise [w, sqrt(lambda) n], from a gain that stabilises, if one is given."""
     A, C = plant.A, plant.C
     B = np.hstack([plant.Bw, np.sqrt(lambda_) * plant.Bn])
     D = np.hstack([plant.Dw, np.sqrt(lambda_) * plant.Dn])
-    state = _sizes(B)
+    state = _sizes(B)[:, None]
     output = _sizes(np.hstack([D, C @ B]))
-    A_, B_ = A * state / state[:, None], B / state[:, None]
-    C_, D_ = C * state / output[:, None], D / output[:, None]
+    scaled = A * state.T / state, B / state, C * state.T / output[:, None], D / output[:, None]
+    start = _stabilising(*scaled) if near is None else near * output / state
+    return _polished(*scaled, start) * state / output
+
+
+def _stabilising(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
     advice = "a mode of A on the unit circle is not driven by w: give it noise in Bw"
     try:
-        P = scipy.linalg.solve_discrete_are(A_.T, C_.T, B_ @ B_.T, D_ @ D_.T, s=B_ @ D_.T)
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, B @ B.T, D @ D.T, s=B @ D.T)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError(f"the Kalman filter has no steady state: {advice} ({error})") from error
-    K = _update(A_, B_, C_, D_, P)
-    if not (radius := spectral_radius(A_ - K @ C_)) < 1.0:
+    K = _update(A, B, C, D, P)
+    if not (radius := spectral_radius(A - K @ C)) < 1.0:
         raise ValueError(
             f"the Kalman filter has no steady state, its error decays by {radius:.9g}: {advice}"
         )
-    return _polished(A_, B_, C_, D_, K) * state[:, None] / output
+    return K
 
 
 def _polished(
@@ -215,11 +213,13 @@ def _polished(
     change = np.inf
     for _ in range(_STEPS):
         better = _update(A, B, C, D, gramian(A - K @ C, B - K @ D))
-        smaller = float(np.max(np.abs(better - K)))
-        if not smaller < change or spectral_radius(A - better @ C) >= 1.0:
+        before, change = change, float(np.max(np.abs(better - K)))
+        size = float(np.max(np.abs(K)))
+        close = change < 1e-7 * size
+        if (close and change > 0.5 * before) or spectral_radius(A - better @ C) >= 1.0:
             break
-        K, change = better, smaller
-        if change <= 1e-15 * float(np.max(np.abs(K))):
+        K = better
+        if change <= 1e-15 * size:
             break
     return K
 
@@ -230,12 +230,14 @@ def _update(
     """K = (A P C' + B D') (C P C' + D D')^-1."""
     S = C @ P @ C.T + D @ D.T
     try:
-        return scipy.linalg.solve(S, C @ P @ A.T + D @ B.T, assume_a="pos").T
+        root = np.linalg.cholesky(S)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             "some combination of measurements is known beforehand and free of noise: give each "
             "noise of its own in Dw"
         ) from error
+    half = np.linalg.solve(root, C @ P @ A.T + D @ B.T)
+    return np.linalg.solve(root.T, half).T
 
 
 def _sizes(rows: np.ndarray) -> np.ndarray:
