@@ -5,23 +5,40 @@ about the boresight commonly some times as large as across it, and a low-frequen
 warping and from stars that cross the field. All errors of a run are drawn beforehand, so a closed
 loop only turns its attitude by the next of them. (`robins.sim.star_tracker` observes a motion that
 is known beforehand.)
+
+`StarCamera` and `photograph` go a step further down: the stars of a catalogue that are in the field
+of view, each with an error of its own, some missed and some that are none. `measure_attitude` is
+the whole sensor: the image, the stars known again, the attitude by QUEST with its covariance, and
+no answer where there are too few. Aberration, the motion of a star across a long exposure and
+double stars that melt into one are not simulated.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from robins import _float64  # noqa: F401
-from robins.rotation import from_rotvec, multiply, normalise, rotate
+from robins.earth.star_catalogue import Stars
+from robins.earth.star_index import StarIndex, index_stars, near
+from robins.ins.star_tracking import track_stars
+from robins.ins.vector_attitude import quest
+from robins.rotation import conjugate, from_rotvec, multiply, normalise, rotate
 from robins.sim import _given
 
 # Folded into the key of the sensor; part of the file format, as `Component` is.
 _NOISE, _PHASE = 0, 1
+# Folded into the key of a frame of the camera; three numbers of each kind a row, false stars last.
+_NORMAL, _UNIFORM = 0, 1
+
+ARCSEC = np.pi / 648e3
+"""A second of arc [rad]."""
 
 
 def star_errors(
@@ -81,3 +98,192 @@ def read_star(
     if q_bs is not None:
         error = rotate(normalise(_given.rows("q_bs", q_bs, 4)), error)
     return normalise(multiply(q_ib, from_rotvec(error)))
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=(
+        "field_rad",
+        "magnitude_limit",
+        "sigma_rad",
+        "sigma_magnitude",
+        "sigma_growth",
+        "magnitude_sigma",
+        "missed",
+        "q_bs",
+    ),
+    meta_fields=("most_stars", "false_stars"),
+)
+@dataclass(frozen=True)
+class StarCamera:
+    """A camera that reports directions of stars. Its axes: boresight z.
+
+    The error of a direction has sigma in each of two angles. It grows with the magnitude of
+    stars fainter than ``sigma_magnitude`` as 10^(growth (m - sigma_magnitude)): 0.2 where the light
+    of the star itself is the noise, 0.4 where it is that of the background.
+    """
+
+    field_rad: Any = np.pi / 9.0  # full angle of the round field of view, 20 deg
+    magnitude_limit: Any = 6.0  # fainter stars are not seen
+    sigma_rad: Any = 20.0 * ARCSEC  # of a bright star
+    sigma_magnitude: Any = 4.0
+    sigma_growth: Any = 0.0
+    magnitude_sigma: Any = 0.0  # of the reported magnitude
+    missed: Any = 0.0  # probability that a star in the field is not reported
+    q_bs: Any = (1.0, 0.0, 0.0, 0.0)  # sensor axes to body axes
+    most_stars: int = 40  # the brightest are reported if there are more
+    false_stars: int = 0  # directions reported of no star, anywhere in the field
+
+
+class StarImage(NamedTuple):
+    """What a camera reports of a moment, brightest first; M = most_stars + false_stars rows."""
+
+    vectors_b: Any  # (M, 3) unit vectors, body axes; NaN: none
+    sigma_rad: Any  # (M,) of each of the two angles of a direction
+    magnitude: Any  # (M,) as reported; NaN: none
+    star: Any  # (M,) int, the truth: place in the catalogue; -1: none or false
+
+
+def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0.5)) -> StarIndex:
+    """The stars that a camera can see, sorted into cells that it can search inside a loop.
+
+    Args:
+        camera: which is checked here.
+        stars: the catalogue, from `robins.earth.star_catalogue`.
+        margin_rad: by which a list reaches beyond the field, for attitudes not exactly known [rad].
+
+    Raises:
+        ValueError: a figure of the camera out of its range, or a catalogue without a star that is
+            bright enough.
+    """
+    half_turn = np.pi / 2.0
+    _given.number("field_rad", camera.field_rad, 0.0, half_turn - 2.0 * margin_rad, above=True)
+    _given.number("magnitude_limit", camera.magnitude_limit)
+    _given.number("sigma_rad", camera.sigma_rad, 0.0, 0.1, above=True)
+    _given.number("sigma_magnitude", camera.sigma_magnitude)
+    _given.number("sigma_growth", camera.sigma_growth, 0.0, 1.0)
+    _given.number("magnitude_sigma", camera.magnitude_sigma, 0.0)
+    _given.number("missed", camera.missed, 0.0, 1.0)
+    length = np.linalg.norm(_given.rows("q_bs", camera.q_bs, 4))
+    _given.number("q_bs must be a unit quaternion: its length", length, 0.999, 1.001)
+    _given.count_of("most_stars", camera.most_stars)
+    _given.number("false_stars", camera.false_stars, 0.0)
+    bright = np.asarray(stars.magnitude) < camera.magnitude_limit
+    if not np.any(bright):
+        raise ValueError(
+            f"no star of the catalogue is brighter than magnitude_limit {camera.magnitude_limit}"
+        )
+    seen = Stars(*(np.asarray(x)[bright] for x in stars))
+    return index_stars(seen, 0.5 * float(camera.field_rad) + margin_rad)
+
+
+def photograph(
+    key: Array,
+    index: StarIndex,
+    q_ib: Float[Array, "4"],
+    camera: StarCamera,
+    turn_rad: Any = None,
+) -> StarImage:
+    """Stars as a camera sees them. Pure JAX: it maps over keys, attitudes and sizes of errors.
+
+    Args:
+        key: of the frame.
+        index: of the stars, from `index_for`.
+        q_ib: true attitude of the body.
+        camera: the camera.
+        turn_rad: (3,) an error that all stars share, such as a low-frequency one from
+            `star_errors`: the image is that of the attitude that `read_star` makes of q_ib and
+            it. None: there is none.
+    """
+    q_bs = normalise(_given.rows("q_bs", camera.q_bs, 4))
+    q_is = multiply(q_ib, q_bs)
+    if turn_rad is not None:
+        q_is = multiply(q_is, from_rotvec(jnp.asarray(turn_rad, float)))
+    rows = camera.most_stars + camera.false_stars
+
+    normal = jax.random.normal(jax.random.fold_in(key, _NORMAL), (rows, 3))
+    uniform = jax.random.uniform(jax.random.fold_in(key, _UNIFORM), (rows, 3))
+
+    members = near(index, rotate(q_is, jnp.array([0.0, 0.0, 1.0])))
+    vectors_s = rotate(conjugate(q_is), jnp.asarray(index.unit_i)[members])
+    cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float))
+    seen = (members >= 0) & (vectors_s[:, 2] > cos_edge)
+    seen = seen & (jnp.asarray(index.magnitude)[members] < camera.magnitude_limit)
+    # Lists are brightest first, so the first of the seen are the brightest.
+    (first,) = jnp.nonzero(seen, size=camera.most_stars, fill_value=-1)
+    caught = uniform[: camera.most_stars, 0] >= camera.missed
+    star = jnp.where((first >= 0) & caught, members[first], -1)
+
+    # False ones are uniform over the cap of the field, and bright as stars are, see `synthetic`.
+    where = uniform[camera.most_stars :]
+    z, azimuth = 1.0 - where[:, 0] * (1.0 - cos_edge), 2.0 * np.pi * where[:, 1]
+    across = jnp.sqrt(1.0 - z**2)
+    false_s = jnp.stack([across * jnp.cos(azimuth), across * jnp.sin(azimuth), z], 1)
+    false_magnitude = camera.magnitude_limit + jnp.log10(1.0 - where[:, 2]) / 0.4888
+
+    there = jnp.concatenate([star >= 0, jnp.ones(camera.false_stars, bool)])
+    star = jnp.concatenate([star, jnp.full(camera.false_stars, -1)])
+    magnitude = jnp.concatenate([jnp.asarray(index.magnitude)[members[first]], false_magnitude])
+    fainter = jnp.maximum(magnitude - camera.sigma_magnitude, 0.0)
+    sigma = camera.sigma_rad * 10.0 ** (camera.sigma_growth * fainter)
+    noise = sigma[:, None] * normal[:, :2]
+    vectors_s = _shifted(jnp.concatenate([vectors_s[first], false_s]), noise)
+    reported = magnitude + camera.magnitude_sigma * normal[:, 2]
+
+    order = jnp.argsort(jnp.where(there, reported, jnp.inf))
+    here = there[order]
+    vectors_b = rotate(q_bs, vectors_s[order])
+    return StarImage(
+        jnp.where(here[:, None], vectors_b, jnp.nan),
+        sigma[order],
+        jnp.where(here, reported[order], jnp.nan),
+        star[order],
+    )
+
+
+def measure_attitude(
+    key: Array,
+    index: StarIndex,
+    q_ib: Float[Array, "4"],
+    camera: StarCamera,
+    turn_rad: Any = None,
+    q_ib_prior: Any = None,
+    tolerance_rad: Any = None,
+) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
+    """A frame of a star sensor: photograph, know the stars again, QUEST. Pure JAX.
+
+    Args:
+        key: of the frame.
+        index: of the stars, from `index_for`.
+        q_ib: true attitude of the body.
+        camera: the camera.
+        turn_rad: an error that all stars share, see `photograph`.
+        q_ib_prior: (4,) attitude as far as known; the stars are then those that
+            `robins.ins.star_tracking.track_stars` matches with it. None: each star is known.
+        tolerance_rad: of the match [rad]; None: six sigmas of the faintest star that is reported.
+
+    Returns:
+        q_ib as measured, its covariance (3, 3) [rad^2] in body axes (of dtheta in
+        ``q_true = q exp(dtheta)``), the number of stars used. With fewer than two stars, or none
+        far enough from another, the first two are NaN.
+    """
+    image = photograph(key, index, q_ib, camera, turn_rad)
+    star = image.star
+    if q_ib_prior is not None:
+        boresight = rotate(normalise(_given.rows("q_bs", camera.q_bs, 4)), jnp.array([0.0, 0, 1.0]))
+        there = ~jnp.isnan(image.magnitude)
+        if tolerance_rad is None:
+            tolerance_rad = 6.0 * jnp.max(jnp.where(there, image.sigma_rad, 0.0))
+        prior = _given.rows("q_ib_prior", q_ib_prior, 4)
+        star = track_stars(index, image.vectors_b, prior, boresight, tolerance_rad)
+    weight = jnp.where(star >= 0, 1.0 / image.sigma_rad**2, 0.0)
+    found = quest(image.vectors_b, jnp.asarray(index.unit_i)[star], weight)
+    return found.q_ib, found.covariance, found.stars
+
+
+def _shifted(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+    """Directions near z, moved by angles across themselves."""
+    first = jnp.stack([unit[:, 2], jnp.zeros(len(unit)), -unit[:, 0]], 1)
+    first = first / jnp.sqrt(jnp.sum(first**2, 1, keepdims=True))
+    moved = unit + angles[:, :1] * first + angles[:, 1:] * jnp.cross(unit, first)
+    return moved / jnp.sqrt(jnp.sum(moved**2, 1, keepdims=True))
