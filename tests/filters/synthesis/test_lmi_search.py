@@ -1,0 +1,179 @@
+"""The retuned LMI against the tables and a direct search for the best gain; the least gamma."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+from design_plants import attitude_axis, quaternion, two_states
+
+from robins.filters.synthesis import Unreachable, certify, error_system, kalman_gain, search
+from robins.filters.synthesis.lmi import observer
+from robins.filters.synthesis.search import least_gamma, retuned
+
+CIRCLE = np.exp(1j * np.concatenate([[0.0], np.geomspace(1e-3, np.pi, 200)]))
+
+
+@cache
+def found(plant, gamma, form="slack"):
+    return retuned(PLANTS[plant](), gamma, form)
+
+
+PLANTS = {"axis": attitude_axis, "two states": two_states}
+TABLES = [  # gamma, retuned slack form, best gain by search
+    ("axis", 4.9576, 2.8924, 2.8924),
+    ("axis", 3.8559, 2.9706, 2.9706),
+    ("axis", 2.7542, 3.1984, 3.1983),
+    ("axis", 1.6525, 3.7716, 3.7716),
+    ("axis", 1.1017, 4.3789, 4.3788),
+    ("axis", 0.5508, 5.6129, 5.6128),
+    ("two states", 1.0, 0.9066, 0.8746),
+    ("two states", 0.8, 1.5006, 1.4393),
+    ("two states", 0.7, 2.4225, 2.3286),
+]
+
+
+def white(plant, K):
+    """H2 norm by a Lyapunov equation; inf for a gain that lets errors grow."""
+    e = error_system(plant, K)
+    if np.abs(np.linalg.eigvals(e.A)).max() >= 1.0:
+        return np.inf
+    return np.sqrt(np.trace(e.L @ scipy.linalg.solve_discrete_lyapunov(e.A, e.Bw @ e.Bw.T) @ e.L.T))
+
+
+def worst(plant, K):
+    """Greatest gain from n on a fixed grid of frequencies; inf likewise."""
+    e = error_system(plant, K)
+    if np.abs(np.linalg.eigvals(e.A)).max() >= 1.0:
+        return np.inf
+    inner = np.linalg.solve(CIRCLE[:, None, None] * np.eye(len(e.A)) - e.A, e.Bn.astype(complex))
+    return np.linalg.norm(e.L @ inner, ord=2, axis=(1, 2)).max()
+
+
+def best_by_search(plant, gamma, start):
+    """Least H2 norm of two-component gains with a worst gain of gamma: that is, on its contour.
+
+    The contour is followed about a gain inside it: for each direction the farthest way to the
+    Kalman filter's side is where the worst gain is gamma.
+    """
+    goal = kalman_gain(plant) - start
+    size = np.abs(goal) + 0.05 * np.abs(start)
+
+    def on_contour(angle):
+        direction = size * (np.cos(angle) * goal / size + np.sin(angle) * np.array([[-1.0], [1.0]]))
+        low, high = 0.0, 0.05
+        while worst(plant, start + high * direction) <= gamma and high < 4.0:
+            low, high = high, 1.5 * high
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            inside = worst(plant, start + middle * direction) <= gamma
+            low, high = (middle, high) if inside else (low, middle)
+        return start + low * direction
+
+    coarse = np.linspace(-1.5, 1.5, 25)
+    costs = [white(plant, on_contour(a)) for a in coarse]
+    middle, step = coarse[int(np.argmin(costs))], coarse[1] - coarse[0]
+    fine = scipy.optimize.minimize_scalar(
+        lambda a: white(plant, on_contour(a)), bounds=(middle - step, middle + step),
+        method="bounded", options={"maxiter": 15},
+    )  # fmt: skip
+    return min(float(fine.fun), *costs)
+
+
+@pytest.mark.parametrize(("plant", "gamma", "slack", "best"), TABLES)
+def test_retuned_designs_have_the_tabulated_price(plant, gamma, slack, best):
+    design = found(plant, gamma)
+    assert design.h2 == pytest.approx(slack, rel=1e-4)
+    assert design.hinf == pytest.approx(gamma, rel=1e-5)
+    assert design.hinf <= gamma * (1.0 + 1e-6)
+    assert best * (1.0 - 1e-4) < design.h2 <= design.bound
+    before = observer(PLANTS[plant](), gamma, "slack")
+    assert design.h2 < before.h2 * 0.997  # it takes back what the proof cost
+    assert "gamma' = " in design.status
+
+
+@pytest.mark.parametrize(
+    ("plant", "gamma", "best"), [(p, g, b) for p, g, _, b in TABLES if g in (2.7542, 0.8, 0.7)]
+)
+def test_a_search_over_gains_finds_what_the_table_calls_best(plant, gamma, best):
+    given, design = PLANTS[plant](), found(plant, gamma)
+    start = observer(given, gamma).gain  # inside: its worst gain is below gamma
+    searched = best_by_search(given, gamma, start)
+    assert searched == pytest.approx(best, rel=3e-4)
+    assert searched <= design.h2 * (1.0 + 1e-5)
+
+
+def test_attitude_gain():
+    of_angle, of_bias = found("axis", 2.7542).gain[:, 0]
+    assert of_angle == pytest.approx(0.15365, rel=2e-5)
+    assert of_bias == pytest.approx(-0.000346, abs=5e-7)
+
+
+def test_the_common_form_is_retuned_to_the_same_price_or_nearly():
+    for plant, gamma in (("axis", 1.1017), ("two states", 0.7)):
+        common = found(plant, gamma, "common")
+        assert common.hinf == pytest.approx(gamma, rel=1e-5)
+        assert common.h2 == pytest.approx(found(plant, gamma).h2, rel=5e-3)
+        assert common.method == "lmi common, retuned"
+
+
+@pytest.mark.parametrize("gamma", [1.8, np.inf])
+def test_a_gamma_that_the_kalman_filter_meets_asks_for_nothing_more(gamma):
+    given = two_states()
+    best = certify(given, kalman_gain(given), method="kalman")
+    design = retuned(given, gamma)
+    assert best.hinf < 1.8
+    assert design.h2 == pytest.approx(best.h2, rel=1e-8)
+    assert (design.gamma, design.status) == (gamma, "optimal at gamma' = inf")
+
+
+def test_a_gamma_next_to_the_kalman_filters_ends_the_search():
+    """The true norm hardly depends on gamma' any more, and the solver's digits decide."""
+    given = two_states()
+    best = certify(given, kalman_gain(given), method="kalman")
+    design = retuned(given, best.hinf * (1.0 - 1e-7))
+    assert design.h2 == pytest.approx(best.h2, rel=1e-4)
+
+
+# ------------------------------------------------------------------------------------ least gamma
+
+
+@pytest.mark.parametrize("form", ["common", "slack", "full"])
+def test_least_gamma_of_all_forms(form):
+    assert least_gamma(two_states(), form) == pytest.approx(0.594542, rel=2e-6)
+
+
+def test_least_gamma_is_what_gains_can_reach_and_none_can_beat():
+    """Against a search for the least worst gain over two numbers."""
+    given = two_states()
+    start = observer(given, 0.6).gain
+    searched = scipy.optimize.minimize(
+        lambda k: worst(given, k.reshape(2, 1)), start.ravel(), method="Nelder-Mead",
+        options={"xatol": 1e-5, "fatol": 1e-8, "maxfev": 300},
+    )  # fmt: skip
+    assert searched.fun == pytest.approx(least_gamma(given), rel=1e-3)
+    assert searched.fun > least_gamma(given) * (1.0 - 1e-6)
+
+
+def test_least_gamma_of_a_plant_that_shows_the_error_is_zero():
+    """The rate error moves what the star sensor measures: K = (1, 0) takes it out whole."""
+    assert least_gamma(attitude_axis()) == 0.0
+    assert least_gamma(quaternion()) == pytest.approx(0.5, rel=1e-7)  # b: seen a step too late
+
+
+def test_least_gamma_follows_the_units():
+    given = two_states()
+    small = given._replace(L=1e-5 * given.L, Bn=1e-3 * given.Bn)
+    assert least_gamma(small) == pytest.approx(1e-8 * 0.594542, rel=1e-5)
+
+
+def test_out_of_reach_and_bad_arguments():
+    with pytest.raises(Unreachable, match=r"gamma 0\.5 is out of reach.*slack.*0\.594542"):
+        retuned(two_states(), 0.5)
+    with pytest.raises(ValueError, match="gamma must be positive"):
+        retuned(two_states(), 0.0)
+    with pytest.raises(ValueError, match=r"spectral radius 1\b.*observer form"):
+        least_gamma(attitude_axis(), "full")
+    with pytest.raises(ValueError, match="form must be"):
+        search.check_form("full")
