@@ -44,7 +44,10 @@ def believed_walk(given: AttitudeLoop, kind: Kind) -> float:
     """Random walk of the gyro's rate that a filter believes in [rad/s/sqrt(s)]."""
     g = given.gyro
     true = model.equivalent_walk(g.rate_walk, g.markov, g.markov_time)
-    return true if kind.drift is None else given.believed.drift * math.sqrt(kind.drift) * true
+    if kind.drift is None:
+        return true
+    believed = true if given.believed.drift is None else given.believed.drift
+    return math.sqrt(kind.drift) * believed
 
 
 @cache

@@ -61,9 +61,7 @@ class Vehicle(NamedTuple):
     theta: Array  # (3,) rad, what it reported last
 
 
-def acm(
-    given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Step
-) -> Command:
+def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Step) -> Command:
     """Attitude control: from the estimate, the last sample of the gyro and the wheels' speeds.
 
     The rate is that of the gyro less the estimated bias; the field is that of its model, turned

@@ -116,9 +116,12 @@ class Star(Parameters):
 
 
 class Believed(Parameters):
-    """What filters believe; ``drift`` is the believed over the true slow drift of the gyro."""
+    """What filters believe; ``drift`` is the random walk of the gyro's rate, Markov drift included.
 
-    drift: Annotated[float, Quantity("ratio", above="0")] = default("1")
+    Where it is left out they believe the equivalent of the true one.
+    """
+
+    drift: Annotated[float, Quantity("rate random walk", above="0 rad/s/sqrt(s)")] | None = None
     attitude: Annotated[float, Quantity("angle", above="0 deg")] = default("60 arcsec")
     bias: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("3 arcsec/s")
 
