@@ -8,6 +8,8 @@
 - `imu_errors`, `imu_grades`: what is wrong with gyros and accelerometers, from data sheets.
 - `allan`: Allan deviation with bounds, and the noises fitted to it (import it by its name).
 - `magnetometer_calibration`: hard and soft iron from turning about (import it by its name).
+- `vector_attitude`: attitude from stars; `star_identification`, `star_tracking`: which stars those
+  are, lost in space or nearly known (import them by their names).
 - `alignment`: attitude at rest, from gravity, Earth rate or velocity.
 """
 

@@ -1,0 +1,323 @@
+"""Which stars are seen, when nothing is known: lost in space.
+
+The angle between two stars is the same in all axes, so it can be looked up. `index_pairs` makes the
+table of all pairs of a catalogue that fit into a field of view, sorted by angle, with the k-vector
+of Mortari & Neta (2000) to find a range of it without search. `identify` looks up the angles of a
+triangle of directions, keeps the triangles of stars that have all three and the same handedness,
+and asks the other directions: a fourth star where the triangle says it must be makes it a pyramid
+(Mortari, Samaan, Bruccoleri & Junkins 2004). Triangles are tried in their order, which puts a
+false star aside after one attempt where nested loops would try it again and again.
+
+Nothing is guessed. With p the probability that some star lies by chance within the tolerance of a
+direction, m of n other directions agree by chance with probability P(Binomial(n, p) >= m); times
+the number of triangles asked so far that is `chance`, and the stars are named only where it is
+below a limit. So four stars are enough where they are bright and few, and are not where they
+are faint and many. A direction that two stars could be, or a star that two directions could be, has
+no name. The work is NumPy's; for an attitude that is nearly known see `robins.ins.star_tracking`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom
+
+from robins.earth.star_catalogue import Stars
+
+_WIDE = 4.0
+"""Sigmas of a tolerance: one angle in 16 000 is beyond them, one direction in 3 000."""
+
+_CROWDED = 3.0
+"""Density of stars over its mean, as near the Milky Way."""
+
+_MOST_TRIANGLES = 400
+_LEAST_SIDES = (
+    0.03  # of a triangle, twice its area over its longest side [rad]: else it tells little
+)
+
+
+class PairIndex(NamedTuple):
+    """A catalogue of N stars and the P pairs of them that fit into a field of view."""
+
+    unit_i: np.ndarray  # (N, 3) directions, inertial axes
+    magnitude: np.ndarray  # (N,)
+    identifier: np.ndarray  # (N,) int
+    first: np.ndarray  # (P,) int, place of a star in the catalogue
+    second: np.ndarray  # (P,) int, of the other
+    angle_rad: np.ndarray  # (P,) between them, ascending
+    k_vector: np.ndarray  # (P + 1,) int, how many angles are at or below each step of the line
+    line: tuple[float, float]  # start and step of that line [rad]
+    tree: Any  # to find the star nearest to a direction
+
+
+class Identification(NamedTuple):
+    """Stars named, or why none are."""
+
+    star: np.ndarray  # (n,) int, place in the catalogue; -1: not named
+    identifier: np.ndarray  # (n,) int, number in the catalogue; -1: not named
+    q_ib: np.ndarray  # (4,) attitude they lead to, scalar first; NaN: none
+    named: int  # directions with a name
+    chance: float  # bound of the probability that they agree by chance; 1: nothing agreed
+    triangles: int  # asked before these stars, or in vain
+    refusal: str  # why there are no names; empty: there are
+
+
+def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
+    """Make the table of pairs; once for a catalogue, a fraction of a second for 4559 stars.
+
+    Args:
+        stars: those that a camera can see, from `robins.earth.star_catalogue`. Many more, or less,
+            than it sees make identification slower or impossible.
+        field_rad: largest angle between two stars in its field of view [rad].
+
+    Raises:
+        ValueError: fewer than four stars, directions not of unit length, a field not above zero or
+            over 90 deg.
+    """
+    field = float(field_rad)
+    if not 0.0 < field <= np.pi / 2.0:
+        raise ValueError(f"field_rad must be above 0 and at most pi/2, got {field_rad}")
+    unit = np.asarray(stars.unit_i, float)
+    if unit.ndim != 2 or unit.shape[1] != 3 or len(unit) < 4:
+        raise ValueError(f"unit_i must have shape (N, 3), N four at least, got {unit.shape}")
+    off = np.flatnonzero(~(np.abs(np.linalg.norm(unit, axis=1) - 1.0) < 1e-9))
+    if off.size:
+        raise ValueError(f"unit_i[{off[0]}] is {unit[off[0]]}: directions must be unit vectors")
+    tree = KDTree(unit)
+    pairs = tree.query_pairs(2.0 * np.sin(field / 2.0), output_type="ndarray")
+    if not len(pairs):
+        raise ValueError(f"no two stars are within the field of {np.degrees(field):g} deg")
+    angle = _angle(unit[pairs[:, 0]], unit[pairs[:, 1]])
+    order = np.argsort(angle, kind="stable")
+    pairs, angle = pairs[order], angle[order]
+    # A straight line from just below the first angle to just above the last, a step for each.
+    margin = 1e-12 + 1e-3 * field / len(angle)
+    start = angle[0] - margin
+    step = (angle[-1] + margin - start) / len(angle)
+    k_vector = np.searchsorted(angle, start + step * np.arange(len(angle) + 1), side="right")
+    return PairIndex(
+        unit,
+        np.asarray(stars.magnitude, float),
+        np.asarray(stars.identifier, int),
+        pairs[:, 0],
+        pairs[:, 1],
+        angle,
+        k_vector,
+        (float(start), float(step)),
+        tree,
+    )
+
+
+def pairs_between(index: PairIndex, low_rad: float, high_rad: float) -> tuple[Any, Any]:
+    """Pairs of stars with an angle from low to high: places in the catalogue of both.
+
+    The k-vector says at once between which rows they are, to a few rows too many at either end.
+    """
+    start, step = index.line
+    last = len(index.k_vector) - 1
+    below = min(max(int(np.floor((low_rad - start) / step)), 0), last)
+    above = min(max(int(np.ceil((high_rad - start) / step)), 0), last)
+    rows = slice(index.k_vector[below], index.k_vector[above])
+    angle = index.angle_rad[rows]
+    inside = (angle >= low_rad) & (angle <= high_rad)
+    return index.first[rows][inside], index.second[rows][inside]
+
+
+def identify(
+    index: PairIndex,
+    vectors_b: ArrayLike,
+    sigma_rad: ArrayLike | float,
+    magnitude: ArrayLike | None = None,
+    magnitude_tolerance: float = 1.0,
+    most_chance: float = 1e-6,
+) -> Identification:
+    """Name the stars of an image.
+
+    Args:
+        index: from `index_pairs`.
+        vectors_b: (n, 3) directions, unit vectors in body axes; NaN: missing. False ones may be
+            among them.
+        sigma_rad: of each of the two angles of a direction [rad], a number or (n,).
+        magnitude: (n,) as seen; None: not used.
+        magnitude_tolerance: a star may be brighter or fainter than in the catalogue by so much.
+        most_chance: limit of the probability that the stars agree by chance.
+
+    Returns:
+        The names, or the reason for none. Too few stars, or none that agree, is no error.
+
+    Raises:
+        ValueError: shapes that do not fit together, directions not of unit length (to 1e-3), a
+            sigma, tolerance or limit that is not positive.
+    """
+    b, sigma, light = _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance)
+    there = np.flatnonzero(~np.isnan(b[:, 0]))
+    nothing = _nothing(len(b))
+    if len(there) < 4:
+        return nothing._replace(refusal=f"{len(there)} stars are seen; a pyramid has four")
+    image = _Image(b[there], sigma[there], None if light is None else light[there])
+    density = _CROWDED * len(index.unit_i) / (4.0 * np.pi)  # stars per steradian
+    tried = asked = 0
+    best = 1.0
+    for corners in _triangles(len(there)):
+        if tried == _MOST_TRIANGLES:
+            break
+        if _height(image.b[list(corners)]) < _LEAST_SIDES:
+            continue
+        tried += 1
+        for stars in _candidates(index, image, corners, magnitude_tolerance):
+            asked += 1
+            found = _confirmed(index, image, corners, stars, magnitude_tolerance)
+            if found is None:
+                continue
+            star, rotation, tolerance = found
+            others = len(there) - 3
+            p = -np.expm1(-density * np.pi * np.mean(tolerance**2))
+            agreed = int(np.sum(star >= 0)) - 3
+            chance = float(asked * binom.sf(agreed - 1, others, p)) if agreed > 0 else 1.0
+            best = min(best, chance)
+            if chance < most_chance:
+                return _named(index, len(b), there, star, rotation, chance, tried)
+    reason = "no triangle of stars is confirmed by a fourth one"
+    if best < 1.0:
+        reason = f"too few stars agree: chance {best:.1g} is not below {most_chance:g}"
+    return nothing._replace(triangles=tried, chance=best, refusal=reason)
+
+
+class _Image(NamedTuple):
+    b: np.ndarray  # (n, 3)
+    sigma: np.ndarray  # (n,)
+    magnitude: np.ndarray | None  # (n,)
+
+
+def _triangles(n: int) -> Iterator[tuple[int, int, int]]:
+    """Triples of n things so that one of them is soon left out of several in a row."""
+    for second in range(1, n - 1):
+        for third in range(1, n - second):
+            for i in range(n - second - third):
+                yield i, i + second, i + second + third
+
+
+def _candidates(index: PairIndex, image: _Image, corners, magnitude_tolerance) -> np.ndarray:
+    """Triples of stars (T, 3) with the angles of three directions and their handedness."""
+    i, j, k = corners
+    tables = []
+    for other in (j, k):
+        angle = _angle(image.b[i], image.b[other])
+        tolerance = _WIDE * np.hypot(image.sigma[i], image.sigma[other])
+        first, second = pairs_between(index, angle - tolerance, angle + tolerance)
+        both = np.concatenate([first, second]), np.concatenate([second, first])
+        if image.magnitude is not None:
+            fits = _alike(index, both[0], image.magnitude[i], magnitude_tolerance)
+            fits &= _alike(index, both[1], image.magnitude[other], magnitude_tolerance)
+            both = both[0][fits], both[1][fits]
+        tables.append(both)
+    (start, second), (again, third) = tables
+    # Join the tables where they share their first star.
+    order = np.argsort(again, kind="stable")
+    again, third = again[order], third[order]
+    low = np.searchsorted(again, start, side="left")
+    count = np.searchsorted(again, start, side="right") - low
+    ends = np.cumsum(count)
+    rows = np.arange(count.sum()) + np.repeat(low - ends + count, count)
+    triple = np.stack([np.repeat(start, count), np.repeat(second, count), third[rows]], 1)
+    a, b, c = (index.unit_i[triple[:, m]] for m in range(3))
+    tolerance = _WIDE * np.hypot(image.sigma[j], image.sigma[k])
+    fits = np.abs(_angle(b, c) - _angle(image.b[j], image.b[k])) < tolerance
+    hand = np.linalg.det(image.b[list(corners)])
+    a, b, c, triple = (x[fits] for x in (a, b, c, triple))
+    return triple[np.sign(np.sum(a * np.cross(b, c), 1)) == np.sign(hand)]
+
+
+def _confirmed(index: PairIndex, image: _Image, corners, stars, magnitude_tolerance):
+    """Star of each direction, rotation and tolerances, by the attitude of a triangle; else None."""
+    star = np.full(len(image.b), -1)
+    star[list(corners)] = stars
+    rotation, tolerance = Rotation.identity(), image.sigma
+    for _ in range(4):
+        used = np.flatnonzero(star >= 0)
+        weight = 1.0 / image.sigma[used] ** 2
+        rotation = Rotation.align_vectors(index.unit_i[star[used]], image.b[used], weight)[0]
+        b = image.b[used]
+        information = weight.sum() * np.eye(3) - (weight[:, None] * b).T @ b
+        covariance = np.linalg.inv(information)
+        # Of the place where the attitude puts a direction, across that direction.
+        spread = np.trace(covariance) - np.einsum("ni,ij,nj->n", image.b, covariance, image.b)
+        tolerance = _WIDE * np.sqrt(image.sigma**2 + spread)
+        before, star = star, _nearest(index, image, rotation, tolerance, magnitude_tolerance)
+        if np.sum(star >= 0) < 4:
+            return None
+        if np.array_equal(before, star):
+            break
+    if not np.array_equal(star[list(corners)], stars):
+        return None
+    return star, rotation, tolerance
+
+
+def _nearest(index: PairIndex, image: _Image, rotation, tolerance, magnitude_tolerance):
+    """The only star near each direction, if it is near no other direction; else -1."""
+    chord = 2.0 * np.sin(tolerance / 2.0)
+    distance, star = index.tree.query(rotation.apply(image.b), k=2)
+    close = distance < chord[:, None]
+    if image.magnitude is not None:
+        for m in range(2):
+            close[:, m] &= _alike(index, star[:, m], image.magnitude, magnitude_tolerance)
+    only = np.where(close[:, 0] != close[:, 1], np.where(close[:, 0], star[:, 0], star[:, 1]), -1)
+    claimed = np.bincount(star[close], minlength=len(index.unit_i))
+    return np.where((only >= 0) & (claimed[only] == 1), only, -1)
+
+
+def _named(index, n, there, star, rotation, chance, tried) -> Identification:
+    whole = np.full(n, -1)
+    whole[there] = star
+    identifier = np.where(whole >= 0, index.identifier[whole], -1)
+    q_ib = rotation.as_quat(canonical=True, scalar_first=True)
+    return Identification(whole, identifier, q_ib, int(np.sum(star >= 0)), chance, tried, "")
+
+
+def _nothing(n: int) -> Identification:
+    none = np.full(n, -1)
+    return Identification(none, none.copy(), np.full(4, np.nan), 0, 1.0, 0, "nothing was tried")
+
+
+def _alike(index: PairIndex, star, magnitude, tolerance):
+    return np.abs(index.magnitude[star] - magnitude) <= tolerance
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> Any:
+    """Between unit vectors, exact for small angles too."""
+    return 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(a - b, axis=-1), 1.0))
+
+
+def _height(b: np.ndarray) -> float:
+    """Least height of a triangle, twice its area over its longest side."""
+    sides = b[[1, 2, 0]] - b
+    return float(np.linalg.norm(np.cross(sides[0], sides[1])) / np.linalg.norm(sides, axis=1).max())
+
+
+def _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance):
+    b, sigma = np.asarray(vectors_b, float), np.asarray(sigma_rad, float)
+    if b.ndim != 2 or b.shape[1] != 3:
+        raise ValueError(f"vectors_b must have shape (n, 3), got {b.shape}")
+    b = np.where(np.isnan(b).any(1, keepdims=True), np.nan, b)
+    off = np.flatnonzero(np.abs(np.linalg.norm(b, axis=1) - 1.0) >= 1e-3)
+    if off.size:
+        raise ValueError(
+            f"vectors_b[{off[0]}] is {b[off[0]]}: directions must be unit vectors, to 1e-3"
+        )
+    if sigma.shape not in ((), (len(b),)):
+        raise ValueError(f"sigma_rad must be a number or of shape ({len(b)},), got {sigma.shape}")
+    if not np.all((sigma > 0.0) & np.isfinite(sigma)):
+        raise ValueError(f"sigma_rad must be positive and finite, got {sigma_rad}")
+    light = None if magnitude is None else np.asarray(magnitude, float)
+    if light is not None and light.shape != (len(b),):
+        raise ValueError(f"magnitude must have shape ({len(b)},), got {light.shape}")
+    if not magnitude_tolerance > 0.0:
+        raise ValueError(f"magnitude_tolerance must be positive, got {magnitude_tolerance}")
+    if not 0.0 < most_chance < 1.0:
+        raise ValueError(f"most_chance must be between 0 and 1, got {most_chance}")
+    return b, np.broadcast_to(sigma, (len(b),)), light
