@@ -1,13 +1,18 @@
 """Vectors of three as tuples of scalars: within a compiled loop several times faster than arrays.
 
-A scan over small arrays spends its time starting kernels; scalars are joined into one. Under `vmap`
-each scalar is an array over the batch.
+A scan over small arrays spends its time starting kernels; scalars are joined into few. Under `vmap`
+each scalar is an array over the batch. Long chains of them want `settled` in between.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from robins import _float64  # noqa: F401
 
 Three = Sequence[Any]
 Matrix = Sequence[Sequence[Any]]
@@ -21,6 +26,14 @@ def scalars(v: Any) -> tuple[Any, ...]:
 def matrix(m: Any) -> Matrix:
     """The rows of a matrix, each a tuple of its components."""
     return tuple(scalars(m[i]) for i in range(m.shape[0]))
+
+
+def settled(*vectors: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """The same vectors, computed here and once.
+
+    Else XLA would compute what a component needs once more wherever that component is needed.
+    """
+    return [scalars(v) for v in jax.lax.optimization_barrier([jnp.stack(v) for v in vectors])]
 
 
 def plus(a: Three, b: Three, *more: Three) -> Three:

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -207,28 +206,28 @@ def advance(
     # Within the step everything is seen in the axes 0 that the body has at its beginning.
     C = u.dcm(u.scalars(state.q_ib))
     to_0 = u.transposed(C)
-    start = [u.apply(to_0, u.scalars(v)) for v in (state.momentum_i, r_i_m, field_i_t)]
-    total, place, field = (u.scalars(v) for v in _compute_now(*(jnp.stack(v) for v in start)))
+    total, place, field = u.settled(
+        *(u.apply(to_0, u.scalars(v)) for v in (state.momentum_i, r_i_m, field_i_t))
+    )
 
     def slope(y, share):
         """Rates of (g, H - H0) in axes 0, a share of the step after its beginning."""
-        g, added = u.scalars(y)[:3], u.scalars(y)[3:]
-        wheels = u.plus(held, u.times(share, gained))
-        omega = u.apply(J_inv, u.minus(_turned(g, u.plus(total, added), -1.0), wheels))
-        torque = u.plus(
-            _gravity_gradient(J, _turned(g, place, -1.0)),
-            u.cross(dipole, _turned(g, field, -1.0)),
-            other,
+        g, added = y[:3], y[3:]
+        momentum, r_b, field_b = u.settled(
+            *(_turned(g, v, -1.0) for v in (u.plus(total, added), place, field))
         )
+        wheels = u.plus(held, u.times(share, gained))
+        torque = u.plus(_gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
+        omega, torque = u.settled(u.apply(J_inv, u.minus(momentum, wheels)), torque)
         along = u.plus(omega, u.cross(g, omega), u.times(u.dot(g, omega), g))
-        (rate,) = _compute_now(jnp.stack([*u.times(0.5, along), *_turned(g, torque, 1.0)]))
+        (rate,) = u.settled((*u.times(0.5, along), *_turned(g, torque, 1.0)))
         return rate
 
-    k1 = slope(jnp.zeros(6), 0.0)
-    k2 = slope(0.5 * dt_s * k1, 0.5)
-    k3 = slope(0.5 * dt_s * k2, 0.5)
-    k4 = slope(dt_s * k3, 1.0)
-    step = u.scalars(dt_s / 6.0 * (k1 + 2.0 * (k2 + k3) + k4))
+    k1 = slope((0.0,) * 6, 0.0)
+    k2 = slope(u.times(0.5 * dt_s, k1), 0.5)
+    k3 = slope(u.times(0.5 * dt_s, k2), 0.5)
+    k4 = slope(u.times(dt_s, k3), 1.0)
+    step = u.times(dt_s / 6.0, u.plus(k1, u.times(2.0, u.plus(k2, k3)), k4))
     q = jnp.stack(u.product(u.scalars(state.q_ib), (1.0, *step[:3])))
     momentum = state.momentum_i + jnp.stack(u.apply(C, step[3:]))
     return CraftState(q / jnp.sqrt(jnp.sum(q * q)), momentum, h1)
@@ -247,11 +246,6 @@ def _turned(g: u.Three, v: u.Three, sign: float) -> u.Three:
     across = u.times(sign, u.cross(g, v))
     twice = 2.0 / (1.0 + u.dot(g, g))
     return u.plus(v, u.times(twice, u.plus(across, u.times(sign, u.cross(g, across)))))
-
-
-def _compute_now(*arrays: Array) -> list[Array]:
-    """Keep XLA from computing these once more for each component of what follows from them."""
-    return jax.lax.optimization_barrier(list(arrays))
 
 
 def _times(m, v) -> Array:
