@@ -12,6 +12,8 @@
 - `air_data`, `barometer`, `sar`, `star_tracker`: sensors of an airship.
 - `ballistic`, `free_body`: a rocket after burnout, the way it flies and the way it turns.
 - `mems_gyro`, `magnetometer`: its sensors.
+- `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and what is about it.
+- `attitude_reference`, `attitude_control`: where it is to point, and the law that turns it there.
 - `gyro`, `star_sensor`: sensors of a spacecraft that turns as it is told to.
 - `gauss_markov`: first-order Gauss-Markov processes, exact at any step.
 - `random`: streams of random numbers by seed, run and component.
