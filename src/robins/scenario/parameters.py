@@ -74,9 +74,9 @@ class Quantity:
         return core_schema.with_info_before_validator_function(on_each_axis, each)
 
 
-def default(text: str) -> Any:
-    """The default of a field, written as in a scenario."""
-    return pydantic.Field(default=text, validate_default=True)
+def default(text: str, *more: str) -> Any:
+    """The default of a field, written as in a scenario; several texts for several axes."""
+    return pydantic.Field(default=[text, *more] if more else text, validate_default=True)
 
 
 class Parameters(pydantic.BaseModel):

@@ -105,13 +105,19 @@ def inflation(b: Believed, recipe: Recipe) -> np.ndarray:
 
 
 def facts(b: Believed, recipe: Recipe) -> Mapping[str, Any]:
-    """Certified norms of the three axes, for the metrics of a filter."""
+    """What the certified norms say of a filter, for its metrics.
+
+    ``predicted_rms_arcsec``: the H2 norms of the three axes as one, the error at star frames if the
+    noise is as believed. ``worst_case_share``: the H-infinity norm over that of the Kalman filter,
+    of the worst axis.
+    """
     if recipe.way == "raw":
         return {}
     designs = [axis_design(b, star_rad, recipe) for star_rad in b.star_rad]
+    best = [kalman_design(axis_plant(b, star_rad, recipe.enters)) for star_rad in b.star_rad]
     return {
         "predicted_rms_arcsec": float(np.sqrt(sum(d.h2**2 for d in designs))),
-        **{f"worst_case_{a}_s": float(d.hinf) for a, d in zip("xyz", designs, strict=True)},
+        "worst_case_share": max(d.hinf / k.hinf for d, k in zip(designs, best, strict=True)),
     }
 
 

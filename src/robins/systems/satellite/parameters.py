@@ -30,13 +30,13 @@ class Body(Parameters):
     """Inertia and what disturbs it; products are the elements xy, xz, yz of the matrix."""
 
     moments: Annotated[Three, Quantity("moment of inertia", above="0 kg m^2")] = default(
-        ["1.9 kg m^2", "2.1 kg m^2", "2.4 kg m^2"]  # type: ignore[arg-type]
+        "1.9 kg m^2", "2.1 kg m^2", "2.4 kg m^2"
     )
     products: Annotated[Three, Quantity("moment of inertia")] = default(
-        ["0.02 kg m^2", "-0.03 kg m^2", "0.01 kg m^2"]  # type: ignore[arg-type]
+        "0.02 kg m^2", "-0.03 kg m^2", "0.01 kg m^2"
     )
     dipole: Annotated[Three, Quantity("magnetic moment")] = default(
-        ["0.05 A m^2", "-0.03 A m^2", "0.04 A m^2"]  # type: ignore[arg-type]
+        "0.05 A m^2", "-0.03 A m^2", "0.04 A m^2"
     )
     # amplitude of a torque on each axis that goes with the orbit, a third of a turn apart
     disturbance: Annotated[float, Quantity("torque", least="0 N m")] = default("1 uN m")
@@ -61,7 +61,8 @@ class Wheels(Parameters):
             raise ValueError(f"lost: there is no wheel {beyond[0]}, only 0 to {len(self.axes) - 1}")
         if abs(self.start) > self.momentum:
             raise ValueError(
-                f"start ({self.start:g} N m s) is beyond what a wheel holds, {self.momentum:g} N m s"
+                f"start ({self.start:g} N m s) is beyond what a wheel holds, "
+                f"{self.momentum:g} N m s"
             )
         return self
 
@@ -108,7 +109,7 @@ class Star(Parameters):
 
     period: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
     noise: Annotated[Three, Quantity("angle", above="0 deg")] = default(
-        ["10 arcsec", "10 arcsec", "40 arcsec"]  # type: ignore[arg-type]
+        "10 arcsec", "10 arcsec", "40 arcsec"
     )
     low_frequency: Annotated[float, Quantity("angle", least="0 deg")] = default("0 arcsec")
     low_frequency_period: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
