@@ -1,0 +1,118 @@
+"""A three-axis rate table: it carries a gyro and turns as it is told, a little late.
+
+Each axis follows its commanded rate c with a first-order lag, and with limits of its rate and of
+its acceleration:
+
+    w' = clip((c - w)/lag, -a, a),    |c| <= limit of rate.
+
+While the command stays the same, w has a closed form, a ramp of slope a while the lag alone would
+ask for more and then an exponential, and so has its integral: both are exact at any step. The
+attitude turns by the integral and Magnus' term of the fourth order for a rate whose direction
+changes (Hairer, Lubich & Wanner 2006, "Geometric Numerical Integration", sec. IV.7).
+
+The axes are those of what it carries, as if the gimbals were driven to turn it about these: the
+kinematics of gimbals, their lock among them, are not in the model.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from robins import _float64  # noqa: F401
+from robins.rotation import from_rotvec, multiply, normalise
+from robins.sim import _given
+
+_GAUSS = np.sqrt(3.0) / 6.0  # of a step, from its middle to the two points of Gauss
+
+
+class RateTable(NamedTuple):
+    """What the table can do; `rate_table` makes one of checked numbers."""
+
+    lag_s: Any  # (3,)
+    rate_limit_rad_s: Any  # (3,)
+    acceleration_limit_rad_s2: Any  # (3,)
+
+
+class TableState(NamedTuple):
+    """Where it is."""
+
+    q_ib: Any  # (4,) what it carries to inertial, scalar first
+    rate_b: Any  # (3,) rad/s
+
+
+def rate_table(
+    lag_s: Any = 0.02,
+    rate_limit_rad_s: Any = np.inf,
+    acceleration_limit_rad_s2: Any = np.inf,
+) -> RateTable:
+    """A rate table of checked numbers, one for all axes or one each; infinity is no limit.
+
+    Raises:
+        ValueError: a lag or limit that is not positive, or another shape.
+    """
+    positive = {"low": 0.0, "above": True}
+    limits = {
+        "rate_limit_rad_s": rate_limit_rad_s,
+        "acceleration_limit_rad_s2": acceleration_limit_rad_s2,
+    }
+    return RateTable(
+        _given.vector("lag_s", lag_s, 3, **positive),
+        *(_given.vector(name, x, 3, endless=True, **positive) for name, x in limits.items()),
+    )
+
+
+def table_state(q_ib: Any = (1.0, 0.0, 0.0, 0.0), rate_b: Any = 0.0) -> TableState:
+    """The state of a given attitude and rate [rad/s].
+
+    Raises:
+        ValueError: not a unit quaternion, or a rate that is not finite.
+    """
+    q = _given.rows("q_ib", q_ib, 4)
+    _given.number("q_ib must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
+    return TableState(normalise(q), _given.vector("rate_b", rate_b, 3))
+
+
+def step(
+    table: RateTable, state: TableState, command_b: Float[Array, "3"], dt_s: Any
+) -> tuple[TableState, Float[Array, "4"]]:
+    """The state a step later, and its attitude q_ib.
+
+    Exact for a command that stays the same over the step; the attitude to the fourth order in
+    ``dt_s`` where the direction of the rate changes.
+
+    Args:
+        table: what it can do.
+        state: at the beginning.
+        command_b: (3,) commanded rate [rad/s], in the axes of what it carries.
+        dt_s: length of the step, positive.
+    """
+    most = table.rate_limit_rad_s
+    goal = jnp.clip(command_b, -most, most)
+    rate, angle = _response(table, goal, state.rate_b, dt_s)
+    early, late = (
+        _response(table, goal, state.rate_b, share * dt_s)[0]
+        for share in (0.5 - _GAUSS, 0.5 + _GAUSS)
+    )
+    turn = angle + 0.5 * _GAUSS * dt_s**2 * jnp.cross(early, late)
+    q = normalise(multiply(state.q_ib, from_rotvec(turn)))
+    return TableState(q, rate), q
+
+
+def _response(table: RateTable, goal: Array, rate: Array, t: Any) -> tuple[Array, Array]:
+    """Rate, and angle gone through, a time t > 0 after a command was given."""
+    lag, most = table.lag_s, table.acceleration_limit_rad_s2
+    way = jnp.abs(goal - rate)
+    # What the ramp has to go until the lag alone asks for no more than the limit.
+    excess = jnp.maximum(way - most * lag, 0.0)
+    ramp = jnp.minimum(t, excess / most)
+    done = jnp.minimum(most * t, excess)
+    after = way - done
+    fading = -jnp.expm1(-(t - ramp) / lag)
+    left = after * (1.0 - fading)
+    area = ramp * (way - 0.5 * done) + after * lag * fading
+    sign = jnp.sign(goal - rate)
+    return goal - sign * left, goal * t - sign * area
