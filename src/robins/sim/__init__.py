@@ -14,6 +14,7 @@
 - `mems_gyro`, `magnetometer`: its sensors.
 - `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and what is about it.
 - `attitude_reference`, `attitude_control`: where it is to point, and the law that turns it there.
+- `rate_table`: what turns a gyro on the ground.
 - `gyro`, `star_sensor`: sensors of a spacecraft that turns as it is told to.
 - `gauss_markov`: first-order Gauss-Markov processes, exact at any step.
 - `random`: streams of random numbers by seed, run and component.
