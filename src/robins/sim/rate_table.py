@@ -105,14 +105,12 @@ def step(
 def _response(table: RateTable, goal: Array, rate: Array, t: Any) -> tuple[Array, Array]:
     """Rate, and angle gone through, a time t > 0 after a command was given."""
     lag, most = table.lag_s, table.acceleration_limit_rad_s2
-    way = jnp.abs(goal - rate)
+    way = goal - rate
     # What the ramp has to go until the lag alone asks for no more than the limit.
-    excess = jnp.maximum(way - most * lag, 0.0)
-    ramp = jnp.minimum(t, excess / most)
-    done = jnp.minimum(most * t, excess)
+    excess = way - jnp.clip(way, -most * lag, most * lag)
+    done = jnp.clip(excess, -most * t, most * t)
+    ramp = jnp.minimum(t, jnp.abs(excess) / most)
     after = way - done
     fading = -jnp.expm1(-(t - ramp) / lag)
-    left = after * (1.0 - fading)
-    area = ramp * (way - 0.5 * done) + after * lag * fading
-    sign = jnp.sign(goal - rate)
-    return goal - sign * left, goal * t - sign * area
+    short = ramp * (way - 0.5 * done) + after * lag * fading
+    return goal - after * (1.0 - fading), goal * t - short
