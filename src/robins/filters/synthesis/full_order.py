@@ -20,7 +20,7 @@ from robins.filters.synthesis.programs import Answer
 from robins.filters.synthesis.riccati import check_gamma
 from robins.filters.synthesis.scaling import Scales
 
-METHOD = "lmi full"
+METHOD = "full-order"
 
 
 def full(plant: Plant, gamma: Number) -> Design:

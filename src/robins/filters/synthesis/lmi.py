@@ -46,7 +46,7 @@ def observer(plant: Plant, gamma: Number, form: ObserverForm = "common") -> Desi
     """
     check_gamma(gamma)
     check_form(form)
-    return _designed(plant, float(gamma), form, f"lmi {form}")
+    return _designed(plant, float(gamma), form, f"lmi-{form}")
 
 
 def h2(plant: Plant) -> Design:
@@ -56,7 +56,7 @@ def h2(plant: Plant) -> Design:
         NotCertified: as `observer`.
         MissingExtra: cvxpy or Clarabel is not installed.
     """
-    return _designed(plant, np.inf, "common", "lmi h2")
+    return _designed(plant, np.inf, "common", "lmi-h2")
 
 
 def check_form(form: str) -> None:

@@ -54,7 +54,7 @@ def retuned(plant: Plant, gamma: Number, form: ObserverForm = "slack") -> Design
     return certify(
         plant,
         best.gain,
-        method=f"lmi {form}, retuned",
+        method=f"retuned-{form}",
         gamma=gamma,
         bound=best.bound,
         status=f"{best.status} at gamma' = {best.gamma:.7g}",
