@@ -1,0 +1,109 @@
+"""Closed loops of the satellite's scenarios, and what its filters make of them."""
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import scenario
+from robins.campaign import worlds
+from robins.filters import run_closed
+from robins.filters.consistency import normalised_sq
+from robins.manifold import local
+from robins.systems.satellite import SYSTEM
+from robins.systems.system import Problem
+
+ARCSEC = math.pi / 648000.0
+QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run
+
+
+class Found(NamedTuple):
+    """What came of runs, in arcsec; (runs, E, ...)."""
+
+    error: np.ndarray  # (.., 3) of attitude determination, body axes
+    nees: np.ndarray  # (..) of the attitude, by its three components
+    sigma: np.ndarray  # (.., 3) stated of the attitude
+    pointing: np.ndarray  # (.., 3)
+    wheel_momentum: np.ndarray  # (.., W) N m s
+    used: np.ndarray  # (..) bool, whether the star sensor was used
+    time_s: np.ndarray
+    counted: slice
+
+    @property
+    def attitude(self) -> float:
+        return float(np.sqrt(3.0 * np.mean(self.error[:, self.counted] ** 2)))
+
+    @property
+    def points(self) -> float:
+        return float(np.sqrt(3.0 * np.mean(self.pointing[:, self.counted] ** 2)))
+
+    @property
+    def spread(self) -> float:
+        each = np.sqrt(3.0 * np.mean(self.error[:, self.counted] ** 2, axis=(1, 2)))
+        return float(np.std(each, ddof=1))
+
+
+def parsed(name: str, settings: tuple[str, ...] = ()) -> Any:
+    text = SYSTEM.scenarios[name].read_text()
+    study = SYSTEM.studies["attitude-loop"]
+    return scenario.parse(study.parameters, text, settings, source=name)
+
+
+def problem(name: str, filters: tuple[str, ...], settings: tuple[str, ...] = ()) -> Problem:
+    study = SYSTEM.studies["attitude-loop"]
+    return study.problem(parsed(name, settings), filters, 0)
+
+
+@cache
+def _program(filter_: Any):
+    def one(model, case, world):
+        it = case(world)
+
+        def keep(step):
+            return step.posterior, step.info["star"].used
+
+        closed = run_closed(filter_, model, it.start, it.loop, keep)
+        given = closed.readings
+
+        def judged(belief, truth, rows):
+            error, factor = local(belief.mean, truth), belief.factor
+            if rows is not None:
+                error, factor = rows @ error, rows @ factor
+            sigma = jnp.sqrt(jnp.sum(factor**2, axis=1))
+            return error[:3], normalised_sq(error[:3], factor[:3]) / 3.0, sigma[:3]
+
+        along = None if given.rows is None else 0
+        posterior, used = closed.steps
+        found = jax.vmap(judged, (0, 0, along))(posterior, given.truth, given.rows)
+        return *found, given.outputs, jnp.any(used, axis=-1)
+
+    return jax.jit(jax.vmap(one, (None, None, 0)), compiler_options=QUICK)
+
+
+def found(p: Problem, name: str, batch: Any) -> Found:
+    """What a filter makes of a batch of worlds."""
+    c = p.contenders[name]
+    error, nees, sigma, outputs, used = _program(c.filter)(c.model, c.case, batch)
+    size = [np.asarray(x) / ARCSEC for x in (error, sigma, outputs["pointing"])]
+    return Found(
+        size[0],
+        np.asarray(nees),
+        size[1],
+        size[2],
+        np.asarray(outputs["wheel_momentum"]),
+        np.asarray(used),
+        p.epoch_s,
+        slice(p.count_from, None),
+    )
+
+
+def flown(
+    name: str, filters: tuple[str, ...], runs: int, settings: tuple[str, ...] = ()
+) -> dict[str, Found]:
+    """Runs of a packaged scenario, changed, with filters."""
+    p = problem(name, filters, settings)
+    ((batch, _),) = worlds(p, runs)
+    return {one: found(p, one, batch) for one in filters}

@@ -1,0 +1,133 @@
+"""The satellite in closed loop: what it does, also when something fails, and what it refuses."""
+
+import jax
+import numpy as np
+import pytest
+from satellite_runs import ARCSEC, flown, parsed, problem
+
+from robins.campaign import worlds
+from robins.campaign.bound import bound
+from robins.filters import run, run_closed
+from robins.scenario import ScenarioError
+
+SHORT = ('duration="120 s"', 'counted_from="60 s"')
+
+
+@pytest.fixture(scope="module")
+def mekf():
+    return flown("s1", ("mekf",), 4, SHORT)["mekf"]
+
+
+def test_it_settles_and_points(mekf):
+    assert np.max(np.abs(mekf.error[:, mekf.counted, :2])) < 25.0
+    end = mekf.pointing[:, -200:]
+    assert np.sqrt(np.mean(end**2)) < 40.0  # arcsec; begun with 60 unknown to it
+    assert np.max(np.abs(mekf.wheel_momentum)) < 0.02
+    used = mekf.used[0].reshape(-1, 5)  # 2 Hz of 10
+    assert not np.any(used[:, :4])
+    assert np.all(used[:, 4])
+
+
+def test_the_additive_filter_is_the_multiplicative_one(mekf):
+    other = flown("s1", ("ekf-quaternion",), 4, SHORT)["ekf-quaternion"]
+    # to a few counts of the gyro, 0.05 arcsec, for in a loop a count may fall on either side
+    np.testing.assert_allclose(other.error, mekf.error, atol=0.15)
+    np.testing.assert_allclose(other.pointing, mekf.pointing, atol=0.15)
+
+
+def test_a_run_over_its_measurements_gives_the_same_estimates():
+    p = problem("s1", ("mekf",), SHORT)
+    ((batch, _),) = worlds(p, 1)
+    c = p.contenders["mekf"]
+    world = _first(batch)
+    it = c.case(world)
+    closed = run_closed(c.filter, c.model, it.start, it.loop, lambda s: s.posterior.mean)
+    again = run(c.filter, c.model, it.start, closed.readings.y, closed.readings.u)
+    for a, b in zip(_arrays(closed.steps), _arrays(again.mean), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_momentum_is_conserved_without_environment():
+    # no field, so no torque of the magnetorquers; no gravity: the orbit is far away
+    settings = (*SHORT, 'body.disturbance="0 N m"', 'orbit.altitude="1e9 km"')
+    p = problem("s2", ("mekf",), settings)
+    ((batch, _),) = worlds(p, 1)
+    c, world = p.contenders["mekf"], _first(batch)
+    it = c.case(world)
+    closed = run_closed(c.filter, c.model, it.start, it.loop, lambda s: ())
+    moved = np.asarray(closed.world.craft.momentum_i - world.craft.momentum_i)
+    assert np.max(np.abs(moved)) < 1e-15
+    assert np.max(np.abs(closed.world.craft.wheel_h)) > 1e-3  # and yet it slews
+
+
+def _first(batch):
+    return jax.tree_util.tree_map(lambda x: x[0], batch)
+
+
+def _arrays(tree):
+    return [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
+
+
+# ------------------------------------------------------------------------------------- what fails
+
+
+def test_without_stars_it_goes_on_by_gyro(mekf):
+    lost = flown("s1", ("mekf",), 4, (*SHORT, 'star.lost=[{begin="60 s", end="110 s"}]'))["mekf"]
+    before, away = slice(0, 599), slice(600, 1099)
+    np.testing.assert_allclose(lost.error[:, before], mekf.error[:, before], atol=1e-6)
+    assert not np.any(lost.used[:, away])
+    assert np.all(np.diff(lost.sigma[0, away, 0]) > 0.0)  # it knows
+    assert np.max(np.abs(lost.error[:, away] / lost.sigma[:, away])) < 5.0
+    assert np.sqrt(np.mean(lost.error[:, 1195:] ** 2)) < 15.0  # and finds back
+
+
+def test_a_lost_wheel(mekf):
+    known = flown("s1", ("mekf",), 4, (*SHORT, "wheels.lost=[0]"))["mekf"]
+    assert np.all(known.wheel_momentum[:, :, 0] == 0.0)
+    assert known.points < 1.5 * mekf.points
+    unknown = (*SHORT, "wheels.lost=[0]", "wheels.loss_known=false")
+    unknown = flown("s1", ("mekf",), 4, unknown)["mekf"]
+    assert np.all(unknown.wheel_momentum[:, :, 0] == 0.0)
+    assert unknown.points > known.points  # a quarter of the torque about x is missing
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (('star.period="0.25 s"',), "must be a multiple of step"),
+        (('counted_from="1500 s"',), "must be before the end at 1500 s"),
+        (("wheels.lost=[4]",), "there is no wheel 4, only 0 to 3"),
+        (('wheels.start="0.2 N m s"',), "is beyond what a wheel holds, 0.1 N m s"),
+        (("wheels.axes=[[0,0,0]]",), "wheel 0 has none"),
+        (('gyro.rate_walk="5 deg/h"',), "arcsec/s/sqrt"),
+    ],
+)
+def test_parameters_that_cannot_be(settings, words):
+    with pytest.raises(ScenarioError, match=words):
+        parsed("s1", settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (('body.moments=["1 kg m^2","1 kg m^2","3 kg m^2"]',), "none is greater than the sum"),
+        (("wheels.lost=[0, 1]",), "2 independent axes, and three are needed"),
+    ],
+)
+def test_craft_that_cannot_be(settings, words):
+    with pytest.raises(ValueError, match=words):
+        problem("s1", ("mekf",), settings)
+
+
+def test_unknown_filter():
+    with pytest.raises(ValueError, match="no filter 'ekf' in this study; it has raw, mekf,"):
+        problem("s1", ("ekf",))
+
+
+def test_the_covariance_bound_of_the_loop():
+    p = problem("s1", ("mekf",), SHORT)
+    found = bound(p, "mekf")
+    sigma = np.asarray(found["bound_attitude"])[-5:] / ARCSEC
+    # what a steady Kalman filter states at its frames and between them
+    mekf = flown("s1", ("mekf",), 1, SHORT)["mekf"].sigma[0, -5:]
+    np.testing.assert_allclose(sigma, mekf, rtol=1e-3)
