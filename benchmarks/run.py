@@ -18,6 +18,7 @@ ORDER = [
     "transfer_alignment.py",
     "airship.py",
     "magnetic.py",
+    "stars.py",
     "synthesis.py",
 ]
 
