@@ -72,7 +72,9 @@ def test_an_attitude_whose_rate_is_in_doubt():
     one = kalman(rules=[channel_inflation(4.0, 0.01 * np.eye(3))])
     state, _ = one.predict(one.init(start, {}), motion, None)
     # all is isotropic, so turning changes nothing
-    np.testing.assert_allclose(state.belief.covariance, (1e-4 + 1e-6 + 4e-4) * np.eye(3), rtol=0, atol=1e-17)
+    np.testing.assert_allclose(
+        state.belief.covariance, (1e-4 + 1e-6 + 4e-4) * np.eye(3), rtol=0, atol=1e-17
+    )
 
 
 def test_the_likelihood_has_a_gradient_in_the_channel():

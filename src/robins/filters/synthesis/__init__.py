@@ -21,6 +21,7 @@ from robins.filters.synthesis.plant import (
     error_system,
     plant,
 )
+from robins.filters.synthesis.programs import MissingExtra
 from robins.filters.synthesis.riccati import (
     inflated_gain,
     kalman_design,
@@ -28,13 +29,18 @@ from robins.filters.synthesis.riccati import (
     least_riccati_gamma,
     riccati,
 )
+from robins.filters.synthesis.trade_off import METHODS, Outcome, TradeOff, trade_off
 
 __all__ = [
+    "METHODS",
     "Design",
     "ErrorSystem",
     "Isotropic",
+    "MissingExtra",
     "NotCertified",
+    "Outcome",
     "Plant",
+    "TradeOff",
     "Unreachable",
     "certify",
     "certify_full",
@@ -52,4 +58,5 @@ __all__ = [
     "plant",
     "riccati",
     "spectral_radius",
+    "trade_off",
 ]

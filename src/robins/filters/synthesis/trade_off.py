@@ -1,0 +1,158 @@
+"""What a bound on the worst case costs: the true H2 norm against gamma, by every method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis import full_order, lmi, search
+from robins.filters.synthesis.closed_form import closed_form, isotropic
+from robins.filters.synthesis.design import Design, NotCertified, Unreachable
+from robins.filters.synthesis.norms import Number
+from robins.filters.synthesis.plant import Plant
+from robins.filters.synthesis.programs import MissingExtra, packages
+from robins.filters.synthesis.riccati import (
+    check_gamma,
+    kalman_design,
+    least_riccati_gamma,
+    riccati,
+)
+
+_DESIGNERS: dict[str, Callable[[Plant, float], Design]] = {
+    "riccati": riccati,
+    "closed-form": closed_form,
+    "lmi-common": lambda plant, gamma: lmi.observer(plant, gamma, "common"),
+    "lmi-slack": lambda plant, gamma: lmi.observer(plant, gamma, "slack"),
+    "retuned-common": lambda plant, gamma: search.retuned(plant, gamma, "common"),
+    "retuned-slack": lambda plant, gamma: search.retuned(plant, gamma, "slack"),
+    "full-order": full_order.full,
+}
+METHODS = tuple(_DESIGNERS)
+_PLAIN = ("riccati", "closed-form")  # need no solver
+_POINTS = 6  # of a range that is chosen automatically
+_DEEPEST = 0.1  # of the Kalman filter's own norm: how far down such a range goes
+
+Progress = Callable[[int, int, str], None]
+
+
+class Outcome(NamedTuple):
+    """What one method made of one gamma."""
+
+    method: str
+    gamma: float
+    design: Design | None
+    why: str  # there is no design; "" where there is one
+    least: float  # gamma that the method reaches, where that is why; else nan
+
+
+class TradeOff(NamedTuple):
+    """All methods over all gammas."""
+
+    kalman: Design  # no bound at all
+    least: float  # H-infinity norm that any gain can have, or of any lambda where `by_lmi` is false
+    by_lmi: bool
+    gammas: tuple[float, ...]  # falling
+    outcomes: list[Outcome]  # every method for the first gamma, then for the next
+    left_out: dict[str, str]  # methods that do not apply, and why
+
+    def best(self, gamma: Number) -> Outcome | None:
+        """The least H2 norm for a gamma; of equals (to 1e-4) that of the simplest method."""
+        made = [
+            (o, o.design.h2) for o in self.outcomes if o.gamma == gamma and o.design is not None
+        ]
+        least = min((h2 for _, h2 in made), default=np.nan)
+        return next((o for o, h2 in made if h2 <= least * (1.0 + 1e-4)), None)
+
+
+def trade_off(
+    plant: Plant,
+    gammas: Sequence[Number] | None = None,
+    methods: Sequence[str] = METHODS,
+    progress: Progress | None = None,
+) -> TradeOff:
+    """Design by every method for every gamma; what a method cannot do is part of the answer.
+
+    Args:
+        plant: what is filtered.
+        gammas: bounds on the H-infinity norm; by default six, from nine tenths of the Kalman
+            filter's own down to the least there is, or a tenth of the Kalman filter's.
+        methods: which, out of `METHODS`.
+        progress: called with done, total and a word on what is done.
+
+    Raises:
+        Unreachable: every gamma is below the least one, which the message names.
+        ValueError: a gamma is not positive or finite, a method is not known, or the plant has no
+            steady Kalman filter.
+    """
+    for gamma in () if gammas is None else gammas:
+        check_gamma(gamma)
+        if not np.isfinite(gamma):
+            raise ValueError("gamma must be finite here; without a bound it is the Kalman filter")
+    if unknown := [name for name in methods if name not in METHODS]:
+        raise ValueError(f"no method {unknown[0]!r}; there are {', '.join(METHODS)}")
+    tell = progress or (lambda done, total, what: None)
+    tell(0, 1, "least gamma")
+    kalman = kalman_design(plant)
+    left_out = {name: why for name in methods if (why := _why_not(plant, name))}
+    least, by_lmi = _least(plant)
+    if gammas is None:
+        chosen = _range(least, kalman.hinf)
+    else:
+        chosen = tuple(sorted({float(gamma) for gamma in gammas}, reverse=True))
+        if by_lmi and chosen and chosen[0] < least:
+            raise Unreachable(
+                f"gamma {chosen[0]:.6g} is below the least that any gain can have, {least:.6g}: "
+                "ask for more",
+                least,
+            )
+    used = [name for name in METHODS if name in methods and name not in left_out]
+    outcomes: list[Outcome] = []
+    total = len(chosen) * len(used)
+    for gamma in chosen:
+        for name in used:
+            tell(len(outcomes), total, f"{name}, gamma {gamma:.4g}")
+            outcomes.append(_outcome(plant, gamma, name))
+    return TradeOff(kalman, least, by_lmi, chosen, outcomes, left_out)
+
+
+def _outcome(plant: Plant, gamma: float, name: str) -> Outcome:
+    try:
+        return Outcome(name, gamma, _DESIGNERS[name](plant, gamma), "", np.nan)
+    except Unreachable as error:
+        return Outcome(name, gamma, None, str(error), error.least)
+    except NotCertified as error:
+        return Outcome(name, gamma, None, str(error), np.nan)
+
+
+def _why_not(plant: Plant, name: str) -> str:
+    """Why a method does not apply to a plant; "" where it does."""
+    try:
+        if name == "closed-form":
+            isotropic(plant)
+        elif name not in _PLAIN:
+            packages()
+        if name == "full-order":
+            full_order.refuse_unstable(plant)
+    except (ValueError, MissingExtra) as error:
+        return str(error)
+    return ""
+
+
+def _least(plant: Plant) -> tuple[float, bool]:
+    try:
+        return search.least_gamma(plant), True
+    except (MissingExtra, NotCertified):
+        return least_riccati_gamma(plant), False
+
+
+def _range(least: float, own: float) -> tuple[float, ...]:
+    """Gammas from just below the Kalman filter's own norm to just above the least."""
+    if own <= 0.0:
+        return ()
+    low = max(1.02 * least, _DEEPEST * own)
+    if low >= 0.9 * own:  # hardly anything to gain
+        return (0.5 * (least + own),) if least < own else ()
+    # Rounded, as they are for people to read and to ask for again.
+    return tuple(float(f"{gamma:.4g}") for gamma in np.geomspace(0.9 * own, low, _POINTS))
