@@ -244,7 +244,7 @@ def test_examples_in_the_help_are_commands(line):
 def test_help_teaches_the_contract(robins):
     text = " ".join(robins("--help").out.split())
     assert "Exit status: 0 done, 1 failed, 2 bad input, 3 interrupted" in text
-    for command in ("demo", "run", "replay", "doctor", "allan", "list"):
+    for command in ("demo", "run", "replay", "doctor", "allan", "design", "list"):
         assert f"robins {command}" in text
 
 

@@ -26,6 +26,7 @@ Examples:
   robins replay imu.csv gnss.pos --out walk      navigate it
   robins allan still.csv                         noise parameters of my IMU
   robins calibrate turned.csv                    hard and soft iron of my magnetometer
+  robins design attitude-axis                    gains that bound the worst case, and their price
 
 Every command that computes writes a folder with a summary, the time series, figures and a page
 report.html to open in a browser. With --json a command prints one JSON object for scripts.
@@ -309,6 +310,31 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
         raise BadInput(f"{log[0]}: is a configuration; give the log beside it.")
     name = f"calibrate-{files[0].name.split('.')[0]}"
     magnetometer(log, files[0], out=out or Path("results") / name, **options)
+
+
+@app.command(
+    short_help="Gains that bound the worst case, and what that costs.",
+    epilog=_examples(
+        "robins design attitude-axis",
+        'robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json',
+    ),
+)
+@click.argument("problem")
+@_option("--gamma", metavar="a,b", help="Bounds on the H-infinity norm. [default: a range]")
+@_option("--methods", callback=_names, metavar="a,b", help="Which methods to compare.")
+@_out
+@_json
+@_debug
+def design(problem: str, gamma: str | None, **options: Any) -> None:
+    """Constant-gain filters for PROBLEM, a TOML file with the matrices of a plant or an example.
+
+    Compares methods that keep the gain from a modelling error to the estimate below gamma: how much
+    noise each lets through, by true norms. Examples: attitude-axis, attitude-axis-drift,
+    baro-height, two-states.
+    """
+    from robins.cli.design import design as compare
+
+    compare(problem, gamma, **options)
 
 
 @app.command("list", short_help="Name the scenarios, systems, filters and claims.")

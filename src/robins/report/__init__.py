@@ -27,6 +27,7 @@ from robins.report.maps import track
 from robins.report.numbers import verdict
 from robins.report.style import Picture
 from robins.report.terminal import plain, table
+from robins.report.trade_off import trade_off
 from robins.report.updates import consistency, innovations
 
 __all__ = [
@@ -91,6 +92,8 @@ def _drawings(
             drawings.append(lambda name=name: consistency(ds, name))
     for sensor in series.find(ds, "allan"):
         drawings.append(lambda sensor=sensor: allan(ds, sensor))
+    if "trade_off_h2" in ds:
+        drawings.append(lambda: trade_off(ds))
     if "field_calibrated" in ds:
         drawings += [lambda: iron.planes(ds), lambda: iron.size(ds)]
     return drawings + last

@@ -1,0 +1,249 @@
+"""The command `design`: filters with constant gains, and what a bound on the worst case costs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import xarray as xr
+
+from robins import report, results
+from robins.cli.frame import BadInput, command_line, only_json
+from robins.cli.problem import Problem, read_problem
+from robins.cli.progress import Progress
+from robins.filters.synthesis import METHODS, Design, Outcome, TradeOff, trade_off
+from robins.results import variable
+from robins.results.summary import dumps, plain
+
+GAINS, TABLE = "gains.json", "trade_off.csv"
+_NUMBERS = ("h2", "hinf", "hinf_sweep", "bound", "radius", "lambda_", "seconds")
+_MISSING = "robins[lmi]"  # in the sentence of a method whose packages are not there
+
+
+def as_text(gammas: Sequence[float]) -> list[str]:
+    """Gammas with as few digits as tell them apart, four at least."""
+    for digits in range(4, 18):
+        texts = [f"{gamma:.{digits}g}" for gamma in gammas]
+        if len(set(texts)) == len(texts):
+            return texts
+    return [repr(gamma) for gamma in gammas]
+
+
+def cell(outcome: Outcome) -> Any:
+    """What a table says where a method has no design."""
+    if np.isfinite(outcome.least):
+        return f"cannot, least {outcome.least:.4g}"
+    return "not certified"
+
+
+def summary_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
+    """Norms by method and gamma."""
+    columns: dict[str, dict[str, Any]] = {
+        "kalman": {"h2": found.kalman.h2, "hinf": found.kalman.hinf}
+    }
+    for gamma, text in zip(found.gammas, as_text(found.gammas), strict=True):
+        for outcome in (o for o in found.outcomes if o.gamma == gamma):
+            column = columns.setdefault(outcome.method, {})
+            made = outcome.design
+            column[f"h2_at_gamma_{text}"] = cell(outcome) if made is None else made.h2
+            column[f"hinf_at_gamma_{text}"] = None if made is None else made.hinf
+    return {
+        "scenario": f"design/{problem.name}",
+        "seed": 0,
+        "runs": 1,
+        "filters": columns,
+        "claims": [],
+        "counts": {},
+    }
+
+
+def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
+    """Norms as arrays (design, gamma); the first is the method."""
+    methods = list(dict.fromkeys(outcome.method for outcome in found.outcomes))
+
+    def numbers(name: str) -> np.ndarray:
+        values = np.full((len(methods), len(found.gammas)), np.nan)
+        for outcome in found.outcomes:
+            if outcome.design is not None:
+                at = methods.index(outcome.method), found.gammas.index(outcome.gamma)
+                values[at] = getattr(outcome.design, name)
+        return values
+
+    dims, z, gain = ("design", "gamma"), problem.unit_z, problem.unit_gain
+    kalman = found.kalman
+    arrays = {
+        "trade_off_h2": variable(dims, numbers("h2"), z, "true H2 norm"),
+        "trade_off_hinf": variable(
+            dims,
+            numbers("hinf"),
+            gain,
+            "true H-infinity norm",
+            least=found.least,
+            least_of=_whose(found),
+        ),
+        "trade_off_bound": variable(dims, numbers("bound"), z, "bound on the H2 norm"),
+        "kalman_h2": variable((), kalman.h2, z, "H2 norm of the Kalman filter"),
+        "kalman_hinf": variable((), kalman.hinf, gain, "H-infinity norm of the Kalman filter"),
+    }
+    gamma = variable("gamma", np.array(found.gammas), gain, "bound on the H-infinity norm")
+    return xr.Dataset(arrays, {"design": methods, "gamma": gamma})
+
+
+def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
+    """Every gain with full digits, and what could not be had."""
+    made = [("kalman", found.kalman)]
+    made += [(o.method, o.design) for o in found.outcomes if o.design is not None]
+    refused = [o for o in found.outcomes if o.design is None]
+    return {
+        "problem": problem.name,
+        "form": problem.form,
+        "blocks": problem.blocks,
+        "least_gamma": found.least,
+        "least_gamma_of": _whose(found),
+        "designs": [_told(name, design) for name, design in made],
+        "not_reached": [
+            {"method": o.method, "gamma": o.gamma, "why": o.why, "least": o.least} for o in refused
+        ],
+        "left_out": found.left_out,
+    }
+
+
+def _told(name: str, design: Design) -> dict[str, Any]:
+    told: dict[str, Any] = {"method": name, "gamma": design.gamma, "order": design.order}
+    if design.filter is None:
+        told["K"] = design.gain
+    else:
+        told |= dict(zip(("Ah", "Bh", "Gh"), design.filter, strict=True))
+    told |= {number.rstrip("_"): getattr(design, number) for number in _NUMBERS}
+    return told | {"status": design.status}
+
+
+def table_of(found: TradeOff) -> str:
+    """The curve as CSV, a row for each method and gamma."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["method", "gamma", *(n.rstrip("_") for n in _NUMBERS), "not_reached"])
+    kalman = Outcome("kalman", np.inf, found.kalman, "", np.nan)
+    for o in (kalman, *found.outcomes):
+        numbers = [repr(float(getattr(o.design, n))) if o.design else "" for n in _NUMBERS]
+        writer.writerow([o.method, repr(o.gamma), *numbers, o.why])
+    return text.getvalue()
+
+
+def advice(problem: Problem, found: TradeOff) -> list[str]:
+    """What the numbers say, in sentences."""
+    own, gain = found.kalman, _unit(problem.unit_gain)
+    reach = f"the least Hinf of {_whose(found)} is {found.least:.4g}{gain}"
+    if found.least == 0.0:
+        reach = "no Hinf is too small to be reached"
+    notes = [
+        f"The Kalman filter has H2 {own.h2:.4g}{_unit(problem.unit_z)} and Hinf {own.hinf:.4g}"
+        f"{gain}; {reach}."
+    ]
+    for gamma, text in zip(found.gammas, as_text(found.gammas), strict=True):
+        if (best := found.best(gamma)) is not None and best.design is not None:
+            cost = best.design.h2 / own.h2 - 1.0 if own.h2 > 0.0 else np.nan
+            notes.append(
+                f"gamma {text}: least H2 {best.design.h2:.4g}{_unit(problem.unit_z)} by "
+                f"{best.method}, {cost:+.1%} of the Kalman filter's."
+            )
+        else:
+            notes.append(f"gamma {text}: no method of these reaches it.")
+    missing = [name for name, why in found.left_out.items() if _MISSING in why]
+    if missing:
+        notes.append(
+            f"Left out: {', '.join(missing)}; they need cvxpy and Clarabel: "
+            f"pip install '{_MISSING}'. A gamma out of reach here may be in reach of theirs."
+        )
+    for name, why in found.left_out.items():
+        if name not in missing:
+            notes.append(f"Left out: {name}: {why}.")
+    return notes
+
+
+def _whose(found: TradeOff) -> str:
+    """Whose least gamma it is."""
+    return "any gain" if found.by_lmi else "any Riccati design"
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
+
+
+def gammas_of(text: str | None) -> list[float] | None:
+    """Gammas of an option, "1, 0.8".
+
+    Raises:
+        BadInput: one of them is not a number.
+    """
+    if text is None:
+        return None
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise BadInput(f'--gamma {text!r}: give numbers, such as "1, 0.8".') from error
+
+
+def design(
+    given: str, gamma: str | None, methods: Sequence[str], out: Path | None, as_json: bool
+) -> None:
+    """Design filters for a problem, write and print them."""
+    command = command_line()
+    asked = gammas_of(gamma)
+    with only_json(as_json), Progress() as progress:
+        problem = read_problem(given)
+        out = out or Path("results") / f"design-{problem.name}"
+        writer = results.ResultWriter(out, command=command, scenario_text=problem.text)
+        with writer:
+            try:
+                found = trade_off(
+                    problem.plant,
+                    problem.gammas if asked is None else asked,
+                    methods or METHODS,
+                    lambda done, total, what: progress(0.9 * done / max(total, 1), what),
+                )
+            except ValueError as error:
+                raise BadInput(f"{given}: {error}.") from error
+            notes = advice(problem, found)
+            writer.save_solution(solution_of(problem, found))
+            writer.save_summary(summary_of(problem, found))
+            writer.save_file(GAINS, dumps(plain(gains_of(problem, found))).encode())
+            writer.save_file(TABLE, table_of(found).encode())
+            report.add(writer, lambda done, total, what: progress(0.95, what), notes)
+    if as_json:
+        click.echo((out / "summary.json").read_text("utf-8"), nl=False)
+        return
+    from rich.console import Console
+
+    console = Console()
+    click.secho(f"{problem.title}\n", bold=True)
+    console.print(report.table(results.read(out).summary, console.width))
+    click.echo()
+    for note in notes:
+        click.echo(note)
+    click.echo(f"\nResult: {out}\nGains:  {out / GAINS}   (every digit; {TABLE} has the curve)")
+    click.echo(f"Report: {out / 'report.html'}   (open it in a browser)")
+    click.echo(_next(given, problem, found))
+
+
+def _next(given: str, problem: Problem, found: TradeOff) -> str:
+    usable = [o for g in found.gammas if (o := found.best(g)) is not None and o.design is not None]
+    if not usable:
+        return f'Next:   robins design {given} --gamma "{1.05 * found.least:.4g}"   is in reach'
+    inflated = [
+        o.design
+        for o in found.outcomes
+        if o.method == "riccati" and o.design is not None and o.design.lambda_ > 0.0
+    ]
+    if inflated and not np.any(problem.blocks.get("Dn", 0.0)):
+        middle = inflated[len(inflated) // 2]
+        return (
+            f"Next:   kalman(taylor(), [channel_inflation({middle.lambda_:.6g}, Bn)])   is the "
+            f"filter for gamma {middle.gamma:.4g}"
+        )
+    return 'Next:   kalman(taylor(), [constant_gain({"sensor": K})])   runs with a gain of these'

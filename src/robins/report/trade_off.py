@@ -1,0 +1,73 @@
+"""What a bound on the worst case costs: the true H2 norm of designs over their H-infinity norm."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from robins.report import series, style
+from robins.report.style import Picture
+
+# The forms of one family share a colour: what is retuned is dashed.
+_LOOKS: dict[str, dict[str, Any]] = {
+    "riccati": {"color": style.colour(0), "marker": "o", "markersize": 6.5, "zorder": 4},
+    "closed-form": {"color": style.colour(3), "marker": "x", "linestyle": ":", "zorder": 5},
+    "lmi-common": {"color": style.colour(1), "marker": "s"},
+    "lmi-slack": {"color": style.colour(2), "marker": "D"},
+    "retuned-common": {"color": style.colour(1), "marker": "s", "linestyle": "--"},
+    "retuned-slack": {"color": style.colour(2), "marker": "D", "linestyle": "--"},
+    "full-order": {"color": style.colour(5), "marker": "+", "linestyle": ":", "markersize": 7.0},
+}
+_KALMAN = {"color": style.TRUTH, "marker": "*", "markersize": 11.0, "linestyle": "", "zorder": 6}
+_LEAST = {"color": style.GREY, "linewidth": 0.9, "linestyle": (0, (1, 2))}
+
+
+@style.styled
+def trade_off(solution: xr.Dataset) -> Picture:
+    """A line for each method through its designs, and how far each is from the best for a gamma.
+
+    Args:
+        solution: ``trade_off_h2`` and ``trade_off_hinf`` (design, gamma), NaN where a method has no
+            design; ``kalman_h2`` and ``kalman_hinf``; the attributes ``least``
+            and ``least_of`` of ``trade_off_hinf``.
+    """
+    h2, hinf = solution["trade_off_h2"], solution["trade_off_hinf"]
+    gamma = np.asarray(solution[h2.dims[1]].values, float)
+    value, reached = np.asarray(h2.values, float), np.asarray(hinf.values, float)
+    best = np.fmin.reduce(value, axis=0)
+    figure, grid = style.new(2, height=5.6, sharex=True, height_ratios=(3, 2))
+    above, below = grid[:, 0]
+    keys = []
+    for k, name in enumerate(series.coordinate(solution, h2.dims[0])):
+        if not np.isfinite(value[k]).any():
+            continue
+        look = {"markersize": 4.0, "markerfacecolor": "none", "markeredgewidth": 1.1}
+        look |= _LOOKS.get(name, {"color": style.colour(k), "marker": "."})
+        order = np.argsort(reached[k])
+        above.plot(reached[k][order], value[k][order], **look)
+        below.plot(gamma, 100.0 * (value[k] / best - 1.0), **look)
+        keys.append(style.key(name, **look))
+    above.plot(solution["kalman_hinf"].item(), solution["kalman_h2"].item(), **_KALMAN)
+    keys.append(style.key("Kalman filter", **_KALMAN))
+    least = float(hinf.attrs.get("least", np.nan))
+    if least > 0.0:
+        above.axvline(least, **_LEAST)
+        below.axvline(least, **_LEAST)
+        keys.append(style.key(f"least of {hinf.attrs['least_of']}", **_LEAST))
+    unit = hinf.attrs["units"]
+    above.set(ylabel=_label("H2 norm", h2.attrs["units"]), title="over the true H∞ norm")
+    below.set(ylabel="above the best [%]", title="over the gamma that was asked for")
+    below.set(xlabel=_label("H∞ norm from the modelling error to the estimate", unit))
+    style.legend(figure, keys)
+    caption = (
+        "True norms. Above, left is safer against the modelling error and down is less noise; a "
+        "method that ends has no gain for what is further left. Below, what is lost to the best "
+        "method for that gamma: designs by LMI that are not retuned prove more than was asked."
+    )
+    return Picture("trade_off", "What a bound on the worst case costs", caption, figure)
+
+
+def _label(text: str, unit: str) -> str:
+    return text if unit == "1" else f"{text} [{unit}]"
