@@ -55,6 +55,7 @@ class Statistics:
     _norm_peaks: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _output_square: dict[str, Any] = field(default_factory=dict)
     _run_output_rms: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    _run_output_worst: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.chunks` yields it."""
@@ -83,6 +84,8 @@ class Statistics:
             self._output_square[name] = self._output_square.get(name, 0.0) + np.sum(value**2, 0)
             squares = np.mean(value[:, self.counted] ** 2, axis=1)
             self._run_output_rms.setdefault(name, []).append(np.sqrt(squares))
+            worst = np.max(np.linalg.norm(value[:, self.counted], axis=2), axis=1)
+            self._run_output_worst.setdefault(name, []).append(worst)
         self.n = int(record["dim"][0])
         counted = error[:, self.counted]
         for norm in self.norms:
@@ -153,6 +156,10 @@ class Statistics:
     def run_output_rms(self, name: str) -> np.ndarray:
         """(runs, k) root mean square of an output over the epochs counted."""
         return np.concatenate(self._run_output_rms[name])
+
+    def run_output_worst(self, name: str) -> np.ndarray:
+        """(runs,) greatest length of an output over the epochs counted."""
+        return np.concatenate(self._run_output_worst[name])
 
     @property
     def run_rms(self) -> np.ndarray:

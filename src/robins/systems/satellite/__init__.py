@@ -13,12 +13,16 @@ from robins.systems.satellite.problem import attitude_problem
 from robins.systems.system import Study, System
 
 _HERE = Path(__file__).parent / "scenarios"
+_SCENARIOS = (
+    *("s1", "s2", "s3", "s4"),
+    *("star-stuck", "star-wrong", "star-lost", "star-sign", "wheel-lost"),
+)
 
 SYSTEM = System(
     name="satellite",
     summary="a satellite's attitude in closed loop: gyro, star sensor, mixed H2/H-infinity",
     studies={"attitude-loop": Study(AttitudeLoop, attitude_problem, FILTERS, CLAIMS)},
-    scenarios={name: _HERE / f"{name}.toml" for name in ("s1", "s2", "s3", "s4")},
+    scenarios={name: _HERE / f"{name}.toml" for name in _SCENARIOS},
 )
 
 __all__ = ["SYSTEM"]

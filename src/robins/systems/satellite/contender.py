@@ -28,7 +28,6 @@ class Numbers(NamedTuple):
     """Data of a contender, so that contenders that differ in these alone compile once."""
 
     course: Any  # `Step` with leading axis E
-    seen: Array  # (E,) bool
     due: Array  # (E,) bool
     craft: Any
     control: Any
@@ -57,7 +56,7 @@ def _case(additive: bool, body: str):
 
     def case(n: Numbers, world: World) -> Case:
         given = Given(n.craft, n.control, n.pinv, n.step_s, n.quantum_rad, world.gyro_matrix)
-        rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error, n.seen)
+        rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error)
         start = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
         if body.startswith("fixed"):
             start = with_gains(make_filter(body).init(start, _DIMS), {STAR: n.gain})
@@ -91,7 +90,6 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
             noise = noise._replace(factor=jnp.concatenate([noise.factor, more], axis=1))
     numbers = Numbers(
         course=course.steps,
-        seen=jnp.asarray(course.seen),
         due=jnp.asarray(course.due),
         craft=course.craft,
         control=course.control,

@@ -13,7 +13,16 @@ from robins.sim.attitude_control import Controller, allocation_matrix, controlle
 from robins.sim.attitude_reference import Reference, inertial, nadir, slews
 from robins.sim.orbit import circular_orbit, field_along_orbit
 from robins.sim.spacecraft import Spacecraft, spacecraft
-from robins.systems.satellite.parameters import AttitudeLoop, Body, Wheels
+from robins.systems.satellite.parameters import AttitudeLoop, Body, Star, Wheels
+
+
+class StarSays(NamedTuple):
+    """What the star sensor makes of the truth at the end of a step, besides noise."""
+
+    seen: Array  # () bool, whether there is a frame
+    stuck: Array  # () bool, whether it is the last one again
+    turn: Array  # (3,) rad, rotation vector in sensor axes
+    factor: Array  # () of the components of the quaternion: 1, -1, or wrong
 
 
 class Step(NamedTuple):
@@ -26,6 +35,8 @@ class Step(NamedTuple):
     r_i_m: Array  # (3,) place in the middle of it
     field_i_t: Array  # (3,) magnetic field there
     disturbance_b: Array  # (3,) N m
+    wheel_works: Array  # (W,) 1, or 0 for a wheel that gives no torque
+    star: StarSays
 
 
 class Course(NamedTuple):
@@ -34,7 +45,6 @@ class Course(NamedTuple):
     time_s: np.ndarray  # (E,) at the end of each step
     steps: Step
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame
-    seen: np.ndarray  # (E,) bool, and the sensor is not lost
     craft: Spacecraft
     control: Controller
     pinv: np.ndarray  # (W, 3) from torques of the body to those of the wheels
@@ -73,12 +83,11 @@ def lay_out(given: AttitudeLoop) -> Course:
     frame = round(given.star.period / dt)
     due = np.arange(1, count + 1) % frame == 0
     time = edges[1:]
-    seen = due.copy()
-    for span in given.star.lost:
-        seen &= ~span.holds(time)
     body, wheels, axes = inertia(given.body), given.wheels, wheel_axes(given.wheels)
-    works = np.ones(len(wheels.axes))
-    works[list(wheels.lost)] = 0.0
+    works = np.ones((count, len(wheels.axes)))
+    works[np.ix_(edges[:-1] > wheels.lost_at - 1e-9, list(wheels.lost))] = 0.0
+    left = np.ones(len(wheels.axes))
+    left[list(wheels.lost)] = 0.0
     return Course(
         time_s=time,
         steps=Step(
@@ -89,9 +98,10 @@ def lay_out(given: AttitudeLoop) -> Course:
             middle.r_i_m,
             field,
             jnp.asarray(_disturbance(given, np.asarray(middle.time_s))),
+            jnp.asarray(works),
+            _star_says(given.star, due, time),
         ),
         due=due,
-        seen=seen,
         craft=spacecraft(
             body,
             axes,
@@ -99,12 +109,11 @@ def lay_out(given: AttitudeLoop) -> Course:
             wheels.momentum,
             given.control.dipole,
             given.body.dipole,
-            works,
         ),
         control=controller(
             body, given.control.frequency, given.control.damping, given.control.unloading
         ),
-        pinv=allocation_matrix(axes, works if wheels.loss_known else 1.0),
+        pinv=allocation_matrix(axes, left if wheels.loss_known else 1.0),
     )
 
 
@@ -112,6 +121,24 @@ def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Referen
     if (slew := given.slew) is None:
         return base
     return slews(base, slew.angle, slew.period, time_s, fade_in_s=slew.grows)
+
+
+def _star_says(star: Star, due: np.ndarray, time_s: np.ndarray) -> StarSays:
+    seen, stuck = due.copy(), np.zeros(len(due), dtype=bool)
+    turn, factor = np.zeros((len(due), 3)), np.ones(len(due))
+    for span in star.lost:
+        seen &= ~span.holds(time_s)
+    for fault in star.faults:
+        here = fault.holds(time_s)
+        if fault.kind == "stuck":
+            stuck |= here
+        elif fault.kind == "turned":
+            turn[here, 2] += fault.angle
+        elif fault.kind == "sign":
+            factor[here & (np.floor(time_s + 1e-9) % 2 == 1)] *= -1.0
+        else:
+            factor[here] *= 0.99
+    return StarSays(*(jnp.asarray(x) for x in (seen, stuck, turn, factor)))
 
 
 def _disturbance(given: AttitudeLoop, time_s: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.filters import Belief, Reading
-from robins.rotation import BodyRotation, conjugate, multiply, rotate, to_rotvec
+from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.sim.attitude_control import Controller, allocate, desaturation_dipole, torque
 from robins.sim.gyro import read_gyro
 from robins.sim.spacecraft import CraftState, Spacecraft, advance, rate_b, wheel_momentum_b
@@ -23,6 +23,7 @@ from robins.sim.star_sensor import read_star
 from robins.systems.satellite.course import Step
 
 STAR = "star"
+UNIT = 1e-3  # that the length of a quaternion may be off by
 
 
 class Command(NamedTuple):
@@ -50,7 +51,6 @@ class Row(NamedTuple):
     gyro_angle: Array  # (3,) rad
     gyro_bias: Array  # (3,) rad/s
     star_error: Array  # (3,) rad
-    seen: Array  # () bool
 
 
 class Vehicle(NamedTuple):
@@ -59,6 +59,7 @@ class Vehicle(NamedTuple):
     craft: CraftState
     residue: Array  # (3,) rad, what the gyro has not reported yet
     theta: Array  # (3,) rad, what it reported last
+    star_q_ib: Array  # (4,) what the star sensor saw last
 
 
 def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, row: Step) -> Command:
@@ -81,7 +82,7 @@ def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, ro
 def plant(given: Given, state: CraftState, command: Command, row: Step) -> CraftState:
     """The craft one step on."""
     return advance(
-        given.craft,
+        given.craft._replace(wheel_works=row.wheel_works),
         state,
         command.wheel_torque,
         command.dipole_b,
@@ -98,9 +99,18 @@ def gyro(given: Given, before: Array, after: Array, residue: Array, row: Row):
     return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
 
 
-def star(q_ib: Array, row: Row) -> Array:
-    """What the star sensor reports; NaN without a frame."""
-    return jnp.where(row.seen, read_star(q_ib, row.star_error), jnp.nan)
+def star(q_ib: Array, before: Array, row: Row) -> tuple[Array, Array]:
+    """What the star sensor reports, NaN without a frame, and what it has seen for the next time."""
+    says = row.course.star
+    now = multiply(read_star(q_ib, row.star_error), from_rotvec(says.turn))
+    now = jnp.where(says.seen & ~says.stuck, now, before)
+    return jnp.where(says.seen, says.factor * now, jnp.nan), now
+
+
+def believable(q_ib: Array) -> BodyRotation:
+    """An attitude as a measurement; one that is no unit quaternion is taken for missing."""
+    off = jnp.abs(jnp.sum(q_ib * q_ib) - 1.0)
+    return BodyRotation(jnp.where(off <= 2.0 * UNIT, q_ib, jnp.nan))
 
 
 def pointing_error(q_ref_ib: Array, q_ib: Array) -> Array:
@@ -110,7 +120,8 @@ def pointing_error(q_ref_ib: Array, q_ib: Array) -> Array:
 
 def begin(given: Given, craft: CraftState) -> Vehicle:
     """The vehicle before its first step; its gyro has reported the rate that it has."""
-    return Vehicle(craft, jnp.zeros(3), given.step_s * rate_b(given.craft, craft))
+    theta = given.step_s * rate_b(given.craft, craft)
+    return Vehicle(craft, jnp.zeros(3), theta, craft.q_ib)
 
 
 class Kind(NamedTuple):
@@ -128,15 +139,16 @@ def react(kind: Kind, given: Given, v: Vehicle, belief: Belief, row: Row):
     command = acm(given, q, bias, v.theta, v.craft.wheel_h, row.course)
     craft = plant(given, v.craft, command, row.course)
     theta, residue = gyro(given, v.craft.q_ib, craft.q_ib, v.residue, row)
+    frame, seen = star(craft.q_ib, v.star_q_ib, row)
     outputs = {
         "pointing": pointing_error(row.course.ref_end_q_ib, craft.q_ib),
         "wheel_momentum": craft.wheel_h,
     }
     reading = Reading(
         u=theta,
-        y={STAR: BodyRotation(star(craft.q_ib, row))},
+        y={STAR: believable(frame)},
         truth=kind.state(craft.q_ib, row.gyro_bias),
         rows=kind.rows(craft.q_ib),
         outputs=outputs,
     )
-    return Vehicle(craft, residue, theta), reading
+    return Vehicle(craft, residue, theta, seen), reading

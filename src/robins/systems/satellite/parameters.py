@@ -50,7 +50,8 @@ class Wheels(Parameters):
     momentum: Annotated[float, Quantity("angular momentum", above="0 N m s")] = default("0.1 N m s")
     start: Annotated[float, Quantity("angular momentum")] = default("0 N m s")  # each of them
     lost: tuple[pydantic.NonNegativeInt, ...] = ()
-    loss_known: bool = True  # whether torques are shared out among the others
+    lost_at: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    loss_known: bool = True  # from the start; then torques are shared out among the others
 
     @pydantic.model_validator(mode="after")
     def _sound(self) -> Wheels:
@@ -104,6 +105,18 @@ class Gyro(Parameters):
     quantum: Annotated[float, Quantity("angle", least="0 deg")] = default("0.05 arcsec")
 
 
+class StarFault(Span):
+    """The star sensor reports what is not so, from begin (included) to end (not).
+
+    "stuck": again and again what it reported before; "turned": an attitude turned about its
+    boresight; "sign": in every other second the same attitude with the opposite
+    sign, which is no fault of the sensor; "short": a quaternion whose length is not one.
+    """
+
+    kind: Literal["stuck", "turned", "sign", "short"]
+    angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("10 deg")
+
+
 class Star(Parameters):
     """A star sensor, its boresight z; the low-frequency error is a sine of drawn phase."""
 
@@ -114,6 +127,7 @@ class Star(Parameters):
     low_frequency: Annotated[float, Quantity("angle", least="0 deg")] = default("0 arcsec")
     low_frequency_period: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
     lost: tuple[Span, ...] = ()
+    faults: tuple[StarFault, ...] = ()
 
 
 class Believed(Parameters):

@@ -15,7 +15,7 @@ from robins.systems.satellite.metrics import attitude_metrics
 from robins.systems.satellite.nodes import STAR
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import simulate
-from robins.systems.system import Output, Problem, SensorAxes, StateBlock
+from robins.systems.system import Norm, Output, Problem, SensorAxes, StateBlock
 
 AXES = ("x", "y", "z (boresight)")
 BLOCKS = (
@@ -33,6 +33,7 @@ def attitude_problem(given: AttitudeLoop, filters: tuple[str, ...], seed: int) -
         ImportError: a design by LMI without the extra "lmi".
     """
     course = lay_out(given)
+    counted = int(np.searchsorted(course.time_s, given.counted_from + 1e-9))
     return Problem(
         simulate=partial(simulate, given, course, seed),
         contenders={name: contender(given, course, name) for name in filters},
@@ -42,8 +43,10 @@ def attitude_problem(given: AttitudeLoop, filters: tuple[str, ...], seed: int) -
         context=_context(course),
         metrics=attitude_metrics,
         claims=partial(satellite_claims, given.claims),
-        count_from=int(np.searchsorted(course.time_s, given.counted_from + 1e-9)),
+        count_from=counted,
         outputs=_outputs(given),
+        norms=(Norm("attitude", (0, 1, 2)),),
+        windows=(slice(counted, len(course.time_s)),),
     )
 
 
@@ -72,7 +75,7 @@ def _outputs(given: AttitudeLoop) -> tuple[Output, ...]:
 
 def _context(course: Course) -> xr.Dataset:
     """The wanted rate, and when the star sensor is lost."""
-    lost = (course.due & ~course.seen).astype(np.int8)
+    lost = (course.due & ~np.asarray(course.steps.star.seen)).astype(np.int8)
     data = {}
     if np.any(lost):
         data["outage"] = variable("time", lost, "1", "star sensor lost")
