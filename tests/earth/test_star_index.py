@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robins.earth.star_catalogue import Stars, synthetic
-from robins.earth.star_index import index_stars, near
+from robins.earth.star_index import _cube_points, index_stars, near
 
 REACH = np.radians(10.0)
 SKY = synthetic(5.0)
@@ -38,6 +38,23 @@ def test_no_star_within_reach_is_missed():
         assert set(np.flatnonzero(wanted)) <= set(some)
     # And a list is short beside the catalogue, else it were no help.
     assert lists.shape[1] < 0.05 * len(SKY.magnitude)
+
+
+def test_a_star_is_found_from_the_far_corner_of_a_cell():
+    """Each star just within reach of a corner, away from the middle of the cell."""
+    n = round((len(INDEX.members) / 6) ** 0.5)
+    corners, steps = _cube_points(np.arange(n + 1.0), n), np.arange(n) + 0.5
+    corner, middle = corners[:, :-1, :-1].reshape(-1, 3), _cube_points(steps, n).reshape(-1, 3)
+    away = corner * np.sum(corner * middle, 1)[:, None] - middle
+    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    reach = 0.9999 * REACH
+    star = np.cos(reach) * corner + np.sin(reach) * away
+    number = np.arange(len(star))
+    index = index_stars(Stars(star, 5.0 + 0.0 * number, number), REACH)
+    assert len(index.members) == len(star)  # one star for each cell
+    inside = corner + 1e-7 * (middle - corner)
+    lists = np.asarray(found_near(index, jnp.asarray(inside)))
+    assert np.all(np.any(lists == number[:, None], axis=1))
 
 
 def test_a_catalogue_out_of_order_is_sorted_by_brightness():

@@ -26,7 +26,8 @@ def scene():
     b, star = np.full((POINTINGS, ROWS, 3), np.nan), np.full((POINTINGS, ROWS), -1)
     for k in range(POINTINGS):
         unit = true[k].inv().apply(SKY.unit_i)
-        field = rng.permutation(np.flatnonzero(unit @ BORESIGHT > np.cos(FIELD / 2.0)))[: ROWS - 8]
+        field = np.flatnonzero(unit @ BORESIGHT > np.cos(FIELD / 2.0))
+        field = rng.permutation(field)[: len(field) * 2 // 3]  # a third is missed
         rows = rng.permutation(ROWS)[: len(field)]
         b[k, rows], star[k, rows] = unit[field], field
         free = np.setdiff1d(np.arange(ROWS), rows)[:4]
@@ -41,18 +42,18 @@ def test_a_star_is_named_where_it_is_alone_and_nowhere_else(scene):
     q = jnp.asarray(prior.as_quat(scalar_first=True))
     got = np.asarray(track(INDEX, jnp.asarray(b), q, jnp.asarray(BORESIGHT), TOLERANCE))
     tree = KDTree(SKY.unit_i)
-    doubts = 0
+    doubts = np.zeros(2, int)
     for k in range(POINTINGS):
         seen = np.flatnonzero(~np.isnan(b[k, :, 0]))
         close = [set(x) for x in tree.query_ball_point(prior[k].apply(b[k, seen]), TOLERANCE)]
         wanted = np.full(ROWS, -1)
         for row, (i, mine) in zip(seen, enumerate(close), strict=True):
             others = set().union(*close[:i], *close[i + 1 :])
-            doubts += bool(mine) and (len(mine) > 1 or bool(mine & others))
+            doubts += np.array([len(mine) > 1 and not mine & others, bool(mine & others)])
             if len(mine) == 1 and not mine & others:
                 wanted[row] = mine.pop()
         np.testing.assert_array_equal(got[k], wanted)
-    assert doubts > 20  # such cases there were
+    assert min(doubts) > 3  # such cases there were
     named = got >= 0
     assert named.sum() > 0.9 * (star >= 0).sum()
     false = named & (star == -1)
