@@ -113,6 +113,14 @@ def test_least_gamma_of_a_plant_that_shows_the_error_is_zero():
     assert least_gamma(quaternion()) == pytest.approx(0.5, rel=1e-7)  # b: seen a step too late
 
 
+@pytest.mark.parametrize("columns", [0, 1])
+def test_a_plant_without_a_modelling_error_meets_any_gamma(columns):
+    given = two_states()._replace(Bn=np.zeros((2, columns)), Dn=np.zeros((1, columns)))
+    assert least_gamma(given) == 0.0
+    assert observer(given, 1e-3).hinf == 0.0
+    assert observer(given, 1e-3).h2 == pytest.approx(0.6571125579, rel=1e-8)
+
+
 def test_least_gamma_follows_the_units():
     given = two_states()
     small = given._replace(L=1e-5 * given.L, Bn=1e-3 * given.Bn)

@@ -76,6 +76,8 @@ def least_gain(plant: Plant, form: Form) -> float:
     Raises:
         NotCertified: the solver found none.
     """
+    if not plant.Bn.any() and not plant.Dn.any():
+        return 0.0
     scales = balanced(plant)
     unit = scales.hinf(1.0)
     least = np.inf
