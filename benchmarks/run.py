@@ -18,6 +18,8 @@ ORDER = [
     "transfer_alignment.py",
     "airship.py",
     "magnetic.py",
+    "spacecraft.py",
+    "satellite.py",
     "stars.py",
     "synthesis.py",
 ]
