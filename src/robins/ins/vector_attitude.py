@@ -109,7 +109,7 @@ def davenport(
 ) -> VectorAttitude:
     """Davenport's q-method: the eigenvector of K for its largest eigenvalue; arguments as `quest`.
 
-    The most robust of the ways and the dearest.
+    Nothing in it can be close to zero, at half a turn or anywhere.
     """
     seen = _seen(vectors_b, vectors_i, weight, least_separation_rad)
     s, S, z = _parts(seen.profile)
