@@ -165,7 +165,7 @@ def unloading():
     start = craft_state(CRAFT, reference.q_ib[0], reference.omega_b[0], 0.02)
 
     def momentum_b(k):
-        control = CONTROL._replace(desaturation_k=jnp.asarray(k))
+        control = CONTROL._replace(desaturation_k=jnp.asarray(k, float))
         states, _ = closed_loop(CRAFT, control, start, reference, orbit.r_i_m, field, 0.1)
         return np.asarray(states.wheel_h) @ AXES.T
 
