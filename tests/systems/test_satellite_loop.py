@@ -49,7 +49,7 @@ def test_a_run_over_its_measurements_gives_the_same_estimates():
 
 def test_momentum_is_conserved_without_environment():
     # no field, so no torque of the magnetorquers; no gravity: the orbit is far away
-    settings = (*SHORT, 'body.disturbance="0 N m"', 'orbit.altitude="1e9 km"')
+    settings = (*SHORT, 'craft.disturbance="0 N m"', 'orbit.altitude="1e9 km"')
     p = problem("s2", ("mekf",), settings)
     ((batch, _),) = worlds(p, 1)
     c, world = p.contenders["mekf"], _first(batch)
@@ -110,7 +110,7 @@ def test_parameters_that_cannot_be(settings, words):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (('body.moments=["1 kg m^2","1 kg m^2","3 kg m^2"]',), "none is greater than the sum"),
+        (('craft.moments=["1 kg m^2","1 kg m^2","3 kg m^2"]',), "none is greater than the sum"),
         (("wheels.lost=[0, 1]",), "2 independent axes, and three are needed"),
     ],
 )

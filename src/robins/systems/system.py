@@ -49,7 +49,7 @@ class Case(NamedTuple):
     In closed loop the loop gives all of this but the start.
     """
 
-    start: Belief
+    start: Belief  # or the state of a filter
     u: Any  # input of the motion, leading axis E epochs
     y: Mapping[str, Any]
     aux: Mapping[str, Any]

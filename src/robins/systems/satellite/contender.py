@@ -50,16 +50,16 @@ def believed_walk(given: AttitudeLoop, kind: Kind) -> float:
 
 
 @cache
-def _case(additive: bool, body: str):
+def _case(additive: bool, build: str):
     """The same function for the same choice, so that what was compiled serves again."""
     reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
 
     def case(n: Numbers, world: World) -> Case:
         given = Given(n.craft, n.control, n.pinv, n.step_s, n.quantum_rad, world.gyro_matrix)
         rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error)
-        start = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
-        if body.startswith("fixed"):
-            start = with_gains(make_filter(body).init(start, _DIMS), {STAR: n.gain})
+        start: Any = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
+        if build.startswith("fixed"):
+            start = with_gains(make_filter(build).init(start, _DIMS), {STAR: n.gain})
         loop = Loop(Partial(reacts, given), begin(given, world.craft), rows, {STAR: n.due})
         return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
 
@@ -81,7 +81,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     gain, facts = np.zeros((6, 3)), {}
     if kind.recipe is not None:
         facts = dict(design.facts(believed, kind.recipe))
-        if kind.body.startswith("fixed"):
+        if kind.build.startswith("fixed"):
             gain = design.gain(believed, kind.recipe)
         else:
             more = design.inflation(believed, kind.recipe) * math.sqrt(
@@ -100,10 +100,10 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
         bias_rad_s=jnp.asarray(given.believed.bias),
         gain=jnp.asarray(gain),
     )
-    additive = kind.body == "quaternion"
+    additive = kind.build == "quaternion"
     return Contender(
-        filter=make_filter(kind.body),
+        filter=make_filter(kind.build),
         model=model.model(noise, given.star.noise, additive),
-        case=Partial(_case(additive, kind.body), numbers),
+        case=Partial(_case(additive, kind.build), numbers),
         facts=facts,
     )

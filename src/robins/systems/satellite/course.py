@@ -13,7 +13,7 @@ from robins.sim.attitude_control import Controller, allocation_matrix, controlle
 from robins.sim.attitude_reference import Reference, inertial, nadir, slews
 from robins.sim.orbit import circular_orbit, field_along_orbit
 from robins.sim.spacecraft import Spacecraft, spacecraft
-from robins.systems.satellite.parameters import AttitudeLoop, Body, Star, Wheels
+from robins.systems.satellite.parameters import AttitudeLoop, Craft, Star, Wheels
 
 
 class StarSays(NamedTuple):
@@ -47,14 +47,14 @@ class Course(NamedTuple):
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame
     craft: Spacecraft
     control: Controller
-    pinv: np.ndarray  # (W, 3) from torques of the body to those of the wheels
+    pinv: np.ndarray  # (W, 3) from torques of the craft to those of the wheels
 
 
-def inertia(body: Body) -> np.ndarray:
+def inertia(craft: Craft) -> np.ndarray:
     """(3, 3) kg m^2."""
-    xy, xz, yz = body.products
+    xy, xz, yz = craft.products
     off = np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
-    return np.diag(body.moments) + off
+    return np.diag(craft.moments) + off
 
 
 def wheel_axes(wheels: Wheels) -> np.ndarray:
@@ -67,7 +67,7 @@ def lay_out(given: AttitudeLoop) -> Course:
     """Orbit, field and reference.
 
     Raises:
-        ValueError: a body that cannot be, wheels that do not turn it about three axes, or a date
+        ValueError: a craft that cannot be, wheels that do not turn it about three axes, or a date
             outside of the life of the magnetic model.
     """
     dt, o = given.step, given.orbit
@@ -83,11 +83,10 @@ def lay_out(given: AttitudeLoop) -> Course:
     frame = round(given.star.period / dt)
     due = np.arange(1, count + 1) % frame == 0
     time = edges[1:]
-    body, wheels, axes = inertia(given.body), given.wheels, wheel_axes(given.wheels)
+    moments, wheels, axes = inertia(given.craft), given.wheels, wheel_axes(given.wheels)
     works = np.ones((count, len(wheels.axes)))
-    works[np.ix_(edges[:-1] > wheels.lost_at - 1e-9, list(wheels.lost))] = 0.0
-    left = np.ones(len(wheels.axes))
-    left[list(wheels.lost)] = 0.0
+    left = np.array([float(i not in wheels.lost) for i in range(len(wheels.axes))])
+    works[edges[:-1] > wheels.lost_at - 1e-9] = left
     return Course(
         time_s=time,
         steps=Step(
@@ -103,15 +102,15 @@ def lay_out(given: AttitudeLoop) -> Course:
         ),
         due=due,
         craft=spacecraft(
-            body,
+            moments,
             axes,
             wheels.torque,
             wheels.momentum,
             given.control.dipole,
-            given.body.dipole,
+            given.craft.dipole,
         ),
         control=controller(
-            body, given.control.frequency, given.control.damping, given.control.unloading
+            moments, given.control.frequency, given.control.damping, given.control.unloading
         ),
         pinv=allocation_matrix(axes, left if wheels.loss_known else 1.0),
     )
@@ -146,4 +145,4 @@ def _disturbance(given: AttitudeLoop, time_s: np.ndarray) -> np.ndarray:
     turn = circular_orbit(given.orbit.altitude, 0.0, 0.0, 0.0, np.zeros(1))
     rate = np.linalg.norm(turn.v_i_m_s[0]) / np.linalg.norm(turn.r_i_m[0])
     phase = 2.0 * np.pi / 3.0 * np.arange(3.0)
-    return given.body.disturbance * np.sin(rate * time_s[:, None] + phase)
+    return given.craft.disturbance * np.sin(rate * time_s[:, None] + phase)

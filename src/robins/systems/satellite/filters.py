@@ -15,13 +15,13 @@ from robins.systems.satellite.nodes import STAR
 
 GATE = 0.9999962  # chi-square of 3 at 27.9
 PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
-Body = Literal["mekf", "quaternion", "gated", "fixed", "fixed-gated"]
+Build = Literal["mekf", "quaternion", "gated", "fixed", "fixed-gated"]
 
 
 class Kind(NamedTuple):
     """A filter of the study."""
 
-    body: Body
+    build: Build
     recipe: Recipe | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
     drift: float | None = None  # variance of the bias' walk over the believed; None: told the truth
     text: str = ""
@@ -54,9 +54,9 @@ FILTERS = tuple(KINDS)
 
 
 @cache
-def make_filter(body: Body) -> Filter:
+def make_filter(build: Build) -> Filter:
     """The same object each time, so that filters that differ in numbers compile once."""
     reopened = gate(GATE, PATIENCE, "reinitialise")
     held = constant_gain({STAR: np.zeros((6, 3))})
     rules = {"gated": [reopened], "fixed": [held], "fixed-gated": [reopened, held]}
-    return kalman(taylor(), rules.get(body, []))
+    return kalman(taylor(), rules.get(build, []))

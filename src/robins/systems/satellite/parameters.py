@@ -26,7 +26,7 @@ class Orbit(Parameters):
     year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2025.0
 
 
-class Body(Parameters):
+class Craft(Parameters):
     """Inertia and what disturbs it; products are the elements xy, xz, yz of the matrix."""
 
     moments: Annotated[Three, Quantity("moment of inertia", above="0 kg m^2")] = default(
@@ -154,7 +154,7 @@ class AttitudeLoop(Scenario, Parameters):
     points: Literal["nadir", "inertial"] = "nadir"
     slew: Slew | None = None
     orbit: Orbit = pydantic.Field(default_factory=Orbit)
-    body: Body = pydantic.Field(default_factory=Body)
+    craft: Craft = pydantic.Field(default_factory=Craft)
     wheels: Wheels = pydantic.Field(default_factory=Wheels)
     control: Control = pydantic.Field(default_factory=Control)
     gyro: Gyro = pydantic.Field(default_factory=Gyro)

@@ -28,7 +28,7 @@ def attitude_problem(given: AttitudeLoop, filters: tuple[str, ...], seed: int) -
     """The closed loop with each of the filters.
 
     Raises:
-        ValueError: a body that cannot be, too few wheels, a filter that is unknown, or a design
+        ValueError: a craft that cannot be, too few wheels, a filter that is unknown, or a design
             that does not exist.
         ImportError: a design by LMI without the extra "lmi".
     """
