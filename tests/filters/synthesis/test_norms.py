@@ -77,6 +77,30 @@ def test_hinf_is_the_top_of_a_dense_grid():
         assert peak_gain(A, B, C, D) == pytest.approx(found, rel=1e-9)
 
 
+def test_responses_that_are_nearly_flat():
+    # A level may then lie below the response at every frequency, or be hardly above that at one.
+    rng = np.random.default_rng(8)
+    angle = np.linspace(0.0, np.pi, 2001)
+    for k in range(40):
+        radius = (0.01, 0.1, 0.4)[k % 3]
+        A, B, C = stable_system(rng, *(rng.integers(1, 4, size=3)), radius)
+        found, none = hinf_norm(A, B, C), np.zeros((len(C), B.shape[1]))
+        top = np.max(np.linalg.norm(on_circle(A, B, C, none, angle), 2, axis=(1, 2)))
+        assert top * (1.0 - 1e-10) <= found <= top * (1.0 + 1e-6)
+        assert peak_gain(A, B, C) == pytest.approx(found, rel=1e-9)
+
+
+def test_a_plant_whose_whole_response_lies_above_the_hankel_bound():
+    A = np.array([[-0.35371781, -0.41815606], [-0.08547516, 0.05408667]])
+    B = np.array([[-0.51823667, -1.60684668, -0.50546894], [-0.94631628, 0.62882333, -1.75424311]])
+    C = np.array([[0.89488548, -0.34386331], [-1.15209894, 1.23556843], [-0.72794022, -1.12009219]])
+    response = on_circle(A, B, C, np.zeros((3, 3)), np.linspace(0.0, np.pi, 4001))
+    gain = np.linalg.norm(response, 2, axis=(1, 2))
+    hankel = np.linalg.eigvals(gramian(A, B) @ gramian(A.T, C.T)).real
+    assert np.sqrt(hankel.max()) < gain.min()
+    assert hinf_norm(A, B, C) == pytest.approx(gain.max(), rel=1e-9)
+
+
 def test_hinf_is_the_gain_of_long_signals():
     # Over N steps the gain is less than the norm by something that falls as 1 / N^2.
     rng = np.random.default_rng(3)

@@ -11,10 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 Number = float | int  # where types are checked an int is no float
 
-_AXIS = 1e-6  # of the size of the Hamiltonian: eigenvalues as near to the axis are looked at
+_CIRCLE = 1e-6  # eigenvalues as near to the unit circle are looked at
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
@@ -58,11 +59,11 @@ def hinf_norm(
 ) -> float:
     """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by level tests.
 
-    The circle is mapped to the imaginary axis; a level is reached where the Hamiltonian matrix of
-    the level has an eigenvalue on that axis (Boyd, Balakrishnan & Kabamba 1989). A level that is
-    reached is raised to the highest response between such eigenvalues (Bruinsma & Steinbuch 1990),
-    which is a bisection that halves the error quadratically; the one that is not reached is the
-    answer. The Hankel singular values s bound the norm, max(s_1, |D|) <= norm <= |D| + 2 sum(s).
+    A level is reached where the symplectic pencil of the level has an eigenvalue on the circle
+    (Boyd, Balakrishnan & Kabamba 1989, in discrete time). One that is reached is raised to the
+    highest response between such eigenvalues (Bruinsma & Steinbuch 1990), which converges
+    quadratically where bisection halves; the one that is not reached is the answer. The search is
+    started by the Hankel singular values s: max(s_1, |D|) <= norm <= |D| + 2 sum(s).
 
     Args:
         A: (n, n).
@@ -88,72 +89,69 @@ def hinf_norm(
 
 
 class Levels(NamedTuple):
-    """A stable system mapped to continuous time, to be asked which gains it reaches."""
+    """A stable system, scaled, to be asked which gains its frequency response reaches."""
 
-    A: np.ndarray  # (n, n) complex
+    A: np.ndarray  # (n, n)
     B: np.ndarray  # (n, q)
     C: np.ndarray  # (r, n)
-    D: np.ndarray  # (r, q) response at the point of the circle that is mapped to infinity
+    D: np.ndarray  # (r, q)
     lower: float  # gain that is reached
     upper: float  # gain that is not exceeded
 
     @classmethod
     def of(cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Levels:
-        """Scale the states so that both Gramians agree on the diagonal, and map.
-
-        z = -t (s + 1) / (s - 1) with t on the circle, far from all eigenvalues, keeps all singular
-        values; s = j inf is z = -t.
-        """
-        n = len(A)
+        """Scale the states so that both Gramians agree on the diagonal, and bound the norm."""
         Wc, Wo = gramian(A, B), gramian(A.T, C.T)
         control, observe = np.diagonal(Wc), np.diagonal(Wo)
         both = (control > 0.0) & (observe > 0.0)
-        scale = np.ones(n)
+        scale = np.ones(len(A))
         scale[both] = (control[both] / observe[both]) ** 0.25
-        A, B, C = A * scale / scale[:, None], B / scale[:, None], C * scale
         product = (Wc / np.outer(scale, scale)) @ (Wo * np.outer(scale, scale))
         hankel = np.sqrt(np.maximum(np.linalg.eigvals(product).real, 0.0))
-        direct = _largest(D)
-
-        turns = np.exp(1j * np.pi * np.arange(8) / 4.0)
-        distance = np.linalg.svd(A + turns[:, None, None] * np.eye(n), compute_uv=False)[:, -1]
-        turn = turns[np.argmax(distance)]
-        inverse = np.linalg.inv(A / turn + np.eye(n))
-        B = B / turn
+        direct = float(np.linalg.norm(D, ord=2)) if D.size else 0.0
         return cls(
-            inverse @ (A / turn - np.eye(n)),
-            np.sqrt(2.0) * inverse @ B,
-            np.sqrt(2.0) * C @ inverse,
-            D - C @ inverse @ B,
+            A * scale / scale[:, None],
+            B / scale[:, None],
+            C * scale,
+            D,
             max(direct, float(np.max(hankel, initial=0.0))) * (1.0 - 1e-9),
             (direct + 2.0 * float(np.sum(hankel))) * (1.0 + 1e-9),
         )
 
     def reached(self, gain: Number) -> bool:
         """Whether some singular value of the frequency response is as large as this."""
-        return self.highest(gain) >= gain
+        return gain <= self.lower or (gain <= self.upper and self.highest(gain) >= gain)
 
     def highest(self, gain: Number) -> float:
-        """Highest response found where a singular value crosses this level and between; else 0.
+        """Highest response at z = 1, -1, where singular values cross this level, and between.
 
-        Below the level if it is not reached anywhere: eigenvalues near the axis are only believed
-        for what the response is there.
+        Below the level if and only if it is nowhere reached: eigenvalues near the circle are only
+        believed for what the response is there, and one that is above the level everywhere is so at
+        1. With z x = A x + B u, g v = C x + D u, and their adjoints l = z (A' l + C' v),
+        g u = B' l + D' v, nothing is inverted.
         """
-        A, B, C, D = self.A, self.B, self.C, self.D
-        if gain <= (far := _largest(D)):
-            return far
-        R = gain**2 * np.eye(B.shape[1]) - D.conj().T @ D
-        shift = np.linalg.solve(R, D.conj().T @ C)
-        corner = A + B @ shift
-        top = np.hstack([corner, gain * B @ np.linalg.solve(R, B.conj().T)])
-        below = -(C.conj().T @ C + C.conj().T @ D @ shift) / gain
-        found = np.linalg.eigvals(np.vstack([top, np.hstack([below, -corner.conj().T])]))
-        near = found[np.abs(found.real) <= _AXIS * max(1.0, np.max(np.abs(found)))]
-        if near.size == 0:
-            return 0.0
-        w = np.sort(near.imag)
-        w = np.concatenate([w, 0.5 * (w[1:] + w[:-1])])
-        return float(np.max(_gains(A, B, C, D, 1j * w)))
+        n, (r, q) = len(self.A), self.D.shape
+        root = np.sqrt(gain)  # input and output in units in which the level is one
+        B, C, D = self.B / root, self.C / root, self.D / gain
+        M = np.block(
+            [
+                [self.A, np.zeros((n, n)), B, np.zeros((n, r))],
+                [np.zeros((n, n)), np.eye(n), np.zeros((n, q)), np.zeros((n, r))],
+                [C, np.zeros((r, n)), D, -np.eye(r)],
+                [np.zeros((q, n)), B.T, -np.eye(q), D.T],
+            ]
+        )
+        N = np.zeros_like(M)
+        N[:n, :n] = np.eye(n)
+        N[n : 2 * n, n : 2 * n] = self.A.T
+        N[n : 2 * n, 2 * n + q :] = C.T
+        above, below = np.asarray(scipy.linalg.eigvals(M, N, homogeneous_eigvals=True))
+        size = np.maximum(np.abs(above), np.abs(below))
+        near = (np.abs(np.abs(above) - np.abs(below)) <= _CIRCLE * size) & (size > 0.0)
+        crossings = np.sort(np.abs(np.angle(above[near] * below[near].conj())))
+        angle = np.concatenate([[0.0], crossings, [np.pi]])
+        angle = np.concatenate([angle, 0.5 * (angle[1:] + angle[:-1])])
+        return float(np.max(_gains(self.A, self.B, self.C, self.D, np.exp(1j * angle))))
 
 
 def peak_gain(
@@ -215,7 +213,3 @@ def _gains(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, z: np.nda
         z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B, (len(z), *B.shape))
     )
     return np.linalg.norm(C @ inner + D, ord=2, axis=(1, 2))
-
-
-def _largest(D: np.ndarray) -> float:
-    return float(np.linalg.norm(D, ord=2)) if D.size else 0.0
