@@ -49,7 +49,7 @@ class Design(NamedTuple):
     filter: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # (Ah, Bh, Gh) where order is "full"
     bound: float  # what the solver promised for the H2 norm; nan where it promised nothing
     h2: float  # true, by the Gramian
-    hinf: float  # true, by bisection
+    hinf: float  # true, by tests of levels (`hinf_norm`)
     hinf_sweep: float  # the same, by a sweep of the frequency
     radius: float  # spectral radius of the error, or of plant and full-order filter together
     lambda_: float  # by how much n was made noise; nan where no Riccati equation was solved
@@ -154,7 +154,7 @@ def _checked(design: Design) -> Design:
         )
     if abs(design.hinf - design.hinf_sweep) > _AGREE * design.hinf:
         raise NotCertified(
-            f"{told}: H-infinity norm {design.hinf:.9g} by bisection but {design.hinf_sweep:.9g} "
+            f"{told}: H-infinity norm {design.hinf:.9g} by levels but {design.hinf_sweep:.9g} "
             f"by a sweep of the frequency{said}"
         )
     return design
