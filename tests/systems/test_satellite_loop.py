@@ -68,6 +68,17 @@ def _arrays(tree):
     return [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
 
 
+def test_stars_are_tracked_and_say_how_sure_they_are():
+    """A camera with false stars and missed ones; the covariance of each frame is the filter's R."""
+    stars = flown("stars", ("mekf",), 4, SHORT)["mekf"]
+    assert np.all(stars.used[:, 4::5])
+    at = slice(700, None)
+    assert abs(np.mean(stars.nees[:, at]) - 1.0) < 0.35
+    assert np.sqrt(np.mean(stars.error[:, at, :2] ** 2)) < 4.0  # a star is off by 20
+    # fewer stars, another sigma: what is stated is not the same from frame to frame
+    assert np.ptp(stars.sigma[:, at, 2]) > 0.5
+
+
 # ------------------------------------------------------------------------------------- what fails
 
 

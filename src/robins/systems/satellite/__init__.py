@@ -14,7 +14,7 @@ from robins.systems.system import Study, System
 
 _HERE = Path(__file__).parent / "scenarios"
 _SCENARIOS = (
-    *("s1", "s2", "s3", "s4"),
+    *("s1", "s2", "s3", "s4", "stars"),
     *("star-stuck", "star-wrong", "star-lost", "star-sign", "wheel-lost"),
 )
 

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.systems.satellite import design, model
-from robins.systems.satellite.course import Course
+from robins.systems.satellite.course import Course, Lens
 from robins.systems.satellite.filters import KINDS, Kind, make_filter
 from robins.systems.satellite.nodes import STAR, Given, Row, begin, react
 from robins.systems.satellite.parameters import AttitudeLoop
@@ -37,6 +37,7 @@ class Numbers(NamedTuple):
     attitude_rad: Array  # believed at the start
     bias_rad_s: Array
     gain: Array  # (6, 3); zeros where there is none
+    lens: Lens | None
 
 
 def believed_walk(given: AttitudeLoop, kind: Kind) -> float:
@@ -55,7 +56,16 @@ def _case(additive: bool, build: str):
     reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
 
     def case(n: Numbers, world: World) -> Case:
-        given = Given(n.craft, n.control, n.pinv, n.step_s, n.quantum_rad, world.gyro_matrix)
+        given = Given(
+            n.craft,
+            n.control,
+            n.pinv,
+            n.step_s,
+            n.quantum_rad,
+            world.gyro_matrix,
+            world.star_key,
+            n.lens,
+        )
         rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error)
         start: Any = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
         if build.startswith("fixed"):
@@ -99,11 +109,12 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
         attitude_rad=jnp.asarray(given.believed.attitude),
         bias_rad_s=jnp.asarray(given.believed.bias),
         gain=jnp.asarray(gain),
+        lens=course.lens,
     )
     additive = kind.build == "quaternion"
     return Contender(
         filter=make_filter(kind.build),
-        model=model.model(noise, given.star.noise, additive),
+        model=model.model(noise, given.star.noise, additive, given.star.camera is not None),
         case=Partial(_case(additive, kind.build), numbers),
         facts=facts,
     )

@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from robins.earth.star_catalogue import hipparcos, synthetic
+from robins.earth.star_index import StarIndex
 from robins.sim.attitude_control import Controller, allocation_matrix, controller
 from robins.sim.attitude_reference import Reference, inertial, nadir, slews
 from robins.sim.orbit import circular_orbit, field_along_orbit
 from robins.sim.spacecraft import Spacecraft, spacecraft
+from robins.sim.star_sensor import StarCamera, index_for
 from robins.systems.satellite.parameters import AttitudeLoop, Craft, Star, Wheels
 
 
@@ -37,6 +40,15 @@ class Step(NamedTuple):
     disturbance_b: Array  # (3,) N m
     wheel_works: Array  # (W,) 1, or 0 for a wheel that gives no torque
     star: StarSays
+    number: Array  # () of the step, from 0
+
+
+class Lens(NamedTuple):
+    """The camera of a star sensor, and how it knows its stars."""
+
+    camera: StarCamera
+    sky: StarIndex
+    match_rad: Array  # () how near a star must be to where it is expected
 
 
 class Course(NamedTuple):
@@ -47,6 +59,7 @@ class Course(NamedTuple):
     due: np.ndarray  # (E,) bool, whether a step ends with a star frame
     craft: Spacecraft
     control: Controller
+    lens: Lens | None
     pinv: np.ndarray  # (W, 3) from torques of the craft to those of the wheels
 
 
@@ -67,6 +80,7 @@ def lay_out(given: AttitudeLoop) -> Course:
     """Orbit, field and reference.
 
     Raises:
+        ImportError: the Hipparcos catalogue without the extra "stars".
         ValueError: a craft that cannot be, wheels that do not turn it about three axes, or a date
             outside of the life of the magnetic model.
     """
@@ -99,8 +113,10 @@ def lay_out(given: AttitudeLoop) -> Course:
             jnp.asarray(_disturbance(given, np.asarray(middle.time_s))),
             jnp.asarray(works),
             _star_says(given.star, due, time),
+            jnp.arange(count),
         ),
         due=due,
+        lens=_lens(given.star),
         craft=spacecraft(
             moments,
             axes,
@@ -120,6 +136,21 @@ def _turned(given: AttitudeLoop, base: Reference, time_s: np.ndarray) -> Referen
     if (slew := given.slew) is None:
         return base
     return slews(base, slew.angle, slew.period, time_s, fade_in_s=slew.grows)
+
+
+def _lens(star: Star) -> Lens | None:
+    """The camera of a star sensor that has one, and the stars it may see."""
+    if (given := star.camera) is None:
+        return None
+    camera = StarCamera(
+        field_rad=given.field,
+        magnitude_limit=given.magnitude,
+        sigma_rad=given.noise,
+        missed=given.missed,
+        false_stars=given.false_stars,
+    )
+    stars = {"synthetic": synthetic, "hipparcos": hipparcos}[given.catalogue](given.magnitude)
+    return Lens(camera, index_for(camera, stars), jnp.asarray(given.tolerance))
 
 
 def _star_says(star: Star, due: np.ndarray, time_s: np.ndarray) -> StarSays:

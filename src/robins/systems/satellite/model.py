@@ -154,9 +154,13 @@ ADDITIVE = Kind(
 )
 
 
-def model(noise: Noise, star_rad: Any, additive: bool = False) -> Model:
-    """Motion and star sensor."""
-    sigma = jnp.asarray(star_rad, float)
+def _noise_of_frame(x: Any, factor: Array) -> Array:
+    return factor
+
+
+def model(noise: Noise, star_rad: Any, additive: bool = False, of_frame: bool = False) -> Model:
+    """Motion and star sensor, whose noise each frame may bring with it."""
+    sigma = _noise_of_frame if of_frame else jnp.asarray(star_rad, float)
     if additive:
         moves = Motion(Partial(_move_additive, noise), Partial(_noise_additive, noise))
         return Model(moves, (Sensor(_read_additive, sigma, 3, STAR),))

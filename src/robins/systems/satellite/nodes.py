@@ -9,18 +9,21 @@ one program.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from robins import linalg
 from robins.filters import Belief, Reading
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.sim.attitude_control import Controller, allocate, desaturation_dipole, torque
 from robins.sim.gyro import read_gyro
 from robins.sim.spacecraft import CraftState, Spacecraft, advance, rate_b, wheel_momentum_b
-from robins.sim.star_sensor import read_star
-from robins.systems.satellite.course import Step
+from robins.sim.star_sensor import measure_attitude, read_star
+from robins.systems.satellite.course import Lens, Step
 
 STAR = "star"
 UNIT = 1e-3  # that the length of a quaternion may be off by
@@ -42,6 +45,8 @@ class Given(NamedTuple):
     step_s: Array  # ()
     quantum_rad: Array  # () of the gyro
     gyro_matrix: Array  # (3, 3)
+    star_key: Array
+    lens: Lens | None = None  # where the star sensor is a camera
 
 
 class Row(NamedTuple):
@@ -51,6 +56,14 @@ class Row(NamedTuple):
     gyro_angle: Array  # (3,) rad
     gyro_bias: Array  # (3,) rad/s
     star_error: Array  # (3,) rad
+
+
+class Frame(NamedTuple):
+    """What the star sensor reports."""
+
+    q_ib: Array  # (4,); NaN without a frame
+    factor: Array | None  # (3, 3) of its covariance [rad], body axes, where it says one
+    seen_q_ib: Array  # (4,) for the next time
 
 
 class Vehicle(NamedTuple):
@@ -99,12 +112,33 @@ def gyro(given: Given, before: Array, after: Array, residue: Array, row: Row):
     return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
 
 
-def star(q_ib: Array, before: Array, row: Row) -> tuple[Array, Array]:
-    """What the star sensor reports, NaN without a frame, and what it has seen for the next time."""
+def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Row) -> Frame:
+    """What the star sensor reports at the end of a step."""
     says = row.course.star
-    now = multiply(read_star(q_ib, row.star_error), from_rotvec(says.turn))
+    if given.lens is None:
+        now, factor = read_star(q_ib, row.star_error), None
+    else:
+        looks = partial(_looks, given.lens, given.star_key)
+        now, factor = jax.lax.cond(
+            says.seen, looks, _shut, q_ib, expected_q_ib, row.star_error, row.course.number
+        )
+    now = multiply(now, from_rotvec(says.turn))
     now = jnp.where(says.seen & ~says.stuck, now, before)
-    return jnp.where(says.seen, says.factor * now, jnp.nan), now
+    return Frame(jnp.where(says.seen, says.factor * now, jnp.nan), factor, now)
+
+
+def _looks(lens: Lens, star_key: Array, q_ib: Array, expected_q_ib: Array, error: Array, number):
+    """Attitude from an image, and the factor of its covariance; NaN where too few stars are."""
+    key = jax.random.fold_in(star_key, number)
+    q, P, _ = measure_attitude(
+        key, lens.sky, q_ib, lens.camera, error, expected_q_ib, lens.match_rad
+    )
+    solved = jnp.all(jnp.isfinite(P))
+    return q, linalg.cholesky(jnp.where(solved, P, jnp.eye(3)))
+
+
+def _shut(q_ib: Array, expected_q_ib: Array, error: Array, number: Array):
+    return jnp.full(4, jnp.nan), jnp.eye(3)
 
 
 def believable(q_ib: Array) -> BodyRotation:
@@ -139,16 +173,18 @@ def react(kind: Kind, given: Given, v: Vehicle, belief: Belief, row: Row):
     command = acm(given, q, bias, v.theta, v.craft.wheel_h, row.course)
     craft = plant(given, v.craft, command, row.course)
     theta, residue = gyro(given, v.craft.q_ib, craft.q_ib, v.residue, row)
-    frame, seen = star(craft.q_ib, v.star_q_ib, row)
+    expected = multiply(q, from_rotvec(theta - given.step_s * bias))
+    frame = star(given, craft.q_ib, expected, v.star_q_ib, row)
     outputs = {
         "pointing": pointing_error(row.course.ref_end_q_ib, craft.q_ib),
         "wheel_momentum": craft.wheel_h,
     }
     reading = Reading(
         u=theta,
-        y={STAR: believable(frame)},
+        y={STAR: believable(frame.q_ib)},
+        aux={} if frame.factor is None else {STAR: frame.factor},
         truth=kind.state(craft.q_ib, row.gyro_bias),
         rows=kind.rows(craft.q_ib),
         outputs=outputs,
     )
-    return Vehicle(craft, residue, theta, seen), reading
+    return Vehicle(craft, residue, theta, frame.seen_q_ib), reading

@@ -117,6 +117,22 @@ class StarFault(Span):
     angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("10 deg")
 
 
+class Camera(Parameters):
+    """The star sensor as a camera: stars, which it tracks about where the filter believes to look.
+
+    Its attitude comes from their directions by QUEST, with a covariance of each frame; the noise of
+    the star sensor is then what gains are designed for.
+    """
+
+    catalogue: Literal["synthetic", "hipparcos"] = "synthetic"
+    field: Annotated[float, Quantity("angle", above="1 deg", most="60 deg")] = default("20 deg")
+    magnitude: Annotated[float, pydantic.Field(ge=3.0, le=6.5)] = 5.5
+    noise: Annotated[float, Quantity("angle", above="0 arcsec")] = default("20 arcsec")  # of a star
+    missed: Annotated[float, Quantity("ratio", least="0", below="1")] = default("0 %")
+    false_stars: Annotated[int, pydantic.Field(ge=0, le=20)] = 0
+    tolerance: Annotated[float, Quantity("angle", above="0 deg")] = default("0.1 deg")  # of a match
+
+
 class Star(Parameters):
     """A star sensor, its boresight z; the low-frequency error is a sine of drawn phase."""
 
@@ -128,6 +144,7 @@ class Star(Parameters):
     low_frequency_period: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
     lost: tuple[Span, ...] = ()
     faults: tuple[StarFault, ...] = ()
+    camera: Camera | None = None
 
 
 class Believed(Parameters):

@@ -21,6 +21,7 @@ from robins.systems.satellite.parameters import AttitudeLoop, Gyro
 
 # Folded into the key of the gyro beside the streams of `robins.sim.gyro`.
 _BIAS, _RAMP = 16, 17
+_CAMERA = 16  # into that of the star sensor, beside the streams of `robins.sim.star_sensor`
 
 
 class World(NamedTuple):
@@ -30,6 +31,7 @@ class World(NamedTuple):
     gyro_bias: Array  # (E, 3) its slow part, as a rate [rad/s]
     gyro_matrix: Array  # (3, 3) scale factor errors and misalignments
     star_error: Array  # (E, 3) error of the star sensor at the end of each step [rad]
+    star_key: Array  # of what a camera sees
     craft: CraftState  # at the beginning
     start_q_ib: Array  # (4,) attitude that filters begin with
 
@@ -62,9 +64,10 @@ def simulate(given: AttitudeLoop, course: Course, seed: int, index: Array) -> Wo
     count = len(course.time_s)
     gyro = gyro_errors(unit, drawn, count, given.step)
     s, frames = given.star, np.flatnonzero(course.due)
+    eye = key(Component.STAR_SENSOR)
     errors = star_errors(
-        key(Component.STAR_SENSOR),
-        s.noise,
+        eye,
+        s.noise if s.camera is None else 0.0,
         s.period,
         len(frames),
         s.low_frequency,
@@ -78,6 +81,7 @@ def simulate(given: AttitudeLoop, course: Course, seed: int, index: Array) -> Wo
         gyro_bias=gyro.bias,
         gyro_matrix=gyro.matrix,
         star_error=jnp.zeros((count, 3)).at[frames].set(errors),
+        star_key=jax.random.fold_in(eye, _CAMERA),
         craft=craft_state(course.craft, q0, first.ref_omega_b[0], given.wheels.start),
         start_q_ib=multiply(q0, from_rotvec(off)),
     )
