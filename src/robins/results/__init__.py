@@ -78,9 +78,9 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``allan_fit_SENSOR``                    the same; the fitted model
 ``allan_slope_SENSOR``                  (process, tau, axis_SENSOR) its parts, by name
 ``trade_off_h2, trade_off_hinf``        (design, gamma) true norms of designs, NaN where there is
-                                        none; the second with the attributes ``least``, ``least_of``:
-                                        the least norm, and of what designs; also ``kalman_h2`` and
-                                        ``kalman_hinf``
+                                        none; the second with the attributes ``least``, the least
+                                        norm, and ``least_of``, of what designs; also ``kalman_h2``
+                                        and ``kalman_hinf``
 ======================================= =========================================================
 
 BLOCK is a part of the state (``attitude``, ``velocity``, ``position``, ``gyro_bias``, ...). The
