@@ -1,5 +1,7 @@
 """The satellite in closed loop: what it does, also when something fails, and what it refuses."""
 
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from robins.campaign import worlds
 from robins.campaign.bound import bound
 from robins.filters import run, run_closed
 from robins.scenario import ScenarioError
+from robins.systems.satellite.design import axis_design
 
 SHORT = ('duration="120 s"', 'counted_from="60 s"')
 
@@ -133,6 +136,13 @@ def test_craft_that_cannot_be(settings, words):
 def test_unknown_filter():
     with pytest.raises(ValueError, match="no filter 'ekf' in this study; it has raw, mekf,"):
         problem("s1", ("ekf",))
+
+
+def test_a_design_without_its_solver(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    axis_design.cache_clear()
+    with pytest.raises(ValueError, match=r"'mixed-lmi': .* pip install 'robins\[lmi\]'.*--filters"):
+        problem("s1", ("mixed-lmi",), SHORT)
 
 
 def test_the_covariance_bound_of_the_loop():

@@ -1,8 +1,9 @@
 """Offline design of filters with constant gains, for noise and for the worst case at once.
 
 A plant has two inputs: white noise w and a modelling error n. A design minimises the H2 norm from w
-to the error of the estimate while the H-infinity norm from n to it stays below gamma. NumPy only;
-every answer carries its true norms.
+to the error of the estimate while the H-infinity norm from n to it stays below gamma. NumPy only,
+but for the designs by LMI, which ask for their solver when called; every answer carries its true
+norms.
 """
 
 from robins.filters.synthesis.closed_form import Isotropic, closed_form, isotropic
@@ -13,6 +14,9 @@ from robins.filters.synthesis.design import (
     certify,
     certify_full,
 )
+from robins.filters.synthesis.every_step import EveryStep, FrozenTimeWarning
+from robins.filters.synthesis.full_order import full
+from robins.filters.synthesis.lmi import observer
 from robins.filters.synthesis.norms import h2_norm, hinf_norm, peak_gain, spectral_radius
 from robins.filters.synthesis.plant import (
     ErrorSystem,
@@ -29,12 +33,15 @@ from robins.filters.synthesis.riccati import (
     least_riccati_gamma,
     riccati,
 )
+from robins.filters.synthesis.search import least_gamma, retuned
 from robins.filters.synthesis.trade_off import METHODS, Outcome, TradeOff, trade_off
 
 __all__ = [
     "METHODS",
     "Design",
     "ErrorSystem",
+    "EveryStep",
+    "FrozenTimeWarning",
     "Isotropic",
     "MissingExtra",
     "NotCertified",
@@ -47,15 +54,19 @@ __all__ = [
     "closed_form",
     "current_form",
     "error_system",
+    "full",
     "h2_norm",
     "hinf_norm",
     "inflated_gain",
     "isotropic",
     "kalman_design",
     "kalman_gain",
+    "least_gamma",
     "least_riccati_gamma",
+    "observer",
     "peak_gain",
     "plant",
+    "retuned",
     "riccati",
     "spectral_radius",
     "trade_off",

@@ -22,7 +22,7 @@ from robins.filters.synthesis.plant import Plant
 Form = Literal["common", "slack", "full"]
 
 # Where gamma is tight, R and with it the full-order problem are nearly singular; refining each
-# linear solve further than is usual gains a digit there and costs nothing elsewhere.
+# linear solve further than is usual gains a digit there and costs a tenth more elsewhere.
 _CLARABEL = {"iterative_refinement_max_iter": 30, "iterative_refinement_stop_ratio": 2.0}
 _LOCK = Lock()  # a program's parameters belong to one solve at a time
 

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from robins.filters import Loop
 from robins.filters.rules import with_gains
+from robins.filters.synthesis import MissingExtra
 from robins.systems.satellite import design, model
 from robins.systems.satellite.course import Course, Lens
 from robins.systems.satellite.filters import KINDS, Kind, make_filter
@@ -80,7 +81,8 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     """A filter with its model and its data.
 
     Raises:
-        ValueError: there is no filter of this name.
+        ValueError: there is no filter of this name, or its design needs a package that is not
+            there.
     """
     if name not in KINDS:
         raise ValueError(f"no filter '{name}' in this study; it has {', '.join(KINDS)}")
@@ -90,7 +92,10 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     believed = design.believed(given, walk)
     gain, facts = np.zeros((6, 3)), {}
     if kind.recipe is not None:
-        facts = dict(design.facts(believed, kind.recipe))
+        try:
+            facts = dict(design.facts(believed, kind.recipe))
+        except MissingExtra as error:
+            raise ValueError(f"filter '{name}': {error}; or choose others by --filters") from error
         if kind.build.startswith("fixed"):
             gain = design.gain(believed, kind.recipe)
         else:

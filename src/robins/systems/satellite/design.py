@@ -18,8 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robins.filters.synthesis import Design, Plant, current_form
-from robins.filters.synthesis.riccati import kalman_design, riccati
+from robins.filters.synthesis import Design, Plant, current_form, kalman_design, observer, riccati
 from robins.systems.satellite.model import walk_covariance
 from robins.systems.satellite.parameters import AttitudeLoop
 
@@ -75,8 +74,6 @@ def axis_design(b: Believed, star_rad: float, recipe: Recipe) -> Design:
     gamma = recipe.share * best.hinf
     if recipe.way == "riccati":
         return riccati(plant, gamma)
-    from robins.filters.synthesis.lmi import observer
-
     return observer(plant, gamma, "common")
 
 

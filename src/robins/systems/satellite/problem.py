@@ -28,9 +28,9 @@ def attitude_problem(given: AttitudeLoop, filters: tuple[str, ...], seed: int) -
     """The closed loop with each of the filters.
 
     Raises:
-        ValueError: a craft that cannot be, too few wheels, a filter that is unknown, or a design
-            that does not exist.
-        ImportError: a design by LMI without the extra "lmi".
+        ValueError: a craft that cannot be, too few wheels, a filter that is unknown, a design that
+            does not exist, or one by LMI without the extra "lmi".
+        ImportError: the Hipparcos catalogue without the extra "stars".
     """
     course = lay_out(given)
     counted = int(np.searchsorted(course.time_s, given.counted_from + 1e-9))
