@@ -11,6 +11,7 @@ from robins.earth.wgs84 import GM
 from robins.rotation import conjugate, from_rotvec, multiply, rotate
 from robins.sim.attitude_control import (
     allocate,
+    allocate_within,
     allocation_matrix,
     controller,
     desaturation_dipole,
@@ -118,6 +119,27 @@ def test_wheels_that_work_share_the_torque_least_in_norm(lost):
         idle = np.array([S, S, S, -1.0])  # torques that are felt by no axis
         np.testing.assert_allclose(AXES @ idle, 0.0, atol=1e-16)
         assert abs(given @ idle) < 1e-18
+
+
+def test_a_full_wheel_leaves_the_torque_to_the_others():
+    s = 3**-0.5
+    axes = np.array([[1.0, 0.0, 0.0, s], [0.0, 1.0, 0.0, s], [0.0, 0.0, 1.0, s]])
+    pinv, limit = jnp.asarray(allocation_matrix(axes)), jnp.full(4, 0.1)
+    share = jax.jit(lambda t, h: allocate_within(jnp.asarray(axes), pinv, t, h, limit))
+    wanted = jnp.array([1e-3, -2e-3, 5e-4])
+    free = share(wanted, jnp.zeros(4))
+    np.testing.assert_allclose(free, pinv @ wanted, atol=1e-18)
+    for k in range(4):
+        # full in the direction in which its torque would fill it further, then in the other
+        h = jnp.zeros(4).at[k].set(-0.1 * jnp.sign(free[k]))
+        held = share(wanted, h)
+        assert held[k] == 0.0
+        others = np.delete(axes, k, axis=1)
+        np.testing.assert_allclose(np.delete(held, k), np.linalg.solve(others, wanted), atol=1e-15)
+        np.testing.assert_array_equal(share(wanted, -h), free)
+    # two full wheels of four leave no three axes: as much as can be had is not less than before
+    h = -0.1 * jnp.sign(free) * jnp.array([1.0, 1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(share(wanted, h), free)
 
 
 @pytest.mark.parametrize(

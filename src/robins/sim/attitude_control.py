@@ -26,6 +26,9 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
 from robins.sim import _given
+from robins.sim import _unrolled as u
+
+_ENOUGH = 1e-6  # determinant of W W' of unit axes that span space
 
 
 class Controller(NamedTuple):
@@ -88,6 +91,43 @@ def torque(
 def allocate(pinv: Float[Array, "w 3"], torque_b: Float[Array, "3"]) -> Float[Array, "w"]:
     """Torques of the wheels [N m] that make up ``torque_b``, what the magnetorquers leave."""
     return _times(pinv, torque_b)
+
+
+def allocate_within(
+    wheel_axes_b: Float[Array, "3 w"],
+    pinv: Float[Array, "w 3"],
+    torque_b: Float[Array, "3"],
+    wheel_h: Float[Array, "w"],
+    momentum_limit: Float[Array, "w"],
+) -> Float[Array, "w"]:
+    """`allocate`, where a wheel that is full is not asked to take more: the others then do.
+
+    So long as they give torque about three axes; if not, the plain allocation stands, and what a
+    full wheel cannot give is missing.
+
+    Args:
+        wheel_axes_b: (3, W) unit columns.
+        pinv: (W, 3) of `allocation_matrix`; a wheel with a row of zeros is not used.
+        torque_b: torque wanted on the body [N m].
+        wheel_h: (W,) momenta of the wheels along their axes [N m s].
+        momentum_limit: (W,) most of it, either way.
+    """
+    plain = allocate(pinv, torque_b)
+    full = jnp.abs(wheel_h) >= momentum_limit * (1.0 - 1e-9)
+    used = jnp.any(pinv != 0.0, axis=1)
+    asked, free = plain, used
+    for _ in range(max(pinv.shape[0] - 3, 0)):  # as many as may be left out
+        free = free & ~(full & (asked * wheel_h < 0.0))  # its torque is -h'
+        A = jnp.where(free[None, :], wheel_axes_b, 0.0)
+        G = u.matrix(jnp.sum(A[:, None, :] * A[None, :, :], -1))
+        size = u.dot(G[0], u.cross(G[1], G[2]))  # determinant
+        enough = size > _ENOUGH
+        safe = tuple(
+            tuple(jnp.where(enough, G[i][j], float(i == j)) for j in range(3)) for i in range(3)
+        )
+        shared = jnp.stack(u.apply(u.symmetric_inverse(safe), u.scalars(torque_b)))
+        asked = jnp.where(enough, jnp.sum(A * shared[:, None], 0), plain)
+    return jnp.where(jnp.any(free != used), asked, plain)
 
 
 def allocation_matrix(wheel_axes_b: Any, works: Any = 1.0) -> np.ndarray:

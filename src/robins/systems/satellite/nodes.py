@@ -19,7 +19,7 @@ from jaxtyping import Array
 from robins import linalg
 from robins.filters import Belief, Reading
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
-from robins.sim.attitude_control import Controller, allocate, desaturation_dipole, torque
+from robins.sim.attitude_control import Controller, allocate_within, desaturation_dipole, torque
 from robins.sim.gyro import read_gyro
 from robins.sim.spacecraft import CraftState, Spacecraft, advance, rate_b, wheel_momentum_b
 from robins.sim.star_sensor import measure_attitude, read_star
@@ -89,7 +89,10 @@ def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, ro
     )
     k, limit = given.control.desaturation_k, given.craft.dipole_limit_a_m2
     dipole = desaturation_dipole(k, held, field_b, limit)
-    return Command(allocate(given.pinv, wanted - jnp.cross(dipole, field_b)), dipole)
+    left = wanted - jnp.cross(dipole, field_b)
+    most = given.craft.wheel_momentum_limit
+    wheels = allocate_within(given.craft.wheel_axes_b, given.pinv, left, wheel_h, most)
+    return Command(wheels, dipole)
 
 
 def plant(given: Given, state: CraftState, command: Command, row: Step) -> CraftState:
