@@ -13,7 +13,7 @@ import click
 import pytest
 
 from robins import cli, results
-from robins.cli import Status, cache, commands, frame
+from robins.cli import Status, cache, commands, running
 from robins.logs import Finding, LogError
 from robins.scenario import ScenarioError
 from robins.units import UnitError
@@ -490,4 +490,4 @@ def test_statuses_are_those_of_the_contract():
         "BAD_INPUT": 2,
         "INTERRUPTED": 3,
     }
-    assert frame.main is cli.main
+    assert running.main is cli.main

@@ -5,6 +5,7 @@ when it runs, so that help and usage errors come at once.
 """
 
 from robins.cli.commands import app
-from robins.cli.frame import Status, main
+from robins.cli.frame import Status
+from robins.cli.running import main
 
 __all__ = ["Status", "app", "main"]

@@ -1,19 +1,13 @@
-"""What surrounds a command: exit status, errors in a line, interrupts, which stream gets what."""
+"""What every command stands on: exit status, errors of the user, which stream gets what."""
 
 from __future__ import annotations
 
 import contextlib
 import enum
-import errno
-import os
 import sys
-import traceback
-from collections.abc import Iterator, Sequence
-from typing import Any, NoReturn
+from collections.abc import Iterator
 
 import click
-
-from robins.cli import interrupts
 
 
 class Status(enum.IntEnum):
@@ -29,134 +23,6 @@ class BadInput(click.ClickException):
     """Something the user gave cannot be used; the message says what, where and the mend."""
 
     exit_code = Status.BAD_INPUT
-
-
-class _Output:
-    """Standard output that remembers if it could not be written to."""
-
-    def __init__(self, stream: Any):
-        self._stream = stream
-        self.failure: OSError | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        with self._watched():
-            return self._stream.write(text)
-
-    def flush(self) -> None:
-        with self._watched():
-            self._stream.flush()
-
-    @contextlib.contextmanager
-    def _watched(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self.failure = error
-            raise
-
-    def abandon(self) -> None:
-        """Let what is still buffered go nowhere: the interpreter would try once more at its end."""
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line; the arguments of the process by default.
-
-    Returns:
-        The exit status, see `Status`. Errors are told in a few lines on standard error, with the
-        traceback only if ``--debug`` is among the arguments.
-    """
-    from robins.cli.commands import app
-
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    output = _Output(sys.stdout)
-    with interrupts.heeded(), contextlib.redirect_stdout(output):
-        try:
-            status = app.main(given, prog_name="robins", standalone_mode=False, obj=given)
-            output.flush()
-            return status if isinstance(status, int) else Status.DONE
-        except (click.Abort, KeyboardInterrupt):
-            _tell(
-                "interrupted. No half result was written and an earlier one is as it was; the same "
-                "command starts again."
-            )
-            if arguments is None:
-                _leave(Status.INTERRUPTED)
-            return Status.INTERRUPTED
-        except Exception as error:
-            if output.failure is not None:
-                output.abandon()
-                if output.failure.errno != errno.EPIPE:  # a reader may go when it has seen enough
-                    why = output.failure.strerror or output.failure
-                    _tell(f"cannot write to standard output: {why}")
-                return Status.FAILED
-            if "--debug" in given and not isinstance(error, click.ClickException):
-                traceback.print_exception(error)
-            return _told(error)
-
-
-def _leave(status: Status) -> NoReturn:
-    """End the process here and now.
-
-    A compilation goes on in threads of its own when the interpreter takes the rest away, and that
-    ends in a segmentation fault instead of the status. Files are closed already.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(status)
-
-
-def _told(error: Exception) -> Status:
-    """Say what went wrong in a few lines, and which status that is."""
-    if isinstance(error, click.UsageError):
-        _tell(error.format_message())
-        command = error.ctx.command_path if error.ctx else "robins"
-        _tell(f"`{command} --help` tells what can be given.")
-        return Status.BAD_INPUT
-    if isinstance(error, click.ClickException):
-        _tell(error.format_message())
-        return Status(error.exit_code)
-    if _is_refusal(error):
-        _tell(str(error))
-        return Status.BAD_INPUT
-    if isinstance(error, MemoryError):
-        _tell("out of memory; ask for fewer runs or filters at a time.")
-        return Status.FAILED
-    if _is_ours(error):
-        _tell(str(error))
-        return Status.FAILED
-    first = (str(error).strip().splitlines() or [""])[0]
-    _tell(f"failed: {type(error).__name__}: {first}")
-    _tell("this may be a fault of robins; run it again with --debug to see where.")
-    return Status.FAILED
-
-
-def _is_ours(error: Exception) -> bool:
-    return type(error).__module__.split(".")[0] == "robins"
-
-
-def _is_refusal(error: Exception) -> bool:
-    """Whether robins refused what it was given, rather than failed to do it.
-
-    Its rooms say so by errors of their own, all of them ValueErrors. A bare ValueError may come
-    from anywhere below and tells of a fault. A result folder is refused, unless the disk did it.
-    """
-    if not _is_ours(error):
-        return False
-    if isinstance(error, ValueError):
-        return True
-    return type(error).__name__ == "ResultError" and not isinstance(error.__cause__, OSError)
-
-
-def _tell(text: str) -> None:
-    with contextlib.suppress(OSError, ValueError):
-        for line in text.splitlines():
-            print(f"robins: {line}", file=sys.stderr)
 
 
 @contextlib.contextmanager
