@@ -1,0 +1,118 @@
+"""Frames out of a stream of bytes, however it is cut up and whatever is wrong with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from robins.bench.frames import EDGE, LEAST, MOST_PAYLOAD, Frame, FrameError, decode_frame
+
+# COBS adds a byte for each 254 and one more.
+LONGEST = LEAST + MOST_PAYLOAD + (LEAST + MOST_PAYLOAD) // 254 + 1
+
+
+@dataclass
+class Counts:
+    """What a receiver has seen."""
+
+    frames: int = 0  # good ones
+    cobs: int = 0  # not stuffed rightly
+    short: int = 0
+    long: int = 0  # longer than any frame, dropped while they came
+    crc: int = 0  # check wrong
+    version: int = 0
+    header: int = 0
+
+    @property
+    def wrong(self) -> int:
+        """Runs of bytes between zeros that are no frame."""
+        return sum(getattr(self, f.name) for f in fields(self)) - self.frames
+
+
+class Receiver:
+    """Takes bytes, gives frames; what is wrong is counted and skipped to the next zero.
+
+    What it gives depends on the bytes alone, not on how they are cut into pieces, and it never
+    holds more than the longest frame.
+
+    Attributes:
+        counts: so far.
+    """
+
+    def __init__(self) -> None:
+        self.counts = Counts()
+        self._held = bytearray()
+        self._too_long = False
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that end in these bytes."""
+        found: list[Frame] = []
+        *ended, rest = bytes(data).split(EDGE)
+        for piece in ended:
+            self._hold(piece)
+            if self._too_long:
+                self.counts.long += 1
+            elif self._held:  # two zeros in a row are the edges of neighbours
+                self._take(bytes(self._held), found)
+            self._held.clear()
+            self._too_long = False
+        self._hold(rest)
+        return found
+
+    @property
+    def held(self) -> int:
+        """Bytes of a frame that has not ended yet."""
+        return len(self._held)
+
+    def _hold(self, piece: bytes) -> None:
+        if self._too_long or len(self._held) + len(piece) > LONGEST:
+            self._too_long = True
+            self._held.clear()
+        else:
+            self._held += piece
+
+    def _take(self, stuffed: bytes, found: list[Frame]) -> None:
+        try:
+            frame = decode_frame(stuffed)
+        except FrameError as error:
+            setattr(self.counts, error.why, getattr(self.counts, error.why) + 1)
+            return
+        self.counts.frames += 1
+        found.append(frame)
+
+
+class Sequence:
+    """Numbers of the frames of one link and direction: what was lost, repeated, came late.
+
+    Attributes:
+        lost: numbers that have not come and are not expected any more.
+        repeated: frames whose number had come before.
+        late: frames that came after one of a higher number; they are not lost any more.
+    """
+
+    REMEMBERED = 1024
+
+    def __init__(self) -> None:
+        self.lost = self.repeated = self.late = 0
+        self._next: int | None = None
+        self._missing: dict[int, None] = {}
+
+    def take(self, number: int) -> bool:
+        """Count a frame; whether it is new and in its order, and so may be used."""
+        if self._next is None:
+            self._next = number
+        ahead = (number - self._next) % 2**32
+        if ahead < 2**31:
+            for k in range(min(ahead, self.REMEMBERED)):
+                self._missing[(number - 1 - k) % 2**32] = None
+            while len(self._missing) > self.REMEMBERED:
+                self._missing.pop(next(iter(self._missing)))
+            self.lost += ahead
+            self._next = (number + 1) % 2**32
+            return True
+        if number in self._missing:
+            del self._missing[number]
+            self.lost -= 1
+            self.late += 1
+        else:
+            self.repeated += 1
+        return False

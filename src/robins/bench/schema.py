@@ -1,0 +1,164 @@
+"""Every message of the wire, in one table: what is encoded, decoded, documented and put into C.
+
+Numbers are part of the protocol. Add at the end, never renumber, never reuse; a change of the
+fields of a message is a new version of the protocol. All numbers are little endian; lengths of
+vectors are fixed, so that firmware needs no heap.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+VERSION = 1
+WHEELS = 4
+
+Kind = Literal["u8", "u16", "u32", "u64", "f64"]
+SIZES: dict[Kind, int] = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "f64": 8}
+
+
+class Field(NamedTuple):
+    """Some numbers of one kind."""
+
+    name: str
+    kind: Kind
+    length: int
+    unit: str  # "1": a pure number
+    text: str
+
+
+class Message(NamedTuple):
+    """What one part of the bench tells another."""
+
+    number: int
+    name: str
+    text: str
+    fields: tuple[Field, ...]
+
+
+def _f64(name: str, length: int, unit: str, text: str) -> Field:
+    return Field(name, "f64", length, unit, text)
+
+
+_QUATERNION = "body to inertial, scalar first"
+
+MESSAGES: tuple[Message, ...] = (
+    Message(
+        1,
+        "hello",
+        "A part is there; its first message.",
+        (
+            Field("part", "u8", 1, "1", "number of the part"),
+            Field("schema", "u32", 1, "1", "CRC-32C of this table, so that both mean the same"),
+        ),
+    ),
+    Message(
+        2,
+        "tick",
+        "The clock lets a step begin. The time in the header is that of its end.",
+        (Field("step", "u32", 1, "1", "number of the step, from 0"),),
+    ),
+    Message(
+        3,
+        "done",
+        "A part has sent all that it sends in a step.",
+        (
+            Field("step", "u32", 1, "1", "number of the step"),
+            Field("compute", "u32", 1, "ns", "time it took to compute"),
+        ),
+    ),
+    Message(4, "stop", "The run is over.", ()),
+    Message(
+        16,
+        "motion",
+        "The craft as it truly is, from the plant to the rate table.",
+        (
+            _f64("q_ib", 4, "1", _QUATERNION),
+            _f64("omega_b", 3, "rad/s", "rate against inertial"),
+        ),
+    ),
+    Message(
+        17,
+        "mounted",
+        "Attitude of the rate table, which its sensors have.",
+        (_f64("q_ib", 4, "1", _QUATERNION),),
+    ),
+    Message(
+        18,
+        "gyro",
+        "A sample of the gyros.",
+        (_f64("theta_b", 3, "rad", "turn over the step, NaN: no sample of this axis"),),
+    ),
+    Message(
+        19,
+        "star",
+        "A frame of the star sensor.",
+        (
+            _f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved"),
+            _f64("factor", 9, "rad", "L of its covariance L L', body axes, by rows; 0: unknown"),
+            Field("stars", "u16", 1, "1", "used"),
+        ),
+    ),
+    Message(
+        20,
+        "estimate",
+        "Attitude as determined.",
+        (
+            _f64("q_ib", 4, "1", _QUATERNION),
+            _f64("gyro_bias", 3, "rad/s", "reported less true rate"),
+            _f64("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes"),
+            Field("flags", "u8", 1, "1", "bit 0: star used, bit 1: star refused, bit 2: gyro held"),
+        ),
+    ),
+    Message(
+        21,
+        "command",
+        "What control asks of the actuators.",
+        (
+            _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
+            _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
+        ),
+    ),
+    Message(
+        22,
+        "actuation",
+        "What the actuators give.",
+        (
+            _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
+            _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
+        ),
+    ),
+    Message(
+        23,
+        "wheels",
+        "Momenta of the wheels, from their speeds.",
+        (_f64("momentum", WHEELS, "N m s", "along each wheel's axis"),),
+    ),
+)
+"""All of them, by number."""
+
+_BY_NAME = {m.name: m for m in MESSAGES}
+_BY_NUMBER = {m.number: m for m in MESSAGES}
+
+
+def message(which: str | int) -> Message:
+    """A message by its name or number.
+
+    Raises:
+        KeyError: there is none; the message of the error lists those there are.
+    """
+    known = _BY_NAME if isinstance(which, str) else _BY_NUMBER
+    if which not in known:
+        there = ", ".join(_BY_NAME)
+        raise KeyError(f"no message {which!r} in version {VERSION}; there are {there}")
+    return known[which]  # type: ignore[index]
+
+
+def markdown() -> str:
+    """The table as documentation."""
+    lines = ["| number | message | field | type | unit | meaning |", "|---|---|---|---|---|---|"]
+    for m in MESSAGES:
+        lines.append(f"| {m.number} | `{m.name}` | | | | {m.text} |")
+        for f in m.fields:
+            kind = f.kind if f.length == 1 else f"{f.kind} x {f.length}"
+            lines.append(f"| | | `{f.name}` | {kind} | {f.unit} | {f.text} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,329 @@
+"""The wire: golden bytes, streams cut anywhere, damage of every kind, and the same in C."""
+
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robins import bench
+from robins.bench import Frame, Header, Receiver, RecordError, Sequence
+from robins.bench.c_header import c_header, schema_number
+from robins.bench.frames import LEAST, MOST_PAYLOAD, FrameError
+from robins.bench.receiver import LONGEST
+
+# Written down once. If this test fails, the wire has changed: raise the version of the protocol.
+GOLDEN_TICK = bytes.fromhex("00040102070101030201010104e1f50501010103080701052df23f5a00")
+GYRO = {"theta_b": [1.5, -0.25, np.nan]}
+
+
+def frame(payload: bytes, sequence: int = 0, kind: int = 18) -> bytes:
+    return bench.encode_frame(Header(kind, 7, sequence, 10**9), payload)
+
+
+def bitwise_crc(data: bytes) -> int:
+    """CRC-32C by its definition, bit by bit."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (0x82F63B78 if crc & 1 else 0)
+    return crc ^ 0xFFFFFFFF
+
+
+def plain_cobs(data: bytes) -> bytes:
+    """COBS by its definition: blocks of up to 254 bytes that end in a zero that is left out."""
+    out, block = bytearray(), bytearray()
+    for i, byte in enumerate(data):
+        if byte:
+            block.append(byte)
+        if not byte or (len(block) == 254 and i + 1 < len(data)):
+            out += bytes([len(block) + 1]) + block
+            block.clear()
+    return bytes(out + bytes([len(block) + 1]) + block)
+
+
+# ---------------------------------------------------------------------------------------- frames
+
+
+def test_golden_bytes():
+    """Every byte of a frame by hand: header, payload, check, stuffing."""
+    body = struct.pack("<BBIIQ", 1, 2, 7, 258, 100_000_000) + struct.pack("<I", 1800)
+    body += struct.pack("<I", bitwise_crc(body))
+    by_hand = b"\x00" + plain_cobs(body) + b"\x00"
+    made = bench.encode_frame(
+        Header(bench.message("tick").number, 7, 258, 100_000_000),
+        bench.encode("tick", {"step": 1800}),
+    )
+    assert made == by_hand
+    assert made == GOLDEN_TICK
+
+
+@given(st.binary(max_size=600), st.integers(0, 255), st.integers(0, 2**32 - 1))
+def test_frames_come_back(payload, kind, sequence):
+    header = Header(kind, 12345, sequence, 2**63 + 1)
+    made = bench.encode_frame(header, payload)
+    assert made[0] == made[-1] == 0
+    assert 0 not in made[1:-1]
+    assert bench.decode_frame(made[1:-1]) == Frame(header, payload)
+
+
+def test_longest_frame_fits_the_buffer():
+    made = frame(bytes([255]) * MOST_PAYLOAD)
+    assert len(made) - 2 <= LONGEST
+    assert len(Receiver().feed(made)) == 1
+    with pytest.raises(FrameError, match="has 4096 bytes at most, got 4097"):
+        frame(bytes(MOST_PAYLOAD + 1))
+
+
+@pytest.mark.parametrize("wrong", [Header(256, 0, 0, 0), Header(1, -1, 0, 0), Header(1, 0, 0, -1)])
+def test_headers_out_of_range(wrong):
+    with pytest.raises(FrameError, match="header"):
+        bench.encode_frame(wrong, b"")
+
+
+def test_another_version_is_told():
+    made = bench.encode_frame(Header(2, 0, 0, 0, version=2), b"")
+    with pytest.raises(FrameError, match="version 2; this is version 1"):
+        bench.decode_frame(made[1:-1])
+
+
+# ---------------------------------------------------------------------------------------- streams
+
+
+def stream(count: int, rng: np.random.Generator) -> tuple[list[bytes], list[bytes]]:
+    payloads = [rng.bytes(int(rng.integers(0, 120))) for _ in range(count)]
+    return payloads, [frame(p, k) for k, p in enumerate(payloads)]
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=60), st.integers(0, 5))
+def test_how_a_stream_is_cut_does_not_matter(cuts, seed):
+    rng = np.random.default_rng(seed)
+    payloads, frames = stream(8, rng)
+    data = rng.bytes(9) + b"".join(frames) + rng.bytes(3) + frame(b"end", 8)
+    whole, cut = Receiver(), Receiver()
+    at, found = 0, []
+    for size in cuts:
+        found += cut.feed(data[at : at + size])
+        at += size
+    found += cut.feed(data[at:])
+    assert found == whole.feed(data)
+    assert cut.counts == whole.counts
+    assert [f.payload for f in found][-9:] == [*payloads, b"end"]
+
+
+def damaged(kind: str, made: bytes, rng: np.random.Generator) -> bytes:
+    """A frame, damaged; its neighbours' bytes stay as they are."""
+    data = bytearray(made)
+    at = int(rng.integers(0, len(data)))
+    if kind == "one bit":
+        data[at] ^= 1 << int(rng.integers(0, 8))
+    elif kind == "two bits":
+        for k in rng.choice(8 * len(data), 2, replace=False):
+            data[k // 8] ^= 1 << int(k % 8)
+    elif kind == "burst":
+        size = int(rng.integers(2, 12))
+        data[at : at + size] = rng.bytes(len(data[at : at + size]))
+    elif kind == "truncated":
+        del data[at:]
+    elif kind == "dropped byte":
+        del data[at]
+    else:
+        data = bytearray(rng.bytes(int(rng.integers(1, 60)))) + data
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    "kind", ["one bit", "two bits", "burst", "truncated", "dropped byte", "noise before"]
+)
+def test_damage_costs_the_frame_it_hits_and_no_other(kind):
+    """3400 frames of each kind: every good one comes out, no wrong one does."""
+    rng = np.random.default_rng(8)
+    payloads, frames = stream(3400, rng)
+    receiver = Receiver()
+    sent, found = {}, []
+    for k, made in enumerate(frames):
+        bad = k % 2 == 1
+        sent[k] = payloads[k]
+        found += receiver.feed(damaged(kind, made, rng) if bad else made)
+        assert receiver.held <= LONGEST
+    for one in found:  # what comes out was sent, byte for byte
+        assert one.payload == sent[one.header.sequence]
+    numbers = [one.header.sequence for one in found]
+    assert set(range(0, len(frames), 2)) <= set(numbers)
+    if kind == "noise before":
+        assert len(numbers) == len(frames)
+    assert len(numbers) == len(set(numbers))
+
+
+@given(st.binary(max_size=3000))
+def test_any_bytes_do_no_harm(data):
+    receiver = Receiver()
+    for one in receiver.feed(data):
+        assert len(one.payload) <= MOST_PAYLOAD
+    assert receiver.held <= LONGEST
+    good = frame(b"good")
+    # what came before may have eaten the first zero, not the frame after it
+    assert receiver.feed(good + good)[-1].payload == b"good"
+
+
+def test_a_frame_that_never_ends_is_not_kept():
+    receiver = Receiver()
+    for _ in range(100):
+        assert receiver.feed(b"\x01" * 1000) == []
+        assert receiver.held <= LONGEST
+    assert len(receiver.feed(frame(b"next"))) == 1
+    assert receiver.counts.long == 1
+    assert receiver.counts.wrong == 1
+
+
+def test_what_is_wrong_is_counted_by_its_kind():
+    receiver = Receiver()
+    made = bytearray(frame(b"payload"))
+    made[-3] ^= 1
+    receiver.feed(bytes(made))
+    receiver.feed(b"\x00\x05ab\x00")  # says four bytes, has two
+    receiver.feed(b"\x00\x03ab\x00")
+    receiver.feed(bench.encode_frame(Header(2, 0, 0, 0, version=9), b""))
+    counts = receiver.counts
+    assert (counts.crc, counts.cobs, counts.short, counts.version) == (1, 1, 1, 1)
+    assert (counts.wrong, counts.frames) == (4, 0)
+
+
+def test_sequences_tell_lost_repeated_and_late():
+    seen = Sequence()
+    assert [seen.take(k) for k in (5, 6, 9, 9, 8, 10)] == [True, True, True, False, False, True]
+    assert (seen.lost, seen.repeated, seen.late) == (1, 1, 1)  # 7; 9 again; 8
+    around = Sequence()
+    assert [around.take(k) for k in (2**32 - 1, 0, 2)] == [True] * 3
+    assert around.lost == 1
+    far = Sequence()
+    far.take(0)
+    far.take(10**6)
+    assert far.lost == 10**6 - 1
+
+
+# ---------------------------------------------------------------------------------------- records
+
+
+@pytest.mark.parametrize("m", bench.MESSAGES, ids=lambda m: m.name)
+def test_values_come_back_bit_for_bit(m):
+    rng = np.random.default_rng(m.number)
+    values = {
+        f.name: rng.normal(size=f.length) * 10.0 ** rng.integers(-300, 300, f.length)
+        if f.kind == "f64"
+        else rng.integers(0, 200, f.length)
+        for f in m.fields
+    }
+    payload = bench.encode(m.name, values)
+    assert len(payload) == bench.size_of(m.name)
+    back = bench.decode(m.name, payload)
+    for name, value in values.items():
+        np.testing.assert_array_equal(np.ravel(back[name]), value)
+    assert bench.encode(m.name, back) == payload
+
+
+def test_nan_is_a_number_of_the_wire():
+    back = bench.decode("gyro", bench.encode("gyro", GYRO))
+    np.testing.assert_array_equal(back["theta_b"], GYRO["theta_b"])
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("tick", {}, r"has the fields \['step'\], got \[\]"),
+        ("tick", {"step": 1, "more": 2}, "has the fields"),
+        ("tick", {"step": -1}, "message 'tick'"),
+        ("tick", {"step": 2**32}, "message 'tick'"),
+        ("tick", {"step": 1.5}, "tick.step is u32: whole numbers are wanted"),
+        ("gyro", {"theta_b": [1.0, 2.0]}, "gyro.theta_b has 3 numbers, got 2"),
+    ],
+)
+def test_values_that_are_not_the_message(name, values, words):
+    with pytest.raises(RecordError, match=words):
+        bench.encode(name, values)
+
+
+def test_payloads_that_are_not_the_message():
+    with pytest.raises(RecordError, match="message 'tick' has 4 bytes, got 3"):
+        bench.decode("tick", b"abc")
+    with pytest.raises(KeyError, match="no message 'tock' in version 1; there are hello, tick"):
+        bench.encode("tock", {})
+
+
+def test_the_table_is_sound():
+    numbers = [m.number for m in bench.MESSAGES]
+    assert numbers == sorted(set(numbers))
+    assert all(0 < n < 256 for n in numbers)
+    for m in bench.MESSAGES:
+        assert len({f.name for f in m.fields}) == len(m.fields)
+        assert bench.size_of(m.name) <= MOST_PAYLOAD
+        assert bench.message(m.number) is bench.message(m.name)
+
+
+def test_the_page_has_the_table():
+    page = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
+    assert bench.markdown() in page.read_text("utf-8")
+
+
+# ---------------------------------------------------------------------------------------------- C
+
+PROGRAM = """
+#include "robins_wire.h"
+#include <stdio.h>
+#include <stdlib.h>
+
+/* reads "size, bytes" until the end; for each payload a frame, decoded again */
+int main(void) {
+  uint32_t size, number = 0;
+  static uint8_t payload[ROBINS_MOST_PAYLOAD], out[ROBINS_MOST_FRAME], body[ROBINS_MOST_BODY];
+  while (fread(&size, 4, 1, stdin) == 1) {
+    if (size && fread(payload, 1, size, stdin) != size) return 1;
+    size_t made = robins_encode(ROBINS_GYRO, 7, number++, 1000000000u, payload, size, out);
+    if (!made) return 2;
+    long back = robins_decode(out + 1, made - 2, body);
+    if (back != (long)size || memcmp(body + ROBINS_HEADER, payload, size)) return 3;
+    out[made / 2] ^= 4;
+    if (out[made / 2] && robins_decode(out + 1, made - 2, body) >= 0) return 4;
+    out[made / 2] ^= 4;
+    uint32_t length = (uint32_t)made;
+    fwrite(&length, 4, 1, stdout);
+    fwrite(out, 1, made, stdout);
+  }
+  return ROBINS_SCHEMA == strtoul(SCHEMA, 0, 0) ? 0 : 5;
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
+def test_firmware_makes_the_same_bytes(tmp_path):
+    (tmp_path / "robins_wire.h").write_text(c_header())
+    (tmp_path / "echo.c").write_text(PROGRAM)
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1"]
+    schema = f'-DSCHEMA="{schema_number():#x}"'
+    command = ["gcc", *flags, schema, "echo.c", "-o", "echo"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+
+    rng = np.random.default_rng(0)
+    # lengths about those where COBS begins another block, and bytes with and without zeros
+    sizes = [0, 1, *range(225, 240), *range(480, 496), 1000, MOST_PAYLOAD]
+    payloads = [rng.integers(1, 256, n, dtype=np.uint8).tobytes() for n in sizes]
+    payloads += [bytes(n) for n in (1, 254, 300)]
+    payloads += [rng.integers(0, 3, n, dtype=np.uint8).tobytes() for n in (50, 300)]
+    given_bytes = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
+    ran = subprocess.run([tmp_path / "echo"], input=given_bytes, capture_output=True, check=False)
+    assert ran.returncode == 0
+    expected = b"".join(
+        struct.pack("<I", len(made)) + made
+        for made in (frame(p, k) for k, p in enumerate(payloads))
+    )
+    assert ran.stdout == expected
+
+
+def test_a_frame_without_payload_is_the_least():
+    assert len(frame(b"")) == LEAST + 3
