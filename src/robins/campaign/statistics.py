@@ -79,7 +79,7 @@ class Statistics:
             tally = self._codes.setdefault(name, {})
             for kind, number in zip(kinds.tolist(), numbers.tolist(), strict=True):
                 tally[kind] = tally.get(kind, 0) + number
-        for name, value in record["outputs"].items():
+        for name, value in record.get("outputs", {}).items():
             value = np.where(bad[:, None, None], np.inf, value)
             self._output_square[name] = self._output_square.get(name, 0.0) + np.sum(value**2, 0)
             squares = np.mean(value[:, self.counted] ** 2, axis=1)
