@@ -12,15 +12,15 @@ from typing import Literal, NamedTuple
 VERSION = 1
 WHEELS = 4
 
-Kind = Literal["u8", "u16", "u32", "u64", "f64"]
-SIZES: dict[Kind, int] = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "f64": 8}
+WireType = Literal["u8", "u16", "u32", "u64", "f64"]
+SIZES: dict[WireType, int] = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "f64": 8}
 
 
 class Field(NamedTuple):
     """Some numbers of one kind."""
 
     name: str
-    kind: Kind
+    kind: WireType
     length: int
     unit: str  # "1": a pure number
     text: str
