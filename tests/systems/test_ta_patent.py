@@ -24,6 +24,7 @@ from robins.systems.transfer_alignment.patent_claims import patent_claims, paten
 
 FOLDER = Path(patent.__file__).parent / "scenarios"
 RUNS = 100
+QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run
 COUNT_FROM = 300  # t > 30 s
 
 # RMS of attitude errors over all axes ['], t > 30 s, 100 runs
@@ -55,7 +56,7 @@ def simulator(given):
         }
         return patent.simulate(given.model_copy(update=parts), course, 0, index)
 
-    batch = jax.jit(jax.vmap(simulate, (None, 0)))
+    batch = jax.jit(jax.vmap(simulate, (None, 0)), compiler_options=QUICK)
 
     def of(other):
         d = other.disturbance
@@ -69,7 +70,7 @@ def kept(step):
     return step.posterior.mean, step.posterior.sigma, step.prediction.code
 
 
-@partial(jax.jit, static_argnames="filter_")
+@partial(jax.jit, static_argnames="filter_", compiler_options=QUICK)
 @partial(jax.vmap, in_axes=(None, 0))
 def filtered(filter_, case):
     model = va.velocity_attitude_model()
