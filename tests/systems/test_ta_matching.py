@@ -47,7 +47,8 @@ def given(name="s0", *settings):
 COURSE = lay_out(given())
 
 
-@jax.jit
+# slower to compile, faster to run
+@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
 def worlds(sizes):
     """Sizes are data, so one compilation serves all scenarios."""
     return jax.vmap(partial(simulate, COURSE, sizes, 0))(jnp.arange(RUNS))
