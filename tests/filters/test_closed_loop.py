@@ -19,7 +19,7 @@ from robins.filters import (
     run,
     run_closed,
 )
-from robins.filters.rules import constant_gain, gate, with_gains
+from robins.filters.rules import Infeasible, constant_gain, gate, h_infinity, with_gains
 
 DT, STEPS, EVERY = 0.1, 200, 5
 F = jnp.array([[1.0, DT], [0.0, 1.0]])
@@ -96,6 +96,25 @@ def test_what_does_not_fit_is_named():
         run_closed(kalman(), MODEL, START, loop()._replace(due={"heard": np.ones(STEPS, bool)}))
     with pytest.raises(ValueError, match="must have one length, got"):
         run_closed(kalman(), MODEL, START, loop()._replace(due={"seen": np.ones(3, bool)}))
+
+    with pytest.raises(ValueError, match=r"no sensor \['heard'\]; this model has \['seen'\]"):
+        run_closed(kalman(), MODEL, START, loop()._replace(react=heard))
+
+
+def heard(x, belief, row):
+    return x, Reading(jnp.zeros(()), {"heard": x[:1]}, x)
+
+
+def test_rules_report_as_in_a_run():
+    """An H-infinity bound that cannot be met is an error, with the time, and not a silent code."""
+    strict = kalman(rules=[h_infinity(0.05, jnp.eye(2), policy="raise")])
+    time_s = DT * np.arange(1, STEPS + 1)
+    with pytest.raises(Infeasible, match="gamma") as of_loop:
+        run_closed(strict, MODEL, START, loop(due=False), time_s=time_s)
+    readings = run_closed(kalman(), MODEL, START, loop(due=False)).readings
+    with pytest.raises(Infeasible) as of_run:
+        run(strict, MODEL, START, readings.y, readings.u, time_s=time_s)
+    assert str(of_loop.value) == str(of_run.value)
 
 
 # ------------------------------------------------------------------------------ a constant gain

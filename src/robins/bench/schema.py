@@ -40,6 +40,10 @@ def _f64(name: str, length: int, unit: str, text: str) -> Field:
 
 
 _QUATERNION = "body to inertial, scalar first"
+_ACTUATORS = (
+    _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
+    _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
+)
 
 MESSAGES: tuple[Message, ...] = (
     Message(
@@ -113,19 +117,13 @@ MESSAGES: tuple[Message, ...] = (
         21,
         "command",
         "What control asks of the actuators.",
-        (
-            _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
-            _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
-        ),
+        _ACTUATORS,
     ),
     Message(
         22,
         "actuation",
         "What the actuators give.",
-        (
-            _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
-            _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
-        ),
+        _ACTUATORS,
     ),
     Message(
         23,

@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.campaign.monte_carlo import solved, worlds
-from robins.filters import Belief, Filter, Model, Step
+from robins.filters import Belief, Filter, Model
 from robins.filters.bound import bound_along, linearised, used_sensors
 from robins.filters.observability import (
     NOTHING,
@@ -24,6 +24,7 @@ from robins.filters.observability import (
     unobservable,
     worded,
 )
+from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
 from robins.results import variable
 from robins.systems.system import Case, Problem, StateBlock
@@ -106,14 +107,10 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
     return np.sqrt(np.asarray(_variances(c.filter, c.model, case, c.reported, world)))
 
 
-def _nothing(step: Step) -> tuple[()]:
-    return ()
-
-
 def _case(filter_: Filter, model: Model, case: Partial, world: Any) -> Case:
     """The case of a run. In closed loop it takes the filter to know where the vehicle went."""
     it = case(world)
-    return it if it.loop is None else solved(filter_, model, it, _nothing)[1]
+    return it if it.loop is None else solved(filter_, model, it, nothing)[1]
 
 
 @partial(jax.jit, static_argnames="filter_")

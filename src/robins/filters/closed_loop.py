@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import ArrayLike
 
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Model, Sensor
-from robins.filters.run import Step
+from robins.filters.run import Step, check_names, everything, is_traced, nothing
 
 
 class Reading(NamedTuple):
@@ -67,6 +68,7 @@ def _scan(filter_, model, state, loop: Loop, keep):
         state, world = carry
         row, due = given
         world, reading = loop.react(world, state.belief, row)
+        check_names(model, reading.y)
         state, prediction = filter_.predict(state, model.motion, reading.u)
         info = {}
         for sensor in model.sensors:
@@ -91,10 +93,6 @@ def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: An
     return filter_.update(state, sensor, y, aux)
 
 
-def _everything(step: Step) -> Step:
-    return step
-
-
 class Closed(NamedTuple):
     """A run in closed loop; fields but the last two have a leading axis of T steps."""
 
@@ -109,7 +107,8 @@ def run_closed(
     model: Model,
     start: Belief | FilterState,
     loop: Loop,
-    keep: Callable[[Step], Any] = _everything,
+    keep: Callable[[Step], Any] = everything,
+    time_s: ArrayLike | None = None,
 ) -> Closed:
     """Run a filter in a loop: for each step the world reacts to what is believed, then the filter
     predicts with what the world answered and updates with each sensor.
@@ -123,19 +122,29 @@ def run_closed(
         loop: the world.
         keep: what to keep of each step.
 
+        time_s: (T,) time of each step [s], which errors then name.
+
     Raises:
-        ValueError: ``due`` names no sensor of the model, or is not as long as the rows.
+        Exception: what a rule has to report, as in `robins.filters.run`.
+        ValueError: ``due`` or a reading names no sensor of the model, or ``due`` is not as long as
+            the rows.
     """
     steps = {jnp.shape(x)[0] for x in jax.tree_util.tree_leaves((loop.rows, loop.due))}
     if len(steps) != 1:
         raise ValueError(f"rows and due of a loop must have one length, got {sorted(steps)}")
-    if unknown := set(loop.due) - set(model.dims):
-        raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
+    check_names(model, loop.due)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state, world, rows, due = (as_arrays(x) for x in (state, loop.world, loop.rows, loop.due))
     loop = Loop(_as_partial(loop.react), world, rows, due)
-    return Closed(*_scan(filter_, model, state, loop, keep))
+    closed = Closed(*_scan(filter_, model, state, loop, keep))
+    if filter_.audit is not None and not is_traced(closed.final):
+
+        def again(first: FilterState) -> FilterState:
+            return _scan(filter_, model, first, loop, nothing)[2]
+
+        filter_.audit(state, closed.final, again, time_s)
+    return closed
 
 
 def _as_partial(react: Any) -> jax.tree_util.Partial:

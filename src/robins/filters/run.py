@@ -48,11 +48,13 @@ class Solution(NamedTuple):
         return self.steps.posterior.sigma
 
 
-def _everything(step: Step) -> Step:
+def everything(step: Step) -> Step:
+    """Keep the whole step."""
     return step
 
 
-def _nothing(step: Step) -> tuple[()]:
+def nothing(step: Step) -> tuple[()]:
+    """Keep nothing of a step."""
     return ()
 
 
@@ -71,11 +73,12 @@ def _by_sensor(model: Model, data: Any) -> dict[str, Any]:
                 f"this model has {sorted(model.dims)}: give measurements as a dict by sensor name"
             )
         data = {model.sensors[0].name: data}
-    _check_names(model, data)
+    check_names(model, data)
     return {name: as_measurement(name, values) for name, values in data.items()}
 
 
-def _check_names(model: Model, data: Mapping[str, Any]) -> None:
+def check_names(model: Model, data: Mapping[str, Any]) -> None:
+    """Refuse data of sensors that the model does not have."""
     unknown = set(data) - set(model.dims)
     if unknown:
         raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
@@ -130,7 +133,7 @@ def run(
     y: Any,
     u: Any = None,
     aux: Mapping[str, Any] | None = None,
-    keep: Callable[[Step], Any] = _everything,
+    keep: Callable[[Step], Any] = everything,
     time_s: ArrayLike | None = None,
 ) -> Solution:
     """Run a filter over measurements: for each step predict, then update with row k of y.
@@ -159,7 +162,7 @@ def run(
     """
     measurements = _by_sensor(model, y)
     extra = dict(aux or {})
-    _check_names(model, extra)
+    check_names(model, extra)
     _check_lengths(measurements, u, extra)
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
@@ -168,7 +171,7 @@ def run(
     if filter_.audit is not None and not is_traced(solution.final):
 
         def again(first: FilterState) -> FilterState:
-            return _scan(filter_, model, first, u, measurements, extra, _nothing).final
+            return _scan(filter_, model, first, u, measurements, extra, nothing).final
 
         filter_.audit(state, solution.final, again, time_s)
     return solution
