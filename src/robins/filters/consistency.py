@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
-from scipy import stats
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.chi_square import chi_square
 from robins.manifold import State
 
 
@@ -50,7 +50,7 @@ def chi2_band(dof: ArrayLike, count: int = 1, level: float = 0.95) -> np.ndarray
     """
     total = np.asarray(dof, dtype=float) * count
     tail = (1.0 - level) / 2.0
-    return np.stack([stats.chi2.ppf(tail, total), stats.chi2.ppf(1.0 - tail, total)], -1) / count
+    return np.stack([chi_square(tail, total), chi_square(1.0 - tail, total)], -1) / count
 
 
 class Verdict(NamedTuple):
@@ -149,4 +149,4 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
         if pairs > 0:
             r = np.sum(x[lag:] * x[:-lag]) / (count * power)
             total += count * (count + 2) * r**2 / pairs
-    return Verdict(float(total), 0.0, float(stats.chi2.ppf(level, lags)))
+    return Verdict(float(total), 0.0, float(chi_square(level, lags)))

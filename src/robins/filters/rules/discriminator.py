@@ -7,11 +7,10 @@ from enum import IntEnum
 from typing import Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
-from scipy import stats
 
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.chi_square import limits
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._fading import (
@@ -133,8 +132,7 @@ def discriminator(
     def before(memory: _Memory, prior: Belief, o: Observation):
         seen = normalised(o)
         # quantile by number of components used; none used is never too much
-        table = np.array([np.inf, *stats.chi2.ppf(probability, range(1, len(o.residual) + 1))])
-        quantile = jnp.asarray(table)[seen.dof]
+        quantile = jnp.asarray(limits(probability, len(o.residual)))[seen.dof]
         count, power = memory.counter[o.sensor], memory.power[o.sensor]
         longer = jnp.where(seen.nis > quantile, count + 1, 0)
         count = jnp.where(seen.dof == 0, count, longer)

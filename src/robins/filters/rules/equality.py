@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.chi_square import limits
 from robins.filters.constrain import (
     ITERATIONS,
     Function,
@@ -93,8 +93,7 @@ def equality(
         held = constrain(posterior, g, d, weight, noise, hard, iterations)
         refused = jnp.zeros((), bool)
         if gate is not None:
-            table = [np.inf, *stats.chi2.ppf(gate, range(1, len(held.residual) + 1))]
-            refused = held.nis > jnp.asarray(table)[held.dof]
+            refused = held.nis > jnp.asarray(limits(gate, len(held.residual)))[held.dof]
         skip = refused | used
         belief = jax.tree_util.tree_map(
             lambda new, old: linalg.where(skip, old, new), held.belief, posterior

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
-from scipy import stats
 
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.chi_square import limits
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._quantile import scale_to_quantile
@@ -47,8 +46,7 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
     def before(memory, prior: Belief, o: Observation):
         seen = normalised(o)
         if threshold is None:
-            dof = np.arange(1, len(o.residual) + 1)
-            limit = jnp.asarray([np.inf, *stats.chi2.ppf(probability, dof)])[seen.dof]
+            limit = jnp.asarray(limits(probability, len(o.residual)))[seen.dof]
         else:
             limit = float(threshold) ** 2
         s = scale_to_quantile(o, limit, seen)
