@@ -96,7 +96,20 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
 @partial(jax.jit, static_argnames=("filter_", "blocks"))
 def _records(filter_, blocks: _Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
     contender = Contender(filter_, model, case, reported)
-    return jax.vmap(partial(_record, blocks, contender))(worlds)
+    return _each(partial(_record, blocks, contender), worlds)
+
+
+def _each(one: Callable[[Any], Any], many: Any) -> Any:
+    """`one` of each run of a batch.
+
+    A run alone is not made a batch of one: its branches stay branches, and it has the very bits of
+    `run` or `run_closed`, which a batch has to rounding only.
+    """
+    leaves, shape = jax.tree_util.tree_flatten(many)
+    if leaves[0].shape[0] > 1:
+        return jax.vmap(one)(many)
+    alone = one(shape.unflatten([x[0] for x in leaves]))
+    return jax.tree_util.tree_map(lambda x: x[None], alone)
 
 
 def worlds(
@@ -114,7 +127,7 @@ def worlds(
     if runs < 1 or chunk < 1:
         raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
     width = min(chunk, runs)
-    batch = jax.jit(jax.vmap(problem.simulate))
+    batch = jax.jit(partial(_each, problem.simulate))
     for begin in range(first, first + runs, width):
         yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
 

@@ -69,7 +69,7 @@ def _scan(filter_, model, state, loop: Loop, keep):
         row, due = given
         world, reading = loop.react(world, state.belief, row)
         check_names(model, reading.y)
-        state, prediction = filter_.predict(state, model.motion, reading.u)
+        state, prediction = _apart(filter_.predict, state, model.motion, reading.u)
         info = {}
         for sensor in model.sensors:
             if sensor.name in reading.y:
@@ -90,7 +90,17 @@ def _scan(filter_, model, state, loop: Loop, keep):
 
 
 def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: Any):
-    return filter_.update(state, sensor, y, aux)
+    return _apart(filter_.update, state, sensor, y, aux)
+
+
+def _apart(step: Callable, *args: Any) -> Any:
+    """A step of the filter as `OnlineFilter` compiles it, not fused with the world around it.
+
+    So a loop has the same bits here and where filter and world are programs of their own.
+    """
+    leaves, shape = jax.tree_util.tree_flatten(args)
+    settled = jax.lax.optimization_barrier
+    return settled(step(*shape.unflatten(settled(leaves))))
 
 
 class Closed(NamedTuple):

@@ -194,7 +194,7 @@ def advance(
         disturbance_b: (3,) any other torque [N m], body axes.
         dt_s: length of the step.
     """
-    h0, h1 = state.wheel_h, _wheels_after(craft, state.wheel_h, wheel_torque, dt_s)
+    h0, h1 = state.wheel_h, wheels_after(craft, state.wheel_h, wheel_torque, dt_s)
     W = u.matrix(craft.wheel_axes_b)
     held, gained = u.apply(W, u.scalars(h0)), u.apply(W, u.scalars(h1 - h0))
     J = u.matrix(craft.inertia_b)
@@ -233,12 +233,19 @@ def advance(
     return CraftState(q / jnp.sqrt(jnp.sum(q * q)), momentum, h1)
 
 
-def _wheels_after(craft: Spacecraft, h, torque, dt_s) -> Array:
+def wheels_give(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Array, "w"]:
+    """What the wheels give of a torque [N m], while there is room left in them."""
     most = craft.wheel_torque_limit
+    return craft.wheel_works * jnp.clip(wheel_torque, -most, most)
+
+
+def wheels_after(
+    craft: Spacecraft, wheel_h: Float[Array, "w"], wheel_torque: Float[Array, "w"], dt_s: Any
+) -> Float[Array, "w"]:
+    """Momenta of the wheels [N m s] after a step in which a torque [N m] was asked of them."""
     # A wheel that was given more than its limit may lose it, but is not torn back to it.
-    room = jnp.maximum(craft.wheel_momentum_limit, jnp.abs(h))
-    given = craft.wheel_works * jnp.clip(torque, -most, most)
-    return jnp.clip(h - dt_s * given, -room, room)
+    room = jnp.maximum(craft.wheel_momentum_limit, jnp.abs(wheel_h))
+    return jnp.clip(wheel_h - dt_s * wheels_give(craft, wheel_torque), -room, room)
 
 
 def _turned(g: u.Three, v: u.Three, sign: float) -> u.Three:
