@@ -1,31 +1,32 @@
-"""Systems: one problem each, with model, scenarios, filters and claims; here is the registry."""
+"""Systems: one problem each, with model, scenarios, filters and claims; here is the registry.
 
-from robins.systems import airship, ins_gnss, marg, rocket, satellite, transfer_alignment
-from robins.systems.system import (
-    Case,
-    Contender,
-    Limit,
-    Outcome,
-    Output,
-    Problem,
-    Progress,
-    SensorAxes,
-    StateBlock,
-    Study,
-    System,
-)
+Names are imported when they are asked for: who needs the model of one system alone, such as a
+process of the test bench, does not wait for all of them.
+"""
 
-SYSTEMS: dict[str, System] = {
-    s.name: s
-    for s in (
-        ins_gnss.SYSTEM,
-        transfer_alignment.SYSTEM,
-        airship.SYSTEM,
-        rocket.SYSTEM,
-        satellite.SYSTEM,
-        marg.SYSTEM,
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from robins.systems.system import (
+        Case,
+        Contender,
+        Limit,
+        Outcome,
+        Output,
+        Problem,
+        Progress,
+        SensorAxes,
+        StateBlock,
+        Study,
+        System,
     )
-}
+
+    SYSTEMS: dict[str, System]
+
+_PACKAGES = ("ins_gnss", "transfer_alignment", "airship", "rocket", "satellite", "marg")
 
 __all__ = [
     "SYSTEMS",
@@ -41,3 +42,15 @@ __all__ = [
     "Study",
     "System",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "SYSTEMS":
+        every = (importlib.import_module(f"{__name__}.{package}").SYSTEM for package in _PACKAGES)
+        found: Any = {system.name: system for system in every}
+    else:
+        found = getattr(importlib.import_module(f"{__name__}.system"), name)
+    globals()[name] = found
+    return found

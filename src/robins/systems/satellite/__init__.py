@@ -2,27 +2,22 @@
 
 After the patent of a mixed H2/H-infinity filter and its test platform: that filter in the readings
 that can work, what it is compared with, and what should be used instead.
+
+`SYSTEM` is made when it is asked for: the processes of the test bench need the model alone, and
+start much sooner without the campaign's packages.
 """
 
-from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from robins.systems.satellite.claims import CLAIMS
-from robins.systems.satellite.filters import FILTERS
-from robins.systems.satellite.parameters import AttitudeLoop
-from robins.systems.satellite.problem import attitude_problem
-from robins.systems.system import Study, System
-
-_HERE = Path(__file__).parent / "scenarios"
-_SCENARIOS = (
-    *("s1", "s2", "s3", "s4", "stars"),
-    *("star-stuck", "star-wrong", "star-lost", "star-sign", "wheel-lost"),
-)
-
-SYSTEM = System(
-    name="satellite",
-    summary="a satellite's attitude in closed loop: gyro, star sensor, mixed H2/H-infinity",
-    studies={"attitude-loop": Study(AttitudeLoop, attitude_problem, FILTERS, CLAIMS)},
-    scenarios={name: _HERE / f"{name}.toml" for name in _SCENARIOS},
-)
+if TYPE_CHECKING:
+    from robins.systems.satellite.system import SYSTEM
 
 __all__ = ["SYSTEM"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "SYSTEM":
+        from robins.systems.satellite.system import SYSTEM
+
+        return SYSTEM
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,9 +15,10 @@ from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.systems.satellite import design, model
-from robins.systems.satellite.course import Course, Lens
+from robins.systems.satellite.course import Course
+from robins.systems.satellite.driven import Lens
 from robins.systems.satellite.filters import KINDS, Kind, make_filter
-from robins.systems.satellite.nodes import STAR, Given, Row, begin, react
+from robins.systems.satellite.nodes import STAR, Given, Row, Vehicle, begin, react
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import World
 from robins.systems.system import Case, Contender
@@ -41,6 +42,22 @@ class Numbers(NamedTuple):
     lens: Lens | None
 
 
+def surroundings(n: Numbers, world: World) -> tuple[Given, Row, Vehicle]:
+    """The loop around a filter: its numbers, what drives it (E steps), and how it begins."""
+    given = Given(
+        n.craft,
+        n.control,
+        n.pinv,
+        n.step_s,
+        n.quantum_rad,
+        world.gyro_matrix,
+        world.star_key,
+        n.lens,
+    )
+    rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error)
+    return given, rows, begin(given, world.craft)
+
+
 def believed_walk(given: AttitudeLoop, kind: Kind) -> float:
     """Random walk of the gyro's rate that a filter believes in [rad/s/sqrt(s)]."""
     g = given.gyro
@@ -57,21 +74,11 @@ def _case(additive: bool, build: str):
     reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
 
     def case(n: Numbers, world: World) -> Case:
-        given = Given(
-            n.craft,
-            n.control,
-            n.pinv,
-            n.step_s,
-            n.quantum_rad,
-            world.gyro_matrix,
-            world.star_key,
-            n.lens,
-        )
-        rows = Row(n.course, world.gyro_angle, world.gyro_bias, world.star_error)
+        given, rows, vehicle = surroundings(n, world)
         start: Any = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
         if build.startswith("fixed"):
             start = with_gains(make_filter(build).init(start, _DIMS), {STAR: n.gain})
-        loop = Loop(Partial(reacts, given), begin(given, world.craft), rows, {STAR: n.due})
+        loop = Loop(Partial(reacts, given), vehicle, rows, {STAR: n.due})
         return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
 
     return case

@@ -14,25 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from robins.filters.synthesis import Design, Plant, current_form, kalman_design, observer, riccati
+from robins.systems.satellite.filters import Enters, Recipe
 from robins.systems.satellite.model import walk_covariance
 from robins.systems.satellite.parameters import AttitudeLoop
 
 _ARCSEC = math.pi / 648000.0
-Way = Literal["raw", "h2", "lmi", "riccati"]
-Enters = Literal["rate", "bias"]
-
-
-class Recipe(NamedTuple):
-    """How the gain of an axis is found."""
-
-    way: Way
-    share: float = 1.0  # gamma over the H-infinity norm that the Kalman filter of the axis has
-    enters: Enters = "rate"  # where n does
 
 
 class Believed(NamedTuple):

@@ -10,12 +10,23 @@ import numpy as np
 
 from robins.filters import Filter, kalman, taylor
 from robins.filters.rules import constant_gain, gate
-from robins.systems.satellite.design import Recipe
 from robins.systems.satellite.nodes import STAR
 
 GATE = 0.9999962  # chi-square of 3 at 27.9
 PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
+Way = Literal["raw", "h2", "lmi", "riccati"]
+Enters = Literal["rate", "bias"]
+
+
 Build = Literal["mekf", "quaternion", "gated", "fixed", "fixed-gated"]
+
+
+class Recipe(NamedTuple):
+    """How the gain of an axis is found."""
+
+    way: Way
+    share: float = 1.0  # gamma over the H-infinity norm that the Kalman filter of the axis has
+    enters: Enters = "rate"  # where n does
 
 
 class Kind(NamedTuple):

@@ -1,9 +1,10 @@
 """The parts of the loop, each a pure function of what reaches it.
 
-    belief, gyro --acm--> torque, dipole --plant--> attitude --gyro, star--> samples
+    belief, gyro --acm--> command --actuators--> torque, dipole --plant--> motion --gyro, star-->
 
 Each is what a process of the test bench runs, and `react` strings them together for a run inside
-one program.
+one program. There they are kept `apart`: XLA would else fuse the end of one with the beginning of
+the next, and round otherwise than it does in a process that runs one of them alone.
 """
 
 from __future__ import annotations
@@ -21,9 +22,17 @@ from robins.filters import Belief, Reading
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.sim.attitude_control import Controller, allocate_within, desaturation_dipole, torque
 from robins.sim.gyro import read_gyro
-from robins.sim.spacecraft import CraftState, Spacecraft, advance, rate_b, wheel_momentum_b
+from robins.sim.spacecraft import (
+    CraftState,
+    Spacecraft,
+    advance,
+    rate_b,
+    wheel_momentum_b,
+    wheels_after,
+    wheels_give,
+)
 from robins.sim.star_sensor import measure_attitude, read_star
-from robins.systems.satellite.course import Lens, Step
+from robins.systems.satellite.driven import Lens, Step
 
 STAR = "star"
 UNIT = 1e-3  # that the length of a quaternion may be off by
@@ -34,6 +43,14 @@ class Command(NamedTuple):
 
     wheel_torque: Array  # (W,) N m
     dipole_b: Array  # (3,) A m^2
+
+
+class Actuation(NamedTuple):
+    """What the actuators give."""
+
+    wheel_torque: Array  # (W,) N m
+    dipole_b: Array  # (3,) A m^2
+    wheel_h: Array  # (W,) N m s, momenta of the wheels after it, from their speeds
 
 
 class Given(NamedTuple):
@@ -63,6 +80,7 @@ class Frame(NamedTuple):
 
     q_ib: Array  # (4,); NaN without a frame
     factor: Array | None  # (3, 3) of its covariance [rad], body axes, where it says one
+    stars: Array | None  # () used, where it is a camera
     seen_q_ib: Array  # (4,) for the next time
 
 
@@ -95,13 +113,24 @@ def acm(given: Given, q_ib: Array, bias: Array, theta: Array, wheel_h: Array, ro
     return Command(wheels, dipole)
 
 
-def plant(given: Given, state: CraftState, command: Command, row: Step) -> CraftState:
+def actuators(given: Given, wheel_h: Array, command: Command, row: Step) -> Actuation:
+    """What wheels and magnetorquers can give of a command."""
+    craft = given.craft._replace(wheel_works=row.wheel_works)
+    limit = craft.dipole_limit_a_m2
+    return Actuation(
+        wheel_torque=wheels_give(craft, command.wheel_torque),
+        dipole_b=jnp.clip(command.dipole_b, -limit, limit),
+        wheel_h=wheels_after(craft, wheel_h, command.wheel_torque, given.step_s),
+    )
+
+
+def plant(given: Given, state: CraftState, given_by: Actuation, row: Step) -> CraftState:
     """The craft one step on."""
     return advance(
-        given.craft._replace(wheel_works=row.wheel_works),
+        given.craft,
         state,
-        command.wheel_torque,
-        command.dipole_b,
+        given_by.wheel_torque,
+        given_by.dipole_b,
         row.r_i_m,
         row.field_i_t,
         row.disturbance_b,
@@ -115,33 +144,38 @@ def gyro(given: Given, before: Array, after: Array, residue: Array, row: Row):
     return read_gyro(turned, row.gyro_angle, given.gyro_matrix, residue, given.quantum_rad)
 
 
+def expected(given: Given, q_ib: Array, bias: Array, theta: Array) -> Array:
+    """Attitude where a star camera looks for its stars, from what was believed a step before."""
+    return multiply(q_ib, from_rotvec(theta - given.step_s * bias))
+
+
 def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Row) -> Frame:
     """What the star sensor reports at the end of a step."""
     says = row.course.star
     if given.lens is None:
-        now, factor = read_star(q_ib, row.star_error), None
+        now, factor, stars = read_star(q_ib, row.star_error), None, None
     else:
         looks = partial(_looks, given.lens, given.star_key)
-        now, factor = jax.lax.cond(
+        now, factor, stars = jax.lax.cond(
             says.seen, looks, _shut, q_ib, expected_q_ib, row.star_error, row.course.number
         )
     now = multiply(now, from_rotvec(says.turn))
     now = jnp.where(says.seen & ~says.stuck, now, before)
-    return Frame(jnp.where(says.seen, says.factor * now, jnp.nan), factor, now)
+    return Frame(jnp.where(says.seen, says.factor * now, jnp.nan), factor, stars, now)
 
 
 def _looks(lens: Lens, star_key: Array, q_ib: Array, expected_q_ib: Array, error: Array, number):
-    """Attitude from an image, and the factor of its covariance; NaN where too few stars are."""
+    """Attitude from an image, the factor of its covariance, stars; NaN where these are too few."""
     key = jax.random.fold_in(star_key, number)
-    q, P, _ = measure_attitude(
+    q, P, stars = measure_attitude(
         key, lens.sky, q_ib, lens.camera, error, expected_q_ib, lens.match_rad
     )
     solved = jnp.all(jnp.isfinite(P))
-    return q, linalg.cholesky(jnp.where(solved, P, jnp.eye(3)))
+    return q, linalg.cholesky(jnp.where(solved, P, jnp.eye(3))), stars
 
 
 def _shut(q_ib: Array, expected_q_ib: Array, error: Array, number: Array):
-    return jnp.full(4, jnp.nan), jnp.eye(3)
+    return jnp.full(4, jnp.nan), jnp.eye(3), jnp.asarray(0)
 
 
 def believable(q_ib: Array) -> BodyRotation:
@@ -170,14 +204,21 @@ class Kind(NamedTuple):
     rows: Callable[[Array], Any]  # q_ib -> rows that are reported, or None
 
 
+def apart(node: Callable, *args: Any) -> Any:
+    """A node as if it were compiled alone, so that it gives the same bits as where it is."""
+    settled = jax.lax.optimization_barrier
+    return settled(node(*settled(args)))
+
+
 def react(kind: Kind, given: Given, v: Vehicle, belief: Belief, row: Row):
     """The loop one step on: control acts on what is believed, sensors see what comes of it."""
-    q, bias = kind.attitude(belief.mean), kind.bias(belief.mean)
-    command = acm(given, q, bias, v.theta, v.craft.wheel_h, row.course)
-    craft = plant(given, v.craft, command, row.course)
-    theta, residue = gyro(given, v.craft.q_ib, craft.q_ib, v.residue, row)
-    expected = multiply(q, from_rotvec(theta - given.step_s * bias))
-    frame = star(given, craft.q_ib, expected, v.star_q_ib, row)
+    q, bias = apart(kind.attitude, belief.mean), kind.bias(belief.mean)
+    command = apart(acm, given, q, bias, v.theta, v.craft.wheel_h, row.course)
+    acts = apart(actuators, given, v.craft.wheel_h, command, row.course)
+    craft = apart(plant, given, v.craft, acts, row.course)
+    theta, residue = apart(gyro, given, v.craft.q_ib, craft.q_ib, v.residue, row)
+    looks = apart(expected, given, q, bias, theta)
+    frame = apart(star, given, craft.q_ib, looks, v.star_q_ib, row)
     outputs = {
         "pointing": pointing_error(row.course.ref_end_q_ib, craft.q_ib),
         "wheel_momentum": craft.wheel_h,
