@@ -1,36 +1,18 @@
-"""The test bench: so far its wire, the frames in which its parts talk over serial lines.
+"""The test bench: a vehicle part by part, each a process or a board, each on a serial line.
 
-- `schema`: every message, field by field; encoder, decoder, documentation and C header follow it.
-- `records`: payloads, from values to bytes and back.
-- `frames`: header, CRC-32C and COBS around a payload.
-- `receiver`: frames out of a stream of bytes of which some are wrong.
-- `c_header`: the same for firmware.
+From the ground up:
 
-Needs the extra "bench".
+- `wire`: every message, field by field, and the frames that carry it; the same for firmware.
+- `ports`: serial devices, pseudo-terminals in their place, and a line that takes its time.
+- `parts`: what sits at the end of a line, and the seven parts of the satellite.
+- `broker`: the middle, which says what to whom; what goes wrong on purpose.
+- `recording`: what went over the lines, written down, heard again, compared.
+- `live`: a running bench in a browser.
+- `run`: what is asked for, doing it, what came of it. `status`: the benches of this machine.
+
+Needs the extra "bench"; the page needs "live".
 """
 
-from robins.bench.frames import Frame, FrameError, Header, decode_frame, encode_frame
-from robins.bench.receiver import Counts, Receiver, Sequence
-from robins.bench.records import RecordError, decode, encode, size_of
-from robins.bench.schema import MESSAGES, VERSION, Field, Message, markdown, message
+from robins.bench.wire import MESSAGES, PARTS, VERSION
 
-__all__ = [
-    "MESSAGES",
-    "VERSION",
-    "Counts",
-    "Field",
-    "Frame",
-    "FrameError",
-    "Header",
-    "Message",
-    "Receiver",
-    "RecordError",
-    "Sequence",
-    "decode",
-    "decode_frame",
-    "encode",
-    "encode_frame",
-    "markdown",
-    "message",
-    "size_of",
-]
+__all__ = ["MESSAGES", "PARTS", "VERSION"]

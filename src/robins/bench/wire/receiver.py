@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from robins.bench.frames import EDGE, LEAST, MOST_PAYLOAD, Frame, FrameError, decode_frame
+from robins.bench.wire.frames import EDGE, LEAST, MOST_PAYLOAD, Frame, FrameError, decode_frame
 
 # COBS adds a byte for each 254 and one more.
 LONGEST = LEAST + MOST_PAYLOAD + (LEAST + MOST_PAYLOAD) // 254 + 1
@@ -25,7 +25,7 @@ class Counts:
     @property
     def wrong(self) -> int:
         """Runs of bytes between zeros that are no frame."""
-        return sum(getattr(self, f.name) for f in fields(self)) - self.frames
+        return self.cobs + self.short + self.long + self.crc + self.version + self.header
 
 
 class Receiver:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import fastcrc
 from cobs import cobs
 
-from robins.bench.schema import VERSION
+from robins.bench.wire.schema import VERSION
 
 EDGE = b"\x00"
 _HEADER = struct.Struct("<BBIIQ")
@@ -26,7 +26,7 @@ MOST_PAYLOAD = 4096
 
 
 class FrameError(ValueError):
-    """Bytes that are no frame; `why` is one of the names of `robins.bench.receiver.Counts`."""
+    """Bytes that are no frame; `why` is one of the names of `robins.bench.wire.receiver.Counts`."""
 
     def __init__(self, why: str, text: str):
         super().__init__(text)
@@ -36,7 +36,7 @@ class FrameError(ValueError):
 class Header(NamedTuple):
     """What a frame says of itself."""
 
-    type: int  # number of the message, see `robins.bench.schema`
+    type: int  # number of the message, see `robins.bench.wire.schema`
     run: int  # of this run: a frame of an earlier one, left in a buffer, is told by it
     sequence: int  # of the link and direction, from 0, modulo 2^32
     time_ns: int  # of what the payload tells, since the start of the run

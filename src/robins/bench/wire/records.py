@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robins.bench.schema import SIZES, Message, message
+from robins.bench.wire.schema import SIZES, Field, message
 
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f64": "d"}
 
@@ -19,10 +19,6 @@ class RecordError(ValueError):
 
 
 @cache
-def _packer(name: str) -> struct.Struct:
-    return struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in message(name).fields))
-
-
 def size_of(name: str) -> int:
     """Bytes of a payload.
 
@@ -45,24 +41,29 @@ def encode(name: str, values: Mapping[str, Any]) -> bytes:
         RecordError: a field is missing, unknown, of another length, or beyond its type.
     """
     of = message(name)
-    fields = {f.name for f in of.fields}
-    if fields != set(values):
-        raise RecordError(f"message '{name}' has the fields {sorted(fields)}, got {sorted(values)}")
-    flat: list[Any] = []
-    for f in of.fields:
-        numbers = np.ravel(np.asarray(values[f.name]))
-        if len(numbers) != f.length:
-            raise RecordError(f"{name}.{f.name} has {f.length} numbers, got {len(numbers)}")
-        if f.kind != "f64":
-            if numbers.dtype.kind not in "iub":
-                raise RecordError(f"{name}.{f.name} is {f.kind}: whole numbers are wanted")
-            flat += [int(x) for x in numbers]
-        else:
-            flat += [float(x) for x in numbers]
+    if len(values) != len(of.fields) or not all(f.name in values for f in of.fields):
+        fields = sorted(f.name for f in of.fields)
+        raise RecordError(f"message '{name}' has the fields {fields}, got {sorted(values)}")
+    return b"".join([_field(name, f, values[f.name]) for f in of.fields])
+
+
+def _field(name: str, f: Field, value: Any) -> bytes:
+    """The bytes of a field."""
+    if f.kind == "f64":
+        numbers = np.asarray(value, "<f8")
+        if numbers.size != f.length:
+            raise RecordError(f"{name}.{f.name} has {f.length} numbers, got {numbers.size}")
+        return numbers.tobytes()
+    whole = [value] if isinstance(value, int) else np.ravel(np.asarray(value)).tolist()
+    if len(whole) != f.length:
+        raise RecordError(f"{name}.{f.name} has {f.length} numbers, got {len(whole)}")
     try:
-        return _packer(name).pack(*flat)
-    except struct.error as error:
-        raise RecordError(f"message '{name}': {error}") from None
+        return struct.pack(f"<{f.length}{_CODES[f.kind]}", *whole)
+    except struct.error:
+        raise RecordError(
+            f"message '{name}': {name}.{f.name} is {f.kind}: whole numbers are wanted, as large as "
+            f"{256 ** SIZES[f.kind] - 1} at most, got {value}"
+        ) from None
 
 
 def decode(name: str, payload: bytes) -> dict[str, Any]:
@@ -75,14 +76,13 @@ def decode(name: str, payload: bytes) -> dict[str, Any]:
     of = message(name)
     if len(payload) != size_of(name):
         raise RecordError(f"message '{name}' has {size_of(name)} bytes, got {len(payload)}")
-    return _named(of, _packer(name).unpack(payload))
-
-
-def _named(of: Message, flat: tuple[Any, ...]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     at = 0
     for f in of.fields:
-        some = flat[at : at + f.length]
-        out[f.name] = some[0] if f.length == 1 else np.array(some)
-        at += f.length
+        if f.kind == "f64" and f.length > 1:
+            out[f.name] = np.frombuffer(payload, "<f8", f.length, at).copy()
+        else:
+            some = struct.unpack_from(f"<{f.length}{_CODES[f.kind]}", payload, at)
+            out[f.name] = some[0] if f.length == 1 else np.array(some)
+        at += f.length * SIZES[f.kind]
     return out

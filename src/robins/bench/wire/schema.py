@@ -39,7 +39,20 @@ def _f64(name: str, length: int, unit: str, text: str) -> Field:
     return Field(name, "f64", length, unit, text)
 
 
+PARTS = ("bench", "plant", "table", "gyro", "star", "adm", "acm", "actuators")
+"""Who talks; the place in this table is the number of a part."""
+
 _QUATERNION = "body to inertial, scalar first"
+FLAGS = (
+    "star used",
+    "star refused",
+    "gyro held",
+    "safe: do not steer by this",
+    "star silent",
+    "star of a length other than one",
+)
+"""Bits of `estimate.flags`, from the lowest."""
+_FLAGS = ", ".join(f"bit {k}: {text}" for k, text in enumerate(FLAGS))
 _ACTUATORS = (
     _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
     _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
@@ -72,6 +85,12 @@ MESSAGES: tuple[Message, ...] = (
     ),
     Message(4, "stop", "The run is over.", ()),
     Message(
+        5,
+        "begin",
+        "The bench answers a hello. All that follow have the number of the run in this header.",
+        (Field("step", "u64", 1, "ns", "length of a step"),),
+    ),
+    Message(
         16,
         "motion",
         "The craft as it truly is, from the plant to the rate table.",
@@ -99,7 +118,7 @@ MESSAGES: tuple[Message, ...] = (
         (
             _f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved"),
             _f64("factor", 9, "rad", "L of its covariance L L', body axes, by rows; 0: unknown"),
-            Field("stars", "u16", 1, "1", "used"),
+            Field("stars", "u16", 1, "1", "used; 0: not told"),
         ),
     ),
     Message(
@@ -110,7 +129,7 @@ MESSAGES: tuple[Message, ...] = (
             _f64("q_ib", 4, "1", _QUATERNION),
             _f64("gyro_bias", 3, "rad/s", "reported less true rate"),
             _f64("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes"),
-            Field("flags", "u8", 1, "1", "bit 0: star used, bit 1: star refused, bit 2: gyro held"),
+            Field("flags", "u8", 1, "1", _FLAGS),
         ),
     ),
     Message(
@@ -131,8 +150,23 @@ MESSAGES: tuple[Message, ...] = (
         "Momenta of the wheels, from their speeds.",
         (_f64("momentum", WHEELS, "N m s", "along each wheel's axis"),),
     ),
+    Message(
+        24,
+        "innovation",
+        "What the filter made of a frame of the star sensor, for who watches.",
+        (
+            _f64("innovation", 3, "rad", "measured less expected, body axes"),
+            _f64("sigma", 3, "rad", "stated"),
+            _f64("ratio", 1, "1", "squared and normalised, over its limit; above 1: refused"),
+        ),
+    ),
 )
 """All of them, by number."""
+
+FIRST_DATA = 16
+"""Messages of a lower number are of the protocol, the others carry data."""
+NUMBERS = {m.name: m.number for m in MESSAGES}
+NAMES = {m.number: m.name for m in MESSAGES}
 
 _BY_NAME = {m.name: m for m in MESSAGES}
 _BY_NUMBER = {m.number: m for m in MESSAGES}
