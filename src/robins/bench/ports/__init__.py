@@ -1,0 +1,21 @@
+"""Serial ports, and what takes their place where there is no hardware.
+
+- `port`: what people write for one; a real one opened; a pseudo-terminal. `listing`: what there is.
+- `line`: bytes that get through at the baud rate. `cable`: two paths, joined; also a program.
+"""
+
+from robins.bench.ports.line import Line
+from robins.bench.ports.listing import PortInfo, list_ports
+from robins.bench.ports.port import Address, Pair, PortError, address, open_pair, open_port
+
+__all__ = [
+    "Address",
+    "Line",
+    "Pair",
+    "PortError",
+    "PortInfo",
+    "address",
+    "list_ports",
+    "open_pair",
+    "open_port",
+]

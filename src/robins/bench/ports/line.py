@@ -1,0 +1,103 @@
+"""A serial line that takes its time: bytes get through at the baud rate, each at its instant.
+
+A pseudo-terminal hands bytes over at once, whatever its baud rate. A line between two of them
+makes them as late as on a wire: a byte is through a byte's time after the one before it, or after
+it was sent, whichever is later. The arithmetic is in whole numbers, of nanoseconds times baud, so
+nothing adds up over days.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+_SECOND_NS = 1_000_000_000
+BITS_PER_BYTE = 10  # a start bit, eight, a stop bit
+
+
+class Line:
+    """One direction of a serial line.
+
+    It holds at most ``most`` bytes; what is sent beyond is dropped, the newest first, as by a
+    transmitter whose buffer is full. A frame that was cut so is told by its check.
+
+    Attributes:
+        dropped: bytes so far that found no room.
+    """
+
+    def __init__(self, baud: int, bits_per_byte: int = BITS_PER_BYTE, most: int = 65536) -> None:
+        """Set up an empty line.
+
+        Args:
+            baud: bits a second.
+            bits_per_byte: 10 for eight bits without parity and one stop bit.
+            most: bytes it may hold.
+
+        Raises:
+            ValueError: a number below one.
+        """
+        for name, number in (("baud", baud), ("bits_per_byte", bits_per_byte), ("most", most)):
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1, got {number}")
+        self.dropped = 0
+        self._baud = baud
+        self._most = most
+        self._byte = bits_per_byte * _SECOND_NS  # time of one byte, in ns times baud
+        self._backlog = 0
+        # bursts without a pause: when the first byte left begins [ns times baud], what is left
+        self._bursts: deque[tuple[int, bytes]] = deque()
+        self._free = 0  # when the last byte is through; times begin at 0
+
+    def send(self, data: bytes, now_ns: int) -> None:
+        """Put bytes on the line; they begin now, or when those before them are through."""
+        room = self._most - self._backlog
+        self.dropped += max(0, len(data) - room)
+        if kept := bytes(data[:room]):
+            begin = max(now_ns * self._baud, self._free)
+            self._bursts.append((begin, kept))
+            self._free = begin + len(kept) * self._byte
+            self._backlog += len(kept)
+
+    def take(self, now_ns: int) -> bytes:
+        """The bytes that are through by now and were not taken before."""
+        now = now_ns * self._baud
+        out: list[bytes] = []
+        while self._bursts:
+            begin, left = self._bursts[0]
+            through = (now - begin) // self._byte
+            if through < 1:
+                break
+            self._bursts.popleft()
+            out.append(left[:through])
+            if through < len(left):
+                self._bursts.appendleft((begin + through * self._byte, left[through:]))
+                break
+        taken = b"".join(out)
+        self._backlog -= len(taken)
+        return taken
+
+    @property
+    def next_ns(self) -> int | None:
+        """When the next byte is through; None: the line is empty."""
+        if not self._bursts:
+            return None
+        return -(-(self._bursts[0][0] + self._byte) // self._baud)
+
+    @property
+    def backlog(self) -> int:
+        """Bytes sent and not taken yet."""
+        return self._backlog
+
+
+def load(
+    bytes_count: float | int, seconds: float | int, baud: int, bits_per_byte: int = BITS_PER_BYTE
+) -> float:
+    """Share of what a line can carry that so many bytes in so many seconds are.
+
+    Above 1 the backlog grows for ever.
+
+    Raises:
+        ValueError: no time, or no baud.
+    """
+    if not (seconds > 0.0 and baud > 0):
+        raise ValueError(f"seconds and baud must be above 0, got {seconds} and {baud}")
+    return bytes_count * bits_per_byte / (seconds * baud)

@@ -1,0 +1,179 @@
+"""Serial ports: what people write for one, a real one opened, a pseudo-terminal in its place.
+
+A link of the bench has two ends. Without hardware both are those of a pseudo-terminal: the bench
+holds the master, the part opens the path of the slave like any serial port. With hardware the part
+is a board, and the bench opens the device itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+import termios
+import tty
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import serial
+from serial.tools import list_ports
+
+BAUD = 460800
+
+
+class PortError(ValueError):
+    """A port that cannot be had; says which, why, and what to do."""
+
+
+class PortLostError(ConnectionError):
+    """The far end of an open port is gone: pulled out, switched off, or its program ended."""
+
+
+class Address(NamedTuple):
+    """Where a port is and how fast it is."""
+
+    path: str
+    baud: int = BAUD  # pseudo-terminals take any and heed none
+
+
+def address(text: str) -> Address:
+    """An address as people write it: ``/dev/ttyUSB0,460800``, or ``/dev/ttyUSB0`` for 460800 baud.
+
+    Raises:
+        PortError: the speed is no number, or the path is none, is no port, or may not be opened.
+    """
+    path, comma, speed = text.strip().rpartition(",")
+    if not comma:
+        path, speed = speed, str(BAUD)
+    path, speed = path.strip(), speed.strip()
+    if not (speed.isascii() and speed.isdigit() and int(speed) > 0):
+        raise PortError(f"port '{text}': '{speed}' is no speed in baud; write {path},{BAUD}")
+    if why := obstacle(path):
+        raise PortError(f"port '{path}': {why}")
+    return Address(path, int(speed))
+
+
+def obstacle(path: str) -> str:
+    """Why we may not open a path as a serial port, with what to do about it; empty if we may."""
+    try:
+        kind = os.stat(path).st_mode
+    except OSError:
+        there = ", ".join(sorted(p.device for p in list_ports.comports())) or "none"
+        return f"there is no such path; serial ports of this machine: {there}"
+    if not stat.S_ISCHR(kind):
+        return "it is no character device; a serial port is one such as /dev/ttyUSB0"
+    if not os.access(path, os.R_OK | os.W_OK):
+        return (
+            f"no permission to read and write it; it belongs to the group '{_group(path)}': "
+            f"add yourself (sudo usermod -aG {_group(path)} $USER) and log in anew"
+        )
+    return ""
+
+
+def _group(path: str) -> str:
+    import grp  # Unix only, and needed for a hint only
+
+    try:
+        return grp.getgrgid(os.stat(path).st_gid).gr_name
+    except (KeyError, OSError):
+        return "dialout"
+
+
+def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
+    """Open a port: raw, 8 data bits, no parity, one stop bit, no flow control, ours alone.
+
+    What came in before is thrown away. Writing waits until the driver has taken all; who must not
+    wait writes to ``fileno()``, which is non-blocking.
+
+    Args:
+        at: the port.
+        timeout_s: that a read waits at most; 0: not at all, None: until something comes.
+
+    Raises:
+        PortError: it cannot be opened, is in use by another program, or cannot be so fast.
+    """
+    if why := obstacle(at.path):
+        raise PortError(f"port '{at.path}': {why}")
+    try:
+        port = serial.Serial(at.path, at.baud, timeout=timeout_s, exclusive=True)
+    except (OSError, ValueError, termios.error) as error:
+        if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):
+            raise PortError(
+                f"port '{at.path}' is in use by another program; end it first "
+                f"(fuser -v {at.path} names it)"
+            ) from None
+        raise PortError(f"port '{at.path}' at {at.baud} baud: {error}") from None
+    # USB adapters gather bytes for up to 16 ms unless asked not to; ports that gather nothing
+    # refuse to be asked.
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        port.set_low_latency_mode(True)
+    return port
+
+
+def receive(port: serial.Serial) -> bytes:
+    """All that has come in; waits for a first byte as long as the port's timeout says.
+
+    Raises:
+        PortLostError: the far end is gone.
+    """
+    try:
+        return port.read(max(1, port.in_waiting))
+    except (OSError, termios.error) as error:
+        raise PortLostError(f"port '{port.port}': the far end is gone ({error})") from None
+
+
+def send(port: serial.Serial, data: bytes) -> None:
+    """Write all of it.
+
+    Raises:
+        PortLostError: the far end is gone.
+    """
+    try:
+        port.write(data)
+    except (OSError, termios.error) as error:
+        raise PortLostError(f"port '{port.port}': the far end is gone ({error})") from None
+
+
+@dataclass
+class Pair:
+    """Two ends of a pseudo-terminal, as a cable between bench and part; closes as a context.
+
+    Attributes:
+        master: the bench's end, a file descriptor: raw, non-blocking.
+        slave: the part's end, held open here too, so that the master stays usable while no part has
+            it open, as a cable does without a board.
+        path: by which a part opens its end.
+    """
+
+    master: int
+    slave: int
+    path: str
+
+    def close(self) -> None:
+        """Close both ends; a part that has its end open is told by an error. May be repeated."""
+        for end in (self.master, self.slave):
+            if end >= 0:
+                os.close(end)
+        self.master = self.slave = -1
+
+    def __enter__(self) -> Pair:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_pair() -> Pair:
+    """A pseudo-terminal that carries any byte unchanged both ways, with or without a part on it.
+
+    Raises:
+        PortError: the system gives no more of them.
+    """
+    try:
+        master, slave = os.openpty()
+    except OSError as error:
+        raise PortError(f"no pseudo-terminal to be had: {error}") from None
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    return Pair(master, slave, os.ttyname(slave))
