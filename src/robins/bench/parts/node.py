@@ -1,0 +1,58 @@
+"""A part of the vehicle as a process of its own, which knows nothing but its port.
+
+python -m robins.bench.parts.node gyro /dev/pts/5,460800 kit.pickle
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from robins.bench.parts.satellite import BUILD
+from robins.bench.parts.station import ready, serve
+from robins.bench.ports.port import PortError, address, open_port
+
+REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: ask for SCHED_FIFO
+_PRIORITY = 50
+RARELY = 100_000  # allocations between two collections of garbage
+
+
+def be_realtime() -> str:
+    """Ask for a real-time scheduler; says why it was refused, or nothing."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    except (AttributeError, OSError) as error:
+        return f"no real-time scheduler: {error}"
+    return ""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Be a part until the bench says stop, or is gone."""
+    name, port, kit_path = arguments
+    # An interrupt of the terminal is for the bench, which then tells its parts.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    kit = pickle.loads(Path(kit_path).read_bytes())
+    part = ready(BUILD[name](kit), kit.frames)
+    if os.environ.get(REALTIME) and (why := be_realtime()):
+        print(why, file=sys.stderr)
+    gc.collect()
+    gc.freeze()  # all that was imported and compiled stays, and need not be looked at again
+    gc.set_threshold(RARELY)
+    try:
+        with open_port(address(port), timeout_s=None) as line:
+            serve(line, part)
+    except OSError:  # of which pyserial's are
+        return 0  # the bench is gone, and so are we
+    except PortError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,194 @@
+"""The computers on board: attitude determination by any filter of the family, and control.
+
+What they do when a sensor fails: the star sensor may be silent for as long as it likes, then the
+attitude is that of the gyro alone. A gyro's sample stands for one period more. After that nobody
+knows how the craft turns: the estimate says "safe: do not steer by this", control lets wheels and
+magnetorquers rest, and when the gyro is back the filter begins anew from the next star frame.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins.bench.parts.satellite.kit import Kit
+from robins.bench.parts.satellite.vehicle import Held, padded, renew, rest, trusted
+from robins.bench.parts.station import Inputs, Part
+from robins.bench.wire.schema import FLAGS
+from robins.filters import Belief, Code, OnlineFilter, StepInfo
+from robins.filters.chi_square import chi_square
+from robins.filters.kalman import FilterState
+from robins.rotation import normalise
+from robins.systems.satellite import nodes
+from robins.systems.satellite.filters import GATE, make_filter
+from robins.systems.satellite.model import start
+from robins.systems.satellite.nodes import STAR
+
+USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
+SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
+_LIMIT = float(chi_square(GATE, 3))
+
+_acm = jax.jit(nodes.acm)
+_believable = jax.jit(nodes.believable)
+
+
+def sample_of(gyro: Any) -> np.ndarray | None:
+    """The turn that a gyro reports; None if it did not come, or not of all axes."""
+    if gyro is None or not np.all(np.isfinite(gyro["theta_b"])):
+        return None
+    return gyro["theta_b"]
+
+
+class Determined(NamedTuple):
+    """State of the attitude determination."""
+
+    filter: FilterState
+    gyro: Held
+    since_star: int = 0  # steps
+    lost: bool = False  # waits for a star frame to begin anew
+
+
+def adm(kit: Kit) -> Part:
+    """Attitude determination: predicts with the gyro, updates with the star sensor."""
+    kind, additive = kit.kind, kit.build == "quaternion"
+    online = OnlineFilter(kit.filter, kit.model, kit.start)
+    first = online.state
+    period = int(np.max(np.diff(np.flatnonzero(kit.due)), initial=1))
+
+    attitude = jax.jit(kind.attitude)
+
+    @jax.jit
+    def report(belief: Belief):
+        q = nodes.apart(kind.attitude, belief.mean)  # as in `nodes.react`
+        rows = kind.rows(q)
+        factor = belief.factor if rows is None else rows @ belief.factor
+        return q, kind.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
+
+    # A filter that refuses a frame does not say how far off it is; one without rules does.
+    plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
+
+    @jax.jit
+    def judge(belief: Belief, y: Any, factor: Any) -> StepInfo:
+        return plain.update(plain.init(belief, kit.model.dims), sensor, y, factor)[1]
+
+    @jax.jit
+    def fresh(q_ib: Any, bias: Any, state: FilterState) -> FilterState:
+        q = normalise(q_ib)
+        believed = start(q, kit.attitude_rad, 0.0, additive)
+        old = state.belief
+        mean = kind.state(q, bias)
+        block = believed.factor.shape[-1] - 3
+        factor = believed.factor.at[block:, :].set(old.factor[block:, :])
+        return state._replace(belief=Belief(mean, factor))
+
+    def act(state: Determined, k: int, inputs: Inputs):
+        frame = inputs["star"]
+        gyro = renew(state.gyro, sample_of(inputs["gyro"]))
+        flags = 0 if gyro.age == 0 else HELD
+        online.state, lost = state.filter, state.lost or not trusted(gyro)
+        if not lost:
+            online.predict(gyro.values)
+        said, heard = [], False
+        if frame is not None:
+            y = _believable(frame["q_ib"])
+            heard = bool(np.isfinite(np.asarray(y.wxyz)[0]))
+            if not heard and np.all(np.isfinite(frame["q_ib"])):
+                flags |= SHORT
+            if lost and heard and trusted(gyro):
+                online.state, lost = (
+                    fresh(frame["q_ib"], kind.bias(online.belief.mean), first),
+                    False,
+                )
+                flags |= USED
+            elif not lost:
+                factor = _factor(kit, frame)
+                if heard:
+                    said.append(("innovation", _innovation(judge(online.belief, y, factor))))
+                code = Code(int(online.update(y, STAR, factor).code))
+                flags |= USED * (code is Code.DONE) | REFUSED * (code is Code.REFUSED)
+        since = 0 if heard else state.since_star + 1
+        flags |= SILENT * (since > SILENT_PERIODS * period) | SAFE * lost
+        q, bias, sigma = (np.asarray(x) for x in report(online.belief))
+        said.append(
+            (
+                "estimate",
+                {
+                    "q_ib": q,
+                    "gyro_bias": bias,
+                    "sigma": np.full(6, np.nan) if lost else sigma,
+                    "flags": flags,
+                },
+            )
+        )
+        return Determined(online.state, gyro, since, lost), said
+
+    # The rate before the first sample is that which the gyro reported last.
+    begin = Determined(first, Held(np.asarray(kit.vehicle.theta)))
+    example = {
+        "gyro": {"theta_b": np.asarray(kit.vehicle.theta)},
+        "star": {"q_ib": np.asarray(attitude(first.belief.mean)), "factor": np.ravel(np.eye(3))},
+    }
+    return Part("adm", {"gyro": 0, "star": 0}, lambda: begin, act, example)
+
+
+def _factor(kit: Kit, frame: Any) -> Any:
+    """Factor of the covariance of a frame, where frames bring theirs."""
+    return None if kit.given.lens is None else frame["factor"].reshape(3, 3)
+
+
+def _innovation(info: StepInfo) -> dict[str, Any]:
+    ratio = float(info.nis) / _LIMIT
+    return {
+        "innovation": np.asarray(info.innovation),
+        "sigma": np.asarray(info.sigma),
+        "ratio": ratio if math.isfinite(ratio) else np.nan,
+    }
+
+
+class Steered(NamedTuple):
+    """State of the attitude control: what it heard last."""
+
+    estimate: Held  # q_ib, bias, whether it may be steered by
+    theta: Held
+    wheel_h: Any
+
+
+def acm(kit: Kit) -> Part:
+    """Attitude control: a torque of the wheels, a dipole of the magnetorquers."""
+    vehicle = kit.vehicle
+    wheels = len(vehicle.craft.wheel_h)
+    mean = kit.belief.mean
+    q0 = np.asarray(jax.jit(kit.kind.attitude)(mean))
+    known = (q0, np.asarray(kit.kind.bias(mean)), True)
+    begin = Steered(Held(known), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
+
+    def act(state: Steered, k: int, inputs: Inputs):
+        estimate, gyro, speeds = inputs["estimate"], inputs["gyro"], inputs["wheels"]
+        if k > 0:  # before the first step nobody has said anything
+            told = estimate and (
+                estimate["q_ib"],
+                estimate["gyro_bias"],
+                not estimate["flags"] & SAFE,
+            )
+            state = Steered(
+                renew(state.estimate, told),
+                renew(state.theta, sample_of(gyro)),
+                state.wheel_h if speeds is None else speeds["momentum"][:wheels],
+            )
+        q, bias, steered = state.estimate.values
+        if not (steered and trusted(state.estimate) and trusted(state.theta)):
+            return state, [("command", rest())]
+        course = kit.row(k).course
+        command = _acm(kit.given, q, bias, state.theta.values, state.wheel_h, course)
+        torque = padded(np.asarray(command.wheel_torque))
+        return state, [
+            ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})
+        ]
+
+    takes = {"estimate": 1, "gyro": 1, "wheels": 1}
+    example = {"estimate": None, "gyro": None, "wheels": None}
+    return Part("acm", takes, lambda: begin, act, example)

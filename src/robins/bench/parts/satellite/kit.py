@@ -1,0 +1,64 @@
+"""What the parts of the satellite are given before a run: numbers only, so that they can travel.
+
+The bench computes it once, and hands each process a copy; a part started by hand on another
+machine computes the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins import _float64  # noqa: F401
+from robins.filters import Belief, Filter, Model
+from robins.filters.kalman import FilterState
+from robins.sim.rate_table import RateTable
+from robins.systems.satellite.filters import Build, make_filter
+from robins.systems.satellite.model import ADDITIVE, MULTIPLICATIVE
+from robins.systems.satellite.nodes import Given, Kind, Row, Vehicle
+
+
+class Kit(NamedTuple):
+    """A run of the satellite, to the last number; E steps."""
+
+    step_ns: int
+    due: np.ndarray  # (E,) bool, whether a step ends with a star frame
+    given: Given
+    rows: Row  # leading axis E, NumPy
+    vehicle: Vehicle  # before the first step
+    build: Build
+    model: Model
+    start: Belief | FilterState
+    attitude_rad: float  # believed of an attitude from a single star frame
+    table: RateTable | None  # None: it goes with the craft exactly
+
+    @property
+    def filter(self) -> Filter:
+        """The filter of the attitude determination."""
+        return make_filter(self.build)
+
+    @property
+    def belief(self) -> Belief:
+        """What the filter believes before the first step."""
+        return self.start.belief if isinstance(self.start, FilterState) else self.start
+
+    @property
+    def kind(self) -> Kind:
+        """How its state is read."""
+        return ADDITIVE if self.build == "quaternion" else MULTIPLICATIVE
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """A step without a star frame, if there is one, and one with."""
+        return int(np.argmin(self.due)), int(np.argmax(self.due))
+
+    def row(self, step: int) -> Row:
+        """What drives a step; zeros beyond the last, so that a part may be asked for more."""
+        return jax.tree_util.tree_map(lambda x: x[min(step, len(self.due) - 1)], self.rows)
+
+
+def as_numpy(tree: Any) -> Any:
+    """Arrays that were computed, on the host."""
+    return jax.tree_util.tree_map(np.asarray, tree)

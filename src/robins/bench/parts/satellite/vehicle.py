@@ -1,0 +1,137 @@
+"""The vehicle: its dynamics, the rate table that plays them to the gyro, its actuators."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins.bench.parts.satellite.kit import Kit
+from robins.bench.parts.station import Inputs, Part
+from robins.bench.wire.schema import WHEELS
+from robins.rotation import conjugate, multiply, to_rotvec
+from robins.sim.rate_table import RateTable, TableState, step
+from robins.sim.spacecraft import CraftState, rate_b
+from robins.systems.satellite import nodes
+from robins.systems.satellite.nodes import Actuation, Command
+
+HELD = 1  # steps for which what came last stands for what did not come
+
+_plant = jax.jit(nodes.plant)
+_rate = jax.jit(rate_b)
+_actuators = jax.jit(nodes.actuators)
+
+
+class Held(NamedTuple):
+    """What came last, and for how many steps nothing has come since."""
+
+    values: Any
+    age: int = 0
+
+
+def renew(held: Held, came: Any) -> Held:
+    """What is to be acted on in this step; `trusted` says for how long."""
+    return Held(held.values, held.age + 1) if came is None else Held(came, 0)
+
+
+def trusted(held: Held) -> bool:
+    """Whether what came last still stands."""
+    return held.age <= HELD
+
+
+def padded(torque: Any) -> np.ndarray:
+    """Numbers of each wheel, as the wire has them."""
+    out = np.zeros(WHEELS)
+    out[: len(torque)] = torque
+    return out
+
+
+def rest() -> dict[str, np.ndarray]:
+    """A command, or what comes of it, that does nothing."""
+    return {"wheel_torque": np.zeros(WHEELS), "dipole_b": np.zeros(3)}
+
+
+def _acts(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
+    """What acts in this step: torques and dipole that came, or came last, or none."""
+    held = renew(held, came)
+    use = held.values if trusted(held) else rest()
+    return held, use["wheel_torque"][:wheels], use["dipole_b"]
+
+
+def plant(kit: Kit) -> Part:
+    """Dynamics and kinematics of the craft; without actuation nothing acts on it."""
+    wheels = len(kit.vehicle.craft.wheel_h)
+
+    def begin() -> tuple[CraftState, Held]:
+        return kit.vehicle.craft, Held(rest())
+
+    def act(state: tuple[CraftState, Held], k: int, inputs: Inputs):
+        craft, held = state
+        held, torque, dipole = _acts(held, inputs["actuation"], wheels)
+        acts = Actuation(torque, dipole, craft.wheel_h)
+        craft = _plant(kit.given, craft, acts, kit.row(k).course)
+        omega = _rate(kit.given.craft, craft)
+        return (craft, held), [
+            ("motion", {"q_ib": np.asarray(craft.q_ib), "omega_b": np.asarray(omega)})
+        ]
+
+    return Part("plant", {"actuation": 0}, begin, act, {"actuation": rest()})
+
+
+@jax.jit
+def _follow(given: RateTable, state: TableState, q_ib: Any, omega_b: Any, dt_s: Any):
+    # The rate to be where the craft is at the end of the step.
+    wanted = to_rotvec(multiply(conjugate(state.q_ib), q_ib)) / dt_s
+    return step(given, state, wanted, dt_s)
+
+
+def table(kit: Kit) -> Part:
+    """The rate table: it turns its sensors as the craft turns, exactly or a little late."""
+    first = np.asarray(kit.vehicle.craft.q_ib)
+    rate = rate_b(kit.given.craft, kit.vehicle.craft)
+    dt = jnp.asarray(kit.step_ns * 1e-9)
+
+    def begin() -> TableState:
+        return TableState(jnp.asarray(first), rate)
+
+    def act(state: TableState, k: int, inputs: Inputs):
+        motion = inputs["motion"]
+        if motion is None:  # it stays in the rate that it has
+            return _moved(state, state.rate_b)
+        if kit.table is None:
+            state = TableState(motion["q_ib"], motion["omega_b"])
+            return state, [("mounted", {"q_ib": motion["q_ib"]})]
+        state, q = _follow(kit.table, state, motion["q_ib"], motion["omega_b"], dt)
+        return state, [("mounted", {"q_ib": np.asarray(q)})]
+
+    def _moved(state: TableState, rate_b: Any):
+        ideal = RateTable(*(jnp.full(3, x) for x in (1e-9, jnp.inf, jnp.inf)))
+        state, q = step(kit.table or ideal, state, jnp.asarray(rate_b), dt)
+        return state, [("mounted", {"q_ib": np.asarray(q)})]
+
+    example = {"motion": {"q_ib": first, "omega_b": np.asarray(rate)}}
+    return Part("table", {"motion": 0}, begin, act, example)
+
+
+def actuators(kit: Kit) -> Part:
+    """Wheels and magnetorquers; a command stands for a step longer, then they give nothing."""
+    wheels = len(kit.vehicle.craft.wheel_h)
+
+    def begin() -> tuple[Any, Held]:
+        return kit.vehicle.craft.wheel_h, Held(rest())
+
+    def act(state: tuple[Any, Held], k: int, inputs: Inputs):
+        wheel_h, held = state
+        held, torque, dipole = _acts(held, inputs["command"], wheels)
+        command = Command(torque, dipole)
+        acts = _actuators(kit.given, wheel_h, command, kit.row(k).course)
+        given = {
+            "wheel_torque": padded(np.asarray(acts.wheel_torque)),
+            "dipole_b": np.asarray(acts.dipole_b),
+        }
+        speeds = {"momentum": padded(np.asarray(acts.wheel_h))}
+        return (acts.wheel_h, held), [("actuation", given), ("wheels", speeds)]
+
+    return Part("actuators", {"command": 0}, begin, act, {"command": rest()})

@@ -1,0 +1,198 @@
+"""One end of a link, where a part of the vehicle sits: takes bytes, computes at a tick, answers.
+
+A part is a function from what has reached it to what it sends; what the wire does to frames, and
+the order in which they come, is settled here. Firmware does the same, see `bench/wire/firmware`.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from robins.bench.wire.c_header import schema_number
+from robins.bench.wire.frames import Frame, Header, encode_frame
+from robins.bench.wire.receiver import Receiver, Sequence
+from robins.bench.wire.records import RecordError, decode, encode, size_of
+from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS, PARTS
+
+HELLO_EACH_S = 0.5
+_MOST = 65536  # bytes read at once
+
+Inputs = Mapping[str, Any]  # values by field, by message; None where it did not come
+Sent = Iterable[tuple[str, Mapping[str, Any]]]  # messages with their values
+
+
+class Part(NamedTuple):
+    """What a part does.
+
+    Attributes:
+        name: one of `PARTS`.
+        takes: messages it takes, with how many steps they are older than the tick: 0 or 1.
+        begin: () -> state before the first step.
+        act: (state, step, inputs) -> (state, sent), at a tick.
+        example: inputs as they will be, so that all can be compiled before the first tick.
+    """
+
+    name: str
+    takes: Mapping[str, int]
+    begin: Callable[[], Any]
+    act: Callable[[Any, int, Inputs], tuple[Any, Sent]]
+    example: Inputs = MappingProxyType({})
+
+
+class Station:
+    """The protocol of a part, without a port: bytes in, bytes out.
+
+    Attributes:
+        counts: frames that were not used, by why: "strange" (of another run or an unknown message),
+            "repeated", "late" (of a step that is over), "size".
+        over: whether the bench has said that the run is over.
+    """
+
+    def __init__(self, part: Part):
+        self.part = part
+        self.counts: Counter[str] = Counter()
+        self.over = False
+        self._receiver = Receiver()
+        self._run: int | None = None
+        self._step_ns = self._hellos = 0
+        self._reset()
+
+    @property
+    def begun(self) -> bool:
+        """Whether the bench has answered."""
+        return self._run is not None
+
+    def hello(self) -> bytes:
+        """What it says until the bench answers; numbered, so that a part that was started anew is
+        told from one whose hello was on its way when the bench answered.
+        """
+        said = {"part": PARTS.index(self.part.name), "schema": schema_number()}
+        header = Header(NUMBERS["hello"], 0, self._hellos, 0)
+        self._hellos += 1
+        return encode_frame(header, encode("hello", said))
+
+    def feed(self, data: bytes) -> bytes:
+        """Take bytes; the bytes to answer with."""
+        answer = b""
+        for frame in self._receiver.feed(data):
+            answer += self._take(frame)
+        return answer
+
+    def _reset(self) -> None:
+        self._sequence, self._sent = Sequence(), 0
+        self._state = self.part.begin()
+        self._inbox: dict[tuple[str, int], bytes] = {}
+        self._done: tuple[int, int, list[tuple[str, bytes]]] | None = None  # step, time, answer
+
+    def _take(self, frame: Frame) -> bytes:
+        head = frame.header
+        name = NAMES.get(head.type)
+        if name is not None and head.type < FIRST_DATA and len(frame.payload) != size_of(name):
+            self.counts["size"] += 1
+            return b""
+        if name == "begin":
+            if head.run != self._run:
+                self._reset()
+                self._run, self.over = head.run, False
+            self._step_ns = decode("begin", frame.payload)["step"]
+            return b""
+        if head.run != self._run or name is None:
+            self.counts["strange"] += 1
+            return b""
+        fresh = self._sequence.take(head.sequence)
+        if name == "tick":
+            return self._tick(decode("tick", frame.payload)["step"], head.time_ns)
+        if name == "stop":
+            self.over = True
+        elif name not in self.part.takes:
+            self.counts["strange"] += 1
+        elif not fresh:
+            self.counts["repeated"] += 1
+        elif self._done and head.time_ns + self.part.takes[name] * self._step_ns <= self._done[1]:
+            self.counts["late"] += 1  # it was computed without
+        else:
+            self._inbox[name, head.time_ns] = frame.payload
+        return b""
+
+    def _tick(self, step: int, time_ns: int) -> bytes:
+        if self._done and step < self._done[0]:
+            self.counts["late"] += 1
+            return b""
+        if not self._done or step > self._done[0]:
+            self._compute(step, time_ns)
+        assert self._done is not None
+        return b"".join(self._frame(name, payload, time_ns) for name, payload in self._done[2])
+
+    def _compute(self, step: int, time_ns: int) -> None:
+        began = time.perf_counter_ns()
+        inputs = {name: self._input(name, time_ns) for name in self.part.takes}
+        oldest = time_ns - self._step_ns
+        self._inbox = {k: v for k, v in self._inbox.items() if k[1] > oldest}
+        self._state, sent = self.part.act(self._state, step, inputs)
+        answer = [(name, encode(name, values)) for name, values in sent]
+        took = min(time.perf_counter_ns() - began, 2**32 - 1)
+        answer.append(("done", encode("done", {"step": step, "compute": took})))
+        self._done = step, time_ns, answer
+
+    def _input(self, name: str, time_ns: int) -> dict[str, Any] | None:
+        payload = self._inbox.get((name, time_ns - self.part.takes[name] * self._step_ns))
+        if payload is None:
+            return None
+        try:
+            return decode(name, payload)
+        except RecordError:
+            self.counts["size"] += 1
+            return None
+
+    def _frame(self, name: str, payload: bytes, time_ns: int) -> bytes:
+        assert self._run is not None
+        header = Header(NUMBERS[name], self._run, self._sent, time_ns)
+        self._sent = (self._sent + 1) % 2**32
+        return encode_frame(header, payload)
+
+
+def ready(part: Part, steps: Iterable[int]) -> Part:
+    """The part, with all that it will run compiled, before the clock of a run starts.
+
+    Args:
+        part: any.
+        steps: one of each kind that it computes otherwise.
+    """
+    for step in steps:
+        part.act(part.begin(), step, part.example)
+    return part
+
+
+def serve(port: Any, part: Part) -> Counter[str]:
+    """Be a part at a port until the bench says stop.
+
+    Args:
+        port: an open `serial.Serial`.
+        part: what to be.
+
+    Returns:
+        What was not used, see `Station.counts`.
+
+    Raises:
+        OSError: the far end of the port is gone.
+    """
+    station, fd = Station(part), port.fileno()
+    said = 0.0
+    while not station.over:
+        if not station.begun and time.monotonic() - said >= HELLO_EACH_S:
+            port.write(station.hello())
+            said = time.monotonic()
+        # What is there, in one call: `port.read` asks the system thrice for it.
+        if select.select([fd], [], [], None if station.begun else HELLO_EACH_S)[0]:
+            data = os.read(fd, _MOST)
+            if not data:
+                raise ConnectionError(f"port '{port.port}': the far end is gone")
+            if answer := station.feed(data):
+                port.write(answer)
+    return station.counts
