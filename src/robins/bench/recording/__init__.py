@@ -1,0 +1,23 @@
+"""What went over the lines: written down, read, heard again by a part, compared.
+
+- `layout`: how entries lie in an MCAP file. `writer`, `reader`: to the disk and back.
+- `replay`: a part hears a record again. `differences`: two runs, field by field.
+"""
+
+from robins.bench.recording.differences import FieldDifference
+from robins.bench.recording.layout import Entry, Event, RecordingError
+from robins.bench.recording.reader import Record, read_record
+from robins.bench.recording.replay import Replayed, ReplayError
+from robins.bench.recording.writer import Recorder
+
+__all__ = [
+    "Entry",
+    "Event",
+    "FieldDifference",
+    "Record",
+    "Recorder",
+    "RecordingError",
+    "ReplayError",
+    "Replayed",
+    "read_record",
+]

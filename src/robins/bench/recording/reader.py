@@ -1,0 +1,239 @@
+"""Reads what was written down of a run, to the last frame that is whole."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, NamedTuple
+
+from mcap import records as mcap
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+
+from robins.bench.recording.layout import (
+    CHUNK,
+    ENCODING,
+    EVENTS,
+    MAGIC,
+    MESSAGE,
+    METADATA,
+    PROFILE,
+    RECORD,
+    Entry,
+    Event,
+    RecordingError,
+    check_of,
+)
+from robins.bench.wire.schema import VERSION
+
+LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage, and no memory is asked for it
+_ABOUT = {"wire", "header", "check"}
+_DIRECTIONS: dict[str, Literal["to", "from"]] = {"to": "to", "from": "from"}
+
+
+class Record(NamedTuple):
+    """What was written down."""
+
+    header: dict[str, Any]
+    entries: list[Entry]  # in the order in which they were written
+    events: list[Event]
+    whole: bool  # closed, and every check of the file holds
+    why: str  # it is not, or nothing
+
+
+class _Damage(Exception):
+    """Why the reading of a record ends before its end."""
+
+
+# what damaged bytes make of those who read them
+_UNREADABLE = (_Damage, EndOfFile, struct.error, ValueError, KeyError)
+
+
+def read_record(path: str | Path) -> Record:
+    """Read a record, or what is there of it.
+
+    A file that was cut, or of which a part is damaged, gives what comes before, and says so.
+
+    Raises:
+        RecordingError: there is no such file, it is no record of the bench, it is of another
+            version of the wire, or it ends before the header of the run is whole.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            reader = _Reader(file)
+            header = _header(str(path), reader)
+            try:
+                while reader.step():
+                    pass
+            except _Damage as damage:
+                return Record(header, reader.entries, reader.events, False, str(damage))
+            return Record(header, reader.entries, reader.events, True, "")
+    except OSError as error:
+        raise RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from None
+
+
+def _header(path: str, reader: _Reader) -> dict[str, Any]:
+    """The header of the run.
+
+    Raises:
+        RecordingError: it is not there.
+    """
+    if (magic := reader.take(len(MAGIC))) != MAGIC:
+        if MAGIC.startswith(magic):
+            raise RecordingError(f"'{path}' ends at byte {len(magic)}: nothing was recorded")
+        raise RecordingError(f"'{path}' is no MCAP file: give a record that the bench wrote")
+    try:
+        opcode, body = reader.record()
+        profile = mcap.Header.read(_stream(body)).profile if opcode == Opcode.HEADER else ""
+    except _UNREADABLE as error:
+        raise RecordingError(f"'{path}' {error}, before the header of the run") from None
+    if profile != PROFILE:
+        raise RecordingError(
+            f"'{path}' is an MCAP file of the profile '{profile}', not one that the bench wrote "
+            f"('{PROFILE}')"
+        )
+    try:
+        opcode, body = reader.record()
+        about = mcap.Metadata.read(_stream(body)) if opcode == Opcode.METADATA else None
+    except _UNREADABLE as error:
+        raise RecordingError(f"'{path}' {error}, within the header of the run") from None
+    if about is None or about.name != METADATA or set(about.metadata) != _ABOUT:
+        raise RecordingError(f"'{path}' is damaged: no header of the run where it should be")
+    wire, text = about.metadata["wire"], about.metadata["header"]
+    if check_of(wire + text) != about.metadata["check"]:
+        raise RecordingError(f"'{path}' is damaged: the header of the run fails its check")
+    if wire != str(VERSION):
+        raise RecordingError(
+            f"'{path}' has version {wire} of the wire, this is version {VERSION}: read it with the "
+            "robins that wrote it"
+        )
+    return json.loads(text)
+
+
+class _Reader:
+    """Goes through a file, record by record."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.entries: list[Entry] = []
+        self.events: list[Event] = []
+        self._file = file
+        self._at = self._check = self._before = 0
+        self._topics: dict[int, tuple[str, Literal["to", "from"]] | None] = {}  # None: events
+        self._count = 0  # messages so far, which have numbers
+
+    def take(self, size: int) -> bytes:
+        """So many bytes, or as many as there are."""
+        data = self._file.read(size)
+        self._at += len(data)
+        self._check = zlib.crc32(data, self._check)
+        return data
+
+    def record(self) -> tuple[int, bytes]:
+        """The next record.
+
+        Raises:
+            _Damage: there is none that is whole; the messages of half a chunk are taken.
+        """
+        at, self._before = self._at, self._check
+        head = self.take(RECORD.size)
+        opcode, size = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
+        if size > LONGEST:
+            raise _Damage(f"is damaged at byte {at}: a record of {size} bytes")
+        body = self.take(size)
+        if len(head) < RECORD.size or len(body) < size:
+            if opcode == Opcode.CHUNK:
+                self._chunk(at, head + body)
+            raise _Damage(f"ends at byte {self._at} without having been closed")
+        return opcode, body
+
+    def step(self) -> bool:
+        """Take the next record; whether there is more to come.
+
+        Raises:
+            _Damage: the file ends, or is damaged there.
+        """
+        at = self._at
+        opcode, body = self.record()
+        if opcode == Opcode.CHUNK:
+            self._chunk(at, RECORD.pack(opcode, len(body)) + body)
+        elif opcode == Opcode.DATA_END:
+            self._end(at, body)
+        elif opcode not in (Opcode.SCHEMA, Opcode.MESSAGE_INDEX):
+            raise _Damage(f"is damaged at byte {at}: a record of kind {opcode}")
+        return opcode != Opcode.DATA_END
+
+    def _chunk(self, at: int, data: bytes) -> None:
+        """The messages of a chunk whose end may be missing."""
+        if len(data) < CHUNK.size:
+            if at + len(data) == self._at and RECORD.unpack_from(data)[1] > len(data) - RECORD.size:
+                return
+            raise _Damage(f"is damaged at byte {at}: a chunk without a head")
+        _, size, _, _, plain, check, packed, inside = CHUNK.unpack_from(data)
+        if packed != 0 or plain != inside or CHUNK.size - RECORD.size + inside != size:
+            raise _Damage(f"is damaged at byte {at}: the sizes of a chunk do not agree")
+        body = data[CHUNK.size :]
+        if len(body) == inside and zlib.crc32(body) != check:
+            raise _Damage(f"is damaged between the bytes {at} and {at + len(data)}")
+        place = 0
+        while place + RECORD.size <= len(body):
+            opcode, length = RECORD.unpack_from(body, place)
+            end = place + RECORD.size + length
+            if end > len(body):
+                break
+            try:
+                self._inner(opcode, body[place:end])
+            except _UNREADABLE as error:
+                raise _Damage(f"is damaged at byte {at + CHUNK.size + place}: {error}") from None
+            place = end
+
+    def _inner(self, opcode: int, data: bytes) -> None:
+        """Take a record within a chunk."""
+        if opcode == Opcode.CHANNEL:
+            channel = mcap.Channel.read(_stream(data[RECORD.size :]))
+            self._topics[channel.id] = _place(channel)
+            return
+        if opcode != Opcode.MESSAGE:
+            raise _Damage(f"a record of kind {opcode}")
+        _, _, channel, number, log_ns, _ = MESSAGE.unpack_from(data)
+        if number != self._count & 0xFFFFFFFF:
+            raise _Damage(f"message {number} where number {self._count} should be")
+        place, content = self._topics[channel], data[MESSAGE.size :]
+        if place is None:
+            told = json.loads(content)
+            self.events.append(Event(log_ns, told["kind"], told["text"], told["fields"]))
+        else:
+            self.entries.append(Entry(log_ns, *place, content))
+        self._count += 1
+
+    def _end(self, at: int, body: bytes) -> None:
+        """The checks of all of the data and of the summary after it."""
+        if body != struct.pack("<I", self._before):
+            raise _Damage(f"is damaged before byte {at}: the check of all fails")
+        check, tail = 0, b""
+        while block := self._file.read(1 << 20):
+            data = tail + block
+            check = zlib.crc32(data[:-12], check)
+            tail = data[-12:]
+            self._at += len(block)
+        if tail[4:] != MAGIC:
+            raise _Damage(f"ends at byte {self._at} without having been closed")
+        if tail[:4] != struct.pack("<I", check):
+            raise _Damage(f"is damaged after byte {at}: the check of its summary fails")
+
+
+def _stream(body: bytes) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(body))
+
+
+def _place(channel: mcap.Channel) -> tuple[str, Literal["to", "from"]] | None:
+    """Link and direction of a topic; None: events."""
+    if channel.topic == EVENTS:
+        return None
+    empty, link, direction = channel.topic.split("/")
+    if empty or channel.message_encoding != f"{ENCODING}{VERSION}":
+        raise _Damage(f"topic '{channel.topic}' of messages '{channel.message_encoding}'")
+    return link, _DIRECTIONS[direction]
