@@ -1,0 +1,25 @@
+"""The middle of the bench: it holds the far ends of all lines and passes on what is said.
+
+- `broker`: who says what to whom, step by step. `link`: one far end; what is wrong with its frames.
+- `faults`: what may go wrong on purpose, as parameters; `injector` does it.
+- `revive`: a part that was started anew is told all again. `errors`: what ends a run.
+"""
+
+from robins.bench.broker.broker import Broker, Wiring
+from robins.bench.broker.errors import BenchError, LinkLost
+from robins.bench.broker.faults import ROUTES, LinkFault
+from robins.bench.broker.injector import Injector, Piece
+from robins.bench.broker.link import Health, Link
+
+__all__ = [
+    "ROUTES",
+    "BenchError",
+    "Broker",
+    "Health",
+    "Injector",
+    "Link",
+    "LinkFault",
+    "LinkLost",
+    "Piece",
+    "Wiring",
+]

@@ -1,0 +1,312 @@
+"""Passes messages between the parts, step by step, over the links whose far ends it holds.
+
+In each step it ticks a part as soon as all parts whose data of this step it needs are done, and the
+step is over when all are. Nothing here depends on how long anything took: that is the matter of the
+clock, which only says when a step begins and how long a part is waited for.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from robins.bench.broker.errors import BenchError, LinkLost
+from robins.bench.broker.injector import Injector
+from robins.bench.broker.link import Link
+from robins.bench.broker.revive import Told, beginning, catch_up
+from robins.bench.wire.c_header import schema_number
+from robins.bench.wire.frames import Frame
+from robins.bench.wire.records import decode, encode
+from robins.bench.wire.schema import PARTS
+
+Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
+Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
+_GLANCE_S = 0.05  # how often the world beside the wire is looked at while nothing comes
+_CLOCK_NS = time.monotonic_ns
+
+
+class Wiring(NamedTuple):
+    """Who says what to whom."""
+
+    sends: Sends
+    takes: Takes
+
+    def sources(self, part: str) -> frozenset[str]:
+        """Parts that must be done before this one may compute."""
+        wanted = {name for name, lag in self.takes[part].items() if lag == 0}
+        return frozenset(p for p, sent in self.sends.items() if wanted & set(sent))
+
+    def takers(self, message: str) -> tuple[str, ...]:
+        """Parts that take a message."""
+        return tuple(p for p, taken in self.takes.items() if message in taken)
+
+
+class Ticked(NamedTuple):
+    """A tick that has been sent."""
+
+    at_ns: int  # of the wall clock
+    last_ns: int  # when it was sent last
+
+
+class Broker:
+    """The middle of the star.
+
+    Attributes:
+        links: by part.
+        time_ns: of the run: the end of the step that is being computed.
+        heard: what was said last, by message: time of its header, payload.
+        silent: steps in which a part did not answer in time, by part.
+    """
+
+    def __init__(
+        self,
+        links: Mapping[str, Link],
+        wiring: Wiring,
+        step_ns: int,
+        injector: Injector,
+        observe: Callable[[str, int, bytes], None],
+        glance: Callable[[], None],
+        done: Callable[[str, int, int, int, int], None],
+        keep: frozenset[str] = frozenset(),
+    ):
+        """Take the links of a run.
+
+        Args:
+            links: by part.
+            wiring: who says what to whom.
+            step_ns: length of a step.
+            injector: the faults that the links have.
+            observe: told of each message that passes: name, time [ns], payload.
+            glance: called now and then while nothing comes, and once a step.
+            done: told of an answer: part, step, when ticked, when answered [ns of the wall clock],
+                time it computed [ns].
+            keep: parts of which all is kept that was sent to them, so that they can be started
+                anew.
+        """
+        self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
+        self.time_ns = 0
+        self.heard: dict[str, tuple[int, bytes]] = {}
+        self.silent = dict.fromkeys(links, 0)
+        self._run = 0
+        self._injector, self._observe = injector, observe
+        self._glance, self._tell = glance, done
+        self._sources = {p: wiring.sources(p) & set(links) for p in links}
+        self._takers = {
+            name: tuple(p for p in wiring.takers(name) if p in links)
+            for sent in wiring.sends.values()
+            for name in sent
+        }
+        self._sends = {p: frozenset(wiring.sends[p]) for p in links}
+        self._kept: dict[str, list[Told]] = {p: [] for p in keep}
+        self._routed: set[tuple[str, int]] = set()
+        self._ticked: dict[str, Ticked] = {}
+        self._done: set[str] = set()
+        self._by_fd = {link.fd: link for link in links.values()}
+        self._fds = list(self._by_fd)
+        self._slow = [link for link in links.values() if link.is_slow]
+        self._step = -1
+        self._glanced = 0.0
+
+    # ------------------------------------------------------------------------------- beginning
+
+    def gather(self, run: int, patience_s: float) -> None:
+        """Wait until every part has said hello, and let the run begin.
+
+        Raises:
+            BenchError: a part says nothing, or speaks another version of the wire.
+        """
+        self._run = run
+        for link in self.links.values():
+            link.restart(run)
+            link.greeted = False
+        until = time.monotonic() + patience_s
+        while waited := [n for n, link in self.links.items() if not link.greeted]:
+            if time.monotonic() > until:
+                raise BenchError(
+                    f"no hello from {', '.join(waited)} in {patience_s:g} s: is it connected, "
+                    "at this speed, and does it run? (`robins bench ports` lists the ports)"
+                )
+            self.poll(_GLANCE_S)
+
+    def _greet(self, name: str, frame: Frame) -> None:
+        link, said = self.links[name], decode("hello", frame.payload)
+        if said["schema"] != schema_number():
+            raise BenchError(
+                f"'{name}' speaks another version of the wire (schema {said['schema']:#010x}, "
+                f"here {schema_number():#010x}): build it with the header of this version"
+            )
+        if (number := said["part"]) != PARTS.index(name):
+            known = PARTS[number] if number < len(PARTS) else f"part {number}"
+            raise BenchError(f"at the port of '{name}' there is {known}: exchange the ports")
+        if link.greeted and self._step >= 0 and frame.header.sequence == 0:
+            link.restart(self._run)  # it has been started anew
+        link.greeted = True
+        self._put(link, "begin", encode("begin", {"step": self.step_ns}), 0)
+        link.flush(_CLOCK_NS())
+
+    # ----------------------------------------------------------------------------------- a step
+
+    def step(
+        self,
+        number: int,
+        patience_ns: int | None = None,
+        again_ns: int = 1_000_000_000,
+        most_ns: int = 30_000_000_000,
+    ) -> None:
+        """One step of all parts.
+
+        Args:
+            number: of the step, from 0.
+            patience_ns: how long a part is waited for before the step goes on without it; None: as
+                long as it takes, up to ``most_ns``.
+            again_ns: a tick that is not answered is sent again after this.
+            most_ns: after which a part that is there but does not answer fails the run.
+
+        Raises:
+            BenchError: a part does not answer.
+            LinkLost: the far end of a port is gone.
+        """
+        self._step, self.time_ns = number, (number + 1) * self.step_ns
+        self._done, self._ticked, self._routed = set(), {}, set()
+        self._glance()
+        for name, link in self.links.items():
+            link.release(self.time_ns)
+            self._take(name, link.held(self.time_ns))
+        self._advance()
+        while len(self._done) < len(self.links):
+            self.poll(_GLANCE_S if patience_ns is None else min(_GLANCE_S, patience_ns * 1e-9))
+            self._wait(patience_ns, again_ns, most_ns)
+
+    def _wait(self, patience_ns: int | None, again_ns: int, most_ns: int) -> None:
+        """Look after parts that have not answered yet."""
+        now = _CLOCK_NS()
+        for name, ticked in list(self._ticked.items()):
+            if name in self._done:
+                continue
+            if patience_ns is not None and now - ticked.at_ns > patience_ns:
+                self.silent[name] += 1
+                self._end(name)
+            elif now - ticked.at_ns > most_ns:
+                raise BenchError(
+                    f"'{name}' does not answer the tick of step {self._step} "
+                    f"(for {most_ns * 1e-9:g} s)"
+                )
+            elif now - ticked.last_ns > again_ns:
+                self._ticked[name] = ticked._replace(last_ns=now)
+                self._tick(name)
+
+    def _advance(self) -> None:
+        """Tick every part whose sources are done."""
+        for name, sources in self._sources.items():
+            if name not in self._ticked and sources <= self._done:
+                now = _CLOCK_NS()
+                self._ticked[name] = Ticked(now, now)
+                self._tick(name)
+
+    def _tick(self, name: str) -> None:
+        link = self.links[name]
+        self._put(link, "tick", self._step.to_bytes(4, "little"), self.time_ns)
+        self._flush(link)
+
+    def _end(self, name: str) -> None:
+        self._done.add(name)
+        self._advance()
+
+    def revive(self, name: str, patience_s: float) -> None:
+        """Bring a part that was started anew to where the old one was; the run waits.
+
+        Raises:
+            BenchError: it does not answer, or nothing was kept of what the old one was told.
+        """
+        link = self.links[name]
+        answered = self._step if name in self._done else self._step - 1
+        begin = beginning(self._run, self.step_ns)
+        catch_up(link, self._kept[name], begin, answered, patience_s, self._glance)
+
+    # ----------------------------------------------------------------------------------- the wire
+
+    def poll(self, timeout_s: float) -> None:
+        """Take what comes within a time, pass it on, write what waits; returns when something came.
+
+        Raises:
+            LinkLost: the far end of a port is gone.
+        """
+        by_fd, slow = self._by_fd, []
+        if self._slow:  # lines that take their time
+            due = [t for link in self._slow if (t := link.next_ns()) is not None]
+            slow = [link.fd for link in self._slow]
+            if due:
+                timeout_s = min(timeout_s, (min(due) - _CLOCK_NS()) * 1e-9)
+        waiting = [link.fd for link in by_fd.values() if link.pending]
+        ready, writable, _ = select.select(self._fds, waiting, [], max(0.0, timeout_s))
+        for fd in dict.fromkeys([*ready, *slow]) if slow else ready:
+            link = by_fd[fd]
+            try:
+                found = link.read(_CLOCK_NS(), self.time_ns)
+            except OSError as error:
+                raise LinkLost(link.name, f"the port of '{link.name}' is gone: {error}") from None
+            self._take(link.name, found)
+        for fd in dict.fromkeys([*writable, *slow]):
+            self._flush(by_fd[fd])
+        if time.monotonic() - self._glanced > _GLANCE_S:
+            self._glance()
+            self._glanced = time.monotonic()
+
+    def _take(self, name: str, found: list[tuple[str, Frame]]) -> None:
+        for message, frame in found:
+            if message == "hello":
+                self._greet(name, frame)
+            elif message == "done":
+                self._finished(name, frame)
+            elif message not in self._sends[name]:
+                self.links[name].health.strange += 1
+            elif frame.header.time_ns == self.time_ns and name in self._done:
+                self.links[name].health.late += 1  # those who need it have computed without it
+                self._route(message, frame)
+            elif (message, frame.header.time_ns) in self._routed:
+                self.links[name].health.repeated += 1
+            else:
+                self._route(message, frame)
+
+    def _finished(self, name: str, frame: Frame) -> None:
+        said = decode("done", frame.payload)
+        if said["step"] != self._step or name not in self._ticked or name in self._done:
+            return
+        at = self._ticked[name].at_ns
+        self._tell(name, self._step, at, _CLOCK_NS(), said["compute"])
+        self._end(name)
+
+    def _route(self, message: str, frame: Frame) -> None:
+        at, payload = frame.header.time_ns, frame.payload
+        self._routed.add((message, at))
+        self.heard[message] = at, payload
+        self._observe(message, at, payload)
+        for taker in self._takers[message]:
+            link = self.links[taker]
+            self._put(link, message, payload, at)
+            if taker in self._ticked:
+                self._flush(link)  # else it goes out with the tick
+
+    def _put(self, link: Link, name: str, payload: bytes, time_ns: int) -> None:
+        raw = link.send(name, payload, time_ns, self.time_ns)
+        if link.name in self._kept and name != "begin":
+            self._kept[link.name].append(Told(self._step if name == "tick" else None, raw))
+
+    def _flush(self, link: Link) -> None:
+        try:
+            link.flush(_CLOCK_NS())
+        except OSError as error:
+            raise LinkLost(link.name, f"the port of '{link.name}' is gone: {error}") from None
+
+    # ------------------------------------------------------------------------------------- the end
+
+    def stop(self) -> None:
+        """Tell every part that the run is over."""
+        for link in self.links.values():
+            try:
+                self._put(link, "stop", b"", self.time_ns)
+                link.flush(_CLOCK_NS())
+            except OSError:
+                continue  # it is gone already

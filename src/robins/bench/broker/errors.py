@@ -1,0 +1,15 @@
+"""What ends a run on the bench."""
+
+from __future__ import annotations
+
+
+class BenchError(RuntimeError):
+    """A run on the bench that cannot go on; says which part, when and why."""
+
+
+class LinkLost(BenchError):
+    """A port whose far end is gone."""
+
+    def __init__(self, part: str, text: str):
+        super().__init__(text)
+        self.part = part

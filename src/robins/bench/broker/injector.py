@@ -1,0 +1,292 @@
+"""What goes wrong on the links, on purpose, done at the bench.
+
+A fault of the line acts on bytes: bit errors (the check is then wrong), loss, duplication,
+disorder, delay, silence. A fault of a sensor or an actuator acts on what is said: the payload
+changes, and the frame is as sound as any. Those come first, as on the way of a frame.
+
+Random numbers are addressed, not drawn in a row (Salmon et al., "Parallel random numbers: as easy
+as 1, 2, 3", SC 2011: NumPy's Philox): by the seed, the number of the fault, link, direction, and
+the how-manieth frame it met there. So what happens depends on the frames and the clock of the run
+only, never on how fast it ran or which other faults there are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.bench.broker.faults import ROUTES, Direction, LinkFault
+from robins.bench.wire.frames import Frame, encode_frame
+from robins.bench.wire.records import decode, encode, size_of
+from robins.bench.wire.schema import FIRST_DATA, PARTS, message
+
+__all__ = ["ROUTES", "Direction", "Injector", "LinkFault", "Piece"]
+
+_SECOND_NS = 1_000_000_000
+_STAR = message("star").number
+_CHANCE, _BITS = 0, 1  # what noise is for
+_BLOCK = 256  # chances drawn at once
+_SAYS = ("turned", "stuck", "sign", "lost", "wheel")  # what is changed is what is said
+
+
+class Piece(NamedTuple):
+    """What goes on: bytes that the line damaged, as they are, or a frame that gets a new header."""
+
+    raw: bytes | None
+    frame: Frame | None
+
+
+class _Held(NamedTuple):
+    due_ns: float | int
+    piece: Piece
+    type: int
+    fault: int | None  # a reorder, which waits for the next frame of this type
+
+
+class _Fault(NamedTuple):
+    """A fault as frames meet it."""
+
+    number: int
+    begin_ns: int
+    end_ns: float | int
+    type: int | None  # of the message
+    is_: LinkFault
+
+    def meets(self, link: str, direction: str, kind: int, now_ns: int) -> bool:
+        return (
+            self.begin_ns <= now_ns < self.end_ns
+            and self.is_.link in (None, link)
+            and self.is_.direction == direction
+            and self.type in (None, kind)
+            and self.is_.kind != "killed"
+        )
+
+
+class Injector:
+    """Does what the faults say to the frames that pass.
+
+    Attributes:
+        counts: frames hit so far, by kind and link; parts for "killed".
+    """
+
+    def __init__(self, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
+        """Take the faults of a run.
+
+        Raises:
+            ValueError: a seed below 0 or of more than 64 bits.
+        """
+        if not 0 <= seed < 2**64:
+            raise ValueError(f"seed must be from 0 to 2^64 - 1, got {seed}")
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self._seed = seed
+        self._faults: list[_Fault] = []
+        self._added = 0
+        self._met: Counter[tuple[int, str, str]] = Counter()
+        self._chances: dict[tuple[int, str, str], np.ndarray] = {}
+        self._said: dict[tuple[str, str], bytes] = {}
+        self._held: dict[tuple[str, str], list[_Held]] = {}
+        self._killed: set[int] = set()
+        for fault in faults:
+            self.add(fault)
+
+    def add(self, fault: LinkFault) -> None:
+        """One more fault, after those there are; if its time has begun it acts from now on."""
+        kind = None if fault.message is None else message(fault.message).number
+        # a number is never used again, even when faults are cleared: each has its own noise
+        self._faults.append(_Fault(self._added, fault.begin_ns, fault.end_ns, kind, fault))
+        self._added += 1
+
+    def clear(self) -> None:
+        """No fault any more; frames that are held back are due now."""
+        self._faults.clear()
+        for held in self._held.values():
+            held[:] = [one._replace(due_ns=-math.inf, fault=None) for one in held]
+
+    def remove(self, fault: LinkFault) -> None:
+        """That fault no more; frames that it holds back come in their time."""
+        self._faults = [one for one in self._faults if one.is_ is not fault]
+
+    def active(self, now_ns: int) -> list[LinkFault]:
+        """The faults that are there at that time of the run."""
+        return [fault.is_ for fault in self._faults if fault.is_.holds(now_ns)]
+
+    def killed(self, now_ns: int) -> list[str]:
+        """Links whose part is to be killed by now; each fault says so once."""
+        found = []
+        for fault in self._faults:
+            link, due = fault.is_.link, fault.begin_ns <= now_ns
+            if fault.is_.kind == "killed" and link and due and fault.number not in self._killed:
+                self._killed.add(fault.number)
+                self.counts["killed", link] += 1
+                found.append(link)
+        return found
+
+    def pass_on(
+        self, link: str, direction: Direction, frame: Frame, raw: bytes, now_ns: int
+    ) -> list[Piece]:
+        """What becomes of a frame: one piece, or two; none if it is lost or held back.
+
+        Args:
+            link: part whose link it is.
+            direction: from the part, or to it.
+            frame: as received, or as it would be sent.
+            raw: its bytes, zeros at both ends included.
+            now_ns: time of the run, that of the end of the step.
+        """
+        kind = frame.header.type
+        if kind < FIRST_DATA:
+            return [Piece(None, frame)]
+        where = link, direction
+        met = [one for one in self._faults if one.meets(link, direction, kind, now_ns)]
+        if met or kind == _STAR:
+            payload = self._say(where, kind, frame.payload, met, now_ns)
+            if payload is not frame.payload:
+                frame = frame._replace(payload=payload)
+                raw = encode_frame(*frame)
+        pieces = [Piece(None, frame)]
+        for one in met:
+            if pieces and one.is_.kind not in _SAYS:
+                pieces = self._spoil(where, kind, one, pieces, raw, now_ns)
+        if pieces and where in self._held:
+            pieces += self._overtaken(where, kind)
+        return pieces
+
+    def release(self, link: str, direction: Direction, now_ns: int) -> list[Piece]:
+        """Frames that were held back and are due, the earliest first."""
+        held = self._held.get((link, direction))
+        if not held:
+            return []
+        due = sorted((one for one in held if one.due_ns <= now_ns), key=lambda one: one.due_ns)
+        held[:] = [one for one in held if one.due_ns > now_ns]
+        return [one.piece for one in due]
+
+    def _hit(self, where: tuple[str, str], one: _Fault) -> int | None:
+        """Number of a frame among those that a fault met there; None: it is spared."""
+        stream = one.number, *where
+        count = self._met[stream]
+        self._met[stream] += 1
+        if one.is_.share < 1.0:
+            if count % _BLOCK == 0:
+                self._chances[stream] = self._noise(where, one, count, _CHANCE).random(_BLOCK)
+            if self._chances[stream][count % _BLOCK] >= one.is_.share:
+                return None
+        self.counts[one.is_.kind, where[0]] += 1
+        return count
+
+    def _noise(
+        self, where: tuple[str, str], one: _Fault, count: int, use: int
+    ) -> np.random.Generator:
+        """Random numbers of a fault, for a frame."""
+        place = 2 * PARTS.index(where[0]) + (where[1] == "to")
+        key = [self._seed, one.number * 2 * len(PARTS) + place]
+        return np.random.Generator(np.random.Philox(key=key, counter=[0, count, use, 0]))
+
+    # ---------------------------------------------------------------- what is said
+
+    def _say(
+        self, where: tuple[str, str], kind: int, payload: bytes, met: list[_Fault], now_ns: int
+    ) -> bytes:
+        """What a sensor or an actuator says, under the faults that it has.
+
+        The order is that of the loop in one program: a stuck sensor repeats a turned attitude, and
+        what it had lost it does not repeat.
+        """
+        if len(payload) != size_of(message(kind).name):
+            return payload  # no such message; who takes it will refuse it
+        hits = [
+            one.is_ for one in met if one.is_.kind in _SAYS and self._hit(where, one) is not None
+        ]
+        for fault in hits:
+            if fault.kind == "turned":
+                payload = _turned(payload, fault.angle)
+        if any(fault.kind == "stuck" for fault in hits):
+            payload = self._said.get(where, payload)
+        lost = any(fault.kind == "lost" for fault in hits)
+        if kind == _STAR and not lost and not _unsolved(payload):
+            self._said[where] = payload
+        for fault in hits:
+            if fault.kind == "sign" and (now_ns + 1) // _SECOND_NS % 2 == 1:
+                payload = _negative(payload)
+            elif fault.kind == "wheel" and fault.wheel is not None:
+                payload = _without_wheel(payload, fault.wheel)
+        return _blind(payload) if lost else payload
+
+    # ---------------------------------------------------------------- what the line does
+
+    def _spoil(
+        self,
+        where: tuple[str, str],
+        kind: int,
+        one: _Fault,
+        pieces: list[Piece],
+        raw: bytes,
+        now_ns: int,
+    ) -> list[Piece]:
+        """What a fault of the line leaves of the pieces of a frame."""
+        fault, held = one.is_, self._held.setdefault(where, [])
+        waits = any(h.fault == one.number and h.type == kind for h in held)
+        if fault.kind == "reorder" and waits:
+            return pieces  # the one that the frame before it waits for
+        count = self._hit(where, one)
+        if count is None:
+            return pieces
+        if fault.kind == "bit errors":
+            noise = self._noise(where, one, count, _BITS)
+            return [Piece(_inverted(p.raw or raw, fault.bits, noise), None) for p in pieces]
+        if fault.kind == "duplication":
+            return pieces * 2
+        if fault.kind == "delay" and fault.delay is not None:
+            due = now_ns + round(fault.delay * _SECOND_NS)
+            held += [_Held(due, piece, kind, None) for piece in pieces]
+        elif fault.kind == "reorder":
+            held += [_Held(one.end_ns, piece, kind, one.number) for piece in pieces]
+        return []  # held, or lost
+
+    def _overtaken(self, where: tuple[str, str], kind: int) -> list[Piece]:
+        """Frames that waited for one of this kind."""
+        held = self._held[where]
+        out = [one.piece for one in held if one.fault is not None and one.type == kind]
+        if out:
+            held[:] = [one for one in held if one.fault is None or one.type != kind]
+        return out
+
+
+def _inverted(raw: bytes, bits: int, noise: np.random.Generator) -> bytes:
+    """With so many bits the other way, no two the same."""
+    out = bytearray(raw)
+    for k in noise.choice(8 * len(raw), min(bits, 8 * len(raw)), replace=False):
+        out[k // 8] ^= 1 << int(k % 8)
+    return bytes(out)
+
+
+def _star(payload: bytes, q_ib: np.ndarray, **other: object) -> bytes:
+    return encode("star", decode("star", payload) | {"q_ib": q_ib} | other)
+
+
+def _unsolved(payload: bytes) -> bool:
+    return bool(np.isnan(decode("star", payload)["q_ib"]).any())
+
+
+def _turned(payload: bytes, angle_rad: float) -> bytes:
+    """Times a turn about body z, by hand: a bench that compiles nothing starts at once."""
+    w, x, y, z = decode("star", payload)["q_ib"]
+    c, s = math.cos(0.5 * angle_rad), math.sin(0.5 * angle_rad)
+    return _star(payload, np.array([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]))
+
+
+def _negative(payload: bytes) -> bytes:
+    return _star(payload, -decode("star", payload)["q_ib"])
+
+
+def _blind(payload: bytes) -> bytes:
+    return _star(payload, np.full(4, np.nan), factor=np.zeros(9), stars=0)
+
+
+def _without_wheel(payload: bytes, wheel: int) -> bytes:
+    values = decode("actuation", payload)
+    values["wheel_torque"][wheel] = 0.0
+    return encode("actuation", values)

@@ -1,0 +1,239 @@
+"""The bench's end of a link: frames out of bytes, bytes out of frames, and what is wrong with them.
+
+What leaves gets its header here, then what goes wrong on purpose happens to it, then the line
+takes its time. What arrives goes the same way back. So a fault of the line is seen by whoever
+counts frames at the other end, exactly as a real one. Who watches sees what a part said as it said
+it, and what a part heard as it heard it: then its record can be heard again.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from robins.bench.broker.injector import Injector, Piece
+from robins.bench.ports.line import Line
+from robins.bench.wire.frames import Frame, Header, encode_frame
+from robins.bench.wire.receiver import Receiver, Sequence
+from robins.bench.wire.records import size_of
+from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS
+
+Direction = Literal["to", "from"]
+_MOST = 65536  # bytes read at once
+
+Watcher = Callable[[str, Direction, bytes, int], None]
+"""Who is told of all that goes over a link, as it was on the line: link, direction, the bytes of a
+whole frame or bytes that are none, time [ns]."""
+
+
+@dataclass
+class Health:
+    """What a link has carried so far, towards the bench."""
+
+    frames: int = 0  # data frames, sound and new
+    wrong: int = 0  # runs of bytes that are no frame
+    lost: int = 0  # sequence numbers that never came
+    repeated: int = 0
+    late: int = 0  # out of order, or of a step that was over
+    strange: int = 0  # of another run, or a message that this part has not to send
+    bytes_in: int = 0
+    bytes_out: int = 0
+    heard_ns: int = 0  # time of the run when data came last
+
+
+class Link:
+    """The far end of the port of a part.
+
+    Attributes:
+        name: of the part.
+        health: see `Health`.
+        greeted: whether the part has said hello, in this run.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        fd: int,
+        injector: Injector,
+        watch: Watcher,
+        baud: int | None = None,
+    ):
+        """Take over an open port.
+
+        Args:
+            name: of the part.
+            fd: non-blocking file descriptor, of a pseudo-terminal or a real port.
+            injector: what goes wrong on purpose.
+            watch: told of everything on the line.
+            baud: of the virtual line; None: bytes get through at once, or the line is real.
+        """
+        self.name, self.fd = name, fd
+        self.health = Health()
+        self.greeted = False
+        self._injector, self._watch = injector, watch
+        self._lines = None if baud is None else (Line(baud), Line(baud))
+        self._run = 0
+        self._out, self._ready = bytearray(), bytearray()  # for the line, and through it
+        self.restart(0)
+
+    def restart(self, run: int) -> None:
+        """Both directions begin anew, for a run or for a part that has been started anew."""
+        self._run, self._sent = run, 0
+        self._sequence = Sequence()
+        self._receiver, self._spoilt = Receiver(), Receiver()
+        self._before = replace(self.health)
+
+    # ------------------------------------------------------------------------------------- to
+
+    def send(self, name: str, payload: bytes, time_ns: int, now_ns: int) -> bytes:
+        """Put a message on the line, or what the faults leave of it; `flush` writes it.
+
+        Args:
+            name: of the message.
+            payload: its bytes.
+            time_ns: of its header.
+            now_ns: time of the run.
+
+        Returns:
+            The bytes that go out.
+        """
+        if name == "begin":  # said to each hello, always as number 0
+            number, self._sent = 0, max(self._sent, 1)
+        else:
+            number, self._sent = self._sent, (self._sent + 1) % 2**32
+        header = Header(NUMBERS[name], self._run, number, time_ns)
+        frame = Frame(header, payload)
+        raw = encode_frame(header, payload)
+        if header.type < FIRST_DATA:
+            return self._put(raw, time_ns)
+        return self._pass(self._injector.pass_on(self.name, "to", frame, raw, now_ns), time_ns)
+
+    def release(self, now_ns: int) -> bytes:
+        """Put on the line what a fault held back until now."""
+        return self._pass(self._injector.release(self.name, "to", now_ns), now_ns)
+
+    def _pass(self, pieces: list[Piece], time_ns: int) -> bytes:
+        out = b""
+        for piece in pieces:
+            raw = encode_frame(*piece.frame) if piece.frame is not None else piece.raw
+            out += self._put(raw or b"", time_ns)
+        return out
+
+    def _put(self, raw: bytes, time_ns: int) -> bytes:
+        self._watch(self.name, "to", raw, time_ns)
+        self._out += raw
+        return raw
+
+    def flush(self, wall_ns: int) -> None:
+        """Write what can be written now.
+
+        Raises:
+            OSError: the far end is gone.
+        """
+        if self._lines is None:
+            self._ready += self._out
+        else:
+            self._lines[0].send(bytes(self._out), wall_ns)
+            self._ready += self._lines[0].take(wall_ns)
+        self._out.clear()
+        while self._ready:
+            try:
+                written = os.write(self.fd, self._ready)
+            except BlockingIOError:
+                return  # the port is full; what is left goes first next time
+            self.health.bytes_out += written
+            del self._ready[:written]
+
+    @property
+    def pending(self) -> bool:
+        """Whether bytes wait for the port."""
+        return bool(self._out or self._ready)
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether it has a virtual line, which takes its time."""
+        return self._lines is not None
+
+    def next_ns(self) -> int | None:
+        """When the line will have carried another byte, on the clock that `flush` is given."""
+        if self._lines is None:
+            return None
+        times = [t for line in self._lines if (t := line.next_ns) is not None]
+        return min(times, default=None)
+
+    # ----------------------------------------------------------------------------------- from
+
+    def read(self, wall_ns: int, now_ns: int) -> list[tuple[str, Frame]]:
+        """Frames that have come, by name of their message; of data only what may be used.
+
+        Raises:
+            OSError: the far end is gone.
+        """
+        try:
+            data = os.read(self.fd, _MOST)
+            if not data:
+                raise OSError(f"the port of '{self.name}' was closed")
+        except BlockingIOError:
+            data = b""
+        if self._lines is not None:
+            self._lines[1].send(data, wall_ns)
+            data = self._lines[1].take(wall_ns)
+        self.health.bytes_in += len(data)
+        found: list[tuple[str, Frame]] = []
+        for frame in self._receiver.feed(data):
+            if frame.header.type < FIRST_DATA:
+                self._control(frame, found)
+            elif frame.header.run != self._run:
+                self.health.strange += 1
+            else:
+                raw = encode_frame(*frame)
+                self._watch(self.name, "from", raw, frame.header.time_ns)
+                pieces = self._injector.pass_on(self.name, "from", frame, raw, now_ns)
+                self._arrive(pieces, found, now_ns)
+        self._count()
+        return found
+
+    def held(self, now_ns: int) -> list[tuple[str, Frame]]:
+        """Frames from the part that a fault held back until now."""
+        found: list[tuple[str, Frame]] = []
+        self._arrive(self._injector.release(self.name, "from", now_ns), found, now_ns)
+        return found
+
+    def _control(self, frame: Frame, found: list[tuple[str, Frame]]) -> None:
+        name = NAMES.get(frame.header.type)
+        if name is not None and len(frame.payload) != size_of(name):
+            self.health.strange += 1
+        elif name == "hello":
+            self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
+            found.append((name, frame))
+        elif name == "done" and frame.header.run == self._run:
+            self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
+            self._sequence.take(frame.header.sequence)
+            found.append((name, frame))
+        else:
+            self.health.strange += 1
+
+    def _arrive(self, pieces: list[Piece], found: list[tuple[str, Frame]], now_ns: int) -> None:
+        for piece in pieces:
+            frames = self._spoilt.feed(piece.raw or b"") if piece.frame is None else [piece.frame]
+            for frame in frames:
+                self._use(frame, found, now_ns)
+
+    def _use(self, frame: Frame, found: list[tuple[str, Frame]], now_ns: int) -> None:
+        name = NAMES.get(frame.header.type)
+        if name is None:
+            self.health.strange += 1
+        elif self._sequence.take(frame.header.sequence):
+            self.health.frames += 1
+            self.health.heard_ns = now_ns
+            found.append((name, frame))
+
+    def _count(self) -> None:
+        health, before, sequence = self.health, self._before, self._sequence
+        wrong = self._receiver.counts.wrong + self._spoilt.counts.wrong
+        health.wrong = before.wrong + wrong
+        health.lost = before.lost + sequence.lost
+        health.repeated = before.repeated + sequence.repeated
+        health.late = before.late + sequence.late

@@ -1,0 +1,99 @@
+"""A part that died is started anew and told all that the old one was told.
+
+The same part with the same frames has the same state to the last bit, so a run goes on as if
+nothing had happened. It costs the time to compute all steps so far, less than they took.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from robins.bench.broker.errors import BenchError
+from robins.bench.broker.link import Link
+from robins.bench.wire.frames import Header, encode_frame
+from robins.bench.wire.receiver import Receiver
+from robins.bench.wire.records import decode, encode
+from robins.bench.wire.schema import NUMBERS
+
+
+class Told(NamedTuple):
+    """Bytes that went out to a part."""
+
+    step: int | None  # of the tick that they are; None: other frames
+    raw: bytes
+
+
+def catch_up(
+    link: Link,
+    told: Sequence[Told],
+    begin: bytes,
+    answered: int,
+    patience_s: float,
+    glance: Callable[[], None],
+) -> None:
+    """Wait for the hello of a part that was started anew, and bring it to where the old one was.
+
+    Args:
+        link: its link; nothing else reads or writes it meanwhile.
+        told: all that was sent to the old one, in order.
+        begin: the frame that begins the run.
+        answered: the last step whose tick the old one answered; ticks beyond are sent, but their
+            answers are left to the broker. -1: none.
+        patience_s: for its hello, and for each answer.
+        glance: called now and then.
+
+    Raises:
+        BenchError: it does not answer.
+        OSError: the far end is gone.
+    """
+    talk = _Talk(link, patience_s, glance)
+    talk.until("hello", None)
+    talk.say(begin)
+    for one in told:
+        talk.say(one.raw)
+        if one.step is not None and one.step <= answered:
+            talk.until("done", one.step)
+
+
+def beginning(run: int, step_ns: int) -> bytes:
+    """The frame that begins a run."""
+    return encode_frame(Header(NUMBERS["begin"], run, 0, 0), encode("begin", {"step": step_ns}))
+
+
+class _Talk:
+    def __init__(self, link: Link, patience_s: float, glance: Callable[[], None]):
+        self._link, self._patience_s, self._glance = link, patience_s, glance
+        self._receiver = Receiver()
+        self._come: list[tuple[int, bytes]] = []
+
+    def say(self, raw: bytes) -> None:
+        while raw:
+            try:
+                raw = raw[os.write(self._link.fd, raw) :]
+            except BlockingIOError:
+                select.select([], [self._link.fd], [], 0.05)
+
+    def until(self, name: str, step: int | None) -> None:
+        """Read until a message has come, of a step if that is given."""
+        end = time.monotonic() + self._patience_s
+        while True:
+            while self._come:
+                number, payload = self._come.pop(0)
+                if number == NUMBERS[name] and (
+                    step is None or decode(name, payload)["step"] == step
+                ):
+                    return
+            if time.monotonic() > end:
+                what = name if step is None else f"answer to the tick of step {step}"
+                raise BenchError(
+                    f"'{self._link.name}' was started anew, but there is no {what} from it in "
+                    f"{self._patience_s:g} s"
+                )
+            self._glance()
+            if select.select([self._link.fd], [], [], 0.05)[0]:
+                for frame in self._receiver.feed(os.read(self._link.fd, 65536)):
+                    self._come.append((frame.header.type, frame.payload))
