@@ -22,6 +22,7 @@ from robins.report.bars import comparison
 from robins.report.curves import campaign, errors, estimates, height
 from robins.report.document import LIMIT, Origin, page
 from robins.report.embed import Drawn, draw
+from robins.report.lateness import lateness
 from robins.report.limits import within, worst_case
 from robins.report.maps import track
 from robins.report.numbers import verdict
@@ -94,6 +95,8 @@ def _drawings(
         drawings.append(lambda sensor=sensor: allan(ds, sensor))
     if "trade_off_h2" in ds:
         drawings.append(lambda: trade_off(ds))
+    if "lateness_steps" in ds:
+        drawings.append(lambda: lateness(ds))
     if "field_calibrated" in ds:
         drawings += [lambda: iron.planes(ds), lambda: iron.size(ds)]
     return drawings + last

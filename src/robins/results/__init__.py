@@ -77,6 +77,8 @@ time dimension serves whose coordinate is in seconds since the start (``time``, 
 ``allan_low_SENSOR, allan_high_SENSOR`` the same; confidence bounds
 ``allan_fit_SENSOR``                    the same; the fitted model
 ``allan_slope_SENSOR``                  (process, tau, axis_SENSOR) its parts, by name
+``lateness_steps``                      (bin) steps of a bench that began so late, one more than
+                                        ``lateness_edge`` (edge), microseconds
 ``trade_off_h2, trade_off_hinf``        (design, gamma) true norms of designs, NaN where there is
                                         none; the second with the attributes ``least``, the least
                                         norm, and ``least_of``, of what designs; also ``kalman_h2``

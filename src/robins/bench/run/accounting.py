@@ -1,0 +1,202 @@
+"""How late, how long: times of the parts and of whole cycles, over days in little memory.
+
+A histogram keeps each number to one part in 256 (the leading eight bits, as HdrHistogram by G. Tene
+does), so a run of any length needs a few thousand counters, and a number costs the same whenever
+it comes. The largest is kept as it is.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from typing import Any
+
+_BITS = 8  # kept of a number
+RECENT = 100  # cycles, for who watches
+EDGES_US = (1, 2, 5, 10, 20, 50, 100, 200, 500, *(k * 10**d for d in (3, 4, 5) for k in (1, 2, 5)))
+EDGES_US += (1_000_000,)
+"""Of the histogram of lateness; numbers below the first and from the last on are counted too."""
+_KINDS = ("lateness", "compute", "round_trip")
+
+
+class Histogram:
+    """Numbers of nanoseconds; a negative one counts as none.
+
+    Attributes:
+        count: of them.
+        most: the largest.
+    """
+
+    def __init__(self) -> None:
+        self.count = self.most = 0
+        self._cells: dict[int, int] = {}
+
+    def add(self, ns: int) -> None:
+        """One more."""
+        ns = max(ns, 0)
+        shift = max(ns.bit_length() - _BITS, 0)
+        cell = (shift << _BITS) + (ns >> shift)
+        self._cells[cell] = self._cells.get(cell, 0) + 1
+        self.count += 1
+        self.most = max(self.most, ns)
+
+    def quantile(self, share: float) -> float | None:
+        """The smallest number which so large a share do not exceed, to 0.4 %; None: there is none.
+
+        Args:
+            share: from 0 to 1.
+        """
+        wanted, passed = share * self.count, 0
+        for cell in sorted(self._cells):
+            passed += self._cells[cell]
+            if passed >= wanted:
+                shift = cell >> _BITS
+                low = (cell & (2**_BITS - 1)) << shift
+                return min(low + 0.5 * (2**shift - 1), float(self.most))
+        return None
+
+
+class _Times:
+    """The three times of a part or of a cycle: of all, and of the latest."""
+
+    def __init__(self) -> None:
+        self._all = {kind: Histogram() for kind in _KINDS}
+        self._latest = {kind: deque[int](maxlen=RECENT) for kind in _KINDS}
+
+    def add(self, kind: str, ns: int) -> None:
+        self._all[kind].add(ns)
+        self._latest[kind].append(max(ns, 0))
+
+    def summary(self) -> dict[str, dict[str, float | int | None]]:
+        return {f"{kind}_us": _quantiles(histogram) for kind, histogram in self._all.items()}
+
+    def recent(self) -> dict[str, dict[str, float | int | None]]:
+        out = {}
+        for kind, latest in self._latest.items():
+            histogram = Histogram()
+            for ns in latest:
+                histogram.add(ns)
+            out[f"{kind}_us"] = _quantiles(histogram)
+        return out
+
+
+class Latencies:
+    """Accounts of the times of a run.
+
+    *Lateness* is how much after its deadline a tick was sent or a cycle began: of waking up, in
+    real time; a clock in lock-step has no deadlines, and none of it. *Compute* is what a part says
+    that it computed, for a cycle the sum of its parts. *Round trip* is from a tick to its done, for
+    a cycle from its beginning to its end.
+    """
+
+    def __init__(self) -> None:
+        self._parts: dict[str, _Times] = {}
+        self._cycle = _Times()
+        self._asked: dict[str, tuple[int, int]] = {}  # by part: step, and when
+        self._answered: dict[str, int] = {}  # by part: step
+        self._computed = 0  # ns in the cycle that runs
+        self._cycles = self._missed = 0
+        self._latest_missed = deque[bool](maxlen=RECENT)
+        self._late = [0] * (len(EDGES_US) + 1)
+
+    def tick(self, part: str, step: int, deadline_ns: int | None, sent_ns: int) -> None:
+        """A part was told to compute a step; when it is told again, the first time counts."""
+        if self._asked.get(part, (None, 0))[0] == step:
+            return
+        self._asked[part] = step, sent_ns
+        if deadline_ns is not None:
+            self._of(part).add("lateness", sent_ns - deadline_ns)
+
+    def done(self, part: str, step: int, received_ns: int, compute_ns: int) -> None:
+        """A part has done a step; what was not asked, or is said again, does not count."""
+        asked, sent_ns = self._asked.get(part, (None, 0))
+        if asked != step or self._answered.get(part) == step:
+            return
+        self._answered[part] = step
+        times = self._of(part)
+        times.add("compute", compute_ns)
+        times.add("round_trip", received_ns - sent_ns)
+        self._computed += compute_ns
+
+    def cycle(
+        self, step: int, deadline_ns: int | None, began_ns: int, ended_ns: int, missed: bool
+    ) -> None:
+        """All parts have done a step, or its time is over.
+
+        Args:
+            step: its number.
+            deadline_ns: when it was to begin; None in lock-step.
+            began_ns: when it began.
+            ended_ns: when the last part had done it.
+            missed: whether that was too late.
+        """
+        if deadline_ns is not None:
+            late_ns = max(began_ns - deadline_ns, 0)
+            self._cycle.add("lateness", late_ns)
+            self._late[bisect_right(EDGES_US, late_ns / 1000)] += 1
+        self._cycle.add("round_trip", ended_ns - began_ns)
+        self._cycle.add("compute", self._computed)
+        self._computed = 0
+        self._cycles += 1
+        self._missed += missed
+        self._latest_missed.append(missed)
+
+    def summary(self) -> dict[str, Any]:
+        """Of the run, as JSON holds it: microseconds, None where there is no number.
+
+        ``histogram`` is that of the lateness of cycles: ``counts`` has one number more than
+        ``edges_us``, that of those below the first edge comes first; an edge belongs to what is
+        above it.
+        """
+        return {
+            "cycles": self._cycles,
+            "missed": self._missed,
+            "cycle": self._cycle.summary(),
+            "parts": {part: times.summary() for part, times in self._parts.items()},
+            "histogram": {"edges_us": list(EDGES_US), "counts": list(self._late)},
+        }
+
+    def recent(self) -> dict[str, Any]:
+        """Of the last hundred cycles, as `summary` without the histogram."""
+        return {
+            "cycles": len(self._latest_missed),
+            "missed": sum(self._latest_missed),
+            "cycle": self._cycle.recent(),
+            "parts": {part: times.recent() for part, times in self._parts.items()},
+        }
+
+    def table(self) -> str:
+        """The summary for people."""
+        names = [*self._parts, "cycle"]
+        wide = max(len(name) for name in names)
+        heads = (f"{kind.replace('_', ' ')} [us]" for kind in _KINDS)
+        lines = [
+            " " * wide + "".join(f"  {head:^29}" for head in heads).rstrip(),
+            " " * wide + f"  {'p50':>9} {'p99':>9} {'max':>9}" * len(_KINDS),
+        ]
+        for name, times in (*self._parts.items(), ("cycle", self._cycle)):
+            cells = [_shown(c[q]) for c in times.summary().values() for q in ("p50", "p99", "max")]
+            groups = (" ".join(f"{c:>9}" for c in cells[k : k + 3]) for k in range(0, 9, 3))
+            lines.append(f"{name:<{wide}}  " + "  ".join(groups))
+        lines.append(f"{self._cycles} cycles, {self._missed} missed")
+        return "\n".join(lines) + "\n"
+
+    def _of(self, part: str) -> _Times:
+        if part not in self._parts:
+            self._parts[part] = _Times()
+        return self._parts[part]
+
+
+def _quantiles(histogram: Histogram) -> dict[str, float | int | None]:
+    """In microseconds."""
+    p50, p99 = (_us(histogram.quantile(share)) for share in (0.5, 0.99))
+    most = _us(histogram.most) if histogram.count else None
+    return {"p50": p50, "p99": p99, "max": most, "count": histogram.count}
+
+
+def _us(ns: float | int | None) -> float | None:
+    return None if ns is None else ns / 1000
+
+
+def _shown(us: float | int | None) -> str:
+    return "-" if us is None else f"{us:.1f}"

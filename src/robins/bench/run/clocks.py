@@ -1,0 +1,101 @@
+"""When a step begins: as soon as it can, or at its time.
+
+Soft real time: an ordinary kernel wakes us late now and then, and Python collects garbage. It is
+counted, not promised.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Literal
+
+from robins.bench.broker.errors import BenchError
+
+Overrun = Literal["continue", "skip", "abort"]
+_SPIN_NS = 200_000  # before a deadline from which on we do not sleep
+
+
+class LockStep:
+    """The next step begins when the last one is over."""
+
+    patience_ns: int | None = None
+
+    def wait(self, step: int, serve: Callable[[float], None]) -> int | None:
+        """Return at once; there is no deadline."""
+        return None
+
+    def over(self, step: int) -> bool:
+        """Whether the step has missed its deadline: there is none."""
+        return False
+
+    def rested(self, ns: int) -> None:
+        """The run was paused so long; nothing comes of it."""
+
+
+class RealTime:
+    """Step k begins at t0 + k/rate on the monotonic clock, whenever the one before it ended.
+
+    Attributes:
+        patience_ns: how long a part is waited for.
+        skipped: deadlines that were let go by.
+    """
+
+    def __init__(self, rate_hz: float, overrun: Overrun = "continue", patience: float = 1.0):
+        """Set the clock.
+
+        Args:
+            rate_hz: steps a second.
+            overrun: what to do when a step is not over at the next one's deadline.
+            patience: periods for which a part is waited for.
+        """
+        self._rate_hz, self._overrun = rate_hz, overrun
+        self.patience_ns: int | None = round(patience * 1e9 / rate_hz)
+        self.skipped = 0
+        self._began_ns: int | None = None
+
+    def deadline_ns(self, step: int) -> int:
+        """When a step is to begin."""
+        assert self._began_ns is not None
+        return self._began_ns + round((step + self.skipped) * 1e9 / self._rate_hz)
+
+    def wait(self, step: int, serve: Callable[[float], None]) -> int | None:
+        """Wait for the deadline of a step, and meanwhile serve what comes.
+
+        Args:
+            step: its number.
+            serve: takes what comes within a time [s].
+
+        Returns:
+            The deadline [ns of the monotonic clock].
+        """
+        if self._began_ns is None:
+            self._began_ns = time.monotonic_ns() + 10_000_000
+        deadline = self.deadline_ns(step)
+        while (left := deadline - time.monotonic_ns()) > 0:
+            if left > _SPIN_NS:
+                serve((left - _SPIN_NS) * 1e-9)
+        return deadline
+
+    def rested(self, ns: int) -> None:
+        """The run was paused so long; all deadlines move."""
+        if self._began_ns is not None:
+            self._began_ns += ns
+
+    def over(self, step: int) -> bool:
+        """Whether the step that is just done has missed the deadline of the next one.
+
+        Raises:
+            BenchError: it has, and the policy is to abort.
+        """
+        late_ns = time.monotonic_ns() - self.deadline_ns(step + 1)
+        if late_ns <= 0:
+            return False
+        if self._overrun == "abort":
+            raise BenchError(
+                f"step {step} ended {late_ns * 1e-6:.1f} ms after the next one's deadline, and "
+                'overrun = "abort"'
+            )
+        if self._overrun == "skip":
+            self.skipped += 1 + int(late_ns * 1e-9 * self._rate_hz)
+        return True

@@ -1,0 +1,116 @@
+"""The processes of the parts: started anew (never forked), watched, killed, and none left over."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from robins.bench.parts.node import REALTIME
+
+_ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
+_GRACE_S = 2.0  # between being told and being killed
+
+
+class Death(NamedTuple):
+    """A process that has ended."""
+
+    part: str
+    code: int  # negative: the signal that ended it
+    said: str  # its last words on standard error
+
+    def __str__(self) -> str:
+        how = f"ended with status {self.code}"
+        if self.code < 0:
+            with contextlib.suppress(ValueError):
+                how = f"was killed by {signal.Signals(-self.code).name}"
+        return f"'{self.part}' {how}" + (f": {self.said}" if self.said else "")
+
+
+class Crew:
+    """Processes, one a part; a context that ends them all however it is left."""
+
+    def __init__(self, kit: Any, realtime: bool = False):
+        """Lay out what they are given.
+
+        Args:
+            kit: for all of them.
+            realtime: whether they ask for a real-time scheduler.
+        """
+        self._kit, self._realtime = kit, realtime
+        self._folder: Path | None = None
+        self._running: dict[str, subprocess.Popen] = {}
+
+    def __enter__(self) -> Crew:
+        self._folder = Path(tempfile.mkdtemp(prefix="robins-bench-"))  # readable by us alone
+        (self._folder / "kit.pickle").write_bytes(pickle.dumps(self._kit))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def start(self, part: str, port: str) -> None:
+        """Start a part on its port; it says hello when it is ready."""
+        assert self._folder is not None
+        words = (self._folder / f"{part}.txt").open("wb")
+        # Steps are short: handing each to a thread of JAX and back takes longer than some of them.
+        environment = {**os.environ, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "false"}
+        if self._realtime:
+            environment[REALTIME] = "1"
+        command = [sys.executable, "-m", "robins.bench.parts.node", part, port]
+        with words:
+            self._running[part] = subprocess.Popen(
+                [*command, str(self._folder / "kit.pickle")],
+                stdin=subprocess.DEVNULL,
+                stdout=words,
+                stderr=words,
+                env=environment,
+                start_new_session=True,  # Ctrl-C of the terminal is for the bench
+            )
+
+    def process(self, part: str) -> int | None:
+        """The process number of a part; None where a board takes its place."""
+        running = self._running.get(part)
+        return None if running is None else running.pid
+
+    def deaths(self) -> list[Death]:
+        """Processes that have ended since this was asked last."""
+        dead = [(part, code) for part, p in self._running.items() if (code := p.poll()) is not None]
+        for part, _ in dead:
+            del self._running[part]
+        return [Death(part, code, self._said(part)) for part, code in dead]
+
+    def kill(self, part: str) -> None:
+        """Kill a part at once, as a fault."""
+        if part in self._running:
+            self._running[part].kill()
+
+    def end(self) -> None:
+        """End all: those that were told to stop do so by themselves, the others are killed."""
+        until = time.monotonic() + _GRACE_S
+        while any(p.poll() is None for p in self._running.values()):
+            if time.monotonic() > until:
+                break
+            time.sleep(0.01)
+        for p in self._running.values():
+            if p.poll() is None:
+                p.kill()
+            p.wait()
+        self._running.clear()
+
+    def _said(self, part: str) -> str:
+        assert self._folder is not None
+        lines = (self._folder / f"{part}.txt").read_text("utf-8", "replace").strip().splitlines()
+        errors = [line for line in lines if _ERROR.match(line)]  # notes may follow them
+        return (errors or lines or [""])[-1]

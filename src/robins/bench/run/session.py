@@ -1,0 +1,477 @@
+"""A run on the bench, from a setup to arrays and counts: processes, links, broker, clock."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from robins import __version__
+from robins.bench.broker.broker import Broker, Wiring
+from robins.bench.broker.errors import BenchError
+from robins.bench.broker.faults import ROUTES, LinkFault
+from robins.bench.broker.injector import Injector
+from robins.bench.broker.link import Direction, Health, Link
+from robins.bench.parts.node import RARELY, be_realtime
+from robins.bench.parts.satellite import BUILD, Kit
+from robins.bench.parts.satellite.preparing import kit_for
+from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
+from robins.bench.recording import Entry, Event, Recorder
+from robins.bench.run import telemetry
+from robins.bench.run.accounting import Latencies
+from robins.bench.run.clocks import LockStep, RealTime
+from robins.bench.run.crew import Crew, Death
+from robins.bench.run.setup import NODES, Flight
+from robins.bench.run.telemetry import Flown, Telemetry
+from robins.bench.wire.schema import VERSION
+from robins.scenario import ScenarioError
+
+HELLO_S = 120.0  # for all to compile and say hello
+REVIVED_S = 60.0
+_TELL_S = 0.2  # between two words on how far it is
+_GLANCE_NS = 50_000_000  # how often processes are looked at
+
+
+@runtime_checkable
+class Watch(Protocol):
+    """Who looks on while it runs, such as the live page; its calls must return at once."""
+
+    def event(self, kind: str, time_s: float, text: str) -> None:
+        """Something happened."""
+
+    def step(self, session: Session, step: int) -> None:
+        """A step is over."""
+
+    def over(self, session: Session, failed: bool) -> None:
+        """The run is over."""
+
+    def commands(self, session: Session) -> list[dict[str, Any]]:
+        """What whoever looks on wants done: "stop", "pause", "start", "inject", "clear"."""
+        ...
+
+
+class Ran(NamedTuple):
+    """What came of a run."""
+
+    flown: Flown
+    kit: Kit
+    steps: int  # that were done
+    seconds: float  # of the wall clock, from the first tick to the last answer
+    latencies: Latencies
+    health: Mapping[str, Health]
+    injected: Mapping[tuple[str, str], int]
+    silent: Mapping[str, int]
+    star_frames: int
+    events: list[Event]
+    deaths: int
+    failure: str  # empty: the run came to its end
+    stopped: bool  # by whoever looked on
+
+
+def counted_from(flight: Flight, steps: int) -> int:
+    """First step of which figures of merit count: as the scenario says, else the second half."""
+    first = round(flight.loop.counted_from / flight.loop.step)
+    return first if first < steps else steps // 2
+
+
+def steps_of(flight: Flight) -> int:
+    """Steps of a run.
+
+    Raises:
+        ScenarioError: longer than the scenario, or not a step long.
+    """
+    most = round(flight.loop.duration / flight.loop.step)
+    if flight.setup.seconds is None:
+        return most
+    steps = round(flight.setup.seconds / flight.loop.step)
+    if not 1 <= steps <= most:
+        raise ScenarioError(
+            [
+                f"seconds: {flight.setup.seconds:g} s is not from a step ({flight.loop.step:g} s) "
+                f"to the end of the scenario ({flight.loop.duration:g} s); "
+                "set its duration to make that longer"
+            ]
+        )
+    return steps
+
+
+class Session:
+    """A run; `run` does it.
+
+    Attributes:
+        flight: what was asked for.
+        latencies: so far.
+        telemetry: so far.
+        injector: its faults; more may be added while it runs.
+        crew: the processes.
+        broker: the middle.
+        done: steps so far.
+        step_ms: how long the last step took.
+        pace: steps a second, of late.
+        deaths: of processes, so far.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        record: Path | None = None,
+        watch: Watch | None = None,
+        progress: Callable[[float, str], None] | None = None,
+        paused: bool = False,
+        kit: Kit | None = None,
+    ):
+        """Make ready.
+
+        Args:
+            flight: the run.
+            record: where to write the record; None: none.
+            watch: who looks on.
+            progress: told of the share that is done, and what is going on.
+            paused: whether it waits for a "start" of whoever looks on.
+            kit: of the same run, if it has been made before.
+
+        Raises:
+            ScenarioError: the length of the run does not fit the scenario.
+            PortError: a port cannot be opened.
+            ValueError: what `kit_for` refuses.
+        """
+        self.flight, self._watch = flight, watch
+        self._tell = progress or (lambda share, what: None)
+        self.steps = steps_of(flight)
+        setup = flight.setup
+        self.ports = {part: address(text) for part, text in setup.ports.items()}
+        self._record_path, self._kit = record, kit
+        self.injector = Injector(setup.faults, setup.seed)
+        self.latencies = Latencies()
+        self.events: list[Event] = []
+        self.deaths = 0
+        self.run_number = int.from_bytes(os.urandom(4), "little") or 1
+        self.done = 0
+        self.step_ms = self.pace = 0.0
+        self._labels: list[tuple[str, LinkFault]] = []
+        self._paused, self._stop = paused, False
+        self._speaks: dict[str, str] = {}  # by part: the port that its process opens
+        self._glanced_ns = 0
+        self._began_ns = time.monotonic_ns()
+
+    # --------------------------------------------------------------------------------- going
+
+    def run(self) -> Ran:
+        """Do it; a run that fails is told in `Ran.failure`, with all that there was until then.
+
+        Raises:
+            KeyboardInterrupt: after all processes have ended and the record is whole.
+        """
+        setup, loop = self.flight.setup, self.flight.loop
+        if self._kit is None:
+            self._tell(0.0, "preparing")
+            table = None if setup.table is None else setup.table.table()
+            self._kit = kit_for(loop, setup.filter, setup.seed, table=table)
+        self.kit = self._kit
+        self.telemetry = Telemetry(self.steps, self.kit.step_ns)
+        failure, done, seconds = "", 0, 0.0
+        with contextlib.ExitStack() as stack:
+            self._recorder = self._open_record(stack)
+            self.crew = stack.enter_context(Crew(self.kit, setup.fifo))
+            self.broker = self._wire(stack)
+            began = time.monotonic()
+            try:
+                self._tell(0.0, "waiting for the parts")
+                self.broker.gather(self.run_number, HELLO_S)
+                began = time.monotonic()
+                done = self._go()
+            except BenchError as error:
+                failure, done = str(error), max(self.broker.time_ns // self.kit.step_ns - 1, 0)
+                self.event("failed", failure)
+            finally:
+                seconds = time.monotonic() - began
+                self.broker.stop()
+                if self._watch is not None:
+                    self._watch.over(self, bool(failure))
+        return Ran(
+            flown=Flown(*(x[:done] for x in self.telemetry.flown)),
+            kit=self.kit,
+            steps=done,
+            seconds=seconds,
+            latencies=self.latencies,
+            health={name: link.health for name, link in self.broker.links.items()},
+            injected=dict(self.injector.counts),
+            silent=dict(self.broker.silent),
+            star_frames=self.telemetry.star_frames,
+            events=self.events,
+            deaths=self.deaths,
+            failure=failure,
+            stopped=self._stop and done < self.steps,
+        )
+
+    def _go(self) -> int:
+        """All steps."""
+        setup = self.flight.setup
+        rate = setup.rate or 1.0 / self.flight.loop.step
+        self.clock = (
+            LockStep()
+            if setup.clock == "lockstep"
+            else RealTime(rate, setup.overrun, setup.patience)
+        )
+        if setup.fifo and (why := be_realtime()):
+            self.event("scheduler", why)
+        told, counted, since = 0.0, 0, time.monotonic()
+        with _few_collections():
+            for k in range(self.steps):
+                self._obey(k)
+                if self._stop:
+                    return k
+                deadline = self.clock.wait(k, self.broker.poll)
+                began = time.monotonic_ns()
+                self.broker.step(k, self.clock.patience_ns)
+                missed = self.clock.over(k)
+                ended = time.monotonic_ns()
+                self.latencies.cycle(k, deadline, began, ended, missed)
+                self.done, self.step_ms = k + 1, (ended - began) * 1e-6
+                if missed:
+                    self.event(
+                        "missed", f"step {k} was not over at the deadline of the next", False
+                    )
+                if self._watch is not None:
+                    self._watch.step(self, k)
+                counted += 1
+                if (now := time.monotonic()) - told > _TELL_S:
+                    self.pace, counted, since = counted / max(now - since, 1e-9), 0, now
+                    told = now
+                    self._tell((k + 1) / self.steps, f"{self.time_s:.0f} s of the run")
+        return self.steps
+
+    def _obey(self, step: int) -> None:
+        """Do what whoever looks on wants; wait while it is paused."""
+        time_ns = (step + 1) * self.kit.step_ns
+        for part in self.injector.killed(time_ns):
+            self.event("killed", f"'{part}' is killed, as a fault")
+            self.crew.kill(part)
+            self._bury(until=part)
+        if self._watch is None:
+            return
+        began = time.monotonic_ns()
+        while True:
+            for command in self._watch.commands(self):
+                self._do(command)
+            if not self._paused or self._stop:
+                break
+            self.broker.poll(0.05)
+        self.clock.rested(time.monotonic_ns() - began)
+
+    def _do(self, command: Mapping[str, Any]) -> None:
+        what, label = command.get("do"), command.get("label")
+        if what == "stop":
+            self._stop = True
+        elif what in ("pause", "start"):
+            self._paused = what == "pause"
+        elif what == "clear":
+            self._clear(label)
+        elif what == "inject":
+            self._inject(str(label), command["fault"], command.get("duration_s"))
+        self.event("command", f"{what} {label or ''}".strip())
+
+    def _inject(self, label: str, fault: Mapping[str, Any], seconds: float | None) -> None:
+        """One more fault, from the next step on."""
+        begin = self.time_s + self.kit.step_ns * 1e-9
+        end = {} if seconds is None else {"end": begin + seconds}
+        made = LinkFault(**{**fault, "begin": begin, **end})
+        self.injector.add(made)
+        self._labels.append((label, made))
+
+    def _clear(self, label: str | None) -> None:
+        for one, fault in self._labels:
+            if label in (None, one):
+                self.injector.remove(fault)
+        if label is None:
+            self.injector.clear()
+        self._labels = [x for x in self._labels if label is not None and x[0] != label]
+
+    def active_faults(self) -> list[tuple[str, LinkFault]]:
+        """Faults that are there now, with what they are called."""
+        names = {id(fault): label for label, fault in self._labels}
+        active = self.injector.active(self.broker.time_ns)
+        return [(names.get(id(f), f"{f.kind} at {f.link or 'all links'}"), f) for f in active]
+
+    def state_of(self, part: str) -> str:
+        """What a part is: "up", "board", or "dead"."""
+        if part in self.ports:
+            return "board"
+        return "dead" if self.crew.process(part) is None else "up"
+
+    # ------------------------------------------------------------------------------- making ready
+
+    def _open_record(self, stack: contextlib.ExitStack) -> Recorder | None:
+        if self._record_path is None:
+            return None
+        setup, loop = self.flight.setup, self.flight.loop
+        header = {
+            "robins": __version__,
+            "wire": VERSION,
+            "name": self.flight.name,
+            "run": self.run_number,
+            "setup": setup.model_dump(mode="json", exclude_unset=True),
+            "loop": loop.model_dump(mode="json", exclude_unset=True),
+            "step_ns": self.kit.step_ns,
+            "steps": self.steps,
+        }
+        return stack.enter_context(Recorder(self._record_path, header, overwrite=True))
+
+    def _wire(self, stack: contextlib.ExitStack) -> Broker:
+        """Open the far ends and start the processes."""
+        setup = self.flight.setup
+        links: dict[str, Link] = {}
+        for part in NODES:
+            if (real := self.ports.get(part)) is not None:
+                port = stack.enter_context(open_port(real))
+                links[part] = Link(part, port.fileno(), self.injector, self._watch_wire)
+                continue
+            pair = stack.enter_context(open_pair())
+            links[part] = Link(part, pair.master, self.injector, self._watch_wire, setup.baud)
+            self._start(part, pair)
+        restarts = setup.on_death == "restart"
+        keep = frozenset(links) - set(self.ports) if restarts else frozenset()
+        return Broker(
+            links,
+            wiring(self.kit),
+            self.kit.step_ns,
+            self.injector,
+            self.telemetry.observe,
+            self._glance,
+            self._answered,
+            keep,
+        )
+
+    def _start(self, part: str, pair: Pair) -> None:
+        self._speaks[part] = f"{pair.path},{self.flight.setup.baud or BAUD}"
+        self.crew.start(part, self._speaks[part])
+
+    # -------------------------------------------------------------------------------- looking on
+
+    @property
+    def time_s(self) -> float:
+        """Of the run."""
+        return self.broker.time_ns * 1e-9 if hasattr(self, "broker") else 0.0
+
+    @property
+    def paused(self) -> bool:
+        """Whether it waits for a start."""
+        return self._paused
+
+    def event(self, kind: str, text: str, shown: bool = True) -> None:
+        """Write down that something happened."""
+        one = Event(self._wall_ns(), kind, text, {"time_s": round(self.time_s, 9)})
+        self.events.append(one)
+        if self._recorder is not None:
+            self._recorder.event(one)
+        if shown and self._watch is not None:
+            self._watch.event(kind, self.time_s, text)
+
+    def _wall_ns(self) -> int:
+        return time.monotonic_ns() - self._began_ns
+
+    def _watch_wire(self, link: str, direction: Direction, data: bytes, time_ns: int) -> None:
+        if self._recorder is not None:
+            try:
+                self._recorder.write(Entry(self._wall_ns(), link, direction, data), time_ns)
+            except OSError as error:
+                raise BenchError(f"the record cannot be written: {error}") from None
+
+    def _answered(self, part: str, step: int, at_ns: int, now_ns: int, compute_ns: int) -> None:
+        self.latencies.tick(part, step, None, at_ns)
+        self.latencies.done(part, step, now_ns, compute_ns)
+
+    def _glance(self) -> None:
+        now = time.monotonic_ns()
+        if now - self._glanced_ns > _GLANCE_NS:
+            self._glanced_ns = now
+            if self._recorder is not None and self._paused:
+                self._recorder.flush()  # nothing comes that would
+            self._bury()
+
+    def _bury(self, until: str | None = None) -> None:
+        """Look for processes that have ended, and do what the setup says.
+
+        Raises:
+            BenchError: one has, and the run is to fail.
+        """
+        deaths = self.crew.deaths()
+        while until is not None and until not in [d.part for d in deaths]:
+            time.sleep(0.001)
+            deaths += self.crew.deaths()
+        for death in deaths:
+            self._mourn(death)
+
+    def _mourn(self, death: Death) -> None:
+        self.deaths += 1
+        self.event("died", str(death))
+        if self.flight.setup.on_death == "fail" or self.broker.time_ns == 0:
+            raise BenchError(
+                f'{death}, at {self.time_s:.1f} s of the run; on_death = "restart" would start '
+                "it anew"
+            )
+        self.crew.start(death.part, self._speaks[death.part])
+        self.broker.revive(death.part, REVIVED_S)
+        self.event("restarted", f"'{death.part}' was started anew and told all again")
+
+
+def wiring(kit: Kit) -> Wiring:
+    """Who says what to whom, for a satellite."""
+    sends = {part: ROUTES[part]["from"] for part in NODES}
+    return Wiring(sends, {part: dict(BUILD[part](kit).takes) for part in NODES})
+
+
+@contextlib.contextmanager
+def _few_collections() -> Iterator[None]:
+    """Hardly any collection of garbage in the middle of a step: counted references free what a run
+    makes, and each collection looks at all of JAX.
+    """
+    before = gc.get_threshold()
+    gc.collect()
+    gc.set_threshold(RARELY, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+
+
+def in_process(flight: Flight, kit: Kit) -> Flown:
+    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
+    import jax
+
+    from robins.bench.parts.satellite.kit import as_numpy
+    from robins.filters import Loop, run_closed
+    from robins.systems.satellite.nodes import STAR, react
+
+    loop = Loop(
+        jax.tree_util.Partial(partial(react, kit.kind), kit.given),
+        kit.vehicle,
+        kit.rows,
+        {STAR: kit.due},
+    )
+    done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
+    mean, said = done.steps.mean, done.readings
+    q_est = as_numpy(jax.jit(jax.vmap(kit.kind.attitude))(mean))
+    q = np.asarray(jax.tree_util.tree_leaves(said.truth)[0])  # first of the state of each kind
+    steps = len(q)
+    none = np.full((steps, 3), np.nan)
+    return Flown(
+        time_s=np.arange(1, steps + 1) * flight.loop.step,
+        q_ib=np.asarray(q),
+        omega_b=none,
+        q_est_ib=np.asarray(q_est),
+        bias=np.asarray(kit.kind.bias(mean)),
+        sigma=np.full((steps, 6), np.nan),
+        flags=np.zeros(steps, np.int64),
+        innovation=none,
+        innovation_sigma=none,
+        ratio=none[:, 0],
+        wheel_h=telemetry.padded(np.asarray(said.outputs["wheel_momentum"])),
+    )

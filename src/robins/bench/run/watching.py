@@ -1,0 +1,249 @@
+"""Who looks on while a bench runs: its live page, and the file that `robins bench status` reads."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from robins.bench.live import Live, Signal
+from robins.bench.run import telemetry
+from robins.bench.run.session import Session
+from robins.bench.run.telemetry import ARCSEC
+from robins.bench.status import Status
+from robins.bench.wire.schema import FLAGS
+
+_EACH_S = 0.05  # samples for the page come no faster than that
+_STATUS_S = 0.5
+_XYZ = ("x", "y", "z")
+ALARMS = ("died", "failed", "killed")
+WARNINGS = ("missed", "refused", "command")
+
+
+@runtime_checkable
+class Page(Protocol):
+    """What a live page can do; see `robins.bench.live.Live`."""
+
+    url: str
+
+    def push(self, time_s: float, values: Sequence[float]) -> None:
+        """Show a sample."""
+
+    def status(self, status: Mapping[str, Any]) -> None:
+        """Show how the bench is."""
+
+    def event(self, level: Any, time_s: float, text: str) -> None:
+        """Show that something happened."""
+
+    def commands(self) -> list[dict[str, Any]]:
+        """What was pressed."""
+        ...
+
+    def poll(self) -> None:
+        """Keep its server alive."""
+
+
+def signals(wheels: int) -> list[Signal]:
+    """What the page draws."""
+
+    def three(plot: str, unit: str, sigma: bool = False) -> list[Signal]:
+        found = []
+        for axis in _XYZ:
+            found.append(Signal(f"{plot} {axis}", unit, plot))
+            if sigma:
+                found.append(Signal(f"{plot} sigma {axis}", unit, plot, "sigma", f"{plot} {axis}"))
+        return found
+
+    momentum = "wheel momentum"
+    return [
+        *three("attitude error", "arcsec", sigma=True),
+        *three("pointing error", "arcsec"),
+        *three("innovation of the star sensor", "arcsec", sigma=True),
+        Signal("test ratio", "1", "test ratio of the star sensor"),
+        Signal("test ratio limit", "1", "test ratio of the star sensor", "limit"),
+        *three("rate", "deg/s"),
+        *(Signal(f"{momentum} {k}", "N m s", momentum) for k in range(wheels)),
+        Signal(f"{momentum} limit", "N m s", momentum, "limit"),
+        Signal(f"{momentum} lower limit", "N m s", momentum, "limit"),
+        Signal("time of a step", "ms", "time of a step"),
+    ]
+
+
+OFFERED: tuple[dict[str, Any], ...] = (
+    {"label": "star: wrong by 10 deg", "fault": {"kind": "turned"}},
+    {"label": "star: stuck", "fault": {"kind": "stuck"}},
+    {"label": "star: lost", "fault": {"kind": "lost"}},
+    {"label": "star: sign flips", "fault": {"kind": "sign"}},
+    {"label": "star: link silent", "fault": {"kind": "silent", "link": "star"}},
+    {"label": "gyro: link silent", "fault": {"kind": "silent", "link": "gyro"}},
+    {"label": "wheel 0: no torque", "fault": {"kind": "wheel", "wheel": 0}},
+    {"label": "all links: 2 % of frames damaged", "fault": {"kind": "bit errors", "share": 0.02}},
+    {"label": "all links: 2 % of frames lost", "fault": {"kind": "loss", "share": 0.02}},
+)
+"""Faults that the page offers."""
+
+
+class Looking:
+    """Tells the page and the status file; as `robins.bench.run.session.Watch` wants it."""
+
+    def __init__(self, page: Page | None, status: Status):
+        """Take the page, if there is one."""
+        self._page, self._status = page, status
+        self._pushed = self._told = 0.0
+        self._began = time.monotonic()
+        self._seen_flags = 0
+
+    def over(self, session: Session, failed: bool) -> None:
+        """The run is over."""
+        if self._page is not None:
+            last = {**state(session, session.done), "state": "failed" if failed else "stopped"}
+            self._page.status(last)
+            self._page.poll()
+
+    def event(self, kind: str, time_s: float, text: str) -> None:
+        """Something happened."""
+        if self._page is not None:
+            level = "alarm" if kind in ALARMS else "warning" if kind in WARNINGS else "info"
+            self._page.event(level, time_s, text)
+
+    def commands(self, session: Session) -> list[dict[str, Any]]:
+        """What was pressed on the page."""
+        if self._page is None:
+            return []
+        self._page.poll()
+        if session.paused:
+            self._tell(session, session.done)
+        return self._page.commands()
+
+    def step(self, session: Session, step: int) -> None:
+        """A step is over."""
+        self._alarms(session, step)
+        now = time.monotonic()
+        if self._page is not None and now - self._pushed >= _EACH_S:
+            self._pushed = now
+            self._page.push(session.time_s, sample(session, step))
+        self._tell(session, step + 1)
+
+    def _tell(self, session: Session, done: int) -> None:
+        now = time.monotonic()
+        if self._page is not None and now - self._told >= _STATUS_S:
+            self._told = now
+            self._page.status(state(session, done))
+        if self._status.due:
+            self._status.tell(report(session, done, "" if self._page is None else self._page.url))
+
+    def _alarms(self, session: Session, step: int) -> None:
+        """Say what the determination flags, when it begins."""
+        flags = int(session.telemetry.flown.flags[step])
+        new, self._seen_flags = flags & ~self._seen_flags, flags
+        for k, text in enumerate(FLAGS):
+            if k and new >> k & 1:
+                kind = "failed" if text.startswith("safe") else "refused"
+                if self._page is not None:
+                    level = "alarm" if kind == "failed" or "refused" in text else "warning"
+                    self._page.event(level, session.time_s, f"adm: {text}")
+
+
+def sample(session: Session, step: int) -> list[float]:
+    """The signals of a step."""
+    f, now = session.telemetry.flown, slice(step, step + 1)
+    error = telemetry.turn(f.q_est_ib[now], f.q_ib[now])[0] / ARCSEC
+    sigma = f.sigma[step, :3] / ARCSEC
+    wanted = np.asarray(session.kit.rows.course.ref_end_q_ib)[now]
+    pointing = telemetry.turn(wanted, f.q_ib[now])[0] / ARCSEC
+    # star frames are rarer than samples: the page gets the latest since the last sample
+    heard = session.telemetry.latest_innovation
+    innovation, its_sigma, ratio = (
+        heard if heard is not None else (np.full(3, np.nan),) * 2 + (np.nan,)
+    )
+    session.telemetry.latest_innovation = None
+    wheels = len(session.kit.vehicle.craft.wheel_h)
+    limit = float(np.asarray(session.kit.given.craft.wheel_momentum_limit)[0])
+    both = [x for pair in zip(error, sigma, strict=True) for x in pair]
+    innovated = [x / ARCSEC for pair in zip(innovation, its_sigma, strict=True) for x in pair]
+    return [
+        *both,
+        *pointing,
+        *innovated,
+        ratio,
+        1.0,
+        *np.degrees(f.omega_b[step]),
+        *f.wheel_h[step, :wheels],
+        limit,
+        -limit,
+        session.step_ms,
+    ]
+
+
+def state(session: Session, done: int) -> dict[str, Any]:
+    """How the bench is, for the page."""
+    recent = session.latencies.recent()
+    late = recent["cycle"]["lateness_us"]
+    flags = session.telemetry.flown.flags[:done]
+    return {
+        "state": "paused" if session.paused else "running",
+        "clock": session.flight.setup.clock,
+        "deadlines": {
+            "missed": session.latencies.summary()["missed"],
+            "lateness_us": {k: late[k] for k in ("p50", "p99", "max")},
+            "cycles_per_s": session.pace,
+            "histogram": session.latencies.summary()["histogram"],
+        },
+        "links": {
+            name: {
+                "frames": link.health.frames,
+                "wrong": link.health.wrong,
+                "lost": link.health.lost,
+                "late": link.health.late,
+                "silent_s": max(session.broker.time_ns - link.health.heard_ns, 0) * 1e-9,
+            }
+            for name, link in session.broker.links.items()
+        },
+        "nodes": {name: session.state_of(name) for name in session.broker.links},
+        "faults": [
+            {"label": label, "until_s": fault.end} for label, fault in session.active_faults()
+        ],
+        "counts": {
+            "refused_measurements": int(np.sum(flags >> FLAGS.index("star refused") & 1)),
+            "wrong_frames": sum(link.health.wrong for link in session.broker.links.values()),
+            "lost_frames": sum(link.health.lost for link in session.broker.links.values()),
+            "processes_died": session.deaths,
+        },
+    }
+
+
+def report(session: Session, done: int, url: str) -> dict[str, Any]:
+    """How the bench is, for the status file."""
+    return {
+        "name": session.flight.name,
+        "filter": session.flight.setup.filter,
+        "clock": session.flight.setup.clock,
+        "state": "paused" if session.paused else "running",
+        "time_s": session.time_s,
+        "step": done,
+        "steps": session.steps,
+        "cycles_per_s": session.pace,
+        "url": url,
+        "parts": {
+            name: {
+                "process": session.crew.process(name),
+                "port": session.flight.setup.ports.get(name, ""),
+                "frames": link.health.frames,
+                "wrong": link.health.wrong,
+                "lost": link.health.lost,
+                "late": link.health.late,
+            }
+            for name, link in session.broker.links.items()
+        },
+    }
+
+
+def page_for(session_name: str, run: int, wheels: int, host: str, port: int) -> Live:
+    """A live page for a run.
+
+    Raises:
+        ImportError, OSError, RuntimeError: as `Live` says.
+    """
+    return Live(signals(wheels), session_name, run, host, port, OFFERED)
