@@ -1,0 +1,74 @@
+"""What the page may ask of the bench: nothing but what it was offered."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+PLAIN = ("start", "pause", "stop")
+LONGEST_S = 3600.0  # of a fault; without a length it lasts until it is cleared
+
+
+class CommandError(ValueError):
+    """What the page sent is no command; the text is for the page."""
+
+
+def read(text: str | bytes, faults: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The command that a page sent.
+
+    Args:
+        text: JSON: `{"do": ...}`, with "label" and "duration_s" (or neither) for "inject", with
+            "label" (or not) for "clear".
+        faults: that the page was offered, each with its label.
+
+    Returns:
+        The command as `Live.commands` gives it.
+
+    Raises:
+        CommandError: it is none; nothing else is raised, whatever was sent.
+    """
+    try:
+        asked = json.loads(text)
+    except (ValueError, RecursionError):
+        raise CommandError("a command is a JSON object, this is no JSON") from None
+    if not isinstance(asked, dict):
+        raise CommandError("a command is a JSON object")
+    do = asked.get("do")
+    if do in PLAIN:
+        _only(asked, {"do"})
+        return {"do": do}
+    if do == "inject":
+        _only(asked, {"do", "label", "duration_s"})
+        label, duration_s = asked.get("label"), asked.get("duration_s")
+        for f in faults:
+            if f["label"] == label:
+                return {"do": do, **f, "duration_s": _duration(duration_s)}
+        there = ", ".join(f"'{f['label']}'" for f in faults) or "none"
+        raise CommandError(f"no fault is labelled {_short(label)}; there are: {there}")
+    if do == "clear":
+        _only(asked, {"do", "label"})
+        label = asked.get("label")
+        if label is not None and not isinstance(label, str):
+            raise CommandError("the label of a fault is a text")
+        return {"do": do, "label": label}
+    known = ", ".join((*PLAIN, "inject", "clear"))
+    raise CommandError(f"no command {_short(do)}; there are: {known}")
+
+
+def _only(asked: Mapping[str, Any], allowed: set[str]) -> None:
+    if extra := set(asked) - allowed:
+        raise CommandError(f"'{asked['do']}' takes no {', '.join(map(_short, sorted(extra)))}")
+
+
+def _duration(value: Any) -> float | None:
+    if value is None:
+        return None
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not 0.0 < value <= LONGEST_S:
+        raise CommandError(f"a fault lasts 0 to {LONGEST_S:g} s, or until cleared: {_short(value)}")
+    return float(value)
+
+
+def _short(value: Any) -> str:
+    return f"{value!r:.60}"

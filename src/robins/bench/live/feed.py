@@ -1,0 +1,71 @@
+"""What goes between the bench and the server of its page, over a pair of sockets.
+
+To the server: `length u32 | kind u8 | body`, little endian; a body is a sample as the browser gets
+it, or JSON. Back: JSON, one object a line.
+
+    sample: run u32 | sequence u32 | time_s f64 | values f64 ...
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+HEAD = struct.Struct("<IB")
+SAMPLE_HEAD = struct.Struct("<IId")
+RECENT = 300  # samples that a page which comes later is shown
+EVENTS = 200  # lines of the same
+
+
+class Kind(IntEnum):
+    """What a body is."""
+
+    HELLO = 0
+    SAMPLE = 1
+    STATUS = 2
+    EVENT = 3
+
+
+def pack(kind: Kind, body: bytes) -> bytes:
+    """A body with its head."""
+    return HEAD.pack(len(body), kind) + body
+
+
+def pack_sample(
+    run: int, sequence: int, time_s: float, values: Sequence[float] | np.ndarray
+) -> bytes:
+    """The body of a sample."""
+    head = SAMPLE_HEAD.pack(run & 0xFFFFFFFF, sequence & 0xFFFFFFFF, time_s)
+    return head + np.asarray(values, dtype="<f8").tobytes()
+
+
+def sequence_of(sample: bytes) -> int:
+    """The number of a sample."""
+    return SAMPLE_HEAD.unpack_from(sample)[1]
+
+
+def to_json(value: Any) -> str:
+    """JSON that every browser reads: numbers that are not finite become null.
+
+    Raises:
+        TypeError: something in it is no number, text, list or mapping.
+    """
+    return json.dumps(_plain(value), allow_nan=False, separators=(",", ":"))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,176 @@
+"""What the server knows of the bench, and the pages that watch it.
+
+Each page has queues of its own, with a bound: one that is slow loses its oldest samples, which are
+counted, and slows nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from robins.bench.live.feed import EVENTS, RECENT, Kind, sequence_of, to_json
+
+QUEUE = 2 * RECENT  # samples that wait for a page
+
+
+class Client:
+    """What waits for one page.
+
+    Attributes:
+        dropped: samples that it was too slow for.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._lines: deque[str] = deque(maxlen=EVENTS)
+        self._latest: dict[str, str] = {}  # of which only the newest matters
+        self._samples: deque[bytes] = deque()
+        self._some = asyncio.Event()
+
+    def greet(self, hello: str, recent: deque[bytes]) -> None:
+        """All from the beginning: what waits is of no more interest."""
+        self._lines.clear()
+        self._latest.clear()
+        self._samples = deque(recent)
+        self._lines.append(hello)
+        self._some.set()
+
+    def line(self, text: str) -> None:
+        """Something to tell, in order."""
+        self._lines.append(text)
+        self._some.set()
+
+    def latest(self, key: str, text: str) -> None:
+        """Something that replaces what was said of it before."""
+        self._latest[key] = text
+        self._some.set()
+
+    def sample(self, sample: bytes) -> None:
+        """A sample; the oldest goes if there are too many."""
+        if len(self._samples) == QUEUE:
+            self._samples.popleft()
+            self.dropped += 1
+        self._samples.append(sample)
+        self._some.set()
+
+    async def pump(
+        self,
+        send_text: Callable[[str], Awaitable[None]],
+        send_bytes: Callable[[bytes], Awaitable[None]],
+    ) -> None:
+        """Send what waits, for ever, as fast as the page takes it."""
+        while True:
+            if self._lines:
+                await send_text(self._lines.popleft())
+            elif self._latest:
+                await send_text(self._latest.pop(next(iter(self._latest))))
+            elif self._samples:
+                await send_bytes(self._samples.popleft())
+            else:
+                self._some.clear()
+                await self._some.wait()
+
+
+class Hub:
+    """Takes what the bench says, keeps what a page that comes later needs, and passes it on.
+
+    Attributes:
+        clients: pages.
+        faults: that a page may inject.
+    """
+
+    def __init__(self) -> None:
+        self.clients: set[Client] = set()
+        self.faults: list[dict[str, Any]] = []
+        self._hello: dict[str, Any] | None = None
+        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
+        self._recent: deque[bytes] = deque(maxlen=RECENT)
+        self._status: dict[str, Any] | None = None
+        self._expected: int | None = None  # number of the next sample
+        self._dropped = 0  # on the way from the bench
+
+    def take(self, kind: int, body: bytes) -> None:
+        """Something the bench said."""
+        if kind == Kind.SAMPLE:
+            return self._take_sample(body)
+        said = json.loads(body)
+        if kind == Kind.HELLO:
+            self._take_hello(said)
+        elif kind == Kind.STATUS:
+            self._status = said
+            self._tell_latest("status", {"kind": "status", "status": said})
+        elif kind == Kind.EVENT:
+            self._events.append(said)
+            self._tell({"kind": "event", **said})
+        return None
+
+    def join(self, client: Client) -> None:
+        """A page that came."""
+        client.greet(self._greeting(), self._recent)
+        self.clients.add(client)
+        self.beat()
+
+    def leave(self, client: Client) -> None:
+        """A page that went."""
+        self.clients.discard(client)
+
+    def beat(self) -> None:
+        """Tell each page that the server lives, and what was dropped."""
+        for client in self.clients:
+            beat = {
+                "kind": "beat",
+                "dropped": client.dropped,
+                "dropped_before": self._dropped,
+                "pages": len(self.clients),
+            }
+            client.latest("beat", to_json(beat))
+
+    def end(self) -> None:
+        """Tell each page that the bench is gone."""
+        self._tell({"kind": "ended"})
+
+    def _take_hello(self, said: dict[str, Any]) -> None:
+        self._hello = said
+        self.faults = said["faults"]
+        self._dropped = said["dropped"]
+        self._expected = None
+        self._status = None
+        self._events.clear()
+        self._recent.clear()
+        for client in self.clients:
+            client.greet(self._greeting(), self._recent)
+
+    def _take_sample(self, sample: bytes) -> None:
+        number = sequence_of(sample)
+        if self._expected is not None:
+            self._dropped += (number - self._expected) & 0xFFFFFFFF
+        self._expected = number + 1
+        self._recent.append(sample)
+        for client in self.clients:
+            client.sample(sample)
+
+    def _greeting(self) -> str:
+        return to_json(
+            {
+                "kind": "hello",
+                "bench": self._hello is not None,
+                **(self._hello or {"run": 0, "title": "", "signals": [], "faults": []}),
+                "events": list(self._events),
+                "status": self._status,
+                "history": len(self._recent),
+            }
+        )
+
+    def _tell(self, message: dict[str, Any]) -> None:
+        text = to_json(message)
+        for client in self.clients:
+            client.line(text)
+
+    def _tell_latest(self, key: str, message: dict[str, Any]) -> None:
+        text = to_json(message)
+        for client in self.clients:
+            client.latest(key, text)

@@ -1,0 +1,148 @@
+// Everything beside the plots: clock, links, faults, counts, events, alarm line.
+
+import { count, element, number, say, seconds } from "./format.js";
+
+const byId = (id) => document.getElementById(id);
+const MOST_EVENTS = 200;
+const SILENT_S = 1;
+const FRESH_MS = 10000; // an alarm is loud for so long
+const GOOD = /^(ok|up|run|ready|live|alive|done)/i;
+const BAD = /^(dead|fail|kill|lost|gone|silent)/i;
+
+const alarms = { tally: 0, timer: 0 };
+
+/** One number with its name. `mood`: "", "warning" or "alarm". */
+function fact(name, text, mood = "") {
+  const value = element("dd", mood, text);
+  return element("div", "", element("dt", "", name), value);
+}
+
+/** Put in place of the old only if something changed. */
+function replace(parent, children) {
+  const made = element("div", "", ...children).innerHTML;
+  if (parent.innerHTML !== made) parent.replaceChildren(...children);
+}
+
+function showDeadlines(deadlines = {}, clock) {
+  const late = deadlines.lateness_us ?? {};
+  const { missed } = deadlines;
+  say(byId("clock"), clock ?? "–");
+  replace(byId("deadlines"), [
+    fact("cycles/s", number(deadlines.cycles_per_s, 1)),
+    fact("missed", count(missed), missed > 0 ? "warning" : ""),
+    fact("p50 [µs]", count(late.p50)),
+    fact("p99 [µs]", count(late.p99)),
+    fact("max [µs]", count(late.max)),
+  ]);
+  showHistogram(deadlines.histogram);
+}
+
+/** How often a step was how late: bars by the logarithm of their counts, so that a single one shows. */
+function showHistogram(histogram) {
+  const place = byId("histogram");
+  const counts = histogram?.counts ?? [];
+  place.hidden = !counts.length;
+  if (!counts.length) return;
+  const { edges_us: edges } = histogram;
+  const height = (n) => (n > 0 ? Math.log10(1 + n) : 0);
+  const most = Math.max(1, ...counts.map(height));
+  const range = (k) => (k === 0 ? `below ${edges[0]}` : k === edges.length ? `${edges[k - 1]} or more` : `${edges[k - 1]} to ${edges[k]}`);
+  replace(place, counts.map((n, k) => {
+    const bar = element("i");
+    bar.style.height = `${(100 * height(n)) / most}%`;
+    bar.title = `${range(k)} µs: ${count(n)}`;
+    return bar;
+  }));
+  const time = (us) => (us < 1000 ? `${us} µs` : us < 1e6 ? `${us / 1000} ms` : `${us / 1e6} s`);
+  Object.assign(place.dataset, { least: time(edges[0]), most: time(edges[edges.length - 1]) });
+  place.setAttribute("aria-label", `Lateness of steps: ${counts.map((n, k) => (n ? `${range(k)} µs ${n}` : "")).filter(Boolean).join(", ")}`);
+}
+
+function showLinks(links = {}, nodes = {}) {
+  const names = [...new Set([...Object.keys(links), ...Object.keys(nodes)])];
+  const rows = names.map((name) => {
+    const link = links[name] ?? {};
+    const state = String(nodes[name] ?? "–");
+    const mood = BAD.test(state) ? "alarm" : GOOD.test(state) || state === "–" ? "" : "warning";
+    const word = element("td", `word ${mood}`, element("i"), state);
+    word.title = state;
+    const counted = ["wrong", "lost", "late"].map((key) => element("td", link[key] > 0 ? "warning" : "", count(link[key])));
+    const silent = element("td", link.silent_s > SILENT_S ? "alarm" : "", number(link.silent_s, 1));
+    const head = element("th", "", name);
+    head.scope = "row";
+    return element("tr", "", head, word, element("td", "", count(link.frames)), ...counted, silent);
+  });
+  replace(byId("links").tBodies[0], rows);
+}
+
+function showFaults(faults = []) {
+  const rows = faults.map((fault) => {
+    const given = typeof fault === "string" ? { label: fault } : fault;
+    const until = Number.isFinite(given.until_s) ? `until ${seconds(given.until_s)}` : "until cleared";
+    const clear = element("button", "small", "Clear");
+    clear.type = "button";
+    clear.dataset.do = "clear";
+    clear.dataset.label = given.label;
+    clear.setAttribute("aria-label", `Clear ${given.label}`);
+    return element("li", "", element("span", "", String(given.label)), element("small", "", until), clear);
+  });
+  replace(byId("faults"), rows);
+  say(byId("fault-tally"), faults.length ? `${faults.length} active` : "none");
+  byId("fault-tally").classList.toggle("warning", faults.length > 0);
+}
+
+function showCounts(counts = {}) {
+  replace(
+    byId("counts"),
+    Object.entries(counts).map(([name, value]) => {
+      const mood = value > 0 && /refused|wrong|lost/.test(name) ? "warning" : "";
+      const made = fact(name.replace(/_(frames|measurements)$/, "").replaceAll("_", " "), count(value), mood);
+      made.title = name.replaceAll("_", " ");
+      return made;
+    }),
+  );
+}
+
+/** The latest that the bench said of itself. */
+export function showStatus(status) {
+  const given = status ?? {};
+  showDeadlines(given.deadlines, given.clock);
+  showLinks(given.links, given.nodes);
+  showFaults(given.faults);
+  showCounts(given.counts);
+  const state = given.state ?? "–";
+  say(byId("bench-state"), state);
+  byId("bench-state").classList.toggle("alarm", state === "failed");
+  document.body.dataset.bench = state;
+}
+
+/** Faults that can be injected. */
+export function offerFaults(faults) {
+  const options = faults.map(({ label }) => new Option(label, label));
+  byId("fault").replaceChildren(...(options.length ? options : [new Option("no faults prepared", "")]));
+  byId("inject").classList.toggle("none", !options.length);
+}
+
+/** A line of the events; alarms go to the alarm line too. */
+export function addEvent({ level, time_s, text }, fresh = true) {
+  const list = byId("events");
+  const line = element("li", level, element("time", "", seconds(time_s)), element("span", "", text));
+  list.prepend(line);
+  while (list.children.length > MOST_EVENTS) list.lastChild.remove();
+  if (level !== "alarm") return;
+  alarms.tally++;
+  say(byId("alarm-text"), `${seconds(time_s)}  ${text}`);
+  say(byId("alarm-tally"), alarms.tally === 1 ? "1 alarm" : `${count(alarms.tally)} alarms`);
+  byId("alarm").dataset.level = fresh ? "alarm" : "old";
+  clearTimeout(alarms.timer);
+  alarms.timer = setTimeout(() => (byId("alarm").dataset.level = "old"), FRESH_MS);
+}
+
+export function clearEvents() {
+  byId("events").replaceChildren();
+  alarms.tally = 0;
+  clearTimeout(alarms.timer);
+  say(byId("alarm-text"), "no alarm");
+  say(byId("alarm-tally"), "");
+  byId("alarm").dataset.level = "none";
+}
