@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
 from robins import __version__
+from robins.cli.bench import bench
 from robins.cli.frame import BadInput, Status, only_json
+from robins.cli.options import (
+    LOGS,
+    as_names,
+    choices,
+    debug_option,
+    examples,
+    folder_name,
+    json_option,
+    option,
+    out_option,
+)
 
 DEMO = "ins-gnss/drive"
-_LOGS = click.Path(path_type=Path)
 
 _EXAMPLES = """
 \b
@@ -27,6 +37,7 @@ Examples:
   robins allan still.csv                         noise parameters of my IMU
   robins calibrate turned.csv                    hard and soft iron of my magnetometer
   robins design attitude-axis                    gains that bound the worst case, and their price
+  robins bench up satellite/s1                   the same filter over serial lines, part by part
 
 Every command that computes writes a folder with a summary, the time series, figures and a page
 report.html to open in a browser. With --json a command prints one JSON object for scripts.
@@ -34,11 +45,6 @@ report.html to open in a browser. With --json a command prints one JSON object f
 \b
 Exit status: 0 done, 1 failed, 2 bad input, 3 interrupted (run it again).
 """
-
-
-def _examples(*lines: str) -> str:
-    """The end of a help text; the control character keeps click from joining its lines."""
-    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
 
 
 class _Group(click.Group):
@@ -55,76 +61,14 @@ def app() -> None:
     """Robust inertial navigation: simulate, navigate real logs, compare filters, show how good."""
 
 
-def _option(*names: str, **settings: Any) -> Callable[[Callable], Callable]:
-    return click.option(*names, **settings)
-
-
-def _debug(command: Callable) -> Callable:
-    return _option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")(command)
-
-
-def _json(command: Callable) -> Callable:
-    return _option(
-        "--json", "as_json", is_flag=True, help="Print one JSON object, nothing else, to stdout."
-    )(command)
-
-
-def _out(command: Callable) -> Callable:
-    return _option(
-        "--out", type=_LOGS, metavar="DIR", help="Result folder. [default: results/<name>]"
-    )(command)
-
-
-def _names(_context: click.Context, _option: click.Parameter, text: str | None) -> tuple[str, ...]:
-    if text is None:
-        return ()
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names):
-        raise click.BadParameter(f"{text!r} has an empty name; write it as a,b")
-    return names
-
-
-def _settings(
-    _context: click.Context, _option: click.Parameter, texts: tuple[str, ...]
-) -> tuple[str, ...]:
-    for text in texts:
-        key, equals, _ = text.partition("=")
-        if not equals or not key.strip():
-            raise click.BadParameter(f'{text!r} is not key=value, such as imu.gyro_bias="5 deg/h"')
-    return texts
-
-
-def _choices(command: Callable) -> Callable:
-    """Options that `run` and `replay` share."""
-    for option in (
-        _option("--filters", callback=_names, metavar="a,b", help="Which filters to compare."),
-        _option(
-            "--set",
-            "settings",
-            multiple=True,
-            callback=_settings,
-            metavar="key=value",
-            help="Change a parameter, with its unit; may be repeated.",
-        ),
-        _option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of all noise."),
-    ):
-        command = option(command)
-    return command
-
-
-def _name(scenario: str) -> str:
-    """Of the result folder of a scenario."""
-    return Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
-
-
-_RUNS = _option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
+_RUNS = option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
 
 
 @app.command(short_help="Simulate a drive and navigate it; ends with PASS or FAIL.")
 @_RUNS
-@_out
-@_json
-@_debug
+@out_option
+@json_option
+@debug_option
 def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
     """Simulate a drive with a GNSS outage and navigate it; ends with PASS or FAIL."""
     from robins.cli.work import simulate
@@ -144,7 +88,7 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
 
 @app.command(
     short_help="Simulate a scenario with several filters.",
-    epilog=_examples(
+    epilog=examples(
         "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
         'robins run my.toml --set gnss.sigma="2 m" --json',
         "robins run transfer-alignment/replay --master master.csv --slave slave.csv",
@@ -152,12 +96,12 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
 )
 @click.argument("scenario")
 @_RUNS
-@_option("--master", type=_LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
-@_option("--slave", type=_LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
-@_choices
-@_out
-@_json
-@_debug
+@option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
+@option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
+@choices
+@out_option
+@json_option
+@debug_option
 def run(
     scenario: str, out: Path | None, master: Path | None, slave: Path | None, **options: Any
 ) -> None:
@@ -170,7 +114,7 @@ def run(
     from robins.cli import work
 
     if master is None and slave is None:
-        work.simulate(scenario, out=out or Path("results") / _name(scenario), **options)
+        work.simulate(scenario, out=out or Path("results") / folder_name(scenario), **options)
         return
     if master is None or slave is None:
         raise BadInput("--master and --slave belong together: give both files, or neither.")
@@ -184,20 +128,20 @@ def run(
 
 @app.command(
     short_help="What the sensors of a scenario allow at best.",
-    epilog=_examples(
+    epilog=examples(
         "robins bound ins-gnss/drive",
         'robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"',
         'robins bound transfer-alignment/s0 --filters kf-flexure --set slave.gyro_bias="10 deg/h"',
     ),
 )
 @click.argument("scenario")
-@_option("--runs", type=click.IntRange(min=1), default=1, help="Trajectories to average over.")
-@_option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
-@_option("--at", multiple=True, metavar="TIME", help='Tell that time, "200 s"; may be repeated.')
-@_choices
-@_out
-@_json
-@_debug
+@option("--runs", type=click.IntRange(min=1), default=1, help="Trajectories to average over.")
+@option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
+@option("--at", multiple=True, metavar="TIME", help='Tell that time, "200 s"; may be repeated.')
+@choices
+@out_option
+@json_option
+@debug_option
 def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: Any) -> None:
     """Covariance bound and observability of SCENARIO: no filter with this model can do better.
 
@@ -209,24 +153,24 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
 
     if len(filters) > 1:
         raise BadInput(f"--filters {','.join(filters)}: a bound is that of one model; name one.")
-    out = out or Path("results") / f"bound-{_name(scenario)}"
+    out = out or Path("results") / f"bound-{folder_name(scenario)}"
     tell_bound(scenario, filter_name="".join(filters), out=out, **options)
 
 
 @app.command(
     short_help="Navigate a recorded log.",
-    epilog=_examples(
+    epilog=examples(
         "robins replay imu.csv gnss.pos --out walk",
         'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
     ),
 )
-@click.argument("log", nargs=-1, required=True, type=_LOGS)
+@click.argument("log", nargs=-1, required=True, type=LOGS)
 @_RUNS
-@_option("--system", default="ins-gnss", show_default=True, help="What navigates the log.")
-@_choices
-@_out
-@_json
-@_debug
+@option("--system", default="ins-gnss", show_default=True, help="What navigates the log.")
+@choices
+@out_option
+@json_option
+@debug_option
 def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
     """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
 
@@ -244,11 +188,11 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
 
 @app.command(
     short_help="Judge a log before anyone navigates it.",
-    epilog=_examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
+    epilog=examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
 )
-@click.argument("log", nargs=-1, required=True, type=_LOGS)
-@_json
-@_debug
+@click.argument("log", nargs=-1, required=True, type=LOGS)
+@json_option
+@debug_option
 def doctor(log: tuple[Path, ...], as_json: bool) -> int:
     """Judge a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
@@ -264,13 +208,13 @@ def doctor(log: tuple[Path, ...], as_json: bool) -> int:
 
 @app.command(
     short_help="Noise parameters of a resting IMU.",
-    epilog=_examples("robins allan still.csv", "robins allan still.csv --terms N --json"),
+    epilog=examples("robins allan still.csv", "robins allan still.csv --terms N --json"),
 )
-@click.argument("log", type=_LOGS)
-@_option("--terms", default="NBK", show_default=True, help="Noises to fit, of Q, N, B, K, R.")
-@_out
-@_json
-@_debug
+@click.argument("log", type=LOGS)
+@option("--terms", default="NBK", show_default=True, help="Noises to fit, of Q, N, B, K, R.")
+@out_option
+@json_option
+@debug_option
 def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
     """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
 
@@ -284,18 +228,18 @@ def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
 
 @app.command(
     short_help="Hard and soft iron of a turned magnetometer.",
-    epilog=_examples(
+    epilog=examples(
         "robins calibrate turned.csv",
         'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
     ),
 )
-@click.argument("log", nargs=-1, required=True, type=_LOGS)
-@_option("--field", metavar="FIELD", help='Its size at the place, "48.5 uT"; sets the scale.')
-@_option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
-@_option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
-@_out
-@_json
-@_debug
+@click.argument("log", nargs=-1, required=True, type=LOGS)
+@option("--field", metavar="FIELD", help='Its size at the place, "48.5 uT"; sets the scale.')
+@option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
+@option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
+@out_option
+@json_option
+@debug_option
 def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
 
@@ -314,17 +258,17 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
 
 @app.command(
     short_help="Gains that bound the worst case, and what that costs.",
-    epilog=_examples(
+    epilog=examples(
         "robins design attitude-axis",
         'robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json',
     ),
 )
 @click.argument("problem")
-@_option("--gamma", metavar="a,b", help="Bounds on the H-infinity norm. [default: a range]")
-@_option("--methods", callback=_names, metavar="a,b", help="Which methods to compare.")
-@_out
-@_json
-@_debug
+@option("--gamma", metavar="a,b", help="Bounds on the H-infinity norm. [default: a range]")
+@option("--methods", callback=as_names, metavar="a,b", help="Which methods to compare.")
+@out_option
+@json_option
+@debug_option
 def design(problem: str, gamma: str | None, **options: Any) -> None:
     """Constant-gain filters for PROBLEM, a TOML file with the matrices of a plant or an example.
 
@@ -337,9 +281,12 @@ def design(problem: str, gamma: str | None, **options: Any) -> None:
     compare(problem, gamma, **options)
 
 
+app.add_command(bench)
+
+
 @app.command("list", short_help="Name the scenarios, systems, filters and claims.")
-@_json
-@_debug
+@json_option
+@debug_option
 def list_(as_json: bool) -> None:
     """Name the scenarios, systems, filters and claims there are."""
     from robins.cli.listing import listing

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import click
 
 from robins.cli import cache
 from robins.cli.frame import only_json
+from robins.cli.problem import examples
 
 
 def listing(as_json: bool) -> None:
-    """Print scenarios, systems, filters and claims."""
+    """Print what there is: systems with their filters and claims, benches, problems of design."""
     cache.enable()
     with only_json(as_json):
         from robins.systems import SYSTEMS
@@ -29,6 +32,12 @@ def listing(as_json: bool) -> None:
         for claim in system["claims"]:
             click.echo(f"  claim      {claim['id']}: {claim['text']}")
         click.echo()
+    click.secho("bench", bold=True, nl=False)
+    click.echo("  the satellite part by part over serial lines, `robins bench up`")
+    click.echo(f"  scenarios  {', '.join(known['bench'])}, and those of the satellite\n")
+    click.secho("design", bold=True, nl=False)
+    click.echo("  gains between H2 and H-infinity, `robins design`")
+    click.echo(f"  problems   {', '.join(known['designs'])}\n")
     if known["scenarios"]:
         click.echo(f"Next:   robins run {known['scenarios'][0]}")
 
@@ -51,4 +60,12 @@ def inventory(systems: Any) -> dict[str, Any]:
         "systems": told,
         "filters": list(dict.fromkeys(name for system in told for name in system["filters"])),
         "claims": [claim | {"system": s["name"]} for s in told for claim in s["claims"]],
+        "bench": _benches(),
+        "designs": examples(),
     }
+
+
+def _benches() -> list[str]:
+    """Scenarios of the bench, looked up without it: its packages are an extra."""
+    folder = files("robins") / "bench" / "run" / "scenarios"
+    return sorted(Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".toml"))

@@ -1,0 +1,87 @@
+"""Options that commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+LOGS = click.Path(path_type=Path)
+
+
+def examples(*lines: str) -> str:
+    """The end of a help text; the control character keeps click from joining its lines."""
+    return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
+
+
+def option(*names: str, **settings: Any) -> Callable[[Callable], Callable]:
+    """An option of a command."""
+    return click.option(*names, **settings)
+
+
+def debug_option(command: Callable) -> Callable:
+    """With tracebacks."""
+    return option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")(command)
+
+
+def json_option(command: Callable) -> Callable:
+    """For scripts."""
+    return option(
+        "--json", "as_json", is_flag=True, help="Print one JSON object, nothing else, to stdout."
+    )(command)
+
+
+def out_option(command: Callable) -> Callable:
+    """Where the result goes."""
+    return option(
+        "--out", type=LOGS, metavar="DIR", help="Result folder. [default: results/<name>]"
+    )(command)
+
+
+def as_names(_context: click.Context, _given: click.Parameter, text: str | None) -> tuple[str, ...]:
+    """Names that commas part."""
+    if text is None:
+        return ()
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise click.BadParameter(f"{text!r} has an empty name; write it as a,b")
+    return names
+
+
+def as_settings(
+    _context: click.Context, _given: click.Parameter, texts: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Settings, each key=value."""
+    for text in texts:
+        key, equals, _ = text.partition("=")
+        if not equals or not key.strip():
+            raise click.BadParameter(f'{text!r} is not key=value, such as imu.gyro_bias="5 deg/h"')
+    return texts
+
+
+SETTINGS = option(
+    "--set",
+    "settings",
+    multiple=True,
+    callback=as_settings,
+    metavar="key=value",
+    help="Change a parameter, with its unit; may be repeated.",
+)
+
+
+def choices(command: Callable) -> Callable:
+    """Options that `run` and `replay` share."""
+    for one in (
+        option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare."),
+        SETTINGS,
+        option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of all noise."),
+    ):
+        command = one(command)
+    return command
+
+
+def folder_name(scenario: str) -> str:
+    """Of the result folder of a scenario."""
+    return Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
