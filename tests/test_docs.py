@@ -8,11 +8,13 @@ import json
 import re
 from pathlib import Path
 
+import click
 import matplotlib.pyplot as plt
 import pytest
 from plain_docstrings import plain
 
 from robins import scenario
+from robins.bench.run.setup import Setup
 from robins.cli import Status, app
 from robins.logs import FORMATS
 from robins.results.summary import checked
@@ -161,12 +163,13 @@ def test_the_contract_names_every_command_option_and_status():
     commands = [row[0].split()[1].strip("`") for row in rows if row[0].startswith("`robins ")]
     assert sorted(commands) == sorted(app.commands)
     has: dict[str, list[str]] = {}
-    for name, command in app.commands.items():
+    alone = {k: c for k, c in app.commands.items() if not isinstance(c, click.Group)}
+    for name, command in alone.items():
         for flag in itertools.chain(*(option.opts for option in command.params)):
             if flag.startswith("--"):
                 has.setdefault(flag, []).append(name)
     options = {
-        row[0].strip("`").split()[0]: list(app.commands) if row[1] == "all" else row[1].split(", ")
+        row[0].strip("`").split()[0]: list(alone) if row[1] == "all" else row[1].split(", ")
         for row in rows
         if row[0].startswith("`--")
     }
@@ -183,7 +186,11 @@ def test_the_configurations_shown_can_be_read():
         if language == "toml"
     ]
     assert shown
+    assert any("bench" in mapping for mapping in shown)
     for mapping in shown:
+        if "bench" in mapping:
+            scenario.validate(Setup, mapping)
+            continue
         system = SYSTEMS[mapping["system"]]
         aligned = system.alignment and system.alignment.parameters
         parameters = system.replay_parameters or aligned

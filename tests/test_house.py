@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 import typing
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -280,6 +281,13 @@ def test_every_module_says_what_it_is():
         if not ast.get_docstring(ast.parse(path.read_text("utf-8")))
     ]
     assert not bare
+
+
+def test_no_two_files_of_tests_share_a_name():
+    """They are imported by their bare names, so of two the second would not be found."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("*.py"))
+    del names["conftest.py"]  # these pytest tells apart
+    assert [name for name, times in names.items() if times > 1] == []
 
 
 def undocumented(package) -> list[str]:

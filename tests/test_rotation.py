@@ -37,7 +37,8 @@ def rotvecs(sizes):
 
 EVERY = rotvecs(np.concatenate([np.ravel(s) for s in SIZES.values()]))
 # Rounding is judged in the code that users run, which the other tests do without.
-compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
+AS_USERS = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+compiled = partial(jax.jit, compiler_options=AS_USERS)
 exp = compiled(rot.from_rotvec)
 log = compiled(rot.to_rotvec)
 product = compiled(rot.multiply)

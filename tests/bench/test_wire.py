@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robins import bench
-from robins.bench import Frame, Header, Receiver, RecordError, Sequence
-from robins.bench.c_header import c_header, schema_number
-from robins.bench.frames import LEAST, MOST_PAYLOAD, FrameError
-from robins.bench.receiver import LONGEST
+from robins.bench import wire
+from robins.bench.wire import Frame, Header, Receiver, RecordError, Sequence
+from robins.bench.wire.c_header import c_header, schema_number
+from robins.bench.wire.frames import LEAST, MOST_PAYLOAD, FrameError
+from robins.bench.wire.receiver import LONGEST
 
 # Written down once. If this test fails, the wire has changed: raise the version of the protocol.
 GOLDEN_TICK = bytes.fromhex("00040102070101030201010104e1f50501010103080701052df23f5a00")
@@ -22,7 +22,7 @@ GYRO = {"theta_b": [1.5, -0.25, np.nan]}
 
 
 def frame(payload: bytes, sequence: int = 0, kind: int = 18) -> bytes:
-    return bench.encode_frame(Header(kind, 7, sequence, 10**9), payload)
+    return wire.encode_frame(Header(kind, 7, sequence, 10**9), payload)
 
 
 def bitwise_crc(data: bytes) -> int:
@@ -55,9 +55,9 @@ def test_golden_bytes():
     body = struct.pack("<BBIIQ", 1, 2, 7, 258, 100_000_000) + struct.pack("<I", 1800)
     body += struct.pack("<I", bitwise_crc(body))
     by_hand = b"\x00" + plain_cobs(body) + b"\x00"
-    made = bench.encode_frame(
-        Header(bench.message("tick").number, 7, 258, 100_000_000),
-        bench.encode("tick", {"step": 1800}),
+    made = wire.encode_frame(
+        Header(wire.message("tick").number, 7, 258, 100_000_000),
+        wire.encode("tick", {"step": 1800}),
     )
     assert made == by_hand
     assert made == GOLDEN_TICK
@@ -66,10 +66,10 @@ def test_golden_bytes():
 @given(st.binary(max_size=600), st.integers(0, 255), st.integers(0, 2**32 - 1))
 def test_frames_come_back(payload, kind, sequence):
     header = Header(kind, 12345, sequence, 2**63 + 1)
-    made = bench.encode_frame(header, payload)
+    made = wire.encode_frame(header, payload)
     assert made[0] == made[-1] == 0
     assert 0 not in made[1:-1]
-    assert bench.decode_frame(made[1:-1]) == Frame(header, payload)
+    assert wire.decode_frame(made[1:-1]) == Frame(header, payload)
 
 
 def test_longest_frame_fits_the_buffer():
@@ -83,13 +83,13 @@ def test_longest_frame_fits_the_buffer():
 @pytest.mark.parametrize("wrong", [Header(256, 0, 0, 0), Header(1, -1, 0, 0), Header(1, 0, 0, -1)])
 def test_headers_out_of_range(wrong):
     with pytest.raises(FrameError, match="header"):
-        bench.encode_frame(wrong, b"")
+        wire.encode_frame(wrong, b"")
 
 
 def test_another_version_is_told():
-    made = bench.encode_frame(Header(2, 0, 0, 0, version=2), b"")
+    made = wire.encode_frame(Header(2, 0, 0, 0, version=2), b"")
     with pytest.raises(FrameError, match="version 2; this is version 1"):
-        bench.decode_frame(made[1:-1])
+        wire.decode_frame(made[1:-1])
 
 
 # ---------------------------------------------------------------------------------------- streams
@@ -188,7 +188,7 @@ def test_what_is_wrong_is_counted_by_its_kind():
     receiver.feed(bytes(made))
     receiver.feed(b"\x00\x05ab\x00")  # says four bytes, has two
     receiver.feed(b"\x00\x03ab\x00")
-    receiver.feed(bench.encode_frame(Header(2, 0, 0, 0, version=9), b""))
+    receiver.feed(wire.encode_frame(Header(2, 0, 0, 0, version=9), b""))
     counts = receiver.counts
     assert (counts.crc, counts.cobs, counts.short, counts.version) == (1, 1, 1, 1)
     assert (counts.wrong, counts.frames) == (4, 0)
@@ -210,7 +210,7 @@ def test_sequences_tell_lost_repeated_and_late():
 # ---------------------------------------------------------------------------------------- records
 
 
-@pytest.mark.parametrize("m", bench.MESSAGES, ids=lambda m: m.name)
+@pytest.mark.parametrize("m", wire.MESSAGES, ids=lambda m: m.name)
 def test_values_come_back_bit_for_bit(m):
     rng = np.random.default_rng(m.number)
     values = {
@@ -219,16 +219,16 @@ def test_values_come_back_bit_for_bit(m):
         else rng.integers(0, 200, f.length)
         for f in m.fields
     }
-    payload = bench.encode(m.name, values)
-    assert len(payload) == bench.size_of(m.name)
-    back = bench.decode(m.name, payload)
+    payload = wire.encode(m.name, values)
+    assert len(payload) == wire.size_of(m.name)
+    back = wire.decode(m.name, payload)
     for name, value in values.items():
         np.testing.assert_array_equal(np.ravel(back[name]), value)
-    assert bench.encode(m.name, back) == payload
+    assert wire.encode(m.name, back) == payload
 
 
 def test_nan_is_a_number_of_the_wire():
-    back = bench.decode("gyro", bench.encode("gyro", GYRO))
+    back = wire.decode("gyro", wire.encode("gyro", GYRO))
     np.testing.assert_array_equal(back["theta_b"], GYRO["theta_b"])
 
 
@@ -245,29 +245,29 @@ def test_nan_is_a_number_of_the_wire():
 )
 def test_values_that_are_not_the_message(name, values, words):
     with pytest.raises(RecordError, match=words):
-        bench.encode(name, values)
+        wire.encode(name, values)
 
 
 def test_payloads_that_are_not_the_message():
     with pytest.raises(RecordError, match="message 'tick' has 4 bytes, got 3"):
-        bench.decode("tick", b"abc")
+        wire.decode("tick", b"abc")
     with pytest.raises(KeyError, match="no message 'tock' in version 1; there are hello, tick"):
-        bench.encode("tock", {})
+        wire.encode("tock", {})
 
 
 def test_the_table_is_sound():
-    numbers = [m.number for m in bench.MESSAGES]
+    numbers = [m.number for m in wire.MESSAGES]
     assert numbers == sorted(set(numbers))
     assert all(0 < n < 256 for n in numbers)
-    for m in bench.MESSAGES:
+    for m in wire.MESSAGES:
         assert len({f.name for f in m.fields}) == len(m.fields)
-        assert bench.size_of(m.name) <= MOST_PAYLOAD
-        assert bench.message(m.number) is bench.message(m.name)
+        assert wire.size_of(m.name) <= MOST_PAYLOAD
+        assert wire.message(m.number) is wire.message(m.name)
 
 
 def test_the_page_has_the_table():
     page = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
-    assert bench.markdown() in page.read_text("utf-8")
+    assert wire.markdown() in page.read_text("utf-8")
 
 
 # ---------------------------------------------------------------------------------------------- C

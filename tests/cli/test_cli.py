@@ -18,6 +18,8 @@ from robins.logs import Finding, LogError
 from robins.scenario import ScenarioError
 from robins.units import UnitError
 
+PACKAGE = Path(cli.__file__).parents[1]
+
 # ------------------------------------------------------------------------------------------- runs
 
 
@@ -282,9 +284,12 @@ def test_the_list_names_everything(robins, systems):
         ],
         "filters": ["ekf", "ukf"],
         "claims": [{"id": "C1", "text": "it holds", "system": "car"}],
+        "bench": sorted(p.stem for p in PACKAGE.glob("bench/run/scenarios/*.toml")),
+        "designs": sorted(p.stem for p in PACKAGE.glob("cli/problems/*.toml")),
     }
     people = robins("list").out
-    for expected in ("car  a car", "car/town, car/road", "ekf, ukf", "C1: it holds", "kite"):
+    told = ("car  a car", "car/town, car/road", "ekf, ukf", "C1: it holds", "kite")
+    for expected in (*told, "noisy-line, sign-star", "baro-height, two-states"):
         assert expected in people
     assert "robins run car/town" in people
 

@@ -1,0 +1,352 @@
+"""Runs on the bench with real processes: bits, faults, deaths, clocks, boards."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from robins.bench.broker import BenchError, LinkFault
+from robins.bench.parts.satellite import Kit
+from robins.bench.parts.satellite.preparing import kit_for
+from robins.bench.ports.cable import cable
+from robins.bench.recording import read_record
+from robins.bench.run import Flight, Setup
+from robins.bench.run.session import Ran, Session, in_process
+from robins.bench.run.setup import changed, read
+from robins.bench.run.telemetry import difference, flag
+from robins.bench.wire.frames import Frame
+from robins.bench.wire.receiver import Receiver
+from robins.bench.wire.records import decode
+from robins.bench.wire.schema import message
+from robins.scenario import ScenarioError
+
+LOOP = "duration=60 s", "counted_from=10 s"
+PARTS = ("plant", "table", "gyro", "star", "adm", "acm", "actuators")
+
+
+def flight(**options: Any) -> Flight:
+    return changed(read("satellite/s1", LOOP), {"seconds": 20.0, **options})
+
+
+class Watch:
+    """Does things at steps of a run."""
+
+    def __init__(self, at: dict[int, Any] | None = None):
+        self.at, self.events, self.pids = at or {}, [], {}
+
+    def event(self, kind: str, time_s: float, text: str) -> None:
+        self.events.append((kind, time_s, text))
+
+    def step(self, session: Session, step: int) -> None:
+        self.pids |= {p: pid for p in PARTS if (pid := session.crew.process(p)) is not None}
+        if (do := self.at.pop(step, None)) is not None:
+            do(session)
+
+    def over(self, session: Session, failed: bool) -> None:
+        self.failed = failed
+
+    def commands(self, session: Session) -> list[dict[str, Any]]:
+        return []
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@cache
+def kit(filter_: str = "mekf") -> Kit:
+    return kit_for(read("satellite/s1", LOOP).loop, filter_, 0)
+
+
+class Done(NamedTuple):
+    ran: Ran
+    off: float  # from the same inside one program
+    watch: Watch
+
+
+def run(of: Flight, at: dict[int, Any] | None = None, record: Any = None) -> Done:
+    watch = Watch(at)
+    ran = Session(of, record, watch, kit=kit(of.setup.filter)).run()
+    assert not any(alive(pid) for pid in watch.pids.values()), "a process was left over"
+    return Done(ran, difference(ran.flown, in_process(of, ran.kit)), watch)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A run in lock-step, in which a part was stopped for two seconds."""
+
+    def stop(session):
+        pid = session.crew.process("adm")
+        os.kill(pid, signal.SIGSTOP)
+        threading.Timer(2.0, os.kill, (pid, signal.SIGCONT)).start()
+
+    record = tmp_path_factory.mktemp("bench") / "plain.mcap"
+    began = time.monotonic()
+    done = run(flight(), {50: stop}, record)
+    assert time.monotonic() - began > 2.0
+    return done, record
+
+
+def test_lock_step_has_the_bits_of_one_program_even_if_a_part_is_stopped(plain):
+    done, _ = plain
+    assert done.ran.failure == ""
+    assert done.ran.steps == 200
+    assert done.off == 0.0
+    assert max(h.wrong + h.lost + h.late + h.strange for h in done.ran.health.values()) == 0
+    assert done.ran.star_frames == 40
+
+
+def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
+    from robins.campaign.monte_carlo import record, worlds
+    from robins.systems.satellite.problem import attitude_problem
+
+    done, _ = plain
+    problem = attitude_problem(flight().loop, ("mekf",), 0)
+    ((world, count),) = worlds(problem, 1)
+    found = record(problem, "mekf", world, count)
+    np.testing.assert_array_equal(done.ran.flown.q_est_ib, found["mean"].attitude.wxyz[0, :200])
+    np.testing.assert_array_equal(done.ran.flown.bias, found["mean"].gyro_bias[0, :200])
+    np.testing.assert_array_equal(
+        done.ran.flown.wheel_h, found["outputs"]["wheel_momentum"][0, :200]
+    )
+
+
+def test_the_record_holds_all_that_went_over_the_links(plain):
+    done, path = plain
+    record = read_record(path)
+    assert record.whole
+    assert record.header["steps"] == 200
+    said: dict[tuple[str, str], list[Frame]] = {}
+    for entry in record.entries:
+        said.setdefault((entry.link, entry.direction), []).extend(Receiver().feed(entry.data))
+    assert {link for link, _ in said} == set(PARTS)
+    # by time: a tick that was sent twice is answered twice, with the same
+    estimates = {
+        f.header.time_ns: f.payload
+        for f in said["adm", "from"]
+        if f.header.type == message("estimate").number
+    }
+    q = np.array([decode("estimate", estimates[time])["q_ib"] for time in sorted(estimates)])
+    np.testing.assert_array_equal(q, done.ran.flown.q_est_ib)
+    ticks = [f for f in said["adm", "to"] if f.header.type == message("tick").number]
+    # the one that was not answered for two seconds was sent again
+    assert 200 < len(ticks) <= 203
+    assert [f.header.sequence for f in said["adm", "to"]] == list(range(len(said["adm", "to"])))
+
+
+# --------------------------------------------------------------------------------------- deaths
+
+
+def test_each_part_is_killed_in_turn_and_started_anew_to_the_last_bit(tmp_path):
+    killed_at = {}
+
+    def kill(part):
+        def now(session):
+            killed_at[part] = session._wall_ns()
+            os.kill(session.crew.process(part), signal.SIGKILL)
+
+        return now
+
+    at = {10 * (k + 1): kill(part) for k, part in enumerate(PARTS)}
+    done = run(flight(on_death="restart", seconds=10.0), at, tmp_path / "r.mcap")
+    assert done.ran.failure == ""
+    assert done.ran.deaths == 7
+    assert done.off == 0.0
+    died = {e.text.split("'")[1]: e for e in done.ran.events if e.kind == "died"}
+    assert list(died) == list(PARTS)
+    for part, event in died.items():
+        assert event.received_ns - killed_at[part] < 2e9
+        assert "SIGKILL" in event.text
+    record = read_record(tmp_path / "r.mcap")
+    assert record.whole
+    assert [e.kind for e in record.events].count("restarted") == 7
+
+
+def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(tmp_path):
+    def kill(session):
+        os.kill(session.crew.process("plant"), signal.SIGKILL)
+
+    began = time.monotonic()
+    done = run(flight(), {30: kill}, tmp_path / "f.mcap")
+    assert "'plant' was killed by SIGKILL, at 3." in done.ran.failure
+    assert done.ran.steps == 31
+    assert done.off == 0.0  # as far as it went
+    assert done.watch.events[-1][0] == "failed"
+    record = read_record(tmp_path / "f.mcap")
+    assert record.whole
+    assert record.events[-1].kind == "failed"
+    assert time.monotonic() - began < 60.0
+
+
+def test_parts_end_when_the_bench_is_killed(tmp_path):
+    code = (
+        "import sys, pathlib\n"
+        "from robins.bench.run.session import Session\n"
+        "from robins.bench.run.setup import changed, read\n"
+        f"of = changed(read('satellite/s1', {LOOP!r}), {{'seconds': 60.0, 'baud': 9600}})\n"
+        "class Watch:\n"
+        "    def event(self, *a): pass\n"
+        "    def over(self, *a): pass\n"
+        "    def commands(self, s): return []\n"
+        "    def step(self, s, k):\n"
+        "        if k == 5: print(*(s.crew.process(p) for p in s.broker.links), flush=True)\n"
+        "if __name__ == '__main__':\n"
+        f"    Session(of, pathlib.Path({str(tmp_path / 'k.mcap')!r}), Watch()).run()\n"
+    )
+    bench = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert bench.stdout is not None
+    pids = [int(word) for word in bench.stdout.readline().split()]
+    assert len(pids) == 7
+    time.sleep(0.6)  # the record is written at least each half second
+    bench.kill()
+    bench.wait()
+    bench.stdout.close()
+    until = time.monotonic() + 10.0
+    while any(alive(pid) for pid in pids) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(alive(pid) for pid in pids)
+    record = read_record(tmp_path / "k.mcap")
+    assert not record.whole
+    assert len(record.entries) > 100
+
+
+# --------------------------------------------------------------------------------------- clocks
+
+
+def test_real_time_keeps_its_deadlines_and_counts_those_it_misses():
+    of = flight(clock="realtime", rate=25.0, seconds=6.0)
+    ran = Session(of, kit=kit()).run()
+    assert ran.steps == 60
+    assert ran.failure == ""
+    # never sleep(1/f): 60 steps take 60 periods, however late each was
+    assert ran.seconds > 59 / 25.0
+    told = ran.latencies.summary()
+    assert told["cycles"] == 60
+    assert sum(told["histogram"]["counts"]) == 60
+    assert told["cycle"]["lateness_us"]["count"] == 60
+    assert told["missed"] == sum(e.kind == "missed" for e in ran.events)
+
+
+def test_a_part_that_is_stopped_in_real_time_is_not_waited_for():
+    stopped = {}
+
+    def stop(session):
+        stopped["pid"] = session.crew.process("star")
+        os.kill(stopped["pid"], signal.SIGSTOP)
+
+    def go_on(session):
+        os.kill(stopped["pid"], signal.SIGCONT)
+
+    of = flight(clock="realtime", rate=25.0, seconds=10.0, patience=0.5, filter="mekf-gate")
+    done = run(of, {20: stop, 60: go_on})
+    assert done.ran.steps == 100
+    assert done.ran.silent["star"] >= 30
+    assert np.any(flag(done.ran.flown, "star silent"))
+    # what it says afterwards is of steps that are over
+    assert done.ran.health["star"].late + done.ran.health["star"].frames > 0
+
+
+def test_overrun_may_abort_the_run():
+    def slow(session):
+        time.sleep(0.3)
+
+    of = flight(clock="realtime", rate=25.0, overrun="abort", seconds=10.0)
+    ran = Session(of, None, Watch(dict.fromkeys(range(20, 25), slow)), kit=kit()).run()
+    assert 'overrun = "abort"' in ran.failure
+    assert ran.steps < 40
+
+
+# --------------------------------------------------------------------------------------- faults
+
+
+def test_faults_are_the_same_however_fast_it_goes():
+    faults = (
+        LinkFault(kind="bit errors", begin=2.0, share=0.05),
+        LinkFault(kind="loss", begin=4.0, end=8.0, share=0.05, direction="to"),
+        LinkFault(kind="duplication", begin=2.0, share=0.05),
+        LinkFault(kind="delay", begin=5.0, link="star", delay=0.5, share=0.3),
+        LinkFault(kind="reorder", begin=8.0, link="gyro", share=0.3),
+    )
+    fast, slow = (
+        run(flight(filter="mekf-gate", seconds=12.0, faults=faults, **more))
+        for more in ({}, {"baud": 115200})
+    )
+    np.testing.assert_array_equal(fast.ran.flown.q_est_ib, slow.ran.flown.q_est_ib)
+    np.testing.assert_array_equal(fast.ran.flown.q_ib, slow.ran.flown.q_ib)
+    assert fast.ran.injected == slow.ran.injected
+    assert {kind for kind, _ in fast.ran.injected} == {f.kind for f in faults}
+    health = fast.ran.health.values()
+    damaged = sum(n for (kind, _), n in fast.ran.injected.items() if kind == "bit errors")
+    # one that is doubled is wrong twice, and one with a new zero in it too
+    assert damaged <= sum(h.wrong for h in health) <= 2 * damaged
+    held = sum(n for (kind, _), n in fast.ran.injected.items() if kind in ("delay", "reorder"))
+    assert damaged <= sum(h.lost for h in health) <= damaged + held  # a number that never came
+    assert sum(h.repeated for h in health) > 0
+    assert fast.off > 0.0
+    assert slow.ran.seconds > fast.ran.seconds
+
+
+# --------------------------------------------------------------------------------------- boards
+
+
+@contextmanager
+def board(part: str, path: str):
+    robins = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
+    command = [*robins, "bench", "node", part, path, "satellite/s1"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_part_may_be_a_board_on_a_real_port():
+    """Here the board is a process started by hand, at the other end of a cable."""
+    whole = changed(read("satellite/s1"), {"seconds": 5.0})
+    with cable() as ends, board("gyro", ends.board) as process:
+        of = changed(whole, {"ports": {"gyro": ends.bench}})
+        ran = Session(of).run()
+        assert ran.failure == ""
+        assert difference(ran.flown, in_process(of, ran.kit)) == 0.0
+        said, _ = process.communicate(timeout=20.0)
+        assert "The bench has said stop." in said
+
+
+def test_what_does_not_fit_is_refused_before_anything_starts():
+    with pytest.raises(ScenarioError, match=r"seconds: 1000 s is not from a step \(0.1 s\) to"):
+        Session(flight(seconds=1000.0))
+    with pytest.raises(ScenarioError, match=r"ports: there is no part 'gyros', only plant"):
+        flight(ports={"gyros": "/dev/null"})
+    with pytest.raises(ScenarioError, match="rate: a clock in lock-step has none"):
+        flight(rate=100.0)
+    with pytest.raises(ValueError, match="there is no such path"):
+        Session(flight(ports={"gyro": "/dev/ttyNOTHERE"}))
+    with pytest.raises(
+        ScenarioError, match="no filter 'mekff' for the satellite; did you mean 'mekf"
+    ):
+        flight(filter="mekff")
+
+
+def test_a_board_that_says_nothing_is_named(monkeypatch):
+    monkeypatch.setattr("robins.bench.run.session.HELLO_S", 0.2)
+    with cable() as ends:
+        of = flight(ports={"gyro": ends.bench})
+        ran = Session(of, kit=kit()).run()
+    assert "no hello from" in ran.failure
+    assert "gyro" in ran.failure
+    assert ran.steps == 0
+    assert isinstance(BenchError("x"), RuntimeError)
+    assert Setup().clock == "lockstep"

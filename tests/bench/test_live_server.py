@@ -1,0 +1,362 @@
+"""The live page without a browser: what the bench says comes, what strangers say does not."""
+
+import json
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from robins.bench import live as package
+from robins.bench.live import Live, Signal
+from robins.bench.live.feed import to_json
+from robins.bench.live.hub import QUEUE, Client
+
+STATIC = Path(package.__file__).parent / "static"
+SIGNALS = [
+    Signal("error x", "arcsec", "Error"),
+    Signal("sigma x", "arcsec", "Error", "sigma", "error x"),
+    Signal("ratio", "1", "Ratio"),
+]
+FAULTS = [
+    {"label": "star stuck", "fault": {"kind": "stuck", "link": "star"}},
+    {"label": "noise", "fault": {"kind": "bit errors", "bits": 2}},
+]
+RUN = 41
+
+
+@pytest.fixture
+def live():
+    """A server for a test that is rough with it."""
+    with Live(SIGNALS, "a bench", RUN, faults=FAULTS) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def server():
+    with Live(SIGNALS, "a bench", RUN, faults=FAULTS) as made:
+        yield made
+
+
+@pytest.fixture
+def shared(server):
+    """The server of all tests that leave it as it was, with nothing of the test before."""
+    server.new_run(server.run + 1)
+    return server
+
+
+def page_of(live: Live, **options):
+    """A websocket to the server, as a page opens it; it takes in all that comes."""
+    return connect(live.url.replace("http", "ws") + "live", max_queue=None, **options)
+
+
+def texts(page, kind: str, within_s: float = 3.0):
+    """The next text of a kind; others and samples are passed over."""
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        got = page.recv(timeout=within_s)
+        if isinstance(got, str) and json.loads(got)["kind"] == kind:
+            return json.loads(got)
+    raise AssertionError(f"no {kind} within {within_s} s")
+
+
+def frames(page, many: int, within_s: float = 5.0) -> list[bytes]:
+    """Samples that come; fewer if the rest stays away."""
+    found: list[bytes] = []
+    until = time.monotonic() + within_s
+    while len(found) < many and time.monotonic() < until:
+        try:
+            got = page.recv(timeout=0.5)
+        except TimeoutError:
+            continue
+        if isinstance(got, bytes):
+            found.append(got)
+    return found
+
+
+def numbers(samples: list[bytes]) -> np.ndarray:
+    return np.array([struct.unpack_from("<I", s, 4)[0] for s in samples])
+
+
+def gone(pid: int, within_s: float = 4.0) -> bool:
+    """Whether a process ends; one that nobody waited for yet has ended too."""
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.02)
+    return False
+
+
+# --------------------------------------------------------------------------- what the bench says
+
+
+def test_a_sample_comes_bit_for_bit(shared):
+    values = [1.0 / 3.0, -5e-324, float("nan")]
+    with page_of(shared) as page:
+        hello = texts(page, "hello")
+        shared.push(0.1, values)
+        (frame,) = frames(page, 1)
+    assert frame == struct.pack("<IId3d", shared.run, 0, 0.1, *values)
+    assert (hello["run"], hello["title"], hello["bench"]) == (shared.run, "a bench", True)
+    assert hello["signals"] == [
+        {"name": n, "unit": u, "plot": p, "role": r, "of": o} for n, u, p, r, o in SIGNALS
+    ]
+    assert hello["faults"] == FAULTS
+
+
+def test_a_page_that_comes_late_sees_what_was(shared):
+    for k in range(500):
+        shared.push(0.1 * k, [float(k), 1.0, 0.5])
+    for k in range(250):
+        shared.event("info", float(k), f"event {k}")
+    shared.status({"state": "running", "deadlines": {"missed": 2}})
+    with page_of(shared) as first:  # the feed keeps the order: with the last sample all is there
+        while numbers(frames(first, 1)) != [499]:
+            pass
+    with page_of(shared) as page:
+        hello = texts(page, "hello")
+        assert hello["history"] == 300
+        assert np.array_equal(numbers(frames(page, 300)), np.arange(200, 500))
+    assert [e["text"] for e in hello["events"]] == [f"event {k}" for k in range(50, 250)]
+    assert hello["status"] == {"state": "running", "deadlines": {"missed": 2}}
+
+
+def test_the_latest_status_and_every_event_come(shared):
+    with page_of(shared) as page:
+        texts(page, "hello")
+        shared.status({"deadlines": {"lateness_us": {"p50": np.float64(1.5), "max": np.nan}}})
+        got = texts(page, "status")["status"]
+        shared.event("alarm", 3.5, "star refused")
+        event = texts(page, "event")
+    assert got == {"deadlines": {"lateness_us": {"p50": 1.5, "max": None}}}
+    assert event == {"kind": "event", "level": "alarm", "time_s": 3.5, "text": "star refused"}
+
+
+def test_another_run_begins_on_the_same_page(shared):
+    old = shared.run
+    shared.push(0.1, [1.0, 1.0, 1.0])
+    shared.event("info", 0.1, "old")
+    with page_of(shared) as page:
+        assert texts(page, "hello")["run"] == old
+        shared.new_run(old + 1)
+        hello = texts(page, "hello")
+        shared.push(0.1, [2.0, 1.0, 1.0])
+        (frame,) = frames(page, 1)
+    assert (hello["run"], hello["events"], hello["history"]) == (old + 1, [], 0)
+    assert struct.unpack_from("<IId", frame) == (old + 1, 0, 0.1)
+    with pytest.raises(ValueError, match=f"run {old + 1} is shown already"):
+        shared.new_run(old + 1)
+
+
+def test_json_has_nothing_that_a_browser_does_not_read():
+    text = to_json({"a": [np.nan, np.inf, 1.5], "b": np.arange(2), 3: (True, None, "x")})
+    assert json.loads(text) == {"a": [None, None, 1.5], "b": [0, 1], "3": [True, None, "x"]}
+
+
+# -------------------------------------------------------------------- slow pages, dead processes
+
+
+def test_the_bench_never_waits_for_a_server_that_does_not_read(live):
+    os.kill(live._process.pid, signal.SIGSTOP)
+    try:
+        longest = 0.0
+        for k in range(6000):
+            began = time.perf_counter()
+            live.push(0.1 * k, [float(k), 1.0, 1.0])
+            longest = max(longest, time.perf_counter() - began)
+    finally:
+        os.kill(live._process.pid, signal.SIGCONT)
+    assert (
+        longest < 1.0
+    )  # microseconds, but on a machine that others use; waiting would be for ever
+    assert live.dropped > 1000
+    with page_of(live) as page:
+        texts(page, "hello")
+        seen: list[bytes] = []
+        until = time.monotonic() + 5.0
+        while not seen or numbers(seen)[-1] < 5999:
+            assert time.monotonic() < until
+            live.poll()
+            seen += frames(page, 50, 0.1)
+        got = numbers(seen)
+        # What was dropped is the oldest of what waited; what came last is there.
+        assert np.array_equal(got[-300:], np.arange(5700, 6000))
+        assert np.all(np.diff(got) > 0)
+        beat = texts(page, "beat")
+    assert beat["dropped_before"] == live.dropped
+    assert beat["dropped"] == 0
+
+
+@contextmanager
+def deaf_page(live: Live):
+    """A page that asks for samples and does not read them, with the least buffer there is."""
+    at = live._at.getsockname()
+    with socket.socket() as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        raw.settimeout(5.0)
+        raw.connect(at)
+        raw.sendall(
+            f"GET /live HTTP/1.1\r\nHost: {at[0]}:{at[1]}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+            "Sec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        yield raw
+
+
+def test_a_slow_page_loses_its_oldest_samples_and_slows_nobody():
+    many = [Signal(f"s{k}", "1", "Many") for k in range(400)]  # 3 kB each, so that buffers fill
+    with Live(many, "a bench", RUN) as live, deaf_page(live) as deaf, page_of(live) as page:
+        texts(page, "hello")
+        seen: list[bytes] = []
+        for k in range(2000):
+            live.push(0.1 * k, np.full(400, float(k)))
+            if k % 20 == 19:
+                seen += frames(page, 20, 5.0)
+        assert np.array_equal(numbers(seen), np.arange(2000))  # the quick one has all of them
+        assert live.dropped == 0
+        got = drain(deaf)
+        late = numbers([body for kind, body in got if kind == 2])
+        beats = [json.loads(b) for kind, b in got if kind == 1 and b'"beat"' in b]
+    assert late[-1] == 1999
+    missing = np.diff(late) - 1
+    assert np.count_nonzero(missing) == 1  # the oldest that waited went, no other
+    assert missing.sum() == beats[-1]["dropped"] > 1000
+    assert np.count_nonzero(late > late[np.argmax(missing)]) >= QUEUE
+
+
+def drain(raw: socket.socket) -> list[tuple[int, bytes]]:
+    """Messages of a websocket, opcode and body, until a beat comes after the last sample."""
+    stream, found, last = raw.makefile("rb"), [], False
+    while stream.readline().strip():
+        pass  # the answer to the handshake
+    with stream:
+        while not last or b'"beat"' not in found[-1][1]:
+            kind, length = stream.read(2)
+            if length == 126:
+                (length,) = struct.unpack(">H", stream.read(2))
+            found.append((kind & 15, stream.read(length)))
+            last = last or (found[-1][0] == 2 and numbers([found[-1][1]]) == 1999)
+    return found
+
+
+def test_memory_of_the_server_stays_constant(shared):
+    def resident_kb() -> int:
+        status = Path(f"/proc/{shared._process.pid}/status").read_text()
+        return int(re.findall(r"VmRSS:\s+(\d+)", status)[0])
+
+    sizes = []
+    with deaf_page(shared), page_of(shared) as page:
+        texts(page, "hello")
+        for block in range(4):
+            for k in range(1500 * block, 1500 * (block + 1)):
+                shared.push(0.1 * k, [float(k), 1.0, 1.0])
+                shared.event("info", 0.1 * k, f"event {k} " * 200)  # 2 kB
+                if k % 100 == 99:
+                    frames(page, 100)
+            sizes.append(resident_kb())
+    assert sizes[-1] < 1.1 * sizes[0]
+
+
+def test_a_queue_counts_what_it_drops():
+    client = Client()
+    for k in range(QUEUE + 7):
+        client.sample(bytes([k % 256]))
+    assert client.dropped == 7
+
+
+def test_a_killed_server_comes_back_at_the_same_port_with_what_was(live):
+    for k in range(10):
+        live.push(0.1 * k, [float(k), 1.0, 1.0])
+    live.event("alarm", 0.5, "before")
+    live.status({"state": "running"})
+    os.kill(live._process.pid, signal.SIGKILL)
+    until = time.monotonic() + 2.0
+    while live.alive:
+        assert time.monotonic() < until
+    for k in range(10, 20):
+        live.push(0.1 * k, [float(k), 1.0, 1.0])  # nobody listens, nothing is raised
+    assert live.commands() == []
+    url, until = live.url, time.monotonic() + 5.0
+    while not live.alive and time.monotonic() < until:
+        live.poll()
+        time.sleep(0.02)
+    assert (live.restarts, live.url, live.dropped) == (1, url, 0)
+    with page_of(live, open_timeout=10) as page:
+        assert texts(page, "hello")["restarts"] == 1
+        assert np.array_equal(numbers(frames(page, 20)), np.arange(20))
+    with page_of(live) as page:
+        hello = texts(page, "hello")
+    assert [e["text"] for e in hello["events"]] == ["before"]
+    assert hello["status"] == {"state": "running"}
+
+
+def test_a_server_that_keeps_dying_is_not_started_more_than_once_a_second(live):
+    started = set()
+    until = time.monotonic() + 2.5
+    while time.monotonic() < until:
+        live.poll()
+        if live.alive:
+            started.add(live._process.pid)
+            os.kill(live._process.pid, signal.SIGKILL)
+            live._process.wait()
+    assert 2 <= len(started) <= 4
+
+
+BENCH = """
+import sys, time
+from robins.bench.live import Live, Signal
+live = Live([Signal("a", "1", "A")], "a bench", 1)
+print(live._process.pid, live.url, flush=True)
+time.sleep(60)
+"""
+
+
+def test_no_server_outlives_a_bench_that_was_killed():
+    with subprocess.Popen(
+        [sys.executable, "-c", BENCH], stdout=subprocess.PIPE, text=True
+    ) as bench:
+        assert bench.stdout
+        pid, url = bench.stdout.readline().split()
+        with connect(url.replace("http", "ws") + "live") as page:
+            assert texts(page, "hello")["bench"]
+            bench.kill()
+            assert texts(page, "ended")
+            with pytest.raises(ConnectionClosed):
+                texts(page, "hello")
+        assert gone(int(pid))
+
+
+def test_ctrl_c_at_the_terminal_does_not_reach_the_server(shared):
+    assert os.getsid(shared._process.pid) == shared._process.pid != os.getsid(0)
+
+
+def test_close_ends_the_server_though_a_page_does_not_read():
+    many = [Signal(f"s{k}", "1", "Many") for k in range(400)]
+    with Live(many, "a bench", RUN) as live, deaf_page(live):
+        for k in range(200):
+            live.push(0.1 * k, np.zeros(400))
+        pid = live._process.pid
+        began = time.monotonic()
+        live.close()
+        assert time.monotonic() - began < 4.5
+        assert gone(pid, 0.1)
+        live.close()
+        live.poll()
+        assert not live.alive
+        with pytest.raises(RuntimeError, match="closed"):
+            live.restart()

@@ -1,0 +1,241 @@
+"""The parts of the satellite, joined by bytes: the bits of the loop in one program, and faults."""
+
+import numpy as np
+import pytest
+from stations import Loop, kit
+
+from robins.bench.parts.satellite import BUILD
+from robins.bench.parts.station import Station
+from robins.bench.run.session import in_process
+from robins.bench.run.setup import read
+from robins.bench.run.telemetry import turn
+from robins.bench.wire import Header, decode, encode, encode_frame, message
+from robins.bench.wire.schema import FLAGS
+
+ARCSEC = np.pi / 648000.0
+SHORT = "duration=60 s", "counted_from=10 s"
+
+
+def bit(flags, text):
+    return flags >> FLAGS.index(text) & 1 == 1
+
+
+def reference(of, steps):
+    loop = in_process(read("satellite/s1", SHORT), of)
+    return {name: getattr(loop, name)[:steps] for name in ("q_ib", "q_est_ib", "bias", "wheel_h")}
+
+
+@pytest.mark.parametrize("name", ["mekf", "mekf-gate", "mixed-bias"])
+def test_over_bytes_the_loop_has_the_bits_of_one_program(name):
+    of = kit("satellite/s1", name, *SHORT)
+    loop = Loop(of).run(300)
+    wanted = reference(of, 300)
+    np.testing.assert_array_equal(loop.all("motion", "q_ib"), wanted["q_ib"])
+    np.testing.assert_array_equal(loop.all("estimate", "q_ib"), wanted["q_est_ib"])
+    np.testing.assert_array_equal(loop.all("estimate", "gyro_bias"), wanted["bias"])
+    np.testing.assert_array_equal(loop.all("wheels", "momentum"), wanted["wheel_h"])
+    used = bit(loop.flags(), "star used")
+    np.testing.assert_array_equal(used, of.due[:300])
+    assert not np.any(loop.flags() & ~1)
+
+
+def test_the_additive_filter_is_the_same_to_rounding():
+    # XLA multiplies its matrices in another order where it is not in a scan.
+    of = kit("satellite/s1", "ekf-quaternion", *SHORT)
+    loop, wanted = Loop(of).run(100), reference(of, 100)
+    np.testing.assert_allclose(loop.all("estimate", "q_ib"), wanted["q_est_ib"], atol=1e-13)
+    np.testing.assert_allclose(loop.all("estimate", "gyro_bias"), wanted["bias"], atol=1e-15)
+
+
+def test_a_camera_is_told_where_to_look():
+    settings = "duration=30 s", "counted_from=10 s", "star.camera.magnitude=5.0"
+    of = kit("satellite/stars", "mekf", *settings)
+    loop = Loop(of).run(100)
+    inside = in_process(read("satellite/stars", settings), of)
+    np.testing.assert_array_equal(loop.all("estimate", "q_ib"), inside.q_est_ib[:100])
+    factor, stars = loop.all("star", "factor"), loop.all("star", "stars")
+    assert np.all(np.any(factor != 0.0, axis=1))
+    # of twice as many stars the mean is better by the root of two
+    spread = np.linalg.norm(factor.reshape(-1, 9), axis=1)
+    assert np.min(stars) >= 2
+    assert np.median(spread[stars > np.median(stars)]) < np.median(spread[stars < np.median(stars)])
+    assert loop.stations["star"].part.takes == {"motion": 0, "gyro": 0, "estimate": 1}
+
+
+def test_messages_are_of_the_schema_and_of_the_end_of_their_step():
+    of = kit("satellite/s1", "mekf", *SHORT)
+    loop = Loop(of).run(20)
+    for part, frame in loop.said:
+        name = message(frame.header.type).name
+        decode(name, frame.payload)
+        assert frame.header.time_ns % of.step_ns == 0
+        assert name in ("done", *_sends(part))
+
+
+def _sends(part):
+    from robins.bench.broker.faults import ROUTES
+
+    return ROUTES[part]["from"]
+
+
+def test_what_parts_take_is_what_the_links_carry():
+    from robins.bench.broker.faults import ROUTES
+
+    of = kit("satellite/s1", "mekf", *SHORT)
+    for name, build in BUILD.items():
+        assert set(build(of).takes) <= set(ROUTES[name]["to"])
+
+
+# ------------------------------------------------------------------------------- what goes wrong
+
+
+def without(name, taker, steps):
+    def meddle(step, message, to, payload):
+        gone = message == name and to == taker and step in steps
+        return [] if gone else [((step + 1) * 100_000_000, payload)]
+
+    return meddle
+
+
+def test_without_star_frames_the_gyro_carries_on():
+    of = kit("satellite/s1", "mekf", *SHORT)
+    loop = Loop(of, without("star", "adm", range(100, 400))).run(300)
+    error = np.linalg.norm(turn(loop.all("estimate", "q_ib"), loop.all("motion", "q_ib")), axis=1)
+    assert np.all(bit(loop.flags()[125:], "star silent"))
+    assert not np.any(bit(loop.flags()[:119], "star silent"))
+    sigma = np.linalg.norm(loop.all("estimate", "sigma")[:, :3], axis=1)
+    assert sigma[-1] > 1.5 * sigma[99]  # it knows that it knows less
+    assert error[-1] < 5.0 * sigma[-1]
+
+
+def test_a_gyro_sample_that_is_missing_is_held_for_one_step():
+    of = kit("satellite/s1", "mekf", *SHORT)
+    loop = Loop(of, without("gyro", "adm", {50})).run(100)
+    flags = loop.flags()
+    assert list(np.flatnonzero(bit(flags, "gyro held"))) == [50]
+    assert not np.any(bit(flags, FLAGS[3]))
+    torque = loop.all("command", "wheel_torque")
+    assert np.all(np.any(torque[1:] != 0.0, axis=1))
+
+
+def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back():
+    of = kit("satellite/s1", "mekf", *SHORT)
+
+    def meddle(step, message, to, payload):
+        gone = message == "gyro" and step in range(50, 60)
+        return [] if gone else [((step + 1) * of.step_ns, payload)]
+
+    loop = Loop(of, meddle).run(200)
+    flags, torque = loop.flags(), loop.all("command", "wheel_torque")
+    safe = np.flatnonzero(bit(flags, FLAGS[3]))
+    again = int(np.flatnonzero(of.due[60:])[0]) + 60  # the first star frame with a gyro
+    assert list(safe) == list(range(51, again))
+    assert np.all(np.isnan(loop.all("estimate", "sigma")[safe]))
+    # control hears of it in the next step, and rests
+    assert np.all(torque[52 : again + 1] == 0.0)
+    assert np.any(torque[again + 1] != 0.0)
+    off = np.linalg.norm(turn(loop.all("estimate", "q_ib"), loop.all("motion", "q_ib")), axis=1)
+    assert off[-1] < 60.0 * ARCSEC
+
+
+def test_no_sample_of_an_axis_is_no_sample():
+    of = kit("satellite/s1", "mekf", *SHORT)
+
+    def meddle(step, message, to, payload):
+        if message == "gyro" and to == "adm" and step == 40:
+            payload = encode("gyro", {"theta_b": [0.0, np.nan, 0.0]})
+        return [((step + 1) * of.step_ns, payload)]
+
+    loop = Loop(of, meddle).run(60)
+    assert list(np.flatnonzero(bit(loop.flags(), "gyro held"))) == [40]
+    assert np.all(np.isfinite(loop.all("estimate", "q_ib")))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [(lambda q: 0.99 * q, FLAGS[5]), (lambda q: np.full(4, np.nan), None), (lambda q: -q, "same")],
+)
+def test_quaternions_that_are_none_are_refused_and_either_sign_is_the_same(change, text):
+    of = kit("satellite/s1", "mekf", *SHORT)
+
+    def meddle(step, message, to, payload):
+        if message == "star" and step >= 50:
+            said = decode("star", payload)
+            payload = encode("star", {**said, "q_ib": change(said["q_ib"])})
+        return [((step + 1) * of.step_ns, payload)]
+
+    plain, loop = Loop(of).run(80), Loop(of, meddle).run(80)
+    due = np.flatnonzero(of.due[50:80]) + 50
+    if text == "same":
+        np.testing.assert_allclose(
+            loop.all("estimate", "q_ib"), plain.all("estimate", "q_ib"), rtol=0.0, atol=1e-14
+        )
+        return
+    assert not np.any(bit(loop.flags()[due], "star used"))
+    assert np.all(bit(loop.flags()[due], FLAGS[5]) == (text is not None))
+
+
+def test_late_frames_are_not_fused_at_the_wrong_time():
+    of = kit("satellite/s1", "mekf", *SHORT)
+
+    def late(step, message, to, payload):
+        behind = of.step_ns * (3 if message == "star" else 0)
+        return [((step + 1) * of.step_ns - behind, payload)]
+
+    loop = Loop(of, late).run(60)
+    assert not np.any(bit(loop.flags(), "star used"))
+    assert loop.stations["adm"].counts["late"] == int(np.sum(of.due[:60]))
+
+
+def test_a_lost_command_stands_for_a_step_then_wheels_rest():
+    of = kit("satellite/s1", "mekf", *SHORT)
+    loop = Loop(of, without("command", "actuators", {30, 31, 32})).run(40)
+    given, asked = loop.all("actuation", "wheel_torque"), loop.all("command", "wheel_torque")
+    np.testing.assert_array_equal(given[30], given[29])
+    assert np.all(given[31:33] == 0.0)
+    np.testing.assert_array_equal(given[33], asked[33])
+
+
+def test_a_gyro_reports_what_it_missed_with_its_next_sample():
+    of = kit("satellite/s1", "mekf", *SHORT)
+    plain = Loop(of).run(40)
+    loop = Loop(of, without("mounted", "gyro", {20})).run(40)
+    assert len(loop.heard["gyro"]) == 39
+    whole, missed = plain.all("gyro", "theta_b"), loop.all("gyro", "theta_b")
+    np.testing.assert_array_equal(missed[:20], whole[:20])
+    # the turn of two steps, to the noise of a sample and what control made of it
+    np.testing.assert_allclose(missed[20], whole[20] + whole[21], atol=20.0 * ARCSEC)
+
+
+def test_a_table_that_lags_is_where_the_craft_was():
+    from robins.bench.parts.satellite.preparing import kit_for
+    from robins.bench.run.setup import Carrier
+
+    flight = read("satellite/s2", ("duration=200 s", "counted_from=10 s"))
+    of = kit_for(flight.loop, "mekf", 0, table=Carrier(lag=0.02).table())
+    loop = Loop(of).run(600)
+    behind = turn(loop.all("mounted", "q_ib"), loop.all("motion", "q_ib"))
+    change = np.linalg.norm(np.diff(loop.all("motion", "omega_b"), axis=0), axis=1)
+    size = np.linalg.norm(behind, axis=1)
+    # asked in each step for the way to where the craft is, it lags by tau times the change of rate
+    assert np.all(size[20:] < 3.0 * 0.02 * np.max(change))
+    assert np.max(size) > 0.2 * 0.02 * np.max(change)
+
+
+def test_more_wheels_than_the_wire_has_are_refused():
+    from robins.bench.parts.satellite.preparing import kit_for
+
+    flight = read("satellite/s1", ("wheels.axes=[[1,0,0],[0,1,0],[0,0,1],[1,1,1],[1,1,0]]",))
+    with pytest.raises(ValueError, match=r"the wire carries 4 wheels, this craft has 5"):
+        kit_for(flight.loop, "mekf", 0)
+
+
+def test_a_part_of_another_run_hears_nothing():
+    of = kit("satellite/s1", "mekf", *SHORT)
+    station = Station(BUILD["adm"](of))
+    begin = encode("begin", {"step": of.step_ns})
+    station.feed(encode_frame(Header(message("begin").number, 5, 0, 0), begin))
+    tick = encode_frame(
+        Header(message("tick").number, 4, 1, of.step_ns), encode("tick", {"step": 0})
+    )
+    assert station.feed(tick) == b""

@@ -1,0 +1,235 @@
+"""The commands of the bench: their words, and what they refuse before anything is started."""
+
+import ast
+import json
+import re
+import typing
+from pathlib import Path
+
+import click
+import mcap.writer
+import pydantic
+import pytest
+
+from robins.bench.broker.faults import LinkFault
+from robins.bench.run.session import Session
+from robins.bench.run.setup import NODES, built_in
+from robins.bench.wire.c_header import c_header
+from robins.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "bench.md").read_text("utf-8")
+CONTRACT = (ROOT / "docs" / "contract.md").read_text("utf-8")
+BENCH = app.commands["bench"]
+assert isinstance(BENCH, click.Group)
+COMMANDS = BENCH.commands
+SATELLITE = "satellite/s1"
+
+
+@pytest.fixture(autouse=True)
+def nothing_starts(monkeypatch):
+    """Whatever would start a process or run a bench fails the test."""
+
+    def refuse(*_, **__):
+        pytest.fail("a process would have been started")
+
+    monkeypatch.setattr("subprocess.Popen", refuse)
+    monkeypatch.setattr(Session, "run", refuse)
+
+
+@pytest.fixture(autouse=True)
+def own_runtime(monkeypatch, tmp_path):
+    """Benches that run on this machine for other reasons are not seen."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def rows(text: str, heading: str) -> list[list[str]]:
+    """Cells of the tables below a heading whose first cell is code."""
+    part = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    found = [line.strip("|").split("|") for line in part.splitlines() if line.startswith("| `")]
+    return [[cell.strip() for cell in row] for row in found]
+
+
+def code(text: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", text)
+
+
+# -------------------------------------------------------------------------------------- help
+
+
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_help_tells_what_it_does_and_how(robins, name):
+    told = robins("bench", *name.split(), "--help")
+    assert told.status == 0
+    assert "Usage: robins bench" in told.out
+    if name not in ("status", "ports"):  # those take nothing
+        assert f"robins bench {name}" in told.out.split("Examples:")[1]
+
+
+def test_examples_name_commands_and_options_that_there_are(robins):
+    shown = "".join(robins("bench", *name.split(), "--help").out for name in ["", *COMMANDS])
+    examples = re.findall(r"^ +robins bench (\w+) (.*)$", shown, re.MULTILINE)
+    assert len(examples) > 10
+    for name, rest in examples:
+        has = {flag for option in COMMANDS[name].params for flag in option.opts}
+        assert set(re.findall(r"--[\w-]+", rest)) <= has
+
+
+def test_every_scenario_is_named_in_the_help_and_on_the_page(robins):
+    told = " ".join(robins("bench", "up", "--help").out.split()).replace("- ", "-")
+    listed = told.split("Scenarios of the bench: ")[1].split(". ")[0]
+    assert listed.split(", ") == sorted(built_in())
+    named = [code(row[0])[0] for row in rows(PAGE, "Faults")]
+    assert [n for n in named if "-" in n] == sorted(built_in())
+
+
+# ------------------------------------------------------------------------------ what is promised
+
+
+def test_the_contract_names_commands_and_options():
+    told = {code(row[0])[0].split()[2]: code(row[2]) for row in rows(CONTRACT, "The test bench")}
+    has = {
+        name: [flag for option in command.params for flag in option.opts if flag[:2] == "--"]
+        for name, command in COMMANDS.items()
+    }
+    assert {k: sorted(v) for k, v in told.items()} == {k: sorted(v) for k, v in has.items()}
+
+
+def keys(tree: ast.AST, name: str | None = None) -> list[str]:
+    """Keys of the dictionary that `figures` returns, or of the one under a key of it."""
+    (function,) = (
+        n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == "figures"
+    )
+    (returned,) = (n.value for n in ast.walk(function) if isinstance(n, ast.Return))
+    assert isinstance(returned, ast.Dict)
+    for key, value in zip(returned.keys, returned.values, strict=True):
+        if (
+            name is not None
+            and isinstance(value, ast.Dict)
+            and key
+            and ast.literal_eval(key) == name
+        ):
+            returned = value
+    return [ast.literal_eval(key) for key in returned.keys if key is not None]
+
+
+def test_the_page_names_every_key_of_the_object():
+    source = ROOT / "src" / "robins" / "bench" / "run" / "outcome.py"
+    tree, told = ast.parse(source.read_text("utf-8")), rows(PAGE, "For scripts")
+    assert sorted(k for row in told for k in code(row[0])) == sorted(keys(tree))
+    (counts,) = (row[1] for row in told if row[0] == "`counts`")
+    assert code(counts) == keys(tree, "counts")
+
+
+def test_the_page_names_every_kind_of_fault_with_its_fields():
+    told = {code(row[0])[0]: code(row[2]) for row in rows(PAGE, "Faults") if len(row) == 3}
+    kinds = typing.get_args(LinkFault.model_fields["kind"].annotation)
+    assert sorted(told) == sorted(kinds)
+    every = {"link": "star", "direction": "to", "message": "star", "share": 0.5, "bits": 2}
+    every |= {"delay": 0.1, "angle": 0.1, "wheel": 0}
+    for kind in kinds:
+        with pytest.raises(pydantic.ValidationError) as refused:
+            LinkFault(kind=kind, begin=0.0, **every)
+        (takes,) = re.findall(r"it takes ([\w, ]+\w)", str(refused.value))
+        assert told[kind] == [
+            field for field in takes.split(", ") if field not in ("kind", "begin", "end")
+        ]
+
+
+# ------------------------------------------------------------------------------------ small ones
+
+
+def test_the_header_is_that_of_the_wire(robins):
+    assert robins("bench", "header").out == c_header()
+
+
+def test_ports_are_listed_for_programs(robins):
+    said = json.loads(robins("bench", "ports", "--json").out)
+    known = {"path", "description", "manufacturer", "serial_number", "usable", "why"}
+    assert list(said) == ["ports"]
+    assert all(set(port) == known for port in said["ports"])
+
+
+def test_status_where_none_runs(robins):
+    assert json.loads(robins("bench", "status", "--json").out) == {"benches": []}
+    told = robins("bench", "status")
+    assert (told.status, told.out.splitlines()[0]) == (0, "No bench runs.")
+
+
+# ------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["noisy-lin"], r"no scenario 'noisy-lin' for the bench; did you mean 'noisy-line'\?"),
+        (["satellite/s11"], r"no scenario 'satellite/s11' .*did you mean 'satellite/s1'\?"),
+        ([SATELLITE, "--node", "gyros=/dev/x"], r"ports: there is no part 'gyros', only plant, "),
+        ([SATELLITE, "--node", "gyro"], r"'--node': 'gyro' is not PART=PORT, such as gyro=/dev/"),
+        ([SATELLITE, "--node", "=/dev/x"], r"'--node': '=/dev/x' is not PART=PORT"),
+        ([SATELLITE, "--node", "gyro=/dev/none-such"], r"'/dev/none-such'.*no such path"),
+        ([SATELLITE, "--paused"], r"--paused waits for the page's Start: give --live too"),
+        ([SATELLITE, "--rate", "100"], r'rate: .*lock-step has none; choose the clock "realtime"'),
+        ([SATELLITE, "--filter", "mekff"], r"no filter 'mekff' .*did you mean 'mekf"),
+        ([SATELLITE, "--seconds", "1e6"], r"seconds: 1e\+06 s .*to the end .* \(1500 s\)"),
+        ([SATELLITE, "--seconds", "0.01"], r"seconds: 0\.01 s is not from a step \(0\.1 s\)"),
+        (["wrong-star", "--set", "faults.0.kind=turnd"], r"faults\.0\.kind .*mean 'turned'\?"),
+        (["none.toml"], r"none\.toml"),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else "",
+)
+def test_a_run_that_cannot_be_is_refused_with_the_mend(robins, given, told, tmp_path):
+    answer = robins("bench", "up", *given)
+    assert answer.status == 2
+    assert answer.out == ""
+    assert re.search(told, answer.err)
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_a_part_to_be_by_hand_must_be_one(robins):
+    answer = robins("bench", "node", "gyros", "/dev/null", SATELLITE)
+    assert answer.status == 2
+    assert answer.err.strip() == f"robins: no part 'gyros', only {', '.join(NODES)}"
+
+
+@pytest.fixture
+def foreign(tmp_path):
+    """An MCAP file that the bench did not write."""
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        writer.finish()
+    return path
+
+
+@pytest.fixture
+def text(tmp_path):
+    path = tmp_path / "text.mcap"
+    path.write_text("no record")
+    return path
+
+
+@pytest.mark.parametrize("which", ["text", "foreign"])
+def test_what_is_no_record_is_refused(robins, request, which):
+    path = request.getfixturevalue(which)
+    answer = robins("bench", "replay", path, "--node", "adm")
+    assert answer.status == 2
+    assert str(path) in answer.err
+    assert re.search("a record that the bench wrote|not one that the bench wrote", answer.err)
+
+
+def test_a_part_to_be_replayed_must_be_one(robins):
+    record = ROOT / "tests" / "bench" / "records" / "adm.mcap"
+    answer = robins("bench", "replay", record, "--node", "amd")
+    assert answer.status == 2
+    assert f"--node: there is no part 'amd', only {', '.join(NODES)}" in answer.err
+
+
+def test_a_filter_and_a_second_record_exclude_each_other(robins):
+    record = ROOT / "tests" / "bench" / "records" / "adm.mcap"
+    answer = robins(
+        "bench", "replay", record, "--node", "adm", "--filter", "mekf", "--diff", record
+    )
+    assert answer.status == 2
+    assert "--filter and --diff" in answer.err
