@@ -22,6 +22,8 @@ ORDER = [
     "satellite.py",
     "stars.py",
     "synthesis.py",
+    "wire.py",
+    "bench.py",
 ]
 
 

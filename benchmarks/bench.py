@@ -1,0 +1,47 @@
+"""The bench: steps a second with seven processes in lock-step, and lateness in real time.
+
+    python benchmarks/bench.py [--seconds 200]
+
+The peer is the same loop inside one program, a compiled scan, so the ratio is what the wire costs:
+seven processes, fourteen switches between them a step, frames made, checked and recorded.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from robins.bench.run.session import Session, in_process
+from robins.bench.run.setup import changed, read
+from robins.bench.run.telemetry import difference
+
+
+def main() -> None:
+    ask = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    ask.add_argument("--seconds", type=float, default=200.0)
+    asked = ask.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        record = Path(folder) / "bench.mcap"
+        flight = changed(read("satellite/s1"), {"seconds": asked.seconds})
+        ran = Session(flight, record).run()
+        in_process(flight, ran.kit)  # compiles
+        began = time.perf_counter()
+        inside = in_process(flight, ran.kit)
+        spent = (time.perf_counter() - began) / len(inside.time_s)
+        steps = ran.steps / ran.seconds
+        print(f"lock-step, seven processes   {steps:10.0f} steps/s")
+        ratio = 1.0 / spent / steps
+        print(f"one program                  {1.0 / spent:10.0f} steps/s, {ratio:.0f} times")
+        print(f"difference                   {difference(ran.flown, inside):10.3g}")
+        print(f"record                       {record.stat().st_size / ran.steps:10.0f} bytes/step")
+        print(ran.latencies.table())
+        real = changed(flight, {"clock": "realtime", "rate": 100.0})
+        ran = Session(real, record, kit=ran.kit).run()
+        late = ran.latencies.summary()
+        print(f"real time, 100 Hz            {late['missed']:6d} of {ran.steps} deadlines missed")
+        print(f"lateness p50, p99, max [us]  {late['cycle']['lateness_us']}")
+        print(ran.latencies.table())
+
+
+if __name__ == "__main__":
+    main()
