@@ -85,6 +85,7 @@ def browse(chromium, url: str, **options):
     page.on("console", hear)
     try:
         page.goto(url)
+        page.wait_for_function("() => bench.hellos > 0")  # what is done before, the hello may undo
         yield page
         assert outside == []
         assert wrong + page.evaluate("bench.errors") == []
@@ -400,6 +401,17 @@ def test_a_fault_is_injected_with_the_keyboard_alone(chromium, live):
         page.get_by_test_id("duration").fill("")
         page.get_by_test_id("inject").click()
         assert command(live) == {"do": "inject", **FAULTS[1], "duration_s": None}
+
+
+def test_a_chosen_fault_stays_chosen_when_the_server_returns(chromium):
+    with (
+        Live(SIGNALS, "satellite/test", RUN, faults=FAULTS) as live,
+        browse(chromium, live.url) as page,
+    ):
+        page.get_by_test_id("fault").select_option("gyro noise")
+        live.restart()
+        page.wait_for_function("() => bench.hellos > 1 && bench.state !== 'lost'")
+        expect(page.get_by_test_id("fault")).to_have_value("gyro noise")
 
 
 def test_what_the_server_refuses_is_said(chromium, live):

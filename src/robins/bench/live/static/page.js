@@ -14,7 +14,7 @@ const REST = 2; // times as long as drawing took, so that a slow machine keeps u
 const byId = (id) => document.getElementById(id);
 
 /** What the page has seen, for tests and for the curious. */
-const bench = { run: null, received: 0, shown: 0, repeated: 0, missed: 0, dropped: 0, reconnects: 0, errors: [], state: "waiting", plots: [] };
+const bench = { run: null, hellos: 0, received: 0, shown: 0, repeated: 0, missed: 0, dropped: 0, reconnects: 0, errors: [], state: "waiting", plots: [] };
 window.bench = bench;
 addEventListener("error", (event) => bench.errors.push(String(event.message)));
 addEventListener("unhandledrejection", (event) => bench.errors.push(String(event.reason)));
@@ -48,6 +48,7 @@ function paint() {
 // -------------------------------------------------------------------------------------- what comes
 
 function hello(message) {
+  bench.hellos++;
   if (!message.bench && bench.run !== null) return; // a server that came anew; the bench is to speak
   const anew = message.run !== bench.run || JSON.stringify(message.signals) !== signals;
   if (anew && message.bench) {

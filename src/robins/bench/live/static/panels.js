@@ -116,10 +116,12 @@ export function showStatus(status) {
   document.body.dataset.bench = state;
 }
 
-/** Faults that can be injected. */
+/** Faults that can be injected. What was chosen stays chosen, so that a server may come and go. */
 export function offerFaults(faults) {
-  const options = faults.map(({ label }) => new Option(label, label));
-  byId("fault").replaceChildren(...(options.length ? options : [new Option("no faults prepared", "")]));
+  const list = byId("fault");
+  const chosen = list.value;
+  const options = faults.map(({ label }) => new Option(label, label, false, label === chosen));
+  list.replaceChildren(...(options.length ? options : [new Option("no faults prepared", "")]));
   byId("inject").classList.toggle("none", !options.length);
 }
 
