@@ -11,7 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from robins.bench.run.session import Session, in_process
+from robins.bench.run.one_program import in_process
+from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.run.telemetry import difference
 

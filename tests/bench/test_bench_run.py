@@ -19,7 +19,8 @@ from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.ports.cable import cable
 from robins.bench.recording import read_record
 from robins.bench.run import Flight, Setup
-from robins.bench.run.session import Ran, Session, in_process
+from robins.bench.run.one_program import in_process
+from robins.bench.run.session import Ran, Session
 from robins.bench.run.setup import changed, read
 from robins.bench.run.telemetry import difference, flag
 from robins.bench.wire.frames import Frame

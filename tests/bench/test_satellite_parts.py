@@ -6,7 +6,7 @@ from stations import Loop, kit
 
 from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station
-from robins.bench.run.session import in_process
+from robins.bench.run.one_program import in_process
 from robins.bench.run.setup import read
 from robins.bench.run.telemetry import turn
 from robins.bench.wire import Header, decode, encode, encode_frame, message

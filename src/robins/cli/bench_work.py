@@ -61,7 +61,8 @@ def bring_up(
     command = command_line()
     with only_json(as_json), _told(), Progress() as progress:
         from robins.bench.run import outcome
-        from robins.bench.run.session import Session, in_process
+        from robins.bench.run.one_program import in_process
+        from robins.bench.run.session import Session
         from robins.results import ResultWriter
 
         flight = _flight(scenario, settings, {"filter": filter_, **options})

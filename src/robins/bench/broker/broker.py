@@ -56,7 +56,6 @@ class Broker:
     Attributes:
         links: by part.
         time_ns: of the run: the end of the step that is being computed.
-        heard: what was said last, by message: time of its header, payload.
         silent: steps in which a part did not answer in time, by part.
     """
 
@@ -69,6 +68,7 @@ class Broker:
         observe: Callable[[str, int, bytes], None],
         glance: Callable[[], None],
         done: Callable[[str, int, int, int, int], None],
+        meanwhile: Callable[[], None] = lambda: None,
         keep: frozenset[str] = frozenset(),
     ):
         """Take the links of a run.
@@ -82,16 +82,17 @@ class Broker:
             glance: called now and then while nothing comes, and once a step.
             done: told of an answer: part, step, when ticked, when answered [ns of the wall clock],
                 time it computed [ns].
+            meanwhile: called when there is nothing to do but to wait for a part: what need not be
+                done before the part computes is done while it does.
             keep: parts of which all is kept that was sent to them, so that they can be started
                 anew.
         """
         self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
         self.time_ns = 0
-        self.heard: dict[str, tuple[int, bytes]] = {}
         self.silent = dict.fromkeys(links, 0)
         self._run = 0
         self._injector, self._observe = injector, observe
-        self._glance, self._tell = glance, done
+        self._glance, self._tell, self._meanwhile = glance, done, meanwhile
         self._sources = {p: wiring.sources(p) & set(links) for p in links}
         self._takers = {
             name: tuple(p for p in wiring.takers(name) if p in links)
@@ -240,7 +241,10 @@ class Broker:
             if due:
                 timeout_s = min(timeout_s, (min(due) - _CLOCK_NS()) * 1e-9)
         waiting = [link.fd for link in by_fd.values() if link.pending]
-        ready, writable, _ = select.select(self._fds, waiting, [], max(0.0, timeout_s))
+        ready, writable, _ = select.select(self._fds, waiting, [], 0.0)
+        if not (ready or writable):
+            self._meanwhile()
+            ready, writable, _ = select.select(self._fds, waiting, [], max(0.0, timeout_s))
         for fd in dict.fromkeys([*ready, *slow]) if slow else ready:
             link = by_fd[fd]
             try:
@@ -281,7 +285,6 @@ class Broker:
     def _route(self, message: str, frame: Frame) -> None:
         at, payload = frame.header.time_ns, frame.payload
         self._routed.add((message, at))
-        self.heard[message] = at, payload
         self._observe(message, at, payload)
         for taker in self._takers[message]:
             link = self.links[taker]

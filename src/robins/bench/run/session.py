@@ -7,11 +7,8 @@ import gc
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
-
-import numpy as np
 
 from robins import __version__
 from robins.bench.broker.broker import Broker, Wiring
@@ -24,7 +21,6 @@ from robins.bench.parts.satellite import BUILD, Kit
 from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
 from robins.bench.recording import Entry, Event, Recorder
-from robins.bench.run import telemetry
 from robins.bench.run.accounting import Latencies
 from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.crew import Crew, Death
@@ -158,6 +154,8 @@ class Session:
         self._labels: list[tuple[str, LinkFault]] = []
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
+        self._passed: list[tuple[Entry, int]] = []  # not written yet
+        self._heard: list[tuple[str, int, bytes]] = []  # not noted yet
         self._glanced_ns = 0
         self._began_ns = time.monotonic_ns()
 
@@ -193,6 +191,8 @@ class Session:
             finally:
                 seconds = time.monotonic() - began
                 self.broker.stop()
+                with contextlib.suppress(BenchError):  # whose failure has been told, or is next
+                    self._catch_up()
                 if self._watch is not None:
                     self._watch.over(self, bool(failure))
         return Ran(
@@ -227,6 +227,7 @@ class Session:
             for k in range(self.steps):
                 self._obey(k)
                 if self._stop:
+                    self._catch_up()
                     return k
                 deadline = self.clock.wait(k, self.broker.poll)
                 began = time.monotonic_ns()
@@ -240,12 +241,14 @@ class Session:
                         "missed", f"step {k} was not over at the deadline of the next", False
                     )
                 if self._watch is not None:
+                    self._catch_up()
                     self._watch.step(self, k)
                 counted += 1
                 if (now := time.monotonic()) - told > _TELL_S:
                     self.pace, counted, since = counted / max(now - since, 1e-9), 0, now
                     told = now
                     self._tell((k + 1) / self.steps, f"{self.time_s:.0f} s of the run")
+        self._catch_up()
         return self.steps
 
     def _obey(self, step: int) -> None:
@@ -343,9 +346,10 @@ class Session:
             wiring(self.kit),
             self.kit.step_ns,
             self.injector,
-            self.telemetry.observe,
+            self._observe,
             self._glance,
             self._answered,
+            self._catch_up,
             keep,
         )
 
@@ -367,6 +371,7 @@ class Session:
 
     def event(self, kind: str, text: str, shown: bool = True) -> None:
         """Write down that something happened."""
+        self._catch_up()  # what passed before it stands before it
         one = Event(self._wall_ns(), kind, text, {"time_s": round(self.time_s, 9)})
         self.events.append(one)
         if self._recorder is not None:
@@ -379,10 +384,19 @@ class Session:
 
     def _watch_wire(self, link: str, direction: Direction, data: bytes, time_ns: int) -> None:
         if self._recorder is not None:
-            try:
-                self._recorder.write(Entry(self._wall_ns(), link, direction, data), time_ns)
-            except OSError as error:
-                raise BenchError(f"the record cannot be written: {error}") from None
+            self._passed.append((Entry(self._wall_ns(), link, direction, data), time_ns))
+
+    def _observe(self, message: str, time_ns: int, payload: bytes) -> None:
+        self._heard.append((message, time_ns, payload))
+
+    def _catch_up(self) -> None:
+        """Write and note down what has passed since; the parts do not wait for that."""
+        passed, self._passed = self._passed, []
+        heard, self._heard = self._heard, []
+        for message in heard:
+            self.telemetry.observe(*message)
+        if self._recorder is not None:
+            _write(self._recorder, passed)
 
     def _answered(self, part: str, step: int, at_ns: int, now_ns: int, compute_ns: int) -> None:
         self.latencies.tick(part, step, None, at_ns)
@@ -422,6 +436,17 @@ class Session:
         self.event("restarted", f"'{death.part}' was started anew and told all again")
 
 
+def _write(recorder: Recorder, passed: list[tuple[Entry, int]]) -> None:
+    failure: OSError | None = None
+    for entry, time_ns in passed:
+        try:
+            recorder.write(entry, time_ns)
+        except OSError as error:  # it counts what it loses from here on
+            failure = error
+    if failure is not None:
+        raise BenchError(f"the record cannot be written: {failure}")
+
+
 def wiring(kit: Kit) -> Wiring:
     """Who says what to whom, for a satellite."""
     sends = {part: ROUTES[part]["from"] for part in NODES}
@@ -440,38 +465,3 @@ def _few_collections() -> Iterator[None]:
         yield
     finally:
         gc.set_threshold(*before)
-
-
-def in_process(flight: Flight, kit: Kit) -> Flown:
-    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
-    import jax
-
-    from robins.bench.parts.satellite.kit import as_numpy
-    from robins.filters import Loop, run_closed
-    from robins.systems.satellite.nodes import STAR, react
-
-    loop = Loop(
-        jax.tree_util.Partial(partial(react, kit.kind), kit.given),
-        kit.vehicle,
-        kit.rows,
-        {STAR: kit.due},
-    )
-    done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
-    mean, said = done.steps.mean, done.readings
-    q_est = as_numpy(jax.jit(jax.vmap(kit.kind.attitude))(mean))
-    q = np.asarray(jax.tree_util.tree_leaves(said.truth)[0])  # first of the state of each kind
-    steps = len(q)
-    none = np.full((steps, 3), np.nan)
-    return Flown(
-        time_s=np.arange(1, steps + 1) * flight.loop.step,
-        q_ib=np.asarray(q),
-        omega_b=none,
-        q_est_ib=np.asarray(q_est),
-        bias=np.asarray(kit.kind.bias(mean)),
-        sigma=np.full((steps, 6), np.nan),
-        flags=np.zeros(steps, np.int64),
-        innovation=none,
-        innovation_sigma=none,
-        ratio=none[:, 0],
-        wheel_h=telemetry.padded(np.asarray(said.outputs["wheel_momentum"])),
-    )

@@ -15,24 +15,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.bench.parts.satellite.kit import Kit
+from robins.bench.parts.satellite.kit import Kit, driven
 from robins.bench.parts.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.wire.schema import FLAGS
-from robins.filters import Belief, Code, OnlineFilter, StepInfo
+from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState
 from robins.rotation import normalise
 from robins.systems.satellite import nodes
 from robins.systems.satellite.filters import GATE, make_filter
 from robins.systems.satellite.model import start
-from robins.systems.satellite.nodes import STAR
+from robins.systems.satellite.nodes import STAR, Command, Given, Row
 
 USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
 _LIMIT = float(chi_square(GATE, 3))
 
-_acm = jax.jit(nodes.acm)
 _believable = jax.jit(nodes.believable)
 
 
@@ -72,8 +71,9 @@ def adm(kit: Kit) -> Part:
     plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
 
     @jax.jit
-    def judge(belief: Belief, y: Any, factor: Any) -> StepInfo:
-        return plain.update(plain.init(belief, kit.model.dims), sensor, y, factor)[1]
+    def judge(belief: Belief, y: Any, factor: Any):
+        info = plain.update(plain.init(belief, kit.model.dims), sensor, y, factor)[1]
+        return info.innovation, info.sigma, info.nis
 
     @jax.jit
     def fresh(q_ib: Any, bias: Any, state: FilterState) -> FilterState:
@@ -107,7 +107,7 @@ def adm(kit: Kit) -> Part:
             elif not lost:
                 factor = _factor(kit, frame)
                 if heard:
-                    said.append(("innovation", _innovation(judge(online.belief, y, factor))))
+                    said.append(("innovation", _innovation(*judge(online.belief, y, factor))))
                 code = Code(int(online.update(y, STAR, factor).code))
                 flags |= USED * (code is Code.DONE) | REFUSED * (code is Code.REFUSED)
         since = 0 if heard else state.since_star + 1
@@ -140,11 +140,11 @@ def _factor(kit: Kit, frame: Any) -> Any:
     return None if kit.given.lens is None else frame["factor"].reshape(3, 3)
 
 
-def _innovation(info: StepInfo) -> dict[str, Any]:
-    ratio = float(info.nis) / _LIMIT
+def _innovation(innovation: Any, sigma: Any, nis: Any) -> dict[str, Any]:
+    ratio = float(nis) / _LIMIT
     return {
-        "innovation": np.asarray(info.innovation),
-        "sigma": np.asarray(info.sigma),
+        "innovation": np.asarray(innovation),
+        "sigma": np.asarray(sigma),
         "ratio": ratio if math.isfinite(ratio) else np.nan,
     }
 
@@ -157,8 +157,13 @@ class Steered(NamedTuple):
     wheel_h: Any
 
 
+def _steers(given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, row: Row) -> Command:
+    return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
+
+
 def acm(kit: Kit) -> Part:
     """Attitude control: a torque of the wheels, a dipole of the magnetorquers."""
+    steers = driven(kit, _steers)
     vehicle = kit.vehicle
     wheels = len(vehicle.craft.wheel_h)
     mean = kit.belief.mean
@@ -182,8 +187,7 @@ def acm(kit: Kit) -> Part:
         q, bias, steered = state.estimate.values
         if not (steered and trusted(state.estimate) and trusted(state.theta)):
             return state, [("command", rest())]
-        course = kit.row(k).course
-        command = _acm(kit.given, q, bias, state.theta.values, state.wheel_h, course)
+        command = steers(k, q, bias, state.theta.values, state.wheel_h)
         torque = padded(np.asarray(command.wheel_torque))
         return state, [
             ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})

@@ -6,10 +6,13 @@ machine computes the same.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from robins import _float64  # noqa: F401
 from robins.filters import Belief, Filter, Model
@@ -17,7 +20,7 @@ from robins.filters.kalman import FilterState
 from robins.sim.rate_table import RateTable
 from robins.systems.satellite.filters import Build, make_filter
 from robins.systems.satellite.model import ADDITIVE, MULTIPLICATIVE
-from robins.systems.satellite.nodes import Given, Kind, Row, Vehicle
+from robins.systems.satellite.nodes import Given, Kind, Row, Vehicle, apart
 
 
 class Kit(NamedTuple):
@@ -54,9 +57,34 @@ class Kit(NamedTuple):
         """A step without a star frame, if there is one, and one with."""
         return int(np.argmin(self.due)), int(np.argmax(self.due))
 
-    def row(self, step: int) -> Row:
-        """What drives a step; zeros beyond the last, so that a part may be asked for more."""
-        return jax.tree_util.tree_map(lambda x: x[min(step, len(self.due) - 1)], self.rows)
+
+def driven(kit: Kit, node: Callable) -> Callable:
+    """A node compiled, driven by the rows of a run.
+
+    A row travels as one vector: to be given an array more costs compiled code more than most nodes
+    compute.
+
+    Args:
+        kit: with the rows.
+        node: ``(given, *args, row) -> out``, kept apart as `robins.systems.satellite.nodes.react`
+            does.
+
+    Returns:
+        ``(step, *args) -> out``; a step beyond the last has the row of the last, so that a part may
+        be asked for more.
+    """
+    columns, shape = jax.tree_util.tree_flatten(kit.rows)
+    steps = len(kit.due)
+    table = np.concatenate([x.reshape(steps, -1).astype(float) for x in columns], axis=1)
+    ends = np.cumsum([x[0].size for x in columns])
+
+    @jax.jit
+    def run(given: Given, numbers: Array, *args: Any):
+        pieces = zip(jnp.split(numbers, ends[:-1]), columns, strict=True)
+        row = shape.unflatten([p.reshape(x.shape[1:]).astype(x.dtype) for p, x in pieces])
+        return apart(node, given, *args, row)
+
+    return lambda step, *args: run(kit.given, table[min(step, steps - 1)], *args)
 
 
 def as_numpy(tree: Any) -> Any:

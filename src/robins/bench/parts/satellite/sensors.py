@@ -8,24 +8,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.bench.parts.satellite.kit import Kit
+from robins.bench.parts.satellite.kit import Kit, driven
 from robins.bench.parts.station import Inputs, Part
 from robins.systems.satellite import nodes
 
-_gyro = jax.jit(nodes.gyro)
-_star = jax.jit(nodes.star)
 _expected = jax.jit(nodes.expected)
 
 
 def gyro(kit: Kit) -> Part:
     """The gyro triad: it reports the turn since its last sample, in whole counts."""
+    reads = driven(kit, nodes.gyro)
     first = (jnp.asarray(kit.vehicle.craft.q_ib), kit.vehicle.residue)
 
     def act(state: tuple[Any, Any], k: int, inputs: Inputs):
         before, residue = state
         if (mounted := inputs["mounted"]) is None:  # what it turned comes with the next sample
             return state, []
-        theta, residue = _gyro(kit.given, before, mounted["q_ib"], residue, kit.row(k))
+        theta, residue = reads(k, before, mounted["q_ib"], residue)
         return (mounted["q_ib"], residue), [("gyro", {"theta_b": np.asarray(theta)})]
 
     example = {"mounted": {"q_ib": np.asarray(kit.vehicle.craft.q_ib)}}
@@ -34,7 +33,7 @@ def gyro(kit: Kit) -> Part:
 
 def star(kit: Kit) -> Part:
     """The star sensor; a camera is told where to look for its stars."""
-    lens = kit.given.lens
+    lens, sees = kit.given.lens, driven(kit, nodes.star)
     takes = {"motion": 0} if lens is None else {"motion": 0, "gyro": 0, "estimate": 1}
     at_first = np.asarray(kit.vehicle.star_q_ib)
 
@@ -52,7 +51,7 @@ def star(kit: Kit) -> Part:
             return (seen, q, bias), []
         at = motion["q_ib"]
         looks = at if lens is None else _expected(kit.given, q, bias, theta)
-        frame = _star(kit.given, at, looks, seen, kit.row(k))
+        frame = sees(k, at, looks, seen)
         factor = np.zeros(9) if frame.factor is None else np.ravel(np.asarray(frame.factor))
         stars = 0 if frame.stars is None else int(frame.stars)
         says = {"q_ib": np.asarray(frame.q_ib), "factor": factor, "stars": stars}

@@ -8,20 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.bench.parts.satellite.kit import Kit
+from robins.bench.parts.satellite.kit import Kit, driven
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.wire.schema import WHEELS
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.sim.rate_table import RateTable, TableState, step
 from robins.sim.spacecraft import CraftState, rate_b
 from robins.systems.satellite import nodes
-from robins.systems.satellite.nodes import Actuation, Command
+from robins.systems.satellite.nodes import Actuation, Command, Given, Row
 
 HELD = 1  # steps for which what came last stands for what did not come
-
-_plant = jax.jit(nodes.plant)
-_rate = jax.jit(rate_b)
-_actuators = jax.jit(nodes.actuators)
 
 
 class Held(NamedTuple):
@@ -60,9 +56,15 @@ def _acts(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
     return held, use["wheel_torque"][:wheels], use["dipole_b"]
 
 
+def _moves(given: Given, craft: CraftState, acts: Actuation, row: Row):
+    craft = nodes.apart(nodes.plant, given, craft, acts, row.course)
+    return craft, rate_b(given.craft, craft)
+
+
 def plant(kit: Kit) -> Part:
     """Dynamics and kinematics of the craft; without actuation nothing acts on it."""
     wheels = len(kit.vehicle.craft.wheel_h)
+    moves = driven(kit, _moves)
 
     def begin() -> tuple[CraftState, Held]:
         return kit.vehicle.craft, Held(rest())
@@ -71,8 +73,7 @@ def plant(kit: Kit) -> Part:
         craft, held = state
         held, torque, dipole = _acts(held, inputs["actuation"], wheels)
         acts = Actuation(torque, dipole, craft.wheel_h)
-        craft = _plant(kit.given, craft, acts, kit.row(k).course)
-        omega = _rate(kit.given.craft, craft)
+        craft, omega = moves(k, craft, acts)
         return (craft, held), [
             ("motion", {"q_ib": np.asarray(craft.q_ib), "omega_b": np.asarray(omega)})
         ]
@@ -115,9 +116,14 @@ def table(kit: Kit) -> Part:
     return Part("table", {"motion": 0}, begin, act, example)
 
 
+def _gives(given: Given, wheel_h: Any, command: Command, row: Row) -> Actuation:
+    return nodes.actuators(given, wheel_h, command, row.course)
+
+
 def actuators(kit: Kit) -> Part:
     """Wheels and magnetorquers; a command stands for a step longer, then they give nothing."""
     wheels = len(kit.vehicle.craft.wheel_h)
+    gives = driven(kit, _gives)
 
     def begin() -> tuple[Any, Held]:
         return kit.vehicle.craft.wheel_h, Held(rest())
@@ -126,7 +132,7 @@ def actuators(kit: Kit) -> Part:
         wheel_h, held = state
         held, torque, dipole = _acts(held, inputs["command"], wheels)
         command = Command(torque, dipole)
-        acts = _actuators(kit.given, wheel_h, command, kit.row(k).course)
+        acts = gives(k, wheel_h, command)
         given = {
             "wheel_torque": padded(np.asarray(acts.wheel_torque)),
             "dipole_b": np.asarray(acts.dipole_b),
