@@ -229,6 +229,30 @@ def test_a_saved_state_can_be_restored():
     same(again.state, live.state)
 
 
+def test_streaming_compiles_once_however_its_start_was_written():
+    loose = Belief(START.mean, jnp.diag(jnp.full(len(START.factor), 1.0)))  # of a weak type
+    assert loose.factor.weak_type
+    live = OnlineFilter(EKF, MODEL, loose)
+    compiled = []
+
+    def hear(event, seconds, **told):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(told["fun_name"])
+
+    live.predict()
+    live.update(Y[0])
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        for y in Y[1:5]:
+            live.predict()
+            live.update(y)
+        assert compiled == []
+        jax.jit(lambda x: x + 1)(1.0)
+        assert len(compiled) == 1  # it would have been heard
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
+
+
 def test_streaming_takes_lists_and_names_its_sensors():
     live = OnlineFilter(EKF, two_sensors(), START)
     live.predict()

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
@@ -22,6 +23,12 @@ def _predict(filter_, motion, state, u):
 @partial(jax.jit, static_argnames=("filter_",))
 def _update(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
+
+
+def _settled(leaf: Any) -> jax.Array:
+    """With a type of its own: a weak one would have all compiled again after the first step."""
+    array = jnp.asarray(leaf)
+    return jnp.asarray(array, array.dtype)
 
 
 class OnlineFilter:
@@ -43,7 +50,8 @@ class OnlineFilter:
             start: initial belief or saved state.
         """
         self._filter, self._model = filter_, model
-        self.state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
+        state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
+        self.state = jax.tree_util.tree_map(_settled, state)
         self.counts: Counter[str] = Counter()
 
     @property
