@@ -1,5 +1,6 @@
 """The parts of the satellite, joined by bytes: the bits of the loop in one program, and faults."""
 
+import jax
 import numpy as np
 import pytest
 from stations import Loop, kit
@@ -136,6 +137,34 @@ def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back():
     assert np.any(torque[again + 1] != 0.0)
     off = np.linalg.norm(turn(loop.all("estimate", "q_ib"), loop.all("motion", "q_ib")), axis=1)
     assert off[-1] < 60.0 * ARCSEC
+
+
+def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
+    # In real time a step that waits for the compiler misses its deadline, and some after it.
+    of = kit("satellite/s1", "mekf-gate", *SHORT)
+    carried = [name for part in BUILD.values() for name in part(of).takes]
+    lost_at = {name: range(10 * k, 10 * k + 6) for k, name in enumerate(dict.fromkeys(carried), 2)}
+
+    def meddle(step, message, to, payload):
+        return [] if step in lost_at[message] else [((step + 1) * of.step_ns, payload)]
+
+    compiled = []
+
+    def hear(event, seconds, **told):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(told["fun_name"])
+
+    jax.clear_caches()
+    loop = Loop(of, meddle)
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        loop.run(10 * (len(lost_at) + 4))
+        assert compiled == []
+        jax.jit(lambda x: x + 1)(1.0)
+        assert len(compiled) == 1  # it would have been heard
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
+    assert np.any(bit(loop.flags(), FLAGS[3]))
 
 
 def test_no_sample_of_an_axis_is_no_sample():

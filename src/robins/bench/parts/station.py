@@ -36,6 +36,7 @@ class Part(NamedTuple):
         begin: () -> state before the first step.
         act: (state, step, inputs) -> (state, sent), at a tick.
         example: inputs as they will be, so that all can be compiled before the first tick.
+        rare: computes what no example does, to compile that too.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Part(NamedTuple):
     begin: Callable[[], Any]
     act: Callable[[Any, int, Inputs], tuple[Any, Sent]]
     example: Inputs = MappingProxyType({})
+    rare: Callable[[], Any] = lambda: None
 
 
 class Station:
@@ -166,6 +168,7 @@ def ready(part: Part, steps: Iterable[int]) -> Part:
     """
     for step in steps:
         part.act(part.begin(), step, part.example)
+    part.rare()
     return part
 
 

@@ -132,7 +132,12 @@ def adm(kit: Kit) -> Part:
         "gyro": {"theta_b": np.asarray(kit.vehicle.theta)},
         "star": {"q_ib": np.asarray(attitude(first.belief.mean)), "factor": np.ravel(np.eye(3))},
     }
-    return Part("adm", {"gyro": 0, "star": 0}, lambda: begin, act, example)
+
+    def rare() -> None:
+        anew, _ = act(begin._replace(lost=True), 0, example)
+        act(anew, 0, {**example, "star": None})
+
+    return Part("adm", {"gyro": 0, "star": 0}, lambda: begin, act, example, rare)
 
 
 def _factor(kit: Kit, frame: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -88,32 +89,34 @@ def _follow(given: RateTable, state: TableState, q_ib: Any, omega_b: Any, dt_s: 
     return step(given, state, wanted, dt_s)
 
 
+@jax.jit
+def _turn_on(given: RateTable, state: TableState, dt_s: Any):
+    # It stays in the rate that it has.
+    return step(given, state, state.rate_b, dt_s)
+
+
 def table(kit: Kit) -> Part:
     """The rate table: it turns its sensors as the craft turns, exactly or a little late."""
     first = np.asarray(kit.vehicle.craft.q_ib)
     rate = rate_b(kit.given.craft, kit.vehicle.craft)
     dt = jnp.asarray(kit.step_ns * 1e-9)
 
-    def begin() -> TableState:
-        return TableState(jnp.asarray(first), rate)
+    ideal = RateTable(*(jnp.full(3, x) for x in (1e-9, jnp.inf, jnp.inf)))
+    begin = TableState(jnp.asarray(first), rate)
 
     def act(state: TableState, k: int, inputs: Inputs):
         motion = inputs["motion"]
-        if motion is None:  # it stays in the rate that it has
-            return _moved(state, state.rate_b)
-        if kit.table is None:
-            state = TableState(motion["q_ib"], motion["omega_b"])
-            return state, [("mounted", {"q_ib": motion["q_ib"]})]
-        state, q = _follow(kit.table, state, motion["q_ib"], motion["omega_b"], dt)
-        return state, [("mounted", {"q_ib": np.asarray(q)})]
-
-    def _moved(state: TableState, rate_b: Any):
-        ideal = RateTable(*(jnp.full(3, x) for x in (1e-9, jnp.inf, jnp.inf)))
-        state, q = step(kit.table or ideal, state, jnp.asarray(rate_b), dt)
+        if motion is None:
+            state, q = _turn_on(kit.table or ideal, state, dt)
+        elif kit.table is None:
+            state, q = TableState(motion["q_ib"], motion["omega_b"]), motion["q_ib"]
+        else:
+            state, q = _follow(kit.table, state, motion["q_ib"], motion["omega_b"], dt)
         return state, [("mounted", {"q_ib": np.asarray(q)})]
 
     example = {"motion": {"q_ib": first, "omega_b": np.asarray(rate)}}
-    return Part("table", {"motion": 0}, begin, act, example)
+    rare = partial(_turn_on, kit.table or ideal, begin, dt)
+    return Part("table", {"motion": 0}, lambda: begin, act, example, rare)
 
 
 def _gives(given: Given, wheel_h: Any, command: Command, row: Row) -> Actuation:
