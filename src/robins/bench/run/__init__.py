@@ -2,7 +2,7 @@
 
 - `setup`: what is asked for; `scenarios`: some to begin with.
 - `session`: doing it. `crew`: its processes. `clocks`: when a step begins. `accounting`: how late.
-- `telemetry`, `outcome`: what came of it. `watching`: who looks on.
+- `telemetry`, `outcome`: what came of it. `watching`: who looks on. `alarms`: what is said.
 - `one_program`: the same without any wire.
 """
 

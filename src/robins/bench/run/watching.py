@@ -10,6 +10,7 @@ import numpy as np
 
 from robins.bench.live import Live, Signal
 from robins.bench.run import telemetry
+from robins.bench.run.alarms import Alarms
 from robins.bench.run.session import Session
 from robins.bench.run.telemetry import ARCSEC
 from robins.bench.status import Status
@@ -64,9 +65,9 @@ def signals(wheels: int) -> list[Signal]:
         Signal("test ratio", "1", "test ratio of the star sensor"),
         Signal("test ratio limit", "1", "test ratio of the star sensor", "limit"),
         *three("rate", "deg/s"),
-        *(Signal(f"{momentum} {k}", "N m s", momentum) for k in range(wheels)),
-        Signal(f"{momentum} limit", "N m s", momentum, "limit"),
-        Signal(f"{momentum} lower limit", "N m s", momentum, "limit"),
+        *(Signal(f"{momentum} {k}", "mN m s", momentum) for k in range(wheels)),
+        Signal(f"{momentum} limit", "mN m s", momentum, "limit"),
+        Signal(f"{momentum} lower limit", "mN m s", momentum, "limit"),
         Signal("time of a step", "ms", "time of a step"),
     ]
 
@@ -91,9 +92,9 @@ class Looking:
     def __init__(self, page: Page | None, status: Status):
         """Take the page, if there is one."""
         self._page, self._status = page, status
-        self._pushed = self._told = 0.0
-        self._began = time.monotonic()
-        self._seen_flags = 0
+        self._told = 0.0
+        self._due = 0.0  # when the page gets its next sample
+        self._alarms = Alarms()
 
     def over(self, session: Session, failed: bool) -> None:
         """The run is over."""
@@ -119,11 +120,13 @@ class Looking:
 
     def step(self, session: Session, step: int) -> None:
         """A step is over."""
-        self._alarms(session, step)
-        now = time.monotonic()
-        if self._page is not None and now - self._pushed >= _EACH_S:
-            self._pushed = now
-            self._page.push(session.time_s, sample(session, step))
+        if self._page is not None:
+            for level, text in self._alarms.hear(int(session.telemetry.flown.flags[step])):
+                self._page.event(level, session.time_s, f"adm: {text}")
+            now = time.monotonic()
+            if now >= self._due:  # a step that comes a little late does not make the next one wait
+                self._due = max(self._due + _EACH_S, now - _EACH_S)
+                self._page.push(session.time_s, sample(session, step))
         self._tell(session, step + 1)
 
     def _tell(self, session: Session, done: int) -> None:
@@ -133,17 +136,6 @@ class Looking:
             self._page.status(state(session, done))
         if self._status.due:
             self._status.tell(report(session, done, "" if self._page is None else self._page.url))
-
-    def _alarms(self, session: Session, step: int) -> None:
-        """Say what the determination flags, when it begins."""
-        flags = int(session.telemetry.flown.flags[step])
-        new, self._seen_flags = flags & ~self._seen_flags, flags
-        for k, text in enumerate(FLAGS):
-            if k and new >> k & 1:
-                kind = "failed" if text.startswith("safe") else "refused"
-                if self._page is not None:
-                    level = "alarm" if kind == "failed" or "refused" in text else "warning"
-                    self._page.event(level, session.time_s, f"adm: {text}")
 
 
 def sample(session: Session, step: int) -> list[float]:
@@ -170,9 +162,9 @@ def sample(session: Session, step: int) -> list[float]:
         ratio,
         1.0,
         *np.degrees(f.omega_b[step]),
-        *f.wheel_h[step, :wheels],
-        limit,
-        -limit,
+        *(1e3 * f.wheel_h[step, :wheels]),
+        1e3 * limit,
+        -1e3 * limit,
         session.step_ms,
     ]
 
@@ -184,7 +176,7 @@ def state(session: Session, done: int) -> dict[str, Any]:
     flags = session.telemetry.flown.flags[:done]
     return {
         "state": "paused" if session.paused else "running",
-        "clock": session.flight.setup.clock,
+        "clock": _clock(session),
         "deadlines": {
             "missed": session.latencies.summary()["missed"],
             "lateness_us": {k: late[k] for k in ("p50", "p99", "max")},
@@ -212,6 +204,13 @@ def state(session: Session, done: int) -> dict[str, Any]:
             "processes_died": session.deaths,
         },
     }
+
+
+def _clock(session: Session) -> str:
+    setup = session.flight.setup
+    if setup.clock == "lockstep":
+        return "lock-step"
+    return f"real time, {setup.rate or 1.0 / session.flight.loop.step:g} Hz"
 
 
 def report(session: Session, done: int, url: str) -> dict[str, Any]:
