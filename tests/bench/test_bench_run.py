@@ -240,6 +240,27 @@ def test_real_time_keeps_its_deadlines_and_counts_those_it_misses():
     assert told["missed"] == sum(e.kind == "missed" for e in ran.events)
 
 
+@pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="this system has no SCHED_FIFO")
+def test_a_better_scheduler_is_had_or_its_refusal_told():
+    seen = {}
+
+    def look(session):
+        numbers = {part: session.crew.process(part) for part in PARTS}
+        seen.update({part: os.sched_getscheduler(n) for part, n in numbers.items()})
+        seen["bench"] = os.sched_getscheduler(0)
+
+    before = os.sched_getscheduler(0)
+    done = run(flight(clock="realtime", rate=25.0, seconds=3.0, fifo=True), {20: look})
+    refused = [event.text for event in done.ran.events if event.kind == "scheduler"]
+    if refused:
+        assert refused[0].startswith("no real-time scheduler: ")
+        assert set(seen.values()) == {os.SCHED_OTHER}
+    else:
+        assert set(seen.values()) == {os.SCHED_FIFO}
+    assert os.sched_getscheduler(0) == before  # only while it runs
+    assert done.ran.steps == 30
+
+
 def test_a_part_that_is_stopped_in_real_time_is_not_waited_for():
     stopped = {}
 

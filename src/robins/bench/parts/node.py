@@ -5,12 +5,13 @@ python -m robins.bench.parts.node gyro /dev/pts/5,460800 kit.pickle
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import pickle
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from robins.bench.parts.satellite import BUILD
@@ -29,6 +30,17 @@ def be_realtime() -> str:
     except (AttributeError, OSError) as error:
         return f"no real-time scheduler: {error}"
     return ""
+
+
+@contextlib.contextmanager
+def realtime(wanted: bool) -> Iterator[str]:
+    """A real-time scheduler for a while, if it is wanted; gives why it was refused, or nothing."""
+    why = be_realtime() if wanted else ""
+    try:
+        yield why
+    finally:
+        if wanted and not why:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def main(arguments: Sequence[str]) -> int:

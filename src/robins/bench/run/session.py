@@ -16,7 +16,7 @@ from robins.bench.broker.errors import BenchError
 from robins.bench.broker.faults import ROUTES, LinkFault
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import Direction, Health, Link
-from robins.bench.parts.node import RARELY, be_realtime
+from robins.bench.parts.node import RARELY, realtime
 from robins.bench.parts.satellite import BUILD, Kit
 from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
@@ -220,10 +220,10 @@ class Session:
             if setup.clock == "lockstep"
             else RealTime(rate, setup.overrun, setup.patience)
         )
-        if setup.fifo and (why := be_realtime()):
-            self.event("scheduler", why)
         told, counted, since = 0.0, 0, time.monotonic()
-        with _few_collections():
+        with _few_collections(), realtime(setup.fifo) as refused:
+            if refused:
+                self.event("scheduler", refused)
             for k in range(self.steps):
                 self._obey(k)
                 if self._stop:
