@@ -1,6 +1,7 @@
 """Runs on the bench with real processes: bits, faults, deaths, clocks, boards."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -219,6 +220,27 @@ def test_parts_end_when_the_bench_is_killed(tmp_path):
         time.sleep(0.05)
     assert not any(alive(pid) for pid in pids)
     record = read_record(tmp_path / "k.mcap")
+    assert not record.whole
+    assert len(record.entries) > 100
+
+
+def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path):
+    path = tmp_path / "full.mcap"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(session):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 5_000, before[1]))
+
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        ran = Session(flight(), path, Watch({100: fill}), kit=kit()).run()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert "the record cannot be written" in ran.failure
+    assert "File too large" in ran.failure
+    assert 100 <= ran.steps < 200
+    record = read_record(path)
     assert not record.whole
     assert len(record.entries) > 100
 

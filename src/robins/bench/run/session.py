@@ -6,6 +6,7 @@ import contextlib
 import gc
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -154,8 +155,8 @@ class Session:
         self._labels: list[tuple[str, LinkFault]] = []
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
-        self._passed: list[tuple[Entry, int]] = []  # not written yet
-        self._heard: list[tuple[str, int, bytes]] = []  # not noted yet
+        self._passed: deque[tuple[Entry, int]] = deque()  # not written yet
+        self._heard: deque[tuple[str, int, bytes]] = deque()  # not noted yet
         self._glanced_ns = 0
         self._began_ns = time.monotonic_ns()
 
@@ -391,12 +392,16 @@ class Session:
 
     def _catch_up(self) -> None:
         """Write and note down what has passed since; the parts do not wait for that."""
-        passed, self._passed = self._passed, []
-        heard, self._heard = self._heard, []
-        for message in heard:
-            self.telemetry.observe(*message)
-        if self._recorder is not None:
-            _write(self._recorder, passed)
+        while self._heard:
+            self.telemetry.observe(*self._heard.popleft())
+        recorder, failure = self._recorder, None
+        while recorder is not None and self._passed:
+            try:
+                recorder.write(*self._passed.popleft())
+            except OSError as error:  # it counts what it loses from here on
+                failure = error
+        if failure is not None:
+            raise BenchError(f"the record cannot be written: {failure}")
 
     def _answered(self, part: str, step: int, at_ns: int, now_ns: int, compute_ns: int) -> None:
         self.latencies.tick(part, step, None, at_ns)
@@ -434,17 +439,6 @@ class Session:
         self.crew.start(death.part, self._speaks[death.part])
         self.broker.revive(death.part, REVIVED_S)
         self.event("restarted", f"'{death.part}' was started anew and told all again")
-
-
-def _write(recorder: Recorder, passed: list[tuple[Entry, int]]) -> None:
-    failure: OSError | None = None
-    for entry, time_ns in passed:
-        try:
-            recorder.write(entry, time_ns)
-        except OSError as error:  # it counts what it loses from here on
-            failure = error
-    if failure is not None:
-        raise BenchError(f"the record cannot be written: {failure}")
 
 
 def wiring(kit: Kit) -> Wiring:
