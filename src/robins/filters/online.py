@@ -25,10 +25,11 @@ def _update(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
 
 
-def _settled(leaf: Any) -> jax.Array:
-    """With a type of its own: a weak one would have all compiled again after the first step."""
-    array = jnp.asarray(leaf)
-    return jnp.asarray(array, array.dtype)
+def _settled(state: FilterState) -> FilterState:
+    """With types of their own: a weak one would have all compiled again after the first step."""
+    if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):
+        return state
+    return jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)
 
 
 class OnlineFilter:
@@ -51,7 +52,7 @@ class OnlineFilter:
         """
         self._filter, self._model = filter_, model
         state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-        self.state = jax.tree_util.tree_map(_settled, state)
+        self.state = _settled(state)
         self.counts: Counter[str] = Counter()
 
     @property
