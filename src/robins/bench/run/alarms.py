@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from robins.bench.wire.schema import FLAGS
+from robins.bench.wire.schema import FLAGS, HELD, REFUSED, SAFE, SHORT, SILENT, USED
 
 Level = Literal["info", "warning", "alarm"]
-_USED, _REFUSED, _HELD, _SAFE, _SILENT, _SHORT = (1 << k for k in range(len(FLAGS)))
-_OF_FRAMES = _USED | _REFUSED | _SHORT  # said of a star frame, so nothing between two frames
+_OF_FRAMES = USED | REFUSED | SHORT  # said of a star frame, so nothing between two frames
 
 
 class Said(NamedTuple):
@@ -33,22 +32,22 @@ class Alarms:
         """
         now, begun = flags, self._stands
         if not flags & _OF_FRAMES:  # no frame: what was said of the last one stands
-            now |= begun & (_REFUSED | _SHORT)
+            now |= begun & (REFUSED | SHORT)
         new, over = now & ~begun, begun & ~now
-        if flags & _REFUSED:
-            self._frames = 1 if new & _REFUSED else self._frames + 1
-        self._stands = now & ~_USED
+        if flags & REFUSED:
+            self._frames = 1 if new & REFUSED else self._frames + 1
+        self._stands = now & ~USED
         said = []
-        if new & _REFUSED:
+        if new & REFUSED:
             said.append(Said("alarm", "star refused"))
-        if over & _REFUSED:
+        if over & REFUSED:
             frames = "one frame was" if self._frames == 1 else f"{self._frames} frames were"
             said.append(Said("info", f"star used again, {frames} refused"))
-        for flag in (_HELD, _SILENT, _SHORT):
+        for flag in (HELD, SILENT, SHORT):
             if new & flag:
                 said.append(Said("warning", FLAGS[flag.bit_length() - 1]))
-        if new & _SAFE:
-            said.append(Said("alarm", FLAGS[_SAFE.bit_length() - 1]))
-        if over & _SAFE:
+        if new & SAFE:
+            said.append(Said("alarm", FLAGS[SAFE.bit_length() - 1]))
+        if over & SAFE:
             said.append(Said("info", "the estimate can be steered by again"))
         return said

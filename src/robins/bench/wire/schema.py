@@ -52,6 +52,7 @@ FLAGS = (
     "star of a length other than one",
 )
 """Bits of `estimate.flags`, from the lowest."""
+USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
 _FLAGS = ", ".join(f"bit {k}: {text}" for k, text in enumerate(FLAGS))
 _ACTUATORS = (
     _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),

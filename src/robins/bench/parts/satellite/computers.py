@@ -18,7 +18,7 @@ import numpy as np
 from robins.bench.parts.satellite.kit import Kit, driven
 from robins.bench.parts.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.wire.schema import FLAGS
+from robins.bench.wire.schema import HELD, REFUSED, SAFE, SHORT, SILENT, USED
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState
@@ -28,7 +28,6 @@ from robins.systems.satellite.filters import GATE, make_filter
 from robins.systems.satellite.model import start
 from robins.systems.satellite.nodes import STAR, Command, Given, Row
 
-USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
 _LIMIT = float(chi_square(GATE, 3))
 
