@@ -114,6 +114,7 @@ def _write(
             "filters": outcome.metrics,
             "claims": outcome.claims,
             "counts": outcome.counts,
+            "warnings": outcome.warnings,
         }
     )
     writer.save_solution(outcome.solution)

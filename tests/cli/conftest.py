@@ -35,6 +35,7 @@ class Workbench:
         self.verdict = "reproduced"
         self.error = None
         self.findings = []
+        self.warnings = []
 
     def run_scenario(self, name, **asked):
         return self._work(name, asked)
@@ -55,6 +56,7 @@ class Workbench:
             "filters": {"ekf": {"horizontal_rms_m": 0.25, "worst_m": float("nan")}},
             "claims": [claim | {"verdict": self.verdict}] if self.verdict else [],
             "counts": {"imu_nan": 2},
+            "warnings": self.warnings,
         }
         with results.ResultWriter(asked["out"], command=asked["command"]) as writer:
             writer.save_summary(summary)

@@ -29,7 +29,7 @@ def test_json_is_the_summary_and_nothing_else(robins, workbench):
     assert answer.out == Path("drive/summary.json").read_text("utf-8")
     told = json.loads(answer.out)
     assert list(told) == [
-        *("scenario", "seed", "runs", "filters", "claims", "counts", "files", "seconds")
+        *("scenario", "seed", "runs", "filters", "claims", "counts", "warnings", "files", "seconds")
     ]
     assert told["filters"] == {"ekf": {"horizontal_rms_m": 0.25, "worst_m": None}}
     assert "noise of some library" in answer.err
@@ -51,6 +51,14 @@ def test_people_get_tables_paths_and_what_to_do_next(robins, workbench):
     ):
         assert expected in answer.out
     assert answer.err == ""
+
+
+def test_a_doubt_is_told_to_people_and_to_scripts(robins, workbench):
+    workbench.warnings = ["ekf: 76 % of the fixes were refused."]
+    assert "\nWarning: ekf: 76 % of the fixes were refused.\n" in robins("run", "car/town").out
+    answer = robins("run", "car/town", "--json")
+    assert json.loads(answer.out)["warnings"] == workbench.warnings
+    assert "Warning: ekf: 76 %" in answer.err
 
 
 def test_options_reach_the_workbench(robins, workbench):

@@ -119,6 +119,7 @@ def test_hostile_names_are_printed_and_not_obeyed(town):
             "filters": {hostile: {f"{hostile}_m": 1.0}},
             "claims": [claim],
             "counts": {hostile: 3},
+            "warnings": [hostile],
         },
         [],
         report.Origin(
@@ -127,7 +128,7 @@ def test_hostile_names_are_printed_and_not_obeyed(town):
     )
     reader = Reader(page)
     assert "script" not in reader.tags
-    assert reader.words.count("alert(1)") >= 10
+    assert reader.words.count("alert(1)") >= 11
     assert hostile in reader.text
 
 

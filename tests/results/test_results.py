@@ -44,7 +44,7 @@ def test_everything_comes_back(tmp_path):
         "other": ["other/path.csv"],
     }
     assert list(back.summary) == [
-        *("scenario", "seed", "runs", "filters", "claims", "counts", "files", "seconds")
+        *("scenario", "seed", "runs", "filters", "claims", "counts", "warnings", "files", "seconds")
     ]
     assert back.figures["track"].read_bytes().startswith(b"\x89PNG")
     assert back.report.read_text("utf-8") == "<p>ü</p>"
@@ -135,6 +135,7 @@ A_CLAIM = {"id": "c", "text": "t", "verdict": "not", "value": 1.0, "band": [0, 1
         ({"filters": {"k": {1: 1.0}}}, "summary.filters.k: the key 1 is not text"),
         ({"claims": [A_CLAIM | {"verdict": "yes"}]}, r"claims\[0\].verdict: 'yes' is none of"),
         ({"claims": [{"id": "c"}]}, r"claims\[0\]: needs exactly the keys id, text"),
+        ({"warnings": [3]}, r"summary.warnings\[0\]: 3 is not a sentence"),
         ({"counts": {"nan": 1.5}}, "summary.counts.nan: 1.5 is not a whole number"),
     ],
 )

@@ -77,9 +77,14 @@ def _warn(findings: Sequence[Any]) -> None:
 
 def _tell(done: Any, as_json: bool) -> None:
     """Print a finished result: the JSON of its folder, or tables and where everything is."""
+
+    def warn() -> None:
+        for warning in done.summary["warnings"]:
+            click.secho(f"Warning: {warning}", fg="yellow", bold=True, err=as_json)
+
     if as_json:
         click.echo((done.path / "summary.json").read_text("utf-8"), nl=False)
-        return
+        return warn()
     from rich.console import Console
 
     from robins.report import table
@@ -88,6 +93,7 @@ def _tell(done: Any, as_json: bool) -> None:
     console.print(table(done.summary, console.width))
     for note in done.notes:
         click.echo(note)
+    warn()
     click.echo(f"\nResult: {done.path}")
     report = done.summary["files"].get("report")
     if report:

@@ -65,7 +65,8 @@ def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
 <h1>{title}</h1>
 <p class="meta">{" · ".join(meta)}</p>
 {_verdict(summary["claims"])}
-{_notes(origin.notes)}
+{_sentences("warning", summary.get("warnings", ()))}
+{_sentences("note", origin.notes)}
 </header>
 {_metrics(summary["filters"])}
 {_claims(summary["claims"])}
@@ -85,8 +86,8 @@ def _verdict(claims: Sequence[Mapping[str, Any]]) -> str:
     return f'<p class="verdict {worst}">{sign}{escape(numbers.verdict(claims))}</p>'
 
 
-def _notes(notes: Sequence[str]) -> str:
-    return "\n".join(f'<p class="note">{escape(note)}</p>' for note in notes)
+def _sentences(kind: str, sentences: Sequence[str]) -> str:
+    return "\n".join(f'<p class="{kind}">{escape(sentence)}</p>' for sentence in sentences)
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = "") -> str:

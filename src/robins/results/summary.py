@@ -23,7 +23,9 @@ _GIVEN = {
     "seconds": numbers.Real,
 }
 _CLAIM = ("id", "text", "verdict", "value", "band")
-_ORDER = ("scenario", "seed", "runs", "filters", "claims", "counts", "files", "seconds")
+_ORDER = (
+    *("scenario", "seed", "runs", "filters", "claims", "counts", "warnings", "files", "seconds"),
+)
 
 
 def plain(value: Any, where: str = "value") -> Any:
@@ -85,6 +87,9 @@ def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
     for reason, count in flat["counts"].items():
         if not isinstance(count, int) or isinstance(count, bool):
             raise TypeError(f"summary.counts.{reason}: {count!r} is not a whole number")
+    for i, sentence in enumerate(flat.setdefault("warnings", [])):
+        if not isinstance(sentence, str):
+            raise TypeError(f"summary.warnings[{i}]: {sentence!r} is not a sentence")
     return {key: flat.get(key, {}) for key in _ORDER}
 
 

@@ -142,6 +142,7 @@ class Outcome:
     counts: dict[str, int] = field(default_factory=dict)
     files: dict[str, bytes] = field(default_factory=dict)  # more to put into the result folder
     notes: list[str] = field(default_factory=list)  # sentences for the reader of the report
+    warnings: list[str] = field(default_factory=list)  # why a reader should doubt the figures
 
 
 class Scenario(Parameters):
