@@ -94,7 +94,7 @@ def draw(steps: int, smallest: float, target: Path) -> None:
     for unit, colour in (("deg", "tab:blue"), ("arcmin", "tab:orange")):
         over_all = least(unit)
         for share, style in ((np.inf, "-"), (1.0001, "--")):
-            notes = filtered(unit, share * over_all)[2].steps.info["attitude"].notes
+            notes = filtered(unit, share * over_all)[2].steps.info["attitude_matching"].notes
             label = f"{unit}, " + ("Kalman" if share == np.inf else "gamma_min")
             bound = notes["h_infinity.bound"] / over_all
             right.plot(time_s, bound, style, color=colour, label=label)

@@ -1,5 +1,7 @@
 """Campaigns against plain loops and closed forms, on a problem small enough to know by heart."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -129,8 +131,8 @@ def test_a_diverged_run_is_counted_not_dropped(problem):
 def test_a_filter_that_cannot_predict_has_no_error_to_show(problem):
     """An H-infinity filter that does not exist must not look like a result."""
     rule = h_infinity(0.5, jnp.eye(2))
-    none = problem._replace(
-        contenders={"hinf": Contender(kalman(taylor(), [rule]), _model(0.4), bounds=True)}
+    none = replace(
+        problem, contenders={"hinf": Contender(kalman(taylor(), [rule]), _model(0.4), bounds=True)}
     )
     record = next(chunks(none, "hinf", 3))
     first = np.argmax(np.isnan(record["error"]).any(axis=2), axis=1)
@@ -170,7 +172,8 @@ def test_filters_may_have_states_of_their_own(problem):
         return case._replace(start=start, y=y, truth=100.0 * case.truth)
 
     right = problem.contenders["right"].filter
-    mixed = problem._replace(
+    mixed = replace(
+        problem,
         contenders={
             "right": problem.contenders["right"],
             "wide": Contender(right, wide, widened, np.eye(2, 3), facts={"states": 3}),
@@ -208,7 +211,7 @@ def test_limits_say_how_many_are_inside_and_since_when(problem):
 def test_filters_that_differ_in_numbers_share_what_was_compiled(problem):
     step = problem.contenders["right"].filter
     models = [Model(Motion(_move, Q_FACTOR), (Sensor(_read, jnp.array([s]), 1),)) for s in (1, 2)]
-    pair = problem._replace(contenders={str(i): Contender(step, m) for i, m in enumerate(models)})
+    pair = replace(problem, contenders={str(i): Contender(step, m) for i, m in enumerate(models)})
     before = monte_carlo._records._cache_size()
     simulate(pair, 3, chunk=3)
     assert monte_carlo._records._cache_size() == before + 1

@@ -1,5 +1,6 @@
 """The bound of a problem against its Kalman filter, on a problem small enough to know by heart."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ F = jnp.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 MODEL = Model(
     Motion(lambda x, u: F @ x, jnp.array([0.02, 0.03, 0.0])),
     (
-        Sensor(lambda x, a: x[:1], jnp.array([0.4]), 1, "place"),
+        Sensor(lambda x, a: x[:1], jnp.array([0.4]), 1, "fix"),
         Sensor(lambda x, a: x[1:2] ** 2 / 2.0, jnp.array([0.3]), 1, "energy"),
         Sensor(lambda x, a: x[2:], jnp.array([0.3]), 1, "broken"),
     ),
@@ -34,7 +35,7 @@ def simulate(index):
     """Run 0 stands still, so that its energy tells nothing; run 1 moves."""
     x0 = jnp.stack([jnp.zeros(()), index.astype(float), jnp.zeros(())])
     _, truth = jax.lax.scan(lambda x, _: (F @ x, F @ x), x0, None, STEPS)
-    y = {k: jnp.zeros((STEPS, 1)) for k in ("place", "energy")}
+    y = {k: jnp.zeros((STEPS, 1)) for k in ("fix", "energy")}
     y["broken"] = jnp.full((STEPS, 1), jnp.nan)
     return Case(START, None, y, {}, truth)
 
@@ -50,7 +51,7 @@ def problem():
         contenders={"kf": Contender(kalman(), MODEL, reported=TURNED)},
         epoch_s=np.arange(1.0, STEPS + 1),
         blocks=blocks,
-        sensors={"place": SensorAxes("m", "E", ("east",))},
+        sensors={k: SensorAxes("m", "E", ("east",)) for k in ("fix", "energy", "broken", "y")},
         context=xr.Dataset(),
         metrics=lambda s: {},
         claims=lambda m: [],
@@ -67,7 +68,7 @@ def kalman_sigma(y):
 
 
 def test_what_stands_still_is_bounded_by_the_kalman_filter(found):
-    sigma = kalman_sigma({"place": np.zeros((STEPS, 1))})
+    sigma = kalman_sigma({"fix": np.zeros((STEPS, 1))})
     np.testing.assert_allclose(found.bound_speed[:, 0], sigma[:, 1], rtol=1e-12)
     np.testing.assert_allclose(found.bound_place[:, 0], sigma[:, 0], rtol=1e-12)
     assert found.bound_prior_speed.item() == 1.0
@@ -75,8 +76,8 @@ def test_what_stands_still_is_bounded_by_the_kalman_filter(found):
 
 
 def test_a_sensor_that_is_left_out_tells_nothing(found):
-    assert list(found.sensor.values) == ["place", "energy"]  # the third never spoke
-    without = found.bound_without_place.sel(sensor="place")
+    assert list(found.sensor.values) == ["fix", "energy"]  # the third never spoke
+    without = found.bound_without_place.sel(sensor="fix")
     np.testing.assert_allclose(without, found.bound_unaided_place, rtol=1e-14)
     t = found.time.values
     walk = 0.5**2 * 0.03**2 * (t - 1) * t * (2 * t - 1) / 6
@@ -90,7 +91,7 @@ def test_a_sensor_that_is_left_out_tells_nothing(found):
 def test_variances_are_averaged_over_the_runs(problem, found):
     both, moving = (
         bound(problem, "kf", runs=2),
-        problem._replace(simulate=lambda i: simulate(i + 1)),
+        replace(problem, simulate=lambda i: simulate(i + 1)),
     )
     other = bound(moving, "kf")
     assert other.bound_speed[-1, 0] < 0.9 * found.bound_speed[-1, 0]
@@ -126,7 +127,8 @@ def test_states_that_nothing_reports_are_named_by_their_fields(problem):
     course = Sensor(lambda x, a: x.wind_error[:1] - x.rest["drift"].local(Angle(0.0)), [1.0], 1)
     case = Case(start, None, {"y": jnp.zeros((STEPS, 1))}, {}, along(state))
     turned = np.eye(6)[:2]
-    ship = problem._replace(
+    ship = replace(
+        problem,
         simulate=lambda i: case,
         contenders={"kf": Contender(kalman(), Model(still, (course,)), reported=turned)},
     )
@@ -155,12 +157,12 @@ def test_bad_input_is_named(problem):
     with pytest.raises(ValueError, match=r"'kf' has no sensor 'sonar'; this model has \['broken'"):
         bound(problem, "kf", without=["sonar"])
     with pytest.raises(ValueError, match="no sensor of filter 'kf' is left that measures"):
-        bound(problem, "kf", without=["place", "energy"])
+        bound(problem, "kf", without=["fix", "energy"])
 
 
 def test_a_model_that_does_not_hold_along_the_truth_is_named(problem):
-    broken = problem._replace(
-        simulate=lambda i: simulate(i)._replace(truth=jnp.full((30, 3), jnp.nan))
+    broken = replace(
+        problem, simulate=lambda i: simulate(i)._replace(truth=jnp.full((30, 3), jnp.nan))
     )
     with pytest.raises(ValueError, match="cannot be linearised along the true states"):
         bound(broken, "kf")

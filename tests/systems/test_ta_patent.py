@@ -164,7 +164,7 @@ def test_the_kalman_filter_is_consistent_where_errors_are_small():
     assert np.all((ratio[3:] >= 0.7) & (ratio[3:] <= 1.3)), ratio
 
     statistics = Statistics(problem.blocks, problem.count_from, problem.limits)
-    blank = {"velocity": np.zeros((RUNS, 1)), "attitude": np.zeros((RUNS, 1))}
+    blank = {"velocity_matching": np.zeros((RUNS, 1)), "attitude_matching": np.zeros((RUNS, 1))}
     statistics.add(
         {
             "error": error,

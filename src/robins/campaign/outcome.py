@@ -23,6 +23,7 @@ def simulate(
     runs: int,
     chunk: int = CHUNK,
     progress: Callable[[float, str], None] | None = None,
+    keep: Callable[[Any], None] | None = None,
 ) -> Outcome:
     """Run every filter of a problem over the same runs and compare them.
 
@@ -31,6 +32,7 @@ def simulate(
         runs: how many runs of each filter.
         chunk: runs per batch.
         progress: called with the share done in 0..1 and what is being done.
+        keep: called with all arrays of the statistics, by filter, before anything is made of them.
     """
     tell = progress if progress is not None else (lambda share, what: None)
     names = list(problem.contenders)
@@ -52,6 +54,8 @@ def simulate(
             tell(share, f"{name}: {verb}runs {done + 1} to {done + count} of {runs}")
             found[name].add(record(problem, name, batch, count))
         done += count
+    if keep is not None:
+        keep({name: vars(s) for name, s in found.items()})
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
     metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
     if bound is not None:
@@ -162,9 +166,6 @@ def campaign_solution(
     data |= _notes(found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
-    if clash := sorted(set(coords) & set(places)):
-        names = ", ".join(name.removeprefix("axis_") for name in clash)
-        raise ValueError(f"{names}: a block and a sensor cannot have one name, for it names axes")
     return xr.Dataset(data | more, coords | places)
 
 
@@ -209,14 +210,7 @@ def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
 
 def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:
     """Innovations of the first run, by sensor; NaN for filters that use no such sensor."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for s in found.values():
-        for name, innovation in s.first_run["innovation"].items():
-            if shapes.setdefault(name, innovation.shape) != innovation.shape:
-                raise ValueError(
-                    f"sensor '{name}' has {innovation.shape[-1]} components in one filter and "
-                    f"{shapes[name][-1]} in another: sensors that differ need names of their own"
-                )
+    shapes = {k: v.shape for s in found.values() for k, v in s.first_run["innovation"].items()}
 
     def of(kind: str, sensor: str) -> np.ndarray:
         shape = shapes[sensor] if kind.startswith("innovation") else shapes[sensor][:1]

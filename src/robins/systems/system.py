@@ -108,8 +108,14 @@ class Norm(NamedTuple):
     components: tuple[int, ...]
 
 
-class Problem(NamedTuple):
-    """A simulated scenario, ready to be run any number of times."""
+@dataclass(frozen=True)
+class Problem:
+    """A simulated scenario, ready to be run any number of times.
+
+    Raises:
+        ValueError: names clash, or what one part names no other part has; it says so before a
+            campaign is computed whose result could not be written.
+    """
 
     simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it batches
     contenders: Mapping[str, Contender]
@@ -130,6 +136,39 @@ class Problem(NamedTuple):
     windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
     notes: Sequence[str] = ()  # sentences for the reader of the report
     outputs: Sequence[Output] = ()  # of its cases
+
+    def __post_init__(self) -> None:
+        """Check that all names fit each other."""
+        named: dict[str, str] = {}  # what has an axis of its own, in the result
+        for kind, names in (
+            ("block", [b.name for b in self.blocks]),
+            ("output", [o.name for o in self.outputs]),
+            ("sensor", list(self.sensors)),
+            ("context", [str(c).removeprefix("axis_") for c in self.context.coords]),
+        ):
+            for name in names:
+                if other := named.get(name):
+                    raise ValueError(
+                        f"{name}: names a {kind} and a {other}, whose axes could not be told "
+                        "apart in the result; rename one of them"
+                    )
+                named[name] = kind
+        for limit in self.limits:
+            if named.get(limit.block) != "block":
+                raise ValueError(f"limit {limit.name}: there is no block '{limit.block}'")
+        for name, contender in self.contenders.items():
+            for sensor, dim in contender.model.dims.items():
+                if sensor not in self.sensors:
+                    raise ValueError(
+                        f"filter '{name}' has a sensor '{sensor}' whose axes nobody declares; "
+                        f"declared are {', '.join(self.sensors)}"
+                    )
+                if dim != len(self.sensors[sensor].axes):
+                    raise ValueError(
+                        f"filter '{name}': sensor '{sensor}' has {dim} components and "
+                        f"{len(self.sensors[sensor].axes)} declared axes; sensors that differ "
+                        "need names of their own"
+                    )
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from robins.systems.transfer_alignment.bank_turn import (
     rate_in_enu,
 )
 
-ATTITUDE = "attitude"  # name of the sensor
+ATTITUDE = "attitude_matching"  # name of the sensor
 STATES = 9
 STATES_FLEXIBLE = 15
 

@@ -40,7 +40,7 @@ LAT, LON, VE, VN, PHI_E, PHI_N, PHI_U, NABLA_X, NABLA_Y, EPS_X, EPS_Y, EPS_Z = r
 POSITION, VELOCITY, PHI = slice(0, 2), slice(2, 4), slice(4, 7)
 NABLA, EPS = slice(7, 9), slice(9, 12)
 
-VELOCITY_SENSOR, ATTITUDE_SENSOR = "velocity", "attitude"
+VELOCITY_SENSOR, ATTITUDE_SENSOR = "velocity_matching", "attitude_matching"
 STEEPEST_RAD = math.radians(85.0)
 
 
