@@ -101,11 +101,14 @@ def _write(
     outcome: Outcome,
     writer: results.ResultWriter,
     tell: Progress,
+    keep: Callable[[Any], None],
     *,
     name: str,
     seed: int,
     runs: int = 1,
 ) -> Done:
+    variables = outcome.solution.variables.items()
+    keep({"solution": {k: v.values for k, v in variables}, "metrics": outcome.metrics})
     writer.save_summary(
         {
             "scenario": name,
@@ -163,13 +166,13 @@ def run_scenario(
     parameters = scenario.parse(study.parameters, text, settings, source=name)
     chosen = _check_filters(label, study.filters, filters or parameters.filters)
     count = parameters.runs if runs is None else runs
-    with _writer(out, text, settings, command) as writer:
+    with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         try:
             problem = study.problem(parameters, chosen, seed)
         except ValueError as error:
             raise InputError(f"{name}: {error}") from error
-        outcome = simulate(problem, count, progress=lambda s, w: tell(0.85 * s, w))
-        done = _write(outcome, writer, tell, name=label, seed=seed, runs=count)
+        outcome = simulate(problem, count, progress=lambda s, w: tell(0.85 * s, w), keep=keep)
+        done = _write(outcome, writer, tell, keep, name=label, seed=seed, runs=count)
     return _finished(done)
 
 
@@ -217,7 +220,7 @@ def bound_scenario(
     wanted = filter_name or next(iter(parameters.filters or study.filters))
     chosen = _check_filters(label, study.filters, [wanted])
     times = [units.parse(time, "time") for time in at]
-    with _writer(out, text, settings, command) as writer:
+    with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "linearising along the truth")
         try:
             problem = study.problem(parameters, chosen, seed)
@@ -231,7 +234,7 @@ def bound_scenario(
             files={"bound.csv": bounds.csv(solution).encode()},
             notes=bounds.sentences(solution),
         )
-        done = _write(outcome, writer, tell, name=label, seed=seed, runs=runs)
+        done = _write(outcome, writer, tell, keep, name=label, seed=seed, runs=runs)
     return _finished(done), bounds.table(solution, epochs)
 
 
@@ -282,7 +285,7 @@ def replay_log(
     source = configurations[0] if configurations else "the default configuration"
     parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
     chosen = _check_filters(system, chosen_system.replay_filters, filters)
-    with _writer(out, text, settings, command) as writer:
+    with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "reading")
         angles = np.degrees(chosen_system.orientation(parameters))
         dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles))
@@ -294,7 +297,7 @@ def replay_log(
             )
         except ValueError as error:
             raise InputError(f"{dataset.name}: {error}") from error
-        done = _write(outcome, writer, tell, name=f"{system}/{dataset.name}", seed=seed)
+        done = _write(outcome, writer, tell, keep, name=f"{system}/{dataset.name}", seed=seed)
     return _finished(done)
 
 
@@ -344,7 +347,7 @@ def align_pair(
         )
     parameters: Any = scenario.parse(alignment.parameters, text, settings, source=name)
     chosen = _check_filters(label, alignment.filters, filters or parameters.filters)
-    with _writer(out, text, settings, command) as writer:
+    with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "reading")
         dataset = logs.load_pair(master, slave)
         # the doctor looks along the master's axes, the filter along those of the slave
@@ -357,7 +360,7 @@ def align_pair(
             )
         except ValueError as error:
             raise InputError(f"{dataset.name}: {error}") from error
-        done = _write(outcome, writer, tell, name=f"{system.name}/{dataset.name}", seed=seed)
+        done = _write(outcome, writer, tell, keep, name=f"{system.name}/{dataset.name}", seed=seed)
     return _finished(done)
 
 

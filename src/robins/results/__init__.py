@@ -94,6 +94,7 @@ figures follow from ``degrees_of_freedom`` and ``runs`` at ``probability`` (0.95
 from robins.results.errors import ResultError
 from robins.results.manifest import SCHEMA_VERSION, versions
 from robins.results.reader import Result, read
+from robins.results.rescue import NotWritten, rescued
 from robins.results.solution import variable
 from robins.results.summary import VERDICTS
 from robins.results.writer import ResultWriter, extend, write
@@ -101,11 +102,13 @@ from robins.results.writer import ResultWriter, extend, write
 __all__ = [
     "SCHEMA_VERSION",
     "VERDICTS",
+    "NotWritten",
     "Result",
     "ResultError",
     "ResultWriter",
     "extend",
     "read",
+    "rescued",
     "variable",
     "versions",
     "write",
