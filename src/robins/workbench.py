@@ -45,17 +45,34 @@ def _hint(word: str, among: Iterable[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else "."
 
 
-def find_scenario(name: str) -> tuple[System, str, str]:
+def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
     """System, name and text of a packaged scenario "system/name", or of a TOML file.
 
     A file says its system in the key ``system``.
 
+    Args:
+        name: of the scenario, or a path that ends in .toml.
+        recorded: a recorded pair takes the place of the simulation.
+
     Raises:
-        InputError: there is no such scenario or file, or the file names no system.
+        InputError: there is no such scenario or file, the file names no system, or only a
+            recorded pair fits it.
     """
     packaged = {
         f"{s.name}/{k}": (s, path) for s in SYSTEMS.values() for k, path in s.scenarios.items()
     }
+    of_pairs = {
+        f"{s.name}/{k}": (s, path)
+        for s in SYSTEMS.values()
+        if s.alignment is not None
+        for k, path in s.alignment.configurations.items()
+    }
+    if name in of_pairs and not recorded:
+        raise InputError(
+            f"{name} describes a recorded pair: give its logs with --master and --slave. To "
+            f"simulate such a pair, copy {of_pairs[name][1]}, put your units in and run the copy"
+        )
+    packaged |= of_pairs if recorded else {}
     if name in packaged:
         system, path = packaged[name]
         return system, name, path.read_text()
@@ -335,7 +352,7 @@ def align_pair(
     """
     _float64.require()
     tell = progress or (lambda share, what: None)
-    system, label, text = find_scenario(name)
+    system, label, text = find_scenario(name, recorded=True)
     settings = tuple(settings)
     alignment = system.alignment
     study = scenario.mapping_of(text).get("study")

@@ -29,7 +29,7 @@ def test_a_pair_takes_the_place_of_the_simulation(robins, asked):
     assert (asked["filters"], asked["settings"]) == (("a", "b"), ("mounting.sigma=1 deg",))
     assert asked["seed"] == 3
     assert "runs" not in asked
-    assert "robins run car/town   simulates such a pair" in answer.out
+    assert "simulates such a pair; COPY is car/town with your units" in answer.out
 
 
 @pytest.mark.parametrize("given", [("--master", "m.csv"), ("--slave", "s.csv")])

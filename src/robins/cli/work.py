@@ -65,7 +65,7 @@ def align(scenario: str, master: Path, slave: Path, *, out: Path, as_json: bool,
     _tell(done, as_json)
     if not as_json:
         click.echo(
-            f"Next:   robins run {scenario}   simulates such a pair and shows what can be expected"
+            f"Next:   robins run COPY   simulates such a pair; COPY is {scenario} with your units"
         )
 
 

@@ -25,7 +25,7 @@ _HERE = Path(__file__).parent / "scenarios"
 _SCENARIOS = (
     *("s0", "s0r", "s1", "s2", "s3"),
     *("a", "b", "c", "d", "e"),
-    *("aircraft", "ship", "vehicle", "replay"),
+    *("aircraft", "ship", "vehicle"),
 )
 
 SYSTEM = System(

@@ -9,6 +9,7 @@ is aligned anew.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -211,7 +212,9 @@ def orientation(parameters: Replay) -> tuple[float, float, float]:
     return roll, pitch, yaw
 
 
-ALIGNMENT = Alignment("product", Replay, FILTERS, replay)
+ALIGNMENT = Alignment(
+    "product", Replay, FILTERS, replay, {"replay": Path(__file__).parent / "scenarios/replay.toml"}
+)
 
 
 def _epochs(pieces: list[Piece]) -> np.ndarray:

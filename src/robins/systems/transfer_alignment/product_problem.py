@@ -79,6 +79,7 @@ def product_problem(given: Product, filters: tuple[str, ...], seed: int) -> Prob
         shown=_tracks,
         count_from=count_from,
         limits=(Limit(FIVE_ARCMIN, "attitude", units.parse("5 arcmin", "angle")),),
+        notes=("The pair is simulated; --master and --slave align a recorded one.",),
     )
 
 
