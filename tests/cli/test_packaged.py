@@ -1,0 +1,259 @@
+"""What is packaged or documented runs: every scenario, every filter, every command line shown.
+
+One run each, through the command itself, as short as the scenario allows. Figures and claims are
+judged elsewhere; here it counts that a user who types it gets a result.
+"""
+
+import io
+import re
+import shlex
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from robins import logs, results, scenario
+from robins.cli import Status, app, main
+from robins.dataset import ImuTable
+from robins.report import numbers
+from robins.systems import SYSTEMS
+from robins.systems.ins_gnss import Drive, drive_dataset
+from robins.systems.transfer_alignment.pair_log import pair_dataset
+from robins.systems.transfer_alignment.pair_replay import Replay
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# Of each study the filter that costs least and uses every sensor, and what makes a run short.
+STUDIES = {
+    "drive": ("ekf", ()),
+    "attitude-matching": ("kf", ()),
+    "velocity-attitude": ("kf", ()),
+    "product": ("kf", ()),
+    "navigation": ("ekf", ()),
+    "magnetic-attitude": ("ukf", ()),
+    "field-vector": ("usque", ()),
+    "attitude-loop": ("mekf", ("duration=60 s", "counted_from=30 s")),
+}
+
+
+def study_of(name):
+    """System, study and name of the study of a packaged scenario."""
+    system = SYSTEMS[name.split("/")[0]]
+    text = system.scenarios[name.split("/")[1]].read_text()
+    study = scenario.mapping_of(text).get("study", next(iter(system.studies)))
+    return system, system.studies[study], study
+
+
+def settings_of(study):
+    return [word for setting in STUDIES[study][1] for word in ("--set", setting)]
+
+
+PACKAGED = [f"{s.name}/{scenario}" for s in SYSTEMS.values() for scenario in s.scenarios]
+FIRST = {study_of(name)[2]: name for name in reversed(PACKAGED)}  # here all filters run
+
+
+def test_every_study_is_in_the_table_and_every_file_is_listed():
+    assert set(STUDIES) == {study for s in SYSTEMS.values() for study in s.studies}
+    assert set(FIRST) == set(STUDIES)
+    for s in SYSTEMS.values():
+        pairs = s.alignment.configurations if s.alignment else {}
+        listed = {*s.scenarios.values(), *pairs.values(), s.replay_default}
+        on_disk = set((ROOT / "src/robins/systems").glob(f"{s.name.replace('-', '_')}/**/*.toml"))
+        assert {p.name for p in on_disk - listed} <= {
+            "walk.toml"
+        }  # a configuration of the documents
+
+
+@pytest.mark.parametrize("name", PACKAGED)
+def test_a_packaged_scenario_runs(robins, name):
+    _, study, kind = study_of(name)
+    causal = [f for f in study.filters if not f.endswith("+rts")]
+    filters = causal if name == FIRST[kind] else [STUDIES[kind][0]]
+    answer = robins(
+        *("run", name, "--runs", 1, "--filters", ",".join(filters), "--out", "out"),
+        *settings_of(kind),
+    )
+    assert answer.status == Status.DONE, answer.err
+    summary = results.read("out").summary
+    assert list(summary["filters"]) == filters
+    for found in summary["filters"].values():
+        assert any(numbers.show(value) not in ("", "-") for value in found.values())
+    assert {c["id"] for c in summary["claims"]} <= {c["id"] for c in study.claims}
+    assert summary["files"]["figures"]
+    assert "report.html" in answer.out
+
+
+# ------------------------------------------------------------------------- command lines shown
+
+GNSS_HEAD = (
+    "%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) "
+    "sdun(m) age(s) ratio vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun\n"
+)
+
+
+def write_pos(path, gnss):
+    """Fixes as RTKLIB writes them."""
+    lines = io.StringIO()
+    lines.write(GNSS_HEAD)
+    for k, stamp in enumerate(gnss.time_ns):
+        week, left = divmod(int(stamp) - 315_964_800_000_000_000, 604_800_000_000_000)
+        n, e, d = gnss.v_n[k]
+        lat, lon = np.rad2deg([gnss.lat_rad[k], gnss.lon_rad[k]])
+        lines.write(
+            f"{week} {left * 1e-9:.3f} {lat:.9f} {lon:.9f} {gnss.alt_m[k]:.4f} 1 12 1 1 2 0 0 0 0 "
+            f"9 {n:.4f} {e:.4f} {-d:.4f} 0.05 0.05 0.1 0 0 0\n"
+        )
+    Path(path).write_text(lines.getvalue())
+
+
+def write_nine_axes(path, seconds=40.0, hz=50.0):
+    """A unit that is turned about all its axes, in CSV of x-io."""
+    rng = np.random.default_rng(3)
+    t = np.arange(round(seconds * hz)) / hz
+    s = np.maximum(t - 5.0, 0.0)
+    roll, pitch, yaw = 1.3 * s, 1.2 * np.sin(0.6 * s), 0.9 * s
+    rate = np.gradient(np.stack([roll, pitch, yaw]), 1.0 / hz, axis=1)
+    sr, cr, sp, cp, sy, cy = (f(a) for a in (roll, pitch, yaw) for f in (np.sin, np.cos))
+    gyro = [
+        rate[0] - sp * rate[2],
+        cr * rate[1] + sr * cp * rate[2],
+        cr * cp * rate[2] - sr * rate[1],
+    ]
+    down = np.stack([-sp, sr * cp, cr * cp])
+    north = np.stack([cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy])
+    columns = [
+        *np.rad2deg(gyro),
+        *-down,
+        *(20.0 * north + 43.0 * down + np.array([[12.0], [-8.0], [5.0]])),
+    ]
+    noise = np.repeat([0.05, 0.002, 0.2], 3)[:, None] * rng.standard_normal((9, len(t)))
+    head = [
+        f"{kind} {axis} ({unit})"
+        for kind, unit in (("Gyroscope", "deg/s"), ("Accelerometer", "g"), ("Magnetometer", "uT"))
+        for axis in "XYZ"
+    ]
+    rows = np.column_stack([t, *(np.array(columns) + noise)])
+    np.savetxt(path, rows, "%.6f", ",", header=",".join(["Time (s)", *head]), comments="")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The files that the documents name, made small."""
+    here = tmp_path_factory.mktemp("shown")
+    text = SYSTEMS["ins-gnss"].scenarios["drive"].read_text()
+    head, *legs = text.split("[[legs]]")
+    car = "[[legs]]".join([head, *legs[:4]])
+    (here / "my.toml").write_text(car)
+    drive = drive_dataset(scenario.parse(Drive, car, ["settle=5 s"]), seed=1)
+    logs.write_named(here / "imu.csv", drive.imu)
+    write_pos(here / "gnss.pos", drive.gnss)
+    (here / "unit.toml").write_text(
+        'system = "ins-gnss"\n[gnss]\nlever_arm = ["0 m", "0 m", "0 m"]\n'
+    )
+    write_nine_axes(here / "turned.csv")
+    for name in ("nine_axes.csv", "flight.csv"):
+        (here / name).write_bytes((here / "turned.csv").read_bytes())
+    rng = np.random.default_rng(2)
+    still = rng.normal(size=(2, 3000, 3)) * [[[1e-3]], [[5e-3]]] + [[[0, 0, 0]], [[0, 0, -9.81]]]
+    stamps = np.arange(3000) * 10_000_000
+    logs.write_named(here / "still.csv", ImuTable(stamps, still[0], still[1], "rate"))
+    pair = SYSTEMS["transfer-alignment"].alignment.configurations["replay"].read_text()
+    (here / "my-pair.toml").write_text(pair)
+    dataset = pair_dataset(scenario.parse(Replay, pair, ["slave.rate=20 Hz"]), seed=3)
+    logs.write_named(here / "master.csv", dataset.master)
+    logs.write_named(here / "slave.csv", dataset.imu)
+    problem = ROOT / "src/robins/cli/problems/baro-height.toml"
+    (here / "my-problem.toml").write_text(problem.read_text())
+    return here
+
+
+# What stands in a document for a file of the reader.
+STANDS_FOR = {
+    "imu.csv.xz": "imu.csv",
+    "gnss.pos.xz": "gnss.pos",
+    "walk.toml": "unit.toml",
+    "turned.ulg": "turned.csv",
+    "broad_33_disturbed_attached_magnet_2cm.npz": "nine_axes.csv",
+    "record.mcap": "results/bench-satellite-s1/record.mcap",
+    "other.mcap": "results/bench-satellite-s1/record.mcap",
+}
+# A reader's own devices, and pages that stay open until someone closes them.
+NEEDS_MORE = re.compile(r"/dev/|--live|bench node|> ")
+
+
+def helps(command=app):
+    """The help texts of all commands."""
+    yield command.epilog or ""
+    for inner in getattr(command, "commands", {}).values():
+        yield from helps(inner)
+
+
+def shown():
+    """Every command line of the documents and of the help texts."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    texts = [p.read_text("utf-8") for p in pages if "_build" not in p.parts] + list(helps())
+    lines = re.findall(r"^ *(?:\$ )?(robins (?!needs ).*)$", "\n".join(texts), re.MULTILINE)
+    cut = (re.sub(r"\s(\s{2,}|\s+#).*", "", line) for line in lines)
+    needed = ("calibrate", "bench up")  # others use what these leave behind
+    return sorted(set(cut), key=lambda line: (not any(word in line for word in needed), line))
+
+
+def as_short_as_can_be(line):
+    """The words of a command line on small files, one run, the cheapest of what is not chosen."""
+    _, *words = shlex.split(line)
+    words = [STANDS_FOR.get(word, word) for word in words]
+    chosen = "--filters" in words
+    match words:
+        case ["run", name, *_] if "--master" in words:
+            return [word.replace("my.toml", "my-pair.toml") for word in words]
+        case ["design", "my.toml", *rest]:
+            return ["design", "my-problem.toml", *rest]
+        case ["run", name]:
+            return [*words, "--runs", "1"]
+        case ["run", name, *_] if name in PACKAGED:
+            kind = study_of(name)[2]
+            filters = [] if chosen else ["--filters", STUDIES[kind][0]]
+            short = [] if "--set" in words else settings_of(kind)
+            return [*words, *filters, *short, "--runs", "1"]
+        case ["run" | "demo", *_]:
+            return [*words, "--runs", "1"]
+        case ["design", *_] if "--methods" not in words:
+            return [*words, "--methods", "riccati"]
+        case ["bench", "up", *rest]:
+            at = rest.index("--seconds") if "--seconds" in rest else len(rest)
+            return ["bench", "up", *rest[:at], *rest[at + 2 :], "--seconds", "2"]
+    return words
+
+
+def reaches(words):
+    """Let click parse a command line without running it."""
+    command = app
+    while isinstance(command, click.Group):
+        name, *words = words
+        command = command.commands[name]
+    command.make_context(name, list(words))
+
+
+# Those that come to the same are run once, and a scenario by its bare name runs above.
+SHOWN = {tuple(as_short_as_can_be(line)): line for line in shown()}
+SHOWN = {k: v for k, v in SHOWN.items() if not (k[0] == "run" and k[1] in PACKAGED and len(k) == 4)}
+
+
+def test_every_command_is_shown():
+    assert {words[0] for words in SHOWN} >= set(app.commands)
+    assert len(SHOWN) > 40
+
+
+@pytest.mark.parametrize("words", SHOWN, ids=SHOWN.values())
+def test_a_command_line_shown_runs(words, folder, monkeypatch, capsys):
+    if NEEDS_MORE.search(SHOWN[words]):
+        reaches(words)
+        return
+    monkeypatch.chdir(folder)
+    status = main(words)
+    # one run says little of a claim, and the demo ends with a verdict
+    allowed = {Status.DONE, Status.FAILED} if words[0] == "demo" else {Status.DONE}
+    told = capsys.readouterr()
+    assert status in allowed, told.err
+    assert "fault of robins" not in told.err
