@@ -140,11 +140,17 @@ def test_a_filter_that_cannot_predict_has_no_error_to_show(problem):
     assert np.all(np.isnan(record["error"][:, first[0] :]))
     assert np.all(np.isfinite(record["error"][:, : first[0]]))
     assert collect([record], problem.blocks).diverged == 3
+    outcome = simulate(none, 3, chunk=3)
+    assert outcome.counts["hinf_prediction_infeasible"] == outcome.counts["hinf_y_not_predicted"]
+    assert outcome.counts["hinf_prediction_infeasible"] >= np.sum(STEPS - 1 - first)
+    assert outcome.warnings[0].startswith("hinf: ")
+    assert f"of {3 * STEPS} predictions are INFEASIBLE" in outcome.warnings[0]
 
 
 def test_all_filters_see_the_same_numbers(problem):
     outcome = simulate(problem, 5, chunk=5)
     assert list(outcome.metrics) == ["right", "sure", "wrong R"]
+    assert not outcome.warnings  # R = 0.2^2 for 0.4^2 is not yet worth a word
     y = outcome.solution["innovation_y"].values[:, 0, 0]
     # the first innovation is y - F m0 whatever R is believed
     np.testing.assert_allclose(y, y[0], atol=1e-14)
@@ -210,11 +216,24 @@ def test_limits_say_how_many_are_inside_and_since_when(problem):
 
 def test_filters_that_differ_in_numbers_share_what_was_compiled(problem):
     step = problem.contenders["right"].filter
-    models = [Model(Motion(_move, Q_FACTOR), (Sensor(_read, jnp.array([s]), 1),)) for s in (1, 2)]
+    models = [_model_of(sigma) for sigma in (1.0, 2.0)]
     pair = replace(problem, contenders={str(i): Contender(step, m) for i, m in enumerate(models)})
     before = monte_carlo._records._cache_size()
     simulate(pair, 3, chunk=3)
     assert monte_carlo._records._cache_size() == before + 1
+
+
+def test_a_filter_that_is_far_too_sure_is_doubted(problem):
+    # Numbers alone differ from the models above, so nothing is compiled anew.
+    far = problem._replace(
+        contenders={"far": Contender(problem.contenders["right"].filter, _model_of(0.1))}
+    )
+    (said,) = simulate(far, 3, chunk=3).warnings
+    assert said.startswith("far: the innovations of 'y' are larger than the filter expects")
+
+
+def _model_of(sigma):
+    return Model(Motion(_move, Q_FACTOR), (Sensor(_read, jnp.array([sigma]), 1),))
 
 
 def _move(x, u):

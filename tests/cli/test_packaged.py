@@ -148,9 +148,9 @@ def folder(tmp_path_factory):
     drive = drive_dataset(scenario.parse(Drive, car, ["settle=5 s"]), seed=1)
     logs.write_named(here / "imu.csv", drive.imu)
     write_pos(here / "gnss.pos", drive.gnss)
-    (here / "unit.toml").write_text(
-        'system = "ins-gnss"\n[gnss]\nlever_arm = ["0 m", "0 m", "0 m"]\n'
-    )
+    lever_arm = 'lever_arm = ["0.5 m", "-0.2 m", "-1 m"]'
+    unit = car[car.index("[imu]") : car.index("[gnss]")]
+    (here / "unit.toml").write_text(f'system = "ins-gnss"\n{unit}[gnss]\n{lever_arm}\n')
     write_nine_axes(here / "turned.csv")
     for name in ("nine_axes.csv", "flight.csv"):
         (here / name).write_bytes((here / "turned.csv").read_bytes())

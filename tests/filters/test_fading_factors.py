@@ -14,6 +14,7 @@ from robins.filters import (
     Motion,
     OnlineFilter,
     Sensor,
+    StepWarning,
     kalman,
     rts_smoother,
     run,
@@ -278,7 +279,8 @@ def test_all_that_adapts_survives_the_worst():
     model = Model(Motion(Partial(times, jnp.array(F)), lambda x, u: u), (sensor,))
     rules = [sage_husa(adapt="QR"), variational_bayes(), innovation_fading(), fading_memory(1.001)]
     start = Belief.of(jnp.zeros(n), 1e12 * np.eye(n))
-    solution = run(kalman(rules=rules), model, start, y, G, {"y": (H, W)})
+    with pytest.warns(StepWarning, match="1 of 2000 updates with 'y' are NOT_FINITE"):
+        solution = run(kalman(rules=rules), model, start, y, G, {"y": (H, W)})
     P = np.asarray(solution.covariance)
     assert np.all(np.isfinite(solution.mean))
     assert np.all(np.isfinite(P))

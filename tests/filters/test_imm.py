@@ -9,7 +9,18 @@ from jax.tree_util import Partial
 from scipy.spatial.transform import Rotation as Turn
 from scipy.stats import multivariate_normal
 
-from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, run, unscented
+from robins.filters import (
+    Belief,
+    Code,
+    Model,
+    Motion,
+    OnlineFilter,
+    Sensor,
+    StepWarning,
+    kalman,
+    run,
+    unscented,
+)
 from robins.filters.imm import imm, mode
 from robins.filters.mixture import log_normalised, matched, root
 from robins.filters.rules import gate
@@ -189,7 +200,8 @@ def test_a_mode_that_fails_is_out_and_comes_back():
     np.testing.assert_allclose(mu[[0, 1]], 0.5)
     assert 0.1 < mu[4] < mu[5]
 
-    lost = run(imm([broken] * 2, np.eye(2)), Model(sound, (sensor,)), found.final.belief, y)
+    with pytest.warns(StepWarning, match="4 of 6 predictions are NOT_FINITE"):
+        lost = run(imm([broken] * 2, np.eye(2)), Model(sound, (sensor,)), found.final.belief, y)
     assert lost.steps.prediction.code.tolist()[:4] == [0, 0, Code.NOT_FINITE, Code.NOT_FINITE]
     assert np.isneginf(lost.log_likelihood)
     assert np.all(np.isfinite(lost.mean))

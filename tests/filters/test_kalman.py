@@ -17,6 +17,7 @@ from robins.filters import (
     Model,
     Motion,
     Sensor,
+    StepWarning,
     cubature,
     kalman,
     run,
@@ -290,18 +291,23 @@ def test_what_is_missing_may_have_a_reading_that_fails():
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("step", [lambda x, u: x * 1e200 * 1e200, lambda x, u: jnp.sqrt(x - 2.0)])
 def test_a_prediction_that_would_break_the_belief_is_not_taken(form, step):
-    state, prediction, _, info = one_step(EKF[form], model_of(step=step), 1.2)
+    state, prediction, after, info = one_step(EKF[form], model_of(step=step), 1.2)
     assert int(prediction.code) == Code.NOT_FINITE
     np.testing.assert_array_equal(state.belief.mean, np.ones(4))
     np.testing.assert_array_equal(state.belief.factor, np.eye(4))
-    assert int(info.code) == Code.DONE  # and the filter goes on
+    # The belief is of an earlier time than the measurement, which is not fused into it.
+    assert int(info.code) == Code.NOT_PREDICTED
+    assert (float(info.nis), int(info.dof), float(info.log_likelihood)) == (0.0, 0, -np.inf)
+    np.testing.assert_array_equal(after.belief.mean, state.belief.mean)
+    np.testing.assert_array_equal(after.belief.factor, state.belief.factor)
 
 
 def test_no_search_is_drawn_to_models_that_fail():
     system = random_system(1)
     y = simulate(system, 1, T)[1]
     for broken in (system._replace(F=system.F * np.nan), system._replace(H=system.H * np.nan)):
-        solution = run(EKF["sqrt"], broken.model(), system.start(), y)
+        with pytest.warns(StepWarning, match=f"{T} of {T} .* are NOT_FINITE"):
+            solution = run(EKF["sqrt"], broken.model(), system.start(), y)
         assert float(solution.log_likelihood) == -np.inf
         assert np.all(np.isfinite(solution.mean))
 
@@ -322,7 +328,8 @@ def test_joseph_form_says_what_it_cannot_do():
     system = random_system(1)
     still = system._replace(P0=np.zeros((4, 4)), G=np.zeros((4, 4)))
     y = simulate(system, 1, T)[1]
-    solution = run(EKF["joseph"], still.model(), still.start(), y)
+    with pytest.warns(StepWarning, match="predictions are INDEFINITE.*'y' are NOT_PREDICTED"):
+        solution = run(EKF["joseph"], still.model(), still.start(), y)
     assert set(solution.steps.prediction.code.tolist()) == {Code.INDEFINITE}
     assert np.all(np.isfinite(solution.mean))
     root = run(EKF["sqrt"], still.model(), still.start(), y)

@@ -272,7 +272,7 @@ def test_streaming_counts_predictions_that_were_not_taken():
     live = OnlineFilter(EKF, SYSTEM._replace(F=np.full((4, 4), np.nan)).model(), START)
     assert int(live.predict().code) == Code.NOT_FINITE
     live.update(np.full(3, 1e308))
-    assert live.counts == {"NOT_FINITE": 2}
+    assert live.counts == {"NOT_FINITE": 1, "NOT_PREDICTED": 1}
     same(live.belief, START)
 
 

@@ -13,6 +13,7 @@ from robins.filters import (
     Model,
     Motion,
     Sensor,
+    StepWarning,
     kalman,
     rts_smoother,
     run,
@@ -90,12 +91,14 @@ def test_with_part_of_the_start_known_the_prediction_is_singular(rank):
 def test_a_prediction_that_was_not_taken_holds_the_state():
     F, G, H, W, m0, P0, y = time_varying(3)
     F[5] = np.nan
-    solution = run(EKF, MODEL, Belief.of(jnp.array(m0), P0), y, (F, G), {"y": (H, W)})
+    with pytest.warns(StepWarning, match="1 of 12 predictions are NOT_FINITE"):
+        solution = run(EKF, MODEL, Belief.of(jnp.array(m0), P0), y, (F, G), {"y": (H, W)})
     assert np.flatnonzero(solution.steps.prediction.code).tolist() == [5]
     assert int(solution.steps.prediction.code[5]) == Code.NOT_FINITE
     smooth = rts_smoother(solution)
     np.testing.assert_array_equal(smooth.mean[4], smooth.mean[5])
-    F[5], G[5] = np.eye(N), 0.0  # which is what a step of no motion and no noise would be
+    # Which is what a step of no motion, no noise and no measurement would be.
+    F[5], G[5], y[5] = np.eye(N), 0.0, np.nan
     agree(smooth, both(EKF, (F, G, H, W, m0, P0, y))[2], 1e-9)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import Belief, Code, Step, run, run_closed
+from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.consistency import nees, normalised_sq
 from robins.manifold import State, local
 from robins.systems.system import Case, Contender, Problem
@@ -54,22 +54,24 @@ def reported_rows(contender: Contender, case: Case) -> tuple[Array | None, int |
     return (None if fixed is None else jnp.asarray(fixed, float)), None
 
 
-def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any, Case]:
-    """What is kept of the steps of a filter, and the case with all that it was given.
+def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any, Case, Tally]:
+    """What is kept of the steps of a filter, the case with all that it was given, and how it went.
 
     A case in closed loop knows its truth and its measurements only when the filter has run.
     """
     if case.loop is None:
-        steps = run(filter_, model, case.start, case.y, case.u, case.aux, keep=keep).steps
-        return steps, case
-    steps, given, _, _ = run_closed(filter_, model, case.start, case.loop, keep)
+        done = run(filter_, model, case.start, case.y, case.u, case.aux, keep=keep)
+        return done.steps, case, done.tally
+    done = run_closed(filter_, model, case.start, case.loop, keep)
+    given = done.readings
     found = {"u": given.u, "y": given.y, "aux": given.aux, "truth": given.truth}
-    return steps, case._replace(**found, rows=given.rows, outputs=given.outputs, loop=None)
+    case = case._replace(**found, rows=given.rows, outputs=given.outputs, loop=None)
+    return done.steps, case, done.tally
 
 
 def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]:
     """One run of one filter, to what statistics need."""
-    steps, case = solved(contender.filter, contender.model, contender.case(world), _kept)
+    steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
     rows, along = reported_rows(contender, case)
     error, factor = jax.vmap(_reported, (0, 0, along))(posterior, case.truth, rows)
@@ -90,6 +92,7 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
         "code": {k: v[4] for k, v in info.items()},
         "notes": {k: v[5] for k, v in info.items()},
         "outputs": dict(case.outputs),
+        "tally": tally,
     }
 
 
@@ -138,7 +141,8 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     Returns:
         NumPy records with a leading axis of ``count`` runs. Of the reported components error and
         sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
-        innovation, innovation_sigma, nis, dof, code and the notes of rules; by name the outputs.
+        innovation, innovation_sigma, nis, dof, code and the notes of rules; by name the outputs;
+        the tally of its steps.
 
     Raises:
         ValueError: there is no such contender.

@@ -12,7 +12,7 @@ import xarray as xr
 from robins.campaign.bound import bound_sigma
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
-from robins.filters import Code
+from robins.filters import Code, doubts
 from robins.results import variable
 from robins.systems.system import Outcome, Output, Problem
 from robins.systems.tables import Seen, innovation_tables
@@ -67,6 +67,11 @@ def simulate(
         claims=problem.claims(metrics),
         counts=_counts(found),
         notes=list(problem.notes),
+        warnings=[
+            f"{name}: {sentence}"
+            for name, s in found.items()
+            for sentence in doubts(s.tally, problem.contenders[name].bounds)
+        ],
     )
 
 
@@ -82,15 +87,15 @@ def _over_bound(problem: Problem, s: Statistics, bound: np.ndarray) -> dict[str,
 
 
 def _counts(found: dict[str, Statistics]) -> dict[str, int]:
-    """Updates by outcome, and runs that diverged, over all filters."""
+    """Predictions and updates by outcome, and runs that diverged, over all filters."""
     out: dict[str, int] = {}
     for name, s in found.items():
         if s.diverged:
             out[f"{name}_diverged_runs"] = s.diverged
-        for sensor, tally in s.codes.items():
-            for code, number in tally.items():
+        for what in (None, *s.tally.updates):
+            for code, number in s.tally.counts(what).items():
                 if code not in (Code.DONE, Code.MISSING):
-                    out[f"{name}_{sensor}_{Code(code).name.lower()}"] = number
+                    out[f"{name}_{what or 'prediction'}_{code.name.lower()}"] = number
     return out
 
 

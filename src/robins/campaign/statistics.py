@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from scipy import stats
 
+from robins.filters import Tally
 from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
 from robins.systems.system import Limit, Norm, StateBlock
 
@@ -45,7 +46,7 @@ class Statistics:
     _block_nees: dict[str, Any] = field(default_factory=dict)
     _nis: dict[str, Any] = field(default_factory=dict)
     _dof: dict[str, Any] = field(default_factory=dict)
-    _codes: dict[str, dict[int, int]] = field(default_factory=dict)
+    _tallies: list[Tally] = field(default_factory=list)
     _run_rms: list[np.ndarray] = field(default_factory=list)
     _run_worst: list[np.ndarray] = field(default_factory=list)
     _within: dict[str, Any] = field(default_factory=dict)
@@ -75,10 +76,7 @@ class Statistics:
         for name, value in record["nis"].items():
             self._nis[name] = self._nis.get(name, 0.0) + np.sum(value, axis=0)
             self._dof[name] = self._dof.get(name, 0) + np.sum(record["dof"][name], axis=0)
-            kinds, numbers = np.unique(record["code"][name], return_counts=True)
-            tally = self._codes.setdefault(name, {})
-            for kind, number in zip(kinds.tolist(), numbers.tolist(), strict=True):
-                tally[kind] = tally.get(kind, 0) + number
+        self._tallies.append(record.get("tally", Tally.blank(())))
         for name, value in record.get("outputs", {}).items():
             value = np.where(bad[:, None, None], np.inf, value)
             self._output_square[name] = self._output_square.get(name, 0.0) + np.sum(value**2, 0)
@@ -180,9 +178,9 @@ class Statistics:
         return np.concatenate(self._settled[limit])
 
     @property
-    def codes(self) -> dict[str, dict[int, int]]:
-        """Number of updates by sensor and `robins.filters.Code`."""
-        return self._codes
+    def tally(self) -> Tally:
+        """How the steps went; leading axis of runs."""
+        return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *self._tallies)
 
     def overall_ratio(self) -> np.ndarray:
         """(r,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""

@@ -34,6 +34,7 @@ from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
 from robins.filters.shares import observability_shares
 from robins.filters.smooth import rts_smoother
+from robins.filters.tally import StepWarning, Tally, doubts
 from robins.filters.worst_case import (
     existence_margin,
     gamma_min,
@@ -67,6 +68,8 @@ __all__ = [
     "Solution",
     "Step",
     "StepInfo",
+    "StepWarning",
+    "Tally",
     "Transition",
     "at_master",
     "bound_along",
@@ -76,6 +79,7 @@ __all__ = [
     "cubature",
     "delayed",
     "distributed",
+    "doubts",
     "existence_margin",
     "federated",
     "filter_step",

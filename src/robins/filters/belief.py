@@ -70,6 +70,8 @@ class Code(IntEnum):
     NOT_FINITE = 5
     INFEASIBLE = 6
     TOO_OLD = 7
+    NOT_PREDICTED = 8
+    CONTRADICTED = 9
 
 
 SENTENCES: dict[Code, str] = {
@@ -92,6 +94,14 @@ SENTENCES: dict[Code, str] = {
     Code.TOO_OLD: (
         "the measurement is older than the buffer of the filter reaches back, so the belief stands"
     ),
+    Code.NOT_PREDICTED: (
+        "the prediction before it was not taken, so the belief is of an earlier time than the "
+        "measurement, and stands"
+    ),
+    Code.CONTRADICTED: (
+        "a component without noise contradicts what is known exactly and was left out: give the "
+        "sensor, the constraint or the initial state the noise that it has"
+    ),
 }
 
 
@@ -102,7 +112,8 @@ class StepInfo(NamedTuple):
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
     gain: Array  # (n, m); zero columns where not used
     used: Array  # (m,) bool: there, not refused, and independent of the components above
-    nis: Float[Array, ""]  # normalised innovation squared, chi-square of `dof`
+    # normalised innovation squared, chi-square of `dof`; infinite if a component is CONTRADICTED
+    nis: Float[Array, ""]
     dof: Array  # number of components used
     log_likelihood: Float[Array, ""]
     code: Array  # a `Code`

@@ -19,6 +19,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Model, Sensor
 from robins.filters.run import Step, check_names, everything, is_traced, nothing
+from robins.filters.tally import Tally, warn_not_taken
 
 
 class Reading(NamedTuple):
@@ -65,7 +66,7 @@ def _without(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: A
 @partial(jax.jit, static_argnames=("filter_", "keep"))
 def _scan(filter_, model, state, loop: Loop, keep):
     def body(carry, given):
-        state, world = carry
+        state, world, tally = carry
         row, due = given
         world, reading = loop.react(world, state.belief, row)
         check_names(model, reading.y)
@@ -81,12 +82,12 @@ def _scan(filter_, model, state, loop: Loop, keep):
                 else:
                     state, info[sensor.name] = taken(*args)
         step = Step(prediction, state.belief, info)
-        return (state, world), (keep(step), reading)
+        return (state, world, tally.and_step(prediction.code, info)), (keep(step), reading)
 
-    (state, world), (steps, readings) = jax.lax.scan(
-        body, (state, loop.world), (loop.rows, dict(loop.due))
+    (state, world, tally), (steps, readings) = jax.lax.scan(
+        body, (state, loop.world, Tally.blank(tuple(model.dims))), (loop.rows, dict(loop.due))
     )
-    return steps, readings, state, world
+    return steps, readings, state, world, tally
 
 
 def _update(filter_: Filter, sensor: Sensor, state: FilterState, y: Any, aux: Any):
@@ -104,12 +105,13 @@ def _apart(step: Callable, *args: Any) -> Any:
 
 
 class Closed(NamedTuple):
-    """A run in closed loop; fields but the last two have a leading axis of T steps."""
+    """A run in closed loop; steps and readings have a leading axis of T steps."""
 
     steps: Any  # what `keep` chose of each `robins.filters.Step`
     readings: Reading  # what the world answered, truth and outputs included
     final: FilterState
     world: Any  # state of the world at the end
+    tally: Tally  # how the steps went, whatever was kept of them
 
 
 def run_closed(
@@ -138,6 +140,9 @@ def run_closed(
         Exception: what a rule has to report, as in `robins.filters.run`.
         ValueError: ``due`` or a reading names no sensor of the model, or ``due`` is not as long as
             the rows.
+
+    Warns:
+        StepWarning: as in `robins.filters.run`.
     """
     steps = {jnp.shape(x)[0] for x in jax.tree_util.tree_leaves((loop.rows, loop.due))}
     if len(steps) != 1:
@@ -154,6 +159,8 @@ def run_closed(
             return _scan(filter_, model, first, loop, nothing)[2]
 
         filter_.audit(state, closed.final, again, time_s)
+    if not is_traced(closed.tally):
+        warn_not_taken(closed.tally)
     return closed
 
 

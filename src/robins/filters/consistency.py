@@ -70,7 +70,8 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
     """Mean of all innovations squared per degree of freedom, over runs and time.
 
     Innovations of a right filter are white, so their sum over time is chi-square too; this is the
-    sharpest single test of R and Q. Steps with nothing measured (dof = 0) do not count.
+    sharpest single test of R and Q. Steps with nothing measured (dof = 0) do not count; an infinite
+    NIS, that of a contradiction, does.
 
     Args:
         nis: any shape.
@@ -85,7 +86,8 @@ def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Ver
     if total == 0.0:
         return Verdict(float("nan"), float("nan"), float("nan"))
     low, high = chi2_band(total, 1, level) / total
-    return Verdict(float(np.sum(nis[dof > 0]) / total), float(low), float(high))
+    counts = (dof > 0) | np.isinf(nis)
+    return Verdict(float(np.sum(nis[counts]) / total), float(low), float(high))
 
 
 def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray, float]:

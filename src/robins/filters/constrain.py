@@ -27,7 +27,7 @@ from robins.filters.iterated import iterated
 from robins.filters.kalman import updated
 from robins.filters.linearise import taylor
 from robins.filters.model import Sensor, as_noise
-from robins.filters.observation import Observation, normalised
+from robins.filters.observation import Observation, contradicted, normalised
 from robins.manifold import State
 
 Numbers = ArrayLike | Sequence[Any]
@@ -46,7 +46,9 @@ class Constrained(NamedTuple):
     belief: Belief
     residual: Array  # (c,) d - g(x) before
     used: Array  # (c,) bool: not known already, and independent of the components above
-    nis: Array  # () residual squared by D P D' + R_d before, chi-square of `dof`
+    # () residual squared by D P D' + R_d before, chi-square of `dof`; infinite where an exact
+    # component contradicts what is known exactly or the components above it
+    nis: Array
     dof: Array  # () number of components that were not known already
 
 
@@ -104,7 +106,8 @@ def constrain(
         else:
             factor = linalg.tria(rest, G @ sensor.noise)
         posterior = Belief(mean, linalg.where(jnp.any(used), factor, S))
-    return Constrained(posterior, before.residual, used, judged.nis, judged.dof)
+    nis = jnp.where(jnp.any(contradicted(before, judged)), jnp.inf, judged.nis)
+    return Constrained(posterior, before.residual, used, nis, judged.dof)
 
 
 def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array]:

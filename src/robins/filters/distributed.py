@@ -49,7 +49,7 @@ from robins.filters.fusion import (
     information_sum,
     intersection_weights,
 )
-from robins.filters.kalman import Filter, FilterState, compiled
+from robins.filters.kalman import Filter, FilterState, in_step
 from robins.filters.model import Motion
 
 Feedback = Literal["own", "mean", "full"]
@@ -169,6 +169,4 @@ def _side_by_side(
         members = tuple(c.filter.reset(m, belief) for c, m in pairs)
         return FilterState(belief, joined._replace(members=members))
 
-    return compiled(
-        Filter(init, predict, updating(channels, fuse, name), reset, auditing(channels))
-    )
+    return in_step(Filter(init, predict, updating(channels, fuse, name), reset, auditing(channels)))

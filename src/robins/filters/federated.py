@@ -42,7 +42,7 @@ from robins.filters.channels import (
     with_noise,
 )
 from robins.filters.fusion import Sharing, check_sharing, information_sum, part
-from robins.filters.kalman import Filter, FilterState, compiled, kalman
+from robins.filters.kalman import Filter, FilterState, in_step, kalman
 from robins.filters.linearise import Linearisation, Number
 from robins.filters.model import Motion, as_noise
 from robins.filters.shares import diagonal_shares, equal_shares, floored, trace_shares
@@ -215,7 +215,7 @@ def federated(
         return FilterState(belief, joined._replace(members=tuple(members)))
 
     update = updating(channels, information_sum, "federated")
-    return compiled(Filter(init, predict, update, reset, auditing(channels)))
+    return in_step(Filter(init, predict, update, reset, auditing(channels)))
 
 
 def _is_plain(member: FilterState) -> bool:

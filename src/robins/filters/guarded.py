@@ -36,7 +36,7 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.channels import Joined
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, compiled
+from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
 from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
@@ -219,7 +219,7 @@ def guarded(
             one.audit(getattr(start.memory, side), getattr(final.memory, side), once_more, time)
 
     audited = filter.audit is not None or reference.audit is not None
-    return compiled(Filter(init, predict, update, reset, audit if audited else None))
+    return in_step(Filter(init, predict, update, reset, audit if audited else None))
 
 
 def _names(given: str | Sequence[str]) -> tuple[str, ...]:
@@ -263,7 +263,7 @@ def _members(groups: Groups | None, n: int) -> np.ndarray:
 
 def _failure(info: StepInfo) -> Array:
     """Whether a step was not taken."""
-    lost = (Code.INDEFINITE, Code.NOT_FINITE, Code.INFEASIBLE)
+    lost = (Code.INDEFINITE, Code.NOT_FINITE, Code.INFEASIBLE, Code.CONTRADICTED)
     return jnp.any(info.code == jnp.array([int(code) for code in lost]))
 
 
@@ -306,8 +306,8 @@ def _local_by_local(mine: FilterState, other: FilterState) -> FilterState | None
     pairs = list(zip(a.members, b.members, strict=True))
     if any(m.points != () or m.belief.factor.shape != o.belief.factor.shape for m, o in pairs):
         return None
-    members = tuple(m._replace(belief=o.belief) for m, o in pairs)
-    return mine._replace(belief=other.belief, memory=a._replace(members=members))
+    members = tuple(m._replace(belief=o.belief, current=o.current) for m, o in pairs)
+    return FilterState(other.belief, a._replace(members=members))
 
 
 def _check(

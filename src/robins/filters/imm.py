@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, compiled
+from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import equal, select
@@ -177,7 +177,7 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
                 m.filter_.audit(begin.memory.states[i], final.memory.states[i], once_more, time)
 
     audited = any(m.filter_.audit is not None for m in every)
-    return compiled(Filter(init, predict, update, reset, audit if audited else None))
+    return in_step(Filter(init, predict, update, reset, audit if audited else None))
 
 
 def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:
@@ -219,14 +219,15 @@ def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> Ste
     lost = jnp.isneginf(log_likelihood)
     used = used & ~lost
     expected = innovation(seen, jnp.exp(log_normalised(log_prior)[0]), used)
+    code = seen.code[jnp.argmax(log_post)]
     return StepInfo(
         innovation=expected.mean,
         factor=expected.factor,
         gain=jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain),
         used=used,
-        nis=expected.nis,
+        nis=jnp.where(code == int(Code.CONTRADICTED), jnp.inf, expected.nis),
         dof=expected.dof,
         log_likelihood=log_likelihood,
-        code=seen.code[jnp.argmax(log_post)],
+        code=code,
         notes={},
     )

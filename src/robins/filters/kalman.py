@@ -15,13 +15,14 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
-from robins.filters.observation import Observation, left_out, whiten
+from robins.filters.observation import Observation, contradicted, left_out, whiten
 from robins.filters.rule import Memory, Rule, keep_belief
 from robins.filters.trees import finite, select
 
@@ -34,6 +35,7 @@ class FilterState(NamedTuple):
     belief: Belief
     memory: Any  # a tuple with one per rule; other filters keep what they need
     points: Any = ()  # sigma points on their way from a prediction to its update
+    current: Any = np.True_  # () bool: the last prediction was taken, so the belief is of this time
 
 
 class Prediction(NamedTuple):
@@ -77,6 +79,26 @@ def compiled(filter_: Filter) -> Filter:
     return filter_._replace(predict=jax.jit(filter_.predict), update=jax.jit(filter_.update))
 
 
+def in_step(filter_: Filter) -> Filter:
+    """The same filter, compiled, which uses no measurement after a prediction that was not taken.
+
+    The belief is then of an earlier time than the measurement: to fuse it would be to leave out
+    the motion and its noise. It goes on with the next prediction that is taken, or a `reset`.
+    """
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        state, prediction = filter_.predict(state, motion, u)
+        return state._replace(current=prediction.code == int(Code.DONE)), prediction
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        new, info = filter_.update(state, sensor, y, aux)
+        ok = state.current | (info.code == int(Code.MISSING))
+        new = select(state.current, new, state)
+        return new, _not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
+
+    return compiled(filter_._replace(predict=predict, update=update))
+
+
 def predicted_factor(t: Transition, form: Form) -> Array:
     """Factor of ``F P F' + Omega + Q``."""
     if form == "sqrt":
@@ -89,10 +111,11 @@ def predicted_factor(t: Transition, form: Form) -> Array:
     return linalg.cholesky(P)
 
 
-def _outcome(o: Observation) -> Array:
+def _outcome(o: Observation, wrong: Array) -> Array:
     some = jnp.where(jnp.any(o.accepted), int(Code.PARTLY_MISSING), int(Code.REFUSED))
     some = jnp.where(jnp.any(o.present), some, int(Code.MISSING))
-    return jnp.where(jnp.all(o.accepted), int(Code.DONE), some)
+    some = jnp.where(jnp.all(o.accepted), int(Code.DONE), some)
+    return jnp.where(wrong, int(Code.CONTRADICTED), some)
 
 
 def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo]:
@@ -129,8 +152,10 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         S_post = linalg.cholesky(P)
 
     seen = whiten(S_y, used, o.residual)
+    wrong = jnp.any(contradicted(o, seen))
     mean = manifold.retract(prior.mean, cross @ seen.white)
     gain = linalg.solve_lower_transposed(S_y, cross.T).T
+    likely = -0.5 * (seen.nis + seen.dof.astype(float) * math.log(2.0 * math.pi))
     # With nothing to use the belief stands bit for bit, as if there had been no update.
     posterior = select(jnp.any(used), Belief(mean, S_post), prior)
     info = StepInfo(
@@ -138,11 +163,10 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         factor=S_y,
         gain=jnp.where(used[None, :], gain, 0.0),
         used=used,
-        nis=seen.nis,
+        nis=jnp.where(wrong, jnp.inf, seen.nis),
         dof=seen.dof,
-        log_likelihood=-0.5 * (seen.nis + seen.dof.astype(float) * math.log(2.0 * math.pi))
-        - linalg.log_diagonal(S_y, used),
-        code=_outcome(o),
+        log_likelihood=jnp.where(wrong, -jnp.inf, likely - linalg.log_diagonal(S_y, used)),
+        code=_outcome(o, wrong),
         notes={},
     )
     return posterior, info
@@ -243,7 +267,8 @@ def kalman(
         for i, rule in enumerate(rules):
             memory[i], posterior, info = rule.after(memory[i], posterior, info, seen)
         new = FilterState(posterior, tuple(memory), drawn(posterior))
-        ok = finite((new, info.nis))
+        # A contradiction alone has an infinite NIS that is no overflow.
+        ok = finite(new) & (finite(info.nis) | (info.code == int(Code.CONTRADICTED)))
         inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *left_out(seen)[:3])
         why = _failure(inputs, posterior.factor)
         return select(ok, new, state), _not_taken(ok, info, why)
@@ -262,4 +287,4 @@ def kalman(
                 rule.audit(start.memory[i], final.memory[i], once_more, time)
 
     audited = any(rule.audit is not None for rule in rules)
-    return compiled(Filter(init, predict, update, reset, audit if audited else None))
+    return in_step(Filter(init, predict, update, reset, audit if audited else None))

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.channels import Joined
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, compiled, kalman
+from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step, kalman
 from robins.filters.model import Motion, Sensor
 
 
@@ -103,4 +103,4 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
             once_more = None if again is None else rerun
             one.audit(getattr(start.memory, part), getattr(final.memory, part), once_more, time)
 
-    return compiled(Filter(init, predict, update, reset, audit))
+    return in_step(Filter(init, predict, update, reset, audit))

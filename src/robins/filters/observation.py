@@ -12,6 +12,10 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.filters.belief import Belief
 
+# What is known exactly carries rounding, of many steps: a share of what it was summed from that is
+# far above that, and far below any sensor.
+_CONTRADICTS = 1e-9
+
 
 class Observation(NamedTuple):
     """A measurement seen from a belief, linearised. Not a JAX type: `sensor` is a string."""
@@ -110,6 +114,26 @@ def whiten(factor: Array, used: Array, residual: Array) -> Normalised:
     rest = jnp.where(used, residual, 0.0)
     white = linalg.solve_lower(factor, rest[:, None])[:, 0]
     return Normalised(factor, used, white, jnp.sum(white**2), jnp.sum(used))
+
+
+def contradicted(o: Observation, seen: Normalised) -> Array:
+    """(m,) bool: components that have nothing of their own to say, and yet say something else.
+
+    Such a component is known exactly from the belief and the components that are used (R = 0 and P
+    = 0, or one exact sensor twice): its residual can only be what theirs make it.
+    """
+    idle = o.accepted & ~seen.used
+
+    def compare() -> Array:
+        wide = jnp.concatenate([o.spread, o.excess, o.noise], axis=1)
+        among = jnp.where(seen.used[:, None], wide, 0.0) @ wide.T
+        if o.deficit is not None:
+            among = among - jnp.where(seen.used, o.deficit, 0.0)[:, None] * o.deficit[None, :]
+        share = linalg.solve_lower(seen.factor, among).T
+        off = jnp.abs(o.residual - share @ seen.white)
+        return idle & (off > _CONTRADICTS * (o.size + jnp.abs(share) @ jnp.abs(seen.white)))
+
+    return jax.lax.cond(jnp.any(idle), compare, lambda: jnp.zeros_like(idle))
 
 
 def normalised(o: Observation) -> Normalised:

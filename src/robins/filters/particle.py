@@ -33,7 +33,7 @@ from robins.filters.kalman import (
     Filter,
     FilterState,
     Prediction,
-    compiled,
+    in_step,
     predicted_factor,
     updated,
 )
@@ -202,21 +202,24 @@ def particle(
         weight = jnp.exp(log_normalised(jnp.where(sound, log_prior, -jnp.inf))[0])
         expected = innovation(infos, weight, used)
         gain = _gain(state.belief, before, infos, weight, cross, expected)
+        # Where no particle is left, each may have been contradicted: all sampled and R = 0.
         best = jnp.argmax(cloud.log_weight)
+        wrong = infos.code[best] == int(Code.CONTRADICTED)
+        code = jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best])
         info = StepInfo(
             innovation=expected.mean,
             factor=expected.factor,
             gain=jnp.where(used[None], gain, 0.0),
             used=used,
-            nis=expected.nis,
+            nis=jnp.where(wrong, jnp.inf, expected.nis),
             dof=expected.dof,
             log_likelihood=total,
-            code=jnp.where(lost, int(Code.NOT_FINITE), infos.code[best]),
+            code=code,
             notes={"particle.ess": _effective(jnp.exp(cloud.log_weight))},
         )
         return FilterState(belief, cloud), info
 
-    return compiled(Filter(init, predict, update, reset))
+    return in_step(Filter(init, predict, update, reset))
 
 
 def reseed(state: FilterState, key: Any) -> FilterState:

@@ -15,6 +15,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
+from robins.filters.tally import Tally, warn_not_taken
 
 
 class Step(NamedTuple):
@@ -31,6 +32,7 @@ class Solution(NamedTuple):
     steps: Any  # what `keep` chose of each Step; by default the Step itself
     final: FilterState  # after the last step, to go on from
     log_likelihood: Float[Array, ""]
+    tally: Tally  # how the steps went, whatever was kept of them
 
     @property
     def mean(self):
@@ -116,14 +118,16 @@ def filter_step(
 @partial(jax.jit, static_argnames=("filter_", "keep"))
 def _scan(filter_, model, state, u, y, aux, keep):
     def body(carry, row):
-        state, total = carry
+        state, total, tally = carry
         state, step = filter_step(filter_, model, state, *row)
         gained = sum((i.log_likelihood for i in step.info.values()), jnp.zeros(()))
         moved = step.prediction.code == int(Code.DONE)
-        return (state, total + jnp.where(moved, gained, -jnp.inf)), keep(step)
+        total = total + jnp.where(moved, gained, -jnp.inf)
+        return (state, total, tally.and_step(step.prediction.code, step.info)), keep(step)
 
-    (state, total), steps = jax.lax.scan(body, (state, jnp.zeros(())), (u, y, aux))
-    return Solution(steps, state, total)
+    begin = (state, jnp.zeros(()), Tally.blank(tuple(y)))
+    (state, total, tally), steps = jax.lax.scan(body, begin, (u, y, aux))
+    return Solution(steps, state, total, tally)
 
 
 def run(
@@ -159,6 +163,10 @@ def run(
         TypeError: a measurement is not a real number.
         ValueError: lengths differ, a measurement names no sensor of the model or is not of the
             shape that its sensor reads.
+
+    Warns:
+        StepWarning: steps were not taken, or measurements contradict what is known exactly; outside
+            of transformations. `Solution.tally` counts them also there.
     """
     measurements = _by_sensor(model, y)
     extra = dict(aux or {})
@@ -174,4 +182,6 @@ def run(
             return _scan(filter_, model, first, u, measurements, extra, nothing).final
 
         filter_.audit(state, solution.final, again, time_s)
+    if not is_traced(solution.tally):
+        warn_not_taken(solution.tally)
     return solution

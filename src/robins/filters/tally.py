@@ -1,0 +1,155 @@
+"""How the steps of a run went, counted; and what of it should make a reader doubt the figures."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins.filters.belief import SENTENCES, Code, StepInfo
+from robins.filters.consistency import chi2_band
+
+# A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
+# share takes the model for right and the sensor for wrong.
+REFUSED_SHARE = 1.0 / 3.0
+FEWEST = 20  # measurements, or degrees of freedom, below which no share and no mean is judged
+
+# Mean NIS per degree of freedom that is worth a word: standard deviations half of what they should
+# be, or four times. Robust filters are cautious by design, so that side is wider.
+NIS_HIGH, NIS_LOW = 4.0, 1.0 / 16.0
+CORRELATED = 10  # innovations of a wrong model are alike for a while: so many count as one
+LEVEL = 0.999
+
+_LOST = (Code.INDEFINITE, Code.NOT_FINITE, Code.INFEASIBLE, Code.NOT_PREDICTED, Code.CONTRADICTED)
+
+
+class StepWarning(UserWarning):
+    """A run has steps that were not taken, or measurements that contradict what is exact."""
+
+
+class Tally(NamedTuple):
+    """Outcomes of a run's steps, counted; leading axes, of several runs, are summed."""
+
+    predictions: Any  # (codes,) number of predictions by `Code`
+    updates: dict[str, Any]  # (codes,) number of updates by `Code`, by sensor
+    nis: dict[str, Any]  # () sum of the normalised innovations squared, by sensor
+    dof: dict[str, Any]  # () sum of their degrees of freedom, by sensor
+
+    @classmethod
+    def blank(cls, sensors: Mapping[str, Any] | tuple[str, ...]) -> Tally:
+        """Nothing counted yet."""
+        none = jnp.zeros(len(Code), int)
+        return cls(
+            none,
+            dict.fromkeys(sensors, none),
+            dict.fromkeys(sensors, jnp.zeros(())),
+            dict.fromkeys(sensors, jnp.zeros((), int)),
+        )
+
+    def and_step(self, prediction: Any, info: Mapping[str, StepInfo]) -> Tally:
+        """With one more step: the code of its prediction, and its updates by sensor."""
+        judged = {k: (i.dof > 0) & (i.code != int(Code.REFUSED)) for k, i in info.items()}
+        return Tally(
+            self.predictions + _one(prediction),
+            self.updates | {k: self.updates[k] + _one(i.code) for k, i in info.items()},
+            # An infinite NIS is that of a contradiction, which may leave nothing to be used.
+            self.nis
+            | {
+                k: self.nis[k] + jnp.where(judged[k] | jnp.isinf(i.nis), i.nis, 0.0)
+                for k, i in info.items()
+            },
+            self.dof | {k: self.dof[k] + jnp.where(judged[k], i.dof, 0) for k, i in info.items()},
+        )
+
+    def counts(self, sensor: str | None = None) -> dict[Code, int]:
+        """How often each code occurred: in predictions, or in the updates of a sensor."""
+        numbers = np.asarray(self.predictions if sensor is None else self.updates[sensor])
+        total = numbers.reshape(-1, len(Code)).sum(axis=0)
+        return {Code(i): int(number) for i, number in enumerate(total) if number}
+
+
+def _one(code: Array) -> Array:
+    return (jnp.arange(len(Code)) == code).astype(int)
+
+
+def not_taken(tally: Tally) -> list[str]:
+    """Sentences on steps that were not taken and on contradictions."""
+    said = []
+    counts = tally.counts()
+    total = sum(counts.values())
+    for code, number in counts.items():
+        if code is not Code.DONE:
+            said.append(
+                f"{number} of {total} predictions are {code.name}: {SENTENCES[code]}. The belief "
+                "stays behind by these steps"
+            )
+    for sensor in tally.updates:
+        counts = tally.counts(sensor)
+        total = sum(counts.values())
+        said += [
+            f"{number} of {total} updates with '{sensor}' are {code.name}: {SENTENCES[code]}"
+            for code, number in counts.items()
+            if code in _LOST
+        ]
+    return said
+
+
+def doubts(tally: Tally, bounds: bool = False) -> list[str]:
+    """Sentences why a reader should doubt a filter; none where nothing speaks against it.
+
+    They name steps that were not taken, and contradictions; sensors more than a third of whose
+    measurements the filter refused; and sensors whose mean NIS per degree of freedom is above 4
+    (standard deviations half of what they should be) or below 1/16 (four times) and outside the
+    99.9 % band of chi-square with a tenth of the degrees of freedom: innovations of a wrong model
+    are correlated.
+
+    Args:
+        tally: of a run (`Solution.tally`), or of several with leading axes.
+        bounds: the filter states bounds, not standard deviations (an H-infinity filter), so its
+            NIS is not tested.
+    """
+    said = not_taken(tally)
+    for sensor in tally.updates:
+        counts = tally.counts(sensor)
+        refused = counts.get(Code.REFUSED, 0)
+        measured = sum(counts.values()) - counts.get(Code.MISSING, 0)
+        if measured >= FEWEST and refused > REFUSED_SHARE * measured:
+            said.append(
+                f"{refused} of {measured} measurements of '{sensor}' were refused: look at the "
+                "noise of the sensor and of the motion, and at the initial state"
+            )
+        nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
+        if not bounds and dof >= FEWEST:
+            said += _off(sensor, nis / dof, dof)
+    return said
+
+
+def _off(sensor: str, ratio: float, dof: int) -> list[str]:
+    """A sentence where a mean NIS per degree of freedom is far from one."""
+    count = max(dof // CORRELATED, 1)
+    low, high = chi2_band(count, 1, LEVEL) / count
+    if min(low, NIS_LOW) <= ratio <= max(high, NIS_HIGH):
+        return []
+    why = (
+        "larger than the filter expects: its standard deviations are too small"
+        if ratio > 1.0
+        else "smaller than the filter expects: its standard deviations are too large"
+    )
+    return [
+        f"the innovations of '{sensor}' are {why} (mean NIS per degree of freedom {ratio:.3g}, "
+        "one is right)"
+    ]
+
+
+def warn_not_taken(tally: Tally, stacklevel: int = 3) -> None:
+    """Warn of steps that were not taken.
+
+    Warns:
+        StepWarning: there are such steps; the message counts them by outcome.
+    """
+    if said := not_taken(tally):
+        warnings.warn("; ".join(said), StepWarning, stacklevel=stacklevel)
