@@ -1,5 +1,7 @@
 """The smoother against the posterior of all states at once."""
 
+from fractions import Fraction
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,6 +88,73 @@ def test_with_part_of_the_start_known_the_prediction_is_singular(rank):
     agree(smooth, want, 1e-9)
     np.testing.assert_array_equal(smooth.sigma[:, 0], np.zeros(T))
     np.testing.assert_array_equal(smooth.mean[:, 0], np.full(T, m0[0]))
+
+
+def inverse(rows):
+    """Of a matrix of fractions, by elimination."""
+    n = len(rows)
+    work = [[*row, *(Fraction(int(i == j)) for j in range(n))] for i, row in enumerate(rows)]
+    for i in range(n):
+        pivot = next(k for k in range(i, n) if work[k][i])
+        work[i], work[pivot] = work[pivot], work[i]
+        work[i] = [x / work[i][i] for x in work[i]]
+        for k in range(n):
+            if k != i:
+                work[k] = [x - work[k][i] * a for x, a in zip(work[k], work[i], strict=True)]
+    return np.array([row[n:] for row in work])
+
+
+def in_fractions(F, H, m0, P0, y):
+    """Posterior of all states where Q = 0 and R = I, by least squares without rounding."""
+    exact = np.vectorize(Fraction, otypes=[object])
+    F, H, m0, y = exact(F), exact(H), exact(m0), exact(y)
+    A, information = exact(np.eye(N)), inverse(exact(P0))
+    moved, told = [], information @ m0
+    for Fk, Hk, yk in zip(F, H, y, strict=True):
+        A = Fk @ A
+        moved.append(A)
+        seen = Hk @ A
+        information, told = information + seen.T @ seen, told + seen.T @ yk
+    P = inverse(information)
+    m = P @ told
+    return tuple(
+        np.array([f(a) for a in moved], float) for f in (lambda a: a @ m, lambda a: a @ P @ a.T)
+    )
+
+
+@pytest.mark.parametrize("shrinks", [0.01, 0.05, 0.06, 0.07, 0.3])
+def test_a_direction_squeezed_to_rounding_comes_back_from_the_past(shrinks):
+    # Without noise the motion makes one direction 1e-14 of the others, so that the predicted
+    # covariance holds little else of it than rounding.
+    rng = np.random.default_rng(7)
+    V = rng.normal(size=(N, N))
+    F = np.tile(V @ np.diag([shrinks, 0.9, 1.0, 0.95]) @ np.linalg.inv(V), (T, 1, 1))
+    H, y = np.tile(rng.normal(size=(M, N)), (T, 1, 1)), rng.normal(size=(T, M))
+    still, unit = np.zeros((T, N, N)), np.tile(np.eye(M), (T, 1, 1))
+    m0, P0 = rng.normal(size=N), 4.0 * np.eye(N)
+    solution = run(EKF, MODEL, Belief.of(jnp.array(m0), P0), y, (F, still), {"y": (H, unit)})
+    smooth = rts_smoother(solution)
+    mean, P = in_fractions(F, H, m0, P0, y)
+    worst = np.max(np.abs(smooth.covariance - P), axis=(1, 2)) / np.max(np.abs(P), axis=(1, 2))
+    assert np.all(worst < 1e-7), worst
+    # In units of the posterior's own axes, at the first step, where none is rounding yet.
+    axes = np.linalg.inv(np.linalg.cholesky(P[0]))
+    assert np.linalg.norm(axes @ (smooth.covariance[0] - P[0]) @ axes.T, 2) < 1e-6
+    assert np.linalg.norm(axes @ (smooth.mean[0] - mean[0])) < 1e-6
+
+
+def test_states_nearly_the_same_are_told_apart_by_what_comes_later():
+    # Two states 1e-9 apart, with a sensor of their difference: that is no rounding.
+    apart = 1e-9
+    S0 = np.array([[1.0, 0, 0, 0], [1.0, apart, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
+    H = np.array([[1.0 / apart, -1.0 / apart, 0, 0], [0, 0, 1.0, 0]])
+    data = (np.tile(np.eye(N), (T, 1, 1)), np.zeros((T, N, N)))
+    aux = {"y": (np.tile(H, (T, 1, 1)), np.tile(np.eye(M), (T, 1, 1)))}
+    start = Belief(jnp.zeros(N), jnp.array(S0))
+    smooth = rts_smoother(run(EKF, MODEL, start, np.zeros((T, M)), data, aux))
+    difference = smooth.factor[:, 0] - smooth.factor[:, 1]
+    variance = np.sum(difference**2, axis=1)
+    np.testing.assert_allclose(variance, apart**2 / (1 + T), rtol=1e-5)
 
 
 def test_a_prediction_that_was_not_taken_holds_the_state():

@@ -10,6 +10,9 @@ from robins.filters.belief import Belief, Code
 from robins.filters.kalman import Prediction
 from robins.filters.run import Solution
 
+# Rounding of a row of a factor, as a share of the row's length.
+_ROUNDING = 1e-14
+
 
 def rts_smoother(solution: Solution) -> Belief:
     """Beliefs given all measurements, from a run that kept its steps.
@@ -20,6 +23,10 @@ def rts_smoother(solution: Solution) -> Belief:
 
     The first two terms of P_s are what an update of P by the predicted state leaves, and come from
     the same triangularisation, so nothing is subtracted (Park & Kailath 1995).
+
+    A motion that contracts without noise squeezes a direction of P- until only rounding is left of
+    it, which G would blow up again. Where the measurements to come tell less of a direction than
+    the rounding of P-, they are taken to tell nothing of it.
 
     It undoes process and measurement noise as the run used them; covariance a rule added (fading,
     inflation) is not undone: a run with such rules is smoothed as if it were process noise.
@@ -62,10 +69,16 @@ def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief
     unit = jnp.diag(jnp.where(used, 0.0, 1.0))
     deficit = None if t.deficit is None else jnp.where(used, t.deficit, 0.0)
     S, cross, rest = linalg.block_factor(spread, (excess, noise, unit), now.factor, deficit)
-    ahead = jnp.where(used, manifold.local(prediction.belief.mean, later.mean), 0.0)
-    step = cross @ linalg.solve_lower(S, ahead[:, None])[:, 0]
-    G = jnp.where(used[None, :], linalg.solve_lower_transposed(S, cross.T).T, 0.0)
-    smoothed = Belief(manifold.retract(now.mean, step), linalg.tria(rest, G @ later.factor))
+    # The state that followed in units of P-: mean and factor of e in x' = m- + S e, e ~ N(0, 1).
+    ahead = linalg.solve_lower(S, manifold.local(prediction.belief.mean, later.mean)[:, None])[:, 0]
+    M = linalg.solve_lower(S, later.factor)
+    told = jnp.maximum(jnp.max(jnp.abs(M @ M.T - linalg.identity(len(M))), axis=1), jnp.abs(ahead))
+    length = jnp.sqrt(jnp.sum(S**2, axis=1))
+    known = used & (told > _ROUNDING * length / jnp.abs(jnp.diagonal(S)))
+    step = cross @ jnp.where(known, ahead, 0.0)
+    M = jnp.where(known[:, None], M, 0.0)
+    blank = jnp.diag(jnp.where(known, 0.0, 1.0))
+    smoothed = Belief(manifold.retract(now.mean, step), linalg.tria(rest, cross @ M, cross @ blank))
     # A prediction that was not taken left the state where it was: the two are one.
     taken = prediction.code == int(Code.DONE)
     smoothed = jax.tree_util.tree_map(lambda a, b: jnp.where(taken, a, b), smoothed, later)
