@@ -336,6 +336,41 @@ def test_joseph_form_says_what_it_cannot_do():
     assert not np.any(root.steps.prediction.code)
 
 
+def squared(x, aux):
+    return x[:1] ** 2 + 0.1 * x[1:]
+
+
+@pytest.mark.parametrize(
+    ("one", "known", "code"),
+    [
+        # P = 0 and Q = 0 in the first step: the predicted covariance is singular.
+        (EKF["joseph"], 0.0, Code.NOT_PREDICTED),
+        # h = x^2 with a negative weight at the centre: at first its variance comes out negative.
+        (kalman(unscented(1.0, -6.0, 0.0)), 1.0, Code.INDEFINITE),
+        (kalman(unscented(1.0, -6.0, 0.0), form="joseph"), 1.0, Code.INDEFINITE),
+    ],
+    ids=["joseph", "unscented", "unscented-joseph"],
+)
+def test_a_step_that_is_not_taken_leaves_the_gradients_of_the_others(one, known, code):
+    noise = jnp.array([[0.0, 0.0], [0.3, 0.3], [0.3, 0.3], [0.3, 0.3]])
+    start = Belief(jnp.array([0.0, 0.5]), known * jnp.eye(2))
+    y = jnp.array([[0.4], [4.0], [3.8], [4.1]])
+
+    def last(drift):
+        step = Partial(lambda drift, x, u: x + drift, drift)
+        sensor = Sensor(squared, lambda x, aux: aux, 1)
+        model = Model(Motion(step, lambda x, u: u), (sensor,))
+        found = run(one, model, start, y, noise, {"y": jnp.array([[0.1], [9.0], [9.0], [9.0]])})
+        return found.mean[-1, 0], found.steps.info["y"].code
+
+    at = jax.jit(jax.value_and_grad(last, has_aux=True))
+    (_, codes), slope = at(0.7)
+    assert codes[0] == code
+    assert Code.DONE in codes.tolist()
+    (above, _), (below, _) = at(0.7 + 1e-5)[0], at(0.7 - 1e-5)[0]
+    np.testing.assert_allclose(slope, (above - below) / 2e-5, rtol=1e-6)
+
+
 def test_every_code_has_its_sentence():
     assert set(SENTENCES) == set(Code)
 

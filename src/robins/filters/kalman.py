@@ -118,6 +118,11 @@ def _outcome(o: Observation, wrong: Array) -> Array:
     return jnp.where(wrong, int(Code.CONTRADICTED), some)
 
 
+def _aside(sound: Array, S_y: Array) -> Array:
+    """The factor to divide by; NaN in a step that is not taken would make all gradients NaN."""
+    return jnp.where(sound, S_y, linalg.identity(S_y.shape[0]))
+
+
 def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo]:
     """The Kalman update for a linearised observation.
 
@@ -130,6 +135,8 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
     S = prior.factor
     if form == "sqrt":
         S_y, cross, S_post = linalg.block_factor(spread, (excess, noise), S, deficit)
+        sound = finite(S_y)
+        S_y, cross = _aside(sound, S_y), jnp.where(sound, cross, 0.0)
         # After an exact measurement nothing is left in its direction, not even rounding: that
         # would be a covariance of its own to measurements yet to come.
         exact = jnp.any(used & ~jnp.any(noise != 0.0, axis=1) & ~jnp.any(excess != 0.0, axis=1))
@@ -141,6 +148,8 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         if deficit is not None:
             P_y = P_y - deficit[:, None] @ deficit[None, :]
         S_y = linalg.cholesky(P_y)
+        sound = finite(S_y)
+        S_y = _aside(sound, S_y)
         cross = linalg.solve_lower(S_y, spread @ S.T).T
         K = linalg.solve_lower_transposed(S_y, cross.T).T
         # [S - K spread, -K excess, -K noise] is a factor of (I - K H) P (I - K H)' + K R K'.
@@ -149,7 +158,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         if deficit is not None:
             taken = K @ deficit[:, None]
             P = P - taken @ taken.T
-        S_post = linalg.cholesky(P)
+        S_post = jnp.where(sound, linalg.cholesky(P), jnp.nan)
 
     seen = whiten(S_y, used, o.residual)
     wrong = jnp.any(contradicted(o, seen))

@@ -166,8 +166,9 @@ def block_factor(
     return full[:m, :m], full[m:, :m], full[m:, m:]
 
 
+@jax.custom_jvp
 def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower Cholesky factor; all NaN where P is not positive definite."""
+    """Lower Cholesky factor; all NaN, its derivatives zero, where P is not positive definite."""
     n = P.shape[0]
     if n > UNROLLED:
         return jnp.linalg.cholesky(P)
@@ -186,6 +187,19 @@ def cholesky(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.where(positive, lower, jnp.nan)
 
 
+@cholesky.defjvp
+def _cholesky_jvp(primals, tangents):
+    # dL = L W, W the lower half of L^-1 dP L'^-1 (Murray 2016). A step that cannot be taken must
+    # not make the gradients of the others NaN: there L is put aside before it is divided by.
+    (P,), (slope,) = primals, tangents
+    L = cholesky(P)
+    sound = jnp.all(jnp.isfinite(L))
+    solid = jnp.where(sound, L, jnp.eye(P.shape[0]))
+    W = solve_lower(solid, solve_lower(solid, 0.5 * (slope + slope.T)).T)
+    W = jnp.tril(W) - 0.5 * jnp.diag(jnp.diagonal(W))
+    return L, jnp.where(sound, solid @ W, 0.0)
+
+
 def symmetric_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The symmetric positive semidefinite root of P; negative rounding becomes zero."""
     value, vector = jnp.linalg.eigh(P)
@@ -201,8 +215,11 @@ def downdate(L: Float[Array, "n n"], v: Float[Array, "n"]) -> Float[Array, "n n"
     solid, _ = guard(L)
     p = solve_lower(solid, L).T @ solve_lower(solid, v[:, None])
     beyond = jnp.abs(v - (L @ p)[:, 0]) > 1e-10 * jnp.sqrt(jnp.sum(L * L, axis=1))
-    lower = L @ jnp.linalg.cholesky(jnp.eye(L.shape[0]) - p @ p.T)
-    return jnp.where(jnp.any(beyond), jnp.nan, lower)
+    root = cholesky(jnp.eye(L.shape[0]) - p @ p.T)
+    # Put aside before the product, whose gradient it would make NaN.
+    sound = jnp.all(jnp.isfinite(root))
+    lower = L @ jnp.where(sound, root, jnp.eye(L.shape[0]))
+    return jnp.where(jnp.any(beyond) | ~sound, jnp.nan, lower)
 
 
 def solve_lower(L: Float[Array, "n n"], B: Float[Array, "n k"]) -> Float[Array, "n k"]:
