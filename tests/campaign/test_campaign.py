@@ -225,8 +225,8 @@ def test_filters_that_differ_in_numbers_share_what_was_compiled(problem):
 
 def test_a_filter_that_is_far_too_sure_is_doubted(problem):
     # Numbers alone differ from the models above, so nothing is compiled anew.
-    far = problem._replace(
-        contenders={"far": Contender(problem.contenders["right"].filter, _model_of(0.1))}
+    far = replace(
+        problem, contenders={"far": Contender(problem.contenders["right"].filter, _model_of(0.1))}
     )
     (said,) = simulate(far, 3, chunk=3).warnings
     assert said.startswith("far: the innovations of 'y' are larger than the filter expects")
