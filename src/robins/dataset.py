@@ -20,7 +20,8 @@ BodyFrame = Literal["FRD", "RFU"]
 class ImuTable:
     """Inertial samples.
 
-    kind "increment": row k is the integral over (time[k-1], time[k]]; gyro [rad], accel [m/s].
+    kind "increment": row k is the integral over (time[k-1], time[k]], or, where samples before it
+    are missing, over its own sampling interval up to time[k]; gyro [rad], accel [m/s].
     kind "rate": row k is the value at time[k]; gyro [rad/s], accel (specific force) [m/s^2].
     """
 

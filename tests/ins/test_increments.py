@@ -218,3 +218,57 @@ def test_bad_tables_are_refused_by_name_and_line(message):
     bad = replace(imu, **{name: spoil(getattr(imu, name)) for name, spoil in BAD[message].items()})
     with pytest.raises(ValueError, match=f"walk.csv: {message}"):
         from_imu(bad)
+
+
+def without(imu, lost):
+    keep = ~np.isin(np.arange(len(imu)), lost)
+    names = ("time_ns", "gyro", "accel")
+    return replace(imu, **{name: getattr(imu, name)[keep] for name in names})
+
+
+@pytest.mark.parametrize(
+    "lost", [[1], [100, 103], [200, 201, 202], np.arange(100, 110), np.arange(20, 400, 6)]
+)
+def test_lost_increments_are_bridged_by_a_straight_line(lost):
+    """The error of the path is that of one line over each gap, times what the turn makes of it."""
+    body, t = Coning(0.3, 2.0), np.arange(401) / 40.0
+    total, _ = thin(*from_imu(without(body.imu(t, "increment"), lost)), len(t))
+    theta, dv, _ = body.motion(t[0], t[-1])
+    kept = np.delete(t, lost)
+    gaps = np.diff(kept)[np.diff(kept) > 0.03]
+    # |w''| = 0.3 x 2^3 rad/s^3, |f''| < 9.5 m/s^4; a line between means overshoots it by h/40
+    off = (gaps**3 / 12.0 + gaps**2 / 40.0 / 6.0).sum()
+    turned = (Rotation.from_rotvec(theta).inv() * Rotation.from_rotvec(total.theta[0])).magnitude()
+    assert turned < 2.4 * off
+    assert np.linalg.norm(total.dv[0] - dv) < (9.5 + 9.8 * 2.4 * 10.0) * off
+
+
+def burst(t):
+    """Three of four stamps as late as the fourth, but for 0.1 ms each."""
+    k = np.arange(len(t))
+    return t[np.minimum(k | 3, len(t) - 1)] - 1e-4 * (3 - (k & 3))
+
+
+UNEVEN = {
+    "a rate that halves": lambda t: np.delete(t, np.arange(101, 200, 2)),
+    "a sum over every gap": lambda t: np.delete(t, [50, 51, 90, 140]),
+    "a late stamp": lambda t: t + 0.008 * np.isin(np.arange(len(t)), [50, 90]),
+    "bursts": burst,
+}
+
+
+@pytest.mark.parametrize("stamps", UNEVEN)
+def test_nothing_is_added_where_nothing_is_missing(stamps):
+    """Sums and stamps that are not even have long intervals too, but no motion is lost in them."""
+    t = np.arange(201) / 100.0
+    made = UNEVEN[stamps](t)
+    n = len(made)
+    true = made if n < len(t) else t
+    lasted = np.append(0.01, np.diff(true))[:, None]
+    rate, force = np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.0, -9.8])
+    noise = 0.05 * rng.standard_normal((2, n, 3))
+    gyro, accel = lasted * (rate + 0.1 * noise[0]), lasted * (force + noise[1])
+    inc, _ = from_imu(ImuTable(np.round(made * 1e9).astype(np.int64), gyro, accel, "increment"))
+    # coning and sculling of the noise is all that may come on top
+    np.testing.assert_allclose(inc.theta.sum(0), gyro[1:].sum(0), atol=2e-4)
+    np.testing.assert_allclose(inc.dv.sum(0)[2], accel[1:].sum(0)[2], atol=2e-4)

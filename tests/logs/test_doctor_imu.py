@@ -8,6 +8,7 @@ from made_logs import found, rows_of, the
 
 from robins.dataset import ImuTable
 from robins.logs import examine
+from robins.logs.quiet import signal_of
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +196,11 @@ def test_a_missing_column(imu):
 
 def test_too_few_bits(imu):
     assert found(changed(imu, accel=np.round(imu.accel)), "warning").count("coarse") == 3
+
+
+def test_an_increment_after_lost_ones_is_the_rate_of_its_own_interval(imu):
+    sums = changed(imu, gyro=imu.gyro * 0.01, accel=imu.accel * 0.01, kind="increment")
+    keep = np.delete(np.arange(len(imu)), [500, 900, 901, 902])
+    signal = signal_of(rows_of(sums, keep))
+    np.testing.assert_allclose(signal.accel, imu.accel[keep], atol=1e-9)
+    np.testing.assert_allclose(signal.gyro, imu.gyro[keep], atol=1e-9)

@@ -8,10 +8,12 @@ import pytest
 from marg_logs import GRAVITY, RATE_HZ, hand, log_of, scalar_first, with_field, with_imu
 from scipy.spatial.transform import Rotation
 
+from robins.dataset import ImuTable
 from robins.filters import OnlineFilter
+from robins.ins.increments import from_imu
 from robins.systems.marg import Replay, filter_of, model_of, orient, prepare, replay
 from robins.systems.marg.model import MAGNETOMETER
-from robins.systems.marg.prepare import at_samples, every
+from robins.systems.marg.prepare import as_means, at_samples, every
 from robins.systems.marg.rest import still_samples
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
@@ -285,3 +287,12 @@ def test_readings_go_to_the_interval_they_fall_in_and_looks_are_spaced():
     assert np.isnan(found[2]).all()
     taken = every(np.arange(1, 31) * 0.1, np.arange(30) > 4, 1.0)
     assert np.flatnonzero(taken).tolist() == [5, 15, 25]
+
+
+def test_lost_means_are_bridged_by_a_straight_line():
+    """A rate that rises evenly is met exactly over the gap, where the last mean would overshoot."""
+    end = np.delete(np.arange(1, 101), np.arange(40, 70)) * 0.01
+    ramp = np.outer(end - 0.005, [0.0, 0.0, 2.0])  # mean over the interval before each stamp
+    log = ImuTable(np.round(end * 1e9).astype(np.int64), ramp, ramp - [0.0, 0.0, 9.8], "rate")
+    inc, _ = from_imu(as_means(log))
+    np.testing.assert_allclose(inc.theta.sum(0)[2], end[-1] ** 2 - end[0] ** 2, rtol=1e-9)

@@ -8,7 +8,8 @@ inside an interval. One rule for each kind of sensor fills that in:
 *increment*: both ran linearly, with the slope that the previous sample shows. For equal intervals
 the coning term is then a 12th of (previous x this), that of Ignagni (1996) and Savage (1998, part
 1), and sculling goes likewise (part 2). Causal. The error of a path is of third order in the
-interval; after coning it is `coning_drift`.
+interval; after coning it is `coning_drift`. After lost samples the same line runs from the middle
+of the previous sample's own interval to that of this one's (`robins.ins.intervals`).
 
 *rate*: both ran along the cubic through the four nearest samples. Fourth order; needs one sample
 ahead. Where there are fewer than four, or their intervals differ by more than a factor of two, both
@@ -28,6 +29,7 @@ from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.dataset import ImuTable
 from robins.ins.frames import to_ned_frd
+from robins.ins.intervals import own_intervals
 
 _EVEN = 2.0  # largest ratio of neighbouring intervals that a cubic is drawn through
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -97,14 +99,18 @@ def _row(imu: ImuTable, k: int) -> str:
 
 
 def _from_increments(dt, gyro, accel):
-    """Mean and slope over each interval, and so the values at its Gauss points."""
+    """The line through the mean before and the mean at the end of each interval, at Gauss points.
+
+    Without a gap, a sample lasted as long as its interval, whose mean it has.
+    """
     h = dt[:, None]
-    before = np.concatenate([dt[:1], dt[:-1]])[:, None]
+    own = own_intervals(dt, gyro, accel)[:, None]
+    middle = 1.0 - 0.5 * own[1:] / h  # of the sample's own interval, in lengths of this one
     points = []
     for raw in (gyro, accel):
-        mean = raw[1:] / h
-        rise = 2.0 * h / (h + before) * (mean - raw[:-1] / before)  # over the interval
-        points.append([mean + (c - 0.5) * rise for c in _GAUSS])
+        mean = raw / own
+        rise = (mean[1:] - mean[:-1]) / (middle + 0.5 * own[:-1] / h)  # over the interval
+        points.append([mean[1:] + (c - middle) * rise for c in _GAUSS])
     return _integrate(h, *points)
 
 

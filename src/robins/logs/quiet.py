@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
+from robins.ins.intervals import own_intervals
 from robins.logs.findings import Finding, Severity
 from robins.logs.ordering import increasing
 from robins.logs.tables import Table
@@ -88,7 +89,7 @@ def signal_of(imu: ImuTable) -> Signal | None:
     step_s = float(np.mean(steps[steps < 2.5 * np.median(steps)]))
     per = np.ones((len(rows), 1))
     if imu.kind == "increment":
-        per[:, 0] = np.concatenate([[step_s], steps])
+        per[:, 0] = own_intervals(steps, imu.gyro[rows], imu.accel[rows])
     return Signal(rows, time_s, imu.gyro[rows] / per, imu.accel[rows] / per, step_s)
 
 

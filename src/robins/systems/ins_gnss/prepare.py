@@ -15,6 +15,7 @@ from robins.filters import Belief
 from robins.ins.blocks import Blocks, cut, epochs_between
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
+from robins.ins.intervals import after_gap
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import model as names
 from robins.systems.ins_gnss.model import Block, Fix, Velocity
@@ -127,8 +128,8 @@ def prepare(log: Log, piece: slice, parameters: Replay) -> Prepared:
         aux[names.VELOCITY] = Velocity(aux[names.VELOCITY].sigma, rate, *gained)
     _knowledge(y, aux, increments, time_s, epochs, rate, parameters)
 
-    long = increments.dt > 1.9 * np.median(increments.dt)
-    bridged = np.any(long[blocks.parent] & (blocks.parent >= 0), axis=1)
+    gap = after_gap(increments.dt)
+    bridged = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
     withheld = np.zeros(len(epochs), dtype=bool)
     if parameters.outages is not None:
         withheld = outage_mask(epochs, log.gnss_s[0], log.gnss_s[-1], parameters.outages)

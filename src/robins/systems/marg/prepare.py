@@ -12,6 +12,7 @@ from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import Belief
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import from_imu
+from robins.ins.intervals import after_gap, usual_interval
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.marg.align import FirstLook, first_look
@@ -73,7 +74,7 @@ def whole_samples(
 
 
 def as_means(imu: ImuTable) -> ImuTable:
-    """Rates as increments of the intervals that end with them.
+    """Rates as increments of the sampling intervals that end with them.
 
     What a MEMS chip puts out is the mean over its last sampling interval, or later still for its
     filters; to read it as the rate of that instant would run ahead of the motion by half of one.
@@ -81,8 +82,9 @@ def as_means(imu: ImuTable) -> ImuTable:
     if imu.kind == "increment":
         return imu
     dt = np.diff(imu.time_ns) * 1e-9
-    dt = np.concatenate([dt[:1], dt])[:, None]
-    return replace(imu, gyro=imu.gyro * dt, accel=imu.accel * dt, kind="increment")
+    own = np.where(after_gap(dt), usual_interval(dt), dt)
+    own = np.concatenate([own[:1], own])[:, None]
+    return replace(imu, gyro=imu.gyro * own, accel=imu.accel * own, kind="increment")
 
 
 def calibrated(

@@ -21,6 +21,7 @@ from robins.earth import Geodetic, earth_rate_n, transport_rate_n
 from robins.ins.blocks import cut, epochs_between
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
+from robins.ins.intervals import after_gap
 from robins.ins.mechanise import Nav, as_trajectory, refuse_polar
 from robins.rotation import Rotation
 from robins.scenario import Parameters, Quantity, default
@@ -175,7 +176,7 @@ class _Stretch(NamedTuple):
 
 
 def _prepare(stretch: _Stretch, parameters: PairParameters, recording: Recording) -> Piece:
-    increments, time_s, master, master_s, usual_dt = stretch
+    increments, time_s, master, master_s, _ = stretch
     delay = parameters.master.delay
     end_s = float(time_s[-1])
     within = (master_s - delay >= stretch.begin_s - 1e-9) & (master_s <= end_s + 1e-9)
@@ -196,8 +197,8 @@ def _prepare(stretch: _Stretch, parameters: PairParameters, recording: Recording
     record = np.full(len(epochs), -1)
     record[np.searchsorted(epochs, stamps - 1e-9)] = used
     turn = turn_rate(stretch, parameters)
-    long = increments.dt > 1.9 * usual_dt
-    bridged = np.any(long[blocks.parent] & (blocks.parent >= 0), axis=1)
+    gap = after_gap(increments.dt)
+    bridged = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
     return Piece(
         run=_run(stretch, parameters, blocks.increments, record, k, turn),
         start_s=start_s,
