@@ -1,4 +1,5 @@
 import dataclasses
+import datetime
 import io
 
 import numpy as np
@@ -106,12 +107,36 @@ def test_a_mounting_that_is_no_angle():
 # ---------------------------------------------------------------------------------- KF-GINS
 
 
-def test_kfgins_imu_there_and_back_bit_by_bit(tmp_path):
+EPOCH = datetime.datetime(1980, 1, 6)
+
+
+def second_of_week(time_ns):
+    """Week and its second by the calendar; stamps count from 1970 without leap seconds."""
+    since = datetime.timedelta(microseconds=int(time_ns) // 1000) - (
+        EPOCH - datetime.datetime(1970, 1, 1)
+    )
+    week, rest = divmod(since, datetime.timedelta(days=7))
+    return week, rest.total_seconds()
+
+
+def across_a_week(time_ns):
+    """The same intervals, the end of week 2381 in their middle."""
+    sunday = (datetime.datetime(2025, 8, 31) - datetime.datetime(1970, 1, 1)).days * 86400 * 10**9
+    return time_ns - time_ns[len(time_ns) // 2] + sunday + 7
+
+
+@pytest.mark.parametrize("moved", [lambda t: t, across_a_week])
+def test_kfgins_imu_there_and_back_bit_by_bit(tmp_path, moved):
     path = tmp_path / "imu.txt"
-    write_kfgins_imu(path, STEPS)
+    table = dataclasses.replace(STEPS, time_ns=moved(STEPS.time_ns))
+    write_kfgins_imu(path, table)
+    week, first = second_of_week(table.time_ns[0])
+    assert float(path.read_text().split()[0]) == pytest.approx(first, abs=2e-6)
+    assert 0.0 <= first < 604800.0
     back = open_log(path)
     assert back.kind == "increment"
-    np.testing.assert_array_equal(back.time_ns, STEPS.time_ns)
+    beginning = (EPOCH - datetime.datetime(1970, 1, 1)).days * 86400 + week * 604800
+    np.testing.assert_array_equal(back.time_ns + beginning * 10**9, table.time_ns)
     np.testing.assert_array_equal(back.gyro, STEPS.gyro)
     np.testing.assert_array_equal(back.accel, STEPS.accel)
 
@@ -125,29 +150,52 @@ def test_kfgins_gnss_there_and_back(tmp_path):
     back = open_log(path)
     for name in ("lat_rad", "lon_rad"):
         np.testing.assert_allclose(getattr(back, name), getattr(table, name), rtol=3e-16)
-    np.testing.assert_array_equal(back.time_ns, table.time_ns)
+    np.testing.assert_array_equal(np.diff(back.time_ns), np.diff(table.time_ns))
+    assert back.time_ns[0] / 1e9 == pytest.approx(second_of_week(table.time_ns[0])[1], abs=2e-6)
     np.testing.assert_array_equal(back.alt_m, table.alt_m)
     np.testing.assert_array_equal(back.sigma_m, sigma)
-    assert path.read_text().split()[1] == f"{np.rad2deg(truth.lat_rad[0])!r}".split("(")[-1].rstrip(
-        ")"
-    )
+    assert float(path.read_text().split()[1]) == np.rad2deg(truth.lat_rad[0])
+    write_kfgins_gnss(path, table, week=second_of_week(table.time_ns[0])[0] - 1)
+    np.testing.assert_array_equal(open_log(path).time_ns, back.time_ns + 604_800 * 10**9)
 
 
-def test_kfgins_nav_there_and_back(tmp_path):
+@pytest.mark.parametrize("moved", [lambda t: t, across_a_week])
+def test_kfgins_nav_there_and_back(tmp_path, moved):
     truth, angles = path_over_hills()
-    truth = dataclasses.replace(truth, time_ns=truth.time_ns - 1_700_000_000 * 10**9)
+    truth = dataclasses.replace(truth, time_ns=moved(truth.time_ns))
     path = tmp_path / "truth.nav"
-    write_kfgins_nav(path, truth, week=2300)
-    first = np.array(path.read_text().split("\n")[0].split(), float)
-    assert first[0] == 2300
-    assert first[1] == pytest.approx(0.123456789, abs=1e-12)
-    assert first[2:4] == pytest.approx([47.0, 8.0])
+    write_kfgins_nav(path, truth)
+    rows = np.array([line.split() for line in path.read_text().splitlines()], float)
+    for row, time_ns in zip(rows, truth.time_ns, strict=True):
+        assert tuple(row[:2]) == pytest.approx(second_of_week(time_ns), abs=2e-6)
+    assert rows[0, 2:4] == pytest.approx([47.0, 8.0])
     expected = np.rad2deg(angles[0])
-    assert first[8:] == pytest.approx([expected[0], expected[1], expected[2] + 360.0])
+    assert rows[0, 8:] == pytest.approx([expected[0], expected[1], expected[2] + 360.0])
     back = open_log(path)
     np.testing.assert_array_equal(back.v_n, truth.v_n)
-    np.testing.assert_array_equal(back.time_ns, truth.time_ns)
+    np.testing.assert_array_equal(np.diff(back.time_ns), np.diff(truth.time_ns))
+    assert back.time_ns[0] / 1e9 == pytest.approx(rows[0, 1], abs=1e-6)
     assert same_rotation(back.q_nb, truth.q_nb)
+
+
+def test_kfgins_stamps_of_no_week_are_kept(tmp_path):
+    """Stamps since power-up stay what they are; seconds that begin anew go on."""
+    truth, _ = path_over_hills()
+    powered = dataclasses.replace(truth, time_ns=truth.time_ns - truth.time_ns[0])
+    path = tmp_path / "truth.nav"
+    write_kfgins_nav(path, powered, week=2300)
+    assert path.read_text().startswith("2300 0.000 ")
+    np.testing.assert_array_equal(open_log(path).time_ns, powered.time_ns)
+    late = dataclasses.replace(STEPS, time_ns=STEPS.time_ns - STEPS.time_ns[0])
+    write_kfgins_imu(path, late)
+    np.testing.assert_array_equal(open_log(path).time_ns, late.time_ns)
+    # a recorder that counts seconds of the week begins anew at its end
+    lines = [line.split(" ", 1) for line in path.read_text().splitlines()]
+    seconds = [(604799.8 + 0.01 * k) % 604800 for k in range(len(lines))]
+    path.write_text(
+        "".join(f"{s:.2f} {rest}\n" for s, (_, rest) in zip(seconds, lines, strict=True))
+    )
+    np.testing.assert_array_equal(np.diff(open_log(path).time_ns), 10_000_000)
 
 
 def test_kfgins_wants_increments_frames_and_whole_fixes(tmp_path):

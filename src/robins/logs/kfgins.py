@@ -1,11 +1,16 @@
 """Text files of KF-GINS: IMU increments, GNSS positions, navigation results; read and written.
 
-Columns, separated by blanks; t is the second of the GPS week, kept as it is:
+Columns, separated by blanks; t is the second of the GPS week:
 
 - IMU: t, dtheta x y z [rad], dv x y z [m/s], increments since the line before, forward-right-down;
 - GNSS: t, latitude [deg], longitude [deg], height [m], sigmas north, east, down [m];
 - navigation: week, t, latitude [deg], longitude [deg], height [m], velocity north, east, down
-  [m/s], roll, pitch, yaw [deg]. The week is not kept: the other two files have none.
+  [m/s], roll, pitch, yaw [deg].
+
+The first two have no week, so what is read counts from the beginning of the week of the first line,
+in all three. Where t begins anew at 0 the next week begins, and the count goes on. What is written
+from absolute stamps (since 1970 in GPS time) comes back less whole weeks, to the nanosecond. KF-GINS
+itself wants t to grow, so in the first two it goes on beyond 604800 s.
 """
 
 from __future__ import annotations
@@ -19,7 +24,14 @@ from robins import rotation
 from robins.dataset import GnssTable, ImuTable, Trajectory
 from robins.logs.findings import Finding, LogError
 from robins.logs.text import Layout, read_columns
-from robins.logs.timebase import ns_to_decimal, stamps_to_ns
+from robins.logs.timebase import (
+    GPS_EPOCH_NS,
+    WEEK_NS,
+    ns_to_decimal,
+    stamps_to_ns,
+    unrolled,
+    weeks_of,
+)
 from robins.logs.writing import rows_of_numbers, write_lines
 
 _T = "time of week [s]"
@@ -61,7 +73,7 @@ def read_kfgins_imu(path: Path, findings: list[Finding] | None = None) -> ImuTab
     """
     columns = read_columns(path, Layout(_IMU, None), findings)
     return ImuTable(
-        time_ns=stamps_to_ns(str(path), _T, columns.texts[:, 0], columns.rows),
+        time_ns=unrolled(stamps_to_ns(str(path), _T, columns.texts[:, 0], columns.rows)),
         gyro=columns.values[:, 0:3].copy(),
         accel=columns.values[:, 3:6].copy(),
         kind="increment",
@@ -74,7 +86,7 @@ def read_kfgins_gnss(path: Path, findings: list[Finding] | None = None) -> GnssT
     """Read a GNSS file of KF-GINS. Arguments and errors as for `read_kfgins_imu`."""
     columns = read_columns(path, Layout(_GNSS, None), findings)
     return GnssTable(
-        time_ns=stamps_to_ns(str(path), _T, columns.texts[:, 0], columns.rows),
+        time_ns=unrolled(stamps_to_ns(str(path), _T, columns.texts[:, 0], columns.rows)),
         lat_rad=np.deg2rad(columns.values[:, 0]),
         lon_rad=np.deg2rad(columns.values[:, 1]),
         alt_m=columns.values[:, 2].copy(),
@@ -88,8 +100,10 @@ def read_kfgins_nav(path: Path, findings: list[Finding] | None = None) -> Trajec
     """Read a navigation file of KF-GINS. Arguments and errors as for `read_kfgins_imu`."""
     columns = read_columns(path, Layout(_NAV, None, texts=2), findings)
     v = columns.values
+    week = weeks_of(str(path), "week", columns.texts[:, 0], columns.rows)
+    time_ns = stamps_to_ns(str(path), _T, columns.texts[:, 1], columns.rows)
     return Trajectory(
-        time_ns=stamps_to_ns(str(path), _T, columns.texts[:, 1], columns.rows),
+        time_ns=unrolled(time_ns + (week - week[0]) * WEEK_NS),
         lat_rad=np.deg2rad(v[:, 0]),
         lon_rad=np.deg2rad(v[:, 1]),
         alt_m=v[:, 2].copy(),
@@ -99,8 +113,14 @@ def read_kfgins_nav(path: Path, findings: list[Finding] | None = None) -> Trajec
     )
 
 
-def write_kfgins_imu(path: Path, imu: ImuTable) -> None:
+def write_kfgins_imu(path: Path, imu: ImuTable, week: int | None = None) -> None:
     """Write an IMU file of KF-GINS; numbers read back bit by bit.
+
+    Args:
+        path: the file.
+        imu: increments; stamps since 1970 in GPS time, or seconds of a week.
+        week: GPS week whose beginning absolute stamps are counted from; by default that of the
+            first. Give the same for the files of one run.
 
     Raises:
         LogError: the samples are rates, or not forward-right-down; or the file cannot be written.
@@ -110,11 +130,14 @@ def write_kfgins_imu(path: Path, imu: ImuTable) -> None:
             str(path), "KF-GINS wants increments, these are rates", "integrate them first"
         )
     _require(path, "body", imu.body, "FRD")
-    write_lines(path, rows_of_numbers(imu.time_ns, np.hstack([imu.gyro, imu.accel]), " "))
+    values = np.hstack([imu.gyro, imu.accel])
+    write_lines(path, rows_of_numbers(_of_week(imu.time_ns, week), values, " "))
 
 
-def write_kfgins_gnss(path: Path, gnss: GnssTable) -> None:
+def write_kfgins_gnss(path: Path, gnss: GnssTable, week: int | None = None) -> None:
     """Write a GNSS file of KF-GINS, which has no velocities and no missing components.
+
+    ``week`` is that of `write_kfgins_imu`.
 
     Raises:
         LogError: a number is missing, the sigmas are not along NED; the file cannot be written.
@@ -130,11 +153,16 @@ def write_kfgins_gnss(path: Path, gnss: GnssTable) -> None:
             "leave out the fixes that are not complete",
             where=f"time {ns_to_decimal(int(gnss.time_ns[row]))} s",
         )
-    write_lines(path, rows_of_numbers(gnss.time_ns, values, " "))
+    write_lines(path, rows_of_numbers(_of_week(gnss.time_ns, week), values, " "))
 
 
 def write_kfgins_nav(path: Path, trajectory: Trajectory, week: int = 0) -> None:
     """Write a navigation file of KF-GINS, yaw in [0, 360) deg.
+
+    Args:
+        path: the file.
+        trajectory: stamps since 1970 in GPS time, or seconds of a week.
+        week: GPS week that seconds of a week are of; absolute stamps are each in their own.
 
     Raises:
         LogError: the frames are not NED and FRD; the file cannot be written.
@@ -144,8 +172,24 @@ def write_kfgins_nav(path: Path, trajectory: Trajectory, week: int = 0) -> None:
     roll, pitch, yaw = (np.rad2deg(a) for a in rotation.to_euler(jnp.asarray(trajectory.q_nb)))
     position = (np.rad2deg(trajectory.lat_rad), np.rad2deg(trajectory.lon_rad), trajectory.alt_m)
     values = np.column_stack([*position, trajectory.v_n, roll, pitch, np.mod(yaw, 360.0)])
-    lines = rows_of_numbers(trajectory.time_ns, values, " ")
-    write_lines(path, ("".join(f"{week} {line}" for line in b.splitlines(True)) for b in lines))
+    origin_ns = GPS_EPOCH_NS if _absolute(trajectory.time_ns) else -week * WEEK_NS
+    weeks, of_week_ns = np.divmod(trajectory.time_ns - origin_ns, WEEK_NS)
+    lines = rows_of_numbers(of_week_ns, values, " ")
+    rows = (line for block in lines for line in block.splitlines(True))
+    write_lines(path, (f"{w} {line}" for w, line in zip(weeks.tolist(), rows, strict=True)))
+
+
+def _absolute(time_ns: np.ndarray) -> bool:
+    """Whether stamps count from 1970; if not, they are seconds of a week or since power-up."""
+    return len(time_ns) > 0 and bool(time_ns[0] >= GPS_EPOCH_NS)
+
+
+def _of_week(time_ns: np.ndarray, week: int | None) -> np.ndarray:
+    """Stamps from the beginning of a week, by default that of the first of them."""
+    if not _absolute(time_ns):
+        return time_ns
+    since_ns = time_ns - GPS_EPOCH_NS
+    return since_ns - (since_ns[0] // WEEK_NS if week is None else week) * WEEK_NS
 
 
 def _require(path: Path, what: str, has: str, wants: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding, LogError, report
 from robins.logs.text import Head, Layout, peek, read_columns
-from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns
+from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
 # What RTKLIB writes, with velocities or without; used where the header was stripped.
 _POSITION: list[str] = ["latitude", "longitude", "height", "Q", "ns"]
@@ -126,7 +126,7 @@ def _header(head: Head) -> tuple[list[str], bool]:
 
 def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: bool) -> np.ndarray:
     if not calendar:
-        weeks = stamps_to_ns(file, "week", texts[:, 0], rows, exponent=0)
+        weeks = weeks_of(file, "week", texts[:, 0], rows)
         return week_to_ns(weeks, stamps_to_ns(file, "time of week", texts[:, 1], rows))
     out = np.zeros(len(texts), np.int64)
     for i, text in enumerate(texts):

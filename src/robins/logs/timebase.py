@@ -19,6 +19,10 @@ from robins.logs.findings import LogError
 GPS_EPOCH_S = 315_964_800  # 1980-01-06 on a count from 1970-01-01 without leap seconds
 WEEK_S = 604_800
 _NS = 1_000_000_000
+GPS_EPOCH_NS, WEEK_NS = GPS_EPOCH_S * _NS, WEEK_S * _NS
+LIMIT_NS = 2**62  # 146 years; between stamps below it, differences stay within int64
+_LAST_WEEK = (LIMIT_NS - GPS_EPOCH_NS) // WEEK_NS  # in 2116
+_HOUR_NS = 3600 * _NS
 _DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})", re.ASCII)
 _CLOCK = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)", re.ASCII)
 _EPOCH_DAY = datetime.date(1970, 1, 1).toordinal()
@@ -99,6 +103,7 @@ def stamps_to_ns(
         LogError: a stamp is no number, or too large for the unit it is read in.
     """
     time_ns, good = decimals_to_ns(text, exponent)
+    good &= np.abs(time_ns) < LIMIT_NS
     if not good.all():
         bad = int(np.argmin(good))
         shown = text[bad].decode("utf-8", "replace").strip()
@@ -131,7 +136,7 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
         utc: the stamp is UTC; the leap seconds since 1980 are added.
 
     Raises:
-        ValueError: no date or time of that form.
+        ValueError: no date or time of that form, or one 146 years or more from 1970.
     """
     day, time = _DATE.fullmatch(date), _CLOCK.fullmatch(clock)
     if not (day and time):
@@ -145,9 +150,43 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
     whole = (days * 24 + hour) * 3600 + minute * 60
     if utc:
         whole += sum(today >= leap for leap in _LEAPS)
+    if abs(whole) * _NS >= LIMIT_NS - _NS:
+        raise ValueError(f"{date} is no date from which anyone has a log")
     return whole * _NS + int((seconds * _NS).to_integral_value())
 
 
+def weeks_of(file: str, field: str, text: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """A column of GPS weeks, counted from 1980 and not folded at 1024.
+
+    Raises:
+        LogError: a week is no number, or not from 1980 to 2116.
+    """
+    weeks = stamps_to_ns(file, field, text, rows, exponent=0)
+    bad = (weeks < 0) | (weeks > _LAST_WEEK)
+    if bad.any():
+        raise LogError(
+            file,
+            "is no GPS week from which anyone has a log",
+            "repair or delete the line",
+            where=f"line {rows[np.argmax(bad)]}",
+            field=field,
+            value=int(weeks[np.argmax(bad)]),
+        )
+    return weeks
+
+
 def week_to_ns(week: np.ndarray, tow_ns: np.ndarray) -> np.ndarray:
-    """GPS week (counted from 1980, not folded at 1024) and time of week, since 1970 in GPS time."""
-    return (GPS_EPOCH_S + week * WEEK_S) * _NS + tow_ns
+    """GPS week (see `weeks_of`) and time of week, since 1970 in GPS time."""
+    return GPS_EPOCH_NS + week * WEEK_NS + tow_ns
+
+
+def unrolled(of_week_ns: np.ndarray) -> np.ndarray:
+    """Times of week that go on where they begin anew at the end of a week.
+
+    That is a step from the last hour of a week into the first hour of one; any other step back is a
+    fault, and left as it is.
+    """
+    before, after = of_week_ns[:-1], of_week_ns[1:]
+    late, early = WEEK_NS - before, after
+    anew = (late > 0) & (late < _HOUR_NS) & (early >= 0) & (early < _HOUR_NS)
+    return of_week_ns + WEEK_NS * np.concatenate([[0], np.cumsum(anew)])[: len(of_week_ns)]
