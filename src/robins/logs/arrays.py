@@ -9,6 +9,7 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs.findings import LogError
+from robins.logs.timebase import LIMIT_NS
 
 # Columns and the number of components of each; None: one number a row.
 _IMU: dict[str, int | None] = {"gyro": 3, "accel": 3}
@@ -96,6 +97,17 @@ def _checked(
 ) -> dict[str, np.ndarray]:
     out = {"time_ns": _integers(table, "time_ns")}
     n = len(out["time_ns"])
+    # not by np.abs, which leaves the least integer negative
+    if n and not -LIMIT_NS < out["time_ns"].min() <= out["time_ns"].max() < LIMIT_NS:
+        k = int(np.argmax((out["time_ns"] <= -LIMIT_NS) | (out["time_ns"] >= LIMIT_NS)))
+        raise LogError(
+            _name(table),
+            "is 146 years or more from zero",
+            "give int64 nanoseconds; repair or leave out this row",
+            where=f"row {k}" if table.rows is None else f"line {table.rows[k]}",
+            field="time_ns",
+            value=int(out["time_ns"][k]),
+        )
     for field in integers:
         if getattr(table, field) is not None:
             out[field] = _integers(table, field)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.clean import ALT_LIMIT_M, SPEED_LIMIT
 from robins.logs.findings import Finding
+from robins.logs.limits import ALT_LIMIT_M, LAT_LIMIT, LON_LIMIT, SPEED_LIMIT
 from robins.logs.quiet import finding, median_of
 
 _AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
@@ -60,8 +60,8 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
     known = np.isfinite(lat) & np.isfinite(lon)
     if not known.any():
         return
-    beyond = known & ((np.abs(lat) > np.pi / 2) | (np.abs(lon) > 2 * np.pi))
-    if beyond.any():
+    beyond = known & ((np.abs(lat) > LAT_LIMIT) | (np.abs(lon) > LON_LIMIT))
+    if 2 * beyond.sum() > known.sum():  # single ones are nonsense, not a unit
         k = int(np.argmax(beyond))
         lat_deg, lon_deg = np.rad2deg(lat[k]), np.rad2deg(lon[k])
         if abs(lat_deg) <= 360.0 and abs(lon_deg) <= 90.0:

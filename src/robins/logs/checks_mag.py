@@ -13,6 +13,7 @@ import numpy as np
 from robins.dataset import MagTable
 from robins.logs.checks_columns import longest_run
 from robins.logs.findings import Finding, Severity
+from robins.logs.limits import FIELD_LIMIT_T, few_beyond
 from robins.logs.quiet import finding, usual_step_s
 
 EARTH_T = (20e-6, 70e-6)
@@ -49,9 +50,10 @@ def check_mag(mag: MagTable) -> Iterator[Finding]:
     good = np.asarray(np.isfinite(mag.field_t).all(axis=1))
     if not good.all():
         yield _missing(mag, good)
+    good &= ~few_beyond(mag.field_t, FIELD_LIMIT_T)
     if np.count_nonzero(good) < _FEW:
         return
-    zero = good & (mag.field_t == 0.0).all(axis=1)
+    zero = good & (np.linalg.norm(mag.field_t, axis=1) == 0.0)
     if zero.any():
         yield _zero(mag, np.asarray(zero))
     rows = np.flatnonzero(good & ~zero)

@@ -16,6 +16,7 @@ import numpy as np
 from robins.dataset import ImuTable, MagTable
 from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding
+from robins.logs.limits import FIELD_LIMIT_T, few_beyond
 from robins.logs.motion import at, signed_permutations
 from robins.logs.ordering import increasing
 from robins.logs.quiet import finding, signal_of
@@ -54,7 +55,8 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
 
 def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] and field of unit size, each reading once and in order."""
-    good = np.isfinite(mag.field_t).all(axis=1) & (mag.field_t != 0.0).any(axis=1)
+    good = np.isfinite(mag.field_t).all(axis=1) & (np.linalg.norm(mag.field_t, axis=1) > 0.0)
+    good &= ~few_beyond(mag.field_t, FIELD_LIMIT_T)
     rows = np.flatnonzero(good)
     rows = rows[increasing(mag.time_ns[rows])]
     field = mag.field_t[rows]

@@ -18,13 +18,16 @@ from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
 from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
 from robins.logs.clean_mag import clean_attitude, clean_mag
 from robins.logs.findings import LogError
+from robins.logs.limits import (
+    ACCEL_LIMIT,
+    ALT_LIMIT_M,
+    GYRO_LIMIT,
+    LAT_LIMIT,
+    LON_LIMIT,
+    SIGMA_LIMIT,
+    SPEED_LIMIT,
+)
 from robins.logs.ordering import increasing, reasons, rows_where
-
-# Far beyond any vehicle, so that only nonsense is caught: 1e4 rad/s are 95 000 turns a minute.
-GYRO_LIMIT = 1e4  # rad/s, or rad for increments
-ACCEL_LIMIT = 1e6  # m/s^2, or m/s for increments
-ALT_LIMIT_M = 1e9
-SPEED_LIMIT = 1e5  # m/s
 
 _PLACEHOLDER_SIGMA = 1.0
 _COMPONENTS = ("north", "east", "vertical")
@@ -82,7 +85,7 @@ def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     truth = checked_truth(truth)
     position = np.stack([truth.lat_rad, truth.lon_rad, truth.alt_m], -1)
     values = np.hstack([position, truth.v_n, truth.q_nb])
-    limit = np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M, *[SPEED_LIMIT] * 3, *[1.001] * 4])
+    limit = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M, *[SPEED_LIMIT] * 3, *[1.001] * 4])
     keep, counts = _whole_rows(truth.time_ns, values, limit)
     return rows_where(truth, keep), {f"truth_{k}": n for k, n in counts.items()}
 
@@ -96,7 +99,7 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     parts = {
         "position": (
             np.stack([master.lat_rad, master.lon_rad, master.alt_m], -1),
-            np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M]),
+            np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M]),
         ),
         "v_n": (master.v_n, np.full(3, SPEED_LIMIT)),
         "q_nb": (master.q_nb, np.full(4, 1.001)),
@@ -129,7 +132,7 @@ def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
     """Clean one GNSS table: the table and counts by reason. See `clean`."""
     gnss = checked_gnss(gnss)
     position = np.stack([gnss.lat_rad, gnss.lon_rad, gnss.alt_m], -1)
-    limit = np.array([np.pi / 2, 2 * np.pi, ALT_LIMIT_M])
+    limit = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M])
     values, sigma, refused = _components(gnss, "position", position, gnss.sigma_m, limit)
     v_n = sigma_v = None
     if gnss.v_n is not None and gnss.sigma_v is not None:
@@ -175,7 +178,7 @@ def _components(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Values with NaN where a component is missing, sigmas, rows touched by each reason."""
     with np.errstate(invalid="ignore"):
-        absurd = np.abs(values) > limit
+        absurd = (np.abs(values) > limit) | (sigma > SIGMA_LIMIT)
         unsure = sigma <= 0.0
     for k, name in enumerate(_COMPONENTS):
         known = np.isfinite(values[:, k])
@@ -194,7 +197,7 @@ def _components(
     unsure &= ~nan & ~inf
     refused = {"nan": nan, "inf": inf, "absurd": absurd, "sigma": unsure}
     missing = nan | inf | absurd | unsure
-    usable = np.isfinite(sigma) & (sigma > 0.0)
+    usable = (sigma > 0.0) & (sigma <= SIGMA_LIMIT)
     return (
         np.where(missing, np.nan, values),
         np.where(usable, sigma, _PLACEHOLDER_SIGMA),

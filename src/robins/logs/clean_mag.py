@@ -13,10 +13,9 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, MagTable
 from robins.logs.arrays import checked_attitude, checked_mag
+from robins.logs.limits import FIELD_LIMIT_T
 from robins.logs.ordering import increasing, reasons, rows_where
 from robins.logs.unit_length import TOLERANCE
-
-FIELD_LIMIT_T = 1.0  # beyond any magnetometer that finds north
 
 
 def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:

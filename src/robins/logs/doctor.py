@@ -22,6 +22,7 @@ from robins.logs.checks_attitude import check_attitude
 from robins.logs.checks_columns import check_columns
 from robins.logs.checks_gnss import check_gnss
 from robins.logs.checks_imu import check_imu
+from robins.logs.checks_limits import check_limits
 from robins.logs.checks_mag import check_mag
 from robins.logs.checks_mag_axes import check_mag_axes
 from robins.logs.checks_master import BY_REST, check_master
@@ -84,8 +85,10 @@ def _examined(
     # What shall tell only how the sensor itself is turned may lie any way.
     in_vehicle = not kinds & {MagTable, AttitudeTable} or bool(kinds & {GnssTable, Trajectory})
     for table in tables:
+        checked = _CHECKED[type(table)](table)
         if not _stamped_as(table, imu):  # said once is enough
-            findings += check_time(_CHECKED[type(table)](table), table.source in unit_known)
+            findings += check_time(checked, table.source in unit_known)
+        findings += check_limits(checked)
         if isinstance(table, ImuTable):
             imu = checked_imu(table)
             findings += check_columns(imu)

@@ -8,7 +8,7 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.earth import curvature_radii
-from robins.logs.clean import ALT_LIMIT_M, SPEED_LIMIT
+from robins.logs.limits import ALT_LIMIT_M, SPEED_LIMIT
 from robins.logs.ordering import increasing
 
 _BASE_S = 1.0

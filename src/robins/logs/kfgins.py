@@ -7,10 +7,10 @@ Columns, separated by blanks; t is the second of the GPS week:
 - navigation: week, t, latitude [deg], longitude [deg], height [m], velocity north, east, down
   [m/s], roll, pitch, yaw [deg].
 
-The first two have no week, so what is read counts from the beginning of the week of the first line,
-in all three. Where t begins anew at 0 the next week begins, and the count goes on. What is written
-from absolute stamps (since 1970 in GPS time) comes back less whole weeks, to the nanosecond. KF-GINS
-itself wants t to grow, so in the first two it goes on beyond 604800 s.
+The first two have no week, so stamps that are read count from the beginning of the week of the
+first line, in all three. Where t begins anew at 0 the next week begins, and the count goes on. What
+is written from absolute stamps (since 1970 in GPS time) comes back less whole weeks, to the
+nanosecond. KF-GINS itself wants t to grow, so in the first two it goes on beyond 604800 s.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def pair_of(signal: Signal, gnss_s: np.ndarray, v_n: np.ndarray, noise: float) -
             continue
         change = np.diff(at(start + np.arange(STRETCH_S + 1), gnss_s, v_n), axis=0)
         power = float(np.mean(np.sum((change - change.mean(axis=0)) ** 2, axis=1)))
-        if power > max(0.2**2, (3.0 * noise) ** 2):
+        if np.sqrt(power) > max(0.2, 3.0 * noise):
             lively.append((power, start))
     if not lively:
         return None

@@ -152,13 +152,13 @@ def _stamps(file: str, columns: Columns) -> np.ndarray:
         match = _STAMP.fullmatch(text)
         try:
             if match is None:
-                raise ValueError(text)
+                raise ValueError("not of that form")
             year, month, day, clock, sign, hours, minutes = match.groups()
             utc_ns = calendar_to_ns(f"{year}/{month}/{day}", clock, utc=True)
         except ValueError as error:
             raise LogError(
                 file,
-                "is not a date and time with its offset from UTC",
+                f"is not a date and time with its offset from UTC ({error})",
                 "write it like 2025-06-11 20:34:27+00:00",
                 where=f"line {columns.rows[k]}",
                 field="time",

@@ -99,7 +99,7 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
         sigma_m=vectors("sdn", "sde", "sdu", 1.0),
         v_n=v_n,
         sigma_v=sigma_v,
-        quality=np.where(np.isfinite(quality), quality, 0.0).astype(np.int64),
+        quality=np.where(np.abs(quality) < 100.0, quality, 0.0).astype(np.int64),
         source=file,
         rows=columns.rows,
     )
@@ -136,7 +136,7 @@ def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: 
         except (ValueError, TypeError) as error:
             raise LogError(
                 file,
-                "is not a time stamp year/month/day hour:minute:second",
+                f"is not a time stamp year/month/day hour:minute:second ({error})",
                 "repair or delete the line",
                 where=f"line {rows[i]}",
                 field="time",

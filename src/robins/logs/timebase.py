@@ -103,7 +103,7 @@ def stamps_to_ns(
         LogError: a stamp is no number, or too large for the unit it is read in.
     """
     time_ns, good = decimals_to_ns(text, exponent)
-    good &= np.abs(time_ns) < LIMIT_NS
+    good &= (time_ns > -LIMIT_NS) & (time_ns < LIMIT_NS)
     if not good.all():
         bad = int(np.argmin(good))
         shown = text[bad].decode("utf-8", "replace").strip()
@@ -151,7 +151,7 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
     if utc:
         whole += sum(today >= leap for leap in _LEAPS)
     if abs(whole) * _NS >= LIMIT_NS - _NS:
-        raise ValueError(f"{date} is no date from which anyone has a log")
+        raise ValueError(f"the year {today.year} is not one from which anyone has a log")
     return whole * _NS + int((seconds * _NS).to_integral_value())
 
 

@@ -27,6 +27,7 @@ from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
 from robins.logs.findings import Finding, LogError, report
 from robins.logs.opening import whole
 from robins.logs.text import Head
+from robins.logs.timebase import LIMIT_NS
 from robins.units import to_si
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -176,7 +177,7 @@ def _stamps(file: str, topic: Topic) -> np.ndarray:
     """When it was measured, or else logged [ns]."""
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
-    if stamps is None or stamps.dtype.kind != "u" or np.any(stamps > np.uint64(2**63 // 1000)):
+    if stamps is None or stamps.dtype.kind != "u" or np.any(stamps >= LIMIT_NS // 1000):
         raise LogError(
             file,
             "are no microseconds since power-up",
