@@ -246,17 +246,20 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     head, found = fitting(path)
     if len(found) == 1:
         return found[0]
-    candidates = found or FORMATS
     shown = (head.data(1) or [(1, head.lines[0])])[0]
     commas = any(re.search(r"\d,\d+(;|\s)\s*[-+\d]", text) for _, text in head.data(2))
-    raise LogError(
-        head.file,
-        f"{'several formats fit' if found else 'no known format fits'} "
-        f"({shown[1][:60]!r}); candidates: "
-        + ", ".join(f"{f.name} ({f.about})" for f in candidates),
+    mend = (
         "write numbers with a decimal point, not a comma"
         if commas
-        else "name the format, or convert the file to one of these",
+        else "name the format, or convert the file to one of these"
+    )
+    candidates = found or FORMATS
+    width = max(len(f.name) for f in candidates)
+    listed = "".join(f"\n  {f.name:{width}}  {f.about}" for f in candidates)
+    raise LogError(
+        head.file,
+        f"{'several formats fit' if found else 'no known format fits'} ({shown[1][:60]!r})",
+        f"{mend}:{listed}",
         where=f"line {shown[0]}",
     )
 
