@@ -366,7 +366,7 @@ def align_pair(
     chosen = _check_filters(label, alignment.filters, filters or parameters.filters)
     with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "reading")
-        dataset = logs.load_pair(master, slave)
+        dataset = logs.load_pair(master, slave, delay_s=parameters.master.delay)
         # the doctor looks along the master's axes, the filter along those of the slave
         turn = logs.Mounting(*np.degrees(system.orientation(parameters)))
         _examine(replace(dataset, imu=turn.turn(to_ned_frd(dataset.imu))), findings)

@@ -308,7 +308,7 @@ def test_a_delay_of_the_master_is_measured(late_ns):
     imu = dataclasses.replace(IMU, gyro=turned, accel=pushed, kind="increment")
     (found,) = [f for f in examine(a_pair(master=late, imu=imu)) if f.code == "master_late"]
     assert found.value == pytest.approx(late_ns * 1e-9, abs=0.001)
-    assert found.severity == "note"
+    assert found.severity == "error"
 
 
 def test_positions_in_radians_under_a_name_of_degrees():

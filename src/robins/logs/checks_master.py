@@ -7,6 +7,7 @@ along the master's axes, as nearly as its mounting is known.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,14 +19,31 @@ from robins.logs.checks_motion import SCALES, words_of
 from robins.logs.checks_velocity import check_velocity
 from robins.logs.findings import Finding
 from robins.logs.motion import signed_permutations
-from robins.logs.ordering import increasing
-from robins.logs.quiet import Signal, finding, name_of, signal_of
+from robins.logs.pair_motion import (
+    Shared,
+    Turning,
+    fit_turning,
+    fit_velocity,
+    forces_of,
+    shared_motion,
+    turned,
+    turned_by_gyros,
+)
+from robins.logs.quiet import finding, name_of, usual_step_s
 
-_WINDOW_S = 0.5  # at most of which a change of attitude is compared with the gyros
-_LONGEST_S = 2.0
 _LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; below it noise of the attitudes is all there is
 _WELL, _BETTER = 0.3, 0.1  # shares of the turning left unexplained
 _WRONG, _RIGHT = 0.1, 0.03  # shares of the specific force left unexplained
+_HALVED = 0.5  # by which what is left over falls where another convention is true
+_THIRD = 1.0 / 3.0  # likewise of velocities, whose fit has more parameters
+_CLEAR = 1.6  # times the scatter: steps of five such sigmas are no chance among thousands
+_LATE_S, _TOO_LATE_S = 0.01, 0.02
+_SIGMAS = 5.0
+_CONVENTIONS = {
+    "heading": ((-1, 1, 1), "counted counterclockwise: count it clockwise from north"),
+    "pitch": ((1, -1, 1), "positive with the nose down: turn its sign"),
+    "roll": ((1, 1, -1), "positive with the right wing up: turn its sign"),
+}
 # What an IMU alone is judged by, at rest or nearly so; a master tells more, in any motion.
 BY_REST = frozenset(
     (
@@ -34,31 +52,49 @@ BY_REST = frozenset(
         *("rates_as_increments", "increments_as_rates"),
     )
 )
-_LAGS_S = np.arange(-50, 51) * 0.02
-_LATE_S = 0.03
 
 
-def check_master(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
-    """Findings about what is missing, velocities against positions, and the IMU against both."""
+def check_master(imu: ImuTable, master: Trajectory, delay_s: float = 0.0) -> Iterator[Finding]:
+    """Findings about what is missing, velocities against positions, and the IMU against both.
+
+    Args:
+        imu: along the axes of the master.
+        master: its records.
+        delay_s: by how much they are said to be older than their stamps.
+    """
     if not len(master):
         return
     imu, master = to_ned_frd(imu), to_ned_frd(master)
+    master = replace(master, time_ns=master.time_ns - round(delay_s * 1e9))
     yield from _missing(master)
-    yield from check_velocity(_as_fixes(master))
-    yield from _turning(imu, master)
-    yield from _force(imu, master)
+    of_velocity = list(check_velocity(_as_fixes(master)))
+    yield from of_velocity
+    shared = shared_motion(imu, master)
+    of_turning = list(_turning(imu, master, shared, delay_s))
+    yield from of_turning
+    if any(f.code == "attitude_sign" for f in of_turning):
+        return  # with such attitudes no force fits
+    yield from _force(imu, master, shared)
+    others = {f.code for f in of_velocity + of_turning if f.severity == "error"}
+    if shared is not None and not others - {"master_late"}:
+        yield from _velocity_sign(imu, master, shared)
 
 
 def _as_fixes(master: Trajectory) -> GnssTable:
-    rough = np.ones((len(master), 3))
+    """With the scatter of the positions, by their second differences, as their sigma."""
+    north_m, east_m = 6.4e6 * master.lat_rad, 6.4e6 * np.cos(master.lat_rad) * master.lon_rad
+    bends = np.abs(np.diff(np.stack([north_m, east_m, master.alt_m], -1), 2, axis=0))
+    bends = bends[np.isfinite(bends).all(axis=1)]
+    scatter = np.median(bends, axis=0) / 0.6745 / np.sqrt(6.0) if len(bends) else np.ones(3)
+    sigma_m = np.tile(np.maximum(_CLEAR * scatter, 1.0), (len(master), 1))
     return GnssTable(
         time_ns=master.time_ns,
         lat_rad=master.lat_rad,
         lon_rad=master.lon_rad,
         alt_m=master.alt_m,
-        sigma_m=rough,
+        sigma_m=sigma_m,
         v_n=master.v_n,
-        sigma_v=rough,
+        sigma_v=np.ones((len(master), 3)),
         source=master.source,
         rows=master.rows,
     )
@@ -85,9 +121,13 @@ def _missing(master: Trajectory) -> Iterator[Finding]:
             )
 
 
-def _turning(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
-    turns = _turns(imu, master)
-    if turns is None:
+def _turning(
+    imu: ImuTable, master: Trajectory, shared: Shared | None, delay_s: float
+) -> Iterator[Finding]:
+    of_master = np.zeros((1, 3)) if shared is None else turned(shared.q, shared)
+    of_master = of_master - of_master.mean(axis=0)
+    length = 1.0 if shared is None else float(np.median(shared.length_s))
+    if shared is None or np.sqrt(np.mean(np.sum(of_master**2, axis=1))) < _LEAST_RATE * length:
         yield finding(
             imu,
             "note",
@@ -97,69 +137,29 @@ def _turning(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
             "vehicle hardly turns while both were recorded.",
         )
         return
-    of_master, of_gyros = turns
-    at = int(np.flatnonzero(_LAGS_S == 0.0)[0])
-    as_is = _left(of_master, of_gyros[at])
-    lags = np.array([_left(of_master, turn) for turn in of_gyros])
-    best = int(np.argmin(lags))
-    if as_is > _WELL and lags[best] > _BETTER:
-        yield _diagnosis(imu, master, of_master, of_gyros[at], as_is)
-    elif 0 < best < len(lags) - 1 and np.isfinite(lags[best - 1 : best + 2]).all():
-        below, here, above = lags[best - 1 : best + 2]
-        curve = below - 2.0 * here + above
-        late = _LAGS_S[best] + (0.5 * (below - above) / curve * 0.02 if curve > 0.0 else 0.0)
-        if abs(late) > _LATE_S:
-            yield finding(
-                master,
-                "warning" if as_is > _WELL else "note",
-                "master_late",
-                float(late),
-                f"its attitudes are {abs(late):.2f} s {'older' if late > 0 else 'younger'} than "
-                f"their stamps, judged by the gyros of {name_of(imu)}. State that as its delay.",
-            )
-
-
-def _turns(imu: ImuTable, master: Trajectory) -> tuple[np.ndarray, list[np.ndarray]] | None:
-    """How far the master turned in each window (w, 3) [rad], and what the gyros say, by lag.
-
-    Means are taken out, so a bias of the gyros takes no part. None where there is too little.
-    """
-    signal = signal_of(imu)
-    known = np.flatnonzero(np.isfinite(master.q_nb).all(axis=1))
-    known = known[increasing(master.time_ns[known])]
-    if signal is None or len(known) < 2:
-        return None
-    start = int(imu.time_ns[signal.rows[0]])
-    time = (master.time_ns[known] - start) * 1e-9
-    first = np.concatenate([[True], np.diff(np.floor(time / _WINDOW_S)) > 0])
-    known, time = known[first], time[first]
-    inside = (time[:-1] > _LAGS_S[-1]) & (time[1:] < signal.time_s[-1] - _LAGS_S[-1])
-    inside &= np.diff(time) < _LONGEST_S
-    if np.count_nonzero(inside) < 10:
-        return None
-    q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
-    of_master = (q[:-1].inv() * q[1:]).as_rotvec()[inside]
-    angle = _integral(imu, signal, signal.gyro)
-
-    def by_gyros(lag: float) -> np.ndarray:
-        at = [np.interp(time - lag, signal.time_s, a) for a in angle.T]
-        turned = np.diff(np.stack(at, -1), axis=0)[inside]
-        return turned - turned.mean(axis=0)
-
-    of_master = of_master - of_master.mean(axis=0)
-    length = float(np.median(np.diff(time)[inside]))
-    if np.sqrt(np.mean(np.sum(of_master**2, axis=1))) < _LEAST_RATE * length:
-        return None
-    return of_master, [by_gyros(lag) for lag in _LAGS_S]
-
-
-def _integral(imu: ImuTable, signal: Signal, values: np.ndarray) -> np.ndarray:
-    """(n, 3) integral of rates up to each sample, from the first; those of increments are means."""
-    steps = np.diff(signal.time_s, prepend=signal.time_s[0])[:, None]
-    before = np.concatenate([values[:1], values[:-1]])
-    return np.cumsum(
-        steps * (values if imu.kind == "increment" else 0.5 * (before + values)), axis=0
+    of_gyros = turned_by_gyros(shared)
+    as_is, unfitted = fit_turning(shared.q, shared), _left(of_master, of_gyros - of_gyros.mean(0))
+    shown = (
+        f"the gyros do not turn as the attitudes of {name_of(master)} do ({unfitted:.0%} of the "
+        "turning is left over"
     )
+    told = [_other_attitudes(imu, master, shared, as_is)]
+    if as_is.share > _BETTER:
+        told.append(_other_gyros(imu, shared, as_is, shown))
+    found = min((t for t in told if t is not None), key=lambda t: float(t.value), default=None)
+    if found is not None:
+        yield found
+    elif as_is.share > _WELL:
+        yield finding(
+            imu,
+            "error",
+            "turning_disagrees",
+            as_is.share,
+            f"{shown}), whatever unit, axis or shift of a second is tried. The files are of "
+            "different recordings or clocks, or the nominal mounting is another.",
+        )
+    elif abs(as_is.late_s) > max(_LATE_S, _SIGMAS * as_is.sigma_s):
+        yield _late(imu, master, as_is, delay_s)
 
 
 def _left(of_master: np.ndarray, of_gyros: np.ndarray) -> float:
@@ -167,28 +167,46 @@ def _left(of_master: np.ndarray, of_gyros: np.ndarray) -> float:
     return float(np.sum((of_master - of_gyros) ** 2) / np.sum(of_master**2))
 
 
-def _diagnosis(
-    imu: ImuTable, master: Trajectory, of_master: np.ndarray, of_gyros: np.ndarray, as_is: float
-) -> Finding:
+def _other_attitudes(
+    imu: ImuTable, master: Trajectory, shared: Shared, as_is: Turning
+) -> Finding | None:
+    """Another convention of the attitudes, if one of them explains the turning."""
+    angles = shared.q.as_euler("ZYX")
+    tried = {
+        f"with {name} reversed": (
+            Rotation.from_euler("ZYX", angles * signs),
+            f"{name.capitalize()} is probably {mend}",
+        )
+        for name, (signs, mend) in _CONVENTIONS.items()
+    }
+    tried["the other way round"] = (
+        shared.q.inv(),
+        "They probably turn navigation to body axes: give their conjugates",
+    )
+    fits = {words: fit_turning(q, shared) for words, (q, _) in tried.items()}
+    words = min(fits, key=lambda w: fits[w].share)
+    if not fits[words].share < min(_BETTER, _HALVED * as_is.share):
+        return None
+    return finding(
+        master,
+        "error",
+        "attitude_sign",
+        fits[words].share,
+        f"its attitudes turn as the gyros of {name_of(imu)} do only {words}: that leaves "
+        f"{fits[words].share:.2%} of the turning over, as they stand {as_is.share:.2%}. "
+        f"{tried[words][1]}.",
+    )
+
+
+def _other_gyros(imu: ImuTable, shared: Shared, as_is: Turning, shown: str) -> Finding | None:
     """Another unit or other axes of the gyros, if one of them explains the turning."""
     maps = signed_permutations()
     scales = np.array([*SCALES, *(1.0 / s for s in SCALES)])
     tried = np.concatenate([maps, scales[:, None, None] * np.eye(3)])
-    left = np.array([_left(of_master, of_gyros @ m.T) for m in tried])
+    left = np.array([fit_turning(shared.q, shared, m).share for m in tried])
     k = int(np.argmin(left))
-    shown = (
-        f"the gyros do not turn as the attitudes of {name_of(master)} do ({as_is:.0%} of the "
-        f"turning is left over"
-    )
-    if left[k] > _BETTER:
-        return finding(
-            imu,
-            "error",
-            "turning_disagrees",
-            as_is,
-            f"{shown}), whatever unit, axis or shift of a second is tried. The files are of "
-            "different recordings or clocks, or the nominal mounting is another.",
-        )
+    if not left[k] < min(_BETTER, _HALVED * as_is.share):
+        return None
     if k < len(maps):
         code = "gyro_axes"
         cause = f"They fit as {words_of(maps[k], 'gyro')}: correct the nominal mounting or the axes"
@@ -202,15 +220,48 @@ def _diagnosis(
     )
 
 
-def _force(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
-    """Accelerometers against what the master's velocities and attitudes ask for."""
-    signal = signal_of(imu)
-    known = np.flatnonzero(
-        np.isfinite(master.q_nb).all(axis=1) & np.isfinite(master.v_n).all(axis=1)
+def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Finding:
+    total_s = fit.late_s + delay_s
+    said = f"the stated delay of {delay_s:g} s makes them" if delay_s else "their stamps"
+    mend = (
+        f'State that: master.delay = "{total_s:.3f} s"'
+        if total_s >= 0.0
+        else f"Add {-total_s:.3f} s to their stamps, and state no delay"
     )
-    known = known[increasing(master.time_ns[known])]
-    forces = None if signal is None or len(known) < 2 else _forces(imu, master, signal, known)
-    if signal is None or forces is None:
+    return finding(
+        master,
+        "error" if abs(fit.late_s) > _TOO_LATE_S else "warning",
+        "master_late",
+        fit.late_s,
+        f"its attitudes are {1e3 * abs(fit.late_s):.0f} ms (one sigma {1e3 * fit.sigma_s:.1f} ms) "
+        f"{'older' if fit.late_s > 0 else 'younger'} than {said}, judged by the gyros of "
+        f"{name_of(imu)}. {mend}.",
+    )
+
+
+def _velocity_sign(imu: ImuTable, master: Trajectory, shared: Shared) -> Iterator[Finding]:
+    """Velocities whose change the accelerometers feel only with the sign of one turned."""
+    as_is = fit_velocity(shared.v_n, shared)
+    if as_is is None:
+        return
+    for k, (name, other) in enumerate((("north", "south"), ("east", "west"), ("down", "up"))):
+        left = fit_velocity(shared.v_n * np.where(np.arange(3) == k, -1.0, 1.0), shared)
+        if left is not None and left[k] < _THIRD * as_is[k]:
+            yield finding(
+                master,
+                "error",
+                "velocity_sign",
+                name,
+                f"its velocity {name} changes against what the accelerometers of {name_of(imu)} "
+                f"feel; with its sign turned {left[k] / as_is[k]:.1%} of the squares are left. "
+                f"It is probably positive {other}: turn its sign.",
+            )
+
+
+def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator[Finding]:
+    """Accelerometers against what the master's velocities and attitudes ask for."""
+    forces = None if shared is None else forces_of(shared)
+    if forces is None:
         yield finding(
             imu,
             "note",
@@ -226,10 +277,11 @@ def _force(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
         return
     maps = signed_permutations()
     units = [(G / value, "gravity_unit", *words) for value, words in UNITS.items()]
+    step_s = usual_step_s(imu.time_ns)
     if imu.kind == "increment":  # before cm/s^2, which look the same at 100 Hz
-        mend = (signal.step_s, "rates_as_increments", "rates", "name a format of rates")
+        mend = (step_s, "rates_as_increments", "rates", "name a format of rates")
     else:
-        mend = (1.0 / signal.step_s, "increments_as_rates", "increments", "name a format of those")
+        mend = (1.0 / step_s, "increments_as_rates", "increments", "name a format of those")
     units.insert(0, mend)
     tried = np.concatenate([maps, [factor * np.eye(3) for factor, *_ in units]])
     left = np.array([_left(wanted, measured @ m.T) for m in tried])
@@ -259,22 +311,3 @@ def _force(imu: ImuTable, master: Trajectory) -> Iterator[Finding]:
         f"the accelerometers do not feel what the velocities and attitudes of {name_of(master)} "
         f"ask for ({as_is:.0%} of the specific force is left over). {cause}.",
     )
-
-
-def _forces(
-    imu: ImuTable, master: Trajectory, signal: Signal, known: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mean specific force (w, 3) along the body in each window: by the master, by the IMU."""
-    time = (master.time_ns[known] - int(imu.time_ns[signal.rows[0]])) * 1e-9
-    first = np.concatenate([[True], np.diff(np.floor(time / _WINDOW_S)) > 0])
-    known, time = known[first], time[first]
-    length = np.diff(time)
-    inside = (time[:-1] > 0.0) & (time[1:] < signal.time_s[-1]) & (length < _LONGEST_S)
-    if np.count_nonzero(inside) < 10:
-        return None
-    q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
-    middle = q[:-1] * Rotation.from_rotvec(0.5 * (q[:-1].inv() * q[1:]).as_rotvec())
-    f_n = np.diff(master.v_n[known], axis=0) / length[:, None] - [0.0, 0.0, G]
-    gained = _integral(imu, signal, signal.accel)
-    at = np.stack([np.interp(time, signal.time_s, a) for a in gained.T], -1)
-    return middle.inv().apply(f_n)[inside], (np.diff(at, axis=0) / length[:, None])[inside]

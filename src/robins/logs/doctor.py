@@ -53,8 +53,9 @@ def examine(subject: Subject) -> list[Finding]:
 
     Args:
         subject: as it was read, before `clean`, so that everything is seen. A dataset brings the
-            findings of its readers along (``meta["findings"]``) and the names of files that say in
-            which unit their stamps are (``meta["time_unit_known"]``).
+            findings of its readers along (``meta["findings"]``), the names of files that say in
+            which unit their stamps are (``meta["time_unit_known"]``), and by how much the records
+            of its master are older than their stamps (``meta["master_delay_s"]``).
 
     Returns:
         Errors first, then warnings, then notes; empty for a log without a flaw.
@@ -66,18 +67,20 @@ def examine(subject: Subject) -> list[Finding]:
         return by_severity(_examined(*_tables(subject), *_context(subject)))
 
 
-def _context(subject: Subject) -> tuple[Trajectory | None, frozenset[str]]:
-    """The master to align to, if any, and the files whose unit of time is beyond doubt."""
+def _context(subject: Subject) -> tuple[Trajectory | None, float, frozenset[str]]:
+    """The master to align to, if any, its delay [s], and files whose unit of time is known."""
     if isinstance(subject, Dataset):
-        return subject.master, frozenset(subject.meta.get("time_unit_known", ()))
+        known = frozenset(subject.meta.get("time_unit_known", ()))
+        return subject.master, float(subject.meta.get("master_delay_s", 0.0)), known
     parts = subject if isinstance(subject, Sequence) else ()
-    return None, frozenset().union(*(_context(p)[1] for p in parts if isinstance(p, Dataset)))
+    return None, 0.0, frozenset().union(*(_context(p)[2] for p in parts if isinstance(p, Dataset)))
 
 
 def _examined(
     tables: list[Table],
     findings: list[Finding],
     master: Trajectory | None,
+    delay_s: float,
     unit_known: frozenset[str],
 ) -> list[Finding]:
     imu = gnss = mag = attitude = None
@@ -109,7 +112,7 @@ def _examined(
             if table is not imu and not isinstance(table, ImuTable):
                 findings += check_span(imu, table)
     if imu is not None and master is not None:
-        of_both = list(check_master(imu, checked_truth(master)))
+        of_both = list(check_master(imu, checked_truth(master), delay_s))
         if not any(f.code == "force_not_checked" for f in of_both):
             findings = [f for f in findings if f.code not in BY_REST]
         return findings + of_both

@@ -76,7 +76,11 @@ def load_dataset(
 
 
 def load_pair(
-    master: str | os.PathLike[str], slave: str | os.PathLike[str], *, name: str | None = None
+    master: str | os.PathLike[str],
+    slave: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    delay_s: float = 0.0,
 ) -> Dataset:
     """Read what a master INS reported and the samples of the IMU to be aligned to it.
 
@@ -84,10 +88,13 @@ def load_pair(
         master: a path in any known format; `named_csv` can also hold turn rates.
         slave: inertial samples in any known format, along the axes of that IMU.
         name: of the dataset; by default the IMU file's name.
+        delay_s: by how much the records of the master are older than their stamps, for the doctor
+            to compare; the stamps stay as they are.
 
     Returns:
         The dataset, as it is in the files; see `clean`. ``meta["files"]`` maps imu and master to
-        paths, ``meta["findings"]`` lists what the readers left out.
+        paths, ``meta["findings"]`` lists what the readers left out, ``meta["master_delay_s"]`` is
+        the delay.
 
     Raises:
         LogError: as `open_log`; or a file holds something else.
@@ -103,7 +110,11 @@ def load_pair(
         name=name or Path(imu.source).name.split(".")[0],
         imu=imu,
         master=path,
-        meta={"files": {"imu": imu.source, "master": path.source}, "findings": findings},
+        meta={
+            "files": {"imu": imu.source, "master": path.source},
+            "findings": findings,
+            "master_delay_s": delay_s,
+        },
     )
 
 

@@ -1,0 +1,188 @@
+"""A master INS and the IMU to be aligned to it as views of one motion, for the doctor.
+
+Between its records the master turns and gains velocity; the IMU says by how much. What differs
+between the two on a healthy vehicle is small and linear, so it is fitted and taken out: a bias of
+each triad, an error of the mounting, the delay of the records, the lever arm. What is left over is
+noise and flexure, unless the records are not what they are said to be. All is NumPy, in NED/FRD.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robins.dataset import ImuTable, Trajectory
+from robins.logs.motion import at
+from robins.logs.ordering import increasing
+from robins.logs.quiet import Signal, signal_of
+
+GRAVITY = 9.80665  # m/s^2
+_WINDOW_S = 0.5  # at most, so that the body hardly turns meanwhile
+_LONGEST_S = 2.0
+_HALF_S = 0.05  # over which the gyros give a rate, to either side
+LAGS_S = np.arange(-10, 11) * 0.1
+
+
+class Shared(NamedTuple):
+    """Records of the master about half a second apart, and the IMU's integrals; w windows."""
+
+    time_s: np.ndarray  # (w + 1,) of the records, from the first sample on
+    inside: np.ndarray  # (w,) bool: windows that are short and lie within the samples
+    q: Rotation  # w + 1 of them, body to navigation
+    v_n: np.ndarray  # (w + 1, 3) m/s, NaN where missing
+    sample_s: np.ndarray  # (n,)
+    angle: np.ndarray  # (n, 3) rad, integral of the gyros
+    pushed: np.ndarray  # (n, 3) m/s, integral of the accelerometers
+
+    @property
+    def length_s(self) -> np.ndarray:
+        """(k,) of the windows inside."""
+        return np.diff(self.time_s)[self.inside]
+
+
+def shared_motion(imu: ImuTable, master: Trajectory) -> Shared | None:
+    """Both on the clock of the IMU; None if there are fewer than ten windows."""
+    signal = signal_of(imu)
+    known = np.flatnonzero(np.isfinite(master.q_nb).all(axis=1))
+    known = known[increasing(master.time_ns[known])]
+    if signal is None or len(known) < 2:
+        return None
+    time_s = (master.time_ns[known] - int(imu.time_ns[signal.rows[0]])) * 1e-9
+    first = np.concatenate([[True], np.diff(np.floor(time_s / _WINDOW_S)) > 0])
+    known, time_s = known[first], time_s[first]
+    inside = (time_s[:-1] > 0.0) & (time_s[1:] < signal.time_s[-1])
+    inside &= np.diff(time_s) < _LONGEST_S
+    if np.count_nonzero(inside) < 10:
+        return None
+    q = Rotation.from_quat(master.q_nb[known], scalar_first=True)
+    angle, pushed = (_integral(imu, signal, a) for a in (signal.gyro, signal.accel))
+    return Shared(time_s, inside, q, master.v_n[known], signal.time_s, angle, pushed)
+
+
+def _integral(imu: ImuTable, signal: Signal, values: np.ndarray) -> np.ndarray:
+    """(n, 3) integral of rates up to each sample, from the first; those of increments are means."""
+    steps = np.diff(signal.time_s, prepend=signal.time_s[0])[:, None]
+    before = np.concatenate([values[:1], values[:-1]])
+    return np.cumsum(
+        steps * (values if imu.kind == "increment" else 0.5 * (before + values)), axis=0
+    )
+
+
+def turned_by_gyros(shared: Shared, lag_s: float = 0.0) -> np.ndarray:
+    """(k, 3) rad: by how much the IMU turned in each window, that much earlier than its stamps."""
+    return np.diff(at(shared.time_s - lag_s, shared.sample_s, shared.angle), axis=0)[shared.inside]
+
+
+def turned(q: Rotation, shared: Shared) -> np.ndarray:
+    """(k, 3) rad: by how much attitudes at the records turn in each window."""
+    return (q[:-1].inv() * q[1:]).as_rotvec()[shared.inside]
+
+
+class Turning(NamedTuple):
+    """How attitudes turn, against the gyros."""
+
+    share: float  # of the turning that is left over
+    late_s: float  # by how much attitudes are older than their stamps
+    sigma_s: float
+
+
+def fit_turning(q: Rotation, shared: Shared, gyro_map: np.ndarray | None = None) -> Turning:
+    """Fit bias, mounting error and delay by Gauss and Newton, from the best of the coarse delays.
+
+    Args:
+        q: attitudes at the records, as they may have been meant.
+        shared: the motion.
+        gyro_map: (3, 3) that the gyros are multiplied by.
+    """
+    of_master = turned(q, shared)
+    C = np.eye(3) if gyro_map is None else gyro_map
+
+    def by_gyros(lag_s: float) -> np.ndarray:
+        return turned_by_gyros(shared, lag_s) @ C.T
+
+    coarse = [by_gyros(lag_s) - of_master for lag_s in LAGS_S]
+    late_s = float(LAGS_S[np.argmin([np.sum((d - d.mean(axis=0)) ** 2) for d in coarse])])
+    bias = shared.length_s[:, None, None] * np.eye(3)
+    step_s = 0.02
+    for _ in range(4):
+        early, here, late = (by_gyros(late_s + k * step_s) for k in (-1, 0, 1))
+        slope = (late - early) / (2.0 * step_s)
+        design = np.concatenate([bias, _cross(here), slope[:, :, None]], axis=-1).reshape(-1, 7)
+        left, found, sigma = _least_squares((of_master - here).ravel(), design)
+        late_s = float(np.clip(late_s + np.clip(found[6], -0.1, 0.1), LAGS_S[0], LAGS_S[-1]))
+    spread = np.sum((of_master - of_master.mean(axis=0)) ** 2)
+    return Turning(float(left @ left / spread), late_s, float(sigma[6]))
+
+
+class _Pushes(NamedTuple):
+    """Windows with velocities at both ends."""
+
+    at: np.ndarray  # (k,) their numbers
+    length_s: np.ndarray  # (k,)
+    C: np.ndarray  # (k, 3, 3) from body to navigation axes in their middle
+    gained: np.ndarray  # (k, 3) m/s along navigation axes, by the master
+    pushed: np.ndarray  # (k, 3) m/s along body axes, by the IMU
+
+
+def _pushes(v_n: np.ndarray, shared: Shared) -> _Pushes | None:
+    """None if there are fewer than ten."""
+    gained = np.diff(v_n, axis=0)
+    at_ = np.flatnonzero(shared.inside & np.isfinite(gained).all(axis=1))
+    if len(at_) < 10:
+        return None
+    q = shared.q[:-1] * Rotation.from_rotvec(0.5 * (shared.q[:-1].inv() * shared.q[1:]).as_rotvec())
+    pushed = np.diff(at(shared.time_s, shared.sample_s, shared.pushed), axis=0)
+    length_s = np.diff(shared.time_s)
+    return _Pushes(at_, length_s[at_], q.as_matrix()[at_], gained[at_], pushed[at_])
+
+
+def forces_of(shared: Shared) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean specific force (k, 3) along the body in each window: by the master, by the IMU."""
+    p = _pushes(shared.v_n, shared)
+    if p is None:
+        return None
+    f_n = p.gained / p.length_s[:, None] - [0.0, 0.0, GRAVITY]
+    return np.einsum("kji,kj->ki", p.C, f_n), p.pushed / p.length_s[:, None]
+
+
+def fit_velocity(v_n: np.ndarray, shared: Shared) -> np.ndarray | None:
+    """Fit bias, mounting error and lever arm; the squares (3,) left over along north, east, down.
+
+    Args:
+        v_n: (w + 1, 3) velocities at the records, as they may have been meant.
+        shared: the motion.
+
+    Returns:
+        Sums of squares [m^2/s^2]; None if fewer than ten windows have velocities.
+    """
+    p = _pushes(v_n, shared)
+    if p is None:
+        return None
+    along = p.length_s[:, None, None]
+    missing = p.gained - np.einsum("kij,kj->ki", p.C, p.pushed) - along[:, 0] * [0, 0, GRAVITY]
+    early, late = (at(shared.time_s + k * _HALF_S, shared.sample_s, shared.angle) for k in (-1, 1))
+    swing = np.diff(shared.q.as_matrix() @ _cross((late - early) / (2.0 * _HALF_S)), axis=0)[p.at]
+    design = np.concatenate(
+        [p.C * along, np.eye(3) * along, p.C @ _cross(p.pushed), swing], axis=-1
+    )
+    left, _, _ = _least_squares(missing.ravel(), design.reshape(-1, 12))
+    return np.sum(left.reshape(-1, 3) ** 2, axis=0)
+
+
+def _cross(a: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) matrices of the cross product with each of the vectors (n, 3)."""
+    return np.cross(a[:, None, :], np.eye(3)).transpose(0, 2, 1)
+
+
+def _least_squares(y: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals, parameters and their standard deviations; what cannot be seen stays zero."""
+    scale = np.linalg.norm(A, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    A = A / scale
+    inverse = np.linalg.pinv(A.T @ A, rcond=1e-10, hermitian=True)
+    found = inverse @ (A.T @ y)
+    left = y - A @ found
+    variance = left @ left / max(len(y) - A.shape[1], 1)
+    return left, found / scale, np.sqrt(variance * np.diag(inverse)) / scale
