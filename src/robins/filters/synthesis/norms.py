@@ -16,6 +16,7 @@ import scipy.linalg
 Number = float | int  # where types are checked an int is no float
 
 _CIRCLE = 1e-6  # eigenvalues as near to the unit circle are looked at
+_STARTS = 65  # even samples of the half circle that begin a search
 _SQUARINGS = 64  # of A: a radius of 1 - eps needs 58
 
 
@@ -62,8 +63,8 @@ def hinf_norm(
     A level is reached where the symplectic pencil of the level has an eigenvalue on the circle
     (Boyd, Balakrishnan & Kabamba 1989, in discrete time). One that is reached is raised to the
     highest response between such eigenvalues (Bruinsma & Steinbuch 1990), which converges
-    quadratically where bisection halves; the one that is not reached is the answer. The search is
-    started by the Hankel singular values s: max(s_1, |D|) <= norm <= |D| + 2 sum(s).
+    quadratically where bisection halves; the one that is not reached is the answer. The search
+    starts from the highest of some responses, below |D| + 2 sum(s) of the Hankel singular values s.
 
     Args:
         A: (n, n).
@@ -109,14 +110,12 @@ class Levels(NamedTuple):
         product = (Wc / np.outer(scale, scale)) @ (Wo * np.outer(scale, scale))
         hankel = np.sqrt(np.maximum(np.linalg.eigvals(product).real, 0.0))
         direct = float(np.linalg.norm(D, ord=2)) if D.size else 0.0
-        return cls(
-            A * scale / scale[:, None],
-            B / scale[:, None],
-            C * scale,
-            D,
-            max(direct, float(np.max(hankel, initial=0.0))) * (1.0 - 1e-9),
-            (direct + 2.0 * float(np.sum(hankel))) * (1.0 + 1e-9),
-        )
+        blocks = A * scale / scale[:, None], B / scale[:, None], C * scale, D
+        # Not the greatest Hankel singular value, which is inaccurate where large numbers cancel;
+        # many responses, for rounding hides the crossings of a flat one.
+        angle = np.append(np.angle(np.linalg.eigvals(A)), np.linspace(0.0, np.pi, _STARTS))
+        lower = max(direct, float(np.max(_gains(*blocks, np.exp(1j * angle))))) * (1.0 - 1e-9)
+        return cls(*blocks, lower, (direct + 2.0 * float(np.sum(hankel))) * (1.0 + 1e-9))
 
     def reached(self, gain: Number) -> bool:
         """Whether some singular value of the frequency response is as large as this."""
