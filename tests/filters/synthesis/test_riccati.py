@@ -115,7 +115,22 @@ def test_a_measurement_without_noise():
         # the same noise-free sum measured twice
         (
             (0.5 * np.eye(1), [[1.0]], [[1.0]], [[1.0], [1.0]]),
-            "known beforehand and free of noise: give each noise of its own in Dw|no steady state",
+            "Dw has rank 0, not 2, and .* one combination .* free of noise.* in Dw",
+        ),
+        # two noise-free sensors of a stable plant that one noise drives
+        (
+            ([[0.9, 0.2], [-0.1, 0.8]], [[1.0], [0.5]], [[0.0], [1.0]], np.eye(2)),
+            "Dw has rank 0, not 2, and .* one combination .* free of noise.* in Dw",
+        ),
+        # the same sensor noise in two sensors
+        (
+            (0.5 * np.eye(1), [[1.0, 0.0]], [[1.0]], [[1.0], [1.0]], [[0.0, 1.0], [0.0, 1.0]]),
+            "Dw has rank 1, not 2, and .* one combination .* free of noise",
+        ),
+        # a difference without noise: what is constant is not in it
+        (
+            ([[0.0, 0.0], [1.0, 0.0]], [[1.0], [0.0]], [[0.0], [1.0]], [[1.0, -1.0]]),
+            r"Dw has rank 0, not 1, and near z = exp\(0 i\)",
         ),
     ],
 )
@@ -170,10 +185,17 @@ def test_where_it_is_not_the_best(gamma, h2):
     assert riccati(two_states(), gamma).h2 == pytest.approx(h2, abs=1e-4)
 
 
+def test_the_least_of_the_curve_is_sought_as_far_as_it_falls():
+    # A sensor of its own sees n, at a millionth: K = [., 1e6] keeps it out, at a great lambda.
+    p = plant([[0.9]], [[1.0, 0, 0]], [[1.0]], [[1], [0]], [[0, 1.0, 0], [0, 0, 1]], [[0], [1e-6]])
+    assert least_riccati_gamma(p) < 1e-9
+    assert riccati(p, 0.1).hinf == pytest.approx(0.1, rel=1e-9)
+
+
 def test_where_it_cannot():
     p = two_states()
     with pytest.raises(
-        Unreachable, match=r"cannot reach gamma 0\.7 for any lambda: the least is"
+        Unreachable, match=r"cannot reach gamma 0\.7 for any lambda tried: the least is"
     ) as e:
         riccati(p, 0.7)
     least = least_riccati_gamma(p)

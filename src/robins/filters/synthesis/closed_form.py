@@ -134,4 +134,5 @@ def closed_form(plant: Plant, gamma: Number) -> Design:
 
 
 def _same(matrix: np.ndarray, wanted: np.ndarray) -> bool:
-    return bool(np.abs(matrix - wanted).max() <= _SAME * np.abs(wanted).max())
+    alike = matrix.shape == wanted.shape
+    return alike and bool(np.abs(matrix - wanted).max() <= _SAME * np.abs(wanted).max())

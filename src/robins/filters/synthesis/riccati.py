@@ -10,12 +10,22 @@ import scipy.linalg
 import scipy.optimize
 
 from robins.filters.synthesis.design import Design, Unreachable, certify
-from robins.filters.synthesis.norms import Levels, Number, gramian, hinf_norm, spectral_radius
+from robins.filters.synthesis.norms import (
+    Levels,
+    Number,
+    gramian,
+    hinf_norm,
+    peak_gain,
+    spectral_radius,
+)
 from robins.filters.synthesis.plant import Plant, error_system
+from robins.filters.synthesis.steady import why_not_steady
 
 METHOD = "riccati"
 
 _DECADES = np.arange(-2.0, 12.1, 0.25)  # of lambda, about the one that makes n as large as w
+_FARTHER, _FARTHEST = 10.0**0.25, 1e12  # steps beyond that grid and their end, if the norm falls
+_FALLS = 1e-4  # relative, in a step
 _RTOL = 1e-10  # of lambda
 _STEPS = 60  # of Newton's iteration at most; it converges quadratically once it is near
 
@@ -26,8 +36,8 @@ def kalman_gain(plant: Plant) -> np.ndarray:
     The Riccati equation is the one with cross terms, E[Bw w (Dw w)'] = Bw Dw'.
 
     Raises:
-        ValueError: there is no steady state (a mode on the unit circle is not driven by w), or a
-            combination of measurements is free of noise and known beforehand.
+        ValueError: there is no steady state: a mode on the unit circle is not driven by w, or a
+            combination of measurements is free of noise, always or at a frequency.
     """
     return _gain(plant, 0.0)
 
@@ -85,7 +95,7 @@ def least_riccati_gamma(plant: Plant) -> float:
     Raises:
         ValueError: as `kalman_gain`.
     """
-    return _least(plant)[1]
+    return _least(plant)[-1]
 
 
 def check_gamma(gamma: Number) -> None:
@@ -112,13 +122,13 @@ def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
         if meets(K):
             return _bisect(plant, meets, below, above, K)
         below = above
-    above, least = _least(plant)
+    K, above, least = _least(plant)
     if least <= gamma:
-        below = max(grid[grid < above], default=0.0)
-        return _bisect(plant, meets, below, above, _gain(plant, above))
+        below = max(grid[grid < above * (1.0 - _RTOL)], default=0.0)
+        return _bisect(plant, meets, below, above, K)
     raise Unreachable(
-        f"the Riccati equation cannot reach gamma {gamma:.6g} for any lambda: the least is "
-        f"{least:.6g}. Raise gamma, or take the observer form of the LMI",
+        f"the Riccati equation cannot reach gamma {gamma:.6g} for any lambda tried: the least is "
+        f"{least:.6g}, at lambda {above:.3g}. Raise gamma, or take the observer form of the LMI",
         least,
     )
 
@@ -142,29 +152,34 @@ def _bisect(
     return K, above
 
 
-def _least(plant: Plant) -> tuple[float, float]:
-    """The lambda of the least H-infinity norm, and that norm."""
+def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
+    """The gain of the least H-infinity norm, its lambda, and that norm."""
 
     def norm(K: np.ndarray) -> float:
         e = error_system(plant, K)
-        return hinf_norm(e.A, e.Bn, e.L)
+        return max(hinf_norm(e.A, e.Bn, e.L), peak_gain(e.A, e.Bn, e.L))
 
     gains = [_gain(plant, 0.0)]
-    grid = np.concatenate([[0.0], _grid(plant, gains[0])])
+    grid = [0.0, *_grid(plant, gains[0])]
     for value in grid[1:]:
         gains.append(_gain(plant, float(value), gains[-1]))
-    norms = [norm(K) for K in gains]
+    norms, end = [norm(K) for K in gains], grid[-1]
+    while norms[-1] < (1.0 - _FALLS) * norms[-2] and grid[-1] < _FARTHEST * end:
+        grid.append(_FARTHER * grid[-1])
+        gains.append(_gain(plant, grid[-1], gains[-1]))
+        norms.append(norm(gains[-1]))
     best = int(np.argmin(norms))
-    found = grid[best], norms[best]
+    found = gains[best], grid[best], norms[best]
     if 1 < best < len(grid) - 1:
         ends = np.log(grid[best - 1]), np.log(grid[best + 1])
         fine = scipy.optimize.minimize_scalar(
             lambda exponent: norm(_gain(plant, float(np.exp(exponent)), gains[best])),
             bounds=ends, method="bounded", options={"xatol": 1e-9},
         )  # fmt: skip
-        if fine.fun < found[1]:
-            found = np.exp(fine.x), fine.fun
-    return float(found[0]), float(found[1])
+        if fine.fun < norms[best]:
+            lambda_ = float(np.exp(fine.x))
+            found = _gain(plant, lambda_, gains[best]), lambda_, float(fine.fun)
+    return found
 
 
 def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
@@ -193,16 +208,13 @@ def _gain(plant: Plant, lambda_: float, near: np.ndarray | None = None) -> np.nd
 
 
 def _stabilising(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> np.ndarray:
-    advice = "a mode of A on the unit circle is not driven by w: give it noise in Bw"
     try:
         P = scipy.linalg.solve_discrete_are(A.T, C.T, B @ B.T, D @ D.T, s=B @ D.T)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(f"the Kalman filter has no steady state: {advice} ({error})") from error
+        raise ValueError(why_not_steady(A, B, C, D)) from error
     K = _update(A, B, C, D, P)
-    if not (radius := spectral_radius(A - K @ C)) < 1.0:
-        raise ValueError(
-            f"the Kalman filter has no steady state, its error decays by {radius:.9g}: {advice}"
-        )
+    if not spectral_radius(A - K @ C) < 1.0:
+        raise ValueError(why_not_steady(A, B, C, D))
     return K
 
 
@@ -232,10 +244,7 @@ def _update(
     try:
         root = np.linalg.cholesky(S)
     except np.linalg.LinAlgError as error:
-        raise ValueError(
-            "some combination of measurements is known beforehand and free of noise: give each "
-            "noise of its own in Dw"
-        ) from error
+        raise ValueError(why_not_steady(A, B, C, D)) from error
     half = np.linalg.solve(root, C @ P @ A.T + D @ B.T)
     return np.linalg.solve(root.T, half).T
 
