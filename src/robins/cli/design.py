@@ -83,7 +83,7 @@ def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
             numbers("hinf"),
             gain,
             "true H-infinity norm",
-            least=found.least,
+            least=found.least.reached,
             least_of=_whose(found),
         ),
         "trade_off_bound": variable(dims, numbers("bound"), z, "bound on the H2 norm"),
@@ -103,8 +103,10 @@ def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
         "problem": problem.name,
         "form": problem.form,
         "blocks": problem.blocks,
-        "least_gamma": found.least,
+        "least_gamma": found.least.reached,
         "least_gamma_of": _whose(found),
+        "least_gamma_proved": found.least.proved,
+        "least_gamma_step": found.least.step,
         "designs": [_told(name, design) for name, design in made],
         "not_reached": [
             {"method": o.method, "gamma": o.gamma, "why": o.why, "least": o.least} for o in refused
@@ -138,9 +140,14 @@ def table_of(found: TradeOff) -> str:
 def advice(problem: Problem, found: TradeOff) -> list[str]:
     """What the numbers say, in sentences."""
     own, gain = found.kalman, _unit(problem.unit_gain)
-    reach = f"the least Hinf of {_whose(found)} is {found.least:.4g}{gain}"
-    if found.least == 0.0:
+    least = found.least
+    reach = f"the least Hinf of {_whose(found)} is {least.reached:.4g}{gain}"
+    if least.reached == 0.0:
         reach = "no Hinf is too small to be reached"
+    elif least.exact:
+        reach += f" (the Riccati recursion of the game proves it at step {least.step})"
+    else:
+        reach += f"; a smaller one is refuted only below {least.proved:.4g}"
     notes = [
         f"The Kalman filter has H2 {own.h2:.4g}{_unit(problem.unit_z)} and Hinf {own.hinf:.4g}"
         f"{gain}; {reach}."
@@ -158,7 +165,7 @@ def advice(problem: Problem, found: TradeOff) -> list[str]:
     if missing:
         notes.append(
             f"Left out: {', '.join(missing)}; they need cvxpy and Clarabel: "
-            f"pip install '{_MISSING}'. A gamma out of reach here may be in reach of theirs."
+            f"pip install '{_MISSING}'. They may reach a gamma that the others do not."
         )
     for name, why in found.left_out.items():
         if name not in missing:
@@ -168,7 +175,7 @@ def advice(problem: Problem, found: TradeOff) -> list[str]:
 
 def _whose(found: TradeOff) -> str:
     """Whose least gamma it is."""
-    return "any gain" if found.by_lmi else "any Riccati design"
+    return "any gain" if found.least.exact or found.least.reached == 0.0 else "the gains found"
 
 
 def _unit(unit: str) -> str:
@@ -234,7 +241,8 @@ def design(
 def _next(given: str, problem: Problem, found: TradeOff) -> str:
     usable = [o for g in found.gammas if (o := found.best(g)) is not None and o.design is not None]
     if not usable:
-        return f'Next:   robins design {given} --gamma "{1.05 * found.least:.4g}"   is in reach'
+        within = f"{1.05 * found.least.reached:.4g}"
+        return f'Next:   robins design {given} --gamma "{within}"   is in reach'
     inflated = [
         o.design
         for o in found.outcomes

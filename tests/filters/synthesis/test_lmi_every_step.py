@@ -104,7 +104,7 @@ def test_a_gain_whose_norms_are_not_right_is_never_given_out(solve, monkeypatch)
 def test_a_gamma_out_of_reach_at_some_step_is_told():
     each = designer(0.52)
     each(quaternion(b=0.5))
-    with pytest.raises(Unreachable, match=r"the least one .* is 0\.6"):
+    with pytest.raises(Unreachable, match=r"below the least .* have, 0\.6 "):
         each(quaternion(b=0.6))
 
 

@@ -1,16 +1,15 @@
-"""The retuned LMI against the tables and a direct search for the best gain; the least gamma."""
+"""The retuned LMI against the tables and a direct search for the best gain."""
 
 from functools import cache
 
 import numpy as np
 import pytest
-import scipy.optimize
-from design_plants import attitude_axis, quaternion, two_states
-from gain_search import best_by_search, worst
+from design_plants import attitude_axis, two_states
+from gain_search import best_by_search
 
 from robins.filters.synthesis import Unreachable, certify, kalman_gain, search
 from robins.filters.synthesis.lmi import observer
-from robins.filters.synthesis.search import least_gamma, retuned
+from robins.filters.synthesis.search import retuned
 
 
 @cache
@@ -87,52 +86,10 @@ def test_a_gamma_next_to_the_kalman_filters_ends_the_search():
     assert design.h2 == pytest.approx(best.h2, rel=1e-4)
 
 
-# ------------------------------------------------------------------------------------ least gamma
-
-
-@pytest.mark.parametrize("form", ["common", "slack", "full"])
-def test_least_gamma_of_all_forms(form):
-    assert least_gamma(two_states(), form) == pytest.approx(0.594542, rel=2e-6)
-
-
-def test_least_gamma_is_what_gains_can_reach_and_none_can_beat():
-    """Against a search for the least worst gain over two numbers."""
-    given = two_states()
-    start = observer(given, 0.6).gain
-    searched = scipy.optimize.minimize(
-        lambda k: worst(given, k.reshape(2, 1)), start.ravel(), method="Nelder-Mead",
-        options={"xatol": 1e-5, "fatol": 1e-8, "maxfev": 300},
-    )  # fmt: skip
-    assert searched.fun == pytest.approx(least_gamma(given), rel=1e-3)
-    assert searched.fun > least_gamma(given) * (1.0 - 1e-6)
-
-
-def test_least_gamma_of_a_plant_that_shows_the_error_is_zero():
-    """The rate error moves what the star sensor measures: K = (1, 0) takes it out whole."""
-    assert least_gamma(attitude_axis()) == 0.0
-    assert least_gamma(quaternion()) == pytest.approx(0.5, rel=1e-7)  # b: seen a step too late
-
-
-@pytest.mark.parametrize("columns", [0, 1])
-def test_a_plant_without_a_modelling_error_meets_any_gamma(columns):
-    given = two_states()._replace(Bn=np.zeros((2, columns)), Dn=np.zeros((1, columns)))
-    assert least_gamma(given) == 0.0
-    assert observer(given, 1e-3).hinf == 0.0
-    assert observer(given, 1e-3).h2 == pytest.approx(0.6571125579, rel=1e-8)
-
-
-def test_least_gamma_follows_the_units():
-    given = two_states()
-    small = given._replace(L=1e-5 * given.L, Bn=1e-3 * given.Bn)
-    assert least_gamma(small) == pytest.approx(1e-8 * 0.594542, rel=1e-5)
-
-
 def test_out_of_reach_and_bad_arguments():
-    with pytest.raises(Unreachable, match=r"gamma 0\.5 is out of reach.*slack.*0\.594542"):
+    with pytest.raises(Unreachable, match=r"gamma 0\.5 is below the least .* 0\.594542"):
         retuned(two_states(), 0.5)
     with pytest.raises(ValueError, match="gamma must be positive"):
         retuned(two_states(), 0.0)
-    with pytest.raises(ValueError, match=r"spectral radius 1\b.*observer form"):
-        least_gamma(attitude_axis(), "full")
     with pytest.raises(ValueError, match="form must be"):
         search.check_form("full")

@@ -16,6 +16,7 @@ from robins.filters.synthesis.design import (
 )
 from robins.filters.synthesis.every_step import EveryStep, FrozenTimeWarning
 from robins.filters.synthesis.full_order import full
+from robins.filters.synthesis.least import LeastGamma, least_gamma
 from robins.filters.synthesis.lmi import observer
 from robins.filters.synthesis.norms import h2_norm, hinf_norm, peak_gain, spectral_radius
 from robins.filters.synthesis.plant import (
@@ -33,7 +34,7 @@ from robins.filters.synthesis.riccati import (
     least_riccati_gamma,
     riccati,
 )
-from robins.filters.synthesis.search import least_gamma, retuned
+from robins.filters.synthesis.search import retuned
 from robins.filters.synthesis.trade_off import METHODS, Outcome, TradeOff, trade_off
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "EveryStep",
     "FrozenTimeWarning",
     "Isotropic",
+    "LeastGamma",
     "MissingExtra",
     "NotCertified",
     "Outcome",

@@ -11,16 +11,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from robins.filters.synthesis.design import Design, NotCertified, Unreachable
+from robins.filters.synthesis.design import Design, NotCertified
 from robins.filters.synthesis.inequalities import Aim
+from robins.filters.synthesis.least import least_gamma
 from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
 from robins.filters.synthesis.programs import Answer, Form, solve
 from robins.filters.synthesis.scaling import Scales, balanced
-
-_REFINED = 4  # solves for the least gamma, each to a thousandth of the one before
-_NOTHING = 1e-6  # of the unit of gamma: no longer told from zero
-_NEAR = 1e-5  # relative distance of gamma to the least at which a design may fail
 
 
 def attempt(
@@ -40,7 +37,7 @@ def attempt(
         certified: makes the design of an answer in scaled units.
 
     Raises:
-        Unreachable: gamma is below the least one; the message and `least` tell that.
+        Unreachable: it is proved that no filter meets gamma (`robins.filters.synthesis.least`).
         NotCertified: no answer passed; the message tells each status and the test it failed.
     """
     told: list[str] = []
@@ -53,48 +50,12 @@ def attempt(
             return certified(answer, scales)
         except NotCertified as error:
             told.append(str(error))
+    failed = f"no design by the {form} form of the LMI; " + "; then ".join(told)
     if aim == "mixed":
-        least = least_gain(plant, form)
-        if gamma <= least * (1.0 + _NEAR):
-            raise Unreachable(
-                f"gamma {gamma:.9g} is out of reach: the least one that the {form} form of the LMI "
-                f"can meet is {least:.9g}",
-                least,
-            )
-    raise NotCertified(f"no design by the {form} form of the LMI; " + "; then ".join(told))
-
-
-def least_gain(plant: Plant, form: Form) -> float:
-    """Least gamma that inequalities can meet, by a program that minimises its square.
-
-    The solver is exact to some 1e-9 of what is one in its units, so the answer becomes the unit and
-    the program is solved again while it is far below.
-
-    Returns:
-        The least gamma; 0 where it is below a millionth of what the plant's n is to its z.
-
-    Raises:
-        NotCertified: the solver found none.
-    """
-    if not plant.Bn.any() and not plant.Dn.any():
-        return 0.0
-    scales = balanced(plant)
-    unit = scales.hinf(1.0)
-    least = np.inf
-    for _ in range(_REFINED):
-        answer = solve(scales.plant(plant), form, "least")
-        if not answer.unknowns:
-            if np.isfinite(least):
-                break
-            raise NotCertified(f"the least gamma was not found; the solver said {answer.status!r}")
-        share = float(np.sqrt(max(answer.value, 0.0)))
-        least = scales.hinf(share)
-        if least < _NOTHING * unit:
-            return 0.0
-        if share > 0.5:
-            break
-        scales = balanced(plant, least)
-    return least
+        least = least_gamma(plant)
+        least.refuse(gamma)
+        failed += f". No proof that gamma is out of reach: a gain has {least.reached:.6g}"
+    raise NotCertified(failed)
 
 
 def _scalings(plant: Plant, gamma: Number) -> Iterator[Scales]:

@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-Aim = Literal["h2", "mixed", "least"]
-"""Least Trace(H) for w alone, least Trace(H) with a gain of at most 1 from n, least gain from n."""
+Aim = Literal["h2", "mixed"]
+"""Least Trace(H) for w alone, or with a gain of at most 1 from n."""
 
 Inequalities = tuple[dict[str, Any], list[Any]]
 
@@ -23,16 +23,9 @@ def common(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
     """(9) and (10): one Lyapunov matrix X for both channels; K = X^-1 Y."""
     X = cp.Variable(plant["A"].shape, symmetric=True, name="X")
     Y = cp.Variable(plant["C"].T.shape, name="Y")
-    unknowns, noise, error = {"X": X, "Y": Y}, [], []
-    if aim != "least":
-        unknowns["H"] = _trace_matrix(cp, plant)
-        noise = [_noise(cp, plant, unknowns["H"], X, X, Y)]
-    if aim == "h2":
-        noise += [_energy(cp, plant, X, X, X, Y)]
-    else:
-        unknowns |= _bound(cp, aim)
-        error = [_gain(cp, plant, unknowns.get("g2", 1.0), X, X, X, Y)]
-    return unknowns, noise + error
+    H = _trace_matrix(cp, plant)
+    error = (_energy if aim == "h2" else _gain)(cp, plant, X, X, X, Y)
+    return {"X": X, "Y": Y, "H": H}, [_noise(cp, plant, H, X, X, Y), error]
 
 
 def slack(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
@@ -40,50 +33,41 @@ def slack(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
     A = plant["A"]
     G = cp.Variable(A.shape, name="G")
     Y = cp.Variable(plant["C"].T.shape, name="Y")
-    unknowns, noise, error = {"G": G, "Y": Y}, [], []
-    if aim != "least":
-        H, X2 = _trace_matrix(cp, plant), cp.Variable(A.shape, symmetric=True, name="X2")
-        unknowns |= {"H": H, "X2": X2}
-        corner = G + G.T - X2
-        noise = [_noise(cp, plant, H, corner, G, Y), _energy(cp, plant, corner, X2, G, Y)]
-    if aim != "h2":
-        Xi = cp.Variable(A.shape, symmetric=True, name="Xi")
-        unknowns |= {"Xi": Xi} | _bound(cp, aim)
-        error = [_gain(cp, plant, unknowns.get("g2", 1.0), G + G.T - Xi, Xi, G, Y)]
-    return unknowns, noise + error
+    H, X2 = _trace_matrix(cp, plant), cp.Variable(A.shape, symmetric=True, name="X2")
+    unknowns, corner = {"G": G, "Y": Y, "H": H, "X2": X2}, G + G.T - X2
+    matrices = [_noise(cp, plant, H, corner, G, Y), _energy(cp, plant, corner, X2, G, Y)]
+    if aim == "mixed":
+        Xi = unknowns["Xi"] = cp.Variable(A.shape, symmetric=True, name="Xi")
+        matrices.append(_gain(cp, plant, G + G.T - Xi, Xi, G, Y))
+    return unknowns, matrices
 
 
 def full(cp: Any, plant: dict[str, Any], aim: Aim) -> Inequalities:
-    """(6) and (7): a filter with matrices of its own, which (8) makes of R, P, S, Q and U."""
+    """(6) and (7): a filter with matrices of its own, which (8) makes of R, P, S, Q and U.
+
+    It has no H2 form of its own: the aim is always "mixed".
+    """
     A, Bw, Bn, C, Dw, Dn, L = (plant[name] for name in ("A", "Bw", "Bn", "C", "Dw", "Dn", "L"))
     R, P = (cp.Variable(A.shape, symmetric=True, name=name) for name in "RP")
     S, Q = cp.Variable(A.shape, name="S"), cp.Variable(C.T.shape, name="Q")
-    U = cp.Variable(L.shape, name="U")
-    unknowns, moved = {"R": R, "P": P, "S": S, "Q": Q, "U": U} | _bound(cp, aim), P @ A + Q @ C
+    U, H, moved = cp.Variable(L.shape, name="U"), _trace_matrix(cp, plant), P @ A + Q @ C
     error = _symmetric(
         cp,
         [R, R, R @ A, R @ A, R @ Bn, 0],
         [P, moved + S, moved, P @ Bn + Q @ Dn, 0],
         [R, R, 0, (L - U).T],
         [P, 0, L.T],
-        [unknowns.get("g2", 1.0) * np.eye(Bn.shape[1]), 0],
+        [np.eye(Bn.shape[1]), 0],
         [np.eye(L.shape[0])],
     )
-    if aim == "least":
-        return unknowns, [error]
-    H = unknowns["H"] = _trace_matrix(cp, plant)
-    return unknowns, [_symmetric(cp, [H, (R @ Bw).T, (P @ Bw + Q @ Dw).T], [R, R], [P]), error]
+    noise = _symmetric(cp, [H, (R @ Bw).T, (P @ Bw + Q @ Dw).T], [R, R], [P])
+    return {"R": R, "P": P, "S": S, "Q": Q, "U": U, "H": H}, [noise, error]
 
 
 def _trace_matrix(cp: Any, plant: dict[str, Any]) -> Any:
     """H, whose trace bounds the squared H2 norm."""
     p = plant["Bw"].shape[1]
     return cp.Variable((p, p), symmetric=True, name="H")
-
-
-def _bound(cp: Any, aim: Aim) -> dict[str, Any]:
-    """The squared gain from n, where it is sought."""
-    return {"g2": cp.Variable(name="g2")} if aim == "least" else {}
 
 
 def _noise(cp: Any, plant: dict[str, Any], H: Any, corner: Any, X: Any, Y: Any) -> Any:
@@ -99,7 +83,7 @@ def _energy(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any)
     )
 
 
-def _gain(cp: Any, plant: dict[str, Any], g2: Any, corner: Any, X: Any, G: Any, Y: Any) -> Any:
+def _gain(cp: Any, plant: dict[str, Any], corner: Any, X: Any, G: Any, Y: Any) -> Any:
     """(10)."""
     L, Bn = plant["L"], plant["Bn"]
     error, disturbed = G @ plant["A"] - Y @ plant["C"], G @ Bn - Y @ plant["Dn"]
@@ -107,7 +91,7 @@ def _gain(cp: Any, plant: dict[str, Any], g2: Any, corner: Any, X: Any, G: Any, 
         cp,
         [corner, error, disturbed, 0],
         [X, 0, L.T],
-        [g2 * np.eye(Bn.shape[1]), 0],
+        [np.eye(Bn.shape[1]), 0],
         [np.eye(L.shape[0])],
     )
 

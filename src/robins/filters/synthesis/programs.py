@@ -35,7 +35,7 @@ class Answer(NamedTuple):
     """What a solver returned; nothing of it is checked."""
 
     status: str  # the solver's own word
-    value: float  # Trace(H), or the least squared gain; nan without a solution
+    value: float  # Trace(H); nan without a solution
     unknowns: dict[str, np.ndarray]  # by the symbols of the equations; empty without a solution
 
 
@@ -85,7 +85,7 @@ def build(form: Form, aim: Aim, n: int, p: int, q: int, m: int, r: int) -> Progr
     sizes |= {"Dw": (m, p), "Dn": (m, q), "L": (r, n)}
     parameters = {name: cp.Parameter(size, name=name) for name, size in sizes.items()}
     unknowns, matrices = getattr(inequalities, form)(cp, parameters, aim)
-    cost = unknowns["g2"] if aim == "least" else cp.trace(unknowns["H"])
+    cost = cp.trace(unknowns["H"])
     problem = cp.Problem(cp.Minimize(cost), [matrix >> 0 for matrix in matrices])
     used = {p.name() for p in problem.parameters()}
     return Program(problem, {k: v for k, v in parameters.items() if k in used}, unknowns)

@@ -1,4 +1,4 @@
-"""What the proof of an LMI costs, taken back; and the least gamma that there is."""
+"""What the proof of an LMI costs, taken back."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import time
 import numpy as np
 import scipy.optimize
 
-from robins.filters.synthesis.attempts import least_gain
 from robins.filters.synthesis.design import Design, certify
-from robins.filters.synthesis.full_order import refuse_unstable
 from robins.filters.synthesis.lmi import ObserverForm, check_form, observer
 from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
-from robins.filters.synthesis.programs import Form
 from robins.filters.synthesis.riccati import check_gamma
 
 _WIDER = 1.5  # factor of gamma' from one trial to the next
@@ -60,28 +57,6 @@ def retuned(plant: Plant, gamma: Number, form: ObserverForm = "slack") -> Design
         status=f"{best.status} at gamma' = {best.gamma:.7g}",
         seconds=time.perf_counter() - began,
     )
-
-
-def least_gamma(plant: Plant, form: Form = "common") -> float:
-    """Least gamma that a form of the LMI can meet, by the program that minimises gamma^2.
-
-    All forms agree where they apply: it is the least H-infinity norm that any gain reaches. It is 0
-    where a measurement shows the whole error that n causes.
-
-    Args:
-        plant: what is filtered.
-        form: "common", "slack" or "full".
-
-    Raises:
-        ValueError: the form is not known, or it is "full" and A is not stable.
-        NotCertified: the solver gave no answer.
-        MissingExtra: cvxpy or Clarabel is not installed.
-    """
-    if form == "full":
-        refuse_unstable(plant)
-    else:
-        check_form(form)
-    return least_gain(plant, form)
 
 
 def _search(plant: Plant, gamma: float, form: ObserverForm, tried: list[Design]) -> None:

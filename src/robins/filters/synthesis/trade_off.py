@@ -10,15 +10,11 @@ import numpy as np
 from robins.filters.synthesis import full_order, lmi, search
 from robins.filters.synthesis.closed_form import closed_form, isotropic
 from robins.filters.synthesis.design import Design, NotCertified, Unreachable
+from robins.filters.synthesis.least import LeastGamma, least_gamma
 from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
 from robins.filters.synthesis.programs import MissingExtra, packages
-from robins.filters.synthesis.riccati import (
-    check_gamma,
-    kalman_design,
-    least_riccati_gamma,
-    riccati,
-)
+from robins.filters.synthesis.riccati import check_gamma, kalman_design, riccati
 
 _DESIGNERS: dict[str, Callable[[Plant, float], Design]] = {
     "riccati": riccati,
@@ -51,8 +47,7 @@ class TradeOff(NamedTuple):
     """All methods over all gammas."""
 
     kalman: Design  # no bound at all
-    least: float  # H-infinity norm that any gain can have, or of any lambda where `by_lmi` is false
-    by_lmi: bool
+    least: LeastGamma  # `reached` counts the designs of `outcomes` in
     gammas: tuple[float, ...]  # falling
     outcomes: list[Outcome]  # every method for the first gamma, then for the next
     left_out: dict[str, str]  # methods that do not apply, and why
@@ -82,7 +77,7 @@ def trade_off(
         progress: called with done, total and a word on what is done.
 
     Raises:
-        Unreachable: every gamma is below the least one, which the message names.
+        Unreachable: it is proved that no filter meets any of the gammas.
         ValueError: a gamma is not positive or finite, a method is not known, or the plant has no
             steady Kalman filter.
     """
@@ -96,17 +91,12 @@ def trade_off(
     tell(0, 1, "least gamma")
     kalman = kalman_design(plant)
     left_out = {name: why for name in methods if (why := _why_not(plant, name))}
-    least, by_lmi = _least(plant)
+    least = least_gamma(plant)
     if gammas is None:
-        chosen = _range(least, kalman.hinf)
+        chosen = _range(least.reached, kalman.hinf)
     else:
         chosen = tuple(sorted({float(gamma) for gamma in gammas}, reverse=True))
-        if by_lmi and chosen and chosen[0] < least:
-            raise Unreachable(
-                f"gamma {chosen[0]:.6g} is below the least that any gain can have, {least:.6g}: "
-                "ask for more",
-                least,
-            )
+        least.refuse(max(chosen, default=np.inf))
     used = [name for name in METHODS if name in methods and name not in left_out]
     outcomes: list[Outcome] = []
     total = len(chosen) * len(used)
@@ -114,7 +104,9 @@ def trade_off(
         for name in used:
             tell(len(outcomes), total, f"{name}, gamma {gamma:.4g}")
             outcomes.append(_outcome(plant, gamma, name))
-    return TradeOff(kalman, least, by_lmi, chosen, outcomes, left_out)
+            if (made := outcomes[-1].design) is not None:
+                least = least.with_(made)
+    return TradeOff(kalman, least, chosen, outcomes, left_out)
 
 
 def _outcome(plant: Plant, gamma: float, name: str) -> Outcome:
@@ -138,13 +130,6 @@ def _why_not(plant: Plant, name: str) -> str:
     except (ValueError, MissingExtra) as error:
         return str(error)
     return ""
-
-
-def _least(plant: Plant) -> tuple[float, bool]:
-    try:
-        return search.least_gamma(plant), True
-    except (MissingExtra, NotCertified):
-        return least_riccati_gamma(plant), False
 
 
 def _range(least: float, own: float) -> tuple[float, ...]:

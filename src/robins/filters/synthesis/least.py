@@ -1,0 +1,153 @@
+"""The least gain from n to the error: below it no filter can get, and a gain that gets there.
+
+Both come from the Riccati recursion of the game in which n is played against the estimate (Hassibi,
+Sayed & Kailath, *Indefinite-Quadratic Estimation and Control*, SIAM 1999, ch. 4), from P = 0:
+
+    P~ = P + P L' (g^2 I - L P L')^-1 L P,
+    P <- (A - K C) P~ (A - K C)' + (Bn - K Dn)(Bn - K Dn)',  K = (A P~ C' + Bn Dn') R^-1,
+    R = C P~ C' + Dn Dn'.
+
+e' P^-1 e is the least energy, less what the error has already cost, with which n makes the error e
+while y shows nothing. So if L P L' reaches g^2 at some step, no causal filter, linear or not, has a
+gain below g: that is the proof. If it never does, the K of some step may be a gain that has less,
+and its true norms decide. Factors of P are propagated, P = S S', and nothing is subtracted. A plant
+whose modes grow without being driven by n may have a greater least gain than is proved.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.filters.synthesis.design import Design, NotCertified, Unreachable, certify
+from robins.filters.synthesis.norms import Number
+from robins.filters.synthesis.plant import Plant
+from robins.filters.synthesis.riccati import kalman_design
+from robins.filters.synthesis.scaling import balanced
+
+_STEPS = 1000  # of a proof at most
+_TRIAL = 200  # of the recursion that only looks for a gain
+_SETTLED = 1e-13  # relative growth of P in a step at which the recursion ends
+_NOTHING = 1e-6  # of the unit of gamma: no longer told from zero
+_RTOL = 1e-7  # to which the gamma that is refuted is found
+_REACHED = 1e-5  # relative distance to it at which a gain is good enough
+_ROUGHLY = 1e-3  # to which others are
+_NOISES = (0.0, *(10.0**k for k in range(-9, 0, 2)))  # share of w added to n, that gains are stable
+_UNSEEN = 1e-14  # relative singular value below which y shows nothing
+
+
+class LeastGamma(NamedTuple):
+    """Between what two numbers the least gamma lies, and why."""
+
+    proved: float  # no causal filter has less than this
+    step: int  # of the recursion that proves it; 0 where nothing is proved
+    reached: float  # the H-infinity norm of `design`; 0 where it is next to nothing
+    design: Design  # certified
+
+    def refuse(self, gamma: Number) -> None:
+        """Raise Unreachable if it is proved that no filter meets gamma."""
+        if gamma < self.proved:
+            raise Unreachable(
+                f"gamma {gamma:.6g} is below the least that any gain can have, {self.proved:.6g} "
+                f"(below it the Riccati recursion of the game ends at step {self.step}); a gain "
+                f"with {self.reached:.6g} was found: ask for more",
+                self.reached,
+            )
+
+    def with_(self, design: Design) -> LeastGamma:
+        """The same, knowing of one more certified design."""
+        if design.hinf >= self.reached:
+            return self
+        return self._replace(reached=design.hinf, design=design)
+
+    @property
+    def exact(self) -> bool:
+        """Whether the two numbers are one, to three digits."""
+        return self.reached <= self.proved * (1.0 + 1e-3)
+
+
+def least_gamma(plant: Plant) -> LeastGamma:
+    """The least H-infinity norm that any gain reaches, proved from below and reached from above.
+
+    No solver is asked. The proof is good to the rounding of the plant's numbers.
+
+    Args:
+        plant: what is filtered.
+
+    Raises:
+        ValueError: the plant has no steady Kalman filter.
+        NotCertified: the norms of the Kalman filter cannot be computed.
+    """
+    best = kalman_design(plant)
+    scales = balanced(plant)
+    scaled, unit = scales.plant(plant), scales.hinf(1.0)
+    low, above, step = _edge(scaled, _NOTHING, best.hinf / unit)
+    enough = max(low * (1.0 + _REACHED), _NOTHING) * unit
+    for noise in _NOISES:
+        if noise:
+            _, above, _ = _edge(scaled, max(low, _NOTHING), best.hinf / unit, noise)
+        for gamma in (above * (1.0 + _RTOL), 1.01 * above, np.inf):
+            if best.hinf <= enough:
+                break
+            K, failed = _play(scaled, gamma, noise)
+            if failed:
+                continue
+            try:
+                found = certify(plant, scales.gain(K), method="game")
+            except (NotCertified, ValueError, np.linalg.LinAlgError):
+                continue
+            best = min(best, found, key=lambda design: design.hinf)
+    reached = best.hinf if best.hinf > _NOTHING * unit else 0.0
+    return LeastGamma(min(low * unit, reached), step, reached, best)
+
+
+def _edge(plant: Plant, low: float, high: float, noise: float = 0.0) -> tuple[float, float, int]:
+    """The greatest gamma at which the game is seen to end, the least at which not, and the step.
+
+    The first is 0 where it does not end at `low`.
+    """
+    step = _play(plant, low, noise)[1] if low < high else 0
+    if not step:
+        return 0.0, low, 0
+    rtol = _ROUGHLY if noise else _RTOL
+    while high > low * (1.0 + rtol):
+        middle = float(np.sqrt(low * high))
+        if failed := _play(plant, middle, noise)[1]:
+            low, step = middle, failed
+        else:
+            high = middle
+    return low, high, step
+
+
+def _play(plant: Plant, gamma: float, noise: float = 0.0) -> tuple[np.ndarray, int]:
+    """The last gain of the recursion, and the step at which L P L' reached gamma^2, or 0."""
+    B = np.hstack([plant.Bn, noise * plant.Bw])
+    D = np.hstack([plant.Dn, noise * plant.Dw])
+    n = len(plant.A)
+    S, K = np.zeros((n, n)), np.zeros((n, len(plant.C)))
+    for step in range(1, (_TRIAL if noise else _STEPS) + 1):
+        _, size, axes = np.linalg.svd(plant.L @ S)
+        share = np.zeros(n)
+        share[: len(size)] = size / gamma
+        if share.max(initial=0.0) >= 1.0:
+            return K, step
+        played = S @ axes.T / np.sqrt(1.0 - share**2)
+        seen, moved = np.hstack([plant.C @ played, D]), np.hstack([plant.A @ played, B])
+        left, size, axes = np.linalg.svd(seen)
+        rank = int(np.sum(size > _UNSEEN * size.max(initial=0.0)))
+        K = moved @ axes[:rank].T / size[:rank] @ left[:, :rank].T
+        before, S = S, _square(moved @ axes[rank:].T)
+        power = np.sum(S**2, axis=1)
+        if np.all(power - np.sum(before**2, axis=1) <= _SETTLED * power):
+            break
+    return K, 0
+
+
+def _square(S: np.ndarray) -> np.ndarray:
+    """A square factor of S S'."""
+    n = len(S)
+    square = np.zeros((n, n))
+    lower = np.asarray(np.linalg.qr(S.T, mode="r")).T
+    square[:, : lower.shape[1]] = lower
+    return square
