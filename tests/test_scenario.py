@@ -216,11 +216,26 @@ def test_a_bound_of_another_kind_is_a_fault_of_the_program(bound):
         ("runs = 3.0\n" + GOOD, "runs = 3.0: should be a valid integer"),
         ("name = 3\n" + GOOD, "name = 3: should be a valid string"),
         # negative and otherwise out of bounds
-        ('[imu]\nrate = "-100 Hz"', 'imu.rate = "-100 Hz": must be above 0 Hz'),
-        ('[imu]\nrate = "0 Hz"', 'imu.rate = "0 Hz": must be above 0 Hz'),
-        ('[imu]\nrate = "1001 Hz"', 'imu.rate = "1001 Hz": must be at most 1 kHz'),
-        ('heights = ["-501 m"]\n' + GOOD, 'heights.0 = "-501 m": must be at least -500 m'),
-        ('heights = ["500 km"]\n' + GOOD, 'heights.0 = "500 km": must be below 500 km'),
+        ('[imu]\nrate = "-100 Hz"', 'imu.rate = "-100 Hz": must be above 0 Hz and at most 1 kHz'),
+        ('[imu]\nrate = "0 Hz"', 'imu.rate = "0 Hz": must be above 0 Hz and at most 1 kHz'),
+        ('[imu]\nrate = "1001 Hz"', 'imu.rate = "1001 Hz": must be at most 1 kHz and above 0 Hz'),
+        (
+            'heights = ["-501 m"]\n' + GOOD,
+            'heights.0 = "-501 m": must be at least -500 m and below 500 km',
+        ),
+        (
+            'heights = ["500 km"]\n' + GOOD,
+            'heights.0 = "500 km": must be below 500 km and at least -500 m',
+        ),
+        # beyond the range of the kind, where a side has no bound of its own
+        (
+            GOOD + 'markov = "1e6 d"',
+            'imu.markov = "1e6 d": must be at most 3650 d and above 0 s',
+        ),
+        (
+            GOOD + 'gyro_bias = "-1e9 deg/h"',
+            'imu.gyro_bias = "-1e9 deg/h": must be at least -100000 deg/s and at most 100000 deg/s',
+        ),
         # no such choice, no table, no list
         (
             'form = "josef"\n' + GOOD,

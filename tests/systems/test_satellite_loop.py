@@ -109,7 +109,7 @@ def test_a_lost_wheel(mekf):
     ("settings", "words"),
     [
         (('star.period="0.25 s"',), "must be a multiple of step"),
-        (('counted_from="1500 s"',), "must be before the end at 1500 s"),
+        (('counted_from="1500 s"',), "leaves nothing to count of a run of 1500 s"),
         (("wheels.lost=[4]",), "there is no wheel 4, only 0 to 3"),
         (('wheels.start="0.2 N m s"',), "is beyond what a wheel holds, 0.1 N m s"),
         (("wheels.axes=[[0,0,0]]",), "wheel 0 has none"),

@@ -20,14 +20,19 @@ with a scenario is one `ScenarioError` with one line a fault: path, value, what 
 
 from robins.scenario.errors import ScenarioError
 from robins.scenario.parameters import Parameters, Quantity, default
+from robins.scenario.ranges import Dof, Entry, Positive, Share
 from robins.scenario.reading import load, parse, validate
 from robins.scenario.span import Span
 from robins.scenario.text import hash_of, mapping_of, override, read_text, text_of
 
 __all__ = [
+    "Dof",
+    "Entry",
     "Parameters",
+    "Positive",
     "Quantity",
     "ScenarioError",
+    "Share",
     "Span",
     "default",
     "hash_of",

@@ -66,6 +66,7 @@ _WORDS = {
     "dict_type": _TABLE,
     "tuple_type": _LIST,
     "list_type": _LIST,
+    "too_short": "should hold {min_length} or more",
     "union_tag_not_found": "{discriminator} is required, but not given",
     "union_tag_invalid": "{discriminator} should be one of {expected_tags}",
 }

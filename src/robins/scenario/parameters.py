@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, get_args, get_origin
 
@@ -9,6 +11,7 @@ import pydantic
 from pydantic_core import core_schema
 
 from robins import units
+from robins.scenario import ranges
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,8 @@ class Quantity:
     """Marks a float, or a tuple of floats, as a quantity of a kind: text with a unit, kept as SI.
 
     Bounds are texts too: ``above`` and ``below`` exclude the bound, ``least`` and ``most`` include
-    it. On a tuple of fixed length each item is a quantity, and one serves for all.
+    it. A side without one has that of the kind, `robins.scenario.ranges`. On a tuple of fixed
+    length each item is a quantity, and one serves for all.
 
     Raises:
         KeyError: unknown kind.
@@ -31,9 +35,17 @@ class Quantity:
 
     def __post_init__(self):
         units.KINDS[self.kind]
-        for bound in (self.above, self.least, self.below, self.most):
-            if bound is not None:
-                units.parse(bound, self.kind)
+        for _, bound, _ in self._bounds():
+            units.parse(bound, self.kind)
+
+    def _bounds(self) -> list[tuple[str, str, Callable[[float, float], bool]]]:
+        """The lower bound, then the upper: its word, its text, and how it is kept."""
+        low = ("at least", self.least or ranges.LEAST[self.kind], operator.ge)
+        high = ("at most", self.most or ranges.MOST[self.kind], operator.le)
+        return [
+            low if self.above is None else ("above", self.above, operator.gt),
+            high if self.below is None else ("below", self.below, operator.lt),
+        ]
 
     def read(self, value: Any, *, unit_needed: bool = True) -> float:
         """SI value of a text; of a plain number too, taken as SI, where no unit is needed.
@@ -43,14 +55,10 @@ class Quantity:
         """
         plain = not unit_needed and not isinstance(value, str)
         si = units.parse(value, "ratio" if plain else self.kind)
-        for bound, word, kept in (
-            (self.above, "above", lambda b: si > b),
-            (self.least, "at least", lambda b: si >= b),
-            (self.below, "below", lambda b: si < b),
-            (self.most, "at most", lambda b: si <= b),
-        ):
-            if bound is not None and not kept(units.parse(bound, self.kind)):
-                raise units.UnitError(f"must be {word} {bound}")
+        low, high = self._bounds()
+        for (word, bound, kept), (other, end, _) in ((low, high), (high, low)):
+            if not kept(si, units.parse(bound, self.kind)):
+                raise units.UnitError(f"must be {word} {bound} and {other} {end}")
         return si
 
     def __get_pydantic_core_schema__(self, source: Any, handler: pydantic.GetCoreSchemaHandler):

@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import pydantic
 import xarray as xr
 from jaxtyping import Array
 
 from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
 from robins.scenario import Parameters
+from robins.systems.limits import Names, Runs
 
 Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
 
@@ -187,8 +187,8 @@ class Outcome:
 class Scenario(Parameters):
     """What every simulated scenario says; a study adds its own, and `study`, its name."""
 
-    runs: Annotated[int, pydantic.Field(ge=1)] = 50
-    filters: tuple[str, ...] = ()
+    runs: Runs = 50
+    filters: Names = ()
 
 
 class Study(NamedTuple):

@@ -74,10 +74,10 @@ class Setup(Parameters):
     clock: Clock = "lockstep"
     rate: Annotated[float, Quantity("frequency", above="0 Hz")] | None = None
     overrun: Literal["continue", "skip", "abort"] = "continue"
-    patience: Annotated[float, pydantic.Field(gt=0.0)] = 1.0
+    patience: Annotated[float, pydantic.Field(gt=0.0, le=1e6)] = 1.0
     on_death: Literal["fail", "restart"] = "fail"
     fifo: bool = False  # ask for the scheduler SCHED_FIFO
-    baud: Annotated[int, pydantic.Field(ge=300)] | None = None
+    baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
     table: Carrier | None = None
     ports: dict[str, str] = pydantic.Field(default_factory=dict)
     faults: tuple[LinkFault, ...] = ()

@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, Span, default
+from robins.scenario import Parameters, Quantity, Share, Span, default
+from robins.systems.limits import Names, Runs, refuse_too_long
 from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
@@ -32,8 +33,12 @@ class Hull(Parameters):
     course: Annotated[float, Quantity("angle")] = default("90 deg")
     response: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
     # amplitudes of roll, pitch and heading, and the periods of their sines
-    sway_calm: Annotated[Three, Quantity("angle", least="0 deg")] = default("0.3 deg")
-    sway_gust: Annotated[Three, Quantity("angle", least="0 deg")] = default("2.3 deg")
+    sway_calm: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0.3 deg"
+    )
+    sway_gust: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "2.3 deg"
+    )
     sway_period: Annotated[Three, Quantity("time", above="0 s")] = default("60 s")
 
 
@@ -77,7 +82,7 @@ class Wind(Parameters):
 class Imu(Parameters):
     """The inertial unit; biases are constant in a run."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("100 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("100 Hz")
     gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")] = default("0.1 deg/h")
     gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
         "0.01 deg/sqrt(h)"
@@ -88,24 +93,24 @@ class Imu(Parameters):
     )
     draw: Draw = "random-sign"  # of the biases
     # share of the acceleration by gusts that the accelerometers do not feel
-    unsensed: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.0
+    unsensed: Share = 0.0
 
 
 class Sar(Parameters):
     """Horizontal position and heading from a radar image matched with a map."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
     position: Annotated[float, Quantity("length", above="0 m")] = default("25 m")  # each axis
-    heading: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
-    outlier_share: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.0
-    outlier_factor: Annotated[float, pydantic.Field(ge=1.0)] = 5.0
+    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
+    outlier_share: Share = 0.0
+    outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 5.0
     lost: tuple[Span, ...] = ()
 
 
 class Barometer(Parameters):
     """Height from static pressure."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
     height: Annotated[float, Quantity("length", above="0 m")] = default("20 m")
     lost: tuple[Span, ...] = ()
 
@@ -113,15 +118,17 @@ class Barometer(Parameters):
 class Star(Parameters):
     """Pitch, roll and heading from stars, once an epoch or several times."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("2 Hz")
-    attitude: Annotated[float, Quantity("angle", above="0 arcsec")] = default("20 arcsec")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("2 Hz")
+    attitude: Annotated[float, Quantity("angle", above="0 arcsec", most="180 deg")] = default(
+        "20 arcsec"
+    )
     lost: tuple[Span, ...] = ()
 
 
 class AirData(Parameters):
     """Velocity through the air, and what is thought to be the wind: both err."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
     noise: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")  # each axis
     wind_error: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")
     wind_time: Annotated[float, Quantity("time", above="0 s")] = default("50 s")
@@ -131,7 +138,7 @@ class AirData(Parameters):
 class Start(Parameters):
     """What is not known at the start, in north, east, down; one standard deviation."""
 
-    attitude: Annotated[Three, Quantity("angle", least="0 deg")]
+    attitude: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
     velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0.1 m/s")
     position: Annotated[Three, Quantity("length", least="0 m")]
     draw: Draw = "plus-sigma"
@@ -150,7 +157,7 @@ class Believed(Parameters):
     accel_noise: Annotated[float, Quantity("velocity random walk", above="0 m/s/sqrt(s)")] = (
         default("0.07 m/s/sqrt(s)")
     )
-    accel_noise_factor: Annotated[float, pydantic.Field(ge=1.0)] = 1.0
+    accel_noise_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 1.0
 
 
 FILTERS = (
@@ -174,8 +181,8 @@ class Airship(Scenario, Parameters):
 
     system: Literal["airship"] = "airship"
     title: str = "Airship in the wind"
-    runs: Annotated[int, pydantic.Field(ge=1)] = 20
-    filters: tuple[str, ...] = COMPARED
+    runs: Runs = 20
+    filters: Names = COMPARED
     claims: tuple[str, ...] = ()  # ids of those the scenario checks
     duration: Annotated[float, Quantity("time", above="0 s")] = default("1000 s")
     epoch: Annotated[float, Quantity("time", above="0 s")] = default("1 s")  # step of the filters
@@ -193,7 +200,10 @@ class Airship(Scenario, Parameters):
 
     @pydantic.model_validator(mode="after")
     def _rates_fit(self) -> Airship:
-        """All that is measured falls on epochs, or on even parts of one."""
+        """All that is measured falls on epochs, or on even parts of one; all of it fits."""
+        refuse_too_long("imu.rate", self.duration, self.imu.rate)
+        if self.wind.turbulence is not None:
+            refuse_too_long("wind.turbulence.step", self.duration, 1.0 / self.wind.turbulence.step)
         for name, among in (("imu", self.star.rate), ("star", 1.0 / self.epoch)):
             ratio = getattr(self, name).rate / among
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:

@@ -47,6 +47,7 @@ from robins.systems.ins_gnss.setup import (
     sigma_of,
     state_blocks,
 )
+from robins.systems.limits import refuse_unsettled
 from robins.systems.system import Case, Contender, Problem
 
 
@@ -264,6 +265,7 @@ def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:
     model = model_of(believed, drive.gnss, drive.aids)
     blocks = state_blocks(drive.imu.scale_states)
     count_from = int(np.searchsorted(course.blocks.epoch_s, drive.settle))
+    refuse_unsettled("settle", drive.settle, float(course.blocks.epoch_s[-1]) + 1e-9)
     return Problem(
         simulate=partial(_simulate, drive, course, seed),
         contenders={

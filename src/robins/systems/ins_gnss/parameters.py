@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Parameters, Positive, Quantity, default
+from robins.systems.limits import Names, refuse_too_long, refuse_unsettled
 from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
@@ -36,13 +37,14 @@ class Imu(Parameters):
 class Gnss(Parameters):
     """The receiver, its antenna and how far its stated sigmas are believed."""
 
-    lever_arm: Annotated[Three, Quantity("length")] = default("0 m")  # IMU to antenna, body
-    latency: Annotated[float, Quantity("time")] = default("0 s")
+    # IMU to antenna, body
+    lever_arm: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
+    latency: Annotated[float, Quantity("time", least="-10 s", most="10 s")] = default("0 s")
     use_velocity: bool = True
     # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix
     velocity_window: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
     # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
-    sigma_factor: dict[str, float] = pydantic.Field(default_factory=dict)
+    sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
     least_velocity_sigma: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")
 
@@ -50,8 +52,8 @@ class Gnss(Parameters):
 class Start(Parameters):
     """How well the start is known, and how the heading is found."""
 
-    tilt: Annotated[float, Quantity("angle", above="0 deg")] = default("2 deg")
-    heading: Annotated[float, Quantity("angle", above="0 deg")] = default("20 deg")
+    tilt: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("2 deg")
+    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("20 deg")
     velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.2 m/s")
     position: Annotated[float, Quantity("length", above="0 m")] = default("0.1 m")
     # heading of the body at the start; without it, the course once above the speed
@@ -72,7 +74,8 @@ class Aids(Parameters):
     quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.15 m/s^2")
     quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.5 deg/s")
     non_holonomic: bool = False
-    axle: Annotated[Three, Quantity("length")] = default("0 m")  # IMU to rear axle, body
+    # IMU to rear axle, body
+    axle: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
     road_velocity: Annotated[tuple[float, float], Quantity("speed", above="0 m/s")] = default(
         "0.1 m/s"
     )
@@ -94,7 +97,8 @@ class Update(Parameters):
     gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
     # an IMU gap longer than this is declared instead of bridged
     longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
-    gap_noise: Annotated[float, pydantic.Field(ge=1.0)] = 30.0  # process noise factor across one
+    # process noise factor across one
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
 class Replay(Parameters):
@@ -108,7 +112,7 @@ class Replay(Parameters):
     aids: Aids = pydantic.Field(default_factory=Aids)
     update: Update = pydantic.Field(default_factory=Update)
     outages: Outages | None = None
-    filters: tuple[str, ...] = ("ekf",)
+    filters: Names = ("ekf",)
 
 
 class Place(Parameters):
@@ -116,7 +120,7 @@ class Place(Parameters):
 
     latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
     longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
-    height: Annotated[float, Quantity("length")] = default("0 m")
+    height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
     heading: Annotated[float, Quantity("angle")] = default("0 deg")
 
 
@@ -126,15 +130,25 @@ class Leg(Parameters):
     do: Literal["stop", "straight", "accelerate", "turn", "climb"]
     seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
     speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
-    angle: Annotated[float, Quantity("angle")] | None = None  # positive to the right
+    # positive to the right
+    angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None
     rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
-    height: Annotated[float, Quantity("length")] | None = None  # gained
+    # gained
+    height: Annotated[float, Quantity("length", least="-100 km", most="100 km")] | None = None
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration as of `robins.sim.commands`; 0 for a leg that does not say it."""
+        if self.seconds is not None or self.angle is None or self.rate is None:
+            return self.seconds or 0.0
+        hold = abs(self.angle) / self.rate
+        return hold + min(hold, 1.0)  # a turn takes a second to ease in and out
 
 
 class Receiver(Gnss):
     """A simulated receiver; its sigmas are true, and what it states."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("1 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
     sigma: Annotated[Three, Quantity("length", above="0 m")]
     velocity_sigma: Annotated[Three, Quantity("speed", above="0 m/s")]
 
@@ -142,8 +156,8 @@ class Receiver(Gnss):
 class Believed(Parameters):
     """What the filters believe, over what is true; 1 is right, and anything else a test."""
 
-    q_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the process noise covariance
-    r_factor: Annotated[float, pydantic.Field(gt=0.0)] = 1.0  # of the fixes' covariance
+    q_factor: Positive = 1.0  # of the process noise covariance
+    r_factor: Positive = 1.0  # of the fixes' covariance
 
 
 class Drive(Scenario):
@@ -152,9 +166,11 @@ class Drive(Scenario):
     system: Literal["ins-gnss"] = "ins-gnss"
     study: Literal["drive"] = "drive"
     title: str = "INS/GNSS drive"
-    imu_rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("100 Hz")
+    imu_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default(
+        "100 Hz"
+    )
     place: Place
-    legs: tuple[Leg, ...]
+    legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     imu: Imu
     gnss: Receiver
     start: Start = pydantic.Field(default_factory=Start)
@@ -164,4 +180,13 @@ class Drive(Scenario):
     believed: Believed = pydantic.Field(default_factory=Believed)
     # figures pooled over time leave out what comes before, while heading errors are large
     settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
-    filters: tuple[str, ...] = ("ekf",)
+    filters: Names = ("ekf",)
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> Drive:
+        lasts = sum(leg.lasts_s for leg in self.legs)
+        refuse_too_long("imu_rate", lasts, self.imu_rate)
+        refuse_too_long("gnss.rate", lasts, self.gnss.rate)
+        refuse_too_long("update.longest_block", lasts, 1.0 / self.update.longest_block)
+        refuse_unsettled("settle", self.settle, lasts)
+        return self

@@ -10,10 +10,12 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Entry, Parameters, Quantity, default
+from robins.systems.limits import Names
 
 Three = tuple[float, float, float]
-Matrix = tuple[Three, Three, Three]
+Row = tuple[Entry, Entry, Entry]
+Matrix = tuple[Row, Row, Row]
 Field = Annotated[Three, Quantity("magnetic field")]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -36,7 +38,7 @@ class Gyro(Parameters):
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("5000 ppm")
     # what nine numbers do not explain, as a share of the angle turned
-    turn_error: Annotated[float, pydantic.Field(ge=0.0)] = 0.001
+    turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
     range: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2000 deg/s")
 
 
@@ -51,7 +53,9 @@ class Accelerometer(Parameters):
         default("0.0001 m/s^2/sqrt(s)")
     )
     range: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("157 m/s^2")
-    gravity: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("9.81 m/s^2")
+    gravity: Annotated[float, Quantity("acceleration", above="0 m/s^2", most="100 m/s^2")] = (
+        default("9.81 m/s^2")
+    )
 
 
 class Magnetometer(Parameters):
@@ -65,7 +69,9 @@ class Magnetometer(Parameters):
     offset: Field = default("0 uT")
     matrix: Matrix = IDENTITY
     noise: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("2.5 uT")
-    declination: Annotated[float, Quantity("angle", above="0 deg")] = default("6 deg")
+    declination: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
+        "6 deg"
+    )
     declination_time: Annotated[float, Quantity("time", above="0 s")] = default("60 s")
     # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
@@ -108,10 +114,14 @@ class Start(Parameters):
 
     still: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
     moving: Annotated[float, Quantity("time", above="0 s")] = default("3 s")
-    tilt: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
-    heading: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
-    tilt_moving: Annotated[float, Quantity("angle", above="0 deg")] = default("5 deg")
-    heading_moving: Annotated[float, Quantity("angle", above="0 deg")] = default("30 deg")
+    tilt: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
+    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
+    tilt_moving: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
+        "5 deg"
+    )
+    heading_moving: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
+        "30 deg"
+    )
 
 
 class Update(Parameters):
@@ -121,7 +131,7 @@ class Update(Parameters):
     samples: Literal["means", "instants"] = "means"
     block: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
     # an interval between samples longer than this many usual ones is a gap
-    gap: Annotated[float, pydantic.Field(gt=1.0)] = 3.0
+    gap: Annotated[float, pydantic.Field(gt=1.0, le=1e6)] = 3.0
     gap_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("60 deg/s")
     gap_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("3 m/s^2")
 
@@ -140,4 +150,4 @@ class Replay(Parameters):
     rest: Rest = pydantic.Field(default_factory=Rest)
     start: Start = pydantic.Field(default_factory=Start)
     update: Update = pydantic.Field(default_factory=Update)
-    filters: tuple[str, ...] = ("marg", "marg-smoothed")
+    filters: Names = ("marg", "marg-smoothed")

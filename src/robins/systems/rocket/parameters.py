@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Span, default
+from robins.systems.limits import Names, refuse_too_long, refuse_unsettled
 from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
@@ -52,7 +53,9 @@ class Gyro(Parameters):
     drift_time: Annotated[float, Quantity("time", above="0 s")] = default("300 s")
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")
     # of the attitude that the gyro is integrated to, where that is what is read of it
-    attitude_noise: Annotated[float, Quantity("angle", above="0 deg")] = default("0.5 deg")
+    attitude_noise: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
+        "0.5 deg"
+    )
     lost: tuple[Span, ...] = ()
 
 
@@ -80,7 +83,7 @@ class Magnetometer(Parameters):
     scale.
     """
 
-    noise: Annotated[float, Quantity("angle", above="0 deg")] = default("1 deg")
+    noise: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
     hard_iron: Annotated[Three, Quantity("magnetic field")] = default("0 uT")
     full_scale: Annotated[float, Quantity("magnetic field", above="0 uT")] | None = None
     disturbance: Disturbance | None = None
@@ -91,7 +94,7 @@ class Start(Parameters):
     """How the estimate begins: its error, and what it believes of it, one sigma."""
 
     attitude_error: Annotated[Three, Quantity("angle")] = default("0 deg")
-    attitude: Annotated[float, Quantity("angle", above="0 deg")] = default("2 deg")
+    attitude: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("2 deg")
     rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("1 deg/s")
 
 
@@ -112,11 +115,8 @@ class Flight(Scenario, Parameters):
 
     @pydantic.model_validator(mode="after")
     def _long_enough(self) -> Flight:
-        if self.counted_from >= self.duration:
-            raise ValueError(
-                f"counted_from ({self.counted_from:g} s) must be before the end of the flight at "
-                f"{self.duration:g} s"
-            )
+        refuse_unsettled("counted_from", self.counted_from, self.duration)
+        refuse_too_long("step", self.duration, 1.0 / self.step)
         if self.duration < 2.0 * self.step:
             raise ValueError(
                 f"duration ({self.duration:g} s) must hold two steps of {self.step:g} s at least"
@@ -164,7 +164,7 @@ class MagneticAttitude(Flight, Parameters):
 
     study: Literal["magnetic-attitude"] = "magnetic-attitude"
     title: str = "Rocket, magnetic attitude"
-    filters: tuple[str, ...] = ANGLES_COMPARED
+    filters: Names = ANGLES_COMPARED
     gyro_reads: Literal["rate", "attitude"] = "rate"
     believed: Believed = pydantic.Field(default_factory=Believed)
 
@@ -187,5 +187,5 @@ class FieldVector(Flight, Parameters):
 
     study: Literal["field-vector"] = "field-vector"
     title: str = "Rocket, field vector"
-    filters: tuple[str, ...] = FIELD_COMPARED
+    filters: Names = FIELD_COMPARED
     scale_factor_sigma: Annotated[float, Quantity("ratio", above="0")] = default("1000 ppm")

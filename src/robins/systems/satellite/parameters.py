@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, Span, default
+from robins.scenario import Entry, Parameters, Positive, Quantity, Span, default
+from robins.systems.limits import refuse_too_long, refuse_unsettled
 from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
@@ -45,11 +46,16 @@ class Craft(Parameters):
 class Wheels(Parameters):
     """Reaction wheels, numbered from 0; those in ``lost`` give no torque, and control knows."""
 
-    axes: tuple[Three, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), _TILTED)
+    axes: tuple[tuple[Entry, Entry, Entry], ...] = (
+        (1.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (0.0, 0.0, 1.0),
+        _TILTED,
+    )
     torque: Annotated[float, Quantity("torque", above="0 N m")] = default("5 mN m")
     momentum: Annotated[float, Quantity("angular momentum", above="0 N m s")] = default("0.1 N m s")
     start: Annotated[float, Quantity("angular momentum")] = default("0 N m s")  # each of them
-    lost: tuple[pydantic.NonNegativeInt, ...] = ()
+    lost: tuple[Annotated[int, pydantic.Field(ge=0, le=99)], ...] = ()
     lost_at: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
     loss_known: bool = True  # from the start; then torques are shared out among the others
 
@@ -72,7 +78,7 @@ class Control(Parameters):
     """Attitude control by wheels, their unloading by magnetorquers."""
 
     frequency: Annotated[float, Quantity("angle rate", above="0 rad/s")] = default("0.12 rad/s")
-    damping: Annotated[float, pydantic.Field(gt=0.0)] = 0.9
+    damping: Positive = 0.9
     dipole: Annotated[float, Quantity("magnetic moment", least="0 A m^2")] = default("5 A m^2")
     unloading: Annotated[float, Quantity("inverse time", least="0 1/s")] = default("0.002 1/s")
 
@@ -101,8 +107,13 @@ class Gyro(Parameters):
         "9.6962736e-10 rad/s^2"  # 2e-4 arcsec/s^2
     )
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")  # one sigma
-    misalignment: Annotated[float, Quantity("angle", least="0 deg")] = default("0 arcsec")  # same
-    quantum: Annotated[float, Quantity("angle", least="0 deg")] = default("0.05 arcsec")
+    # one sigma
+    misalignment: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0 arcsec"
+    )
+    quantum: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0.05 arcsec"
+    )
 
 
 class StarFault(Span):
@@ -127,10 +138,16 @@ class Camera(Parameters):
     catalogue: Literal["synthetic", "hipparcos"] = "synthetic"
     field: Annotated[float, Quantity("angle", above="1 deg", most="60 deg")] = default("20 deg")
     magnitude: Annotated[float, pydantic.Field(ge=3.0, le=6.5)] = 5.5
-    noise: Annotated[float, Quantity("angle", above="0 arcsec")] = default("20 arcsec")  # of a star
+    # of a star
+    noise: Annotated[float, Quantity("angle", above="0 arcsec", most="180 deg")] = default(
+        "20 arcsec"
+    )
     missed: Annotated[float, Quantity("ratio", least="0", below="1")] = default("0 %")
     false_stars: Annotated[int, pydantic.Field(ge=0, le=20)] = 0
-    tolerance: Annotated[float, Quantity("angle", above="0 deg")] = default("0.1 deg")  # of a match
+    # of a match
+    tolerance: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
+        "0.1 deg"
+    )
 
 
 class Star(Parameters):
@@ -140,7 +157,9 @@ class Star(Parameters):
     noise: Annotated[Three, Quantity("angle", above="0 deg")] = default(
         "10 arcsec", "10 arcsec", "40 arcsec"
     )
-    low_frequency: Annotated[float, Quantity("angle", least="0 deg")] = default("0 arcsec")
+    low_frequency: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0 arcsec"
+    )
     low_frequency_period: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
     lost: tuple[Span, ...] = ()
     faults: tuple[StarFault, ...] = ()
@@ -154,7 +173,9 @@ class Believed(Parameters):
     """
 
     drift: Annotated[float, Quantity("rate random walk", above="0 rad/s/sqrt(s)")] | None = None
-    attitude: Annotated[float, Quantity("angle", above="0 deg")] = default("60 arcsec")
+    attitude: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
+        "60 arcsec"
+    )
     bias: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("3 arcsec/s")
 
 
@@ -180,11 +201,8 @@ class AttitudeLoop(Scenario, Parameters):
 
     @pydantic.model_validator(mode="after")
     def _fits(self) -> AttitudeLoop:
-        if self.counted_from >= self.duration:
-            raise ValueError(
-                f"counted_from ({self.counted_from:g} s) must be before the end at "
-                f"{self.duration:g} s"
-            )
+        refuse_unsettled("counted_from", self.counted_from, self.duration)
+        refuse_too_long("step", self.duration, 1.0 / self.step)
         ratio = self.star.period / self.step
         if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
             raise ValueError(

@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Parameters, Positive, Quantity, default
+from robins.systems.limits import Names, Runs, refuse_too_long, refuse_unsettled
 from robins.systems.system import Scenario
 
 Three = tuple[float, float, float]
 Claim = Literal["five-arcmin", "gamma-50", "units", "beats-kf", "saves-the-model"]
-Positive = Annotated[float, pydantic.Field(gt=0.0)]
 
 FILTERS = (
     "kf",
@@ -31,7 +31,8 @@ class Manoeuvre(Parameters):
     """A level bank turn: roll in from the start, turn, roll out, fly on."""
 
     speed: Annotated[float, Quantity("speed", above="0 m/s")]
-    acceleration: Annotated[float, Quantity("acceleration")]  # horizontal, in the turn
+    # horizontal, in the turn
+    acceleration: Annotated[float, Quantity("acceleration", least="-100 g", most="100 g")]
     roll_time: Annotated[float, Quantity("time", above="0 s")]  # of each roll
     turn_time: Annotated[float, Quantity("time", least="0 s")]  # between the rolls
     duration: Annotated[float, Quantity("time", above="0 s")]  # of the run
@@ -42,7 +43,7 @@ class Manoeuvre(Parameters):
 class Master(Parameters):
     """The attitude that the master reports, with white noise at each update."""
 
-    attitude_noise: Annotated[float, Quantity("angle", above="0 rad")]
+    attitude_noise: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
     # no attitude comes from the first to the second time, as in an outage of the link
     outage: Annotated[tuple[float, float], Quantity("time", least="0 s")] | None = None
 
@@ -65,19 +66,20 @@ class Mounting(Parameters):
 class Flexing(Parameters):
     """How the structure moves between the two, in axes right, forward, up of the master."""
 
-    sigma: Annotated[Three, Quantity("angle", least="0 rad")]
+    sigma: Annotated[Three, Quantity("angle", least="0 rad", most="180 deg")]
     time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
     damping: Positive = 1.0
     bending: Annotated[Three, Quantity("angle")] = default("0 rad")  # per g of load above one
-    flutter: Annotated[float, Quantity("angle", least="0 rad")]  # white at each update
+    # white at each update
+    flutter: Annotated[float, Quantity("angle", least="0 rad", most="180 deg")]
 
 
 class Believed(Parameters):
     """What all filters are told of the start, and the one with flexure states of its flexure."""
 
-    attitude: Annotated[float, Quantity("angle", above="0 rad")]
+    attitude: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
     gyro_bias: Annotated[float, Quantity("angle rate", above="0 rad/s")]
-    mounting: Annotated[float, Quantity("angle", above="0 rad")]
+    mounting: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
     flexure_sigma_factor: Positive = 1.0  # believed over true
     flexure_time_factor: Positive = 1.0
 
@@ -95,8 +97,8 @@ class Matching(Scenario):
     system: Literal["transfer-alignment"] = "transfer-alignment"
     study: Literal["attitude-matching"] = "attitude-matching"
     title: str = "Attitude matching in a bank turn"
-    runs: Annotated[int, pydantic.Field(ge=1)] = 200
-    filters: tuple[str, ...] = FILTERS
+    runs: Runs = 200
+    filters: Names = FILTERS
     step: Annotated[float, Quantity("time", above="0 s")] = default("10 ms")  # of the truth
     period: Annotated[float, Quantity("time", above="0 s")] = default("50 ms")  # of the filters
     # figures pooled over time count from here
@@ -111,3 +113,10 @@ class Matching(Scenario):
     flexure: Flexing
     believed: Believed
     h_infinity: HInfinity = pydantic.Field(default_factory=HInfinity)
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> Matching:
+        lasts = self.manoeuvre.duration
+        refuse_too_long("step", lasts, 1.0 / self.step)
+        refuse_unsettled("settle", self.settle, lasts)
+        return self

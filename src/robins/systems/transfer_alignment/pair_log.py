@@ -36,7 +36,8 @@ class Recording(Parameters):
     longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
     # a gap in the slave's samples that is longer is declared: the alignment begins anew after it
     longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
-    gap_noise: Annotated[float, pydantic.Field(ge=1.0)] = 30.0  # process noise factor across one
+    # process noise factor across one
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
 class Piece(NamedTuple):

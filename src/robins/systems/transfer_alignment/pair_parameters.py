@@ -10,8 +10,9 @@ from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
 from robins.systems.ins_gnss.parameters import Leg, Place
+from robins.systems.limits import refuse_too_long, refuse_unsettled
 
 Three = tuple[float, float, float]
 
@@ -26,7 +27,7 @@ class BankLeg(Parameters):
 class Sway(Parameters):
     """A sine of an angle."""
 
-    amplitude: Annotated[float, Quantity("angle", least="0 deg")]
+    amplitude: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")]
     period: Annotated[float, Quantity("time", above="0 s")]
     phase: Annotated[float, Quantity("angle")] = default("0 deg")
 
@@ -34,7 +35,7 @@ class Sway(Parameters):
 class Heave(Parameters):
     """A sine of height."""
 
-    amplitude: Annotated[float, Quantity("length", least="0 m")]
+    amplitude: Annotated[float, Quantity("length", least="0 m", most="1 km")]
     period: Annotated[float, Quantity("time", above="0 s")]
     phase: Annotated[float, Quantity("angle")] = default("0 deg")
 
@@ -46,7 +47,12 @@ class Aircraft(Place):
     speed: Annotated[float, Quantity("speed", above="0 m/s")]
     pitch: Annotated[float, Quantity("angle", least="-80 deg", most="80 deg")] = default("0 deg")
     roll_time: Annotated[float, Quantity("time", above="0 s")] = default("2 s")
-    legs: tuple[BankLeg, ...]
+    legs: Annotated[tuple[BankLeg, ...], pydantic.Field(min_length=1)]
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration."""
+        return sum(leg.seconds for leg in self.legs)
 
 
 class Ship(Place):
@@ -60,21 +66,31 @@ class Ship(Place):
     yaw: tuple[Sway, ...] | None = None
     heave: tuple[Heave, ...] | None = None
 
+    @property
+    def lasts_s(self) -> float:
+        """Duration."""
+        return self.seconds
+
 
 class Vehicle(Place):
     """A ground vehicle that drives legs, on a road that may be rough."""
 
     kind: Literal["vehicle"]
     speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")  # at the start
-    legs: tuple[Leg, ...]
+    legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     roll: tuple[Sway, ...] = ()
     pitch: tuple[Sway, ...] = ()
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration."""
+        return sum(leg.lasts_s for leg in self.legs)
 
 
 class Slave(Parameters):
     """The inertial unit to be aligned; biases are constant in a run, drawn with these sigmas."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("50 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("50 Hz")
     gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")]
     accel_noise: Annotated[Three, Quantity("velocity random walk", least="0 m/s/sqrt(h)")]
     gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")]
@@ -84,9 +100,9 @@ class Slave(Parameters):
 class Master(Parameters):
     """The records of the master; one at each epoch of the filters."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz")] = default("10 Hz")
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("10 Hz")
     # one sigma about north, east, down; flutter of the structure belongs to it
-    attitude_noise: Annotated[Three, Quantity("angle", least="0 deg")]
+    attitude_noise: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
     velocity_noise: Annotated[Three, Quantity("speed", least="0 m/s")]
     position_noise: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
     # a record stamped t describes t - delay
@@ -98,17 +114,18 @@ class Mounting(Parameters):
 
     nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of the slave
     error: Annotated[Three, Quantity("angle")] = default("0 deg")  # the same in every run
-    sigma: Annotated[Three, Quantity("angle", least="0 deg")] = default("0 deg")  # drawn on top
+    # drawn on top
+    sigma: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default("0 deg")
 
 
 class Structure(Parameters):
     """What bends and swings between master and slave, in master axes: roll, pitch, heading."""
 
-    sigma: Annotated[Three, Quantity("angle", least="0 deg")] = default("0 deg")
+    sigma: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default("0 deg")
     time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
-    damping: Annotated[float, pydantic.Field(gt=0.0)] = 1.0
+    damping: Positive = 1.0
     # degrees of freedom of the Student-t noise that drives it; without, normal
-    tail_dof: Annotated[float, pydantic.Field(gt=2.0)] | None = None
+    tail_dof: Dof | None = None
     bending: Annotated[Three, Quantity("angle")] = default("0 deg")  # per g of load factor above 1
 
 
@@ -123,11 +140,11 @@ class Disturbance(Parameters):
     """What no filter is told of, unless a scenario says so."""
 
     # records of the master with attitude and velocity noise that many times as large
-    outlier_share: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.0
-    outlier_factor: Annotated[float, pydantic.Field(ge=1.0)] = 10.0
+    outlier_share: Share = 0.0
+    outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 10.0
     # degrees of freedom of Student-t noise of the master, of the stated sigmas; without, normal
-    tail_dof: Annotated[float, pydantic.Field(gt=2.0)] | None = None
-    gyro_noise_factor: Annotated[float, pydantic.Field(ge=0.0)] = 1.0  # in the window
+    tail_dof: Dof | None = None
+    gyro_noise_factor: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 1.0  # in the window
     gyro_noise_window: Window | None = None
     drift_step: Annotated[Three, Quantity("angle rate")] = default("0 deg/h")  # slave axes
     drift_step_time: Annotated[float, Quantity("time", least="0 s")] | None = None
@@ -140,7 +157,7 @@ class Start(Parameters):
     They are drawn from normal distributions; or all +1 sigma; or 1 sigma of random sign.
     """
 
-    attitude: Annotated[Three, Quantity("angle", least="0 deg")]
+    attitude: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
     velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0 m/s")
     position: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
     draw: Literal["normal", "plus-sigma", "random-sign"] = "normal"
@@ -154,6 +171,16 @@ class PairParameters(Parameters):
     master: Master
     start: Start
     mounting: Mounting = pydantic.Field(default_factory=Mounting)
-    lever_arm: Annotated[Three, Quantity("length")] = default("0 m")  # master to slave, master axes
+    # master to slave, master axes
+    lever_arm: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
     flexure: Structure = pydantic.Field(default_factory=Structure)
     disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> PairParameters:
+        if self.manoeuvre is not None:  # a recorded pair brings its own
+            lasts = self.manoeuvre.lasts_s
+            refuse_too_long("slave.rate", lasts, self.slave.rate)
+            refuse_too_long("master.rate", lasts, self.master.rate)
+            refuse_unsettled("settle", getattr(self, "settle", 0.0), lasts)
+        return self

@@ -23,6 +23,7 @@ from robins.dataset import Dataset
 from robins.filters import Belief, Model, Motion, run
 from robins.ins.frames import to_ned_frd
 from robins.rotation import Rotation
+from robins.systems.limits import Names
 from robins.systems.system import Alignment, Contender, Outcome, Progress
 from robins.systems.transfer_alignment.pair_answer import (
     Answer,
@@ -49,7 +50,7 @@ class Replay(Product):
         Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None
     ) = None
     recording: Recording = pydantic.Field(default_factory=Recording)
-    filters: tuple[str, ...] = ("product",)
+    filters: Names = ("product",)
 
 
 _ATTITUDE, _MOUNTING, _FLEXURE = slice(0, 3), slice(15, 18), slice(18, 21)

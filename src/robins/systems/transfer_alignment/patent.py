@@ -38,6 +38,7 @@ from robins.ins.mechanise import Nav
 from robins.results import variable
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
+from robins.systems.limits import Names, Runs
 from robins.systems.system import Case, Contender, Limit, Problem, Scenario, SensorAxes, StateBlock
 from robins.systems.transfer_alignment import velocity_attitude as va
 from robins.systems.transfer_alignment.open_loop import (
@@ -100,8 +101,8 @@ class Patent(Scenario, PairParameters):
     system: Literal["transfer-alignment"] = "transfer-alignment"
     study: Literal["velocity-attitude"] = "velocity-attitude"
     title: str = "Transfer alignment by velocity and attitude, open loop"
-    runs: Annotated[int, pydantic.Field(ge=1)] = 100
-    filters: tuple[str, ...] = FILTERS[:-1]
+    runs: Runs = 100
+    filters: Names = FILTERS[:-1]
     told: Told = pydantic.Field(default_factory=Told)
     # figures pooled over time count from here
     settle: Annotated[float, Quantity("time", least="0 s")] = default("30 s")

@@ -46,7 +46,9 @@ class Believed(Parameters):
     """What the filters are told; without a word the stated noise, start and mounting are true."""
 
     # one sigma of the mounting error
-    mounting: Annotated[Three, Quantity("angle", least="0 deg")] = default("0.3 deg")
+    mounting: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0.3 deg"
+    )
     # flexure states are for what is given here; tails and bending are not modelled
     flexure: Structure | None = None
     gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")] = (

@@ -18,6 +18,7 @@ import xarray as xr
 from robins import units
 from robins.results import variable
 from robins.scenario import Quantity, default
+from robins.systems.limits import Names
 from robins.systems.system import Limit, Problem, Scenario
 from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_answer import BLOCKS, SENSORS
@@ -43,7 +44,7 @@ class Product(Scenario, PairParameters):
     system: Literal["transfer-alignment"] = "transfer-alignment"
     study: Literal["product"] = "product"
     title: str = "Transfer alignment, closed loop"
-    filters: tuple[str, ...] = ("kf", "product")
+    filters: Names = ("kf", "product")
     believed: Believed = pydantic.Field(default_factory=Believed)
     # figures pooled over time count from here, when the manoeuvre has shown what there is to see
     settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")

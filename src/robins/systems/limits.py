@@ -1,0 +1,46 @@
+"""What a scenario may ask for at most and must leave, refused before anything is simulated."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import pydantic
+
+MOST_RUNS = 1_000_000
+MOST_SAMPLES = 10_000_000  # of one run: a day at 100 Hz; six axes of them are half a gigabyte
+
+Runs = Annotated[int, pydantic.Field(ge=1, le=MOST_RUNS)]
+"""Monte Carlo runs."""
+
+Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
+"""Filters by name, one at least."""
+
+
+def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
+    """Raise a ValueError where the samples of a run would not fit into memory.
+
+    Args:
+        rate: the parameter that says how often.
+        lasts_s: duration of a run.
+        rate_hz: samples a second.
+    """
+    if (samples := lasts_s * rate_hz) > MOST_SAMPLES:
+        raise ValueError(
+            f"{rate}: at {rate_hz:g} Hz a run of {lasts_s:g} s has {samples:.3g} samples, of which "
+            f"{MOST_SAMPLES:.0e} fit at most: lower the rate or shorten the run"
+        )
+
+
+def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
+    """Raise a ValueError where figures would begin to count after the end of the run.
+
+    Args:
+        name: the parameter that says from when.
+        from_s: what it says.
+        lasts_s: duration of a run.
+    """
+    if from_s >= lasts_s:
+        raise ValueError(
+            f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
+            "before the end"
+        )
