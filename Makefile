@@ -2,19 +2,28 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+READY := $(VENV)/.ready
 STAMP := $(VENV)/.installed
 
 .PHONY: install demo test lint docs bench clean
 
 install: $(STAMP)
 
-# A private environment, rebuilt when what it is made from changes.
-$(STAMP): pyproject.toml constraints.txt
+# A private environment, rebuilt when what it is made from changes: robins with its extras, to use.
+$(READY): pyproject.toml constraints.txt
+	@echo "Installing robins with its extras into $(VENV): 1 GB, some minutes. 'make clean' removes it."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev]'
-	touch $@
+	$(PIP) '.[all]'
+	@touch $@
 
-demo: install
+# And what develops and tests it.
+$(STAMP): $(READY)
+	@echo "Adding the tools of development and the packages that tests compare with: 1 GB more."
+	$(PIP) '.[all,dev]'
+	@touch $@
+
+demo: $(READY)
 	$(BIN)/robins demo
 
 lint: install

@@ -89,7 +89,7 @@ def test_a_textbook_sum_in_geocentric_axes_agrees(model):
 
 
 def test_pygeomag_agrees(model):
-    geomag = pytest.importorskip("pygeomag", reason="the cross-check needs the extra 'geo'")
+    geomag = pytest.importorskip("pygeomag", reason="the cross-check needs pygeomag")
     got = np.asarray(magnetic.field_n(model, LAT, LON, ALT, YEAR)) / NT
     peer = geomag.GeoMag(base_year=2025)
     for k in range(COUNT):
