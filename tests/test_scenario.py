@@ -322,6 +322,9 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
     assert message(tmp_path) == "Is a directory"
     (tmp_path / "binary").write_bytes(b"a = 1\n\xff\xfe")
     assert message(tmp_path / "binary") == "byte 6 is not UTF-8 text"
+    (tmp_path / "table.toml").write_text("a = 1\n[imu\n")
+    with pytest.raises(ScenarioError, match=r"table\.toml: not TOML: .*line 2"):
+        scenario.read_text(tmp_path / "table.toml")  # what comes later knows no file
     with open(tmp_path / "sparse", "wb") as file:
         os.truncate(file.fileno(), 10_000_000_000)  # 10 GB that are not there
     assert "hardly a scenario" in message(tmp_path / "sparse")

@@ -45,6 +45,32 @@ def upside_down(tmp_path_factory):
     return path
 
 
+# ------------------------------------------------------------------------------------ bad TOML
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("run", "unit.toml"),
+        ("run", "unit.toml", "--master", "imu.csv", "--slave", "imu.csv"),
+        ("bound", "unit.toml"),
+        ("replay", "imu.csv", "unit.toml"),
+        ("doctor", "imu.csv", "unit.toml"),
+        ("calibrate", "imu.csv", "unit.toml"),
+        ("design", "unit.toml"),
+        ("bench", "up", "unit.toml"),
+    ],
+    ids=" ".join,
+)
+def test_a_fault_of_syntax_is_told_with_its_file(robins, command):
+    Path("unit.toml").write_text('system = "ins-gnss"\n[imu\n')
+    answer = robins(*command)
+    assert answer.status == 2
+    assert answer.err.startswith("robins: unit.toml: ")
+    assert "not TOML: Expected ']'" in answer.err
+    assert "line 2" in answer.err
+
+
 # -------------------------------------------------------------------------------------- the doctor
 
 

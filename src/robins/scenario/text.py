@@ -20,7 +20,8 @@ def read_text(path: str | Path) -> str:
     """Text of a scenario file.
 
     Raises:
-        ScenarioError: the file cannot be read, is no UTF-8 text or is longer than a megabyte.
+        ScenarioError: the file cannot be read, is no UTF-8 text, is longer than a megabyte, or is
+            not TOML; the message names the file.
     """
     try:
         with Path(path).open("rb") as file:
@@ -32,6 +33,7 @@ def read_text(path: str | Path) -> str:
         raise ScenarioError([f"{path}: {error.strerror or error}"]) from None
     if len(content) > _LONGEST:
         raise ScenarioError([f"{path}: longer than {_LONGEST} bytes, so hardly a scenario"])
+    mapping_of(text, source=str(path))
     return text
 
 
