@@ -56,8 +56,8 @@ def test_notes_added_while_the_run_goes_on_are_kept(earlier):
 
 def test_the_folder_one_stands_in_is_not_replaced(earlier, monkeypatch):
     monkeypatch.chdir(earlier)
-    for path in (".", "..", earlier):
-        with pytest.raises(ResultError, match="is the folder you are in"):
+    for path, what in ((".", "is"), (earlier, "is"), ("..", "holds"), ("/", "holds")):
+        with pytest.raises(ResultError, match=f"{what} the folder you are in; choose"):
             ResultWriter(path)
     write("inner", a_summary())
     assert read(earlier / "inner").summary["seed"] == 7

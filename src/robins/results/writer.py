@@ -245,8 +245,10 @@ def _check_replaceable(path: Path) -> None:
     target = folder.resolve(path)
     elsewhere = "choose a new folder"
     with suppress(FileNotFoundError):
-        if Path.cwd().is_relative_to(target):
+        if target == Path.cwd():
             raise ResultError(path, "is the folder you are in", "choose a folder inside it")
+        if target in Path.cwd().parents:
+            raise ResultError(path, "holds the folder you are in", elsewhere)
     if not os.path.lexists(target):
         return
     if not target.is_dir():
