@@ -1,5 +1,6 @@
 """What the command promises: statuses, streams, errors in a line, nothing left behind."""
 
+import io
 import json
 import os
 import shlex
@@ -13,7 +14,7 @@ import click
 import pytest
 
 from robins import cli, results
-from robins.cli import Status, cache, commands, running
+from robins.cli import Status, cache, commands, interrupts, running
 from robins.logs import Finding, LogError
 from robins.scenario import ScenarioError
 from robins.units import UnitError
@@ -343,7 +344,7 @@ sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenari
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workbench, number):
     robins("run", "car/town", "--out", "out", "--seed", 1)
     process = start(
@@ -361,6 +362,16 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
     assert "Traceback" not in err
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert results.read("out").summary["seed"] == 1
+
+
+def test_nohup_is_respected():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupts.heeded():
+            signal.raise_signal(signal.SIGHUP)
+            interrupts.obey()
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 DEAF = """
@@ -449,6 +460,46 @@ def test_a_reader_that_goes_away_is_no_reason_to_complain():
     assert process.stderr.read() == ""
     process.stderr.close()
     assert process.returncode == 1
+
+
+def test_a_closed_standard_output_is_told():
+    process = start("", "--help", preexec_fn=lambda: os.close(1), stderr=subprocess.PIPE)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert err == "robins: cannot write to standard output: it is closed\n"
+
+
+def test_a_closed_standard_error_is_no_fault(robins, workbench, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    assert robins("run", "car/town", "--json").status == 0
+    workbench.error = RuntimeError()
+    answer = robins("run", "car/town", "--debug")
+    assert (answer.status, answer.out) == (1, "noise of some library on standard output\n")
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+@pytest.mark.parametrize("as_json", [True, False])
+def test_a_terminal_that_lacks_characters_gets_the_others(
+    robins, workbench, monkeypatch, encoding, as_json
+):
+    workbench.warnings = ["100 \N{MICRO SIGN}s \N{EN DASH} late \N{ROCKET}"]
+    with io.TextIOWrapper(io.BytesIO(), encoding) as screen:
+        monkeypatch.setattr(sys, "stdout", screen)
+        status = robins("run", "car/town", *(["--json"] if as_json else [])).status
+        screen.flush()
+        shown = screen.buffer.getvalue()
+    assert status == 0
+    if as_json:  # click writes UTF-8 where it is told of a mere ASCII
+        text = shown.decode("utf-8" if encoding == "ascii" else encoding)
+        assert json.loads(text)["warnings"] == workbench.warnings
+    elif encoding == "latin-1":
+        assert b"Warning: 100 \xb5s ? late ?\n" in shown
+
+
+def test_a_command_in_any_bytes_can_be_kept(robins, workbench):
+    folder = os.fsdecode(b"caf\xe9")
+    assert robins("run", "car/town", "--out", folder).status == 0
+    assert results.read(folder).manifest["command"] == r"robins run car/town --out 'caf\xe9'"
 
 
 def test_the_entry_point_is_installed():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import os
 import sys
 from collections.abc import Iterator
 
@@ -35,7 +36,8 @@ def only_json(wanted: bool) -> Iterator[None]:
 
 
 def command_line() -> str:
-    """The command as it was typed, to be typed again."""
+    """The command as it was typed, to be typed again; bytes that are not UTF-8 as escapes."""
     import shlex
 
-    return shlex.join(["robins", *(click.get_current_context().obj or [])])
+    typed = shlex.join(["robins", *(click.get_current_context().obj or [])])
+    return os.fsencode(typed).decode("utf-8", "backslashreplace")

@@ -16,7 +16,7 @@ from types import FrameType
 # Functions whose exceptions Python ignores; JAX hangs the first into every garbage collection.
 _DEAF = frozenset({"_xla_gc_callback", "__del__"})
 _AGAIN_S = 0.05
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 
 _asked = False
 
@@ -40,16 +40,19 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def heeded() -> Iterator[None]:
-    """While this lasts, SIGINT and SIGTERM raise KeyboardInterrupt where it will be heard.
+    """While this lasts, SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt where it will be heard.
 
-    SIGTERM too, so that a killed command unwinds and leaves no half folder.
+    SIGTERM and SIGHUP too, so that a command that is killed, or whose terminal is closed, unwinds
+    and leaves no half folder. `nohup` has SIGHUP ignored, and so it stays.
     """
     global _asked
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     _asked = False
-    before = {number: signal.signal(number, _interrupt) for number in _SIGNALS}
+    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    numbers = [n for n in _SIGNALS if not (nohup and n == signal.SIGHUP)]
+    before = {number: signal.signal(number, _interrupt) for number in numbers}
     try:
         yield
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 from types import TracebackType
@@ -72,5 +73,6 @@ class Progress:
         self._timer.cancel()
         with self._lock:
             if self._bar is not None:
-                self._bar.stop()
+                with contextlib.suppress(OSError):  # the terminal may have been closed
+                    self._bar.stop()
                 self._bar = None

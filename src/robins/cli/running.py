@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import sys
 import traceback
@@ -18,10 +19,14 @@ from robins.cli.frame import Status
 
 
 class _Output:
-    """Standard output that remembers if it could not be written to."""
+    """Standard output that takes any character and remembers if it could not be written to.
 
-    def __init__(self, stream: Any):
+    What its encoding lacks becomes a question mark, or in JSON an escape.
+    """
+
+    def __init__(self, stream: Any, as_json: bool):
         self._stream = stream
+        self._as_json = as_json
         self.failure: OSError | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -29,7 +34,17 @@ class _Output:
 
     def write(self, text: str) -> int:
         with self._watched():
-            return self._stream.write(text)
+            try:
+                return self._stream.write(text)
+            except UnicodeEncodeError:
+                return self._stream.write("".join(map(self._encodable, text)))
+
+    def _encodable(self, character: str) -> str:
+        try:
+            character.encode(self._stream.encoding)
+            return character
+        except UnicodeEncodeError:
+            return json.dumps(character)[1:-1] if self._as_json else "?"
 
     def flush(self) -> None:
         with self._watched():
@@ -57,8 +72,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         traceback only if ``--debug`` is among the arguments.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    output = _Output(sys.stdout)
-    with interrupts.heeded(), contextlib.redirect_stdout(output):
+    with contextlib.ExitStack() as stack:
+        if sys.stderr is None:  # `2>&-`; the next file to be opened would get its number
+            nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+            stack.enter_context(contextlib.redirect_stderr(nowhere))
+        if sys.stdout is None:
+            _tell("cannot write to standard output: it is closed")
+            return Status.FAILED
+        output = _Output(sys.stdout, "--json" in given)
+        stack.enter_context(interrupts.heeded())
+        stack.enter_context(contextlib.redirect_stdout(output))
         try:
             status = app.main(given, prog_name="robins", standalone_mode=False, obj=given)
             output.flush()
