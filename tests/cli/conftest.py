@@ -9,6 +9,7 @@ import pytest
 
 from robins import results
 from robins.cli import main
+from robins.systems import catalogue
 
 Answer = namedtuple("Answer", "status out err")
 Done = namedtuple("Done", "path summary notes")
@@ -76,18 +77,12 @@ def workbench(monkeypatch):
 
 @pytest.fixture
 def systems(monkeypatch):
-    """Two systems in the registry."""
-    car = SimpleNamespace(
-        name="car",
-        summary="a car",
-        scenarios={"town": None, "road": None},
-        filters=("ekf", "ukf"),
-        claims=({"id": "C1", "text": "it holds"},),
-        replay=print,
-    )
-    kite = SimpleNamespace(
-        name="kite", summary="a kite", scenarios={}, filters=("ekf",), claims=(), replay=None
-    )
-    monkeypatch.setitem(
-        sys.modules, "robins.systems", SimpleNamespace(SYSTEMS={"car": car, "kite": kite})
-    )
+    """Two systems in the registry, and what the catalogue says of them."""
+    claim = {"id": "C1", "text": "it holds"}
+    car = SimpleNamespace(name="car", filters=("ekf", "ukf"), claims=(claim,), replay=print)
+    kite = SimpleNamespace(name="kite", filters=("ekf",), claims=(), replay=None)
+    its = {"town": catalogue.Listed(Path("town.toml"), "A car in town", "")}
+    its["road"] = catalogue.Listed(Path("road.toml"), "A car on the road", "")
+    monkeypatch.setattr("robins.systems.SYSTEMS", {"car": car, "kite": kite})
+    monkeypatch.setattr(catalogue, "SUMMARIES", {"car": "a car", "kite": "a kite"})
+    monkeypatch.setattr(catalogue, "listed", lambda system: its if system == "car" else {})

@@ -1,20 +1,16 @@
 """What the command promises: statuses, streams, errors in a line, nothing left behind."""
 
-import io
 import json
 import os
 import shlex
-import signal
-import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import click
 import pytest
 
 from robins import cli, results
-from robins.cli import Status, cache, commands, interrupts, running
+from robins.cli import Status, cache, commands, running
 from robins.logs import Finding, LogError
 from robins.scenario import ScenarioError
 from robins.units import UnitError
@@ -296,220 +292,29 @@ def test_the_list_names_everything(robins, systems):
         "bench": sorted(p.stem for p in PACKAGE.glob("bench/run/scenarios/*.toml")),
         "designs": sorted(p.stem for p in PACKAGE.glob("cli/problems/*.toml")),
     }
-    people = robins("list").out
-    told = ("car  a car", "car/town, car/road", "ekf, ukf", "C1: it holds", "kite")
-    for expected in (*told, "noisy-line, sign-star", "baro-height, two-states"):
-        assert expected in people
-    assert "robins run car/town" in people
+    of_the_car = json.loads(answer.out)["systems"][0]
+    assert json.loads(robins("list", "car", "--json").out) == of_the_car
 
 
-# ------------------------------------------------------------------------- in its own process
-
-
-def start(code, *arguments, **settings):
-    """Start a process that runs `main` after some code of the test's."""
-    prologue = "import sys\nfrom robins.cli import main\n"
-    script = f"{prologue}{textwrap.dedent(code)}\nsys.exit(main(sys.argv[1:]))"
-    return subprocess.Popen([sys.executable, "-c", script, *arguments], text=True, **settings)
-
-
-def test_help_starts_in_a_blink():
-    code = """
-    import atexit, resource
-    def told():
-        heavy = {"jax", "numpy", "matplotlib", "xarray", "scipy", "pydantic", "rich"}
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        print(used.ru_utime + used.ru_stime, sorted(heavy & set(sys.modules)), file=sys.stderr)
-    atexit.register(told)
-    """
-    process = start(code, "--help", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert out.startswith("Usage:")
-    seconds, loaded = err.split(maxsplit=1)
-    assert float(seconds) < 0.5  # of processor time, which other work on the machine does not touch
-    assert loaded.strip() == "[]"
-
-
-SLOW = """
-import time, types
-from pathlib import Path
-from robins import results
-def run_scenario(name, *, out, **asked):
-    with results.ResultWriter(out) as writer:
-        writer.save_file("large.bin", b"x" * 1000)
-        print("writing", flush=True)
-        time.sleep(60)
-sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workbench, number):
-    robins("run", "car/town", "--out", "out", "--seed", 1)
-    process = start(
-        SLOW,
-        *("run", "car/town", "--out", "out"),
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-    assert process.stdout.readline() == "writing\n"
-    assert len(list(tmp_path.iterdir())) == 2
-    process.send_signal(number)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 3
-    assert "Traceback" not in err
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert results.read("out").summary["seed"] == 1
-
-
-def test_nohup_is_respected():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with interrupts.heeded():
-            signal.raise_signal(signal.SIGHUP)
-            interrupts.obey()
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
-DEAF = """
-import gc, os, signal, time, types
-def run_scenario(name, *, progress, **asked):
-    def _xla_gc_callback(phase, info):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.01)
-    gc.callbacks.append(_xla_gc_callback)
-    gc.collect()
-    gc.callbacks.clear()
-    time.sleep(30)
-sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
-"""
-
-SWALLOWED = """
-import os, signal, time, types
-def run_scenario(name, *, progress, **asked):
-    try:
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(1)
-    except BaseException:
-        pass
-    progress(0.5, "on and on")
-    time.sleep(30)
-sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
-"""
-
-
-@pytest.mark.parametrize("code", [DEAF, SWALLOWED], ids=["in a callback", "swallowed"])
-def test_an_interrupt_is_not_lost(tmp_path, code):
-    process = start(
-        code, "run", "car/town", cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    _, err = process.communicate(timeout=15)
-    assert process.returncode == 3
-    assert err.strip().startswith("robins: interrupted.")
-
-
-def test_an_interrupted_process_ends_with_its_status_whatever_its_threads_do(tmp_path):
-    """Compilers leave threads that crash when the interpreter is taken away beneath them."""
-    code = f"""{SLOW}
-import atexit, os
-atexit.register(os.abort)
-main_of_the_process = main
-main = lambda arguments: main_of_the_process()
-"""
-    process = start(
-        code,
-        *("run", "car/town", "--out", "out"),
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-    assert process.stdout.readline() == "writing\n"
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 3
-    assert err.strip().startswith("robins: interrupted.")
-    assert list(tmp_path.iterdir()) == []
-
-
-LISTED = """
-import types
-claim = {"id": "C1", "text": "it holds " * 4000}
-car = types.SimpleNamespace(
-    name="car", summary="", scenarios={}, filters=(), claims=(claim,), replay=None
-)
-sys.modules["robins.systems"] = types.SimpleNamespace(SYSTEMS={"car": car})
-"""
-
-
-@pytest.mark.parametrize("command", [("list",), ("list", "--json"), ("--help",)])
-def test_a_full_standard_output_is_a_failure(command):
-    with open("/dev/full", "w") as full:
-        process = start(LISTED, *command, stdout=full, stderr=subprocess.PIPE)
-        _, err = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert err == "robins: cannot write to standard output: No space left on device\n"
-
-
-def test_a_reader_that_goes_away_is_no_reason_to_complain():
-    process = start(LISTED, "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    process.stdout.close()
-    process.wait(timeout=60)
-    assert process.stderr.read() == ""
-    process.stderr.close()
-    assert process.returncode == 1
-
-
-def test_a_closed_standard_output_is_told():
-    process = start("", "--help", preexec_fn=lambda: os.close(1), stderr=subprocess.PIPE)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert err == "robins: cannot write to standard output: it is closed\n"
-
-
-def test_a_closed_standard_error_is_no_fault(robins, workbench, monkeypatch):
-    monkeypatch.setattr(sys, "stderr", None)
-    assert robins("run", "car/town", "--json").status == 0
-    workbench.error = RuntimeError()
-    answer = robins("run", "car/town", "--debug")
-    assert (answer.status, answer.out) == (1, "noise of some library on standard output\n")
-
-
-@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
-@pytest.mark.parametrize("as_json", [True, False])
-def test_a_terminal_that_lacks_characters_gets_the_others(
-    robins, workbench, monkeypatch, encoding, as_json
-):
-    workbench.warnings = ["100 \N{MICRO SIGN}s \N{EN DASH} late \N{ROCKET}"]
-    with io.TextIOWrapper(io.BytesIO(), encoding) as screen:
-        monkeypatch.setattr(sys, "stdout", screen)
-        status = robins("run", "car/town", *(["--json"] if as_json else [])).status
-        screen.flush()
-        shown = screen.buffer.getvalue()
-    assert status == 0
-    if as_json:  # click writes UTF-8 where it is told of a mere ASCII
-        text = shown.decode("utf-8" if encoding == "ascii" else encoding)
-        assert json.loads(text)["warnings"] == workbench.warnings
-    elif encoding == "latin-1":
-        assert b"Warning: 100 \xb5s ? late ?\n" in shown
-
-
-def test_a_command_in_any_bytes_can_be_kept(robins, workbench):
-    folder = os.fsdecode(b"caf\xe9")
-    assert robins("run", "car/town", "--out", folder).status == 0
-    assert results.read(folder).manifest["command"] == r"robins run car/town --out 'caf\xe9'"
-
-
-def test_the_entry_point_is_installed():
-    done = subprocess.run(
-        [Path(sys.executable).with_name("robins"), "--version"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.startswith("robins, version ")
+def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, systems):
+    lines = robins("list").out.splitlines()
+    assert lines[:4] == [
+        "car  a car",
+        "  car/town                     A car in town",
+        "  car/road                     A car on the road",
+        "",
+    ]
+    for name, title in (("noisy-line", "Noisy lines"), ("two-states", "Two coupled states")):
+        assert any(line.startswith(f"  {name} ") and title in line for line in lines)
+    assert "robins run car/town" in lines[-1]
+    assert "C1" not in "\n".join(lines)
+    car = robins("list", "car").out
+    for expected in ("car  a car", "A car in town", "ekf, ukf", "C1: it holds", "logs     yes"):
+        assert expected in car
+    assert "robins replay LOG --system kite" in robins("list", "kite").out
+    refused = robins("list", "boat")
+    assert refused.status == Status.BAD_INPUT
+    assert refused.err == "robins: no system 'boat'; there are car, kite.\n"
 
 
 # ------------------------------------------------------------------------------------------- cache

@@ -9,7 +9,7 @@ from made_nine_axis import FIELD_ENU_UT, archive, tumble
 
 from robins import workbench
 from robins.scenario import Parameters
-from robins.systems import SYSTEMS, Outcome, System
+from robins.systems import Outcome, System
 
 ROLL = np.pi  # of the body as seen from the sensor
 
@@ -30,15 +30,13 @@ def seen(monkeypatch):
 
     system = System(
         name="compass",
-        summary="attitude from gyro, accelerometer and magnetometer",
         studies={},
-        scenarios={},
         replay_filters=("plain",),
         replay_parameters=Nothing,
         replay=replay,
         orientation=lambda parameters: (ROLL, 0.0, 0.0),
     )
-    monkeypatch.setitem(SYSTEMS, "compass", system)
+    monkeypatch.setattr(workbench, "SYSTEMS", {"compass": system})
     monkeypatch.setattr(workbench.report, "add", lambda *arguments: None)
     return given
 

@@ -284,11 +284,19 @@ def design(problem: str, gamma: str | None, **options: Any) -> None:
 app.add_command(bench)
 
 
-@app.command("list", short_help="Name the scenarios, systems, filters and claims.")
+@app.command(
+    "list",
+    short_help="Name the systems and scenarios; of a system its filters and claims.",
+    epilog=examples("robins list", "robins list ins-gnss", "robins list --json"),
+)
+@click.argument("system", required=False)
 @json_option
 @debug_option
-def list_(as_json: bool) -> None:
-    """Name the scenarios, systems, filters and claims there are."""
+def list_(system: str | None, as_json: bool) -> None:
+    """Name the systems and their scenarios, or tell the filters and claims of SYSTEM.
+
+    With --json everything there is, or SYSTEM alone.
+    """
     from robins.cli.listing import listing
 
-    listing(as_json)
+    listing(system, as_json)

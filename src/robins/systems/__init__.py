@@ -1,13 +1,17 @@
 """Systems: one problem each, with model, scenarios, filters and claims; here is the registry.
 
 Names are imported when they are asked for: who needs the model of one system alone, such as a
-process of the test bench, does not wait for all of them.
+process of the test bench, does not wait for all of them, and `robins.systems.catalogue` tells of
+all without importing one.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
+
+from robins.systems.catalogue import SUMMARIES
 
 if TYPE_CHECKING:
     from robins.systems.system import (
@@ -23,10 +27,6 @@ if TYPE_CHECKING:
         Study,
         System,
     )
-
-    SYSTEMS: dict[str, System]
-
-_PACKAGES = ("ins_gnss", "transfer_alignment", "airship", "rocket", "satellite", "marg")
 
 __all__ = [
     "SYSTEMS",
@@ -44,13 +44,30 @@ __all__ = [
 ]
 
 
+class _Registry(Mapping[str, "System"]):
+    """Systems by name; each is imported when it is taken out."""
+
+    def __getitem__(self, name: str) -> System:
+        if name not in SUMMARIES:
+            raise KeyError(name)
+        return importlib.import_module(f"{__name__}.{name.replace('-', '_')}").SYSTEM
+
+    def __contains__(self, name: object) -> bool:
+        return name in SUMMARIES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(SUMMARIES)
+
+    def __len__(self) -> int:
+        return len(SUMMARIES)
+
+
+SYSTEMS: Mapping[str, System] = _Registry()
+
+
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "SYSTEMS":
-        every = (importlib.import_module(f"{__name__}.{package}").SYSTEM for package in _PACKAGES)
-        found: Any = {system.name: system for system in every}
-    else:
-        found = getattr(importlib.import_module(f"{__name__}.system"), name)
+    found = getattr(importlib.import_module(f"{__name__}.system"), name)
     globals()[name] = found
     return found

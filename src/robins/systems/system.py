@@ -18,6 +18,7 @@ from jaxtyping import Array
 from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
 from robins.scenario import Parameters
+from robins.systems.catalogue import listed
 from robins.systems.limits import Names, Runs
 
 Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
@@ -213,10 +214,8 @@ class Alignment(NamedTuple):
 class System(NamedTuple):
     """One entry of the registry."""
 
-    name: str
-    summary: str
+    name: str  # as in the catalogue, which knows its summary and its scenarios
     studies: Mapping[str, Study]
-    scenarios: Mapping[str, Path]  # packaged scenario files by name
     replay_filters: tuple[str, ...] = ()
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one
@@ -226,6 +225,11 @@ class System(NamedTuple):
     alignment: Alignment | None = None
 
     @property
+    def scenarios(self) -> dict[str, Path]:
+        """Packaged scenario files by name."""
+        return {name: scenario.path for name, scenario in listed(self.name).items()}
+
+    @property
     def filters(self) -> tuple[str, ...]:
         """Names of all filters, each once."""
         named = [name for study in self.studies.values() for name in study.filters]
@@ -233,5 +237,6 @@ class System(NamedTuple):
 
     @property
     def claims(self) -> tuple[Mapping[str, str], ...]:
-        """What scenarios check."""
-        return tuple(claim for study in self.studies.values() for claim in study.claims)
+        """What scenarios check, each once: studies may share claims."""
+        every = [claim for study in self.studies.values() for claim in study.claims]
+        return tuple(claim for i, claim in enumerate(every) if claim not in every[:i])

@@ -15,9 +15,7 @@ _FILTERS = (*FILTERS, *(name + SMOOTHED for name in FILTERS))
 
 SYSTEM = System(
     name="ins-gnss",
-    summary="loosely coupled INS/GNSS: a simulated drive with an outage, and recorded logs",
     studies={"drive": Study(Drive, drive_problem, _FILTERS, CLAIMS)},
-    scenarios={"drive": _HERE / "drive.toml"},
     replay_filters=_FILTERS,
     replay_parameters=Replay,
     replay_default=_HERE / "replay.toml",

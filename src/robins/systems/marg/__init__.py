@@ -13,9 +13,7 @@ from robins.systems.system import System
 
 SYSTEM = System(
     name="marg",
-    summary="orientation from gyro, accelerometer and magnetometer, of recorded logs",
     studies={},
-    scenarios={},
     replay_filters=FILTERS,
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",

@@ -5,8 +5,6 @@ is compared with, and what should be used instead. Two studies: "magnetic-attitu
 the paper's formulation, and "field-vector" (test-beds B), what a magnetometer can do.
 """
 
-from pathlib import Path
-
 from robins.systems.rocket.claims import CLAIMS
 from robins.systems.rocket.parameters import (
     ANGLE_FILTERS,
@@ -17,20 +15,12 @@ from robins.systems.rocket.parameters import (
 from robins.systems.rocket.problem import angle_problem, field_problem
 from robins.systems.system import Study, System
 
-_HERE = Path(__file__).parent / "scenarios"
-_SCENARIOS = (
-    *("a1", "a2", "a3", "a4", "a5", "a6", "a7", "a7q", "a8"),
-    *("b1", "b1n", "b2", "b3", "b4", "b5"),
-)
-
 SYSTEM = System(
     name="rocket",
-    summary="a spinning sounding rocket: attitude from MEMS gyro and magnetometer, federated",
     studies={
         "magnetic-attitude": Study(MagneticAttitude, angle_problem, ANGLE_FILTERS, CLAIMS),
         "field-vector": Study(FieldVector, field_problem, FIELD_FILTERS, CLAIMS),
     },
-    scenarios={name: _HERE / f"{name}.toml" for name in _SCENARIOS},
 )
 
 __all__ = ["SYSTEM"]

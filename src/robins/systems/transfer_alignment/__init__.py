@@ -5,8 +5,6 @@
 - study "product": total state with mounting and flexure, closed loop; also for recorded pairs.
 """
 
-from pathlib import Path
-
 from robins.systems.system import Study, System
 from robins.systems.transfer_alignment import (
     matching_claims,
@@ -21,16 +19,8 @@ from robins.systems.transfer_alignment.matching_parameters import Matching
 from robins.systems.transfer_alignment.pair_replay import ALIGNMENT, orientation
 from robins.systems.transfer_alignment.product_problem import Product, product_problem
 
-_HERE = Path(__file__).parent / "scenarios"
-_SCENARIOS = (
-    *("s0", "s0r", "s1", "s2", "s3"),
-    *("a", "b", "c", "d", "e"),
-    *("aircraft", "ship", "vehicle"),
-)
-
 SYSTEM = System(
     name="transfer-alignment",
-    summary="a slave IMU on a flexing mount aligns itself to a master INS",
     studies={
         "attitude-matching": Study(
             Matching, matching_problem, matching_parameters.FILTERS, matching_claims.CLAIMS
@@ -40,7 +30,6 @@ SYSTEM = System(
         ),
         "product": Study(Product, product_problem, product_filters.FILTERS, product_claims.CLAIMS),
     },
-    scenarios={name: _HERE / f"{name}.toml" for name in _SCENARIOS},
     orientation=orientation,
     alignment=ALIGNMENT,
 )

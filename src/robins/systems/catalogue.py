@@ -1,0 +1,44 @@
+"""What systems there are and the scenarios that come with them, told without importing one."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+SUMMARIES = {
+    "ins-gnss": "loosely coupled INS/GNSS: a simulated drive with an outage, and recorded logs",
+    "transfer-alignment": "a slave IMU on a flexing mount aligns itself to a master INS",
+    "airship": "a stratospheric airship in the wind: SINS, stars, radar, barometer and air data",
+    "rocket": "a spinning sounding rocket: attitude from MEMS gyro and magnetometer, federated",
+    "satellite": "a satellite's attitude in closed loop: gyro, star sensor, mixed H2/H-infinity",
+    "marg": "orientation from gyro, accelerometer and magnetometer, of recorded logs",
+}
+
+
+class Listed(NamedTuple):
+    """A scenario file and what it is about."""
+
+    path: Path
+    title: str
+    study: str  # "" where the system has one alone
+
+
+@cache
+def listed(system: str) -> dict[str, Listed]:
+    """Packaged scenarios of a system by name, those of a study together.
+
+    A file of its folder that states no number of runs configures a replay and is no scenario.
+
+    Args:
+        system: name; one that comes without a folder of scenarios has none.
+    """
+    folder = Path(__file__).parent / system.replace("-", "_") / "scenarios"
+    found: dict[str, Listed] = {}
+    for path in sorted(folder.glob("*.toml")):
+        says: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
+        if "runs" in says:
+            found[path.stem] = Listed(path, says["title"], says.get("study", ""))
+    studies = list(dict.fromkeys(scenario.study for scenario in found.values()))
+    return dict(sorted(found.items(), key=lambda item: studies.index(item[1].study)))
