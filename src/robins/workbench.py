@@ -23,6 +23,7 @@ from robins.ins.frames import to_ned_frd
 from robins.logs import Finding
 from robins.report import bounds
 from robins.systems import SYSTEMS, Outcome, Study, System
+from robins.systems.catalogue import configurations, listed
 
 Progress = Callable[[float, str], None]
 
@@ -58,24 +59,20 @@ def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
         InputError: there is no such scenario or file, the file names no system, or only a
             recorded pair fits it.
     """
-    packaged = {
-        f"{s.name}/{k}": (s, path) for s in SYSTEMS.values() for k, path in s.scenarios.items()
-    }
-    of_pairs = {
-        f"{s.name}/{k}": (s, path)
-        for s in SYSTEMS.values()
-        if s.alignment is not None
-        for k, path in s.alignment.configurations.items()
-    }
-    if name in of_pairs and not recorded:
+    packaged = {f"{s}/{k}": (s, one.path) for s in SYSTEMS for k, one in listed(s).items()}
+    others = {f"{s}/{k}": (s, path) for s in SYSTEMS for k, path in configurations(s).items()}
+    if recorded:
+        packaged |= others
+    elif name in others:
+        path = others[name][1]
         raise InputError(
-            f"{name} describes a recorded pair: give its logs with --master and --slave. To "
-            f"simulate such a pair, copy {of_pairs[name][1]}, put your units in and run the copy"
+            f"{name} describes what is recorded and simulates nothing. A recorded pair is given "
+            f"with --master and --slave, another log with `robins replay LOG... {path}`. To "
+            "simulate a pair, put your units into a copy of that file and run the copy"
         )
-    packaged |= of_pairs if recorded else {}
     if name in packaged:
         system, path = packaged[name]
-        return system, name, path.read_text()
+        return SYSTEMS[system], name, path.read_text("utf-8")
     if not name.endswith(".toml"):
         raise InputError(
             f"no scenario '{name}'{_hint(name, packaged)} `robins list` names those there are; "

@@ -34,11 +34,20 @@ def listed(system: str) -> dict[str, Listed]:
     Args:
         system: name; one that comes without a folder of scenarios has none.
     """
-    folder = Path(__file__).parent / system.replace("-", "_") / "scenarios"
     found: dict[str, Listed] = {}
-    for path in sorted(folder.glob("*.toml")):
+    for path in _files(system):
         says: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
         if "runs" in says:
             found[path.stem] = Listed(path, says["title"], says.get("study", ""))
     studies = list(dict.fromkeys(scenario.study for scenario in found.values()))
     return dict(sorted(found.items(), key=lambda item: studies.index(item[1].study)))
+
+
+def configurations(system: str) -> dict[str, Path]:
+    """The other packaged files of a system by name: what is believed of something recorded."""
+    return {path.stem: path for path in _files(system) if path.stem not in listed(system)}
+
+
+def _files(system: str) -> list[Path]:
+    folder = Path(__file__).parent / system.replace("-", "_") / "scenarios"
+    return sorted(folder.glob("*.toml"))

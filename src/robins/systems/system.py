@@ -208,7 +208,6 @@ class Alignment(NamedTuple):
     parameters: type[Parameters]
     filters: tuple[str, ...]
     align: Callable[..., Outcome]  # (dataset with a master, parameters, filters, progress)
-    configurations: Mapping[str, Path]  # packaged files by name; nobody simulates them
 
 
 class System(NamedTuple):

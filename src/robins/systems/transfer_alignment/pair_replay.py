@@ -9,7 +9,6 @@ is aligned anew.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -213,9 +212,7 @@ def orientation(parameters: Replay) -> tuple[float, float, float]:
     return roll, pitch, yaw
 
 
-ALIGNMENT = Alignment(
-    "product", Replay, FILTERS, replay, {"replay": Path(__file__).parent / "scenarios/replay.toml"}
-)
+ALIGNMENT = Alignment("product", Replay, FILTERS, replay)
 
 
 def _epochs(pieces: list[Piece]) -> np.ndarray:
