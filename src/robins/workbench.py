@@ -181,6 +181,7 @@ def run_scenario(
     chosen = _check_filters(label, study.filters, filters or parameters.filters)
     count = parameters.runs if runs is None else runs
     with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
+        tell(0.0, "setting up the simulation")
         try:
             problem = study.problem(parameters, chosen, seed)
         except ValueError as error:

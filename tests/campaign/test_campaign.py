@@ -189,7 +189,15 @@ def test_filters_may_have_states_of_their_own(problem):
         },
         limits=(Limit("1_m", "line", 1.0),),
     )
-    outcome = simulate(mixed, 6, chunk=4)
+    told = []
+    outcome = simulate(mixed, 6, chunk=4, progress=lambda share, what: told.append((what, share)))
+    # Worlds and three filters, a quarter of a chunk each: of 4 runs, then of the 2 that are left.
+    shares = np.interp(np.arange(8) / 4, [0, 1, 2], [0, 4, 6]) / 6
+    stages = ["simulation", "right", "wide", "cm"]
+    words = [f"{s}: compiling, runs 1 to 4 of 6" for s in stages]
+    words += [f"{s}: runs 5 to 6 of 6" for s in stages]
+    assert [what for what, _ in told] == words
+    np.testing.assert_allclose([share for _, share in told], shares)
     ds = outcome.solution
     for name in ("rms_line", "mean_sigma_line", "error_line"):
         np.testing.assert_allclose(ds[name][1], ds[name][0], rtol=1e-9, atol=1e-12)

@@ -1,6 +1,7 @@
 """A bar for people who wait, and for nobody else."""
 
 import io
+import re
 import time
 
 import pytest
@@ -53,6 +54,17 @@ def test_a_bar_appears_even_if_nothing_is_told():
     screen = Screen(terminal=True)
     with Progress(screen, wait_s=0.01):
         assert until(lambda: "starting" in screen.getvalue())
+
+
+def test_it_moves_while_nothing_is_told():
+    screen = Screen(terminal=True)
+    with Progress(screen, wait_s=0.0) as progress:
+        progress(0.0, "compiling")
+
+        def seen():
+            return set(re.findall(r"([-\\|/])(?:\x1b\[[\d;]*m)? compiling", screen.getvalue()))
+
+        assert until(lambda: len(seen()) > 2)
 
 
 def test_short_work_shows_nothing():

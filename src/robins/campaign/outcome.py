@@ -42,18 +42,27 @@ def simulate(
         for n in names
     }
     done, bound = 0, None
+
+    def stage(what: str, step: int) -> None:
+        """Tell of a step of a chunk: its worlds are simulated first, then every filter is run."""
+        last = min(done + chunk, runs)
+        share = (done + (last - done) * step / (1 + len(names))) / max(runs, 1)
+        verb = "compiling, " if done == 0 else ""
+        tell(share, f"{what}: {verb}runs {done + 1} to {last} of {runs}")
+
+    stage("simulation", 0)
     for batch, count in worlds(problem, runs, chunk):
         of = problem.bound_of
         if bound is None and of is not None and of in problem.contenders:
-            tell(0.0, "covariance bound")
+            stage("covariance bound", 1)
             first = jax.tree_util.tree_map(lambda x: x[0], batch)
             bound = bound_sigma(problem, of, first)
-        for i, name in enumerate(names):
-            verb = "compiling, " if done == 0 else ""
-            share = (done + count * i / len(names)) / runs
-            tell(share, f"{name}: {verb}runs {done + 1} to {done + count} of {runs}")
+        for step, name in enumerate(names, 1):
+            stage(name, step)
             found[name].add(record(problem, name, batch, count))
         done += count
+        if done < runs:
+            stage("simulation", 0)
     if keep is not None:
         keep({name: vars(s) for name, s in found.items()})
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}

@@ -43,10 +43,17 @@ class Progress:
 
     def _show(self) -> None:
         from rich.console import Console
-        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import (
+            BarColumn,
+            SpinnerColumn,
+            TaskProgressColumn,
+            TextColumn,
+            TimeElapsedColumn,
+        )
         from rich.progress import Progress as Bar
 
         columns = (
+            SpinnerColumn("line"),  # a compilation tells nothing of its share, but it goes on
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             TaskProgressColumn(),
