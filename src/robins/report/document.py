@@ -118,7 +118,7 @@ def _metrics(filters: Mapping[str, Mapping[str, Any]]) -> str:
         cells = [_td(numbers.show(values.get(name)), "number") for values in filters.values()]
         rows.append([f'<th scope="row" title="{escape(name)}">{escape(text)}</th>'])
         rows[-1] += [_td(unit, "unit"), *cells]
-    return f"<section>\n<h2>Summary</h2>\n{_table(head, rows)}\n</section>"
+    return f"<section>\n<h2>Summary</h2>\n{_table(head, rows, 'metrics')}\n</section>"
 
 
 def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
@@ -134,7 +134,7 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
         ]
         for c in claims
     ]
-    return f"<section>\n<h2>Claims</h2>\n{_table(head, rows)}\n</section>"
+    return f"<section>\n<h2>Claims</h2>\n{_table(head, rows, 'claims')}\n</section>"
 
 
 def _frame(picture: Picture) -> str:
