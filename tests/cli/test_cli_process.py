@@ -73,6 +73,25 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
     assert results.read("out").summary["seed"] == 1
 
 
+def test_a_terminal_that_is_closed_is_an_interrupt(tmp_path):
+    """What is then written to it fails, also what click writes before it passes Ctrl-C on."""
+    screen, keyboard = os.openpty()
+    process = start(
+        SLOW,
+        *("run", "car/town", "--out", "out"),
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=keyboard,
+    )
+    os.close(keyboard)
+    assert process.stdout.readline() == "writing\n"
+    os.close(screen)
+    process.send_signal(signal.SIGHUP)
+    process.communicate(timeout=30)
+    assert process.returncode == 3
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_nohup_is_respected():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

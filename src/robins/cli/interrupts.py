@@ -49,16 +49,21 @@ def heeded() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    _asked = False
     nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     numbers = [n for n in _SIGNALS if not (nohup and n == signal.SIGHUP)]
     before = {number: signal.signal(number, _interrupt) for number in numbers}
     try:
         yield
     finally:
+        _asked = False
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def asked() -> bool:
+    """Whether an interrupt was asked for."""
+    return _asked
 
 
 def obey() -> None:

@@ -87,14 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             output.flush()
             return status if isinstance(status, int) else Status.DONE
         except (click.Abort, KeyboardInterrupt):
-            _tell(
-                "interrupted. No half result was written and an earlier one is as it was; the same "
-                "command starts again."
-            )
-            if arguments is None:
-                _leave(Status.INTERRUPTED)
-            return Status.INTERRUPTED
+            return _interrupted(for_good=arguments is None)
         except Exception as error:
+            if interrupts.asked():  # and turned into this on its way, as by a terminal that is gone
+                return _interrupted(for_good=arguments is None)
             if output.failure is not None:
                 output.abandon()
                 if output.failure.errno != errno.EPIPE:  # a reader may go when it has seen enough
@@ -104,6 +100,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if "--debug" in given and not isinstance(error, click.ClickException):
                 traceback.print_exception(error)
             return _told(error)
+
+
+def _interrupted(for_good: bool) -> Status:
+    _tell(
+        "interrupted. No half result was written and an earlier one is as it was; the same "
+        "command starts again."
+    )
+    if for_good:
+        _leave(Status.INTERRUPTED)
+    return Status.INTERRUPTED
 
 
 def _leave(status: Status) -> NoReturn:
