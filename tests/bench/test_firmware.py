@@ -250,6 +250,16 @@ def test_it_ends_with_the_line(board):
     assert "the line is gone" in board.process.stderr.read()
 
 
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler, g++")
+def test_it_compiles_as_c_plus_plus_too(tmp_path):
+    flags = ["-std=c++11", *FLAGS[1:], "-fsyntax-only", "-x", "c++"]
+    command = ["g++", *flags, *(name for name in firmware() if name.endswith(".c"))]
+    told = subprocess.run(
+        command, cwd=unpacked(tmp_path), capture_output=True, text=True, check=False
+    )
+    assert told.returncode == 0, told.stderr
+
+
 def test_a_path_that_is_no_line(program):
     ran = subprocess.run([program, "/nowhere"], capture_output=True, text=True, check=False)
     assert ran.returncode == 1
@@ -436,8 +446,11 @@ def test_its_order_is_ours(tmp_path):
     numbers = np.concatenate([numbers, 100 + np.cumsum(rng.integers(-3, 6, 2000))]).astype("<u4")
     ours = Sequence()
     expected = bytes(ours.take(int(n)) for n in numbers)
-    found, counts = ran(compiled(tmp_path, ORDER), numbers.tobytes())
+    program = compiled(tmp_path, ORDER)
+    found, counts = ran(program, numbers.tobytes())
     assert found == expected
+    jumps = np.array([7, 8, 8 - 2**31, 9 - 2**31, 5000, 1, 1, 2]).astype("<u4")
+    assert ran(program, jumps.tobytes())[0] == bytes([1, 1, 1, 1, 1, 1, 0, 1])
     assert 0 in expected
     # it does not remember what is missing, so a late frame is an old one
     assert counts == f"{(ours.lost + ours.late) % 2**32} {ours.repeated + ours.late}"
@@ -447,6 +460,38 @@ def test_it_knows_the_length_of_every_message(tmp_path):
     found, _ = ran(compiled(tmp_path, SIZES))
     known = {m.number: wire.size_of(m.name) for m in wire.MESSAGES}
     assert [int(n) for n in found.split()] == [known.get(k, -1) for k in range(256)]
+
+
+SOUND = """
+#include "robins_wire.h"
+#include <stdio.h>
+
+int main(void) {
+  static uint8_t message[1 + ROBINS_LONGEST_MESSAGE];
+  while (fread(message, sizeof message, 1, stdin) == 1)
+    putchar(robins_sound(message[0], message + 1));
+  return 0;
+}
+"""
+
+
+def test_it_refuses_the_numbers_that_we_refuse(tmp_path):
+    longest = max(wire.size_of(m.name) for m in wire.MESSAGES)
+    given, expected = b"", b""
+    for m in wire.MESSAGES:
+        blank = {f.name: np.zeros(f.length, int) for f in m.fields}
+        for f in (f for f in m.fields if f.limits and f.kind == "f64"):
+            least, most = f.limits
+            edges = (least, most, np.nextafter(least, -np.inf), np.nextafter(most, np.inf))
+            for x in (*edges, np.nan, np.inf, -np.inf, 1e308):
+                for k in range(f.length):
+                    values = np.zeros(f.length)
+                    values[k] = x
+                    payload = wire.encode(m.name, {**blank, f.name: values})
+                    given += bytes([m.number]) + payload.ljust(longest, b"\0")
+                    expected += bytes([wire.unsound(m.name, payload) is None])
+    assert ran(compiled(tmp_path, SOUND), given)[0] == expected
+    assert 0.1 < np.mean(np.frombuffer(expected, "u1")) < 0.6
 
 
 def test_a_receiver_for_a_small_board_is_small(tmp_path):

@@ -1,5 +1,6 @@
 """The wire: golden bytes, streams cut anywhere, damage of every kind, and the same in C."""
 
+import re
 import shutil
 import struct
 import subprocess
@@ -207,6 +208,20 @@ def test_sequences_tell_lost_repeated_and_late():
     assert far.lost == 10**6 - 1
 
 
+def test_a_sender_that_counts_anew_is_not_locked_out():
+    for jump in (2**31, 2**32 - 500, 3):
+        seen = Sequence()
+        for step in range(700):
+            assert seen.take(2 * step, step)
+            assert seen.take(2 * step + 1, step)
+        assert not seen.take(1399, 699)  # came in this step
+        assert not seen.take(7, None)  # an old frame, of an old time
+        at = (1400 + jump) % 2**32
+        assert [seen.take(at + k, 700 + k // 2) for k in range(9)] == [True] * 9
+        assert seen.jumps == (jump >= 2**31)
+        assert seen.repeated == 2
+
+
 # ---------------------------------------------------------------------------------------- records
 
 
@@ -253,6 +268,41 @@ def test_payloads_that_are_not_the_message():
         wire.decode("tick", b"abc")
     with pytest.raises(KeyError, match="no message 'tock' in version 1; there are hello, tick"):
         wire.encode("tock", {})
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("gyro", {"theta_b": [0, 1e308, 0]}, r"theta_b\[1\] is 1e\+308 rad, not -10 to 10 or NaN"),
+        ("gyro", {"theta_b": [np.inf, 0, 0]}, r"theta_b\[0\] is inf rad"),
+        ("motion", {"q_ib": [1, 0, np.nan, 0], "omega_b": [0] * 3}, r"q_ib\[2\] is nan, not -2"),
+        ("wheels", {"momentum": [np.nan] * 4}, r"momentum\[0\] is nan N m s"),
+        (
+            "estimate",
+            {"q_ib": [1, 0, 0, 0], "gyro_bias": [0] * 3, "sigma": [np.nan] * 6, "flags": 64},
+            "flags is 64, not 0 to 63",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(name, values, words):
+    why = wire.unsound(name, wire.encode(name, values))
+    assert why
+    assert why.sized
+    assert re.match(words, why.text)
+
+
+def test_the_gate_knows_lengths_and_what_may_be_missing():
+    for m in wire.MESSAGES:
+        whole = bytes(wire.size_of(m.name))
+        assert wire.unsound(m.name, whole) is None
+        for other in (whole + b"\1", whole[:-1]) if whole else (b"\1",):
+            why = wire.unsound(m.name, other)
+            assert why
+            assert not why.sized
+            assert str(len(other)) in why.text
+    gone = wire.encode("star", {"q_ib": [np.nan] * 4, "factor": [np.nan] * 9, "stars": 0})
+    assert wire.unsound("star", gone) is None
+    assert wire.unsound("gyro", wire.encode("gyro", GYRO)) is None
 
 
 def test_the_table_is_sound():

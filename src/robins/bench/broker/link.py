@@ -17,7 +17,7 @@ from robins.bench.broker.injector import Injector, Piece
 from robins.bench.ports.line import Line
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
-from robins.bench.wire.records import size_of
+from robins.bench.wire.records import Unsound, unsound
 from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS
 
 Direction = Literal["to", "from"]
@@ -26,6 +26,8 @@ _MOST = 65536  # bytes read at once
 Watcher = Callable[[str, Direction, bytes, int], None]
 """Who is told of all that goes over a link, as it was on the line: link, direction, the bytes of a
 whole frame or bytes that are none, time [ns]."""
+Refuser = Callable[[str, str, Unsound], None]
+"""Who is told of a frame that is refused: link, message, why."""
 
 
 @dataclass
@@ -38,6 +40,7 @@ class Health:
     repeated: int = 0
     late: int = 0  # out of order, or of a step that was over
     strange: int = 0  # of another run, or a message that this part has not to send
+    refused: int = 0  # sound frames of a length or with numbers that their message cannot have
     bytes_in: int = 0
     bytes_out: int = 0
     heard_ns: int = 0  # time of the run when data came last
@@ -59,6 +62,7 @@ class Link:
         injector: Injector,
         watch: Watcher,
         baud: int | None = None,
+        refuse: Refuser = lambda link, message, why: None,
     ):
         """Take over an open port.
 
@@ -68,8 +72,11 @@ class Link:
             injector: what goes wrong on purpose.
             watch: told of everything on the line.
             baud: of the virtual line; None: bytes get through at once, or the line is real.
+            refuse: told of each frame that cannot be what its message says; it is counted and goes
+                no further.
         """
         self.name, self.fd = name, fd
+        self._refuse = refuse
         self.health = Health()
         self.greeted = False
         self._injector, self._watch = injector, watch
@@ -183,13 +190,16 @@ class Link:
         self.health.bytes_in += len(data)
         found: list[tuple[str, Frame]] = []
         for frame in self._receiver.feed(data):
+            name = NAMES.get(frame.header.type)
             if frame.header.type < FIRST_DATA:
-                self._control(frame, found)
+                self._control(name, frame, found, now_ns)
             elif frame.header.run != self._run:
                 self.health.strange += 1
             else:
                 raw = encode_frame(*frame)
                 self._watch(self.name, "from", raw, frame.header.time_ns)
+                if name is not None and self._bars(name, frame, now_ns):
+                    continue
                 pieces = self._injector.pass_on(self.name, "from", frame, raw, now_ns)
                 self._arrive(pieces, found, now_ns)
         self._count()
@@ -201,19 +211,31 @@ class Link:
         self._arrive(self._injector.release(self.name, "from", now_ns), found, now_ns)
         return found
 
-    def _control(self, frame: Frame, found: list[tuple[str, Frame]]) -> None:
-        name = NAMES.get(frame.header.type)
-        if name is not None and len(frame.payload) != size_of(name):
+    def _control(
+        self, name: str | None, frame: Frame, found: list[tuple[str, Frame]], now_ns: int
+    ) -> None:
+        if name != "hello" and (name != "done" or frame.header.run != self._run):
             self.health.strange += 1
-        elif name == "hello":
+        elif not self._bars(name, frame, now_ns):
             self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
+            if name == "done":
+                self._counts(frame, now_ns)
             found.append((name, frame))
-        elif name == "done" and frame.header.run == self._run:
-            self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
-            self._sequence.take(frame.header.sequence)
-            found.append((name, frame))
-        else:
-            self.health.strange += 1
+
+    def _bars(self, name: str, frame: Frame, now_ns: int) -> bool:
+        """Refuse a frame that cannot be what its message says."""
+        if (why := unsound(name, frame.payload)) is None:
+            return False
+        if name != "hello":  # whose number is not of this run
+            self._counts(frame, now_ns)
+        self.health.refused += 1
+        self._refuse(self.name, name, why)
+        return True
+
+    def _counts(self, frame: Frame, now_ns: int) -> bool:
+        """Count the number of a frame; whether it is new and in its order."""
+        here = frame.header.time_ns == now_ns
+        return self._sequence.take(frame.header.sequence, now_ns if here else None)
 
     def _arrive(self, pieces: list[Piece], found: list[tuple[str, Frame]], now_ns: int) -> None:
         for piece in pieces:
@@ -225,7 +247,7 @@ class Link:
         name = NAMES.get(frame.header.type)
         if name is None:
             self.health.strange += 1
-        elif self._sequence.take(frame.header.sequence):
+        elif self._counts(frame, now_ns):
             self.health.frames += 1
             self.health.heard_ns = now_ns
             found.append((name, frame))

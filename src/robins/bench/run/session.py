@@ -27,9 +27,11 @@ from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.crew import Crew, Death
 from robins.bench.run.setup import NODES, Flight
 from robins.bench.run.telemetry import Flown, Telemetry
+from robins.bench.wire.records import Unsound
 from robins.bench.wire.schema import VERSION
 from robins.scenario import ScenarioError
 
+TRUTH = "motion"
 HELLO_S = 120.0  # for all to compile and say hello
 REVIVED_S = 60.0
 _TELL_S = 0.2  # between two words on how far it is
@@ -153,6 +155,7 @@ class Session:
         self.done = 0
         self.step_ms = self.pace = 0.0
         self._labels: list[tuple[str, LinkFault]] = []
+        self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
         self._passed: deque[tuple[Entry, int]] = deque()  # not written yet
@@ -334,11 +337,11 @@ class Session:
         links: dict[str, Link] = {}
         for part in NODES:
             if (real := self.ports.get(part)) is not None:
-                port = stack.enter_context(open_port(real))
-                links[part] = Link(part, port.fileno(), self.injector, self._watch_wire)
+                fd = stack.enter_context(open_port(real)).fileno()
+                links[part] = self._link(part, fd, None)
                 continue
             pair = stack.enter_context(open_pair())
-            links[part] = Link(part, pair.master, self.injector, self._watch_wire, setup.baud)
+            links[part] = self._link(part, pair.master, setup.baud)
             self._start(part, pair)
         restarts = setup.on_death == "restart"
         keep = frozenset(links) - set(self.ports) if restarts else frozenset()
@@ -353,6 +356,9 @@ class Session:
             self._catch_up,
             keep,
         )
+
+    def _link(self, part: str, fd: int, baud: int | None) -> Link:
+        return Link(part, fd, self.injector, self._watch_wire, baud, self._refused)
 
     def _start(self, part: str, pair: Pair) -> None:
         self._speaks[part] = f"{pair.path},{self.flight.setup.baud or BAUD}"
@@ -386,6 +392,21 @@ class Session:
     def _watch_wire(self, link: str, direction: Direction, data: bytes, time_ns: int) -> None:
         if self._recorder is not None:
             self._passed.append((Entry(self._wall_ns(), link, direction, data), time_ns))
+
+    def _refused(self, link: str, message: str, why: Unsound) -> None:
+        """Tell of a frame that cannot be; of those like it that follow, their count tells.
+
+        Raises:
+            BenchError: it is the true motion, without which nothing is to be judged.
+        """
+        if message == TRUTH and why.sized and message in ROUTES[link]["from"]:
+            raise BenchError(
+                f"at {self.time_s:.1f} s '{link}' says a true motion that cannot be: {why.text}; "
+                "look in the record at what acted on it before"
+            )
+        if (link, message) not in self._barred:
+            self._barred.add((link, message))
+            self.event("refused", f"'{link}': a frame '{message}' is refused: {why.text}")
 
     def _observe(self, message: str, time_ns: int, payload: bytes) -> None:
         self._heard.append((message, time_ns, payload))

@@ -1,14 +1,15 @@
 """The wire: what the parts of a vehicle say to each other over serial lines.
 
 - `schema`: every message, field by field; encoder, decoder, documentation and C header follow it.
-- `records`: payloads, from values to bytes and back. `frames`: header, check and COBS around them.
+- `records`: payloads, from values to bytes and back, and the gate that each of them passes.
+- `frames`: header, check and COBS around them.
 - `receiver`: frames out of a stream of bytes of which some are wrong.
 - `c_header`: the same for firmware; `firmware`: a board to begin with.
 """
 
 from robins.bench.wire.frames import Frame, FrameError, Header, decode_frame, encode_frame
 from robins.bench.wire.receiver import Counts, Receiver, Sequence
-from robins.bench.wire.records import RecordError, decode, encode, size_of
+from robins.bench.wire.records import RecordError, decode, encode, size_of, unsound
 from robins.bench.wire.schema import (
     FIRST_DATA,
     FLAGS,
@@ -47,4 +48,5 @@ __all__ = [
     "markdown",
     "message",
     "size_of",
+    "unsound",
 ]

@@ -8,7 +8,7 @@ import fastcrc
 
 from robins.bench.wire.frames import MOST_PAYLOAD
 from robins.bench.wire.records import size_of
-from robins.bench.wire.schema import MESSAGES, PARTS, VERSION, Message, markdown
+from robins.bench.wire.schema import MESSAGES, PARTS, SIZES, VERSION, Message, markdown
 
 _TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "u64": "uint64_t", "f64": "double"}
 
@@ -166,10 +166,33 @@ static inline long robins_take(robins_receiver *in, uint8_t byte) {
   return size;
 }
 
-/* The same for what has the length of its message: its number, or 0 as long as there is none. */
+/* Least and most of the numbers of a message; NaN passes where it stands for a number that there is
+ * not. Returns whether a payload of the right length is sound. */
+static inline int robins_sound(uint8_t type, const uint8_t *payload) {
+  static const struct {
+    uint8_t type, at, length, missing;
+    double least, most;
+  } limits[] = {
+@limits@  };
+  for (size_t i = 0; i < sizeof limits / sizeof limits[0]; i++) {
+    if (limits[i].type != type) continue;
+    for (size_t k = 0; k < limits[i].length; k++) {
+      double x;
+      memcpy(&x, payload + limits[i].at + k * sizeof x, sizeof x);
+      if (x >= limits[i].least && x <= limits[i].most) continue;
+      if (!limits[i].missing || x == x) return 0;
+    }
+  }
+  return 1;
+}
+
+/* The same for what has the length of its message and is sound: its number, or 0 as long as there
+ * is none. */
 static inline uint8_t robins_message(robins_receiver *in, uint8_t byte) {
   long size = robins_take(in, byte);
-  return size >= 0 && size == robins_size(in->bytes[1]) ? in->bytes[1] : 0;
+  uint8_t type = in->bytes[1];
+  if (size < 0 || size != robins_size(type)) return 0;
+  return robins_sound(type, in->bytes + ROBINS_HEADER) ? type : 0;
 }
 
 static inline robins_header robins_head(const robins_receiver *in) {
@@ -190,15 +213,16 @@ typedef struct {
   uint32_t old; /* frames that came again, or late */
 } robins_order;
 
-/* Counts a frame. Returns whether it is new and in its order, and so may be used. */
+/* Counts a frame. Returns whether it is new and in its order, and so may be used. A number that is
+ * further back than any frame comes late is of a sender that counts anew. */
 static inline int robins_in_order(robins_order *order, uint32_t sequence) {
   uint32_t ahead = order->any ? sequence - order->next : 0;
-  if (ahead & 0x80000000u) {
+  if (0u - ahead <= 1024u && ahead) {
     order->old++;
     return 0;
   }
   order->any = 1;
-  order->passed += ahead;
+  if (!(ahead & 0x80000000u)) order->passed += ahead;
   order->next = sequence + 1u;
   return 1;
 }
@@ -222,9 +246,9 @@ def c_header() -> str:
         f"    case ROBINS_{m.name.upper()}: return {size_of(m.name)};\n" for m in MESSAGES
     )
     structs = "".join(_struct(m) for m in MESSAGES)
-    return (
-        top + "\n" + parts + structs + _END.format(sizes=sizes) + _STREAM.replace("@cases@", cases)
-    )
+    stream = _STREAM.replace("@cases@", cases)
+    stream = stream.replace("@limits@", "".join(_limits(m) for m in MESSAGES))
+    return top + "\n" + parts + structs + _END.format(sizes=sizes) + stream
 
 
 def firmware() -> dict[str, str]:
@@ -241,9 +265,22 @@ def _struct(m: Message) -> str:
         for f in m.fields:
             many = "" if f.length == 1 else f"[{f.length}]"
             unit = "" if f.unit == "1" else f"{f.unit}; "
-            lines.append(f"  {_TYPES[f.kind]} {f.name}{many}; /* {unit}{f.text} */")
+            span = f.span and f"; {f.span}"
+            lines.append(f"  {_TYPES[f.kind]} {f.name}{many}; /* {unit}{f.text}{span} */")
         lines.append(f"}} robins_{m.name};")
     return "\n".join(lines) + "\n"
+
+
+def _limits(m: Message) -> str:
+    """Rows of the table of limits, for the doubles."""
+    rows, at = "", 0
+    for f in m.fields:
+        if f.limits and f.kind == "f64":
+            least, most = f.limits
+            rows += f"    {{ROBINS_{m.name.upper()}, {at}, {f.length}, {int(f.missing)}, "
+            rows += f"{least!r}, {most!r}}},\n"
+        at += f.length * SIZES[f.kind]
+    return rows
 
 
 def _size_check(m: Message) -> str:

@@ -87,19 +87,30 @@ class Sequence:
         lost: numbers that have not come and are not expected any more.
         repeated: frames whose number had come before.
         late: frames that came after one of a higher number; they are not lost any more.
+        jumps: times that the sender began to count anew.
     """
 
     REMEMBERED = 1024
 
     def __init__(self) -> None:
-        self.lost = self.repeated = self.late = 0
+        self.lost = self.repeated = self.late = self.jumps = 0
         self._next: int | None = None
         self._missing: dict[int, None] = {}
+        self._now_ns: int | None = None
+        self._of_now: set[int] = set()
 
-    def take(self, number: int) -> bool:
-        """Count a frame; whether it is new and in its order, and so may be used."""
+    def take(self, number: int, now_ns: int | None = None) -> bool:
+        """Count a frame; whether it is new and in its order, and so may be used.
+
+        Args:
+            number: of the frame.
+            now_ns: the time of the run, of a frame that is of this time. None: it may be an old
+                one. A frame of now whose number is old, but did not come now, is no repeated one:
+                its sender counts anew.
+        """
         if self._next is None:
             self._next = number
+        again = now_ns is None or self._came(number, now_ns)
         ahead = (number - self._next) % 2**32
         if ahead < 2**31:
             for k in range(min(ahead, self.REMEMBERED)):
@@ -113,6 +124,21 @@ class Sequence:
             del self._missing[number]
             self.lost -= 1
             self.late += 1
-        else:
+        elif again:
             self.repeated += 1
+        else:
+            self.jumps += 1
+            self._missing.clear()
+            self._next = (number + 1) % 2**32
+            return True
+        return False
+
+    def _came(self, number: int, now_ns: int) -> bool:
+        """Whether a number has come at this time already; so many are remembered, no more."""
+        if now_ns != self._now_ns:
+            self._now_ns, self._of_now = now_ns, set()
+        if number in self._of_now:
+            return True
+        if len(self._of_now) < self.REMEMBERED:
+            self._of_now.add(number)
         return False

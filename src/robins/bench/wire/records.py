@@ -1,11 +1,12 @@
-"""Payloads: the values of a message to bytes and back, as the schema says."""
+"""Payloads: values of a message to bytes and back, and whether they can be, as the schema says."""
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,13 @@ _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f64": "d"}
 
 class RecordError(ValueError):
     """Values or bytes that are not those of the message."""
+
+
+class Unsound(NamedTuple):
+    """Why a payload cannot be what its message says."""
+
+    text: str
+    sized: bool  # it has the length of its message, so one of its numbers is to blame
 
 
 @cache
@@ -86,3 +94,42 @@ def decode(name: str, payload: bytes) -> dict[str, Any]:
             out[f.name] = some[0] if f.length == 1 else np.array(some)
         at += f.length * SIZES[f.kind]
     return out
+
+
+class _Number(NamedTuple):
+    """What a number of a payload may be."""
+
+    name: str
+    least: float
+    most: float
+    field: Field
+
+
+@cache
+def _layout(name: str) -> tuple[struct.Struct, tuple[_Number, ...]]:
+    fields = message(name).fields
+    numbers = []
+    for f in fields:
+        least, most = f.limits or (0.0, 256.0 ** SIZES[f.kind])
+        for k in range(f.length):
+            numbers.append(_Number(f.name + f"[{k}]" * (f.length > 1), least, most, f))
+    return struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in fields)), (*numbers,)
+
+
+def unsound(name: str, payload: bytes) -> Unsound | None:
+    """The one gate of every frame: its length, and least and most of each number; None: sound.
+
+    An infinity is beyond every limit; NaN passes only where the table says that it stands for a
+    number that there is not.
+
+    Raises:
+        KeyError: there is no such message.
+    """
+    packed, numbers = _layout(name)
+    if len(payload) != packed.size:
+        return Unsound(f"it has {len(payload)} bytes, '{name}' has {packed.size}", False)
+    for x, n in zip(packed.unpack(payload), numbers, strict=True):
+        if not n.least <= x <= n.most and not (n.field.missing and math.isnan(x)):
+            unit = "" if n.field.unit == "1" else f" {n.field.unit}"
+            return Unsound(f"{n.name} is {x:g}{unit}, not {n.field.span}", True)
+    return None

@@ -1,4 +1,4 @@
-"""Every message of the wire, in one table: what is encoded, decoded, documented and put into C.
+"""Every message of the wire in one table: what is encoded, checked, documented and put into C.
 
 Numbers are part of the protocol. Add at the end, never renumber, never reuse; a change of the
 fields of a message is a new version of the protocol. All numbers are little endian; lengths of
@@ -24,6 +24,15 @@ class Field(NamedTuple):
     length: int
     unit: str  # "1": a pure number
     text: str
+    limits: tuple[float, float] | None = None  # least and most of a sound frame; None: of its type
+    missing: bool = False  # whether NaN stands for a number that there is not
+
+    @property
+    def span(self) -> str:
+        """The limits in words."""
+        if self.limits is None:
+            return ""
+        return "{:g} to {:g}".format(*self.limits) + (" or NaN" if self.missing else "")
 
 
 class Message(NamedTuple):
@@ -35,14 +44,22 @@ class Message(NamedTuple):
     fields: tuple[Field, ...]
 
 
-def _f64(name: str, length: int, unit: str, text: str) -> Field:
-    return Field(name, "f64", length, unit, text)
+def _f64(name: str, length: int, unit: str, text: str, most: float, missing: bool = False) -> Field:
+    return Field(name, "f64", length, unit, text, (-most, most), missing)
+
+
+def _size(name: str, length: int, unit: str, text: str, most: float) -> Field:
+    """Floats that are never negative, NaN: not known."""
+    return Field(name, "f64", length, unit, text, (0.0, most), True)
 
 
 PARTS = ("bench", "plant", "table", "gyro", "star", "adm", "acm", "actuators")
 """Who talks; the place in this table is the number of a part."""
 
 _QUATERNION = "body to inertial, scalar first"
+# Limits are far beyond what a craft does and far from where squares and products overflow. They
+# refuse what cannot be; whether a frame is plausible is for the filter to judge.
+_UNIT, _TURN, _RATE, _SIGMA, _ACTS = 2.0, 10.0, 1e3, 1e6, 1e6
 FLAGS = (
     "star used",
     "star refused",
@@ -55,8 +72,8 @@ FLAGS = (
 USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
 _FLAGS = ", ".join(f"bit {k}: {text}" for k, text in enumerate(FLAGS))
 _ACTUATORS = (
-    _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis"),
-    _f64("dipole_b", 3, "A m^2", "of the magnetorquers"),
+    _f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis", _ACTS),
+    _f64("dipole_b", 3, "A m^2", "of the magnetorquers", _ACTS),
 )
 
 MESSAGES: tuple[Message, ...] = (
@@ -96,29 +113,40 @@ MESSAGES: tuple[Message, ...] = (
         "motion",
         "The craft as it truly is, from the plant to the rate table.",
         (
-            _f64("q_ib", 4, "1", _QUATERNION),
-            _f64("omega_b", 3, "rad/s", "rate against inertial"),
+            _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
+            _f64("omega_b", 3, "rad/s", "rate against inertial", _RATE),
         ),
     ),
     Message(
         17,
         "mounted",
         "Attitude of the rate table, which its sensors have.",
-        (_f64("q_ib", 4, "1", _QUATERNION),),
+        (_f64("q_ib", 4, "1", _QUATERNION, _UNIT),),
     ),
     Message(
         18,
         "gyro",
         "A sample of the gyros.",
-        (_f64("theta_b", 3, "rad", "turn over the step, NaN: no sample of this axis"),),
+        (
+            _f64(
+                "theta_b", 3, "rad", "turn over the step, NaN: no sample of this axis", _TURN, True
+            ),
+        ),
     ),
     Message(
         19,
         "star",
         "A frame of the star sensor.",
         (
-            _f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved"),
-            _f64("factor", 9, "rad", "L of its covariance L L', body axes, by rows; 0: unknown"),
+            _f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved", _UNIT, True),
+            _f64(
+                "factor",
+                9,
+                "rad",
+                "L of its covariance L L', body axes, by rows; 0: unknown; NaN: not solved",
+                _TURN,
+                True,
+            ),
             Field("stars", "u16", 1, "1", "used; 0: not told"),
         ),
     ),
@@ -127,10 +155,10 @@ MESSAGES: tuple[Message, ...] = (
         "estimate",
         "Attitude as determined.",
         (
-            _f64("q_ib", 4, "1", _QUATERNION),
-            _f64("gyro_bias", 3, "rad/s", "reported less true rate"),
-            _f64("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes"),
-            Field("flags", "u8", 1, "1", _FLAGS),
+            _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
+            _f64("gyro_bias", 3, "rad/s", "reported less true rate", _RATE),
+            _size("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes", _SIGMA),
+            Field("flags", "u8", 1, "1", _FLAGS, (0, 2 ** len(FLAGS) - 1)),
         ),
     ),
     Message(
@@ -149,16 +177,18 @@ MESSAGES: tuple[Message, ...] = (
         23,
         "wheels",
         "Momenta of the wheels, from their speeds.",
-        (_f64("momentum", WHEELS, "N m s", "along each wheel's axis"),),
+        (_f64("momentum", WHEELS, "N m s", "along each wheel's axis", _ACTS),),
     ),
     Message(
         24,
         "innovation",
         "What the filter made of a frame of the star sensor, for who watches.",
         (
-            _f64("innovation", 3, "rad", "measured less expected, body axes"),
-            _f64("sigma", 3, "rad", "stated"),
-            _f64("ratio", 1, "1", "squared and normalised, over its limit; above 1: refused"),
+            _f64("innovation", 3, "rad", "measured less expected, body axes", _TURN, True),
+            _size("sigma", 3, "rad", "stated", _SIGMA),
+            _size(
+                "ratio", 1, "1", "squared and normalised, over its limit; above 1: refused", 1e30
+            ),
         ),
     ),
 )
@@ -188,10 +218,11 @@ def message(which: str | int) -> Message:
 
 def markdown() -> str:
     """The table as documentation."""
-    lines = ["| number | message | field | type | unit | meaning |", "|---|---|---|---|---|---|"]
+    lines = ["| number | message | field | type | unit | limits | meaning |"]
+    lines.append("|---|---|---|---|---|---|---|")
     for m in MESSAGES:
-        lines.append(f"| {m.number} | `{m.name}` | | | | {m.text} |")
+        lines.append(f"| {m.number} | `{m.name}` | | | | | {m.text} |")
         for f in m.fields:
             kind = f.kind if f.length == 1 else f"{f.kind} x {f.length}"
-            lines.append(f"| | | `{f.name}` | {kind} | {f.unit} | {f.text} |")
+            lines.append(f"| | | `{f.name}` | {kind} | {f.unit} | {f.span} | {f.text} |")
     return "\n".join(lines) + "\n"

@@ -16,8 +16,7 @@ static void send(uint8_t type, uint64_t time_ns, const void *payload, size_t siz
 
 static void take(robins_header head, const uint8_t *payload) {
   if (head.type == ROBINS_BEGIN && head.run != run) {
-    run = head.run;
-    sequence = next = 0;
+    run = head.run, sequence = next = 0;
     begin_gyro();
   }
   if (!run || head.run != run) return; /* an earlier run left it in a buffer */
@@ -28,7 +27,7 @@ static void take(robins_header head, const uint8_t *payload) {
   if (step >= next) {
     uint64_t began_ns = now_ns();
     read_gyro(head.time_ns, &sample);
-    done = (robins_done){step, (uint32_t)(now_ns() - began_ns)};
+    done.step = step, done.compute = (uint32_t)(now_ns() - began_ns);
     next = step + 1;
   }
   if (step + 1 != next) return; /* its sample is forgotten */
@@ -37,13 +36,14 @@ static void take(robins_header head, const uint8_t *payload) {
 }
 
 int main(int argc, char **argv) {
+  static const robins_hello hello = {ROBINS_PART_GYRO, ROBINS_SCHEMA};
   static robins_receiver in;
   uint8_t byte;
   open_line(argc > 1 ? argv[1] : "");
   for (uint64_t hello_ns = 0;;) {
     if (read_bytes(&byte, 1) && robins_message(&in, byte)) take(robins_head(&in), robins_payload(&in));
     if (run || now_ns() < hello_ns) continue;
-    send(ROBINS_HELLO, 0, &(robins_hello){ROBINS_PART_GYRO, ROBINS_SCHEMA}, sizeof(robins_hello));
+    send(ROBINS_HELLO, 0, &hello, sizeof hello);
     hello_ns = now_ns() + 500000000u;
   }
 }
