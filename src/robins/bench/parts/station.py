@@ -172,12 +172,13 @@ def ready(part: Part, steps: Iterable[int]) -> Part:
     return part
 
 
-def serve(port: Any, part: Part) -> Counter[str]:
+def serve(port: Any, part: Part, station: Station | None = None) -> Counter[str]:
     """Be a part at a port until the bench says stop.
 
     Args:
         port: an open `serial.Serial`.
         part: what to be.
+        station: of the part, where it is to go on from what it has done; None: from the beginning.
 
     Returns:
         What was not used, see `Station.counts`.
@@ -185,7 +186,7 @@ def serve(port: Any, part: Part) -> Counter[str]:
     Raises:
         OSError: the far end of the port is gone.
     """
-    station, fd = Station(part), port.fileno()
+    station, fd = station or Station(part), port.fileno()
     said = 0.0
     while not station.over:
         if not station.begun and time.monotonic() - said >= HELLO_EACH_S:

@@ -55,6 +55,7 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
             "lost_frames": sum(h.lost for h in health),
             "repeated_frames": sum(h.repeated for h in health),
             "late_frames": sum(h.late for h in health),
+            "refused_frames": sum(h.refused for h in health),
             "refused_measurements": int(np.sum(flag(flown, "star refused"))),
             "quaternions_of_wrong_length": int(
                 np.sum(flag(flown, "star of a length other than one"))
@@ -71,6 +72,7 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
         "pointing_peak_arcsec": telemetry.peak_arcsec(pointing, counted),
         "injected": {f"{kind} at {link}": n for (kind, link), n in ran.injected.items()},
         "failure": ran.failure,
+        "warnings": warnings(ran, attitude[counted]),
         "latencies": summary,
         "links": {name: dict(vars(h)) for name, h in ran.health.items()},
         "events": [
@@ -91,7 +93,28 @@ def summary(flight: Flight, told: dict[str, Any]) -> dict[str, Any]:
         "filters": {flight.setup.filter: {name: told[name] for name in names}},
         "claims": [],
         "counts": {k: v for k, v in told["counts"].items() if v},
+        "warnings": told["warnings"],
     }
+
+
+def warnings(ran: Ran, error: np.ndarray) -> list[str]:
+    """Why a reader should doubt the figures.
+
+    Args:
+        ran: the run.
+        error: (E, 3) of the attitude, over the counted steps; NaN where it is not known.
+    """
+    out = [
+        f"'{name}': {h.refused} frames were refused, which cannot be what they say"
+        for name, h in ran.health.items()
+        if h.refused
+    ]
+    if unknown := int(np.sum(~np.all(np.isfinite(error), axis=-1))):
+        out.append(
+            f"The error of the attitude is not known in {unknown} of the {len(error)} steps that "
+            "count, and the figures are those of the others"
+        )
+    return out
 
 
 def solution(flight: Flight, ran: Ran) -> xr.Dataset:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
+
 from robins import __version__
 from robins.bench.broker.broker import Broker, Wiring
 from robins.bench.broker.errors import BenchError
@@ -189,8 +191,10 @@ class Session:
                 self.broker.gather(self.run_number, HELLO_S)
                 began = time.monotonic()
                 done = self._go()
+                self._know_the_truth(done)
             except BenchError as error:
-                failure, done = str(error), max(self.broker.time_ns // self.kit.step_ns - 1, 0)
+                failure = str(error)
+                done = done or max(self.broker.time_ns // self.kit.step_ns - 1, 0)
                 self.event("failed", failure)
             finally:
                 seconds = time.monotonic() - began
@@ -254,6 +258,16 @@ class Session:
                     self._tell((k + 1) / self.steps, f"{self.time_s:.0f} s of the run")
         self._catch_up()
         return self.steps
+
+    def _know_the_truth(self, steps: int) -> None:
+        """That something was heard to judge the estimates by.
+
+        Raises:
+            BenchError: the true motion is not known in any step that counts.
+        """
+        q_ib = self.telemetry.flown.q_ib[counted_from(self.flight, steps) : steps]
+        if len(q_ib) and not np.any(np.all(np.isfinite(q_ib), axis=-1)):
+            raise BenchError(f"no true motion was heard from 'plant' up to {self.time_s:.1f} s")
 
     def _obey(self, step: int) -> None:
         """Do what whoever looks on wants; wait while it is paused."""
