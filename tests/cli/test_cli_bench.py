@@ -186,6 +186,19 @@ def test_a_run_that_cannot_be_is_refused_with_the_mend(robins, given, told, tmp_
     assert not list(tmp_path.rglob("*.mcap"))
 
 
+def test_a_second_bench_with_the_same_folder_is_refused(robins, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(RuntimeError), ResultWriter(out) as first:
+        record = first.beside("record.mcap")
+        record.write_text("of the first")
+        answer = robins("bench", "up", SATELLITE, "--out", out)
+        assert (answer.status, answer.out) == (2, "")
+        assert f"{out}: is being written by process {os.getpid()} on " in answer.err
+        assert "choose another folder (--out)" in answer.err
+        assert record.read_text() == "of the first"
+        raise RuntimeError  # the first one is not to be finished
+
+
 def test_a_part_to_be_by_hand_must_be_one(robins):
     answer = robins("bench", "node", "gyros", "/dev/null", SATELLITE)
     assert answer.status == 2

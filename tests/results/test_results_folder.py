@@ -217,7 +217,8 @@ def test_an_interrupt_at_any_line_leaves_a_whole_result(earlier):
             hidden = [name for name in names(earlier.parent) if name != "out"]
             assert all(name.startswith(".robins-") for name in hidden), f"line {lines}"
             for name in hidden:  # this process lives, so no later writer may sweep them
-                shutil.rmtree(earlier.parent / name)
+                left = earlier.parent / name
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
         else:
             break
         finally:
@@ -306,7 +307,66 @@ def test_a_file_size_limit_leaves_the_earlier_result(earlier):
 # ------------------------------------------------------------------- other writers, left-overs
 
 
-def test_two_writers_of_one_folder(earlier):
+def test_the_second_writer_of_a_folder_is_refused_at_once(earlier):
+    """By its path or a link to it, before it has computed anything; others are not concerned."""
+    link = earlier.parent / "latest"
+    link.symlink_to(earlier)
+    first = ResultWriter(earlier)
+    first.save_summary(a_summary(seed=2))
+    first.beside("record").write_text("what the first has so far")
+    for path in (earlier, link):
+        with pytest.raises(ResultError, match="is being written by process") as refused:
+            ResultWriter(path)
+        assert f"process {os.getpid()} on " in str(refused.value)
+        assert "wait for it to end, or choose another folder (--out)" in str(refused.value)
+    with pytest.raises(ResultError, match="is being written by process"):
+        results.extend(read(earlier))
+    write(earlier.with_name("other"), a_summary())
+    first.commit()
+    assert read(earlier).summary["seed"] == 2
+    write(earlier, a_summary(seed=3))
+    assert read(earlier).summary["seed"] == 3
+    assert names(earlier.parent) == ["latest", "other", "out"]
+
+
+def test_another_process_holds_a_folder_until_it_is_killed(earlier):
+    in_a_process(
+        """
+        import signal, subprocess
+        code = "import sys; from robins.results import ResultWriter; "
+        code += "ResultWriter(sys.argv[1]); print(flush=True); input()"
+        other = subprocess.Popen(
+            [sys.executable, "-c", code, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        other.stdout.readline()
+        try:
+            ResultWriter(out)
+        except ResultError as error:
+            assert f"is being written by process {other.pid} on " in str(error), error
+        else:
+            raise SystemExit("two writers")
+        assert names(out.parent) != ["out"]
+        other.kill()
+        other.communicate()
+        write(out, a_summary(seed=2))
+        assert read(out).summary["seed"] == 2
+        assert names(out.parent) == ["out"], names(out.parent)
+        """,
+        earlier,
+    )
+
+
+def unlocked(monkeypatch):
+    """A file system that knows no locks."""
+
+    def unsupported(*_args):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(folder.fcntl, "flock", unsupported)
+
+
+def test_without_locks_the_last_of_two_writers_stands(earlier, monkeypatch):
+    unlocked(monkeypatch)
     first = ResultWriter(earlier)
     first.save_summary(a_summary(seed=2))
     write(earlier, a_summary(seed=3))  # must not take the first for dead
@@ -317,6 +377,7 @@ def test_two_writers_of_one_folder(earlier):
 
 
 def test_a_writer_that_is_overtaken_in_the_exchange_tries_again(earlier, monkeypatch):
+    unlocked(monkeypatch)
     real, done = os.rename, []
 
     def rename(a, b):
@@ -352,10 +413,7 @@ def test_hidden_folders_of_others_are_not_touched(earlier):
 
 
 def test_without_locks_nothing_is_taken_for_dead(earlier, monkeypatch):
-    def unsupported(*_args):
-        raise OSError(errno.ENOLCK, "no locks")
-
-    monkeypatch.setattr(folder.fcntl, "flock", unsupported)
+    unlocked(monkeypatch)
     unknown = folder._hidden(earlier, "new")
     unknown.mkdir()
     write(earlier, a_summary(seed=2))

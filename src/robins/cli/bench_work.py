@@ -69,8 +69,7 @@ def bring_up(
         text = flight.text or f'bench = "satellite"\nflies = "{flight.setup.flies}"\n'
         with ResultWriter(out, command=command, scenario_text=text) as writer:
             # The record is a file of its own until the end: what kills the bench leaves it.
-            record = Path(f"{out}.{RECORD}")
-            record.parent.mkdir(parents=True, exist_ok=True)
+            record = writer.beside(RECORD)
             with _onlooker(flight, live, host, port) as watch:
                 session = Session(flight, record, watch, _share(progress, 0.0, 0.85), paused)
                 try:
@@ -85,7 +84,6 @@ def bring_up(
             told = outcome.figures(flight, ran, loop)
             notes = outcome.notes(flight, told)
             _write(writer, flight, ran, told, notes, record, progress)
-        record.unlink(missing_ok=True)
     _tell_run(out, told, notes, ran, as_json)
     return Status.FAILED if told["failure"] else Status.DONE
 

@@ -5,9 +5,13 @@ result that was there is renamed aside first and deleted last, so at every insta
 whole on the disk. POSIX has no portable call that exchanges two folders; what a crash between the
 two renames leaves behind is found by `locate` and mended by `sweep`, on the next read or write.
 
-A living writer holds an advisory lock on its folders. The kernel drops it with the process, however
-that ends, so a hidden folder whose lock is free belongs to nobody: no process numbers that could be
-reused, no lock files that stay.
+A living writer holds advisory locks: on a small file beside the target, so that there is one writer
+of a result at a time, and on its folders. The kernel drops them with the process, however that
+ends, so a file or hidden folder whose lock is free belongs to nobody, and the next writer removes
+it. What the file says is for people, nothing trusts it.
+
+A file system may know no locks (some network and FUSE ones). Then two writers do not see each other,
+and the result of the one that is done last stands, whole.
 """
 
 from __future__ import annotations
@@ -19,13 +23,18 @@ import os
 import re
 import secrets
 import shutil
+import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-_TRIES = 20  # of a commit, against other writers of the same folder
+_TRIES = 20  # of a commit, against other writers of the same folder, where there are no locks
 _LEFTOVER = re.compile(r"\.robins-(new|old)-([0-9a-f]{12})-[0-9a-f]{8}")
+
+
+class Busy(BlockingIOError):
+    """Another writer has the target."""
 
 
 class Stage(NamedTuple):
@@ -33,7 +42,7 @@ class Stage(NamedTuple):
 
     path: Path
     target: Path
-    lock: ExitStack | None  # closing it unlocks; None where the file system knows no locks
+    locks: ExitStack  # closing it lets the target go, and the folder
     parents: tuple[Path, ...]  # folders made for it, innermost first
 
 
@@ -43,9 +52,12 @@ def resolve(path: str | os.PathLike[str]) -> Path:
 
 
 def _hidden(target: Path, kind: str) -> Path:
-    # The name of the target enters as a digest: it may already have the longest length allowed.
-    key = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
-    return target.parent / f".robins-{kind}-{key}-{secrets.token_hex(4)}"
+    return target.parent / f".robins-{kind}-{_key(target)}-{secrets.token_hex(4)}"
+
+
+def _key(target: Path) -> str:
+    """The name of the target as a digest: it may already have the longest length allowed."""
+    return hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
 
 
 def _leftovers(target: Path, kind: str) -> list[Path]:
@@ -78,6 +90,46 @@ def _lock(folder: Path) -> ExitStack | None:
         except OSError:
             return None
         return stack.pop_all()
+
+
+def _claim(target: Path) -> ExitStack:
+    """Be the one writer of a target until the stack is closed.
+
+    Raises:
+        Busy: another one is.
+    """
+    path = target.parent / f".robins-lock-{_key(target)}"
+    while True:
+        with ExitStack() as stack:
+            # Network file systems lock only what is open for writing.
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            stack.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                who = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
+                raise Busy(errno.EAGAIN, who or "another process", str(target)) from None
+            except OSError:  # no locks here
+                stack.callback(_unlink, path)
+                return stack.pop_all()
+            if not _is_at(descriptor, path):
+                continue  # its last holder removed it between our two calls
+            stack.callback(_unlink, path)  # before it is let go
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+            return stack.pop_all()
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _unlink(path: Path) -> None:
+    with suppress(OSError):
+        os.unlink(path)
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
@@ -115,6 +167,7 @@ def stage(path: str | os.PathLike[str]) -> Stage:
     """Make the hidden folder in which the content of `path` is built.
 
     Raises:
+        Busy: another writer builds one.
         OSError: it cannot be made there.
     """
     target = resolve(path)
@@ -123,26 +176,30 @@ def stage(path: str | os.PathLike[str]) -> Stage:
     # Asked for, because the short name of the hidden folder would not show it before `commit`.
     if len(os.fsencode(target.name)) > os.pathconf(existing, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
-    folder = None
+    folder, locks = None, ExitStack()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        locks.enter_context(_claim(target))
         sweep(target)
         while True:
             folder = _hidden(target, "new")
             os.mkdir(folder)
             try:
-                return Stage(folder, target, _lock(folder), parents)
+                if lock := _lock(folder):
+                    locks.enter_context(lock)
+                return Stage(folder, target, locks, parents)
             except (BlockingIOError, FileNotFoundError):
                 # A sweep by another writer fell between its making and its locking.
                 shutil.rmtree(folder, ignore_errors=True)
     except BaseException:
-        _remove(folder, parents)
+        _remove(folder, locks, parents)
         raise
 
 
-def _remove(folder: Path | None, parents: tuple[Path, ...]) -> None:
+def _remove(folder: Path | None, locks: ExitStack, parents: tuple[Path, ...]) -> None:
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
+    locks.close()
     for parent in parents:
         with suppress(OSError):
             os.rmdir(parent)
@@ -150,12 +207,13 @@ def _remove(folder: Path | None, parents: tuple[Path, ...]) -> None:
 
 def discard(staged: Stage) -> None:
     """Delete the hidden folder and the parents made for it; the target stays as it was."""
-    _remove(staged.path, staged.parents)
-    _unlock(staged)
+    _remove(staged.path, staged.locks, staged.parents)
 
 
 def commit(staged: Stage) -> None:
     """Sync the hidden folder to the disk and make it the target, in place of what was there.
+
+    The target is let go by `discard`, which then has nothing to delete.
 
     Raises:
         OSError: it could not; what was there is there again.
@@ -174,12 +232,6 @@ def commit(staged: Stage) -> None:
                 raise
     with suppress(OSError):
         sync(staged.target.parent)
-    _unlock(staged)
-
-
-def _unlock(staged: Stage) -> None:
-    if staged.lock is not None:
-        staged.lock.close()
 
 
 def _swap(staged: Stage) -> None:

@@ -34,8 +34,8 @@ class ResultWriter:
             writer.save_summary(summary)
 
     Args:
-        path: the folder; missing parents are made. A folder there that robins did not write is
-            refused at once, before anything is computed.
+        path: the folder; missing parents are made. A folder there that robins did not write, or
+            that another writer is at work on, is refused at once, before anything is computed.
         scenario_text: the scenario as it was read, with what the command line changed.
         device: what computed it, e.g. "cpu" or the name of an accelerator.
         command: the command line or call that makes the result again.
@@ -57,9 +57,16 @@ class ResultWriter:
         self.summary: dict[str, Any] | None = None
         self.solution: xr.Dataset | None = None
         self._began = monotonic()
+        self._beside: list[Path] = []
         _check_replaceable(self.path)
         try:
             self._stage = folder.stage(self.path)
+        except folder.Busy as busy:
+            raise ResultError(
+                self.path,
+                f"is being written by {busy.strerror}",
+                "wait for it to end, or choose another folder (--out)",
+            ) from None
         except OSError as error:
             raise cannot(self.path, "make the result folder", error) from error
 
@@ -119,6 +126,14 @@ class ResultWriter:
         except OSError as error:
             raise cannot(self.path, f"write {name}", error) from error
 
+    def beside(self, name: str) -> Path:
+        """The path of a file beside the folder, ``PATH.NAME``, for what a killed run is to leave.
+
+        It is this writer's alone, as the folder is; it is deleted when the result is in its place.
+        """
+        self._beside.append(Path(f"{self.path}.{name}"))
+        return self._beside[-1]
+
     def commit(self) -> Path:
         """Make the result appear; the last call.
 
@@ -143,6 +158,9 @@ class ResultWriter:
             folder.commit(self._stage)
         except OSError as error:
             raise cannot(self.path, "put the result in its place", error) from error
+        for path in self._beside:
+            path.unlink(missing_ok=True)
+        self.discard()
         return self.path
 
     def _files(self) -> dict[str, Any]:
@@ -174,7 +192,7 @@ class ResultWriter:
             if error is None:
                 self.commit()
         finally:
-            self.discard()  # nothing is left to remove after a commit
+            self.discard()  # nothing is left to do after a commit
 
 
 def write(
