@@ -13,6 +13,7 @@ from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.parts.station import Part, Station, ready, serve
 from robins.bench.ports.port import address, open_port
 from robins.bench.run import outcome
+from robins.bench.run.crew import Death
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 
@@ -62,7 +63,7 @@ class Threads:
 
     rogue: tuple[str, tuple[str, ...]] = ("", ())
 
-    def __init__(self, kit, realtime=False):
+    def __init__(self, kit, realtime=False, restarts=False):
         self.threads: list[threading.Thread] = []
 
     def __enter__(self):
@@ -72,13 +73,11 @@ class Threads:
         for thread in self.threads:
             thread.join(5.0)
 
-    def start(self, name, port, *_):
+    def start(self, name, port, since=-1):
         def be():
             with suppress(OSError), open_port(address(port), timeout_s=None) as line:
-                if name == self.rogue[0]:
-                    serve(line, part(name), Rogue(part(name), self.rogue[1]))
-                else:
-                    serve(line, part(name))
+                rogue = name == self.rogue[0]
+                serve(line, Rogue(part(name), self.rogue[1]) if rogue else Station(part(name)))
 
         self.threads.append(threading.Thread(target=be, daemon=True))
         self.threads[-1].start()
@@ -86,8 +85,11 @@ class Threads:
     def process(self, name):
         return 1
 
-    def deaths(self):
+    def deaths(self, among=None):
         return []
+
+    def remembers(self, name, step):
+        return False
 
 
 @pytest.fixture
@@ -141,3 +143,23 @@ def test_a_part_that_counts_anew_is_heard(fly):
     honest, jumped = fly(), fly("gyro", "jump")
     np.testing.assert_array_equal(jumped.flown.q_est_ib, honest.flown.q_est_ib)
     assert (jumped.health["gyro"].repeated, jumped.health["gyro"].lost) == (0, 0)
+
+
+def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch):
+    class Mortal(Threads):
+        def deaths(self, among=None):
+            return [Death("adm", -9, "")]
+
+        def start(self, name, port, since=-1):
+            if len(self.threads) < len(BUILD):  # nobody comes in the place of the dead
+                super().start(name, port, since)
+
+    monkeypatch.setattr("robins.bench.run.session.Crew", Mortal)
+    of = changed(FLIGHT, {"on_death": "restart", "restarts": 3})
+    session = Session(of, kit=kit())
+    monkeypatch.setattr(session, "_glance", lambda: session.done > 2 and session._bury())
+    ran = session.run()
+    assert ran.failure.startswith("'adm' was killed by SIGKILL, at 0.4 s of the run; that is one")
+    assert ran.failure.endswith("one more than restarts = 3")
+    assert ran.deaths == 4
+    assert [e.kind for e in ran.events] == ["died"] * 4 + ["failed"]

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import re
 import typing
 from pathlib import Path
@@ -16,6 +17,7 @@ from robins.bench.run.session import Session
 from robins.bench.run.setup import NODES, built_in
 from robins.bench.wire.c_header import c_header
 from robins.cli import app
+from robins.results import ResultWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "bench.md").read_text("utf-8")
@@ -188,15 +190,15 @@ def test_a_run_that_cannot_be_is_refused_with_the_mend(robins, given, told, tmp_
 
 def test_a_second_bench_with_the_same_folder_is_refused(robins, tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(RuntimeError), ResultWriter(out) as first:
-        record = first.beside("record.mcap")
-        record.write_text("of the first")
-        answer = robins("bench", "up", SATELLITE, "--out", out)
-        assert (answer.status, answer.out) == (2, "")
-        assert f"{out}: is being written by process {os.getpid()} on " in answer.err
-        assert "choose another folder (--out)" in answer.err
-        assert record.read_text() == "of the first"
-        raise RuntimeError  # the first one is not to be finished
+    first = ResultWriter(out)
+    record = first.beside("record.mcap")
+    record.write_text("of the first")
+    answer = robins("bench", "up", SATELLITE, "--out", out)
+    assert (answer.status, answer.out) == (2, "")
+    assert f"{out}: is being written by process {os.getpid()} on " in answer.err
+    assert "choose another folder (--out)" in answer.err
+    assert record.read_text() == "of the first"
+    first.discard()
 
 
 def test_a_part_to_be_by_hand_must_be_one(robins):

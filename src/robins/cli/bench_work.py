@@ -37,7 +37,8 @@ def _flight(scenario: str, settings: tuple[str, ...], options: Mapping[str, Any]
     """The run that is asked for; options that were not given stay as the scenario has them."""
     from robins.bench.run.setup import changed, read
 
-    given = {k: v for k, v in options.items() if v not in (None, False, {})}
+    # a 0 is one that was given, though it equals False
+    given = {k: v for k, v in options.items() if v is not None and v is not False and v != {}}
     return changed(read(scenario, settings), given)
 
 
@@ -197,7 +198,7 @@ def be_node(part: str, port: str, scenario: str, *, filter_: str | None, seed: i
     with _told():
         from robins.bench.parts.satellite import BUILD
         from robins.bench.parts.satellite.preparing import kit_for
-        from robins.bench.parts.station import ready, serve
+        from robins.bench.parts.station import Station, ready, serve
         from robins.bench.ports.port import address, open_port
         from robins.bench.run.setup import NODES
     if part not in BUILD:
@@ -206,7 +207,7 @@ def be_node(part: str, port: str, scenario: str, *, filter_: str | None, seed: i
     at = address(port)
     table = flight.setup.table and flight.setup.table.table()
     kit = kit_for(flight.loop, flight.setup.filter, flight.setup.seed, table=table)
-    made = ready(BUILD[part](kit), kit.frames)
+    made = Station(ready(BUILD[part](kit), kit.frames))
     with open_port(at, timeout_s=None) as line:
         click.echo(f"'{part}' of {scenario} at {port}, until the bench says stop (Ctrl-C ends it)")
         serve(line, made)

@@ -10,8 +10,8 @@ of a result at a time, and on its folders. The kernel drops them with the proces
 ends, so a file or hidden folder whose lock is free belongs to nobody, and the next writer removes
 it. What the file says is for people, nothing trusts it.
 
-A file system may know no locks (some network and FUSE ones). Then two writers do not see each other,
-and the result of the one that is done last stands, whole.
+A file system may know no locks (some network ones). Then two writers do not see each other, and the
+result of the one that is done last stands, whole.
 """
 
 from __future__ import annotations

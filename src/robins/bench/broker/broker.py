@@ -15,7 +15,7 @@ from typing import NamedTuple
 from robins.bench.broker.errors import BenchError, LinkLost
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import Link
-from robins.bench.broker.revive import Told, beginning, catch_up
+from robins.bench.broker.revive import History, beginning, catch_up
 from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.records import decode, encode
@@ -69,7 +69,7 @@ class Broker:
         glance: Callable[[], None],
         done: Callable[[str, int, int, int, int], None],
         meanwhile: Callable[[], None] = lambda: None,
-        keep: frozenset[str] = frozenset(),
+        keep: Mapping[str, History] | None = None,
     ):
         """Take the links of a run.
 
@@ -84,8 +84,7 @@ class Broker:
                 time it computed [ns].
             meanwhile: called when there is nothing to do but to wait for a part: what need not be
                 done before the part computes is done while it does.
-            keep: parts of which all is kept that was sent to them, so that they can be started
-                anew.
+            keep: the histories of the parts that can be started anew.
         """
         self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
         self.time_ns = 0
@@ -100,7 +99,7 @@ class Broker:
             for name in sent
         }
         self._sends = {p: frozenset(wiring.sends[p]) for p in links}
-        self._kept: dict[str, list[Told]] = {p: [] for p in keep}
+        self._kept = dict(keep or {})
         self._routed: set[tuple[str, int]] = set()
         self._ticked: dict[str, Ticked] = {}
         self._done: set[str] = set()
@@ -173,7 +172,7 @@ class Broker:
         self._done, self._ticked, self._routed = set(), {}, set()
         self._glance()
         for name, link in self.links.items():
-            link.release(self.time_ns)
+            self._keep(link, None, link.release(self.time_ns))
             self._take(name, link.held(self.time_ns))
         self._advance()
         while len(self._done) < len(self.links):
@@ -215,16 +214,25 @@ class Broker:
         self._done.add(name)
         self._advance()
 
-    def revive(self, name: str, patience_s: float) -> None:
+    def revive(self, name: str, patience_s: float, glance: Callable[[], None]) -> None:
         """Bring a part that was started anew to where the old one was; the run waits.
 
+        Args:
+            name: of the part.
+            patience_s: for its hello, and for each answer.
+            glance: called now and then.
+
         Raises:
-            BenchError: it does not answer, or nothing was kept of what the old one was told.
+            BenchError: it does not answer.
+            LinkLost: the far end of its port is gone.
         """
         link = self.links[name]
         answered = self._step if name in self._done else self._step - 1
         begin = beginning(self._run, self.step_ns)
-        catch_up(link, self._kept[name], begin, answered, patience_s, self._glance)
+        try:
+            catch_up(link, self._kept[name].told, begin, answered, patience_s, glance)
+        except OSError as error:
+            raise LinkLost(name, f"the port of '{name}' is gone: {error}") from None
 
     # ----------------------------------------------------------------------------------- the wire
 
@@ -276,6 +284,8 @@ class Broker:
 
     def _finished(self, name: str, frame: Frame) -> None:
         said = decode("done", frame.payload)
+        if name in self._kept:
+            self._kept[name].answered(said["step"])
         if said["step"] != self._step or name not in self._ticked or name in self._done:
             return
         at = self._ticked[name].at_ns
@@ -294,8 +304,12 @@ class Broker:
 
     def _put(self, link: Link, name: str, payload: bytes, time_ns: int) -> None:
         raw = link.send(name, payload, time_ns, self.time_ns)
-        if link.name in self._kept and name != "begin":
-            self._kept[link.name].append(Told(self._step if name == "tick" else None, raw))
+        if name != "begin":
+            self._keep(link, self._step if name == "tick" else None, raw)
+
+    def _keep(self, link: Link, step: int | None, raw: bytes) -> None:
+        if raw and link.name in self._kept:
+            self._kept[link.name].add(step, raw)
 
     def _flush(self, link: Link) -> None:
         try:

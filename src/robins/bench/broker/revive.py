@@ -1,7 +1,7 @@
-"""A part that died is started anew and told all that the old one was told.
+"""A part that died is started anew and told what the old one was told since its last memory.
 
 The same part with the same frames has the same state to the last bit, so a run goes on as if
-nothing had happened. It costs the time to compute all steps so far, less than they took.
+nothing had happened. It costs the time to start, and to compute some hundred steps.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from robins.bench.broker.errors import BenchError
 from robins.bench.broker.link import Link
+from robins.bench.parts.memory import is_due
 from robins.bench.wire.frames import Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.records import decode, encode
@@ -25,6 +26,36 @@ class Told(NamedTuple):
 
     step: int | None  # of the tick that they are; None: other frames
     raw: bytes
+
+
+class History:
+    """What went out to a part since it put its memory aside last.
+
+    Attributes:
+        told: so far.
+        since: the step after which the memory was put aside; -1: never.
+    """
+
+    def __init__(self, is_there: Callable[[int], bool]):
+        """Begin with a run.
+
+        Args:
+            is_there: whether the memory of a step has been written.
+        """
+        self.told: list[Told] = []
+        self.since = -1
+        self._is_there = is_there
+
+    def add(self, step: int | None, raw: bytes) -> None:
+        """Remember what goes out, as `Told`."""
+        self.told.append(Told(step, raw))
+
+    def answered(self, step: int) -> None:
+        """Forget what is in the memory of a step that the part was done with."""
+        if is_due(step) and step > self.since and self._is_there(step):
+            first = next(k for k, one in enumerate(self.told) if one.step == step)
+            del self.told[: first + 1]
+            self.since = step
 
 
 def catch_up(
@@ -39,7 +70,7 @@ def catch_up(
 
     Args:
         link: its link; nothing else reads or writes it meanwhile.
-        told: all that was sent to the old one, in order.
+        told: all that was sent to the old one since the memory of this one, in order.
         begin: the frame that begins the run.
         answered: the last step whose tick the old one answered; ticks beyond are sent, but their
             answers are left to the broker. -1: none.

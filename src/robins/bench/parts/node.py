@@ -1,6 +1,8 @@
 """A part of the vehicle as a process of its own, which knows nothing but its port.
 
 python -m robins.bench.parts.node gyro /dev/pts/5,460800 kit.pickle
+
+With a folder it puts its memory aside there, and with a step too it goes on from that of the step.
 """
 
 from __future__ import annotations
@@ -12,10 +14,12 @@ import pickle
 import signal
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
+from robins.bench.parts.memory import path_of, put_aside
 from robins.bench.parts.satellite import BUILD
-from robins.bench.parts.station import ready, serve
+from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import PortError, address, open_port
 
 REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: ask for SCHED_FIFO
@@ -43,13 +47,32 @@ def realtime(wanted: bool) -> Iterator[str]:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
+@contextlib.contextmanager
+def few_collections() -> Iterator[None]:
+    """Hardly any collection of garbage in the middle of a step: counted references free what a run
+    makes, and each collection looks at all of JAX.
+    """
+    before = gc.get_threshold()
+    gc.collect()
+    gc.set_threshold(RARELY, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+
+
 def main(arguments: Sequence[str]) -> int:
     """Be a part until the bench says stop, or is gone."""
-    name, port, kit_path = arguments
+    name, port, kit_path, *more = arguments
     # An interrupt of the terminal is for the bench, which then tells its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     kit = pickle.loads(Path(kit_path).read_bytes())
     part = ready(BUILD[name](kit), kit.frames)
+    station = Station(part)
+    if more:
+        folder, since = Path(more[0]), int(more[1])
+        memory = None if since < 0 else path_of(folder, name, since).read_bytes()
+        station = Station(part, memory, partial(put_aside, folder, name))
     if os.environ.get(REALTIME) and (why := be_realtime()):
         print(why, file=sys.stderr)
     gc.collect()
@@ -57,7 +80,7 @@ def main(arguments: Sequence[str]) -> int:
     gc.set_threshold(RARELY)
     try:
         with open_port(address(port), timeout_s=None) as line:
-            serve(line, part)
+            serve(line, station)
     except OSError:  # of which pyserial's are
         return 0  # the bench is gone, and so are we
     except PortError as error:

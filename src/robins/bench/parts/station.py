@@ -7,6 +7,7 @@ the order in which they come, is settled here. Firmware does the same, see `benc
 from __future__ import annotations
 
 import os
+import pickle
 import select
 import time
 from collections import Counter
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from robins.bench.parts.memory import is_due
 from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
@@ -22,6 +24,8 @@ from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS, PARTS
 
 HELLO_EACH_S = 0.5
 _MOST = 65536  # bytes read at once
+
+_MEMORY = ("_run", "_step_ns", "_sequence", "_sent", "_state", "_inbox", "_done")
 
 Inputs = Mapping[str, Any]  # values by field, by message; None where it did not come
 Sent = Iterable[tuple[str, Mapping[str, Any]]]  # messages with their values
@@ -54,21 +58,32 @@ class Station:
         counts: frames that were not used, by why: "strange" (of another run or an unknown message),
             "repeated", "late" (of a step that is over), "size".
         over: whether the bench has said that the run is over.
+        begun: whether the bench has answered.
     """
 
-    def __init__(self, part: Part):
-        self.part = part
+    def __init__(
+        self,
+        part: Part,
+        memory: bytes | None = None,
+        put_aside: Callable[[int, bytes], None] | None = None,
+    ):
+        """Be a part.
+
+        Args:
+            part: which.
+            memory: of the one in whose place it is started; None: it begins anew.
+            put_aside: takes the step and the memory now and then; None: nobody wants it.
+        """
+        self.part, self._put_aside = part, put_aside
         self.counts: Counter[str] = Counter()
         self.over = False
         self._receiver = Receiver()
         self._run: int | None = None
         self._step_ns = self._hellos = 0
         self._reset()
-
-    @property
-    def begun(self) -> bool:
-        """Whether the bench has answered."""
-        return self._run is not None
+        if memory is not None:
+            self.__dict__.update(pickle.loads(memory))
+        self.begun = False
 
     def hello(self) -> bytes:
         """What it says until the bench answers; numbered, so that a part that was started anew is
@@ -102,6 +117,7 @@ class Station:
             if head.run != self._run:
                 self._reset()
                 self._run, self.over = head.run, False
+            self.begun = True
             self._step_ns = decode("begin", frame.payload)["step"]
             return b""
         if head.run != self._run or name is None:
@@ -126,10 +142,14 @@ class Station:
         if self._done and step < self._done[0]:
             self.counts["late"] += 1
             return b""
-        if not self._done or step > self._done[0]:
+        fresh = not self._done or step > self._done[0]
+        if fresh:
             self._compute(step, time_ns)
         assert self._done is not None
-        return b"".join(self._frame(name, payload, time_ns) for name, payload in self._done[2])
+        out = b"".join(self._frame(name, payload, time_ns) for name, payload in self._done[2])
+        if fresh and self._put_aside is not None and is_due(step):
+            self._put_aside(step, pickle.dumps({name: self.__dict__[name] for name in _MEMORY}))
+        return out
 
     def _compute(self, step: int, time_ns: int) -> None:
         began = time.perf_counter_ns()
@@ -172,13 +192,12 @@ def ready(part: Part, steps: Iterable[int]) -> Part:
     return part
 
 
-def serve(port: Any, part: Part, station: Station | None = None) -> Counter[str]:
+def serve(port: Any, station: Station) -> Counter[str]:
     """Be a part at a port until the bench says stop.
 
     Args:
         port: an open `serial.Serial`.
-        part: what to be.
-        station: of the part, where it is to go on from what it has done; None: from the beginning.
+        station: of the part.
 
     Returns:
         What was not used, see `Station.counts`.
@@ -186,7 +205,7 @@ def serve(port: Any, part: Part, station: Station | None = None) -> Counter[str]
     Raises:
         OSError: the far end of the port is gone.
     """
-    station, fd = station or Station(part), port.fileno()
+    fd = port.fileno()
     said = 0.0
     while not station.over:
         if not station.begun and time.monotonic() - said >= HELLO_EACH_S:

@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from robins.bench.parts.memory import path_of
 from robins.bench.parts.node import REALTIME
 
 _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
@@ -39,14 +40,15 @@ class Death(NamedTuple):
 class Crew:
     """Processes, one a part; a context that ends them all however it is left."""
 
-    def __init__(self, kit: Any, realtime: bool = False):
+    def __init__(self, kit: Any, realtime: bool = False, restarts: bool = False):
         """Lay out what they are given.
 
         Args:
             kit: for all of them.
             realtime: whether they ask for a real-time scheduler.
+            restarts: whether they put their memory aside, to be started anew from it.
         """
-        self._kit, self._realtime = kit, realtime
+        self._kit, self._realtime, self._restarts = kit, realtime, restarts
         self._folder: Path | None = None
         self._running: dict[str, subprocess.Popen] = {}
 
@@ -60,8 +62,14 @@ class Crew:
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    def start(self, part: str, port: str) -> None:
-        """Start a part on its port; it says hello when it is ready."""
+    def start(self, part: str, port: str, since: int = -1) -> None:
+        """Start a part on its port; it says hello when it is ready.
+
+        Args:
+            part: which.
+            port: by its path.
+            since: the step whose memory it goes on from; -1: it begins anew.
+        """
         assert self._folder is not None
         words = (self._folder / f"{part}.txt").open("wb")
         # Steps are short: handing each to a thread of JAX and back takes longer than some of them.
@@ -69,9 +77,12 @@ class Crew:
         if self._realtime:
             environment[REALTIME] = "1"
         command = [sys.executable, "-m", "robins.bench.parts.node", part, port]
+        command.append(str(self._folder / "kit.pickle"))
+        if self._restarts:
+            command += [str(self._folder), str(since)]
         with words:
             self._running[part] = subprocess.Popen(
-                [*command, str(self._folder / "kit.pickle")],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=words,
                 stderr=words,
@@ -84,9 +95,15 @@ class Crew:
         running = self._running.get(part)
         return None if running is None else running.pid
 
-    def deaths(self) -> list[Death]:
-        """Processes that have ended since this was asked last."""
-        dead = [(part, code) for part, p in self._running.items() if (code := p.poll()) is not None]
+    def remembers(self, part: str, step: int) -> bool:
+        """Whether a part has put its memory aside after a step."""
+        assert self._folder is not None
+        return path_of(self._folder, part, step).exists()
+
+    def deaths(self, among: str | None = None) -> list[Death]:
+        """Processes that have ended since this was asked last; of one part, or of all."""
+        asked = {k: p for k, p in self._running.items() if among in (None, k)}
+        dead = [(part, code) for part, p in asked.items() if (code := p.poll()) is not None]
         for part, _ in dead:
             del self._running[part]
         return [Death(part, code, self._said(part)) for part, code in dead]

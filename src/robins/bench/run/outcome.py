@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 
 from robins.bench.run import telemetry
-from robins.bench.run.session import Ran, counted_from
-from robins.bench.run.setup import Flight
+from robins.bench.run.session import Ran
+from robins.bench.run.setup import Flight, counted_from
 from robins.bench.run.telemetry import ARCSEC, Flown, flag
 from robins.results import variable
 

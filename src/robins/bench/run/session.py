@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -19,7 +19,8 @@ from robins.bench.broker.errors import BenchError
 from robins.bench.broker.faults import ROUTES, LinkFault
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import Direction, Health, Link
-from robins.bench.parts.node import RARELY, realtime
+from robins.bench.broker.revive import History
+from robins.bench.parts.node import few_collections, realtime
 from robins.bench.parts.satellite import BUILD, Kit
 from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
@@ -27,11 +28,10 @@ from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.run.accounting import Latencies
 from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.crew import Crew, Death
-from robins.bench.run.setup import NODES, Flight
+from robins.bench.run.setup import NODES, Flight, counted_from, steps_of
 from robins.bench.run.telemetry import Flown, Telemetry
 from robins.bench.wire.records import Unsound
 from robins.bench.wire.schema import VERSION
-from robins.scenario import ScenarioError
 
 TRUTH = "motion"
 HELLO_S = 120.0  # for all to compile and say hello
@@ -76,31 +76,12 @@ class Ran(NamedTuple):
     stopped: bool  # by whoever looked on
 
 
-def counted_from(flight: Flight, steps: int) -> int:
-    """First step of which figures of merit count: as the scenario says, else the second half."""
-    first = round(flight.loop.counted_from / flight.loop.step)
-    return first if first < steps else steps // 2
+class _DiedAgainError(Exception):
+    """A part that was started anew has died before it was where the old one was."""
 
-
-def steps_of(flight: Flight) -> int:
-    """Steps of a run.
-
-    Raises:
-        ScenarioError: longer than the scenario, or not a step long.
-    """
-    most = round(flight.loop.duration / flight.loop.step)
-    if flight.setup.seconds is None:
-        return most
-    steps = round(flight.setup.seconds / flight.loop.step)
-    if not 1 <= steps <= most:
-        raise ScenarioError(
-            [
-                f"seconds: {flight.setup.seconds:g} s is not from a step ({flight.loop.step:g} s) "
-                f"to the end of the scenario ({flight.loop.duration:g} s); "
-                "set its duration to make that longer"
-            ]
-        )
-    return steps
+    def __init__(self, death: Death):
+        super().__init__(str(death))
+        self.death = death
 
 
 class Session:
@@ -157,6 +138,7 @@ class Session:
         self.done = 0
         self.step_ms = self.pace = 0.0
         self._labels: list[tuple[str, LinkFault]] = []
+        self._histories: dict[str, History] = {}  # of parts that are started anew if they die
         self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
@@ -183,7 +165,8 @@ class Session:
         failure, done, seconds = "", 0, 0.0
         with contextlib.ExitStack() as stack:
             self._recorder = self._open_record(stack)
-            self.crew = stack.enter_context(Crew(self.kit, setup.fifo))
+            restarts = setup.on_death == "restart"
+            self.crew = stack.enter_context(Crew(self.kit, setup.fifo, restarts))
             self.broker = self._wire(stack)
             began = time.monotonic()
             try:
@@ -229,7 +212,7 @@ class Session:
             else RealTime(rate, setup.overrun, setup.patience)
         )
         told, counted, since = 0.0, 0, time.monotonic()
-        with _few_collections(), realtime(setup.fifo) as refused:
+        with few_collections(), realtime(setup.fifo) as refused:
             if refused:
                 self.event("scheduler", refused)
             for k in range(self.steps):
@@ -357,8 +340,9 @@ class Session:
             pair = stack.enter_context(open_pair())
             links[part] = self._link(part, pair.master, setup.baud)
             self._start(part, pair)
-        restarts = setup.on_death == "restart"
-        keep = frozenset(links) - set(self.ports) if restarts else frozenset()
+        if setup.on_death == "restart":
+            own = set(links) - set(self.ports)
+            self._histories = {p: History(partial(self.crew.remembers, p)) for p in own}
         return Broker(
             links,
             wiring(self.kit),
@@ -368,7 +352,7 @@ class Session:
             self._glance,
             self._answered,
             self._catch_up,
-            keep,
+            self._histories,
         )
 
     def _link(self, part: str, fd: int, baud: int | None) -> Link:
@@ -464,33 +448,36 @@ class Session:
             self._mourn(death)
 
     def _mourn(self, death: Death) -> None:
-        self.deaths += 1
-        self.event("died", str(death))
-        if self.flight.setup.on_death == "fail" or self.broker.time_ns == 0:
-            raise BenchError(
-                f'{death}, at {self.time_s:.1f} s of the run; on_death = "restart" would start '
-                "it anew"
-            )
-        self.crew.start(death.part, self._speaks[death.part])
-        self.broker.revive(death.part, REVIVED_S)
-        self.event("restarted", f"'{death.part}' was started anew and told all again")
+        part, setup = death.part, self.flight.setup
+        while True:
+            self.deaths += 1
+            self.event("died", str(death))
+            fatal = f"{death}, at {self.time_s:.1f} s of the run"
+            if setup.on_death == "fail" or self.broker.time_ns == 0:
+                raise BenchError(f'{fatal}; on_death = "restart" would start it anew')
+            if self.deaths > setup.restarts:
+                raise BenchError(f"{fatal}; that is one more than restarts = {setup.restarts}")
+            since = self._histories[part].since
+            self.crew.start(part, self._speaks[part], since)
+            try:
+                self.broker.revive(part, REVIVED_S, partial(self._still_lives, part))
+            except _DiedAgainError as again:
+                death = again.death
+                continue
+            told = "all" if since < 0 else f"all since step {since}"
+            return self.event("restarted", f"'{part}' was started anew and told {told} again")
+
+    def _still_lives(self, part: str) -> None:
+        """Look whether a part that was started anew has died at once; others wait for their turn.
+
+        Raises:
+            _DiedAgainError: it has.
+        """
+        for death in self.crew.deaths(part):
+            raise _DiedAgainError(death)
 
 
 def wiring(kit: Kit) -> Wiring:
     """Who says what to whom, for a satellite."""
     sends = {part: ROUTES[part]["from"] for part in NODES}
     return Wiring(sends, {part: dict(BUILD[part](kit).takes) for part in NODES})
-
-
-@contextlib.contextmanager
-def _few_collections() -> Iterator[None]:
-    """Hardly any collection of garbage in the middle of a step: counted references free what a run
-    makes, and each collection looks at all of JAX.
-    """
-    before = gc.get_threshold()
-    gc.collect()
-    gc.set_threshold(RARELY, *before[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)

@@ -59,7 +59,8 @@ class Setup(Parameters):
     - ``patience``, in real time: periods for which a step waits for a part before it goes on
       without it.
     - ``on_death``: what becomes of a run whose process dies: it "fail"s, or the process is
-      "restart"ed and told all again, for which the run waits; in real time it misses deadlines.
+      "restart"ed and told again what it has forgotten, for which the run waits; in real time it
+      misses deadlines. ``restarts``: how often, of all processes together; one more fails the run.
     - ``baud``: of a virtual line that each link without a real port has; left out: no delay.
     - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``.
     """
@@ -76,6 +77,7 @@ class Setup(Parameters):
     overrun: Literal["continue", "skip", "abort"] = "continue"
     patience: Annotated[float, pydantic.Field(gt=0.0, le=1e6)] = 1.0
     on_death: Literal["fail", "restart"] = "fail"
+    restarts: Annotated[int, pydantic.Field(ge=1)] = 10
     fifo: bool = False  # ask for the scheduler SCHED_FIFO
     baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
     table: Carrier | None = None
@@ -186,6 +188,33 @@ def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
         ]
         raise ScenarioError(told) from None
     return flight._replace(setup=setup)
+
+
+def counted_from(flight: Flight, steps: int) -> int:
+    """First step of which figures of merit count: as the scenario says, else the second half."""
+    first = round(flight.loop.counted_from / flight.loop.step)
+    return first if first < steps else steps // 2
+
+
+def steps_of(flight: Flight) -> int:
+    """Steps of a run.
+
+    Raises:
+        ScenarioError: longer than the scenario, or not a step long.
+    """
+    most = round(flight.loop.duration / flight.loop.step)
+    if flight.setup.seconds is None:
+        return most
+    steps = round(flight.setup.seconds / flight.loop.step)
+    if not 1 <= steps <= most:
+        raise ScenarioError(
+            [
+                f"seconds: {flight.setup.seconds:g} s is not from a step ({flight.loop.step:g} s) "
+                f"to the end of the scenario ({flight.loop.duration:g} s); "
+                "set its duration to make that longer"
+            ]
+        )
+    return steps
 
 
 def recorded_flight(header: Mapping[str, Any], filter_: str | None = None) -> Flight:

@@ -1,0 +1,76 @@
+"""A part that was started in the place of another goes on from what that one remembered."""
+
+from stations import RUN, Loop, kit
+
+from robins.bench.broker.revive import History, beginning
+from robins.bench.parts import memory
+from robins.bench.parts.satellite import BUILD
+from robins.bench.parts.station import Station
+from robins.bench.wire import Header, Receiver, decode, encode_frame, message
+
+LAST = 68  # step whose memory is gone on from
+SHORT = "duration=60 s", "counted_from=10 s"
+
+
+class Told(Loop):
+    """Remembers what each part was told since its memory, as the bench does."""
+
+    def __init__(self, *given):
+        self.histories = {name: History(LAST.__ge__) for name in BUILD}
+        super().__init__(*given)
+
+    def to(self, part, name, payload, time_ns):
+        header = Header(message(name).number, RUN, self.sent[part], time_ns)
+        step = decode("tick", payload)["step"] if name == "tick" else None
+        self.histories[part].add(step, encode_frame(header, payload))
+        answer = super().to(part, name, payload, time_ns)
+        if step is not None:
+            self.histories[part].answered(step)
+        return answer
+
+
+def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "EVERY", 23)
+    loop = Told(kit("satellite/s1", "mekf", *SHORT))
+    for name, station in loop.stations.items():
+        station._put_aside = lambda k, m, name=name: memory.put_aside(tmp_path, name, k, m)
+    loop.run(99)
+    # the two latest of each part are kept
+    kept = sorted(f"{name}.{k}.memory" for name in loop.stations for k in (LAST, LAST + 23))
+    assert sorted(path.name for path in tmp_path.iterdir()) == kept
+    for name, history in loop.histories.items():
+        saved = memory.path_of(tmp_path, name, LAST).read_bytes()
+        new, receiver = Station(loop.stations[name].part, saved), Receiver()
+        assert not new.begun
+        assert new.feed(beginning(RUN, loop.kit.step_ns)) == b""
+        assert new.begun
+        assert history.since == LAST
+        again = [f for one in history.told for f in receiver.feed(new.feed(one.raw))]
+        end_ns = (LAST + 1) * loop.kit.step_ns
+        said = [f for who, f in loop.said if who == name and f.header.time_ns > end_ns]
+        assert [f.header for f in again] == [f.header for f in said]
+        done = message("done").number  # tells how long computing took
+        payloads = [[f.payload for f in x if f.header.type != done] for x in (again, said)]
+        assert payloads[0] == payloads[1]
+        assert len(payloads[0]) >= 30 // 5
+
+
+def test_what_is_kept_for_a_part_is_bounded():
+    there = {255, 767}
+    history, most = History(there.__contains__), 0
+    for step in range(1000):
+        for raw in (b"data", b"more"):
+            history.add(None, raw)
+        history.add(step, b"tick")
+        if step == 255:
+            history.add(None, b"late")
+            history.add(step, b"tick again")
+        history.answered(step)
+        most = max(most, len(history.told))
+        if step == 255:
+            assert (history.since, [t.raw for t in history.told]) == (255, [b"late", b"tick again"])
+        if step == 511:  # its memory could not be written
+            assert history.since == 255
+    assert history.since == 767
+    assert most <= 3 * 2 * memory.EVERY + 2
+    assert [t.step for t in history.told if t.step is not None] == list(range(768, 1000))
