@@ -34,9 +34,15 @@ def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path):
         command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     until, found = time.monotonic() + 120.0, []
-    while not found and time.monotonic() < until:
-        time.sleep(0.5)
+    states = []
+    while states[-1:] != ["running"] and time.monotonic() < until:
+        time.sleep(0.2)
         found = json.loads(told(environment, "status", "--json"))["benches"]
+        states += [one["state"] for one in found]
+        if states == ["starting"]:  # it is there before its parts are
+            assert found[0]["parts"] == {}
+            assert ": starting, 0.0 s" in told(environment, "status")
+    assert states[0] == "starting"
     (one,) = found
     assert (one["name"], one["filter"], one["state"]) == ("satellite/s1", "mekf", "running")
     pids = [part["process"] for part in one["parts"].values()]

@@ -229,6 +229,12 @@ def test_a_reloaded_page_is_not_empty(chromium, live):
         push(live, page, 50)
         live.event("alarm", 4.0, "star refused")
         expect(page.get_by_test_id("alarm")).to_contain_text("star refused")
+        for k in range(250):
+            live.event("warning", 4.0, f"command {k}")
+            live.poll()
+        expect(page.locator("#events li").first).to_contain_text("command 249")
+        expect(page.locator("#events li")).to_have_count(200)
+        expect(page.locator("#events li.alarm")).to_contain_text("star refused")
         page.reload()
         page.wait_for_function("() => bench.shown === 50")
         expect(page.get_by_test_id("alarm")).to_contain_text("4.0 s  star refused")

@@ -44,6 +44,31 @@ def test_the_record_has_what_it_is_for():
     assert RECORD.stat().st_size < 60_000
 
 
+def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
+    content = bytearray(RECORD.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    whole = recorded(read_record(RECORD), "adm")
+    for one, other in ((damaged, damaged), (RECORD, damaged), (damaged, RECORD)):
+        command = ["bench", "replay", str(one), "--node", "adm", "--diff", str(other)]
+        assert main(command) == 1
+        out = capsys.readouterr().out
+        assert f"{damaged} is not whole: is damaged" in out
+        left = recorded(read_record(one), "adm")
+        until_s = left[-1].header.time_ns * 1e-9
+        assert (
+            f"Compared, and no more: {len(left)} frames, up to {until_s:g} s of a run of 8" in out
+        )
+        assert ("Same: as far as the record goes" in out) == (one == other)
+        assert main([*command, "--json"]) == 1
+        said = json.loads(capsys.readouterr().out)
+        assert (said["whole"], said["planned_s"]) == (False, 8.0)
+    assert 0 < len(recorded(read_record(damaged), "adm")) < len(whole)
+    assert main(["bench", "replay", str(RECORD), "--node", "adm", "--diff", str(RECORD)]) == 0
+    assert "Same: 'adm' says the same" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_the_filter_makes_of_it_what_it_made(capsys):
     _, said = told(capsys)

@@ -12,6 +12,7 @@ from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.parts.station import Part, Station, ready, serve
 from robins.bench.ports.port import address, open_port
+from robins.bench.recording import Event
 from robins.bench.run import outcome
 from robins.bench.run.crew import Death
 from robins.bench.run.session import Session
@@ -143,6 +144,11 @@ def test_a_part_that_counts_anew_is_heard(fly):
     honest, jumped = fly(), fly("gyro", "jump")
     np.testing.assert_array_equal(jumped.flown.q_est_ib, honest.flown.q_est_ib)
     assert (jumped.health["gyro"].repeated, jumped.health["gyro"].lost) == (0, 0)
+    # and what happens once is told, whatever happens often
+    often = [Event(k, "missed", f"step {k}", {"time_s": 0.0}) for k in range(500)]
+    once = Event(0, "died", "'adm' was killed", {"time_s": 0.0})
+    told = outcome.figures(FLIGHT, honest._replace(events=[once, *often]), None)["events"]
+    assert (len(told), told[0]["kind"]) == (200, "died")
 
 
 def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch):

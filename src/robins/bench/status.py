@@ -13,6 +13,7 @@ from typing import Any
 
 EACH_S = 1.0
 _OLD_S = 10.0  # after which a bench that says nothing hangs
+STARTING = "starting"  # its state until the first step: it may compile for long, and says nothing
 
 
 def _folder() -> Path:
@@ -71,14 +72,17 @@ def table(benches: list[dict[str, Any]]) -> str:
         return "No bench runs.\n  robins bench up satellite/s1   starts one"
     lines = []
     for b in benches:
-        hangs = f", silent for {b['silent_s']:.0f} s" if b["silent_s"] > _OLD_S else ""
+        hangs = b["silent_s"] > _OLD_S and b["state"] != STARTING
+        silent = f", silent for {b['silent_s']:.0f} s" if hangs else ""
         share = 100.0 * b["step"] / b["steps"]
         lines.append(
-            f"{b['name']} ({b['filter']}, {b['clock']}), process {b['pid']}{hangs}: {b['state']}, "
+            f"{b['name']} ({b['filter']}, {b['clock']}), process {b['pid']}{silent}: {b['state']}, "
             f"{b['time_s']:.1f} s of the run ({share:.0f} %), {b['cycles_per_s']:.0f} steps/s"
         )
         if b.get("url"):
             lines.append(f"  page: {b['url']}")
+        if not b["parts"]:
+            continue
         rows = [("part", "process", "frames", "wrong", "lost", "late")]
         rows += [
             (name, str(p["process"] or p["port"]), *(str(p[k]) for k in ("frames", *rows[0][3:])))

@@ -100,8 +100,9 @@ def _onlooker(flight: Any, live: bool, host: str, port: int) -> Iterator[Any]:
 
     with contextlib.ExitStack() as stack:
         status = stack.enter_context(StatusFile())
-        from robins.bench.run.watching import Looking
+        from robins.bench.run.watching import Looking, starting
 
+        status.tell(starting(flight))
         page = None
         if live:
             from robins.bench.run.watching import page_for
@@ -154,6 +155,8 @@ def _tell_run(out: Path, told: dict[str, Any], notes: list[str], ran: Any, as_js
     click.echo(ran.latencies.table())
     for note in notes:
         click.echo(note)
+    for warning in told["warnings"]:
+        click.secho(f"Warning: {warning}", fg="yellow", bold=True)
     for event in told["events"]:
         if event["kind"] != "missed":
             click.echo(f"  {event['time_s']:9.2f} s  {event['text']}")
@@ -229,9 +232,14 @@ def hear_again(
 
         if node not in NODES:
             raise BadInput(f"--node: there is no part '{node}', only {', '.join(NODES)}")
-        first = read_record(record)
+        first, second = read_record(record), None if diff is None else read_record(diff)
+        damaged = False
+        for path, one in ((record, first), (diff, second)):
+            if one is not None and not one.whole:
+                damaged = True
+                click.echo(f"{path} is not whole: {one.why}")
         step_ns = int(first.header["step_ns"])
-        if diff is None:
+        if second is None:
             flight = recorded_flight(first.header, filter_)
             with _starter(flight, node) as start:
                 heard = replay(
@@ -239,25 +247,30 @@ def hear_again(
                 )
             a, b, same, told = heard.recorded, heard.frames, heard.same, heard.first_difference
         else:
-            a, b = recorded(first, node), recorded(read_record(diff), node)
+            a, b = recorded(first, node), recorded(second, node)
             same, told = not differences(a, b), None
     found = differences(a, b, step_ns)
+    until_s = max((f.header.time_ns for f in a), default=0) * 1e-9
+    planned_s = int(first.header["steps"]) * step_ns * 1e-9
+    compared = f"{len(a)} frames, up to {until_s:g} s of a run of {planned_s:g} s"
     if as_json:
         from robins.results.summary import dumps, plain
 
         rows = [vars(x) for x in found]
         said = {"node": node, "frames": len(b), "same": same, "differences": rows}
-        click.echo(dumps(plain(said | {"whole": first.whole})), nl=False)
+        said |= {"whole": not damaged, "until_s": until_s, "planned_s": planned_s}
+        click.echo(dumps(plain(said)), nl=False)
     else:
-        if not first.whole:
-            click.echo(f"{record} is not whole: {first.why}")
+        if damaged:
+            click.echo(f"Compared, and no more: {compared}.")
         if same:
-            click.echo(f"Same: '{node}' says the same {len(b)} frames, byte for byte.")
+            so_far = "as far as the record goes, " if damaged else ""
+            click.echo(f"Same: {so_far}'{node}' says the same {len(b)} frames, byte for byte.")
         else:
             click.echo(f"Different: {told or 'see below'}\n")
             click.echo(table(found))
     asked = filter_ is not None or diff is not None
-    return Status.DONE if same or asked else Status.FAILED
+    return Status.DONE if (same or asked) and not damaged else Status.FAILED
 
 
 @contextlib.contextmanager

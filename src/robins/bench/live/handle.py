@@ -19,6 +19,7 @@ import numpy as np
 
 from robins.bench.live import feed
 from robins.bench.live.feed import Kind
+from robins.bench.live.latest import latest
 from robins.bench.live.signals import Signal, as_json, check
 
 START_S = 20.0  # most that a server may take to listen
@@ -81,7 +82,7 @@ class Live:
         self._signals, self._title, self._faults = tuple(signals), title, tuple(faults)
         self._sequence = 0
         self._recent: deque[bytes] = deque(maxlen=feed.RECENT)
-        self._events: deque[bytes] = deque(maxlen=feed.EVENTS)
+        self._events: list[tuple[str, bytes]] = []  # with their levels
         self._last_status: bytes | None = None
         self._commands: deque[dict[str, Any]] = deque(maxlen=100)
         self._process: subprocess.Popen[bytes] | None = None
@@ -138,7 +139,8 @@ class Live:
             text: one sentence.
         """
         line = feed.to_json({"level": level, "time_s": time_s, "text": text}).encode()
-        self._events.append(line)
+        kept = [*self._events, (level, line)]
+        self._events = latest(kept, lambda one: one[0], feed.EVENTS)
         self._lines.append(line)
         self._pump()
 
@@ -226,7 +228,7 @@ class Live:
         self._pipe, self._unread, self._listens = ours, b"", False
         # A server that comes anew shows what the one before it did.
         self._hello: bytes | None = self._make_hello()
-        self._lines = deque(self._events, maxlen=feed.EVENTS)
+        self._lines = deque((line for _, line in self._events), maxlen=feed.EVENTS)
         self._samples = deque(self._recent)
         self._status, self._partial = self._last_status, b""
         fds = (theirs.fileno(), self._at.fileno())

@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from robins.bench.live.feed import EVENTS, RECENT, Kind, sequence_of, to_json
+from robins.bench.live.latest import latest
 
 QUEUE = 2 * RECENT  # samples that wait for a page
 
@@ -87,7 +88,7 @@ class Hub:
         self.clients: set[Client] = set()
         self.faults: list[dict[str, Any]] = []
         self._hello: dict[str, Any] | None = None
-        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
+        self._events: list[dict[str, Any]] = []
         self._recent: deque[bytes] = deque(maxlen=RECENT)
         self._status: dict[str, Any] | None = None
         self._expected: int | None = None  # number of the next sample
@@ -104,7 +105,7 @@ class Hub:
             self._status = said
             self._tell_latest("status", {"kind": "status", "status": said})
         elif kind == Kind.EVENT:
-            self._events.append(said)
+            self._events = latest([*self._events, said], lambda one: one.get("level"), EVENTS)
             self._tell({"kind": "event", **said})
         return None
 
@@ -159,7 +160,7 @@ class Hub:
                 "kind": "hello",
                 "bench": self._hello is not None,
                 **(self._hello or {"run": 0, "title": "", "signals": [], "faults": []}),
-                "events": list(self._events),
+                "events": self._events,
                 "status": self._status,
                 "history": len(self._recent),
             }

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from robins.bench.live.latest import latest
 from robins.bench.run import telemetry
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, counted_from
 from robins.bench.run.telemetry import ARCSEC, Flown, flag
 from robins.results import variable
 
+_EVENTS = 200  # told; all are in the record
 _AXES = ("x", "y", "z (boresight)")
 
 
@@ -77,7 +79,7 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
         "links": {name: dict(vars(h)) for name, h in ran.health.items()},
         "events": [
             {"time_s": e.fields["time_s"], "kind": e.kind, "text": e.text}
-            for e in ran.events[-200:]
+            for e in latest(ran.events, lambda event: event.kind, _EVENTS)
         ],
     }
 

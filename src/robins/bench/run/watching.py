@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -12,12 +13,14 @@ from robins.bench.live import Live, Signal
 from robins.bench.run import telemetry
 from robins.bench.run.alarms import Alarms
 from robins.bench.run.session import Session
+from robins.bench.run.setup import Flight, steps_of
 from robins.bench.run.telemetry import ARCSEC
-from robins.bench.status import Status
+from robins.bench.status import STARTING, Status
 from robins.bench.wire.schema import FLAGS
 
 _EACH_S = 0.05  # samples for the page come no faster than that
 _STATUS_S = 0.5
+_COMMANDS, _COMMANDS_S = 10, 10.0  # so many are shown in so long a time
 _XYZ = ("x", "y", "z")
 ALARMS = ("died", "failed", "killed")
 WARNINGS = ("missed", "refused", "command")
@@ -95,6 +98,8 @@ class Looking:
         self._told = 0.0
         self._due = 0.0  # when the page gets its next sample
         self._alarms = Alarms()
+        self._commanded: deque[float] = deque(maxlen=_COMMANDS)
+        self._flooded = False
 
     def over(self, session: Session, failed: bool) -> None:
         """The run is over."""
@@ -105,9 +110,19 @@ class Looking:
 
     def event(self, kind: str, time_s: float, text: str) -> None:
         """Something happened."""
-        if self._page is not None:
+        if self._page is not None and (kind != "command" or (text := self._shown(text))):
             level = "alarm" if kind in ALARMS else "warning" if kind in WARNINGS else "info"
             self._page.event(level, time_s, text)
+
+    def _shown(self, text: str) -> str:
+        """What is shown of a command, so that many do not hide all else; the record has each."""
+        now, flooded = time.monotonic(), self._flooded
+        full = len(self._commanded) == _COMMANDS and now - self._commanded[0] < _COMMANDS_S
+        self._flooded = full
+        if not full:
+            self._commanded.append(now)
+            return text
+        return "" if flooded else "commands come too fast to show each; the record has them all"
 
     def commands(self, session: Session) -> list[dict[str, Any]]:
         """What was pressed on the page."""
@@ -213,16 +228,32 @@ def _clock(session: Session) -> str:
     return f"real time, {setup.rate or 1.0 / session.flight.loop.step:g} Hz"
 
 
+def starting(flight: Flight) -> dict[str, Any]:
+    """The same before there are any parts.
+
+    Raises:
+        ScenarioError: the length of the run does not fit the scenario.
+    """
+    return {
+        "name": flight.name,
+        "filter": flight.setup.filter,
+        "clock": flight.setup.clock,
+        "state": STARTING,
+        "time_s": 0.0,
+        "step": 0,
+        "steps": steps_of(flight),
+        "cycles_per_s": 0.0,
+        "url": "",
+        "parts": {},
+    }
+
+
 def report(session: Session, done: int, url: str) -> dict[str, Any]:
     """How the bench is, for the status file."""
-    return {
-        "name": session.flight.name,
-        "filter": session.flight.setup.filter,
-        "clock": session.flight.setup.clock,
+    return starting(session.flight) | {
         "state": "paused" if session.paused else "running",
         "time_s": session.time_s,
         "step": done,
-        "steps": session.steps,
         "cycles_per_s": session.pace,
         "url": url,
         "parts": {

@@ -125,12 +125,19 @@ export function offerFaults(faults) {
   byId("inject").classList.toggle("none", !options.length);
 }
 
+/** The line to give up: a frequent level must not push out a rare one. */
+function oldestOfTheMost(list) {
+  const lines = {};
+  for (const line of list.children) (lines[line.className] ??= []).push(line);
+  return Object.values(lines).reduce((a, b) => (b.length > a.length ? b : a)).at(-1);
+}
+
 /** A line of the events; alarms go to the alarm line too. */
 export function addEvent({ level, time_s, text }, fresh = true) {
   const list = byId("events");
   const line = element("li", level, element("time", "", seconds(time_s)), element("span", "", text));
   list.prepend(line);
-  while (list.children.length > MOST_EVENTS) list.lastChild.remove();
+  if (list.children.length > MOST_EVENTS) oldestOfTheMost(list).remove();
   if (level !== "alarm") return;
   alarms.tally++;
   say(byId("alarm-text"), `${seconds(time_s)}  ${text}`);

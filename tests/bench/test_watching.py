@@ -1,0 +1,56 @@
+"""Who looks on sees what matters, however much else happens."""
+
+from robins.bench.live.latest import latest
+from robins.bench.run import watching
+from robins.bench.run.watching import Looking
+from robins.bench.status import Status
+
+
+class Page:
+    url = ""
+
+    def __init__(self):
+        self.shown = []
+
+    def push(self, time_s, values):
+        pass
+
+    def status(self, status):
+        pass
+
+    def event(self, level, time_s, text):
+        self.shown.append((level, text))
+
+    def commands(self):
+        return []
+
+    def poll(self):
+        pass
+
+
+def test_a_flood_of_commands_hides_nothing_else(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(watching.time, "monotonic", lambda: now[0])
+    page = Page()
+    looking = Looking(page, Status())
+    looking.event("died", 1.0, "'adm' was killed")
+    for k in range(1000):
+        looking.event("command", 2.0, f"pause {k}")
+    looking.event("failed", 3.0, "the run failed")
+    now[0] += 20.0
+    looking.event("command", 4.0, "stop")
+    texts = [text for _, text in page.shown]
+    assert texts[0] == "'adm' was killed"
+    assert texts[1:11] == [f"pause {k}" for k in range(10)]
+    assert "too fast" in texts[11]
+    assert texts[12:] == ["the run failed", "stop"]
+
+
+def test_a_frequent_kind_does_not_push_out_a_rare_one():
+    events = ["a", *"w" * 500, "a", *"i" * 30, *"w" * 500]
+    found = latest(events, str, 200)
+    assert len(found) == 200
+    assert [found.count(kind) for kind in "aiw"] == [2, 30, 168]
+    assert found == ["a", "a", *"i" * 30, *"w" * 168]
+    assert latest(events[:200], str, 200) == events[:200]
+    assert latest(list(range(300)), lambda k: k % 2, 200) == list(range(100, 300))
