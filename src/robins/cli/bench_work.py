@@ -250,9 +250,9 @@ def hear_again(
             a, b = recorded(first, node), recorded(second, node)
             same, told = not differences(a, b), None
     found = differences(a, b, step_ns)
-    until_s = max((f.header.time_ns for f in a), default=0) * 1e-9
+    until_s = min(max((f.header.time_ns for f in x), default=0) for x in (a, b)) * 1e-9
     planned_s = int(first.header["steps"]) * step_ns * 1e-9
-    compared = f"{len(a)} frames, up to {until_s:g} s of a run of {planned_s:g} s"
+    compared = f"{min(len(a), len(b))} frames, up to {until_s:g} s of a run of {planned_s:g} s"
     if as_json:
         from robins.results.summary import dumps, plain
 
