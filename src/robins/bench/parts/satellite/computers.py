@@ -93,9 +93,7 @@ def adm(kit: Kit) -> Part:
             online.predict(gyro.values)
         said, heard = [], False
         if frame is not None:
-            factor = _factor(kit, frame)
-            solved = factor is None or bool(np.all(np.isfinite(factor)))
-            y = _believable(frame["q_ib"] if solved else np.full(4, np.nan))
+            y = _believable(frame["q_ib"])
             heard = bool(np.isfinite(np.asarray(y.wxyz)[0]))
             if not heard and np.all(np.isfinite(frame["q_ib"])):
                 flags |= SHORT
@@ -106,6 +104,7 @@ def adm(kit: Kit) -> Part:
                 )
                 flags |= USED
             elif not lost:
+                factor = _factor(kit, frame)
                 if heard:
                     said.append(("innovation", _innovation(*judge(online.belief, y, factor))))
                 code = Code(int(online.update(y, STAR, factor).code))
