@@ -5,6 +5,7 @@ import json
 import os
 import re
 import typing
+from functools import partial
 from pathlib import Path
 
 import click
@@ -17,6 +18,7 @@ from robins.bench.run.session import Session
 from robins.bench.run.setup import NODES, built_in
 from robins.bench.wire.c_header import c_header
 from robins.cli import app
+from robins.cli.bench_work import _flight
 from robins.results import ResultWriter
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -186,6 +188,12 @@ def test_a_run_that_cannot_be_is_refused_with_the_mend(robins, given, told, tmp_
     assert answer.out == ""
     assert re.search(told, answer.err)
     assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_an_option_of_nought_is_given(tmp_path):
+    (tmp_path / "mine.toml").write_text('bench = "satellite"\nseed = 5\n')
+    read = partial(_flight, str(tmp_path / "mine.toml"), ())
+    assert [read({"seed": seed}).setup.seed for seed in (0, None, 7)] == [0, 5, 7]
 
 
 def test_a_second_bench_with_the_same_folder_is_refused(robins, tmp_path):

@@ -168,7 +168,7 @@ def node(part: str, port: str, scenario: str, **options: Any) -> None:
 )
 @debug_option
 def header() -> None:
-    """Print robins_wire.h: every message, frames, a receiver; C99, no heap, nothing to link."""
+    """Print robins_wire.h: every message, frames, a receiver; C99 or C++11, no heap."""
     from robins.cli.bench_work import print_header
 
     print_header()

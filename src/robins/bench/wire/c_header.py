@@ -15,7 +15,7 @@ _TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "u64": "uint64_
 _TOP = """\
 /* The wire of robins, version {version}. Made by `robins.bench.wire.c_header`; do not edit.
  *
- * C99, little endian, 64-bit double, no heap. A frame is
+ * C99 or C++11, little endian, 64-bit double, no heap. A frame is
  *   0x00 COBS(version u8, type u8, run u32, sequence u32, time_ns u64, payload, CRC-32C u32) 0x00
  */
 #ifndef ROBINS_WIRE_H
