@@ -80,7 +80,7 @@ def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
         )
     text = scenario.read_text(name)
     chosen = scenario.mapping_of(text).get("system")
-    if chosen not in SYSTEMS:
+    if not isinstance(chosen, str) or chosen not in SYSTEMS:
         raise InputError(
             f'{name}: write system = "..." into its first lines, one of {", ".join(SYSTEMS)}; '
             f"it says {chosen!r}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -98,7 +98,7 @@ def not_taken(tally: Tally) -> list[str]:
     return said
 
 
-def doubts(tally: Tally, bounds: bool = False) -> list[str]:
+def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
     """Sentences why a reader should doubt a filter; none where nothing speaks against it.
 
     They name steps that were not taken, and contradictions; sensors more than a third of whose
@@ -111,6 +111,7 @@ def doubts(tally: Tally, bounds: bool = False) -> list[str]:
         tally: of a run (`Solution.tally`), or of several with leading axes.
         bounds: the filter states bounds, not standard deviations (an H-infinity filter), so its
             NIS is not tested.
+        assumed: sensors whose noise is a guess on the cautious side: a small NIS says nothing.
     """
     said = not_taken(tally)
     for sensor in tally.updates:
@@ -124,15 +125,15 @@ def doubts(tally: Tally, bounds: bool = False) -> list[str]:
             )
         nis, dof = float(np.sum(tally.nis[sensor])), int(np.sum(tally.dof[sensor]))
         if not bounds and dof >= FEWEST:
-            said += _off(sensor, nis / dof, dof)
+            said += _off(sensor, nis / dof, dof, sensor in assumed)
     return said
 
 
-def _off(sensor: str, ratio: float, dof: int) -> list[str]:
+def _off(sensor: str, ratio: float, dof: int, cautious: bool) -> list[str]:
     """A sentence where a mean NIS per degree of freedom is far from one."""
     count = max(dof // CORRELATED, 1)
     low, high = chi2_band(count, 1, LEVEL) / count
-    if min(low, NIS_LOW) <= ratio <= max(high, NIS_HIGH):
+    if (cautious or min(low, NIS_LOW) <= ratio) and ratio <= max(high, NIS_HIGH):
         return []
     why = (
         "larger than the filter expects: its standard deviations are too small"

@@ -56,7 +56,7 @@ def _saved(path: Path, tree: Any) -> Path | None:
         try:
             parent.mkdir(parents=True, exist_ok=True)
             made = Path(tempfile.mkdtemp(prefix=f"{path.name[:100]}-not-written-", dir=parent))
-            np.savez(made / ARRAYS, **arrays)
+            np.savez(made / ARRAYS, allow_pickle=False, **arrays)
         except OSError:
             continue
         return made

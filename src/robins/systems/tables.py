@@ -1,12 +1,16 @@
-"""Labelled time series that replays and campaigns share."""
+"""What replays and campaigns share: labelled time series, and why to doubt what came out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from robins.filters import StepWarning, Tally, doubts
 from robins.results import variable
 from robins.systems.system import SensorAxes
 
@@ -54,3 +58,40 @@ def innovation_tables(
             attrs = display if len(dims) == 3 else {}
             data[name] = variable(dims, values[:, spoke], *words_, **attrs)
     return data, coords
+
+
+@contextmanager
+def doubts_told_at_the_end() -> Iterator[None]:
+    """Runs in here do not warn: what they would say is among the warnings of the outcome."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StepWarning)
+        yield
+
+
+def together(tallies: Sequence[Tally | None]) -> Tally | None:
+    """The tallies of all pieces of a log, as one with a leading axis."""
+    some = [tally for tally in tallies if tally is not None]
+    return jax.tree_util.tree_map(lambda *x: np.stack(x), *some) if some else None
+
+
+def replay_warnings(
+    tallies: Mapping[str, Tally],
+    causes: str,
+    bounds: Collection[str] = (),
+    assumed: Collection[str] = (),
+) -> list[str]:
+    """Why a reader should doubt a replay, and the likely causes; empty where nothing is wrong.
+
+    Args:
+        tallies: by filter, of all pieces of the log.
+        causes: the sentence on what is mostly behind it in this system.
+        bounds: filters that state bounds, not standard deviations.
+        assumed: sensors that nobody built, such as "the wheels do not slip": their noise is a
+            guess on the cautious side, so that small innovations say nothing.
+    """
+    found = [
+        f"{name}: {sentence}."
+        for name, tally in tallies.items()
+        for sentence in doubts(tally, bounds=name in bounds, assumed=assumed)
+    ]
+    return [*found, causes] if found else []

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from robins.earth import Geodetic
-from robins.filters import Belief, Code, StepInfo
+from robins.filters import Belief, Code, StepInfo, Tally
 from robins.filters.consistency import grand_mean_nis
 from robins.results import variable
 from robins.systems.ins_gnss.parameters import Replay
@@ -28,6 +28,7 @@ class Answer(NamedTuple):
     antenna: Geodetic  # where the filter thinks the antenna is
     info: dict[str, StepInfo]  # by sensor; empty for a smoother
     log_likelihood: float
+    tally: Tally | None = None  # how the steps went; None for a smoother
 
 
 class Flight(NamedTuple):

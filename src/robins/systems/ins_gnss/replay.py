@@ -15,11 +15,19 @@ from robins.earth import Geodetic
 from robins.filters import Solution, rts_smoother, run
 from robins.ins.state import InsState
 from robins.systems.ins_gnss.answer import Answer, Flight, replay_metrics, replay_solution
-from robins.systems.ins_gnss.model import Mount, read_position
+from robins.systems.ins_gnss.model import ROAD, STANDSTILL, STILL_RATE, Mount, read_position
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log, Prepared, on_one_clock, pieces, prepare
 from robins.systems.ins_gnss.setup import SMOOTHED, make_filter, model_of, mount_of
 from robins.systems.system import Outcome, Progress
+from robins.systems.tables import doubts_told_at_the_end, replay_warnings, together
+
+CAUSES = (
+    "Likely causes: the lever arm or the latency of the GNSS, the mounting of the unit, sigmas "
+    "that the receiver states too small, noise of the IMU told too small, a velocity that is a "
+    "mean over the receiver's interval, or a vehicle that was taken for still; `robins doctor` "
+    "tells some of them."
+)
 
 
 @jax.jit
@@ -37,20 +45,20 @@ def navigate(prepared: Prepared, parameters: Replay, wanted: tuple[str, ...]) ->
     for name in wanted:
         base = name.removesuffix(SMOOTHED)
         if base not in solutions:
-            solutions[base] = run(
-                make_filter(base, parameters.update.gate),
-                model,
-                prepared.belief,
-                prepared.y,
-                prepared.u,
-                prepared.aux,
-            )
+            filter_ = make_filter(base, parameters.update.gate)
+            p = prepared
+            with doubts_told_at_the_end():
+                solutions[base] = run(filter_, model, p.belief, p.y, p.u, p.aux)
         solution = solutions[base]
         smoothed = name.endswith(SMOOTHED)
         belief = rts_smoother(solution) if smoothed else solution.steps.posterior
         info = {} if smoothed else solution.steps.info
         out[name] = Answer(
-            belief, _antenna(mount, belief.mean, rate), info, float(solution.log_likelihood)
+            belief,
+            _antenna(mount, belief.mean, rate),
+            info,
+            float(solution.log_likelihood),
+            None if smoothed else solution.tally,
         )
     return out
 
@@ -71,7 +79,8 @@ def _joined(answers: list[Answer]) -> Answer:
     belief, place, info = jax.tree_util.tree_map(
         join, *((a.belief, a.antenna, a.info) for a in answers)
     )
-    return Answer(belief, place, info, sum(a.log_likelihood for a in answers))
+    likelihood = sum(a.log_likelihood for a in answers)
+    return Answer(belief, place, info, likelihood, together([a.tally for a in answers]))
 
 
 def _flight(log: Log, parts: list[Prepared]) -> Flight:
@@ -129,15 +138,20 @@ def replay(
     if not parts:
         raise ValueError(" ".join(problems))
     flight = _flight(log, parts)
-    together = {name: _joined(rows) for name, rows in answers.items()}
+    joined = {name: _joined(rows) for name, rows in answers.items()}
     counts = dict(dataset.counts) | {
         "imu_gaps_declared": len(found) - 1,
         "blocks_over_imu_gaps": sum(int(np.sum(np.asarray(p.u.noise_scale) > 1)) for p in parts),
         "pieces_not_navigated": len(problems),
     }
     return Outcome(
-        solution=replay_solution(flight, together, parameters),
-        metrics={name: replay_metrics(flight, answer) for name, answer in together.items()},
+        solution=replay_solution(flight, joined, parameters),
+        metrics={name: replay_metrics(flight, answer) for name, answer in joined.items()},
         counts=counts,
         notes=notes + problems,
+        warnings=replay_warnings(
+            {name: a.tally for name, a in joined.items() if a.tally is not None},
+            CAUSES,
+            assumed=(STANDSTILL, STILL_RATE, ROAD),
+        ),
     )

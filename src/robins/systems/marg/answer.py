@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from robins.dataset import Dataset
-from robins.filters import Code
+from robins.filters import Code, Tally
 from robins.filters.consistency import grand_mean_nis
 from robins.results import variable
 from robins.rotation import to_euler
@@ -38,6 +38,7 @@ class Answer(NamedTuple):
     q_nb: np.ndarray  # (N, 4) at every sample
     updates: dict[str, Update]  # empty for a smoother
     log_likelihood: float
+    tally: Tally | None = None  # how the steps went; None for a smoother
 
 
 def metrics(dataset: Dataset, log: Prepared, answer: Answer) -> dict[str, Any]:

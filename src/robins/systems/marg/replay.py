@@ -12,10 +12,17 @@ from robins.filters import Belief, Code, Filter, Model, StepInfo, rts_smoother, 
 from robins.filters.run import Step
 from robins.systems.marg.answer import Answer, Update, metrics, sentences, solution
 from robins.systems.marg.blocks import causal_attitudes, smoothed_attitudes
+from robins.systems.marg.model import REST_RATE, TRAVEL
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.prepare import Prepared, prepare
 from robins.systems.marg.setup import CAUSAL, SMOOTHED, filter_of, model_of
 from robins.systems.system import Outcome, Progress
+from robins.systems.tables import doubts_told_at_the_end, replay_warnings
+
+CAUSES = (
+    "Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, axes "
+    "or units of a sensor that differ from what the log says, or noise of the gyro told too small."
+)
 
 
 class Light(NamedTuple):
@@ -62,7 +69,8 @@ def orient(
     """
     smooth = SMOOTHED in wanted
     arguments = (filter_, model, log.start, log.y, log.u, log.aux)
-    found = run(*arguments) if smooth else run(*arguments, keep=light)
+    with doubts_told_at_the_end():
+        found = run(*arguments) if smooth else run(*arguments, keep=light)
     kept = _light_of(found.steps) if smooth else found.steps
     blocks = len(log.epoch_s)
     kept, likelihood = _cut(kept, blocks), float(found.log_likelihood)
@@ -71,7 +79,8 @@ def orient(
         mean = found.steps.posterior.mean if smooth else found.steps.mean
         q = causal_attitudes(log.start.mean, mean, log.samples)
         q_nb = _by_sample(log, q, log.look.q_nb)
-        out[CAUSAL] = Answer(kept.mean, np.asarray(kept.sigma), q_nb, kept.info, likelihood)
+        sigma = np.asarray(kept.sigma)
+        out[CAUSAL] = Answer(kept.mean, sigma, q_nb, kept.info, likelihood, found.tally)
     if smooth:
         belief: Belief = rts_smoother(found)
         q, first = smoothed_attitudes(belief.mean, log.samples)
@@ -123,4 +132,9 @@ def replay(
         metrics={name: metrics(dataset, log, answer) for name, answer in answers.items()},
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": failed},
         notes=notes,
+        warnings=replay_warnings(
+            {name: a.tally for name, a in answers.items() if a.tally is not None},
+            CAUSES,
+            assumed=(TRAVEL, REST_RATE),
+        ),
     )

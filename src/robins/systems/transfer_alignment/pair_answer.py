@@ -10,7 +10,7 @@ import xarray as xr
 
 from robins import units
 from robins.dataset import Trajectory
-from robins.filters import Belief, Code, StepInfo
+from robins.filters import Belief, Code, StepInfo, Tally
 from robins.filters.consistency import grand_mean_nis
 from robins.results import variable
 from robins.systems.system import SensorAxes, StateBlock
@@ -45,6 +45,7 @@ class Answer(NamedTuple):
     start: Belief
     log_likelihood: float
     bounds: bool  # its sigmas are bounds of an H-infinity filter
+    tally: Tally  # how the steps went
 
 
 class Recorded(NamedTuple):

@@ -24,6 +24,7 @@ from robins.ins.frames import to_ned_frd
 from robins.rotation import Rotation
 from robins.systems.limits import Names
 from robins.systems.system import Alignment, Contender, Outcome, Progress
+from robins.systems.tables import doubts_told_at_the_end, replay_warnings, together
 from robins.systems.transfer_alignment.pair_answer import (
     Answer,
     Recorded,
@@ -40,6 +41,12 @@ from robins.systems.transfer_alignment.pair_parameters import (
 )
 from robins.systems.transfer_alignment.product_filters import FILTERS, product_contender
 from robins.systems.transfer_alignment.product_problem import Product
+
+CAUSES = (
+    "Likely causes: a delay of the master that is not stated, a sign or frame of its velocity or "
+    "attitude (down for up, heading counterclockwise), a nominal mounting or lever arm that is "
+    "wrong, flexure without states for it, or noise of master and slave told too small."
+)
 
 
 class Replay(Product):
@@ -109,17 +116,13 @@ def aligned(piece: Piece, contender: Contender, parameters: PairParameters) -> A
     case = contender.case(piece.run)
     start = start_belief(case.start, parameters)
     inputs = Bridged(case.u, jnp.asarray(piece.noise_scale))
-    found = run(
-        contender.filter,
-        over_gaps(contender.model),
-        start,
-        case.y,
-        inputs,
-        case.aux,
-        time_s=piece.epoch_s,
-    )
+    filter_, model = contender.filter, over_gaps(contender.model)
+    with doubts_told_at_the_end():
+        found = run(filter_, model, start, case.y, inputs, case.aux, time_s=piece.epoch_s)
     steps = found.steps
-    return Answer(steps.posterior, steps.info, start, float(found.log_likelihood), contender.bounds)
+    likelihood = float(found.log_likelihood)
+    belief, info = steps.posterior, steps.info
+    return Answer(belief, info, start, likelihood, contender.bounds, found.tally)
 
 
 def _joined(answers: list[Answer]) -> Answer:
@@ -137,7 +140,10 @@ def _joined(answers: list[Answer]) -> Answer:
 
     belief, info = jax.tree_util.tree_map(join, *((a.belief, dict(a.info)) for a in answers))
     return answers[-1]._replace(
-        belief=belief, info=info, log_likelihood=sum(a.log_likelihood for a in answers)
+        belief=belief,
+        info=info,
+        log_likelihood=sum(a.log_likelihood for a in answers),
+        tally=together([a.tally for a in answers]),
     )
 
 
@@ -186,6 +192,11 @@ def align(
         metrics={name: metrics_of(answer) for name, answer in answers.items()},
         counts=counts,
         notes=notes,
+        warnings=replay_warnings(
+            {name: answer.tally for name, answer in answers.items()},
+            CAUSES,
+            bounds=[name for name, contender in contenders.items() if contender.bounds],
+        ),
     )
 
 
