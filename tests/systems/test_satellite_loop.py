@@ -11,6 +11,7 @@ from robins.campaign import worlds
 from robins.campaign.bound import bound
 from robins.filters import run, run_closed
 from robins.scenario import ScenarioError
+from robins.systems.satellite import SYSTEM
 from robins.systems.satellite.design import axis_design
 
 SHORT = ('duration="120 s"', 'counted_from="60 s"')
@@ -52,8 +53,10 @@ def test_a_run_over_its_measurements_gives_the_same_estimates():
 
 def test_momentum_is_conserved_without_environment():
     # no field, so no torque of the magnetorquers; no gravity: the orbit is far away
-    settings = (*SHORT, 'craft.disturbance="0 N m"', 'orbit.altitude="1e9 km"')
-    p = problem("s2", ("mekf",), settings)
+    given = parsed("s2", (*SHORT, 'craft.disturbance="0 N m"'))
+    far = given.orbit.model_copy(update={"altitude": 1e12})  # beyond what a scenario may say
+    given = given.model_copy(update={"orbit": far})
+    p = SYSTEM.studies["attitude-loop"].problem(given, ("mekf",), 0)
     ((batch, _),) = worlds(p, 1)
     c, world = p.contenders["mekf"], _first(batch)
     it = c.case(world)

@@ -39,7 +39,7 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
         from_s: what it says.
         lasts_s: duration of a run.
     """
-    if from_s >= lasts_s:
+    if from_s > 0.0 and from_s >= lasts_s:
         raise ValueError(
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
             "before the end"
