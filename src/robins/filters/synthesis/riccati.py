@@ -176,9 +176,9 @@ def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
             lambda exponent: norm(_gain(plant, float(np.exp(exponent)), gains[best])),
             bounds=ends, method="bounded", options={"xatol": 1e-9},
         )  # fmt: skip
-        if fine.fun < norms[best]:
-            lambda_ = float(np.exp(fine.x))
-            found = _gain(plant, lambda_, gains[best]), lambda_, float(fine.fun)
+        K = _gain(plant, lambda_ := float(np.exp(fine.x)), gains[best])
+        if (lowest := norm(K)) < norms[best]:
+            found = K, lambda_, lowest
     return found
 
 
