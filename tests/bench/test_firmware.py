@@ -250,16 +250,6 @@ def test_it_ends_with_the_line(board):
     assert "the line is gone" in board.process.stderr.read()
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler, g++")
-def test_it_compiles_as_c_plus_plus_too(tmp_path):
-    flags = ["-std=c++11", *FLAGS[1:], "-fsyntax-only", "-x", "c++"]
-    command = ["g++", *flags, *(name for name in firmware() if name.endswith(".c"))]
-    told = subprocess.run(
-        command, cwd=unpacked(tmp_path), capture_output=True, text=True, check=False
-    )
-    assert told.returncode == 0, told.stderr
-
-
 def test_a_path_that_is_no_line(program):
     ran = subprocess.run([program, "/nowhere"], capture_output=True, text=True, check=False)
     assert ran.returncode == 1

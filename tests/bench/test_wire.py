@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from robins.bench import wire
 from robins.bench.wire import Frame, Header, Receiver, RecordError, Sequence
-from robins.bench.wire.c_header import c_header, schema_number
+from robins.bench.wire.c_header import c_header, firmware, schema_number
 from robins.bench.wire.frames import LEAST, MOST_PAYLOAD, FrameError
 from robins.bench.wire.receiver import LONGEST
 
@@ -373,6 +373,17 @@ def test_firmware_makes_the_same_bytes(tmp_path):
         for made in (frame(p, k) for k, p in enumerate(payloads))
     )
     assert ran.stdout == expected
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+def test_the_example_compiles_as_c_plus_plus_too(tmp_path):
+    files = firmware()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", "-x", "c++"]
+    command = ["g++", *flags, *(name for name in files if name.endswith(".c"))]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
 
 
 def test_a_frame_without_payload_is_the_least():
