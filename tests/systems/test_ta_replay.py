@@ -328,7 +328,24 @@ def test_the_doctor_sees_the_slave_along_the_axes_of_the_master(pairs):
     assert not codes & {"gyro_axes", "gyro_unit", "turning_disagrees", "left_handed"}
     assert "gyro_axes" in {f.code for f in logs.examine(pairs[0])}
     (late,) = [f for f in logs.examine(turned) if f.code == "master_late"]
-    assert late.value == pytest.approx(PAIR.master.delay, abs=0.01)
+    assert late.severity == "error"
+    assert late.value == pytest.approx(PAIR.master.delay, abs=0.003)
+
+
+def test_the_doctor_has_nothing_to_say_of_healthy_pairs_with_their_delay_stated(pairs):
+    turn = logs.Mounting(*np.degrees(orientation(PAIR)))
+    for pair in pairs:
+        stated = pair.meta | {"master_delay_s": PAIR.master.delay}
+        turned = replace(pair, imu=turn.turn(pair.imu), meta=stated)
+        assert logs.examine(turned) == []
+        heading, pitch, roll = (
+            SciRotation.from_quat(pair.master.q_nb, scalar_first=True).as_euler("ZYX").T
+        )
+        ccw = SciRotation.from_euler("ZYX", np.stack([-heading, pitch, roll], -1))
+        master = replace(pair.master, q_nb=ccw.as_quat(scalar_first=True))
+        (told,) = logs.examine(replace(turned, master=master))
+        assert told.code == "attitude_sign"
+        assert "counted counterclockwise" in told.sentence
 
 
 def test_a_filter_that_is_not_there_is_named(pairs):
@@ -374,10 +391,14 @@ def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
     assert "Aligned from" in done.notes[0]
 
 
-def refused(files, name=None, master="master.csv", slave="slave.csv"):
+def refused(files, name=None, master="master.csv", slave="slave.csv", settings=()):
     with pytest.raises((InputError, logs.LogError)) as caught:
         align_pair(
-            str(name or files / "mine.toml"), files / master, files / slave, out=files / "refused"
+            str(name or files / "mine.toml"),
+            files / master,
+            files / slave,
+            out=files / "refused",
+            settings=settings,
         )
     assert not (files / "refused").exists()
     return str(caught.value)
@@ -396,3 +417,6 @@ def test_what_cannot_be_aligned_is_told_in_a_sentence(files):
     told = refused(files, slave="degrees.csv")
     assert "the gyros do not turn as the attitudes of master.csv do" in told
     assert "no common time" in refused(files, slave="late.csv")
+    told = refused(files, settings=('master.delay="0 s"',))
+    assert "older than their stamps, judged by the gyros of slave.csv" in told
+    assert 'State that: master.delay = "0.06' in told
