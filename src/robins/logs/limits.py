@@ -18,5 +18,5 @@ def few_beyond(values: np.ndarray, limit: float) -> np.ndarray:
 
     None where they are half of the rows or more: then the unit is another.
     """
-    rows = (np.abs(values) > limit).any(axis=tuple(range(1, values.ndim)))
+    rows = np.asarray((np.abs(values) > limit).any(axis=tuple(range(1, values.ndim))))
     return rows if 2 * rows.sum() < len(rows) else np.zeros(len(values), bool)

@@ -106,14 +106,16 @@ def fit_turning(q: Rotation, shared: Shared, gyro_map: np.ndarray | None = None)
     late_s = float(LAGS_S[np.argmin([np.sum((d - d.mean(axis=0)) ** 2) for d in coarse])])
     bias = shared.length_s[:, None, None] * np.eye(3)
     step_s = 0.02
+    spread = np.sum((of_master - of_master.mean(axis=0)) ** 2)
+    fit = Turning(np.inf, late_s, np.inf)
     for _ in range(4):
-        early, here, late = (by_gyros(late_s + k * step_s) for k in (-1, 0, 1))
+        early, here, late = (by_gyros(fit.late_s + k * step_s) for k in (-1, 0, 1))
         slope = (late - early) / (2.0 * step_s)
         design = np.concatenate([bias, _cross(here), slope[:, :, None]], axis=-1).reshape(-1, 7)
         left, found, sigma = _least_squares((of_master - here).ravel(), design)
-        late_s = float(np.clip(late_s + np.clip(found[6], -0.1, 0.1), LAGS_S[0], LAGS_S[-1]))
-    spread = np.sum((of_master - of_master.mean(axis=0)) ** 2)
-    return Turning(float(left @ left / spread), late_s, float(sigma[6]))
+        late_s = np.clip(fit.late_s + np.clip(found[6], -0.1, 0.1), LAGS_S[0], LAGS_S[-1])
+        fit = Turning(float(left @ left / spread), float(late_s), float(sigma[6]))
+    return fit
 
 
 class _Pushes(NamedTuple):
