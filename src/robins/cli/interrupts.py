@@ -46,6 +46,7 @@ def heeded() -> Iterator[None]:
     and leaves no half folder. `nohup` has SIGHUP ignored, and so it stays.
     """
     global _asked
+    _asked = False
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -55,7 +56,6 @@ def heeded() -> Iterator[None]:
     try:
         yield
     finally:
-        _asked = False
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
