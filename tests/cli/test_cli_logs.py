@@ -71,6 +71,13 @@ def test_a_fault_of_syntax_is_told_with_its_file(robins, command):
     assert "line 2" in answer.err
 
 
+def test_a_system_that_is_no_text_is_refused(robins):
+    Path("list.toml").write_text('system = ["ins-gnss"]\n')
+    answer = robins("run", "list.toml")
+    assert answer.status == 2
+    assert answer.err.startswith('robins: list.toml: write system = "..." into its first lines')
+
+
 # -------------------------------------------------------------------------------------- the doctor
 
 
