@@ -7,6 +7,7 @@ judged elsewhere; here it counts that a user who types it gets a result.
 import io
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -146,10 +147,14 @@ def folder(tmp_path_factory):
     text = SYSTEMS["ins-gnss"].scenarios["drive"].read_text()
     head, *legs = text.split("[[legs]]")
     car = "[[legs]]".join([head, *legs[:4]])
+    car = car.replace('settle = "60 s"', 'settle = "5 s"')
     (here / "my.toml").write_text(car)
-    drive = drive_dataset(scenario.parse(Drive, car, ["settle=5 s"]), seed=1)
-    logs.write_named(here / "imu.csv", drive.imu)
-    write_pos(here / "gnss.pos", drive.gnss)
+    drive = drive_dataset(scenario.parse(Drive, car), seed=1)
+    imu, gnss = (
+        replace(t, time_ns=t.time_ns + 1_700_000_000_000_000_000) for t in (drive.imu, drive.gnss)
+    )
+    logs.write_named(here / "imu.csv", imu)
+    write_pos(here / "gnss.pos", gnss)
     lever_arm = 'lever_arm = ["0.5 m", "-0.2 m", "-1 m"]'
     unit = car[car.index("[imu]") : car.index("[gnss]")]
     (here / "unit.toml").write_text(f'system = "ins-gnss"\n{unit}[gnss]\n{lever_arm}\n')

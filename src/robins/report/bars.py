@@ -12,7 +12,7 @@ _MOST = 12  # charts of one figure
 _COLUMNS = 3
 
 
-def metrics(filters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float | None]]:
+def metrics(filters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float | int | None]]:
     """Metrics that are one number in at least two filters, by name, in the filters' order."""
     names = dict.fromkeys(name for values in filters.values() for name in values)
     found = {}
