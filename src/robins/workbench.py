@@ -177,9 +177,10 @@ def run_scenario(
     system, label, text = find_scenario(name)
     settings = tuple(settings)
     study = _study_of(system, text, name)
-    parameters = scenario.parse(study.parameters, text, settings, source=name)
+    asked = settings if runs is None else (*settings, f"runs={runs}")
+    parameters = scenario.parse(study.parameters, text, asked, source=name)
     chosen = _check_filters(label, study.filters, filters or parameters.filters)
-    count = parameters.runs if runs is None else runs
+    count = parameters.runs
     with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "setting up the simulation")
         try:
@@ -231,7 +232,7 @@ def bound_scenario(
     system, label, text = find_scenario(name)
     settings = tuple(settings)
     study = _study_of(system, text, name)
-    parameters = scenario.parse(study.parameters, text, settings, source=name)
+    parameters = scenario.parse(study.parameters, text, (*settings, f"runs={runs}"), source=name)
     wanted = filter_name or next(iter(parameters.filters or study.filters))
     chosen = _check_filters(label, study.filters, [wanted])
     times = [units.parse(time, "time") for time in at]

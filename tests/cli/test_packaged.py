@@ -68,6 +68,14 @@ def test_a_configuration_of_what_is_recorded_is_not_simulated(robins):
     assert not list(Path().iterdir())
 
 
+@pytest.mark.parametrize("command", ["run", "bound"])
+def test_more_runs_than_anyone_waits_for_are_refused_at_once(robins, command):
+    answer = robins(command, "rocket/a1", "--runs", 10**20)
+    assert answer.status == Status.BAD_INPUT
+    assert "runs = 100000000000000000000" in answer.err
+    assert "1000000" in answer.err.replace("100000000000000000000", "")
+
+
 @pytest.mark.parametrize("name", PACKAGED)
 def test_a_packaged_scenario_runs(robins, name):
     _, study, kind = study_of(name)

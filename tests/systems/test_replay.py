@@ -1,5 +1,6 @@
 """Replay of a simulated log, whose truth is known, clean and with every kind of bad sample."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -113,6 +114,17 @@ def test_the_filter_is_far_better_than_the_fixes_and_the_smoother_better_still(c
     smoothed = sigma.sel(filter="ekf+rts", axis_attitude="down").values
     assert heading[-1] < 0.5 * heading[0]
     assert np.all(smoothed <= heading * (1 + 1e-9))
+
+
+def test_a_replay_that_contradicts_its_sigmas_ends_with_the_likely_causes(log, clean_outcome):
+    assert clean_outcome.warnings == []
+    sure = replace(log, gnss=replace(log.gnss, sigma_m=0.05 * log.gnss.sigma_m))
+    outcome = replay_log(logs.clean(sure), configuration("update.gate=0.999"), ("ekf",))
+    refused = outcome.metrics["ekf"]["refused_gnss_position"]
+    assert refused > len(log.gnss) / 3
+    told = rf"ekf: {refused} of \d+ measurements of 'gnss_position' were refused"
+    assert any(re.match(told, warning) for warning in outcome.warnings), outcome.warnings
+    assert outcome.warnings[-1].startswith("Likely causes: the lever arm or the latency")
 
 
 def test_every_fix_falls_on_an_epoch_of_its_own_time(log):

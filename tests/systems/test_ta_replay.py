@@ -158,6 +158,14 @@ def test_what_is_estimated_is_within_its_sigmas_and_they_have_shrunk(clean, runs
         assert found[f"refused_{sensor}"] == 0
 
 
+def test_innovations_that_contradict_the_sigmas_are_told_with_the_likely_causes(clean, pairs):
+    assert clean.warnings == []
+    sure = PAIR.master.model_copy(update={"velocity_noise": (2e-3, 2e-3, 2e-3)})
+    told = replay(pairs[0], PAIR.model_copy(update={"master": sure})).warnings
+    assert told[0].startswith("product: the innovations of 'master_velocity' are larger than")
+    assert told[-1].startswith("Likely causes: a delay of the master that is not stated")
+
+
 def test_the_start_is_correlated_as_its_making_is(pairs):
     piece = only_piece(pairs[0])
     plain = PRODUCT.case(piece.run).start
