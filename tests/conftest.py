@@ -28,10 +28,14 @@ os.environ.setdefault(
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_cpu_parallel_codegen_split_count=1",
 )
-# A shell starts what runs in the background deaf to interrupts, and processes that tests start and
-# interrupt would inherit that.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell starts what runs in the background deaf to interrupts, `nohup` to the end of a terminal;
+# processes that tests start and interrupt would inherit that.
+for number, handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 # Every annotation in robins is checked at each call: shapes by jaxtyping, types by beartype.
 if "robins" in sys.modules:
@@ -58,19 +62,23 @@ hypothesis.settings.load_profile("repeatable")
 
 
 # Linux gives a process 65530 memory maps, and a compiled run of a filter takes 400 of them: a
-# worker that keeps every program it compiled crashes in the compiler.
-MAPS = Path("/proc/self/maps")
+# worker that keeps every program it compiled crashes in the compiler. Two workers of 9 GB, which
+# these then are, leave no room for the processes of the bench.
+MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
+MANY_BYTES = 3 * 2**30
 LOOK_EVERY = 10  # tests
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs when there are many."""
+    """Forget compiled programs when there are many, at the latest with the file that needs them."""
     count = item.config.stash.get(FINISHED, 0) + 1
     item.config.stash[FINISHED] = count
-    if count % LOOK_EVERY or not MAPS.exists():
+    if not MAPS.exists():
         return
-    if MAPS.read_bytes().count(b"\n") > MANY_MAPS:
+    over = nextitem is None or nextitem.path != item.path
+    large = over and int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MANY_BYTES
+    if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
         jax.clear_caches()
         gc.collect()
 

@@ -17,6 +17,7 @@ def car(tmp_path_factory):
     text = SYSTEMS["ins-gnss"].scenarios["drive"].read_text()
     head, *legs = text.split("[[legs]]")
     path = tmp_path_factory.mktemp("bound") / "car.toml"
+    head = head.replace('settle = "60 s"', 'settle = "5 s"')
     path.write_text("[[legs]]".join([head, *legs[:3]]))
     return path
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -64,7 +65,7 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
         stderr=subprocess.PIPE,
     )
     assert process.stdout.readline() == "writing\n"
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 3  # the result, the next one, and its lock
     process.send_signal(number)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 3
@@ -181,10 +182,14 @@ def test_a_reader_that_goes_away_is_no_reason_to_complain():
 
 
 def test_a_closed_standard_output_is_told():
-    process = start("", "--help", preexec_fn=lambda: os.close(1), stderr=subprocess.PIPE)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert err == "robins: cannot write to standard output: it is closed\n"
+    code = shlex.join(
+        [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
+    )
+    closed = subprocess.run(
+        f"{code} --help >&-", shell=True, stderr=subprocess.PIPE, text=True, timeout=30
+    )
+    assert closed.returncode == 1
+    assert closed.stderr == "robins: cannot write to standard output: it is closed\n"
 
 
 def test_a_closed_standard_error_is_no_fault(robins, workbench, monkeypatch):

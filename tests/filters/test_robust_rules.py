@@ -18,6 +18,7 @@ from robins.filters import (
     Motion,
     OnlineFilter,
     Sensor,
+    StepWarning,
     kalman,
     run,
     unscented,
@@ -334,16 +335,17 @@ def test_extremes_leave_a_covariance():
         (Sensor(lambda x, aux: aux[0] @ x, lambda x, aux: aux[1], m),),
     )
     for P0 in (0.0, 1e12):
-        solution = run(
-            CHAIN, model, Belief.of(jnp.zeros(n), P0 * np.eye(n)), y, noise, {"y": (H, W)}
-        )
+        start = Belief.of(jnp.zeros(n), P0 * np.eye(n))
+        with pytest.warns(StepWarning, match="CONTRADICTED"):  # exact sensors that read anything
+            solution = run(CHAIN, model, start, y, noise, {"y": (H, W)})
         P = np.asarray(solution.covariance)
         assert np.all(np.isfinite(solution.mean))
         assert np.all(np.isfinite(P))
         least, greatest = np.linalg.eigvalsh(P)[:, [0, -1]].T
         assert np.all(least >= -1e-15 * greatest)
         codes = set(np.unique(solution.steps.info["y"].code).tolist())
-        assert codes <= {Code.DONE, Code.MISSING, Code.PARTLY_MISSING, Code.REFUSED}
+        taken = {Code.DONE, Code.MISSING, Code.PARTLY_MISSING, Code.REFUSED, Code.CONTRADICTED}
+        assert codes <= taken
 
 
 def test_gradients_of_robust_filters_are_right():

@@ -66,7 +66,7 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Of the attitude de
 @option("--rate", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="In real time.")
 @option("--overrun", type=click.Choice(["continue", "skip", "abort"]), help="Of a deadline.")
 @option("--on-death", type=click.Choice(["fail", "restart"]), help="Of a process.")
-@option("--restarts", type=click.IntRange(1), help="At most, of processes. [default: 10]")
+@option("--restarts", type=click.IntRange(1, 100_000), help="At most, of processes. [default: 10]")
 @option("--node", "ports", multiple=True, callback=_ports, metavar="PART=PORT", help="A board.")
 @option("--baud", type=click.IntRange(300), help="Slow the virtual lines down to this.")
 @option("--fifo", is_flag=True, help="Ask for the real-time scheduler SCHED_FIFO.")

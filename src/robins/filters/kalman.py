@@ -88,7 +88,9 @@ def in_step(filter_: Filter) -> Filter:
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
         state, prediction = filter_.predict(state, motion, u)
-        return state._replace(current=prediction.code == int(Code.DONE)), prediction
+        # of a type of its own: with a weak one a stream would compile again after the first step
+        current = (prediction.code == int(Code.DONE)).astype(bool)
+        return state._replace(current=current), prediction
 
     def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
         new, info = filter_.update(state, sensor, y, aux)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of t
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)))
 _ROWS = 2  # of a legend that every figure has room for
+_REMARK = 100  # characters of small words in a line
 TRUTH = "#222222"
 GREY = "#6B6B6B"
 OUTAGE = "#FBE9B0"
@@ -113,6 +115,16 @@ def filter_keys(filters: Sequence[str]) -> list[Line2D]:
 def outage_key() -> Patch:
     """The entry for shaded outages."""
     return Patch(color=OUTAGE, label="outage")
+
+
+def remark(axes: Axes, text: str) -> None:
+    """Small grey words above the axes; what takes several lines makes the figure taller."""
+    lines = textwrap.wrap(text, _REMARK, break_on_hyphens=False)
+    axes.set_title("\n".join(lines), fontsize=8.5, color=GREY)
+    figure = axes.get_figure(root=True)
+    if figure is not None and len(lines) > 1:
+        width, height = figure.get_size_inches()
+        figure.set_size_inches(width, height + 0.14 * (len(lines) - 1))
 
 
 def legend(figure: Figure, keys: Sequence[Any]) -> None:

@@ -65,7 +65,7 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
         shares = _statistic(stack[-1], solution, f"nis_{sensor}", f"nis_dof_{sensor}", clock)
         stack[-1].set_ylabel("NIS")
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
-        stack[-1].set_title(shares, fontsize=8.5, color=style.GREY)
+        style.remark(stack[-1], shares)
     if outage is not None:
         keys.append(style.outage_key())
     stack[-1].set_xlabel(clock.label)
@@ -208,7 +208,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
         if np.isfinite(limits.expected):
             axes.axhline(limits.expected, color=style.GREY, linewidth=0.7, zorder=1)
-    axes.set_title(shares, fontsize=8.5, color=style.GREY)
+    style.remark(axes, shares)
     axes.margins(x=0.0)
     axes.set(xlabel=clock.label, ylabel=name.upper())
     style.legend(figure, [*keys, style.outage_key()] if outage is not None else keys)

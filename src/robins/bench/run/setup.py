@@ -77,7 +77,7 @@ class Setup(Parameters):
     overrun: Literal["continue", "skip", "abort"] = "continue"
     patience: Annotated[float, pydantic.Field(gt=0.0, le=1e6)] = 1.0
     on_death: Literal["fail", "restart"] = "fail"
-    restarts: Annotated[int, pydantic.Field(ge=1)] = 10
+    restarts: Annotated[int, pydantic.Field(ge=1, le=100_000)] = 10
     fifo: bool = False  # ask for the scheduler SCHED_FIFO
     baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
     table: Carrier | None = None

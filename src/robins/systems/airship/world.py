@@ -189,7 +189,7 @@ def blow(given: Airship, key: Array) -> tuple[Array, float]:
         along_across = shape(own, count, step, given.hull.air_speed, t.sigma, t.length)
         towards = _towards(wind.towards)
         turn = jnp.asarray(np.stack([towards, [-towards[1], towards[0]]]))
-        time = step * jnp.arange(count)
+        time = step * jnp.arange(count, dtype=float)
         inside = (time >= begin) & (time < end)
         total = total + jnp.where(inside[:, None], along_across @ turn, 0.0)
     return total, step

@@ -133,7 +133,8 @@ def existence(
     # which one would.
     least, largest = 0.0, float(np.max(attempt(np.inf)[0]))
     try:
-        attempt(largest * (1.0 - 1e-9))
+        if largest > 0.0:  # something is measured
+            attempt(largest * (1.0 - 1e-9))
     except Infeasible as refused:
         least = refused.gamma_min if refused.gamma_min is not None else np.nan
     asked = over_least * least if gamma is None else gamma
