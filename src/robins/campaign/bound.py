@@ -13,7 +13,7 @@ import xarray as xr
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.campaign.monte_carlo import solved, worlds
+from robins.campaign.monte_carlo import contender, solved, worlds
 from robins.filters import Belief, Filter, Model
 from robins.filters.bound import bound_along, linearised, used_sensors
 from robins.filters.observability import (
@@ -56,14 +56,11 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     Raises:
         ValueError: there is no such contender or sensor, none is left, or the bound is not finite.
     """
-    if name not in problem.contenders:
-        raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
-    c = problem.contenders[name]
+    c = contender(problem, name)
     try:
         use = used_sensors(c.model, without)
     except KeyError as error:
         raise ValueError(f"filter '{name}' has {error.args[0]}") from None
-    case = c.case if isinstance(c.case, Partial) else Partial(c.case)
     names = [s.name for s in c.model.sensors]
     one_less = use & ~np.eye(len(use), dtype=bool)
     subsets = jnp.asarray(np.concatenate([[use], [np.zeros_like(use)], one_less]))
@@ -71,7 +68,7 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
     for batch, count in worlds(problem, runs):
         for k in range(count):
             world = jax.tree_util.tree_map(lambda x, k=k: x[k], batch)
-            found = _bound(c.filter, c.model, case, c.reported, subsets, world)
+            found = _bound(c.filter, c.model, c.case, c.reported, subsets, world)
             variance = variance + np.asarray(found.variance) / runs
             prior = prior + np.asarray(found.prior) / runs
             first = first or found
@@ -102,9 +99,8 @@ def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
         name: the contender whose model and start are believed.
         world: one run, as the problem simulates it.
     """
-    c = problem.contenders[name]
-    case = c.case if isinstance(c.case, Partial) else Partial(c.case)
-    return np.sqrt(np.asarray(_variances(c.filter, c.model, case, c.reported, world)))
+    c = contender(problem, name)
+    return np.sqrt(np.asarray(_variances(c.filter, c.model, c.case, c.reported, world)))
 
 
 def _case(filter_: Filter, model: Model, case: Partial, world: Any) -> Case:

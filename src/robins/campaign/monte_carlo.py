@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.consistency import nees, normalised_sq
+from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
 from robins.systems.system import Case, Contender, Problem
 
@@ -135,6 +136,19 @@ def worlds(
         yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
 
 
+def contender(problem: Problem, name: str) -> Contender:
+    """A contender of a problem, of which what was compiled for an equal one serves again.
+
+    Raises:
+        ValueError: there is none of this name.
+    """
+    if name not in problem.contenders:
+        raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
+    c = problem.contenders[name]
+    case = c.case if isinstance(c.case, Partial) else Partial(c.case)  # whose numbers are data
+    return c._replace(filter=same(c.filter), model=same_model(c.model), case=same(case))
+
+
 def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, Any]:
     """Run a filter of a problem in a chunk of worlds.
 
@@ -147,12 +161,9 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     Raises:
         ValueError: there is no such contender.
     """
-    if name not in problem.contenders:
-        raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
-    c = problem.contenders[name]
+    c = contender(problem, name)
     blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
-    case = c.case if isinstance(c.case, Partial) else Partial(c.case)  # whose numbers are data
-    found = _records(c.filter, blocks, c.model, case, c.reported, worlds)
+    found = _records(c.filter, blocks, c.model, c.case, c.reported, worlds)
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
 
 

@@ -19,6 +19,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Model, Sensor
 from robins.filters.run import Step, check_names, everything, is_traced, nothing
+from robins.filters.sameness import same, same_model
 from robins.filters.tally import Tally, warn_not_taken
 
 
@@ -151,7 +152,8 @@ def run_closed(
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state, world, rows, due = (as_arrays(x) for x in (state, loop.world, loop.rows, loop.due))
-    loop = Loop(_as_partial(loop.react), world, rows, due)
+    loop = Loop(same(_as_partial(loop.react)), world, rows, due)
+    filter_, model = same(filter_), same_model(model)
     closed = Closed(*_scan(filter_, model, state, loop, keep))
     if filter_.audit is not None and not is_traced(closed.final):
 

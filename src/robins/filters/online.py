@@ -13,6 +13,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
+from robins.filters.sameness import same, same_model
 
 
 @partial(jax.jit, static_argnames=("filter_",))
@@ -50,7 +51,7 @@ class OnlineFilter:
             model: the motion and the sensors.
             start: initial belief or saved state.
         """
-        self._filter, self._model = filter_, model
+        self._filter, self._model = same(filter_), same_model(model)
         state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
         self.state = _settled(state)
         self.counts: Counter[str] = Counter()

@@ -15,6 +15,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
+from robins.filters.sameness import same, same_model
 from robins.filters.tally import Tally, warn_not_taken
 
 
@@ -143,8 +144,8 @@ def run(
     """Run a filter over measurements: for each step predict, then update with row k of y.
 
     One compiled scan: batch with `jax.vmap` over any of the data, differentiate with `jax.grad`.
-    A filter, model functions and `keep` that are the same objects, with data of the same shapes,
-    are compiled once.
+    A filter and a model that robins made again with equal arguments, a user's functions and `keep`
+    that are the same objects, with data of the same shapes, are compiled once.
 
     Args:
         filter_: from `kalman` and its kin.
@@ -175,6 +176,7 @@ def run(
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
+    filter_, model = same(filter_), same_model(model)
     solution = _scan(filter_, model, state, u, measurements, extra, keep)
     if filter_.audit is not None and not is_traced(solution.final):
 
