@@ -1,5 +1,7 @@
 """The interacting multiple model filter against one written down plainly in NumPy."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from scipy.stats import multivariate_normal
 from robins.filters import (
     Belief,
     Code,
+    Family,
     Model,
     Motion,
     OnlineFilter,
@@ -182,6 +185,39 @@ def test_one_mode_is_its_filter_and_modes_that_never_change_are_filters_of_their
     np.testing.assert_allclose(mu[refused], before[refused], rtol=1e-13)
 
 
+def scaled(row):
+    """A mode of a family: by numbers, its noise of motion, and of its sensor another factor."""
+    drive, noise = row
+    motion, sensor = linear(0)
+    motion = dataclasses.replace(motion, noise=drive * jnp.asarray(motion.noise))
+    sensor = dataclasses.replace(sensor, noise=noise * jnp.asarray(sensor.noise))
+    return mode(kalman(rules=[gate(0.99)]), motion, [sensor])
+
+
+def test_a_family_is_the_modes_one_by_one(solution):
+    """With measurements missing and refused; one mode in which nothing can be."""
+    y = solution[0][0]
+    numbers = (np.array([1.0, 8.0, 1.0]), np.array([1.0, 1.0, 5.0]))
+    rows = list(zip(*numbers, strict=True))
+    change = np.array([[0.9, 0.05, 0.05], [0.1, 0.9, 0.0], [0.2, 0.0, 0.8]])
+    each = run(imm([scaled(row) for row in rows], change), MODEL, START, y)
+    once = run(imm(Family(scaled, numbers), change), MODEL, START, y)
+    for name in ("steps", "log_likelihood", "tally"):
+        one, other = (getattr(x, name) for x in (once, each))
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+    assert "imm.2.gate.ratio" in once.steps.info["y"].notes
+    settled = imm(Family(scaled, numbers), change).reset(once.final, START)
+    np.testing.assert_array_equal(settled.memory.states.belief.factor[2], START.factor)
+
+
+def test_families_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="one row a mode; their shapes begin with"):
+        imm(Family(scaled, (np.ones(2), np.ones(3))), np.eye(2))
+    with pytest.raises(ValueError, match="one row a mode"):
+        imm(Family(scaled, 1.0), np.eye(2))
+
+
 def test_a_mode_that_fails_is_out_and_comes_back():
     # Its motion is not finite above one; then the other, which knows better, takes over.
     def fragile(x, u):
@@ -287,13 +323,22 @@ def test_a_reset_moves_all_modes_and_keeps_probabilities(solution):
 def test_what_rules_of_a_mode_have_to_report_is_reported():
     heard = []
 
-    def audit(start, final, again, time):
-        heard.append((float(final["y"][1]), float(again({"y": (9, 4.0)})["y"][1]), time))
+    def doubled(memory):
+        return {"y": memory["y"]._replace(ratio=jnp.asarray(4.0))}
 
-    two = imm([kalman(), kalman(rules=[gate()._replace(audit=audit)])], np.eye(2))
-    start = two.init(START, MODEL.dims)
-    two.audit(start, start, lambda first: first, 5.0)
-    assert heard == [(0.0, 4.0, 5.0)]
+    def audit(start, final, again, time):
+        heard.append((float(final["y"][1]), float(again(doubled(start))["y"][1]), time))
+
+    reporting = kalman(rules=[gate()._replace(audit=audit)])
+    for modes, count in (
+        ([kalman(), reporting], 1),
+        (Family(lambda row: reporting, np.ones(2)), 2),
+    ):
+        two = imm(modes, np.eye(2))
+        start = two.init(START, MODEL.dims)
+        two.audit(start, start, lambda first: first, 5.0)
+        assert heard == [(0.0, 4.0, 5.0)] * count
+        heard.clear()
     assert IMM.audit is None
 
 

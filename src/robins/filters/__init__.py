@@ -26,6 +26,7 @@ from robins.filters.linearise import (
 )
 from robins.filters.master import at_master
 from robins.filters.model import Model, Motion, Sensor
+from robins.filters.modes import Family
 from robins.filters.observability import observability, observability_along
 from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
@@ -49,6 +50,7 @@ __all__ = [
     "Channel",
     "Closed",
     "Code",
+    "Family",
     "Filter",
     "FilterState",
     "Late",

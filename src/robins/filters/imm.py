@@ -26,6 +26,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
+from robins.filters.modes import Family, Mode, bank
 from robins.filters.trees import equal, select
 
 Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
@@ -33,18 +34,10 @@ Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
 _ONE = 1e-9  # how far a sum of probabilities may be off
 
 
-class Mode(NamedTuple):
-    """A filter and what of the model is its own."""
-
-    filter_: Filter
-    motion: Motion | None = None
-    sensors: tuple[Sensor, ...] = ()
-
-
 class Interaction(NamedTuple):
     """Memory of a mixture of filters."""
 
-    states: tuple[FilterState, ...]  # one a mode
+    states: Any  # of the modes: a tuple, or those of a family with a leading axis
     log_probability: Array  # (modes,)
 
 
@@ -59,7 +52,9 @@ def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor
     return Mode(filter_, motion, tuple(sensors))
 
 
-def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = None) -> Filter:
+def imm(
+    modes: Sequence[Filter | Mode] | Family, transition: Rows, start: Rows | None = None
+) -> Filter:
     """Interacting multiple model filter over any filters of the same state.
 
     Modes may differ in rules, in linearisation, and by `mode` in motion and sensors. Each keeps the
@@ -74,7 +69,7 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
     step fails is out until the next mixing; the code is a failure only where all fail.
 
     Args:
-        modes: filters, or what `mode` makes of one.
+        modes: filters, or what `mode` makes of one; a `Family` where they differ in numbers only.
         transition: (modes, modes), row i the probabilities to change from i in one step.
         start: (modes,) probabilities before the first prediction; all equal where not given.
 
@@ -82,10 +77,10 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
         ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
             one. When a run begins: a mode brings a sensor that the model does not have.
     """
-    every = tuple(m if isinstance(m, Mode) else Mode(m) for m in modes)
-    count = len(every)
-    if not count:
+    all_ = bank(modes)
+    if not all_.count:
         raise ValueError("imm needs at least one mode")
+    count = all_.count
     even = np.full(count, 1.0 / count)
     first = _probabilities("start", even if start is None else start, (count,))
     with np.errstate(divide="ignore"):
@@ -93,55 +88,34 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
         log_first = np.log(first)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        own = {s.name for m in every for s in m.sensors}
-        if unknown := own - set(dims):
-            raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
-        states = tuple(m.filter_.init(belief, dims) for m in every)
-        return FilterState(belief, Interaction(states, jnp.asarray(log_first)))
+        return FilterState(belief, Interaction(all_.init(belief, dims), jnp.asarray(log_first)))
 
-    def mixed(states: tuple[FilterState, ...], joint: Array) -> tuple[list[FilterState], Array]:
+    def mixed(states: Any, log_now: Array) -> tuple[Any, Array]:
         """Where each filter begins, and the predicted log-probabilities."""
-        begun, log_next = [], []
-        beliefs = _stack([s.belief for s in states])
-        for j, (m, state) in enumerate(zip(every, states, strict=True)):
-            log_weight, log_sum = log_normalised(joint[:, j])
-            weight = jnp.exp(log_weight)
-            other = m.filter_.reset(state, matched(beliefs, weight, state.belief.mean))
-            # A mode that nothing comes to goes on alone, and so bit for bit does one that mixes
-            # with none.
-            alone = ~jnp.isfinite(log_sum) | (weight[j] == 1.0)
-            begun.append(select(alone, state, other))
-            log_next.append(log_sum)
-        return begun, jnp.stack(log_next)
+        joint = log_now[:, None] + jnp.asarray(log_change)
+        log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
+        weight = jnp.exp(log_weight)  # (to, from)
+        beliefs = all_.beliefs(states)
+        begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
+        # A mode that nothing comes to goes on alone, and so bit for bit does one that mixes with
+        # none.
+        alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
+        return all_.restart(states, begun, alone), log_next
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
         states, log_now = state.memory
-        joint = log_now[:, None] + jnp.asarray(log_change)
-        begun, log_next = (list(states), log_now) if count == 1 else mixed(states, joint)
-        after, codes = [], []
-        for m, one in zip(every, begun, strict=True):
-            one, prediction = m.filter_.predict(one, motion if m.motion is None else m.motion, u)
-            after.append(one)
-            codes.append(prediction.code)
-        code = jnp.stack(codes)
+        begun, log_next = (states, log_now) if count == 1 else mixed(states, log_now)
+        after, code = all_.predict(begun, motion, u)
         taken = code == int(Code.DONE)
         log_next = _among(taken, log_next)
         failed = code[jnp.argmax(log_now)]
-        belief = _mixture(after, log_next)
-        memory = Interaction(tuple(after), log_next)
+        belief = _mixture(all_.beliefs(after), log_next)
         outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
-        return FilterState(belief, memory), Prediction(None, belief, outcome)
+        return FilterState(belief, Interaction(after, log_next)), Prediction(None, belief, outcome)
 
     def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
         states, log_prior = state.memory
-        after, infos = [], []
-        for m, one in zip(every, states, strict=True):
-            own = next((s for s in m.sensors if s.name == sensor.name), sensor)
-            one, info = m.filter_.update(one, own, y, aux)
-            after.append(one)
-            infos.append(info)
-        notes = {f"imm.{i}.{k}": v for i, info in enumerate(infos) for k, v in info.notes.items()}
-        seen = _stack([info._replace(notes={}) for info in infos])
+        after, seen, notes = all_.update(states, sensor, y, aux)
         sound = ~jnp.isneginf(seen.log_likelihood)
         of_all = jnp.any(seen.used & sound[:, None], axis=0)
         alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
@@ -149,35 +123,30 @@ def imm(modes: Sequence[Filter | Mode], transition: Rows, start: Rows | None = N
         log_post, _ = log_normalised(log_prior + gained)
         log_post = jnp.where(jnp.any(sound), log_post, log_prior)
         if count == 1:
-            info = infos[0]._replace(notes={})
+            info = jax.tree_util.tree_map(lambda a: a[0], seen)
         else:
             info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
+        notes = {f"imm.{k}": v for k, v in notes.items()}
         notes["imm.probability"] = jnp.exp(log_post)
         # Where no mode has moved the mixture stands bit for bit.
-        still = equal([s.belief for s in after], [s.belief for s in states])
-        belief = select(still, state.belief, _mixture(after, log_post))
-        return FilterState(belief, Interaction(tuple(after), log_post)), info._replace(notes=notes)
+        was, now = all_.beliefs(states), all_.beliefs(after)
+        belief = select(equal(now, was), state.belief, _mixture(now, log_post))
+        return FilterState(belief, Interaction(after, log_post)), info._replace(notes=notes)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
-        held = state.memory
-        states = [m.filter_.reset(s, belief) for m, s in zip(every, held.states, strict=True)]
-        return FilterState(belief, held._replace(states=tuple(states)))
+        states = all_.reset(state.memory.states, belief)
+        return FilterState(belief, state.memory._replace(states=states))
 
     def audit(begin: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        def rerun(i: int, again: Again, inner: FilterState) -> FilterState:
-            states = begin.memory.states
-            states = (*states[:i], inner, *states[i + 1 :])
-            return again(begin._replace(memory=begin.memory._replace(states=states))).memory.states[
-                i
-            ]
+        def rerun(states: Any) -> Any:
+            assert again is not None
+            return again(begin._replace(memory=begin.memory._replace(states=states))).memory.states
 
-        for i, m in enumerate(every):
-            if m.filter_.audit is not None:
-                once_more = None if again is None else (lambda x, i=i, a=again: rerun(i, a, x))
-                m.filter_.audit(begin.memory.states[i], final.memory.states[i], once_more, time)
+        assert all_.audit is not None
+        once_more: Any = None if again is None else rerun
+        all_.audit(begin.memory.states, final.memory.states, once_more, time)
 
-    audited = any(m.filter_.audit is not None for m in every)
-    return in_step(Filter(init, predict, update, reset, audit if audited else None))
+    return in_step(Filter(init, predict, update, reset, all_.audit and audit))
 
 
 def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:
@@ -192,23 +161,18 @@ def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray
     return value / total[..., None]
 
 
-def _stack(trees: Sequence[Any]) -> Any:
-    return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
-
-
 def _among(taken: Array, log_probability: Array) -> Array:
     """The same without modes whose step failed, unless all did."""
     kept = jnp.where(taken | ~jnp.any(taken), log_probability, -jnp.inf)
     return log_normalised(kept)[0]
 
 
-def _mixture(states: Sequence[FilterState], log_probability: Array) -> Belief:
+def _mixture(beliefs: Belief, log_probability: Array) -> Belief:
     """Moments of all modes; those of one that is certain are its own, bit for bit."""
-    if len(states) == 1:
-        return states[0].belief
-    beliefs = _stack([s.belief for s in states])
     likely = jnp.argmax(log_probability)
     best = jax.tree_util.tree_map(lambda a: a[likely], beliefs)
+    if len(log_probability) == 1:
+        return best
     weight = jnp.exp(log_probability)
     return select(weight[likely] == 1.0, best, matched(beliefs, weight, best.mean))
 

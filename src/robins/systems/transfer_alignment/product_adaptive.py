@@ -24,8 +24,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
-from robins.filters import Filter, imm, kalman, taylor
+from robins.filters import Family, Filter, imm, kalman, taylor
 from robins.filters.linearise import Transition
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -39,33 +40,32 @@ _WEIGHED = 0.99  # share of right records that keep their weight
 class Hypothesis(NamedTuple):
     """What process noise is multiplied by."""
 
-    gyro: float = 1.0  # noise of the gyros
-    walk: float = 0.0  # rad/s/sqrt(s) of the gyro biases in units of the gyro noise: 1/s
-    flexure: float = 1.0  # drive of the flexure
+    gyro: ArrayLike = 1.0  # noise of the gyros
+    walk: ArrayLike = 0.0  # rad/s/sqrt(s) of the gyro biases in units of the gyro noise: 1/s
+    flexure: ArrayLike = 1.0  # drive of the flexure
 
 
 QUIET, NOISY, DRIFTING = Hypothesis(), Hypothesis(gyro=20.0), Hypothesis(gyro=20.0, walk=20.0)
 KICKED = Hypothesis(flexure=10.0)
 
 
-def supposing(hypothesis: Hypothesis, stiff: bool) -> Rule:
+def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
     """Filter as if a hypothesis held; a stiff structure has no flexure worth the name."""
     gyro, walk, flexure = hypothesis
-    grown = np.ones(_STATES)
-    grown[_ATTITUDE], grown[_FLEXURE] = gyro, flexure
-    kept = np.ones(_STATES)
-    kept[_FLEXURE] = _STIFF if stiff else 1.0
+    grown = jnp.ones(_STATES).at[_ATTITUDE].set(gyro).at[_FLEXURE].set(flexure)
+    kept = jnp.ones(_STATES).at[_FLEXURE].set(jnp.where(stiff, _STIFF, 1.0))
 
     def process(memory, t: Transition):
         # The noise factor is triangular, and gyro noise enters by its first three columns.
         one_axis = jnp.sqrt(jnp.sum(t.noise[_ATTITUDE] ** 2) / 3.0)
         wander = jnp.zeros((_STATES, 3)).at[_GYRO_BIAS].set(walk * one_axis * jnp.eye(3))
         noise = jnp.concatenate([t.noise * grown[None], wander], 1)
-        if stiff:
-            zero = jnp.zeros(3)
-            mean = t.mean._replace(flexure_rad=zero, flexure_rate_rad_s=zero)
-            t = t._replace(mean=mean, spread=t.spread * kept[:, None])
-        return memory, t._replace(noise=noise * kept[:, None])
+        angle, rate = (
+            jnp.where(stiff, 0.0, x) for x in (t.mean.flexure_rad, t.mean.flexure_rate_rad_s)
+        )
+        mean = t.mean._replace(flexure_rad=angle, flexure_rate_rad_s=rate)
+        spread, noise = t.spread * kept[:, None], noise * kept[:, None]
+        return memory, t._replace(mean=mean, spread=spread, noise=noise)
 
     return Rule(process=process, name="supposing")
 
@@ -104,8 +104,10 @@ def changes() -> np.ndarray:
 def adaptive() -> Filter:
     """The bank, for a product model with flexure states."""
 
-    def one(hypothesis: Hypothesis, stiff: bool) -> Filter:
-        return kalman(taylor(), (supposing(hypothesis, stiff), huber(_WEIGHED)), form="joseph")
+    def one(row: tuple[Hypothesis, ArrayLike]) -> Filter:
+        return kalman(taylor(), (supposing(*row), huber(_WEIGHED)), form="joseph")
 
-    modes = [one(h, True) for h in _STIFF_MODES] + [one(h, False) for h in _FLEXING_MODES]
-    return imm(modes, changes(), 0.5 * np.array([*_STIFF_START, *_FLEXING_START]))
+    modes = (*_STIFF_MODES, *_FLEXING_MODES)
+    numbers = Hypothesis(*np.array(modes).T), np.arange(len(modes)) < len(_STIFF_MODES)
+    start = 0.5 * np.array([*_STIFF_START, *_FLEXING_START])
+    return imm(Family(one, numbers), changes(), start)
