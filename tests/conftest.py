@@ -3,6 +3,7 @@
 Loaded by each worker of a parallel run before any test module, so before `robins` is imported.
 """
 
+import ctypes
 import gc
 import os
 import signal
@@ -13,6 +14,7 @@ import hypothesis
 import jax
 import jaxtyping
 import pytest
+import tiers
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -28,6 +30,9 @@ os.environ.setdefault(
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_cpu_parallel_codegen_split_count=1",
 )
+# What was compiled once serves every worker and the next run; where it is kept is not a cost.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 # A shell starts what runs in the background deaf to interrupts, `nohup` to the end of a terminal;
 # processes that tests start and interrupt would inherit that.
 for number, handler in (
@@ -54,36 +59,50 @@ hypothesis.settings.register_profile(
     print_blob=True,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
-# For hunting: `pytest --hypothesis-profile=explore`.
-hypothesis.settings.register_profile(
-    "explore", hypothesis.settings.get_profile("repeatable"), derandomize=False, max_examples=2000
-)
+# For `make certify`, and for hunting: `pytest --hypothesis-profile=explore`.
+for profile, examples, repeatable in (("thousand", 1000, True), ("explore", 2000, False)):
+    hypothesis.settings.register_profile(
+        profile,
+        hypothesis.settings.get_profile("repeatable"),
+        derandomize=repeatable,
+        max_examples=examples,
+    )
 hypothesis.settings.load_profile("repeatable")
 
 
 # Linux gives a process 65530 memory maps, and a compiled run of a filter takes 400 of them: a
-# worker that keeps every program it compiled crashes in the compiler. Two workers of 9 GB, which
-# these then are, leave no room for the processes of the bench.
+# worker that keeps every program it compiled crashes in the compiler, and two workers with all
+# their programs leave no room for the processes of the bench.
 MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
-MANY_BYTES = 3 * 2**30
-LOOK_EVERY = 10  # tests
+MANY_BYTES = 2 * 2**30
+LOOK_EVERY = 10  # tests, at the maps: to write them out takes the system milliseconds
+FINISHED = pytest.StashKey[int]()
 
 
-def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs when there are many, at the latest with the file that needs them."""
-    count = item.config.stash.get(FINISHED, 0) + 1
-    item.config.stash[FINISHED] = count
+def pytest_runtest_teardown(item):
+    """Forget compiled programs when there are many; the cache gives back those needed again."""
     if not MAPS.exists():
         return
-    over = nextitem is None or nextitem.path != item.path
-    large = over and int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MANY_BYTES
+    count = item.config.stash[FINISHED] = item.config.stash.get(FINISHED, 0) + 1
+    large = int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MANY_BYTES
     if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
         jax.clear_caches()
         gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)  # else what was freed stays with the process
 
 
-FINISHED = pytest.StashKey[int]()
+def pytest_addoption(parser):
+    parser.addoption("--costs", metavar="FOLDER", help="write what each test cost into a folder")
+
+
+def pytest_configure(config):
+    if config.getoption("--costs"):
+        config.pluginmanager.register(tiers.Meter(config.getoption("--costs")))
+
+
+def pytest_collection_modifyitems(items):
+    tiers.mark(items)
 
 
 def outside(variable: str, folder: str) -> Path:

@@ -10,10 +10,7 @@ from robins.bench.ports.cable import cable
 from robins.bench.wire.c_header import firmware
 from robins.cli import main
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc"),
-]
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
 SECONDS = 60
 STEPS = 10 * SECONDS
 STAR_ARCSEC = 10.0  # noise of the star sensor, across its axis

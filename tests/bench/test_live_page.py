@@ -152,7 +152,6 @@ def command(live: Live) -> dict:
 # --------------------------------------------------------------------------------- what is shown
 
 
-@pytest.mark.slow
 def test_twenty_signals_at_10_hz_are_shown(chromium, live):
     assert len(SIGNALS) == 20
     with browse(chromium, live.url) as page:

@@ -73,7 +73,6 @@ def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
     assert "Same: 'adm' says the same" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_the_filter_makes_of_it_what_it_made(capsys):
     _, said = told(capsys)
     assert said["frames"] > STEPS

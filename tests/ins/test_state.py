@@ -154,7 +154,6 @@ def test_biases_decay_with_their_time_constants():
     np.testing.assert_allclose(end.accel_bias, x.accel_bias * np.exp(-1.0 / 200.0), rtol=1e-14)
 
 
-@pytest.mark.slow  # the compiler takes its time over the reverse of all this
 def test_gradients_are_finite_and_right():
     """Through Phi and L, by the level of the noise, a time constant and the state."""
     x, increments = state(2, 30.0, scales=False), block(gentle, 1, 0.5)

@@ -32,7 +32,6 @@ def b():
     }
 
 
-@pytest.mark.slow
 class TestRightModel:
     """A1: the model is right, the magnetometer is off by 5 deg for a second in thirty."""
 
@@ -62,7 +61,6 @@ class TestRightModel:
         assert a1["ukf"].nees_per_dim > 3.0
 
 
-@pytest.mark.slow
 class TestWrongModel:
     """A2: the filters believe coefficients that are 2 % too large."""
 
@@ -75,7 +73,6 @@ class TestWrongModel:
         assert a2["discriminator"].attitude < min(a2["ukf"].attitude, a2[SEED].attitude)
 
 
-@pytest.mark.slow
 class TestFieldVector:
     """B: one vector, the gyro drives."""
 

@@ -23,7 +23,6 @@ def s4():
     return flown("s4", names, RUNS)
 
 
-@pytest.mark.slow
 class TestNoiseAsBelieved:
     def test_errors_are_those_of_the_reference(self, s1):
         assert abs(s1["mekf"].attitude - 8.0) < 0.5
@@ -44,14 +43,12 @@ class TestNoiseAsBelieved:
         assert 0.3 < s1["mekf"].spread < 0.8
 
 
-@pytest.mark.slow
 def test_gyro_errors_that_no_filter_knows_of(s2):
     assert abs(s2["mekf"].attitude - 12.4) < 2.5
     assert abs(s2["mixed-riccati"].attitude - 10.2) < 1.0
     assert s2["mixed-riccati"].spread < 0.6 * s2["mekf"].spread
 
 
-@pytest.mark.slow
 class TestDriftFasterThanBelieved:
     def test_errors_are_those_of_the_reference(self, s4):
         assert abs(s4["mekf"].attitude - 20.0) < 2.0

@@ -1,0 +1,99 @@
+"""Which tests run when: by what they cost, and by what they prove.
+
+    make check      `fast`: not among the costly of `costs.json`
+    make test       all but `certify`
+    make certify    those of `certify.toml`, and every property with a thousand examples
+
+`costs.json` holds the seconds of processor of each test that takes a second or more, with what it
+compiles, from an empty cache; `make costs` writes it. `certify.toml` names what is too long to wait
+for at every push, which promise it guards, and which tests of `make test` stand for it meanwhile.
+"""
+
+import json
+import os
+import re
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+COSTS, CERTIFY = HERE / "costs.json", HERE / "certify.toml"
+LEAST_S = 1.0  # of a cost worth writing down
+
+
+def plain(node: str) -> str:
+    """A test without its parameters: file and name."""
+    return node.partition("[")[0]
+
+
+def certified() -> list[dict[str, str]]:
+    """Entries of `certify.toml`: test, promise, stands."""
+    return tomllib.loads(CERTIFY.read_text("utf-8"))["moved"]
+
+
+def meant(entry: dict[str, str], node: str) -> bool:
+    """Whether an entry means a test: its name, alone or with parameters that match ``only``."""
+    name, _, parameters = node.partition("[")
+    wanted = re.compile(entry.get("only", ".*"))
+    return name == entry["test"] and bool(wanted.fullmatch(parameters.removesuffix("]")))
+
+
+def mark(items: list[pytest.Item]) -> None:
+    """Give each test its tier."""
+    costly, moved = set(json.loads(COSTS.read_text("utf-8"))), certified()
+    for item in items:
+        node = item.nodeid.removeprefix("tests/")
+        if any(meant(entry, node) for entry in moved):
+            item.add_marker(pytest.mark.certify)
+        elif plain(node) not in costly:
+            item.add_marker(pytest.mark.fast)
+
+
+class Meter:
+    """Writes what each test cost, a line a test, into a file for each worker."""
+
+    def __init__(self, folder: str):
+        self.file = Path(folder) / f"{os.getpid()}.jsonl"
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item):
+        """Setup, call and teardown: what the first user of a fixture pays is its cost."""
+        wall, spent = time.monotonic(), _processor()
+        done = yield
+        cost = {"test": item.nodeid.removeprefix("tests/"), "processor_s": _processor() - spent}
+        cost |= {"wall_s": time.monotonic() - wall, "mib": _mib()}
+        with self.file.open("a", encoding="utf-8") as out:
+            print(json.dumps(cost), file=out)
+        return done
+
+
+def _processor() -> float:
+    """Seconds of this process and of those it started and has waited for."""
+    return sum(os.times()[:4])
+
+
+def _mib() -> int:
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * 4096 >> 20 if statm.exists() else 0
+
+
+def write_costs(folder: str) -> None:
+    """Sum what the meters of a run wrote up to a test without its parameters."""
+    sums: dict[str, float] = {}
+    for file in Path(folder).glob("*.jsonl"):
+        for line in file.read_text("utf-8").splitlines():
+            row = json.loads(line)
+            name = plain(row["test"])
+            sums[name] = sums.get(name, 0.0) + row["processor_s"]
+    costly = {k: round(v, 1) for k, v in sorted(sums.items()) if v >= LEAST_S}
+    COSTS.write_text(json.dumps(costly, indent=0) + "\n", "utf-8")
+    print(f"{COSTS}: {len(costly)} of {len(sums)} tests cost {LEAST_S:g} s or more")
+
+
+if __name__ == "__main__":
+    import sys
+
+    write_costs(sys.argv[1])
