@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from robins import units
+from robins.results import roles
 
 
 def variable(
@@ -20,7 +21,7 @@ def variable(
     frame: str = "",
     **attrs: Any,
 ) -> xr.Variable:
-    """An array with what a reader must know about it.
+    """Numbers with what a reader must know about them: a coordinate, such as the time.
 
     Args:
         dims: names of the axes of `values`.
@@ -34,13 +35,53 @@ def variable(
     return xr.Variable(dims, np.asarray(values), named)
 
 
+def array(
+    role: str,
+    values: Any,
+    of: str = "",
+    *,
+    unit: str = "",
+    long_name: str = "",
+    frame: str = "",
+    axes: Sequence[str] = (),
+    dims: str = "",
+    **attrs: Any,
+) -> dict[str, xr.Variable]:
+    """An array of a solution under its name, and with it the coordinate of its axes.
+
+    Args:
+        role: of a row of `robins.results.ROLES`.
+        values: anything NumPy takes.
+        of: what it is of: a block of the state, a sensor, ...; empty where the row has one array.
+        unit: as of `variable`; else that of the row.
+        long_name: likewise.
+        frame: as of `variable`.
+        axes: names of the components along the last dimension.
+        dims: names of the dimensions, between blanks; else those of the row.
+        attrs: as of `variable`; those that the row asks for must be among them.
+
+    Raises:
+        ValueError: there is no such role, or the array lacks what its row asks for.
+    """
+    row = roles.row(role, of)
+    names = (dims or row.dims.format(of=of)).split()
+    text = long_name or row.text.format(of=of.replace("_", " "))
+    about = {"role": role} | ({"of": of} if of else {}) | attrs
+    made = variable(names, values, unit or row.unit, text, frame, **about)
+    name = row.called(of)
+    if wrong := roles.fault(name, made) or ("" if made.attrs["units"] else "has no unit"):
+        raise ValueError(f"{name}: {wrong}")
+    labels = {names[-1]: xr.Variable(names[-1], list(axes))} if axes else {}
+    return {name: made} | labels
+
+
 def check(solution: xr.Dataset) -> None:
     """Refuse a dataset that a reader could misread.
 
     Raises:
         ValueError: a numeric array has no units or no name, components along axes have no frame,
-            a unit for figures is not of its kind, or an attribute is of a type that netCDF cannot
-            hold. The message names the array.
+            a unit for figures is not of its kind, an attribute is of a type that netCDF cannot
+            hold, or the array is not what its role says. The message names the array.
     """
     for name, array in solution.variables.items():
         if array.dtype.kind in "biuf":
@@ -61,6 +102,8 @@ def check(solution: xr.Dataset) -> None:
                 raise ValueError(
                     f"{name}: the attribute {attr!r} is {value!r}; use text or numbers"
                 )
+        if name in solution.data_vars and (wrong := roles.fault(str(name), array)):
+            raise ValueError(f"{name}: {wrong}")
 
 
 def _has_axes(dims: Sequence[Any]) -> bool:
@@ -86,6 +129,6 @@ def pack(solution: xr.Dataset) -> bytes:
 
 
 def read(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Load everything into memory; the file is closed again."""
+    """Load everything into memory; the file is closed again. Every array has its role."""
     with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as solution:
-        return solution.load()
+        return roles.recognised(solution.load())

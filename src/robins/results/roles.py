@@ -1,0 +1,240 @@
+"""What the arrays of a solution are to a reader: one table of roles.
+
+A row tells how arrays are named, what their dimensions are and what must be known with them. All
+else follows from it: `robins.results.array` builds one with its name and its attributes ``role`` and
+``of``, `find` reads by these attributes, `fault` is why a writer refuses one, `recognised` serves
+files written before there were roles, and the documents print the table.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import xarray as xr
+
+_PLACES = "{lat_rad|lon_rad|alt_m|north_m|east_m}"
+_PARTS = re.compile(r"(\w*)(?:\{(.+)\})?(\w*)")
+ANY = "any"  # number of dimensions
+
+
+class Role(NamedTuple):
+    """What some arrays are, each *of* something: a block of the state, a sensor, a limit."""
+
+    variable: str  # name of an array; in braces what it is of, as a word or as choices
+    dims: str  # by place: as time any serves whose coordinate is in seconds since the start
+    text: str  # long name of an array that brings none of its own
+    unit: str = ""  # likewise; empty: each must bring one
+    note: str = ""  # what a reader should know besides
+    attrs: tuple[str, ...] = ()  # what an array must have besides
+    named: str = ""  # the role, where the variable's name does not begin with it
+
+    @property
+    def name(self) -> str:
+        """What the attribute ``role`` says."""
+        return self.named or self._parts[0].strip("_")
+
+    @property
+    def _parts(self) -> tuple[str, str, str]:
+        head, of, tail = _PARTS.fullmatch(self.variable).groups("")  # type: ignore[union-attr]
+        return head, of, tail
+
+    def called(self, of: str) -> str:
+        """Name of the array of something."""
+        head, _, tail = self._parts
+        return f"{head}{of}{tail}"
+
+    def of(self, variable: str) -> str | None:
+        """What an array of this name is of; None if it has no such name."""
+        head, of, tail = self._parts
+        found = re.fullmatch(f"{head}({of if '|' in of else of and '.+'}){tail}", variable)
+        return found[1] if found else None
+
+
+_FT, _FTA = "filter time", "filter time axis_{of}"
+_AT, _ATA = "filter {of}_time", "filter {of}_time axis_{of}"
+_TA, _TAU = "time axis_{of}", "tau axis_{of}"
+
+ROLES = (
+    Role("{lat_rad|lon_rad|alt_m}", _FT, "position of each filter", named="track"),
+    Role(
+        "track_{north_m|east_m}",
+        _FT,
+        "the same on a map about any origin",
+        note="made from latitude and longitude where absent",
+    ),
+    Role(
+        f"reference_{_PLACES}",
+        "time",
+        "the truth or the best known path",
+        note="north and east where the track has them",
+    ),
+    Role(f"gnss_{_PLACES}", "gnss_time", "fixes", note="north and east as for the reference"),
+    Role(
+        "gnss_quality",
+        "gnss_time",
+        "quality of the fixes",
+        "1",
+        "whole numbers; attributes `flag_values` and `flag_meanings` as in the CF conventions, else "
+        "as RTKLIB numbers them",
+    ),
+    Role("outage", "time", "aids withheld", "1", "nonzero where they were"),
+    Role("estimate_{block}", _FTA, "estimated {of}"),
+    Role(
+        "error_{block}",
+        _FTA,
+        "error of {of}",
+        note="true minus estimated, where a truth exists; attribute `comment`, a caption, where it "
+        "is an error of the vehicle",
+    ),
+    Role(
+        "value_{name}",
+        _FTA,
+        "{of}",
+        note="what the vehicle does beside what is estimated of it; attribute `comment`, a caption",
+    ),
+    Role("sigma_{block}", _FTA, "standard deviation of {of}", note="as the filter states it"),
+    Role("innovation_{sensor}", _ATA, "innovation of {of}", note="NaN where missing"),
+    Role("innovation_sigma_{sensor}", _ATA, "expected {of}", note="one standard deviation"),
+    Role(
+        "nis_{sensor}",
+        _AT,
+        "NIS of {of}",
+        "1",
+        "attribute `degrees_of_freedom`, or an array `nis_dof`",
+    ),
+    Role("nis_dof_{sensor}", _AT, "degrees of freedom of {of}", "1"),
+    Role("refused_{sensor}", _AT, "{of} refused by a rule", "1", "nonzero where it was"),
+    Role(
+        "{nees|anees}",
+        _FT,
+        "{of}",
+        "1",
+        "of one run, or the mean over `runs`; attribute `degrees_of_freedom`, or an array `_dof`; "
+        "`normalised=1` if divided by these",
+        named="consistency",
+    ),
+    Role("{nees|anees}_dof", _FT, "state dimension", "1", named="consistency_dof"),
+    Role("rms_{block}", _FTA, "RMS error of {of}", attrs=("runs",)),
+    Role(
+        "mean_sigma_{block}",
+        _FTA,
+        "stated sigma of {of}",
+        note="root of the mean variance the filter states",
+    ),
+    Role("within_{limit}", _FT, "runs within {of}", "1", "share of the runs", ("runs",)),
+    Role(
+        "bounds",
+        "filter",
+        "states bounds, not standard deviations",
+        "1",
+        "nonzero for filters that do",
+    ),
+    Role("note_{note}", _FT, "{of}, first run", "1", "what a rule noted"),
+    Role("bound_{block}", _TA, "covariance bound of {of}", note="one standard deviation"),
+    Role("bound_prior_{block}", "axis_{of}", "prior sigma of {of}"),
+    Role(
+        "bound_left_{block}",
+        "axis_{of}",
+        "share of the start's {of} that the measurements leave, process noise aside",
+        "1",
+    ),
+    Role("bound_unaided_{block}", _TA, "bound of {of} with no sensor"),
+    Role("bound_without_{block}", f"sensor {_TA}", "bound of {of} without", note="each sensor"),
+    Role("information", "state time", "information about the start [bit]", "1"),
+    Role(
+        "gramian",
+        "direction",
+        "least eigenvalues of the observability Gramian, in units of the prior",
+        "1",
+        "not seen below `nothing`",
+        ("nothing",),
+    ),
+    Role("gramian_rank", "", "rank of the observability Gramian", "1"),
+    Role("allan_{sensor}", _TAU, "Allan deviation of the {of}", note="over averaging time"),
+    Role("allan_low_{sensor}", _TAU, "lower bound", note="of confidence"),
+    Role("allan_high_{sensor}", _TAU, "upper bound", note="of confidence"),
+    Role("allan_fit_{sensor}", _TAU, "fit", note="the fitted model"),
+    Role("allan_slope_{sensor}", f"process {_TAU}", "terms", note="parts of the model, by name"),
+    Role("field_measured", "time axis_field", "magnetic field, measured", "T"),
+    Role(
+        "field_calibrated",
+        "time axis_field",
+        "magnetic field, calibrated",
+        "T",
+        "`strength` is the size it should have [T]",
+        ("strength",),
+    ),
+    Role("lateness_steps", "lateness_bin", "steps that began so late", "1", "one more than edges"),
+    Role("lateness_edge", "lateness_edge_number", "edges of the bins", "us"),
+    Role("trade_off_h2", "design gamma", "true H2 norm", note="NaN where there is no design"),
+    Role(
+        "trade_off_hinf",
+        "design gamma",
+        "true H-infinity norm",
+        note="`least` is the least norm, and `least_of`, of what designs",
+        attrs=("least", "least_of"),
+    ),
+    Role("trade_off_bound", "design gamma", "bound on the H2 norm"),
+    Role("kalman_h2", "", "H2 norm of the Kalman filter"),
+    Role("kalman_hinf", "", "H-infinity norm of the Kalman filter"),
+    Role("{name}", ANY, "{of}", note="what else is known of a run", named="context"),
+)
+
+
+def row(role: str, of: str) -> Role:
+    """The row of a role for what an array is of.
+
+    Raises:
+        ValueError: there is none.
+    """
+    rows = [r for r in ROLES if r.name == role]
+    for one in rows:
+        if one.of(one.called(of)) == of:
+            return one
+    known = ", ".join(r.variable for r in rows)
+    names = ", ".join(dict.fromkeys(r.name for r in ROLES))
+    raise ValueError(
+        f"no array of role {role!r} is of {of!r}: its names are {known}"
+        if rows
+        else f"there is no role {role!r}; use one of {names}"
+    )
+
+
+def fault(name: str, array: xr.Variable | xr.DataArray) -> str:
+    """What is wrong with an array by the row of its role; empty if nothing is."""
+    if "role" not in array.attrs:
+        return "the attribute 'role' is missing; build it with robins.results.array"
+    try:
+        one = row(array.attrs["role"], array.attrs.get("of", ""))
+    except ValueError as error:
+        return str(error)
+    called, dims = one.called(array.attrs.get("of", "")), one.dims.split()
+    if name != called:
+        return f"by its role it is called {called}"
+    if one.dims != ANY and len(dims) != array.ndim:
+        return f"has dimensions {array.dims}, not {tuple(dims)}"
+    missing = [attr for attr in one.attrs if attr not in array.attrs]
+    return f"the attribute {missing[0]!r} is missing" if missing else ""
+
+
+def find(solution: xr.Dataset, role: str) -> dict[str, xr.DataArray]:
+    """The arrays of a role, by what each is of (empty where the role has one array only)."""
+    return {
+        array.attrs.get("of", ""): solution[name]
+        for name, array in solution.variables.items()
+        if array.attrs.get("role") == role
+    }
+
+
+def recognised(solution: xr.Dataset) -> xr.Dataset:
+    """Give roles to arrays of a file written before there were any, by their names.
+
+    The longest name counts: ``innovation_sigma_gnss`` is not the innovation of ``sigma_gnss``.
+    """
+    for name, array in solution.data_vars.items():
+        if "role" not in array.attrs:
+            fits = [(r, of) for r in ROLES if (of := r.of(str(name))) is not None]
+            best, of = min(fits, key=lambda fit: len(fit[1]))
+            array.attrs.update({"role": best.name} | ({"of": of} if of else {}))
+    return solution
