@@ -6,10 +6,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from robins import units
 from robins.report import series, style
 from robins.report.numbers import words
 from robins.report.style import Picture
+from robins.results import find
 
 _PROCESS_LINES = ("--", "-.", ":", (0, (4, 1, 1, 1)), (0, (1, 3)))
 
@@ -17,25 +17,19 @@ _PROCESS_LINES = ("--", "-.", ":", (0, (4, 1, 1, 1)), (0, (1, 3)))
 @style.styled
 def allan(solution: xr.Dataset, sensor: str) -> Picture:
     """Allan deviation of each axis of a sensor over averaging time."""
-    array = solution[f"allan_{sensor}"]
-    unit = array.attrs["units"]
-    shown = array.attrs.get("display_unit", unit)
-    tau = np.asarray(solution[array.dims[0]].values, float)
+    array = find(solution, "allan")[sensor]
+    value, unit = series.shown(array)
+    tau = series.x_of(array, 0)
     labels = series.coordinate(solution, array.dims[1])
     figure, grid = style.new(1, len(labels), 3.5, sharex=True, sharey=True)
 
-    def told(name: str) -> np.ndarray | None:
-        if name not in solution:
-            return None
-        return np.asarray(units.convert(np.asarray(solution[name].values, float), unit, shown))
+    def told(role: str) -> np.ndarray | None:
+        found = series.one(solution, role, sensor)
+        return None if found is None else series.shown(found)[0]
 
-    value = told(f"allan_{sensor}")
-    assert value is not None
-    low, high = told(f"allan_low_{sensor}"), told(f"allan_high_{sensor}")
-    fit, slopes = told(f"allan_fit_{sensor}"), told(f"allan_slope_{sensor}")
-    processes: list[str] = []
-    if slopes is not None:
-        processes = series.coordinate(solution, solution[f"allan_slope_{sensor}"].dims[0])
+    low, high, fit = told("allan_low"), told("allan_high"), told("allan_fit")
+    slopes, parts = told("allan_slope"), find(solution, "allan_slope").get(sensor)
+    processes = [] if parts is None else series.coordinate(solution, parts.dims[0])
     for k, (axes, label) in enumerate(zip(grid[0], labels, strict=True)):
         if low is not None and high is not None:
             band = {"color": style.colour(0), "alpha": 0.22, "linewidth": 0}
@@ -49,7 +43,7 @@ def allan(solution: xr.Dataset, sensor: str) -> Picture:
                 axes.plot(tau, slopes[p, :, k], linewidth=0.9, **look)
         axes.set(xscale="log", yscale="log", title=label, xlabel="averaging time τ [s]")
         _fit_limits(axes, [value[:, k] for k in range(len(labels))], low, high)
-    grid[0, 0].set_ylabel(f"Allan deviation [{shown}]")
+    grid[0, 0].set_ylabel(f"Allan deviation [{unit}]")
     keys = [style.key("measured", color=style.colour(0), marker=".")]
     if low is not None:
         confidence = 100.0 * float(array.attrs.get("confidence", 0.95))

@@ -23,20 +23,18 @@ class Band(NamedTuple):
     expected: float
 
 
-def band(solution: xr.Dataset, name: str, degrees_from: str = "") -> Band | None:
+def band(array: xr.DataArray, dof: xr.DataArray | None = None) -> Band | None:
     """The band of a statistic, from its attributes; None if they do not give one.
 
     Args:
-        solution: from `robins.results`.
-        name: of the statistic, (filter, time).
-        degrees_from: of an array of the same shape with its degrees of freedom, if it has one.
+        array: the statistic, (filter, time).
+        dof: its degrees of freedom, of the same shape, if there is such an array.
     """
-    array = solution[name]
     attrs = array.attrs
     probability = float(attrs.get("probability", 0.95))
     runs = int(attrs.get("runs", 1))
-    if degrees_from in solution:
-        degrees = np.asarray(solution[degrees_from].values, float)
+    if dof is not None:
+        degrees = np.asarray(dof.values, float)
     elif "degrees_of_freedom" in attrs:
         degrees = np.full(array.shape, float(attrs["degrees_of_freedom"]))
     else:

@@ -14,10 +14,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from robins import units
 from robins.report import series, style
 from robins.report.numbers import show, words
 from robins.report.style import Picture
+from robins.results import find
 
 # What the sensors may leave of a component that they see, and that they hardly see: of its sigma at
 # the start, process noise aside, and of what its sigma would be at the end with no sensor.
@@ -37,28 +37,23 @@ class Line(NamedTuple):
     x: np.ndarray  # (time,) s
 
 
-def line(solution: xr.Dataset, block: str, kind: str = "") -> Line:
-    """The bound of a block, one standard deviation.
+_ROLES = ("bound", "bound_prior", "bound_unaided", "bound_without")
 
-    Args:
-        solution: from `robins.results`.
-        block: of the state.
-        kind: "" for all sensors, "prior_", "unaided_" or "without_".
+
+def line(solution: xr.Dataset, block: str, role: str = "bound") -> Line:
+    """The bound of a block, one standard deviation.
 
     Raises:
         KeyError: the solution has no such bound.
     """
-    array = solution[f"bound_{kind}{block}"]
-    unit = array.attrs.get("units", "1")
-    shown = array.attrs.get("display_unit", unit)
-    values = units.convert(np.asarray(array.values, float), unit, shown)
+    array = find(solution, role)[block]
     x = series.x_of(array, array.ndim - 2) if array.ndim > 1 else np.zeros(0)
-    return Line(values, "" if shown == "1" else shown, x)
+    return Line(*series.shown(array), x)
 
 
 def beside(solution: xr.Dataset, block: str) -> Line | None:
     """The bound to draw beside the filters; None if the solution has none."""
-    return line(solution, block) if f"bound_{block}" in solution else None
+    return line(solution, block) if block in find(solution, "bound") else None
 
 
 def draw(axes: Axes, bound: Line, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
@@ -76,8 +71,7 @@ def key(times: str = "") -> Line2D:
 
 def blocks(solution: xr.Dataset) -> list[str]:
     """Blocks of a solution that `robins bound` made."""
-    prefix = "bound_prior_"
-    return [str(v).removeprefix(prefix) for v in solution.data_vars if str(v).startswith(prefix)]
+    return list(find(solution, "bound_prior"))
 
 
 def sensors(solution: xr.Dataset) -> list[str]:
@@ -89,7 +83,7 @@ def sensors(solution: xr.Dataset) -> list[str]:
 @style.styled
 def sigmas(solution: xr.Dataset, block: str) -> Picture:
     """The bound of a block over time, with all sensors, without each, and with none."""
-    every, without, unaided = (line(solution, block, k) for k in ("", "without_", "unaided_"))
+    every, _, unaided, without = (line(solution, block, role) for role in _ROLES)
     names, labels = sensors(solution), series.coordinate(solution, f"axis_{block}")
     figure, grid = style.new(len(labels), 1, 0.9 + 1.35 * len(labels), sharex=True)
     clock = series.clock(every.x)
@@ -116,8 +110,8 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
         "way between the line without it and the line with all. Lines that run away leave the "
         "figure."
     )
-    frame = solution[f"bound_{block}"].attrs.get("frame", "")
-    caption += f" Frame: {frame}." if frame else ""
+    frame = find(solution, "bound")[block].attrs["frame"]
+    caption += f" Frame: {frame}."
     return Picture(f"bound_{block}", f"Covariance bound of the {words(block)}", caption, figure)
 
 
@@ -140,7 +134,7 @@ def _scale(axes: Axes, every: np.ndarray, without: np.ndarray, unaided: np.ndarr
 @style.styled
 def information(solution: xr.Dataset) -> Picture:
     """What the measurements so far tell of each state at the start, by state and time."""
-    array = solution["information"]
+    array, rank = find(solution, "information")[""], find(solution, "gramian_rank")[""]
     names = series.coordinate(solution, "state")
     time = series.x_of(array, 1)
     pick = np.unique(np.linspace(0, len(time) - 1, _COLUMNS).astype(int))
@@ -165,7 +159,7 @@ def information(solution: xr.Dataset) -> Picture:
     caption = (
         "About the state at the start, from the observability Gramian in units of the prior: each "
         "bit halves the standard deviation, process noise left aside. A row that stays dark is a "
-        f"state that the sensors do not see. Rank {int(solution['gramian_rank'])} of {len(names)}."
+        f"state that the sensors do not see. Rank {int(rank)} of {len(names)}."
     )
     return Picture("information", "Information by state and time", caption, figure)
 
@@ -225,9 +219,8 @@ def rows(solution: xr.Dataset, at: Sequence[int]) -> list[Row]:
     """One row a component, at the numbers of some epochs."""
     out, names = [], sensors(solution)
     for block in blocks(solution):
-        kinds = ("", "prior_", "unaided_", "without_")
-        start = np.asarray(solution[f"bound_left_{block}"], float)
-        every, prior, unaided, without = (line(solution, block, kind) for kind in kinds)
+        start = np.asarray(find(solution, "bound_left")[block], float)
+        every, prior, unaided, without = (line(solution, block, role) for role in _ROLES)
         for k, axis in enumerate(series.coordinate(solution, f"axis_{block}")):
             out.append(
                 Row(
@@ -278,14 +271,15 @@ def _short(value: float) -> str:
 
 def sentences(solution: xr.Dataset) -> list[str]:
     """What is least observable, for readers."""
-    count = solution.sizes["state"]
+    count, rank = solution.sizes["state"], int(find(solution, "gramian_rank")[""])
     told = [
-        f"The observability Gramian has rank {int(solution['gramian_rank'])} of {count}; the least "
-        "observable directions, in units of the prior, are:"
+        f"The observability Gramian has rank {rank} of {count}; the least observable directions, "
+        "in units of the prior, are:"
     ]
-    nothing = float(solution["gramian"].attrs["nothing"])
+    gramian = find(solution, "gramian")[""]
+    nothing = float(gramian.attrs["nothing"])
     directions = series.coordinate(solution, "direction")
-    for made_of, value in zip(directions, np.asarray(solution["gramian"]), strict=True):
+    for made_of, value in zip(directions, np.asarray(gramian), strict=True):
         weight = f"the measurements weigh {show(float(value))} times the prior"
         told.append(f"{made_of}: {weight if value >= nothing else 'not seen'}")
     return told
@@ -294,11 +288,11 @@ def sentences(solution: xr.Dataset) -> list[str]:
 def csv(solution: xr.Dataset) -> str:
     """The bound over time in SI units, one column a component; of all sensors and without each."""
     heads, columns = ["time_s"], [np.asarray(solution["time"], float)]
-    kinds = [("bound", "", None), ("unaided", "unaided_", None)]
-    kinds += [(f"without_{s}", "without_", i) for i, s in enumerate(sensors(solution))]
-    for label, kind, i in kinds:
+    kinds = [("bound", "bound", None), ("unaided", "bound_unaided", None)]
+    kinds += [(f"without_{s}", "bound_without", i) for i, s in enumerate(sensors(solution))]
+    for label, role, i in kinds:
         for block in blocks(solution):
-            array = solution[f"bound_{kind}{block}"]
+            array = find(solution, role)[block]
             values = np.asarray(array.values if i is None else array.values[i], float)
             axes = series.coordinate(solution, f"axis_{block}")
             unit = array.attrs["units"]

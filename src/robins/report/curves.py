@@ -29,11 +29,6 @@ def _label(axes: Axes, text: str, unit: str) -> None:
     axes.set_ylabel(f"{text} [{unit}]" if unit else text)
 
 
-def _frame_of(solution: xr.Dataset, name: str) -> str:
-    frame = solution[name].attrs.get("frame", "")
-    return f" Frame: {frame}." if frame else ""
-
-
 def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = True) -> bool:
     """Scale to the time after the start if the start is far higher; True if that cuts it off.
 
@@ -132,13 +127,13 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
     more += [bounds.key("±3σ ")] if best is not None else []
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
-    caption = solution[f"error_{block}"].attrs.get("comment", "True minus estimated.")
+    caption = error.attrs.get("comment", "True minus estimated.")
     if sigma is not None:
         caption += (
             " A filter that knows its own accuracy keeps 99.7\u00a0% of it between the thin lines."
         )
         caption += bound_note(solution)
-    caption += _frame_of(solution, f"error_{block}")
+    caption += error.frame
     return Picture(f"error_{block}", f"Error of the {name}", caption, figure)
 
 
@@ -161,12 +156,9 @@ def _envelope(
 
 
 @style.styled
-def estimates(solution: xr.Dataset, block: str, kind: str = "estimate") -> Picture:
-    """Estimates of a block of the state, within three sigma: biases, or a path without truth.
-
-    Or values, of what a vehicle does beside what is estimated of it.
-    """
-    found = series.get(solution, kind, block)
+def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Picture:
+    """Estimates of a block of the state, within three sigma: biases, or a path without truth."""
+    found = series.get(solution, role, block)
     assert found is not None
     sigma = series.get(solution, "sigma", block)
     filters = series.filters(solution)
@@ -187,10 +179,14 @@ def estimates(solution: xr.Dataset, block: str, kind: str = "estimate") -> Pictu
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = "Thin lines: three stated standard deviations to either side." if thin_lines else ""
-    caption += solution[f"{kind}_{block}"].attrs.get("comment", "")
-    caption += _frame_of(solution, f"{kind}_{block}")
-    title = f"Estimated {name}" if kind == "estimate" else name.capitalize()
-    return Picture(f"{kind}_{block}", title, caption.strip(), figure)
+    caption += found.attrs.get("comment", "") + found.frame
+    title = f"Estimated {name}" if role == "estimate" else name.capitalize()
+    return Picture(f"{role}_{block}", title, caption.strip(), figure)
+
+
+def values(solution: xr.Dataset, name: str) -> Picture:
+    """What a vehicle does beside what is estimated of it."""
+    return estimates(solution, name, "value")
 
 
 def _broken(y: np.ndarray, turn: float | None) -> np.ndarray:
@@ -222,7 +218,7 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     stated = series.get(solution, "mean_sigma", block)
     best = bounds.beside(solution, block)
     filters = series.filters(solution)
-    runs = int(solution[f"rms_{block}"].attrs.get("runs", 0))
+    runs = int(rms.attrs.get("runs", 0))
     figure, stack, clock = _stacked(rms, solution)
     for k, axes in enumerate(stack):
         lines = []
@@ -259,29 +255,29 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
         caption += bound_note(solution)
     if best is not None:
         caption += " No filter with this model can come below the covariance bound."
-    caption += _frame_of(solution, f"rms_{block}")
+    caption += rms.frame
     return Picture(f"rms_{block}", f"Scatter of the {name} over the runs", caption, figure)
 
 
 @style.styled
-def height(solution: xr.Dataset) -> Picture:
-    """Height over time, with the fixes and the reference."""
+def height(solution: xr.Dataset) -> Picture | None:
+    """Height over time, with the fixes and the reference; None if no filter tells it."""
     filters = series.filters(solution)
-    data = series.get(solution, "alt_m", "")
-    assert data is not None
+    data = series.get(solution, "track", "alt_m")
+    if data is None:
+        return None
     figure, grid = style.new(1, 1, 2.7)
     axes, clock = grid[0, 0], series.clock(data.x)
     outage = series.outage(solution)
     if outage is not None:
         style.shade(axes, outage[0] / clock.seconds, outage[1])
     more = []
-    if "gnss_alt_m" in solution:
-        fixes = solution["gnss_alt_m"]
+    fixes, truth = (series.one(solution, role, "alt_m") for role in ("gnss", "reference"))
+    if fixes is not None:
         look = {"linestyle": "", "marker": ".", "markersize": 3.0, "color": style.GREY}
         axes.plot(series.x_of(fixes, 0) / clock.seconds, fixes.values, **look)
         more.append(style.key("GNSS fixes", **look))
-    if "reference_alt_m" in solution:
-        truth = solution["reference_alt_m"]
+    if truth is not None:
         x, y = series.thin(series.x_of(truth, 0) / clock.seconds, np.asarray(truth, float))
         axes.plot(x, y, color=style.TRUTH, linewidth=2.4, alpha=0.35)
         more.append(style.key("reference", color=style.TRUTH, linewidth=2.4, alpha=0.35))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import xarray as xr
 
 from robins import units
 from robins.report import series, style
 from robins.report.style import Picture
+from robins.results import find
 
 _DOTS = 3000  # of a cloud; more only make it darker
 _PLANES = ((0, 1), (0, 2), (1, 2))
@@ -15,22 +18,28 @@ _NAMES = ("measured", "calibrated")
 _LOOKS = ({"color": style.colour(1)}, {"color": style.colour(0)})
 
 
-def _told(solution: xr.Dataset) -> tuple[list[np.ndarray], float, str]:
-    """Measured and calibrated field (time, axis) and the size of the field, in its display unit."""
-    arrays = [solution[f"field_{name}"] for name in _NAMES]
-    unit = arrays[0].attrs["units"]
-    shown = arrays[0].attrs.get("display_unit", unit)
-    values = [np.asarray(units.convert(np.asarray(a.values, float), unit, shown)) for a in arrays]
-    return values, float(units.convert(arrays[1].attrs["strength"], unit, shown)), shown
+class _Field(NamedTuple):
+    values: list[np.ndarray]  # measured and calibrated (time, axis), in the display unit
+    strength: float
+    unit: str
+    time: np.ndarray
+    axes: list[str]
+
+
+def _field(solution: xr.Dataset) -> _Field:
+    before, after = (find(solution, f"field_{name}")[""] for name in _NAMES)
+    values, unit = [series.shown(array)[0] for array in (before, after)], series.shown(after)[1]
+    strength = float(units.convert(after.attrs["strength"], after.attrs["units"], unit))
+    axes = series.coordinate(solution, before.dims[1])
+    return _Field(values, strength, unit, series.x_of(before, 0), axes)
 
 
 @style.styled
 def size(solution: xr.Dataset) -> Picture:
     """Size of the field over time, before and after."""
-    values, strength, unit = _told(solution)
+    values, strength, unit, time, _ = _field(solution)
     figure, grid = style.new(height=2.8)
     axes = grid[0, 0]
-    time = series.x_of(solution["field_measured"], 0)
     every = -(-len(time) // _DOTS)
     for field, look in zip(values, _LOOKS, strict=True):
         axes.plot(time[::every], np.linalg.norm(field, axis=1)[::every], linewidth=0.8, **look)
@@ -47,8 +56,7 @@ def size(solution: xr.Dataset) -> Picture:
 @style.styled
 def planes(solution: xr.Dataset) -> Picture:
     """The samples seen along each axis of the sensor, before and after."""
-    values, strength, unit = _told(solution)
-    labels = series.coordinate(solution, solution["field_measured"].dims[1])
+    values, strength, unit, _, labels = _field(solution)
     figure, grid = style.new(1, 3, 3.1)
     every = -(-len(values[0]) // _DOTS)
     around = np.linspace(0.0, 2.0 * np.pi, 181)

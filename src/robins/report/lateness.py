@@ -7,13 +7,14 @@ import xarray as xr
 
 from robins.report import style
 from robins.report.style import Picture
+from robins.results import find
 
 
 @style.styled
 def lateness(solution: xr.Dataset) -> Picture:
     """Histogram of lateness over bins that grow with it."""
-    counts = np.asarray(solution["lateness_steps"].values, float)
-    edges = np.asarray(solution["lateness_edge"].values, float)
+    roles = ("lateness_steps", "lateness_edge")
+    counts, edges = (np.asarray(find(solution, role)[""], float) for role in roles)
     figure, grid = style.new(1, 1, 2.6)
     axes = grid[0, 0]
     names = [f"< {_time(edges[0])}", *map(_time, edges)]

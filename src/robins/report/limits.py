@@ -8,6 +8,7 @@ import xarray as xr
 from robins.report import series, style
 from robins.report.numbers import words
 from robins.report.style import Picture
+from robins.results import find
 
 # rule: its local bound, and what that must stay below
 _WORST_CASE = {"h_infinity": "gamma", "adaptive_h_infinity": "xi"}
@@ -27,21 +28,22 @@ def within(solution: xr.Dataset, limit: str) -> Picture:
     axes.margins(x=0.0)
     axes.set(xlabel=clock.label, ylabel="share of the runs", ylim=(-0.02, 1.02))
     style.legend(figure, style.filter_keys(filters))
-    runs = solution[f"within_{limit}"].attrs.get("runs")
+    runs = data.attrs.get("runs")
     caption = "Share of the runs whose largest component is within the limit"
     caption += f", of {int(runs)}." if runs else "."
-    return Picture(f"within_{limit}", data.label[:1].upper() + data.label[1:], caption, figure)
+    title = data.attrs["long_name"]
+    return Picture(f"within_{limit}", title[:1].upper() + title[1:], caption, figure)
 
 
-def _used(solution: xr.Dataset) -> np.ndarray | None:
+def _used(solution: xr.Dataset) -> xr.DataArray | None:
     """Local bound over gamma (filter, time), NaN for other filters; None if all are other."""
-    ratio = None
+    notes, ratio = find(solution, "note"), None
     for rule, below in _WORST_CASE.items():
-        bound, gamma = (solution.get(f"note_{rule}_{kind}") for kind in ("bound", below))
+        bound, gamma = (notes.get(f"{rule}_{kind}") for kind in ("bound", below))
         if bound is None or gamma is None:
             continue
-        part = np.asarray(bound, float) / np.asarray(gamma, float)
-        ratio = part if ratio is None else np.where(np.isnan(ratio), part, ratio)
+        part = bound / gamma
+        ratio = part if ratio is None else ratio.fillna(part)
     return ratio
 
 
@@ -52,10 +54,10 @@ def worst_case(solution: xr.Dataset) -> Picture | None:
     if ratio is None:
         return None
     filters = series.filters(solution)
+    time, ratio = series.x_of(ratio, 1), ratio.values
     shown = [i for i in range(len(filters)) if np.isfinite(ratio[i]).any()]
     if not shown:
         return None
-    time = series.x_of(solution["anees"] if "anees" in solution else solution["time"], -1)
     figure, grid = style.new(1, 1, 2.8)
     axes, clock = grid[0, 0], series.clock(time)
     for i in shown:
@@ -78,10 +80,10 @@ def worst_case(solution: xr.Dataset) -> Picture | None:
 
 def bound_names(solution: xr.Dataset) -> list[str]:
     """Filters that state bounds, not standard deviations."""
-    if "bounds" not in solution:
+    flags = series.one(solution, "bounds")
+    if flags is None:
         return []
-    flags = np.asarray(solution["bounds"].values) != 0
-    return [name for name, flag in zip(series.filters(solution), flags, strict=True) if flag]
+    return [name for name, flag in zip(series.filters(solution), flags.values, strict=True) if flag]
 
 
 def bound_note(solution: xr.Dataset) -> str:

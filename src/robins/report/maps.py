@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 
 from robins.report import series, style
 from robins.report.style import Picture
+from robins.results import find
 
 # WGS-84, for a map; robins.earth, which computes with it, is not this room's business.
 _A, _E2 = 6378137.0, 6.69437999014e-3
@@ -49,28 +50,24 @@ def metres(lat_rad: np.ndarray, lon_rad: np.ndarray, origin: tuple[float, float]
 
 def paths(solution: xr.Dataset) -> dict[str, Path]:
     """Places of "track" (filter, time), "reference" and "gnss", all on the same map."""
-    if "track_north_m" in solution and "track_east_m" in solution:
-        named = {
-            kind: (f"{kind}_north_m", f"{kind}_east_m") for kind in ("track", "reference", "gnss")
-        }
-        return {
-            kind: Path(*(np.asarray(solution[name].values, float) for name in pair))
-            for kind, pair in named.items()
-            if all(name in solution for name in pair)
-        }
-    if "lat_rad" not in solution or "lon_rad" not in solution:
+    held = {role: find(solution, role) for role in ("track", "reference", "gnss")}
+    pairs = (("north_m", "east_m"), ("lat_rad", "lon_rad"))
+    pair = next((pair for pair in pairs if held["track"].keys() >= {*pair}), None)
+    if pair is None:
         return {}
     found = {
-        kind: tuple(np.asarray(solution[f"{prefix}{c}_rad"].values, float) for c in ("lat", "lon"))
-        for kind, prefix in (("track", ""), ("reference", "reference_"), ("gnss", "gnss_"))
-        if f"{prefix}lat_rad" in solution and f"{prefix}lon_rad" in solution
+        role: Path(*(np.asarray(places[c].values, float) for c in pair))
+        for role, places in held.items()
+        if places.keys() >= {*pair}
     }
+    if pair == ("north_m", "east_m"):
+        return found
     lat, lon = (c.ravel() for c in found["track"])
     good = np.flatnonzero(np.isfinite(lat) & np.isfinite(lon))
     if not good.size:
         return {}
     origin = float(lat[good[0]]), float(lon[good[0]])
-    return {kind: metres(lat, lon, origin) for kind, (lat, lon) in found.items()}
+    return {role: metres(lat, lon, origin) for role, (lat, lon) in found.items()}
 
 
 def unwrapped(path: Path) -> Path:
@@ -132,11 +129,11 @@ def _draw(axes: Axes, path: Path, scale: float, **look) -> None:
 
 def _fixes(axes: Axes, solution: xr.Dataset, path: Path, scale: float) -> list:
     """Draw the fixes, one marker per quality."""
-    if "gnss_quality" not in solution:
+    quality = series.one(solution, "gnss_quality")
+    if quality is None:
         look = {"linestyle": "", "marker": ".", "markersize": 3.0, "color": "#8A8A8A"}
         axes.plot(path.east * scale, path.north * scale, **look)
         return [style.key("GNSS fixes", **look)]
-    quality = solution["gnss_quality"]
     values = [int(v) for v in np.atleast_1d(quality.attrs.get("flag_values", list(_RTKLIB)))]
     meanings = str(quality.attrs.get("flag_meanings", " ".join(_RTKLIB.values()))).split()
     known = dict(zip(values, meanings, strict=False))

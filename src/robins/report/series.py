@@ -1,59 +1,58 @@
-"""What a solution holds, by the names and dimensions that `robins.results` lists."""
+"""What a solution holds, by the roles and dimensions that `robins.results` lists."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from robins import units
+from robins.results import find
 
-_PREFIXES = (
-    *("estimate", "value", "error", "mean_sigma", "sigma", "rms", "within"),
-    *("innovation_sigma", "innovation", "nis_dof", "nis", "refused"),
-    *("allan_low", "allan_high", "allan_fit", "allan_slope", "allan"),
-)
 _POINTS = 1200  # of a line; more than a figure has pixels
 
 
 class Series(NamedTuple):
     """An array over filters, time and perhaps axes, in the unit of figures."""
 
-    name: str  # block or sensor
-    label: str  # its long name
     unit: str
     values: np.ndarray  # (filter, time, axis)
     x: np.ndarray  # (time,) s
     axes: list[str]
+    attrs: dict[str, Any]
+
+    @property
+    def frame(self) -> str:
+        """A sentence on it, for the end of a caption; empty where there is none."""
+        frame = self.attrs.get("frame", "")
+        return f" Frame: {frame}." if frame else ""
 
 
-def find(solution: xr.Dataset, prefix: str) -> Iterator[str]:
-    """Names of the blocks or sensors that have an array of this prefix."""
-    for variable in solution.data_vars:
-        # The longest prefix counts: innovation_sigma_gnss is not the innovation of "sigma_gnss".
-        name = str(variable)
-        fits = [p for p in _PREFIXES if name.startswith(f"{p}_")]
-        if fits and max(fits, key=len) == prefix:
-            yield name.removeprefix(f"{prefix}_")
+def one(solution: xr.Dataset, role: str, of: str = "") -> xr.DataArray | None:
+    """The array of something in a role, or None."""
+    return find(solution, role).get(of)
 
 
-def get(solution: xr.Dataset, prefix: str, name: str) -> Series | None:
-    """An array of the solution, or None."""
-    full = f"{prefix}_{name}" if name else prefix
-    if full not in solution:
-        return None
-    array = solution[full]
+def shown(array: xr.DataArray) -> tuple[np.ndarray, str]:
+    """Values in the unit of figures, and that unit; empty for pure numbers."""
     unit = array.attrs.get("units", "1")
-    shown = array.attrs.get("display_unit", unit)
+    display = array.attrs.get("display_unit", unit)
     values = np.asarray(array.values, float)
-    if shown != unit:
-        values = units.convert(values, unit, shown)
+    if display != unit:
+        values = np.asarray(units.convert(values, unit, display))
+    return values, "" if display == "1" else display
+
+
+def get(solution: xr.Dataset, role: str, of: str = "") -> Series | None:
+    """The same, over filters, time and perhaps axes, in the unit of figures."""
+    array = one(solution, role, of)
+    if array is None:
+        return None
+    values, unit = shown(array)
     axes = coordinate(solution, array.dims[2]) if array.ndim > 2 else [""]
-    label = str(array.attrs.get("long_name", name.replace("_", " ")))
     values = values if array.ndim > 2 else values[..., None]
-    return Series(name, label, "" if shown == "1" else shown, values, x_of(array, 1), axes)
+    return Series(unit, values, x_of(array, 1), axes, array.attrs)
 
 
 def x_of(array: xr.DataArray, place: int) -> np.ndarray:
@@ -94,9 +93,10 @@ def clock(*times: np.ndarray) -> Clock:
 
 def outage(solution: xr.Dataset) -> tuple[np.ndarray, np.ndarray] | None:
     """Times and mask of withheld aids; None where there are none."""
-    if "outage" not in solution or not np.any(solution["outage"].values):
+    array = one(solution, "outage")
+    if array is None or not np.any(array.values):
         return None
-    return x_of(solution["outage"], 0), np.asarray(solution["outage"].values) != 0
+    return x_of(array, 0), np.asarray(array.values) != 0
 
 
 def thin(x: np.ndarray, *ys: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, ...]:

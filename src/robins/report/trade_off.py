@@ -9,7 +9,9 @@ import xarray as xr
 
 from robins.report import series, style
 from robins.report.style import Picture
+from robins.results import find
 
+_ROLES = ("trade_off_h2", "trade_off_hinf", "kalman_h2", "kalman_hinf")
 # The forms of one family share a colour: what is retuned is dashed.
 _LOOKS: dict[str, dict[str, Any]] = {
     "riccati": {"color": style.colour(0), "marker": "o", "markersize": 6.5, "zorder": 4},
@@ -26,15 +28,9 @@ _LEAST = {"color": style.GREY, "linewidth": 0.9, "linestyle": (0, (1, 2))}
 
 @style.styled
 def trade_off(solution: xr.Dataset) -> Picture:
-    """A line for each method through its designs, and how far each is from the best for a gamma.
-
-    Args:
-        solution: ``trade_off_h2`` and ``trade_off_hinf`` (design, gamma), NaN where a method has no
-            design; ``kalman_h2`` and ``kalman_hinf``; the attributes ``least``
-            and ``least_of`` of ``trade_off_hinf``.
-    """
-    h2, hinf = solution["trade_off_h2"], solution["trade_off_hinf"]
-    gamma = np.asarray(solution[h2.dims[1]].values, float)
+    """A line for each method through its designs, and how far each is from the best for a gamma."""
+    h2, hinf, kalman_h2, kalman_hinf = (find(solution, role)[""] for role in _ROLES)
+    gamma = series.x_of(h2, 1)
     value, reached = np.asarray(h2.values, float), np.asarray(hinf.values, float)
     best = np.fmin.reduce(value, axis=0)
     figure, grid = style.new(2, height=5.6, sharex=True, height_ratios=(3, 2))
@@ -49,7 +45,7 @@ def trade_off(solution: xr.Dataset) -> Picture:
         above.plot(reached[k][order], value[k][order], **look)
         below.plot(gamma, 100.0 * (value[k] / best - 1.0), **look)
         keys.append(style.key(name, **look))
-    above.plot(solution["kalman_hinf"].item(), solution["kalman_h2"].item(), **_KALMAN)
+    above.plot(kalman_hinf.item(), kalman_h2.item(), **_KALMAN)
     keys.append(style.key("Kalman filter", **_KALMAN))
     least = float(hinf.attrs.get("least", np.nan))
     if least > 0.0:

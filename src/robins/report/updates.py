@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from robins.report import series, style
-from robins.report.bands import band, inside
+from robins.report.bands import Band, band, inside
 from robins.report.numbers import words
 from robins.report.style import Picture
 
@@ -23,9 +23,9 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     data = series.get(solution, "innovation", sensor)
     assert data is not None
     sigma = series.get(solution, "innovation_sigma", sensor)
-    has_nis = f"nis_{sensor}" in solution
+    nis = series.one(solution, "nis", sensor)
     filters = series.filters(solution)
-    rows = len(data.axes) + has_nis
+    rows = len(data.axes) + (nis is not None)
     figure, grid = style.new(rows, 1, 0.9 + 1.35 * rows, sharex=True)
     stack, clock = grid[:, 0], series.clock(data.x)
     x = data.x / clock.seconds
@@ -61,8 +61,9 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
         keys.append(style.key("±3σ expected", color=style.GREY, linewidth=0.8))
     if refused.any():
         keys.append(style.key("refused", **_CROSS))
-    if has_nis:
-        shares = _statistic(stack[-1], solution, f"nis_{sensor}", f"nis_dof_{sensor}", clock)
+    if nis is not None:
+        limits = band(nis, series.one(solution, "nis_dof", sensor))
+        shares = _statistic(stack[-1], nis, limits, filters, clock)
         stack[-1].set_ylabel("NIS")
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
         style.remark(stack[-1], shares)
@@ -133,23 +134,19 @@ def _points(axes: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
     axes.plot(x, y, linestyle="", marker=mark, color=style.colour(i), **look)
 
 
-def _is_smooth(solution: xr.Dataset, name: str) -> bool:
+def _is_smooth(array: xr.DataArray) -> bool:
     """The mean of many runs is a line; one run is a cloud."""
-    return solution[name].attrs.get("runs", 1) > 1
+    return array.attrs.get("runs", 1) > 1
 
 
 def _statistic(
-    axes: Axes, solution: xr.Dataset, name: str, degrees_from: str, clock: series.Clock
+    axes: Axes, array: xr.DataArray, limits: Band | None, filters: list[str], clock: series.Clock
 ) -> str:
     """Draw a statistic of each filter over its band; return how much of it lies inside."""
-    data = series.get(solution, name, "")
-    assert data is not None
-    values, x = data.values[..., 0], data.x / clock.seconds
-    limits = band(solution, name, degrees_from)
+    values, x = np.asarray(array, float), series.x_of(array, 1) / clock.seconds
     if limits is not None:  # without a degree of freedom nothing was used, and zero says nothing
         values = np.where(np.isfinite(limits.high), values, np.nan)
-    filters = series.filters(solution)
-    joined = _is_smooth(solution, name)
+    joined = _is_smooth(array)
     for i in range(len(filters)):
         if joined:
             look = {"color": style.colour(i), "linestyle": style.line(i), "linewidth": 0.9}
@@ -190,19 +187,18 @@ def _statistic(
 @style.styled
 def consistency(solution: xr.Dataset, name: str) -> Picture:
     """NEES of a run, or its average over the runs of a campaign, in its chi-square band."""
-    data = series.get(solution, name, "")
-    assert data is not None
+    array = series.one(solution, "consistency", name)
+    assert array is not None
     figure, grid = style.new(1, 1, 2.8)
-    axes, clock = grid[0, 0], series.clock(data.x)
+    axes, clock = grid[0, 0], series.clock(series.x_of(array, 1))
     outage = series.outage(solution)
     if outage is not None:
         style.shade(axes, outage[0] / clock.seconds, outage[1])
-    degrees = f"{name}_dof"
-    shares = _statistic(axes, solution, name, degrees, clock)
-    limits = band(solution, name, degrees)
+    limits = band(array, series.one(solution, "consistency_dof", name))
     filters = series.filters(solution)
+    shares = _statistic(axes, array, limits, filters, clock)
     keys = [_dot(f, i) for i, f in enumerate(filters)]
-    if _is_smooth(solution, name):
+    if _is_smooth(array):
         keys = style.filter_keys(filters)
     if limits is not None:
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
@@ -212,7 +208,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
     axes.margins(x=0.0)
     axes.set(xlabel=clock.label, ylabel=name.upper())
     style.legend(figure, [*keys, style.outage_key()] if outage is not None else keys)
-    runs = solution[name].attrs.get("runs")
+    runs = array.attrs.get("runs")
     caption = "Squared estimation error, normalised by the stated covariance"
     caption += f", mean of {int(runs)} runs." if runs else "."
     caption += " Above the band the filter is too sure of itself, below it too modest."

@@ -28,13 +28,13 @@ Solution
 Every numeric array and coordinate has the attributes ``units`` and ``long_name``; an array with
 components along axes also has ``frame`` ("NED", "FRD", ...), and ``display_unit`` ("deg", "deg/h",
 "mg") where figures have another unit. An array tells by ``role`` what it is, and by ``of`` of what:
-the stated sigma of the attitude, the innovation of a sensor. `ROLES` is the table of them, printed
-in the documents under "The arrays"; `array` builds one, `variable` a coordinate, `find` reads those
-of a role. Figures are drawn from whatever is there; dimensions are recognised by their place, so any
-time dimension serves whose coordinate is in seconds since the start (``time``, ``gnss_time``, ...).
-Dimension coordinates ``filter`` and ``axis_...`` hold names. Bands of consistency figures follow
-from ``degrees_of_freedom`` and ``runs`` at ``probability`` (0.95), or are given by ``band_low`` and
-``band_high``.
+the standard deviation of the attitude, the innovation of a sensor. `ROLES` is their table, printed
+on the page of the documents on the result folder. `array` builds an array, `variable` a coordinate,
+`find` reads the arrays of a role. Figures are drawn from whatever is there; dimensions are
+recognised by their place, so any time dimension serves whose coordinate is in seconds since the
+start (``time``, ``gnss_time``, ...). Dimension coordinates ``filter`` and ``axis_...`` hold names.
+Bands of consistency figures follow from ``degrees_of_freedom`` and ``runs`` at ``probability``
+(0.95), or are given by ``band_low`` and ``band_high``.
 """
 
 from robins.results.errors import ResultError

@@ -1,9 +1,9 @@
 """What the arrays of a solution are to a reader: one table of roles.
 
-A row tells how arrays are named, what their dimensions are and what must be known with them. All
-else follows from it: `robins.results.array` builds one with its name and its attributes ``role`` and
-``of``, `find` reads by these attributes, `fault` is why a writer refuses one, `recognised` serves
-files written before there were roles, and the documents print the table.
+A row tells how arrays are named, what their dimensions are and what must be known with them. The
+rest follows from it: `robins.results.array` builds one with its name and its attributes ``role``
+and ``of``, `find` reads by these attributes, `fault` says why a writer refuses one, `recognised`
+serves files written before there were roles, and the documents print the table.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import xarray as xr
 
 _PLACES = "{lat_rad|lon_rad|alt_m|north_m|east_m}"
 _PARTS = re.compile(r"(\w*)(?:\{(.+)\})?(\w*)")
-ANY = "any"  # number of dimensions
+_MORE = "..."  # or other dimensions, of any number
 
 
 class Role(NamedTuple):
@@ -75,8 +75,8 @@ ROLES = (
         "gnss_time",
         "quality of the fixes",
         "1",
-        "whole numbers; attributes `flag_values` and `flag_meanings` as in the CF conventions, else "
-        "as RTKLIB numbers them",
+        "attributes `flag_values` and `flag_meanings` as in the CF conventions, else as RTKLIB "
+        "numbers them",
     ),
     Role("outage", "time", "aids withheld", "1", "nonzero where they were"),
     Role("estimate_{block}", _FTA, "estimated {of}"),
@@ -178,8 +178,13 @@ ROLES = (
     Role("trade_off_bound", "design gamma", "bound on the H2 norm"),
     Role("kalman_h2", "", "H2 norm of the Kalman filter"),
     Role("kalman_hinf", "", "H-infinity norm of the Kalman filter"),
-    Role("{name}", ANY, "{of}", note="what else is known of a run", named="context"),
+    Role("{name}", f"time {_MORE}", "{of}", note="what else is known of a run", named="context"),
 )
+
+
+def dims(role: Role, of: str) -> list[str]:
+    """Names of the dimensions of an array that brings none of its own."""
+    return role.dims.removesuffix(_MORE).format(of=of).split()
 
 
 def row(role: str, of: str) -> Role:
@@ -209,11 +214,11 @@ def fault(name: str, array: xr.Variable | xr.DataArray) -> str:
         one = row(array.attrs["role"], array.attrs.get("of", ""))
     except ValueError as error:
         return str(error)
-    called, dims = one.called(array.attrs.get("of", "")), one.dims.split()
+    called = one.called(array.attrs.get("of", ""))
     if name != called:
         return f"by its role it is called {called}"
-    if one.dims != ANY and len(dims) != array.ndim:
-        return f"has dimensions {array.dims}, not {tuple(dims)}"
+    if _MORE not in one.dims and len(one.dims.split()) != array.ndim:
+        return f"has dimensions {', '.join(map(str, array.dims))}, not {one.dims}"
     missing = [attr for attr in one.attrs if attr not in array.attrs]
     return f"the attribute {missing[0]!r} is missing" if missing else ""
 

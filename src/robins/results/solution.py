@@ -64,7 +64,7 @@ def array(
         ValueError: there is no such role, or the array lacks what its row asks for.
     """
     row = roles.row(role, of)
-    names = (dims or row.dims.format(of=of)).split()
+    names = dims.split() or roles.dims(row, of)
     text = long_name or row.text.format(of=of.replace("_", " "))
     about = {"role": role} | ({"of": of} if of else {}) | attrs
     made = variable(names, values, unit or row.unit, text, frame, **about)

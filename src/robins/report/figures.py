@@ -1,0 +1,77 @@
+"""The figures of a page, one row each, in their order: what is drawn, of arrays of which roles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import xarray as xr
+
+from robins.report import allan_curve, bars, bounds, curves, iron, limits, maps, updates
+from robins.report.lateness import lateness
+from robins.report.style import Picture
+from robins.report.trade_off import trade_off
+from robins.results import find
+
+
+class Figure(NamedTuple):
+    """A picture, or one for each thing that has an array of the first role."""
+
+    draw: Callable[..., Picture | None]  # of a solution; with `each` of a solution and of what
+    roles: str  # that it shows, between blanks; there is a figure where there is the first
+    each: bool = False
+    when: Callable[[xr.Dataset, str], bool] | None = None  # not always, but if this holds
+
+    def of(self, solution: xr.Dataset) -> Iterator[tuple[str, ...]]:
+        """What follows the solution among the arguments of each drawing."""
+        found = find(solution, self.roles.split()[0])
+        if self.each:
+            yield from ((of,) for of in found if self.when is None or self.when(solution, of))
+        elif found:
+            yield ()
+
+
+def _scatters(solution: xr.Dataset, block: str) -> bool:
+    """The RMS of one run is the error itself, without its sign."""
+    return find(solution, "rms")[block].attrs.get("runs", 2) != 1
+
+
+def _tells_more(solution: xr.Dataset, block: str) -> bool:
+    """Beside its error an estimate tells something new only where it should settle on a value."""
+    return block not in find(solution, "error") or "bias" in block or "scale" in block
+
+
+EACH = True
+FIGURES = (
+    Figure(maps.track, "track reference gnss gnss_quality outage"),
+    Figure(bounds.sigmas, "bound_prior bound bound_unaided bound_without", EACH),
+    Figure(bounds.information, "information gramian_rank"),
+    Figure(curves.errors, "error sigma bound bounds outage", EACH),
+    Figure(curves.campaign, "rms mean_sigma bound bounds outage", EACH, _scatters),
+    Figure(limits.within, "within", EACH),
+    Figure(limits.worst_case, "note"),
+    Figure(curves.estimates, "estimate sigma outage", EACH, _tells_more),
+    Figure(curves.values, "value sigma outage", EACH),
+    Figure(curves.height, "track reference gnss outage"),
+    Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused outage", EACH),
+    Figure(updates.consistency, "consistency consistency_dof outage", EACH),
+    Figure(allan_curve.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
+    Figure(trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
+    Figure(lateness, "lateness_steps lateness_edge"),
+    Figure(iron.planes, "field_calibrated field_measured"),
+    Figure(iron.size, "field_calibrated field_measured"),
+)
+
+
+def drawings(
+    solution: xr.Dataset | None, summary: Mapping[str, Any]
+) -> list[Callable[[], Picture | None]]:
+    """What to draw, in the order of the page; the comparison of a summary comes last."""
+    found: list[Callable[[], Picture | None]] = []
+    if solution is not None:
+        found += [partial(f.draw, solution, *of) for f in FIGURES for of in f.of(solution)]
+    # Columns of a summary without filters are something else, such as the axes of a sensor.
+    if solution is None or "filter" in solution.sizes:
+        found.append(partial(bars.comparison, summary))
+    return found
