@@ -26,8 +26,9 @@ from robins.filters.observability import (
 )
 from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
-from robins.results import variable
+from robins.results import array, variable
 from robins.systems.system import Case, Problem, StateBlock
+from robins.systems.tables import block_array
 
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction
 _FEWEST, _MOST = 3, 6  # directions that are told
@@ -85,10 +86,10 @@ def bound(problem: Problem, name: str, runs: int = 1, without: Sequence[str] = (
         raise ValueError(f"no sensor of filter '{name}' is left that measures: it has {names}")
     rows = np.eye(len(D)) if first.rows is None else np.asarray(first.rows)
     left = _left(rows, L[-1], D)
-    data, coords = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
-    more, places = _information(*_states(problem.blocks, rows, first.mean), L, D)
+    data = _sigmas(problem, sigma, prior, left, [names[i] for i in shown], shown)
+    data |= _information(*_states(problem.blocks, rows, first.mean), L, D)
     told = {"filter": name, "runs": runs, "without": ", ".join(without)}
-    return xr.Dataset(data | more, coords | places, told)
+    return xr.Dataset(data, attrs=told)
 
 
 def bound_sigma(problem: Problem, name: str, world: Any) -> np.ndarray:
@@ -180,25 +181,20 @@ def _sigmas(
     left: np.ndarray,
     names: list[str],
     shown: list[int],
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> dict[str, Any]:
     """Standard deviations by block, and their coordinates."""
     time = variable("time", problem.epoch_s, "s", "time since the start")
-    data, coords = {}, {"time": time, "sensor": names}
+    data: dict[str, Any] = {"time": time, "sensor": ("sensor", names)}
     for b in problem.blocks:
-        axis, words = f"axis_{b.name}", b.name.replace("_", " ")
-        coords[axis] = list(b.axes)
-        for kind, dims, values, text in (
-            ("", ("time", axis), sigma[0], f"covariance bound of {words}"),
-            ("prior_", (axis,), prior, f"prior sigma of {words}"),
-            ("unaided_", ("time", axis), sigma[1], f"bound of {words} with no sensor"),
-            ("without_", ("sensor", "time", axis), sigma[2:][shown], f"bound of {words} without"),
+        for role, values in (
+            ("bound", sigma[0]),
+            ("bound_prior", prior),
+            ("bound_unaided", sigma[1]),
+            ("bound_without", sigma[2:][shown]),
         ):
-            data[f"bound_{kind}{b.name}"] = variable(
-                dims, values[..., b.where], b.units, text, b.frame, display_unit=b.display_unit
-            )
-        text = f"share of the start's {words} that the measurements leave, process noise aside"
-        data[f"bound_left_{b.name}"] = variable((axis,), left[b.where], "1", text, b.frame)
-    return data, coords
+            data |= block_array(role, b, values[..., b.where])
+        data |= array("bound_left", left[b.where], b.name, frame=b.frame)
+    return data
 
 
 def _states(
@@ -244,17 +240,7 @@ def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarra
     most = min(max(_FEWEST, int(np.sum(values < FEW))), _MOST)
     shown = (sign[open_, None] * np.concatenate([hidden, rest], axis=1))[:, :most]
     words = [f"{i + 1}: {worded(v, told)}" for i, v in enumerate(shown.T)]
-    data: dict[str, Any] = {
-        "information": variable(
-            ("state", "time"), bits(L[:, open_]).T, "1", "information about the start [bit]"
-        ),
-        "gramian": variable(
-            "direction",
-            values[: len(words)],
-            "1",
-            "least eigenvalues of the observability Gramian, in units of the prior",
-            nothing=NOTHING,
-        ),
-        "gramian_rank": variable((), rank, "1", "rank of the observability Gramian"),
-    }
-    return data, {"state": told, "direction": words}
+    data: dict[str, Any] = {"state": ("state", told), "direction": ("direction", words)}
+    data |= array("information", bits(L[:, open_]).T)
+    data |= array("gramian", values[: len(words)], nothing=NOTHING)
+    return data | array("gramian_rank", rank)

@@ -13,9 +13,9 @@ from robins.campaign.bound import bound_sigma
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
-from robins.results import variable
-from robins.systems.system import Outcome, Output, Problem
-from robins.systems.tables import Seen, innovation_tables
+from robins.results import array, variable
+from robins.systems.system import Outcome, Problem
+from robins.systems.tables import Seen, block_array, innovation_tables
 
 
 def simulate(
@@ -122,80 +122,44 @@ def campaign_solution(
         found: by filter.
         bound: (E, r) covariance bound of the reported components, where there is one.
     """
-    ft = ("filter", "time")
     runs = next(iter(found.values())).runs
-    data: dict[str, Any] = {str(k): v for k, v in problem.context.data_vars.items()}
-    coords: dict[str, Any] = {str(k): v for k, v in problem.context.coords.items()}
-    coords["filter"] = list(found)
-    coords["time"] = variable("time", problem.epoch_s, "s", "time since the start")
+    data: dict[str, Any] = {str(k): v for k, v in problem.context.variables.items()}
+    data["filter"] = ("filter", list(found))
+    data["time"] = variable("time", problem.epoch_s, "s", "time since the start")
     for b in problem.blocks:
-        axis, words = f"axis_{b.name}", b.name.replace("_", " ")
-        coords[axis] = list(b.axes)
-
-        def add(kind: str, text: str, pick, b=b, axis=axis, **attrs):
-            data[f"{kind}_{b.name}"] = variable(
-                (*ft, axis),
-                _stack(found, lambda s: pick(s)[:, b.where]),
-                b.units,
-                text,
-                b.frame,
-                display_unit=b.display_unit,
-                **attrs,
-            )
-
-        add("error", f"error of {words}, first run", lambda s: s.first_run["error"])
-        add("sigma", f"stated sigma of {words}, first run", lambda s: s.first_run["sigma"])
-        add("rms", f"RMS error of {words}", lambda s: s.rms, runs=runs)
-        add("mean_sigma", f"stated sigma of {words}", lambda s: s.sigma, runs=runs)
+        words = b.name.replace("_", " ")
+        for role, text, pick, about in (
+            ("error", f"error of {words}, first run", lambda s: s.first_run["error"], {}),
+            ("sigma", f"stated sigma of {words}, first run", lambda s: s.first_run["sigma"], {}),
+            ("rms", "", lambda s: s.rms, {"runs": runs}),
+            ("mean_sigma", "", lambda s: s.sigma, {"runs": runs}),
+        ):
+            values = _stack(found, pick)[:, :, b.where]
+            data |= block_array(role, b, values, text, **about)
         if bound is not None:
-            data[f"bound_{b.name}"] = variable(
-                ("time", axis),
-                bound[:, b.where],
-                b.units,
-                f"covariance bound of {words}",
-                b.frame,
-                display_unit=b.display_unit,
-            )
+            data |= block_array("bound", b, bound[:, b.where])
     # what an H-infinity filter states is no covariance, so no chi-square test applies to it
     bound = np.array([problem.contenders[name].bounds for name in found])
-    data["bounds"] = variable("filter", bound.astype(np.int8), "1", "states bounds, not sigmas")
+    data |= array("bounds", bound.astype(np.int8), long_name="states bounds, not sigmas")
     blank = np.where(bound, np.nan, 1.0)[:, None]
-    data["anees"] = variable(
-        ft, blank * _stack(found, lambda s: s.anees()), "1", "ANEES", runs=runs, normalised=1
-    )
-    data["anees_dof"] = variable(
-        ft, blank * _stack(found, lambda s: np.full(s.anees().shape, s.n)), "1", "state dimension"
-    )
+    anees = blank * _stack(found, lambda s: s.anees())
+    data |= array("consistency", anees, "anees", long_name="ANEES", runs=runs, normalised=1)
+    dof = np.array([[s.n] for s in found.values()]) + np.zeros_like(anees)
+    data |= array("consistency_dof", blank * dof, "anees")
     for limit in problem.limits:
-        data[f"within_{limit.name}"] = variable(
-            ft,
-            _stack(found, lambda s, name=limit.name: s.share_within(name)),
-            "1",
-            f"runs with {limit.block.replace('_', ' ')} within {limit.name.replace('_', ' ')}",
-            runs=runs,
-        )
-    for output in problem.outputs:
-        more, places = _output(output, found)
-        data, coords = data | more, coords | places
+        share = _stack(found, lambda s, name=limit.name: s.share_within(name))
+        text = f"runs with {limit.block} within {limit.name}".replace("_", " ")
+        data |= array("within", share, limit.name, long_name=text, runs=runs)
+    for o in problem.outputs:
+        words = o.name.replace("_", " ")
+        first = _stack(found, lambda s, name=o.name: s.first_run["outputs"][name])
+        data |= block_array("error" if o.is_error else "value", o, first, words, comment=o.text)
+        if o.is_error:
+            rms = _stack(found, lambda s, name=o.name: s.output_rms(name))
+            data |= block_array("rms", o, rms, f"RMS {words}", comment=o.text, runs=runs)
     data |= _notes(found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
-    more, places = innovation_tables(_seen(found), problem.sensors, problem.epoch_s)
-    return xr.Dataset(data | more, coords | places)
-
-
-def _output(o: Output, found: dict[str, Statistics]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arrays and coordinates of an output: the first run, and the RMS where it is an error."""
-    dims, words = ("filter", "time", f"axis_{o.name}"), o.name.replace("_", " ")
-    told = {"display_unit": o.display_unit, "comment": o.text}
-    first = _stack(found, lambda s: s.first_run["outputs"][o.name])
-    kind = "error" if o.is_error else "value"
-    data = {f"{kind}_{o.name}": variable(dims, first, o.units, words, o.frame, **told)}
-    if o.is_error:
-        rms = _stack(found, lambda s: s.output_rms(o.name))
-        runs = next(iter(found.values())).runs
-        told |= {"runs": runs}
-        data[f"rms_{o.name}"] = variable(dims, rms, o.units, f"RMS {words}", o.frame, **told)
-    return data, {f"axis_{o.name}": list(o.axes)}
+    return xr.Dataset(data | innovation_tables(_seen(found), problem.sensors, problem.epoch_s))
 
 
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
@@ -211,15 +175,12 @@ def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
                     of.setdefault(note, {})[name] = np.asarray(value, dtype=float)
     epochs = next(iter(found.values())).rms.shape[0]
     none = np.full(epochs, np.nan)
-    return {
-        f"note_{note.replace('.', '_')}": variable(
-            ("filter", "time"),
-            np.stack([by.get(name, none) for name in found]),
-            "1",
-            f"{note.replace('.', ': ').replace('_', ' ')}, first run",
-        )
-        for note, by in of.items()
-    }
+    data: dict[str, Any] = {}
+    for note, by in of.items():
+        text = f"{note.replace('.', ': ').replace('_', ' ')}, first run"
+        values = np.stack([by.get(name, none) for name in found])
+        data |= array("note", values, note.replace(".", "_"), long_name=text)
+    return data
 
 
 def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from robins.filters import StepWarning, Tally, doubts
-from robins.results import variable
-from robins.systems.system import SensorAxes
+from robins.results import array, variable
+from robins.systems.system import Output, SensorAxes, StateBlock
 
 
 class Seen(NamedTuple):
@@ -25,10 +25,48 @@ class Seen(NamedTuple):
     refused: np.ndarray  # (F, E)
 
 
+def block_array(
+    role: str, block: StateBlock | Output, values: Any, long_name: str = "", **attrs: Any
+) -> dict[str, Any]:
+    """An array of a block of the state, or of an output, in its units and frame."""
+    shown = {"display_unit": block.display_unit, "axes": block.axes}
+    about = {"unit": block.units, "long_name": long_name, "frame": block.frame}
+    return array(role, values, block.name, **about, **shown, **attrs)
+
+
+def euler_array(values: Any, whose: str = "", frame: str = "FRD to NED") -> dict[str, Any]:
+    """Estimated roll, pitch and heading (filter, time, 3) [rad]."""
+    return array(
+        "estimate",
+        values,
+        "euler",
+        unit="rad",
+        long_name=f"estimated roll, pitch, heading{whose}",
+        frame=frame,
+        axes=("roll", "pitch", "heading"),
+        display_unit="deg",
+    )
+
+
+def place_arrays(
+    role: str, places: Iterable[Any], name: str = "{}", dims: str = ""
+) -> dict[str, Any]:
+    """Latitude, longitude [rad] and height [m] of a track, a reference or fixes.
+
+    `name` is their long name, where {} stands for which of the three it is.
+    """
+    made: dict[str, Any] = {}
+    which = (("lat_rad", "latitude"), ("lon_rad", "longitude"), ("alt_m", "height"))
+    for (of, words), values in zip(which, places, strict=True):
+        about = {"unit": of.rpartition("_")[2], "long_name": name.format(words), "dims": dims}
+        made |= array(role, values, of, **about)
+    return made
+
+
 def innovation_tables(
     seen: Mapping[str, Seen], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Variables and coordinates of a solution, at the epochs where each sensor spoke.
+) -> dict[str, Any]:
+    """Arrays and coordinates of a solution, at the epochs where each sensor spoke.
 
     Args:
         seen: by sensor.
@@ -36,28 +74,21 @@ def innovation_tables(
         epoch_s: (E,) time of each epoch.
     """
     data: dict[str, Any] = {}
-    coords: dict[str, Any] = {}
     for sensor, s in seen.items():
         spoke = np.any(np.isfinite(s.innovation), axis=(0, 2))
         if not np.any(spoke):
             continue
-        time, axis, words = f"{sensor}_time", f"axis_{sensor}", sensor.replace("_", " ")
-        units, frame, labels, shown = axes[sensor]
-        display = {"display_unit": shown} if shown else {}
-        coords[time] = variable(time, epoch_s[spoke], "s", f"time of {words}")
-        coords[axis] = list(labels)
-        ft, fta = ("filter", time), ("filter", time, axis)
-        rows = {
-            f"innovation_{sensor}": (fta, s.innovation, units, f"innovation of {words}", frame),
-            f"innovation_sigma_{sensor}": (fta, s.sigma, units, f"expected {words}", frame),
-            f"nis_{sensor}": (ft, s.nis, "1", f"NIS of {words}"),
-            f"nis_dof_{sensor}": (ft, s.dof, "1", f"degrees of freedom of {words}"),
-            f"refused_{sensor}": (ft, s.refused, "1", f"{words} refused by a rule"),
-        }
-        for name, (dims, values, *words_) in rows.items():
-            attrs = display if len(dims) == 3 else {}
-            data[name] = variable(dims, values[:, spoke], *words_, **attrs)
-    return data, coords
+        time, (units, frame, labels, shown) = f"{sensor}_time", axes[sensor]
+        about: dict[str, Any] = {"unit": units, "frame": frame, "axes": labels}
+        about |= {"display_unit": shown} if shown else {}
+        words = sensor.replace("_", " ")
+        data[time] = variable(time, epoch_s[spoke], "s", f"time of {words}")
+        data |= array("innovation", s.innovation[:, spoke], sensor, **about)
+        data |= array("innovation_sigma", s.sigma[:, spoke], sensor, **about)
+        data |= array("nis", s.nis[:, spoke], sensor)
+        data |= array("nis_dof", s.dof[:, spoke], sensor)
+        data |= array("refused", s.refused[:, spoke], sensor)
+    return data
 
 
 @contextmanager

@@ -7,12 +7,11 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from robins.results import variable
 from robins.systems.airship.claims import airship_claims, airship_metrics, published
 from robins.systems.airship.contender import contender
 from robins.systems.airship.model import SAR, STAR, STAR_EARLY, WIND, WIND_OF_STAR
 from robins.systems.airship.parameters import Airship
-from robins.systems.airship.world import Course, lay_out, simulate
+from robins.systems.airship.world import lay_out, simulate
 from robins.systems.system import Norm, Problem, SensorAxes, StateBlock
 
 ENU = ("east", "north", "up")
@@ -58,7 +57,7 @@ def airship_problem(given: Airship, filters: tuple[str, ...], seed: int) -> Prob
         epoch_s=course.epoch_s,
         blocks=BLOCKS,
         sensors=SENSORS,
-        context=_context(course),
+        context=xr.Dataset(),
         metrics=partial(airship_metrics, course.epoch_s, at_s),
         claims=partial(airship_claims, given.claims),
         count_from=first,
@@ -66,9 +65,3 @@ def airship_problem(given: Airship, filters: tuple[str, ...], seed: int) -> Prob
         norms=NORMS,
         bound_of="product",
     )
-
-
-def _context(course: Course) -> xr.Dataset:
-    """When the radar was lost, for figures."""
-    time = course.epoch_s
-    return xr.Dataset({}, {"time": variable("time", time, "s", "time since the start")})

@@ -12,11 +12,11 @@ import xarray as xr
 from robins.earth import Geodetic
 from robins.filters import Belief, Code, StepInfo, Tally
 from robins.filters.consistency import grand_mean_nis
-from robins.results import variable
+from robins.results import array, variable
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log
 from robins.systems.ins_gnss.setup import SENSORS, state_blocks
-from robins.systems.tables import Seen, innovation_tables
+from robins.systems.tables import Seen, block_array, euler_array, innovation_tables, place_arrays
 
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
@@ -93,51 +93,23 @@ def _stack(answers: dict[str, Answer], pick) -> np.ndarray:
 
 def replay_solution(flight: Flight, answers: dict[str, Answer], parameters: Replay) -> xr.Dataset:
     """Time series of every filter, labelled as `robins.results` lists them."""
-    ft = ("filter", "time")
     data: dict[str, Any] = {
-        "lat_rad": variable(ft, _stack(answers, lambda a: a.antenna.lat), "rad", "latitude"),
-        "lon_rad": variable(ft, _stack(answers, lambda a: a.antenna.lon), "rad", "longitude"),
-        "alt_m": variable(ft, _stack(answers, lambda a: a.antenna.alt), "m", "height"),
-        "outage": variable("time", flight.withheld_epoch.astype(np.int8), "1", "GNSS withheld"),
-    }
-    coords: dict[str, Any] = {
-        "filter": list(answers),
+        "filter": ("filter", list(answers)),
         "time": variable("time", flight.epoch_s, "s", "time since the first IMU sample"),
     }
+    fields = ("lat", "lon", "alt")
+    places = (_stack(answers, lambda a, f=field: getattr(a.antenna, f)) for field in fields)
+    data |= place_arrays("track", places)
+    data |= array("outage", flight.withheld_epoch.astype(np.int8), long_name="GNSS withheld")
     for block in state_blocks(parameters.imu.scale_states):
-        axis = f"axis_{block.name}"
-        coords[axis] = list(block.axes)
-        data[f"sigma_{block.name}"] = variable(
-            (*ft, axis),
-            _stack(answers, lambda a, b=block: a.belief.sigma[:, b.where]),
-            block.units,
-            f"standard deviation of {block.name.replace('_', ' ')}",
-            block.frame,
-            display_unit=block.display_unit,
-        )
-        if block.name in ("attitude", "position"):
-            continue
-        data[f"estimate_{block.name}"] = variable(
-            (*ft, axis),
-            _stack(answers, lambda a, b=block: _estimate(a, b.name)),
-            block.units,
-            f"estimated {block.name.replace('_', ' ')}",
-            block.frame,
-            display_unit=block.display_unit,
-        )
-    coords["axis_euler"] = ["roll", "pitch", "heading"]
-    data["estimate_euler"] = variable(
-        (*ft, "axis_euler"),
-        _stack(answers, lambda a: np.stack(a.belief.mean.q_nb.as_euler(), -1)),
-        "rad",
-        "estimated roll, pitch, heading",
-        "FRD to NED",
-        display_unit="deg",
-    )
+        sigma = _stack(answers, lambda a, b=block: a.belief.sigma[:, b.where])
+        data |= block_array("sigma", block, sigma)
+        if block.name not in ("attitude", "position"):
+            found = _stack(answers, lambda a, b=block: _estimate(a, b.name))
+            data |= block_array("estimate", block, found)
+    data |= euler_array(_stack(answers, lambda a: np.stack(a.belief.mean.q_nb.as_euler(), -1)))
     data |= _fixes(flight.log)
-    coords["gnss_time"] = variable("gnss_time", flight.log.gnss_s, "s", "time of the fixes")
-    more, places = innovation_tables(_seen(answers), SENSORS, flight.epoch_s)
-    return xr.Dataset(data | more, coords | places)
+    return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, flight.epoch_s))
 
 
 def _estimate(answer: Answer, block: str) -> np.ndarray:
@@ -147,18 +119,15 @@ def _estimate(answer: Answer, block: str) -> np.ndarray:
 
 def _fixes(log: Log) -> dict[str, Any]:
     g = log.gnss
-    out = {
-        "gnss_lat_rad": variable("gnss_time", g.lat_rad, "rad", "latitude of the fixes"),
-        "gnss_lon_rad": variable("gnss_time", g.lon_rad, "rad", "longitude of the fixes"),
-        "gnss_alt_m": variable("gnss_time", g.alt_m, "m", "height of the fixes"),
+    out: dict[str, Any] = {
+        "gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes"),
     }
+    out |= place_arrays("gnss", (g.lat_rad, g.lon_rad, g.alt_m), "{} of the fixes")
     if g.quality is not None:
         known = [q for q in RTK_QUALITY if np.any(g.quality == q)]
-        out["gnss_quality"] = variable(
-            "gnss_time",
+        out |= array(
+            "gnss_quality",
             g.quality.astype(np.int32),
-            "1",
-            "quality of the fixes",
             flag_values=np.asarray(known, dtype=np.int32),
             flag_meanings=" ".join(RTK_QUALITY[q] for q in known),
         )

@@ -27,7 +27,7 @@ from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.ins.state import InsState
 from robins.manifold import retract
-from robins.results import variable
+from robins.results import array
 from robins.sim.gnss_sensor import GnssErrorModel, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
@@ -49,6 +49,7 @@ from robins.systems.ins_gnss.setup import (
 )
 from robins.systems.limits import refuse_unsettled
 from robins.systems.system import Case, Contender, Problem
+from robins.systems.tables import place_arrays
 
 
 class Course(NamedTuple):
@@ -288,23 +289,12 @@ def _tracks(means: Mapping[str, InsState]) -> dict[str, Any]:
     def of(field: str) -> np.ndarray:
         return np.stack([np.asarray(getattr(m.position, field)) for m in means.values()])
 
-    ft = ("filter", "time")
-    return {
-        "lat_rad": variable(ft, of("lat"), "rad", "latitude"),
-        "lon_rad": variable(ft, of("lon"), "rad", "longitude"),
-        "alt_m": variable(ft, of("alt"), "m", "height"),
-    }
+    return place_arrays("track", map(of, ("lat", "lon", "alt")))
 
 
 def _context(course: Course) -> xr.Dataset:
     """The true path and the outages, for figures."""
-    p, time = course.truth.position, course.blocks.epoch_s
-    return xr.Dataset(
-        {
-            "reference_lat_rad": variable("time", p.lat, "rad", "true latitude"),
-            "reference_lon_rad": variable("time", p.lon, "rad", "true longitude"),
-            "reference_alt_m": variable("time", p.alt, "m", "true height"),
-            "outage": variable("time", course.outage.astype(np.int8), "1", "GNSS withheld"),
-        },
-        {"time": variable("time", time, "s", "time since the start")},
-    )
+    p = course.truth.position
+    data = place_arrays("reference", (p.lat, p.lon, p.alt), "true {}")
+    data |= array("outage", course.outage.astype(np.int8), long_name="GNSS withheld")
+    return xr.Dataset(data)

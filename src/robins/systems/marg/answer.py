@@ -11,13 +11,14 @@ import xarray as xr
 from robins.dataset import Dataset
 from robins.filters import Code, Tally
 from robins.filters.consistency import grand_mean_nis
-from robins.results import variable
+from robins.results import array, variable
 from robins.rotation import to_euler
 from robins.systems.marg.accuracy import orientation_errors, rms_deg, truth_at
 from robins.systems.marg.model import MAGNETOMETER, MargState
 from robins.systems.marg.prepare import Prepared
 from robins.systems.marg.setup import BLOCKS, SENSORS
-from robins.systems.tables import Seen, innovation_tables
+from robins.systems.system import StateBlock
+from robins.systems.tables import Seen, block_array, euler_array, innovation_tables
 
 
 class Update(NamedTuple):
@@ -110,73 +111,45 @@ def _level_axes(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def solution(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> xr.Dataset:
     """Time series of every filter, labelled as `robins.results` lists them."""
-    ft = ("filter", "time")
-    coords: dict[str, Any] = {
-        "filter": list(answers),
+    data: dict[str, Any] = {
+        "filter": ("filter", list(answers)),
         "time": variable("time", log.epoch_s, "s", "time since the first sample"),
     }
-    data: dict[str, Any] = {
-        "rest": variable("time", log.still.astype(np.int8), "1", "unit lies still")
-    }
+    still = log.still.astype(np.int8)
+    data |= array("context", still, "rest", unit="1", long_name="unit lies still")
     for block in BLOCKS:
-        axis, words = f"axis_{block.name}", block.name.replace("_", " ")
-        coords[axis] = list(block.axes)
-        labels = (block.units, block.frame)
-        data[f"sigma_{block.name}"] = variable(
-            (*ft, axis),
-            np.stack([a.sigma[:, block.where] for a in answers.values()]),
-            labels[0],
-            f"standard deviation of {words}",
-            labels[1],
-            display_unit=block.display_unit,
-        )
+        sigma = np.stack([a.sigma[:, block.where] for a in answers.values()])
+        data |= block_array("sigma", block, sigma)
         if block.name != "attitude":
-            data[f"estimate_{block.name}"] = variable(
-                (*ft, axis),
-                np.stack([_estimate(a, block.name) for a in answers.values()]),
-                labels[0],
-                f"estimated {words}",
-                labels[1],
-                display_unit=block.display_unit,
-            )
-    coords["axis_euler"] = ["roll", "pitch", "heading"]
+            found = np.stack([_estimate(a, block.name) for a in answers.values()])
+            data |= block_array("estimate", block, found)
     euler = [np.stack(to_euler(jnp.asarray(a.mean.q_nb.wxyz)), axis=-1) for a in answers.values()]
-    data["estimate_euler"] = variable(
-        (*ft, "axis_euler"),
-        np.stack(euler),
-        "rad",
-        "estimated roll, pitch, heading",
-        "body to NED",
-        display_unit="deg",
-    )
+    data |= euler_array(np.stack(euler), frame="body to NED")
     if dataset.attitude is not None:
         data |= _error_tables(dataset, log, answers)
-        coords |= {"axis_heading": ["heading"], "axis_inclination": ["north", "east"]}
-    data["magnetic_disturbance"] = variable(
-        ft,
+    data |= array(
+        "context",
         np.stack([_disturbed(a, len(log.epoch_s)) for a in answers.values()]),
-        "1",
-        "magnetometer refused",
+        "magnetic_disturbance",
+        unit="1",
+        long_name="magnetometer refused",
+        dims="filter time",
     )
-    more, places = innovation_tables(_seen(answers), SENSORS, log.epoch_s)
-    return xr.Dataset(data | more, coords | places)
+    return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, log.epoch_s))
 
 
 def _error_tables(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> dict[str, Any]:
     found = [_errors_at_epochs(dataset, log, a) for a in answers.values()]
-    rows = {
-        "heading": ([h[:, None] for h, _, _ in found], slice(2, 3), "true minus estimated heading"),
-        "inclination": ([t for _, t, _ in found], slice(0, 2), "tilt of true against estimated"),
-    }
-    out = {}
-    for name, (values, where, words) in rows.items():
-        dims = ("filter", "time", f"axis_{name}")
-        sigma = np.stack([a.sigma[:, where] for a in answers.values()])
-        for kind, table, text in (
-            ("error", np.stack(values), words),
-            ("sigma", sigma, f"standard deviation of {name}"),
-        ):
-            out[f"{kind}_{name}"] = variable(dims, table, "rad", text, "NED", display_unit="deg")
+    heading = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
+    inclination = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("north", "east"))
+    out: dict[str, Any] = {}
+    for block, values, words in (
+        (heading, [h[:, None] for h, _, _ in found], "true minus estimated heading"),
+        (inclination, [t for _, t, _ in found], "tilt of true against estimated"),
+    ):
+        out |= block_array("error", block, np.stack(values), words)
+        sigma = np.stack([a.sigma[:, block.where] for a in answers.values()])
+        out |= block_array("sigma", block, sigma)
     return out
 
 

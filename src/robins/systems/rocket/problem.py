@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from robins.results import variable
+from robins.results import array
 from robins.systems.rocket.angle_contender import angle_contender, sight_of
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.claims import rocket_claims
@@ -96,16 +96,16 @@ def _problem(given: Flight, course: Course, seed: int, **own: Any) -> Problem:
 
 def _context(course: Course) -> xr.Dataset:
     """The path and the field, for figures."""
-    time = variable("time", course.time_s, "s", "time since the start")
-    data = {
-        "field_n": variable(
-            ("time", "axis_field_n"),
-            course.field_n,
-            "T",
-            "geomagnetic field",
-            "launch NED",
-            display_unit="uT",
-        ),
-        "height": variable("time", course.alt_m, "m", "height", display_unit="km"),
-    }
-    return xr.Dataset(data, {"time": time, "axis_field_n": ["north", "east", "down"]})
+    height = array("context", course.alt_m, "height", unit="m", display_unit="km")
+    field = array(
+        "context",
+        course.field_n,
+        "field_n",
+        unit="T",
+        long_name="geomagnetic field",
+        frame="launch NED",
+        axes=("north", "east", "down"),
+        dims="time axis_field_n",
+        display_unit="uT",
+    )
+    return xr.Dataset(height | field)

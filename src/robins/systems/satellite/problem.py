@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from robins.results import variable
+from robins.results import array
 from robins.systems.satellite.claims import satellite_claims
 from robins.systems.satellite.contender import contender
 from robins.systems.satellite.course import Course, lay_out
@@ -74,10 +74,6 @@ def _outputs(given: AttitudeLoop) -> tuple[Output, ...]:
 
 
 def _context(course: Course) -> xr.Dataset:
-    """The wanted rate, and when the star sensor is lost."""
+    """When the star sensor is lost."""
     lost = (course.due & ~np.asarray(course.steps.star.seen)).astype(np.int8)
-    data = {}
-    if np.any(lost):
-        data["outage"] = variable("time", lost, "1", "star sensor lost")
-    time = variable("time", course.time_s, "s", "time since the start")
-    return xr.Dataset(data, {"time": time})
+    return xr.Dataset(array("outage", lost, long_name="star sensor lost") if np.any(lost) else {})

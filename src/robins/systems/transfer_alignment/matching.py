@@ -22,7 +22,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from robins import rotation, units
-from robins.results import variable
+from robins.results import array
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.random import Component, stream, unit
 from robins.systems.system import Limit, Problem, SensorAxes, StateBlock
@@ -245,12 +245,9 @@ def matching_problem(given: Matching, filters: tuple[str, ...], seed: int) -> Pr
         blocks=BLOCKS,
         sensors=SENSORS,
         context=xr.Dataset(
-            {
-                "roll": variable("time", roll_rad(turn, course.epoch_s), "rad", "roll"),
-                "load_factor": variable("time", course.load[course.at], "1", "load factor"),
-                "outage": variable("time", (~course.heard).astype(np.int8), "1", "no attitude"),
-            },
-            {"time": variable("time", course.epoch_s, "s", "time since the start")},
+            array("context", roll_rad(turn, course.epoch_s), "roll", unit="rad")
+            | array("context", course.load[course.at], "load_factor", unit="1")
+            | array("outage", (~course.heard).astype(np.int8), long_name="no attitude")
         ),
         metrics=matching_metrics,
         claims=partial(matching_claims, given.claims),

@@ -12,9 +12,9 @@ from robins import units
 from robins.dataset import Trajectory
 from robins.filters import Belief, Code, StepInfo, Tally
 from robins.filters.consistency import grand_mean_nis
-from robins.results import variable
+from robins.results import array, variable
 from robins.systems.system import SensorAxes, StateBlock
-from robins.systems.tables import Seen, innovation_tables
+from robins.systems.tables import Seen, block_array, euler_array, innovation_tables, place_arrays
 from robins.systems.transfer_alignment.product import ATTITUDE, POSITION, VELOCITY
 
 _NED, _FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -129,59 +129,33 @@ def remarks(name: str, answer: Answer) -> list[str]:
 
 def solution_of(recorded: Recorded, answers: Mapping[str, Answer]) -> xr.Dataset:
     """Time series of every filter, labelled as `robins.results` lists them."""
-    ft = ("filter", "time")
 
     def stack(pick) -> np.ndarray:
         return np.stack([np.asarray(pick(a)) for a in answers.values()])
 
-    place = stack(lambda a: np.stack([*_place(a.belief.mean.ins.position)], -1))
-    data: dict[str, Any] = {
-        "lat_rad": variable(ft, place[..., 0], "rad", "latitude of the slave"),
-        "lon_rad": variable(ft, place[..., 1], "rad", "longitude of the slave"),
-        "alt_m": variable(ft, place[..., 2], "m", "height of the slave"),
-    }
-    coords: dict[str, Any] = {
-        "filter": list(answers),
-        "time": variable("time", recorded.epoch_s, "s", "time since the slave's first sample"),
-        "axis_euler": ["roll", "pitch", "heading"],
-    }
-    for block in BLOCKS:
-        axis, words = f"axis_{block.name}", block.name.replace("_", " ")
-
-        def add(kind: str, text: str, pick, block=block, axis=axis):
-            rows = [pick(answer) for answer in answers.values()]
-            if all(row is None for row in rows):
-                return
-            blank = np.full((len(recorded.epoch_s), 3), np.nan)
-            values = np.stack([blank if row is None else row for row in rows])
-            coords[axis] = list(block.axes)
-            data[f"{kind}_{block.name}"] = variable(
-                (*ft, axis), values, block.units, text, block.frame, display_unit=block.display_unit
-            )
-
-        add("sigma", f"standard deviation of {words}", lambda a, b=block: sigma(a.belief, b))
-        add(
-            "estimate",
-            f"estimated {words}",
-            lambda a, b=block: estimate(a.belief.mean, b.name),
-        )
-    data["estimate_euler"] = variable(
-        (*ft, "axis_euler"),
-        stack(lambda a: np.stack(a.belief.mean.ins.q_nb.as_euler(), -1)),
-        "rad",
-        "estimated roll, pitch, heading of the slave",
-        "FRD to NED",
-        display_unit="deg",
-    )
-    bounds = np.array([a.bounds for a in answers.values()], dtype=np.int8)
-    data["bounds"] = variable("filter", bounds, "1", "states bounds, not standard deviations")
+    place = stack(lambda a: np.stack([*_place(a.belief.mean.ins.position)]))
     master, mt = recorded.master, "master_time"
-    coords[mt] = variable(mt, recorded.master_s, "s", "time of the master's records")
-    data["reference_lat_rad"] = variable(mt, master.lat_rad, "rad", "latitude of the master")
-    data["reference_lon_rad"] = variable(mt, master.lon_rad, "rad", "longitude of the master")
-    data["reference_alt_m"] = variable(mt, master.alt_m, "m", "height of the master")
-    more, places = innovation_tables(_seen(answers), SENSORS, recorded.epoch_s)
-    return xr.Dataset(data | more, coords | places)
+    data: dict[str, Any] = {
+        "filter": ("filter", list(answers)),
+        "time": variable("time", recorded.epoch_s, "s", "time since the slave's first sample"),
+        mt: variable(mt, recorded.master_s, "s", "time of the master's records"),
+    }
+    data |= place_arrays("track", np.moveaxis(place, 1, 0), "{} of the slave")
+    blank = np.full((len(recorded.epoch_s), 3), np.nan)
+    for block in BLOCKS:
+        for role, rows in (
+            ("sigma", [sigma(a.belief, block) for a in answers.values()]),
+            ("estimate", [estimate(a.belief.mean, block.name) for a in answers.values()]),
+        ):
+            if any(row is not None for row in rows):
+                values = np.stack([blank if row is None else row for row in rows])
+                data |= block_array(role, block, values)
+    euler = stack(lambda a: np.stack(a.belief.mean.ins.q_nb.as_euler(), -1))
+    data |= euler_array(euler, " of the slave")
+    data |= array("bounds", np.array([a.bounds for a in answers.values()], dtype=np.int8))
+    path = (master.lat_rad, master.lon_rad, master.alt_m)
+    data |= place_arrays("reference", path, "{} of the master", dims=mt)
+    return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, recorded.epoch_s))
 
 
 def _place(position: Any) -> tuple[Any, Any, Any]:

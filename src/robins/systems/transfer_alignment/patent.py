@@ -35,7 +35,7 @@ from robins.filters.rules import adaptive_h_infinity, h_infinity
 from robins.ins.frames import swap, swap_q
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
-from robins.results import variable
+from robins.results import array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
 from robins.systems.limits import Names, Runs
@@ -377,11 +377,8 @@ def too_large(given: Patent, end_s: float) -> list[str]:
 def _context(course: Course) -> xr.Dataset:
     """The manoeuvre, for figures."""
     roll, _, heading = (np.asarray(a) for a in to_euler(jnp.asarray(course.path.q_nb.wxyz)))
-    time = course.epoch_s
-    return xr.Dataset(
-        {
-            "roll": variable("time", roll, "rad", "roll"),
-            "heading": variable("time", heading, "rad", "heading"),
-        },
-        {"time": variable("time", time, "s", "time since the start")},
-    )
+    named = {"roll": roll, "heading": heading}
+    data: dict[str, Any] = {}
+    for of, angle in named.items():
+        data |= array("context", angle, of, unit="rad")
+    return xr.Dataset(data)

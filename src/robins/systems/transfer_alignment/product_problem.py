@@ -10,16 +10,15 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any, Literal
 
-import jax
 import numpy as np
 import pydantic
 import xarray as xr
 
 from robins import units
-from robins.results import variable
 from robins.scenario import Quantity, default
 from robins.systems.limits import Names
 from robins.systems.system import Limit, Problem, Scenario
+from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_answer import BLOCKS, SENSORS
 from robins.systems.transfer_alignment.pair_course import Course, lay_out
@@ -90,22 +89,10 @@ def _tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
     def of(field: str) -> np.ndarray:
         return np.stack([np.asarray(getattr(m.ins.position, field)) for m in means.values()])
 
-    ft = ("filter", "time")
-    return {
-        "lat_rad": variable(ft, of("lat"), "rad", "latitude"),
-        "lon_rad": variable(ft, of("lon"), "rad", "longitude"),
-        "alt_m": variable(ft, of("alt"), "m", "height"),
-    }
+    return place_arrays("track", map(of, ("lat", "lon", "alt")))
 
 
 def _context(course: Course) -> xr.Dataset:
     """The true path of the slave, for figures."""
-    p, time = jax.tree.map(np.asarray, course.path.position), course.epoch_s
-    return xr.Dataset(
-        {
-            "reference_lat_rad": variable("time", p.lat, "rad", "true latitude"),
-            "reference_lon_rad": variable("time", p.lon, "rad", "true longitude"),
-            "reference_alt_m": variable("time", p.alt, "m", "true height"),
-        },
-        {"time": variable("time", time, "s", "time since the start")},
-    )
+    p = course.path.position
+    return xr.Dataset(place_arrays("reference", (p.lat, p.lon, p.alt), "true {}"))
