@@ -26,7 +26,7 @@ from robins.logs import open_log
 from robins.logs.clean_mag import clean_mag
 from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
-from robins.results import variable
+from robins.results import array, variable
 from robins.units import UnitError, parse
 
 FILE = "calibration.toml"
@@ -126,14 +126,12 @@ def as_toml(found: Calibration, command: str) -> str:
 
 def analysed(given: Turned, found: Calibration, name: str) -> tuple[xr.Dataset, dict[str, Any]]:
     """Solution and summary of a calibration."""
-    dims, axes = ("time", "axis_field"), {"axis_field": list(_AXES)}
-    told = {"frame": "FRD", "display_unit": "uT"}
+    about: dict[str, Any] = {"frame": "FRD", "axes": _AXES, "display_unit": "uT"}
     after = calibrated(given.field_t, found.offset_t, found.matrix)
-    measured = variable(dims, given.field_t, "T", "magnetic field, measured", **told)
-    made = variable(dims, after, "T", "magnetic field, calibrated", strength=found.field_t, **told)
     solution = xr.Dataset(
-        {"field_measured": measured, "field_calibrated": made},
-        {"time": variable("time", given.time_s, "s", "time since the first sample"), **axes},
+        array("field_measured", given.field_t, **about)
+        | array("field_calibrated", after, strength=found.field_t, **about),
+        {"time": variable("time", given.time_s, "s", "time since the first sample")},
     )
     columns: dict[str, dict[str, Any]] = {
         axis: {

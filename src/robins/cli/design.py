@@ -17,7 +17,7 @@ from robins.cli.frame import BadInput, command_line, only_json
 from robins.cli.problem import Problem, read_problem
 from robins.cli.progress import Progress
 from robins.filters.synthesis import METHODS, Design, Outcome, TradeOff, trade_off
-from robins.results import variable
+from robins.results import array, variable
 from robins.results.summary import dumps, plain
 
 GAINS, TABLE = "gains.json", "trade_off.csv"
@@ -74,24 +74,16 @@ def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
                 values[at] = getattr(outcome.design, name)
         return values
 
-    dims, z, gain = ("design", "gamma"), problem.unit_z, problem.unit_gain
-    kalman = found.kalman
-    arrays = {
-        "trade_off_h2": variable(dims, numbers("h2"), z, "true H2 norm"),
-        "trade_off_hinf": variable(
-            dims,
-            numbers("hinf"),
-            gain,
-            "true H-infinity norm",
-            least=found.least.reached,
-            least_of=_whose(found),
-        ),
-        "trade_off_bound": variable(dims, numbers("bound"), z, "bound on the H2 norm"),
-        "kalman_h2": variable((), kalman.h2, z, "H2 norm of the Kalman filter"),
-        "kalman_hinf": variable((), kalman.hinf, gain, "H-infinity norm of the Kalman filter"),
-    }
+    z, gain, least = problem.unit_z, problem.unit_gain, found.least.reached
     gamma = variable("gamma", np.array(found.gammas), gain, "bound on the H-infinity norm")
-    return xr.Dataset(arrays, {"design": methods, "gamma": gamma})
+    return xr.Dataset(
+        array("trade_off_h2", numbers("h2"), unit=z)
+        | array("trade_off_hinf", numbers("hinf"), unit=gain, least=least, least_of=_whose(found))
+        | array("trade_off_bound", numbers("bound"), unit=z)
+        | array("kalman_h2", found.kalman.h2, unit=z)
+        | array("kalman_hinf", found.kalman.hinf, unit=gain),
+        {"design": methods, "gamma": gamma},
+    )
 
 
 def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from robins.dataset import Dataset, ImuTable
 from robins.ins import allan
 from robins.logs import open_log
 from robins.logs.clean import clean_imu
-from robins.results import variable
+from robins.results import array, variable
 
 _NAMES = {
     "Q": "quantisation",
@@ -110,24 +110,14 @@ def expected(fitted: allan.AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]
 
 def _arrays(sensor: str, curve: allan.Allan, fitted: allan.AllanFit | None, body: str) -> dict:
     si, shown = _UNITS[sensor]
-    axis = f"axis_{sensor}"
-
-    def one(values: np.ndarray, text: str, dims: tuple[str, ...] = ("tau", axis), **attrs: Any):
-        return variable(dims, values, si, text, body, display_unit=shown, **attrs)
-
-    made = {
-        f"allan_{sensor}": one(
-            curve.deviation, f"Allan deviation of the {sensor}", confidence=curve.confidence
-        ),
-        f"allan_low_{sensor}": one(curve.lower, "lower bound"),
-        f"allan_high_{sensor}": one(curve.upper, "upper bound"),
-    }
+    about: dict[str, Any] = {"unit": si, "frame": body, "axes": _AXES, "display_unit": shown}
+    made = array("allan", curve.deviation, sensor, confidence=curve.confidence, **about)
+    made |= array("allan_low", curve.lower, sensor, **about)
+    made |= array("allan_high", curve.upper, sensor, **about)
     if fitted is not None:
-        parts = expected(fitted, curve.tau_s)
-        whole = np.sqrt(sum(part**2 for part in parts.values()))
-        made[f"allan_fit_{sensor}"] = one(whole, "fit")
-        dims = ("process", "tau", axis)
-        made[f"allan_slope_{sensor}"] = one(np.stack(list(parts.values())), "terms", dims)
+        parts = list(expected(fitted, curve.tau_s).values())
+        made |= array("allan_fit", np.sqrt(sum(part**2 for part in parts)), sensor, **about)
+        made |= array("allan_slope", np.stack(parts), sensor, **about)
     return made
 
 
@@ -169,9 +159,7 @@ def analysed(path: Path, terms: str, progress: Any) -> tuple[xr.Dataset, dict[st
                 columns[axis] |= found
         arrays |= _arrays(sensor, curve, fitted, given.body)
         tau_s = curve.tau_s
-    coords: dict[str, Any] = {"tau": variable("tau", tau_s, "s", "averaging time")}
-    coords |= {f"axis_{sensor}": list(_AXES) for sensor in given.rates}
-    solution = xr.Dataset(arrays, coords)
+    solution = xr.Dataset(arrays | {"tau": variable("tau", tau_s, "s", "averaging time")})
     if "process" in solution.sizes:
         solution = solution.assign_coords(process=[_NAMES[term] for term in terms])
     summary = {
