@@ -12,7 +12,7 @@ from robins.bench.run import telemetry
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, counted_from
 from robins.bench.run.telemetry import ARCSEC, Flown, flag
-from robins.results import variable
+from robins.results import array, variable
 
 _EVENTS = 200  # told; all are in the record
 _AXES = ("x", "y", "z (boresight)")
@@ -122,73 +122,48 @@ def warnings(ran: Ran, error: np.ndarray) -> list[str]:
 def solution(flight: Flight, ran: Ran) -> xr.Dataset:
     """Time series of the run, as `robins.results` names them."""
     f = ran.flown
-    dims = ("filter", "time", "axis_attitude")
-    bias_dims = ("filter", "time", "axis_gyro_bias")
     heard = np.flatnonzero(np.isfinite(f.innovation[:, 0]))
     bias = np.asarray(ran.kit.rows.gyro_bias)[: ran.steps]
-    pointing = telemetry.turn(reference_q_ib(ran), f.q_ib)
-    wheels = len(ran.kit.vehicle.craft.wheel_h)
-    arcsec, rate = {"display_unit": "arcsec"}, {"display_unit": "arcsec/s"}
-    body = {"frame": "body"}
-
-    def of(dims: tuple[str, ...], values: np.ndarray, unit: str, name: str, **more: Any) -> Any:
-        return variable(dims, values[None], unit, name, **more)
-
-    arrays = {
-        "error_attitude": of(
-            dims, telemetry.attitude_error(f), "rad", "attitude error", **body, **arcsec
-        ),
-        "sigma_attitude": of(
-            dims, f.sigma[:, :3], "rad", "stated sigma of attitude", **body, **arcsec
-        ),
-        "estimate_gyro_bias": of(bias_dims, f.bias, "rad/s", "estimated gyro bias", **body, **rate),
-        "error_gyro_bias": of(
-            bias_dims, bias - f.bias, "rad/s", "error of the gyro bias", **body, **rate
-        ),
-        "sigma_gyro_bias": of(
-            bias_dims, f.sigma[:, 3:], "rad/s", "stated sigma of the gyro bias", **body, **rate
-        ),
-        "value_pointing": of(
-            ("filter", "time", "axis_pointing"),
-            pointing,
-            "rad",
-            "pointing error",
-            frame="reference",
-            comment="Where the craft points against where it should.",
-            **arcsec,
-        ),
-        "value_wheel_momentum": of(
-            ("filter", "time", "axis_wheel"),
-            f.wheel_h[:, :wheels],
-            "N m s",
-            "momentum of the wheels",
-            frame="wheel axes",
-        ),
-    }
-    coords = {
-        "filter": [flight.setup.filter],
+    wheels = f.wheel_h[:, : len(ran.kit.vehicle.craft.wheel_h)]
+    body: dict[str, Any] = {"unit": "rad", "frame": "body", "axes": _AXES, "display_unit": "arcsec"}
+    rate = body | {"unit": "rad/s", "display_unit": "arcsec/s"}
+    arrays: dict[str, Any] = {
+        "filter": ("filter", [flight.setup.filter]),
         "time": variable("time", f.time_s, "s", "time since the start"),
-        "axis_attitude": list(_AXES),
-        "axis_gyro_bias": list(_AXES),
-        "axis_pointing": ["x", "y", "z"],
-        "axis_wheel": [f"wheel {k}" for k in range(wheels)],
     }
+
+    def add(role: str, values: np.ndarray, of: str, **about: Any) -> None:
+        arrays.update(array(role, values[None], of, **about))
+
+    add("error", telemetry.attitude_error(f), "attitude", **body)
+    add("sigma", f.sigma[:, :3], "attitude", **body)
+    add("estimate", f.bias, "gyro_bias", **rate)
+    add("error", bias - f.bias, "gyro_bias", **rate)
+    add("sigma", f.sigma[:, 3:], "gyro_bias", **rate)
+    add(
+        "value",
+        telemetry.turn(reference_q_ib(ran), f.q_ib),
+        "pointing",
+        long_name="pointing error",
+        comment="Where the craft points against where it should.",
+        **body | {"frame": "reference", "axes": ("x", "y", "z")},
+    )
+    add(
+        "value",
+        wheels,
+        "wheel_momentum",
+        unit="N m s",
+        long_name="momentum of the wheels",
+        frame="wheel axes",
+        axes=[f"wheel {k}" for k in range(wheels.shape[1])],
+        dims="filter time axis_wheel",
+    )
     if len(heard):
-        star = ("filter", "star_time", "axis_star")
-        arrays |= {
-            "innovation_star": of(star, f.innovation[heard], "rad", "innovation", **body, **arcsec),
-            "innovation_sigma_star": of(
-                star, f.innovation_sigma[heard], "rad", "its sigma", **body, **arcsec
-            ),
-            "refused_star": of(
-                star[:2], flag(f, "star refused")[heard].astype(np.int8), "1", "star refused"
-            ),
-        }
-        coords |= {
-            "star_time": variable("star_time", f.time_s[heard], "s", "time since the start"),
-            "axis_star": list(_AXES),
-        }
-    return xr.Dataset(arrays | lateness(ran), coords)
+        arrays["star_time"] = variable("star_time", f.time_s[heard], "s", "time since the start")
+        add("innovation", f.innovation[heard], "star", **body)
+        add("innovation_sigma", f.innovation_sigma[heard], "star", **body)
+        add("refused", flag(f, "star refused")[heard].astype(np.int8), "star")
+    return xr.Dataset(arrays | lateness(ran))
 
 
 def lateness(ran: Ran) -> dict[str, Any]:
@@ -196,13 +171,8 @@ def lateness(ran: Ran) -> dict[str, Any]:
     counted = ran.latencies.summary()["histogram"]
     if not any(counted["counts"]):
         return {}
-    edges = np.array(counted["edges_us"], float)
-    return {
-        "lateness_steps": variable(
-            "lateness_bin", np.array(counted["counts"]), "1", "steps that began so late"
-        ),
-        "lateness_edge": variable("lateness_edge_number", edges, "us", "edges of the bins"),
-    }
+    steps = array("lateness_steps", np.array(counted["counts"]))
+    return steps | array("lateness_edge", np.array(counted["edges_us"], float))
 
 
 def notes(flight: Flight, told: dict[str, Any]) -> list[str]:
