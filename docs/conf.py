@@ -21,6 +21,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "room_pages",
     "plain_docstrings",
+    "role_table",
 ]
 exclude_patterns = ["_build"]
 default_role = "py:obj"  # `name` in a docstring links to the name where there is one

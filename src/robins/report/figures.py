@@ -19,7 +19,7 @@ class Figure(NamedTuple):
     """A picture, or one for each thing that has an array of the first role."""
 
     draw: Callable[..., Picture | None]  # of a solution; with `each` of a solution and of what
-    roles: str  # that it shows, between blanks; there is a figure where there is the first
+    roles: str  # that it shows, between blanks; it is drawn where there is the first
     each: bool = False
     when: Callable[[xr.Dataset, str], bool] | None = None  # not always, but if this holds
 
@@ -44,18 +44,18 @@ def _tells_more(solution: xr.Dataset, block: str) -> bool:
 
 EACH = True
 FIGURES = (
-    Figure(maps.track, "track reference gnss gnss_quality outage"),
+    Figure(maps.track, "track reference gnss gnss_quality"),
     Figure(bounds.sigmas, "bound_prior bound bound_unaided bound_without", EACH),
     Figure(bounds.information, "information gramian_rank"),
-    Figure(curves.errors, "error sigma bound bounds outage", EACH),
-    Figure(curves.campaign, "rms mean_sigma bound bounds outage", EACH, _scatters),
+    Figure(curves.errors, "error sigma bound bounds", EACH),
+    Figure(curves.campaign, "rms mean_sigma bound bounds", EACH, _scatters),
     Figure(limits.within, "within", EACH),
     Figure(limits.worst_case, "note"),
-    Figure(curves.estimates, "estimate sigma outage", EACH, _tells_more),
-    Figure(curves.values, "value sigma outage", EACH),
-    Figure(curves.height, "track reference gnss outage"),
-    Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused outage", EACH),
-    Figure(updates.consistency, "consistency consistency_dof outage", EACH),
+    Figure(curves.estimates, "estimate sigma", EACH, _tells_more),
+    Figure(curves.values, "value sigma", EACH),
+    Figure(curves.height, "track reference gnss"),
+    Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused", EACH),
+    Figure(updates.consistency, "consistency consistency_dof", EACH),
     Figure(allan_curve.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
     Figure(trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
     Figure(lateness, "lateness_steps lateness_edge"),

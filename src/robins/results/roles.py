@@ -78,7 +78,7 @@ ROLES = (
         "attributes `flag_values` and `flag_meanings` as in the CF conventions, else as RTKLIB "
         "numbers them",
     ),
-    Role("outage", "time", "aids withheld", "1", "nonzero where they were"),
+    Role("outage", "time", "aids withheld", "1", "nonzero where they were; shaded in all figures"),
     Role("estimate_{block}", _FTA, "estimated {of}"),
     Role(
         "error_{block}",
@@ -108,7 +108,7 @@ ROLES = (
     Role(
         "{nees|anees}",
         _FT,
-        "{of}",
+        "normalised estimation error squared",
         "1",
         "of one run, or the mean over `runs`; attribute `degrees_of_freedom`, or an array `_dof`; "
         "`normalised=1` if divided by these",
@@ -122,7 +122,7 @@ ROLES = (
         "stated sigma of {of}",
         note="root of the mean variance the filter states",
     ),
-    Role("within_{limit}", _FT, "runs within {of}", "1", "share of the runs", ("runs",)),
+    Role("within_{limit}", _FT, "runs within {of}", "1", "share of the `runs`", ("runs",)),
     Role(
         "bounds",
         "filter",
@@ -140,7 +140,7 @@ ROLES = (
         "1",
     ),
     Role("bound_unaided_{block}", _TA, "bound of {of} with no sensor"),
-    Role("bound_without_{block}", f"sensor {_TA}", "bound of {of} without", note="each sensor"),
+    Role("bound_without_{block}", f"sensor {_TA}", "bound of {of} without", note="one sensor each"),
     Role("information", "state time", "information about the start [bit]", "1"),
     Role(
         "gramian",
@@ -151,9 +151,14 @@ ROLES = (
         ("nothing",),
     ),
     Role("gramian_rank", "", "rank of the observability Gramian", "1"),
-    Role("allan_{sensor}", _TAU, "Allan deviation of the {of}", note="over averaging time"),
-    Role("allan_low_{sensor}", _TAU, "lower bound", note="of confidence"),
-    Role("allan_high_{sensor}", _TAU, "upper bound", note="of confidence"),
+    Role(
+        "allan_{sensor}",
+        _TAU,
+        "Allan deviation of the {of}",
+        note="over averaging time; attribute `confidence`, of its bounds",
+    ),
+    Role("allan_low_{sensor}", _TAU, "lower bound", note="of its confidence"),
+    Role("allan_high_{sensor}", _TAU, "upper bound", note="of its confidence"),
     Role("allan_fit_{sensor}", _TAU, "fit", note="the fitted model"),
     Role("allan_slope_{sensor}", f"process {_TAU}", "terms", note="parts of the model, by name"),
     Role("field_measured", "time axis_field", "magnetic field, measured", "T"),

@@ -1,0 +1,51 @@
+"""The arrays of a result folder, as a table for people, made of the table of roles."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from robins.report import FIGURES
+from robins.results import ROLES
+from robins.results.roles import Role
+
+
+def names(role: Role) -> str:
+    """Names of the arrays of a row."""
+    found = re.search(r"\{(.*)\}", role.variable)
+    choices = found[1].split("|") if found else []
+    every = [role.called(of) for of in choices] if len(choices) > 1 else [role.variable]
+    return ", ".join(f"`{name}`" for name in every)
+
+
+def drawn(role: Role) -> str:
+    """Figures that show a role, each linked to its function."""
+    made = (f.draw for f in FIGURES if role.name in f.roles.split())
+    return ", ".join(f"{{py:func}}`~{d.__module__}.{d.__name__}`" for d in made)
+
+
+def rows() -> Iterator[str]:
+    """The table in Markdown."""
+    yield "| role | arrays | dimensions | unit | what it is | drawn by |"
+    yield "|---|---|---|---|---|---|"
+    for role in ROLES:
+        found = re.search(r"\{\w+\}", role.variable)
+        of = found[0] if found else ""
+        dims = ", ".join(role.dims.replace("{of}", of).split())
+        needs = ", ".join(f"`{attr}`" for attr in role.attrs if f"`{attr}`" not in role.note)
+        told = (role.text.replace("{of}", of), role.note, needs and f"attribute {needs}")
+        text = "; ".join(filter(None, told))
+        cells = (f"`{role.name}`", names(role), dims, role.unit, text, drawn(role))
+        yield f"| {' | '.join(cells)} |"
+
+
+def write(app) -> None:
+    """Write what the contract includes, beside the pages of the reference."""
+    folder = Path(app.srcdir) / "_generated"
+    folder.mkdir(exist_ok=True)
+    (folder / "arrays.txt").write_text("\n".join([*rows(), ""]), "utf-8")
+
+
+def setup(app) -> dict:
+    """Write the table before Sphinx looks for sources."""
+    app.connect("builder-inited", write)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
