@@ -3,7 +3,8 @@
 import numpy as np
 import xarray as xr
 
-from robins.results import variable
+from robins.results import array, variable
+from robins.systems.tables import place_arrays
 
 FILTERS = ["kalman", "robust", "dead reckoning"]
 NED = ["north", "east", "down"]
@@ -30,11 +31,6 @@ def a_drive(filters=2, runs=0, seconds=600.0, lat0=0.85, lon0=0.19):
         noise /= noise.std(axis=1, keepdims=True)
         return noise * sigma * 0.9 * scale
 
-    def series(name, values, unit, axes, text, frame, shown=None):
-        shown = {"display_unit": shown} if shown else {}
-        dims = ("filter", "time", f"axis_{axes}")
-        return {name: variable(dims, values, unit, text, frame, **shown)}
-
     worse = (1.0 + 0.7 * np.arange(f))[:, None, None]
     start = np.exp(-t / 25.0)[None, :, None]
     sigma_p = worse * (0.4 + 0.002 * since[None, :, None] ** 1.7 + 3.0 * start)
@@ -45,44 +41,42 @@ def a_drive(filters=2, runs=0, seconds=600.0, lat0=0.85, lon0=0.19):
     sigma_g = worse * (2e-5 * (0.1 + start)) * np.ones(3)
     error_p = about(1.0, sigma_p)
     arrays = {}
-    for block, axes, unit, frame, shown, sigma, error in (
-        ("position", "position", "m", "NED", None, sigma_p, error_p),
-        ("velocity", "velocity", "m/s", "NED", None, sigma_v, about(1.0, sigma_v)),
-        ("attitude", "attitude", "rad", "NED", "deg", sigma_a, about(1.0, sigma_a)),
-        ("gyro_bias", "gyro_bias", "rad/s", "FRD", "deg/h", sigma_g, about(1.0, sigma_g)),
+    bias = {"unit": "rad/s", "frame": "FRD", "axes": XYZ, "display_unit": "deg/h"}
+    for block, shown, sigma, error in (
+        ("position", {"unit": "m", "frame": "NED", "axes": NED}, sigma_p, error_p),
+        ("velocity", {"unit": "m/s", "frame": "NED", "axes": NED}, sigma_v, about(1.0, sigma_v)),
+        (
+            "attitude",
+            {"unit": "rad", "frame": "NED", "axes": RPH, "display_unit": "deg"},
+            sigma_a,
+            about(1.0, sigma_a),
+        ),
+        ("gyro_bias", bias, sigma_g, about(1.0, sigma_g)),
     ):
-        name = block.replace("_", " ")
         if not runs:
-            arrays |= series(f"error_{block}", error, unit, axes, f"{name} error", frame, shown)
-            arrays |= series(f"sigma_{block}", sigma, unit, axes, f"{name} sigma", frame, shown)
+            arrays |= array("error", error, block, **shown)
+            arrays |= array("sigma", sigma, block, **shown)
         else:
             rms = sigma * np.sqrt(rng.chisquare(runs, size=sigma.shape) / runs)
-            arrays |= series(f"rms_{block}", rms, unit, axes, f"{name} RMS", frame, shown)
-            arrays[f"rms_{block}"].attrs["runs"] = runs
-            arrays |= series(f"mean_sigma_{block}", sigma, unit, axes, name, frame, shown)
+            arrays |= array("rms", rms, block, runs=runs, **shown)
+            arrays |= array("mean_sigma", sigma, block, **shown)
     if runs:
         anees = rng.chisquare(runs * 15, size=(f, n)) / runs
-        about_it = {"degrees_of_freedom": 15, "runs": runs}
-        arrays["anees"] = variable(("filter", "time"), anees, "1", "ANEES", **about_it)
+        arrays |= array("consistency", anees, "anees", degrees_of_freedom=15, runs=runs)
     else:
         truth = np.array([8e-5, -5e-5, 2e-5])
         values = truth - arrays["error_gyro_bias"].values
-        arrays |= series(
-            "estimate_gyro_bias", values, "rad/s", "gyro_bias", "gyro bias", "FRD", "deg/h"
-        )
+        arrays |= array("estimate", values, "gyro_bias", **bias)
         radius = 6.37e6
         lat = lat0 + (north + error_p[..., 0]) / radius
         lon = lon0 + (east + error_p[..., 1]) / radius / np.cos(lat0)
-        dims = ("filter", "time")
-        arrays["lat_rad"] = variable(dims, lat, "rad", "latitude")
-        arrays["lon_rad"] = variable(dims, (lon + np.pi) % (2 * np.pi) - np.pi, "rad", "longitude")
-        arrays["alt_m"] = variable(dims, up - error_p[..., 2], "m", "height")
-        arrays |= place("reference", "time", lat0 + north / radius, lon0 + east / radius, up, lat0)
+        there = lat, (lon + np.pi) % (2 * np.pi) - np.pi, up - error_p[..., 2]
+        arrays |= place_arrays("track", there)
+        arrays |= place("reference", lat0 + north / radius, lon0 + east / radius, up, lat0)
         fix = slice(None, None, 5)
         noise = rng.normal(size=(3, n))[:, fix] * 0.8
         arrays |= place(
             "gnss",
-            "gnss_time",
             lat0 + (north[fix] + noise[0]) / radius,
             lon0 + (east[fix] + noise[1]) / radius,
             up[fix] + noise[2],
@@ -91,34 +85,23 @@ def a_drive(filters=2, runs=0, seconds=600.0, lat0=0.85, lon0=0.19):
         )
         quality = np.where(rng.random(noise.shape[1]) < 0.8, 1, 2)
         quality[rng.random(noise.shape[1]) < 0.05] = 5
-        arrays["gnss_quality"] = variable("gnss_time", quality, "1", "quality of the fix")
+        arrays |= array("gnss_quality", quality)
         arrays |= updates(rng, f, noise.shape[1], outage[fix])
-        arrays["nees"] = variable(
-            dims, rng.chisquare(15, size=(f, n)), "1", "NEES", degrees_of_freedom=15
-        )
-    arrays["outage"] = variable("time", outage, "1", "aids withheld")
+        nees = rng.chisquare(15, size=(f, n))
+        arrays |= array("consistency", nees, "nees", degrees_of_freedom=15)
     return xr.Dataset(
-        arrays,
+        arrays | array("outage", outage),
         coords={
             "filter": FILTERS[:f],
             "time": variable("time", t, "s", "time"),
             "gnss_time": variable("gnss_time", t[::5], "s", "time of fixes"),
-            "axis_position": NED,
-            "axis_velocity": NED,
-            "axis_attitude": RPH,
-            "axis_gyro_bias": XYZ,
         },
     )
 
 
-def place(kind, dim, lat, lon, alt, lat0, lon0=0.19):
+def place(role, lat, lon, alt, lat0, lon0=0.19):
     lon = lon0 + (lon - lon0) / np.cos(lat0)
-    lon = (lon + np.pi) % (2 * np.pi) - np.pi
-    return {
-        f"{kind}_lat_rad": variable(dim, lat, "rad", "latitude"),
-        f"{kind}_lon_rad": variable(dim, lon, "rad", "longitude"),
-        f"{kind}_alt_m": variable(dim, alt, "m", "height"),
-    }
+    return place_arrays(role, (lat, (lon + np.pi) % (2 * np.pi) - np.pi, alt))
 
 
 def updates(rng, filters, count, missing):
@@ -130,14 +113,14 @@ def updates(rng, filters, count, missing):
     at = min(40, count - 1)
     refused[:, at] = True
     innovation[:, at, 0] = 6.0
-    dims = ("filter", "gnss_time")
-    axes = (*dims, "axis_position")
-    return {
-        "innovation_gnss_position": variable(axes, innovation, "m", "GNSS innovation", "NED"),
-        "innovation_sigma_gnss_position": variable(axes, sigma, "m", "expected sigma", "NED"),
-        "nis_gnss_position": variable(dims, nis, "1", "NIS", degrees_of_freedom=3),
-        "refused_gnss_position": variable(dims, refused, "1", "refused by the gate"),
-    }
+    of, dims = "gnss_position", "filter gnss_time"
+    axes = {"unit": "m", "frame": "NED", "axes": NED, "dims": f"{dims} axis_position"}
+    return (
+        array("innovation", innovation, of, **axes)
+        | array("innovation_sigma", sigma, of, **axes)
+        | array("nis", nis, of, degrees_of_freedom=3, dims=dims)
+        | array("refused", refused, of, dims=dims)
+    )
 
 
 def an_allan_curve():
@@ -154,23 +137,20 @@ def an_allan_curve():
     few = np.sqrt(tau / 2000.0)[:, None]
     rng = np.random.default_rng(5)
     value = model * (1.0 + 0.15 * few * rng.normal(size=model.shape))
-    dims = ("tau", "axis_gyro")
-    known = {"display_unit": "deg/h"}
-
-    def one(values, text, dims=dims):
-        return variable(dims, values, "rad/s", text, "FRD", **known)
-
+    arrays = {}
+    for role, values in (
+        ("allan", value),
+        ("allan_low", value * (1.0 - 0.35 * few)),
+        ("allan_high", value * (1.0 + 0.6 * few)),
+        ("allan_fit", model),
+        ("allan_slope", parts),
+    ):
+        about = {"unit": "rad/s", "frame": "FRD", "axes": XYZ, "display_unit": "deg/h"}
+        arrays |= array(role, values, "gyro", **about)
     return xr.Dataset(
-        {
-            "allan_gyro": one(value, "Allan deviation"),
-            "allan_low_gyro": one(value * (1.0 - 0.35 * few), "lower bound"),
-            "allan_high_gyro": one(value * (1.0 + 0.6 * few), "upper bound"),
-            "allan_fit_gyro": one(model, "fit"),
-            "allan_slope_gyro": one(parts, "processes", ("process", *dims)),
-        },
+        arrays,
         coords={
             "tau": variable("tau", tau, "s", "averaging time"),
-            "axis_gyro": XYZ,
             "process": ["angle random walk", "bias instability", "rate random walk"],
         },
     )

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from robins import report
 from robins.report import bounds, curves, style
-from robins.results import variable
+from robins.results import array, variable
 
 TIME = np.arange(1.0, 101.0)
 AXES = ["north", "east"]
@@ -23,27 +23,18 @@ def told():
     every = np.stack([north, east], axis=1)
     unaided = np.stack([8.0 + 0.0 * TIME, 8.0 + 1.01 * TIME], axis=1)
     without = np.stack([0.9 * unaided, every])
-    axis, dims = "axis_position", ("time", "axis_position")
-
-    def metres(dims, values, text):
-        return variable(dims, values, "m", text, "NED", display_unit="km")
-
+    metres = {"unit": "m", "frame": "NED", "axes": AXES, "display_unit": "km"}
     return xr.Dataset(
-        {
-            "bound_position": metres(dims, every, "covariance bound of position"),
-            "bound_prior_position": metres((axis,), [8.0, 8.0], "prior"),
-            "bound_unaided_position": metres(dims, unaided, "no sensor"),
-            "bound_without_position": metres(("sensor", *dims), without, "without"),
-            "bound_left_position": variable((axis,), [0.1, 1.0], "1", "left", "NED"),
-            "information": variable(
-                ("state", "time"), [np.log2(1.0 + TIME) / 2.0, 0.0 * TIME], "1", "information"
-            ),
-            "gramian": variable("direction", [1e-12, 100.0], "1", "eigenvalues", nothing=1e-6),
-            "gramian_rank": variable((), 1, "1", "rank"),
-        },
+        array("bound", every, "position", **metres)
+        | array("bound_prior", [8.0, 8.0], "position", **metres)
+        | array("bound_unaided", unaided, "position", **metres)
+        | array("bound_without", without, "position", **metres)
+        | array("bound_left", [0.1, 1.0], "position", frame="NED")
+        | array("information", [np.log2(1.0 + TIME) / 2.0, 0.0 * TIME])
+        | array("gramian", [1e-12, 100.0], nothing=1e-6)
+        | array("gramian_rank", 1),
         {
             "time": variable("time", TIME, "s", "time since the start"),
-            "axis_position": AXES,
             "sensor": SENSORS,
             "state": ["position north", "position east"],
             "direction": ["1: 100 % position east", "2: 100 % position north"],
@@ -160,9 +151,8 @@ def test_the_bound_is_drawn_beside_the_filters(runs, draw, signs):
     count = ds.sizes["time"]
     best = np.linspace(0.4, 0.2, count)[:, None] * np.ones(3)
     plain = getattr(curves, draw)(ds, "attitude").figure
-    ds["bound_attitude"] = variable(
-        ("time", "axis_attitude"), np.radians(best), "rad", "bound", "NED", display_unit="deg"
-    )
+    shown = {"unit": "rad", "frame": "NED", "display_unit": "deg"}
+    ds = ds.assign(array("bound", np.radians(best), "attitude", **shown))
     figure = getattr(curves, draw)(ds, "attitude").figure
     labels = [t.get_text() for t in figure.legends[0].texts]
     assert sum("covariance bound" in label for label in labels) == 1

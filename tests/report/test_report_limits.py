@@ -7,7 +7,7 @@ from figure_reading import collisions, lines_of
 
 from robins import report
 from robins.report import bands, curves, limits, style, updates
-from robins.results import variable
+from robins.results import array, variable
 
 NAMES = ["kf", "hinf-deg", "adaptive-hinf"]
 TIME = np.arange(40) * 0.5
@@ -15,47 +15,26 @@ TIME = np.arange(40) * 0.5
 
 @pytest.fixture(scope="module")
 def aligned():
-    ft, size = ("filter", "time"), (3, 40)
+    size = (3, 40)
     rng = np.random.default_rng(1)
     share = np.linspace(0.0, 1.0, 40) * np.array([[1.0], [0.6], [0.3]])
     gamma = np.array([[np.nan], [2.0], [np.nan]]) * np.ones(size)
     xi = np.array([[np.nan], [np.nan], [4.0]]) * np.ones(size)
     bound = np.linspace(1.9, 0.5, 40)
-    block = ("filter", "time", "axis_attitude")
+    only = np.array([[1.0], [np.nan], [np.nan]])
+    enu = {"unit": "rad", "frame": "ENU", "axes": ["E", "N", "U"], "display_unit": "arcmin"}
     return xr.Dataset(
-        {
-            "bounds": variable("filter", np.array([0, 1, 1], np.int8), "1", "bounds"),
-            "within_5_arcmin": variable(ft, share, "1", "runs within 5 arcmin", runs=50),
-            "note_h_infinity_bound": variable(ft, np.where(gamma > 0, bound, np.nan), "1", "b"),
-            "note_h_infinity_gamma": variable(ft, gamma, "1", "g"),
-            "note_adaptive_h_infinity_bound": variable(
-                ft, np.where(xi > 0, bound, np.nan), "1", "b"
-            ),
-            "note_adaptive_h_infinity_xi": variable(ft, xi, "1", "xi"),
-            "rms_attitude": variable(
-                block, rng.random((*size, 3)), "rad", "RMS", "ENU", display_unit="arcmin", runs=50
-            ),
-            "mean_sigma_attitude": variable(
-                block, rng.random((*size, 3)), "rad", "sigma", "ENU", display_unit="arcmin"
-            ),
-            "anees": variable(
-                ft,
-                np.where([[1.0], [np.nan], [np.nan]], 1.0 + 0.01 * rng.random(size), np.nan)
-                * np.array([[1.0], [np.nan], [np.nan]]),
-                "1",
-                "ANEES",
-                runs=50,
-                normalised=1,
-            ),
-            "anees_dof": variable(
-                ft, np.array([[9.0], [np.nan], [np.nan]]) * np.ones(size), "1", "dimension"
-            ),
-        },
-        {
-            "filter": NAMES,
-            "time": variable("time", TIME, "s", "time"),
-            "axis_attitude": ["E", "N", "U"],
-        },
+        array("bounds", np.array([0, 1, 1], np.int8))
+        | array("within", share, "5_arcmin", runs=50)
+        | array("note", np.where(gamma > 0, bound, np.nan), "h_infinity_bound")
+        | array("note", gamma, "h_infinity_gamma")
+        | array("note", np.where(xi > 0, bound, np.nan), "adaptive_h_infinity_bound")
+        | array("note", xi, "adaptive_h_infinity_xi")
+        | array("rms", rng.random((*size, 3)), "attitude", runs=50, **enu)
+        | array("mean_sigma", rng.random((*size, 3)), "attitude", **enu)
+        | array("consistency", only + 0.01 * rng.random(size), "anees", runs=50, normalised=1)
+        | array("consistency_dof", 9.0 * only * np.ones(size), "anees"),
+        {"filter": NAMES, "time": variable("time", TIME, "s", "time")},
     )
 
 
@@ -107,7 +86,7 @@ def test_a_filter_that_diverged_or_states_far_too_much_does_not_set_the_scale(al
 
 
 def test_the_band_is_that_of_the_filter_with_a_covariance(aligned):
-    band = bands.band(aligned, "anees", "anees_dof")
+    band = bands.band(aligned["anees"], aligned["anees_dof"])
     np.testing.assert_allclose(band.low[0], bands.quantile(0.025, 450.0) / 450.0)
     picture = updates.consistency(aligned, "anees")
     assert "hinf" not in picture.figure.axes[0].get_title(loc="left")

@@ -7,7 +7,7 @@ from example_results import a_drive
 
 from robins import report
 from robins.report import maps
-from robins.results import variable
+from robins.results import array
 
 
 @pytest.mark.parametrize("lat_deg", [-75.0, 0.0, 48.7, 80.0])
@@ -40,10 +40,8 @@ def test_crossing_180_degrees_draws_no_line_across_the_map(drive):
 
 def test_a_given_track_that_jumps_around_the_globe_is_broken_there(drive):
     east = np.where(drive["time"].values < 300.0, 0.0, -3e7) + np.zeros((2, 1))
-    given = drive.assign(
-        track_north_m=variable(("filter", "time"), np.zeros_like(east), "m", "north"),
-        track_east_m=variable(("filter", "time"), east, "m", "east"),
-    )
+    north = array("track", np.zeros_like(east), "north_m", unit="m")
+    given = drive.assign(north | array("track", east, "east_m", unit="m"))
     path = maps.paths(given)["track"]
     np.testing.assert_array_equal(path.east, east)
     broken = maps.unwrapped(maps.Path(path.north[0], path.east[0]))

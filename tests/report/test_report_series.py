@@ -2,32 +2,11 @@
 
 import numpy as np
 import pytest
-import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from robins.report import series
-from robins.results import variable
-
-
-def test_names_are_found_by_their_longest_prefix():
-    solution = xr.Dataset(
-        {
-            name: variable(("filter", "time"), np.zeros((1, 2)), "1", name)
-            for name in (
-                *("error_position", "sigma_position", "mean_sigma_position", "rms_position"),
-                *("innovation_gnss", "innovation_sigma_gnss", "nis_gnss", "nis_dof_gnss"),
-                *("allan_gyro", "allan_low_gyro", "estimate_gyro_bias", "nees"),
-            )
-        }
-    )
-    assert list(series.find(solution, "innovation")) == ["gnss"]
-    assert list(series.find(solution, "nis")) == ["gnss"]
-    assert list(series.find(solution, "sigma")) == ["position"]
-    assert list(series.find(solution, "allan")) == ["gyro"]
-    assert list(series.find(solution, "estimate")) == ["gyro_bias"]
-    assert list(series.find(solution, "error")) == ["position"]
 
 
 def test_values_come_in_the_unit_of_figures(drive):

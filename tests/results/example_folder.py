@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from robins.results import variable
+from robins.results import array, variable
 
 
 def a_summary(**changes):
@@ -24,22 +24,12 @@ def a_solution(scale=1.0):
     error = scale * rng.normal(size=(2, 50, 3))
     error[0, 3, 1] = np.nan
     axes = ["roll", "pitch", "heading"]
+    shown = {"unit": "rad", "frame": "NED", "axes": axes, "display_unit": "deg"}
+    count = array("context", np.int64(2**40 + 1), "count", unit="1", dims="")
     return xr.Dataset(
-        {
-            "error_attitude": variable(
-                ("filter", "time", "axis_attitude"),
-                error,
-                "rad",
-                "attitude error",
-                frame="NED",
-                display_unit="deg",
-            ),
-            "outage": variable("time", np.arange(50) > 40, "1", "aids withheld"),
-            "count": variable((), np.int64(2**40 + 1), "1", "number of samples"),
-        },
+        array("error", error, "attitude", **shown) | array("outage", np.arange(50) > 40) | count,
         coords={
             "filter": ["kalman", "robust – ü"],
-            "axis_attitude": axes,
             "time": variable("time", np.linspace(0.1, 5.0, 50), "s", "time"),
         },
     )

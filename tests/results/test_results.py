@@ -12,7 +12,7 @@ from example_folder import a_figure, a_solution, a_summary, names
 
 import robins
 from robins import results
-from robins.results import ResultError, ResultWriter, read, variable, write
+from robins.results import ResultError, ResultWriter, array, read, variable, write
 
 # ------------------------------------------------------------------------------- there and back
 
@@ -62,10 +62,9 @@ def test_everything_comes_back(tmp_path):
 
 
 def test_a_run_without_any_update_comes_back(tmp_path):
-    dims = ("filter", "update_time", "axis_gnss")
     empty = xr.Dataset(
-        {"innovation_gnss": variable(dims, np.zeros((1, 0, 3)), "m", "innovation", "NED")},
-        coords={"update_time": variable("update_time", np.zeros(0), "s", "time"), "filter": ["a"]},
+        array("innovation", np.zeros((1, 0, 3)), "gnss", unit="m", frame="NED"),
+        coords={"gnss_time": variable("gnss_time", np.zeros(0), "s", "time"), "filter": ["a"]},
     )
     write(tmp_path / "out", a_summary(), empty)
     back = read(tmp_path / "out").solution
@@ -171,6 +170,8 @@ def without(attr):
         (xr.Dataset({"x": ("t", [1j])}), "x: arrays of complex128 are not stored"),
         (xr.Dataset({"x": ((), 1.0)}), "x: the attribute 'units'"),
         (xr.Dataset({"x": variable((), 1.0, "1", "x", a=None)}), "x: the attribute 'a'"),
+        (xr.Dataset({"x": variable((), 1.0, "1", "x")}), "x: the attribute 'role' is missing"),
+        (a_solution().rename(outage="lost"), "lost: by its role it is called outage"),
         (xr.Dataset(coords={"t": [1.0]}), "t: the attribute 'units' is missing"),
     ],
 )

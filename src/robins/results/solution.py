@@ -44,7 +44,7 @@ def array(
     long_name: str = "",
     frame: str = "",
     axes: Sequence[str] = (),
-    dims: str = "",
+    dims: str | None = None,
     **attrs: Any,
 ) -> dict[str, xr.Variable]:
     """An array of a solution under its name, and with it the coordinate of its axes.
@@ -64,7 +64,7 @@ def array(
         ValueError: there is no such role, or the array lacks what its row asks for.
     """
     row = roles.row(role, of)
-    names = dims.split() or roles.dims(row, of)
+    names = roles.dims(row, of) if dims is None else dims.split()
     text = long_name or row.text.format(of=of.replace("_", " "))
     about = {"role": role} | ({"of": of} if of else {}) | attrs
     made = variable(names, values, unit or row.unit, text, frame, **about)

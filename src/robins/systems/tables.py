@@ -49,7 +49,7 @@ def euler_array(values: Any, whose: str = "", frame: str = "FRD to NED") -> dict
 
 
 def place_arrays(
-    role: str, places: Iterable[Any], name: str = "{}", dims: str = ""
+    role: str, places: Iterable[Any], name: str = "{}", dims: str | None = None
 ) -> dict[str, Any]:
     """Latitude, longitude [rad] and height [m] of a track, a reference or fixes.
 
