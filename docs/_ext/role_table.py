@@ -31,9 +31,8 @@ def rows() -> Iterator[str]:
         found = re.search(r"\{\w+\}", role.variable)
         of = found[0] if found else ""
         dims = ", ".join(role.dims.replace("{of}", of).split())
-        needs = ", ".join(f"`{attr}`" for attr in role.attrs if f"`{attr}`" not in role.note)
-        told = (role.text.replace("{of}", of), role.note, needs and f"attribute {needs}")
-        text = "; ".join(filter(None, told))
+        needs = ", ".join(f"`{attr}`" for attr in role.attrs if f"`{attr}`" not in role.text)
+        text = role.text.replace("{of}", of) + (needs and f"; attribute {needs}")
         cells = (f"`{role.name}`", names(role), dims, role.unit, text, drawn(role))
         yield f"| {' | '.join(cells)} |"
 

@@ -23,9 +23,8 @@ class Role(NamedTuple):
 
     variable: str  # name of an array; in braces what it is of, as a word or as choices
     dims: str  # by place: as time any serves whose coordinate is in seconds since the start
-    text: str  # long name of an array that brings none of its own
+    text: str  # long name of an array that brings none; after a semicolon what else to know
     unit: str = ""  # likewise; empty: each must bring one
-    note: str = ""  # what a reader should know besides
     attrs: tuple[str, ...] = ()  # what an array must have besides
     named: str = ""  # the role, where the variable's name does not begin with it
 
@@ -38,6 +37,10 @@ class Role(NamedTuple):
     def _parts(self) -> tuple[str, str, str]:
         head, of, tail = _PARTS.fullmatch(self.variable).groups("")  # type: ignore[union-attr]
         return head, of, tail
+
+    def long_name(self, of: str) -> str:
+        """Long name of an array that brings none of its own."""
+        return self.text.partition(";")[0].format(of=of.replace("_", " "))
 
     def called(self, of: str) -> str:
         """Name of the array of something."""
@@ -57,81 +60,44 @@ _TA, _TAU = "time axis_{of}", "tau axis_{of}"
 
 ROLES = (
     Role("{lat_rad|lon_rad|alt_m}", _FT, "position of each filter", named="track"),
-    Role(
-        "track_{north_m|east_m}",
-        _FT,
-        "the same on a map about any origin",
-        note="made from latitude and longitude where absent",
-    ),
-    Role(
-        f"reference_{_PLACES}",
-        "time",
-        "the truth or the best known path",
-        note="north and east where the track has them",
-    ),
-    Role(f"gnss_{_PLACES}", "gnss_time", "fixes", note="north and east as for the reference"),
+    Role("track_{north_m|east_m}", _FT, "the same on a map; else made of latitude and longitude"),
+    Role(f"reference_{_PLACES}", "time", "true or best known path; on the map if the track is"),
+    Role(f"gnss_{_PLACES}", "gnss_time", "fixes; on the map if the track is"),
     Role(
         "gnss_quality",
         "gnss_time",
-        "quality of the fixes",
+        "quality of the fixes; by `flag_values` and `flag_meanings` (CF conventions), or as RTKLIB",
         "1",
-        "attributes `flag_values` and `flag_meanings` as in the CF conventions, else as RTKLIB "
-        "numbers them",
     ),
-    Role("outage", "time", "aids withheld", "1", "nonzero where they were; shaded in all figures"),
+    Role("outage", "time", "aids withheld; nonzero where they were; shaded in all figures", "1"),
     Role("estimate_{block}", _FTA, "estimated {of}"),
     Role(
         "error_{block}",
         _FTA,
-        "error of {of}",
-        note="true minus estimated, where a truth exists; attribute `comment`, a caption, where it "
-        "is an error of the vehicle",
+        "error of {of}; true minus estimated; an error of the vehicle has a caption in `comment`",
     ),
-    Role(
-        "value_{name}",
-        _FTA,
-        "{of}",
-        note="what the vehicle does beside what is estimated of it; attribute `comment`, a caption",
-    ),
-    Role("sigma_{block}", _FTA, "standard deviation of {of}", note="as the filter states it"),
-    Role("innovation_{sensor}", _ATA, "innovation of {of}", note="NaN where missing"),
-    Role("innovation_sigma_{sensor}", _ATA, "expected {of}", note="one standard deviation"),
-    Role(
-        "nis_{sensor}",
-        _AT,
-        "NIS of {of}",
-        "1",
-        "attribute `degrees_of_freedom`, or an array `nis_dof`",
-    ),
+    Role("value_{name}", _FTA, "{of}; what the vehicle does besides; caption in `comment`"),
+    Role("sigma_{block}", _FTA, "standard deviation of {of}; as the filter states it"),
+    Role("innovation_{sensor}", _ATA, "innovation of {of}; NaN where missing"),
+    Role("innovation_sigma_{sensor}", _ATA, "expected {of}; one standard deviation"),
+    Role("nis_{sensor}", _AT, "NIS of {of}; with `degrees_of_freedom`, or array `nis_dof`", "1"),
     Role("nis_dof_{sensor}", _AT, "degrees of freedom of {of}", "1"),
-    Role("refused_{sensor}", _AT, "{of} refused by a rule", "1", "nonzero where it was"),
+    Role("refused_{sensor}", _AT, "{of} refused by a rule; nonzero where it was", "1"),
     Role(
         "{nees|anees}",
         _FT,
-        "normalised estimation error squared",
+        "normalised estimation error squared; of one run, or the mean over `runs`; with "
+        "`degrees_of_freedom`, or array `consistency_dof`; `normalised=1` if divided by these",
         "1",
-        "of one run, or the mean over `runs`; attribute `degrees_of_freedom`, or an array `_dof`; "
-        "`normalised=1` if divided by these",
         named="consistency",
     ),
     Role("{nees|anees}_dof", _FT, "state dimension", "1", named="consistency_dof"),
     Role("rms_{block}", _FTA, "RMS error of {of}", attrs=("runs",)),
-    Role(
-        "mean_sigma_{block}",
-        _FTA,
-        "stated sigma of {of}",
-        note="root of the mean variance the filter states",
-    ),
-    Role("within_{limit}", _FT, "runs within {of}", "1", "share of the `runs`", ("runs",)),
-    Role(
-        "bounds",
-        "filter",
-        "states bounds, not standard deviations",
-        "1",
-        "nonzero for filters that do",
-    ),
-    Role("note_{note}", _FT, "{of}, first run", "1", "what a rule noted"),
-    Role("bound_{block}", _TA, "covariance bound of {of}", note="one standard deviation"),
+    Role("mean_sigma_{block}", _FTA, "stated sigma of {of}; root of the mean stated variance"),
+    Role("within_{limit}", _FT, "runs within {of}; share of the `runs`", "1", ("runs",)),
+    Role("bounds", "filter", "states bounds, not standard deviations; nonzero where it does", "1"),
+    Role("note_{note}", _FT, "{of}, first run; what a rule noted", "1"),
+    Role("bound_{block}", _TA, "covariance bound of {of}; one standard deviation"),
     Role("bound_prior_{block}", "axis_{of}", "prior sigma of {of}"),
     Role(
         "bound_left_{block}",
@@ -140,50 +106,43 @@ ROLES = (
         "1",
     ),
     Role("bound_unaided_{block}", _TA, "bound of {of} with no sensor"),
-    Role("bound_without_{block}", f"sensor {_TA}", "bound of {of} without", note="one sensor each"),
+    Role("bound_without_{block}", f"sensor {_TA}", "bound of {of} without; one sensor each"),
     Role("information", "state time", "information about the start [bit]", "1"),
     Role(
         "gramian",
         "direction",
-        "least eigenvalues of the observability Gramian, in units of the prior",
-        "1",
+        "least eigenvalues of the observability Gramian, in units of the prior; "
         "not seen below `nothing`",
+        "1",
         ("nothing",),
     ),
     Role("gramian_rank", "", "rank of the observability Gramian", "1"),
-    Role(
-        "allan_{sensor}",
-        _TAU,
-        "Allan deviation of the {of}",
-        note="over averaging time; attribute `confidence`, of its bounds",
-    ),
-    Role("allan_low_{sensor}", _TAU, "lower bound", note="of its confidence"),
-    Role("allan_high_{sensor}", _TAU, "upper bound", note="of its confidence"),
-    Role("allan_fit_{sensor}", _TAU, "fit", note="the fitted model"),
-    Role("allan_slope_{sensor}", f"process {_TAU}", "terms", note="parts of the model, by name"),
+    Role("allan_{sensor}", _TAU, "Allan deviation of the {of}; `confidence` is of its bounds"),
+    Role("allan_low_{sensor}", _TAU, "lower bound; of its confidence"),
+    Role("allan_high_{sensor}", _TAU, "upper bound; of its confidence"),
+    Role("allan_fit_{sensor}", _TAU, "fit; the fitted model"),
+    Role("allan_slope_{sensor}", f"process {_TAU}", "terms; parts of the model, by name"),
     Role("field_measured", "time axis_field", "magnetic field, measured", "T"),
     Role(
         "field_calibrated",
         "time axis_field",
-        "magnetic field, calibrated",
+        "magnetic field, calibrated; `strength` is the size it should have [T]",
         "T",
-        "`strength` is the size it should have [T]",
         ("strength",),
     ),
-    Role("lateness_steps", "lateness_bin", "steps that began so late", "1", "one more than edges"),
+    Role("lateness_steps", "lateness_bin", "steps that began so late; one more than edges", "1"),
     Role("lateness_edge", "lateness_edge_number", "edges of the bins", "us"),
-    Role("trade_off_h2", "design gamma", "true H2 norm", note="NaN where there is no design"),
+    Role("trade_off_h2", "design gamma", "true H2 norm; NaN where there is no design"),
     Role(
         "trade_off_hinf",
         "design gamma",
-        "true H-infinity norm",
-        note="`least` is the least norm, and `least_of`, of what designs",
+        "true H-infinity norm; `least` is the least norm of the designs `least_of`",
         attrs=("least", "least_of"),
     ),
     Role("trade_off_bound", "design gamma", "bound on the H2 norm"),
     Role("kalman_h2", "", "H2 norm of the Kalman filter"),
     Role("kalman_hinf", "", "H-infinity norm of the Kalman filter"),
-    Role("{name}", f"time {_MORE}", "{of}", note="what else is known of a run", named="context"),
+    Role("{name}", f"time {_MORE}", "{of}; what else is known of a run", named="context"),
 )
 
 

@@ -65,7 +65,7 @@ def array(
     """
     row = roles.row(role, of)
     names = roles.dims(row, of) if dims is None else dims.split()
-    text = long_name or row.text.format(of=of.replace("_", " "))
+    text = long_name or row.long_name(of)
     about = {"role": role} | ({"of": of} if of else {}) | attrs
     made = variable(names, values, unit or row.unit, text, frame, **about)
     name = row.called(of)

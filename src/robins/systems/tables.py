@@ -14,6 +14,8 @@ from robins.filters import StepWarning, Tally, doubts
 from robins.results import array, variable
 from robins.systems.system import Output, SensorAxes, StateBlock
 
+EULER = StateBlock("euler", slice(0, 3), "rad", "deg", "FRD to NED", ("roll", "pitch", "heading"))
+
 
 class Seen(NamedTuple):
     """What the filters saw of one sensor; leading axes are filter and epoch, NaN where nothing."""
@@ -32,20 +34,6 @@ def block_array(
     shown = {"display_unit": block.display_unit, "axes": block.axes}
     about = {"unit": block.units, "long_name": long_name, "frame": block.frame}
     return array(role, values, block.name, **about, **shown, **attrs)
-
-
-def euler_array(values: Any, whose: str = "", frame: str = "FRD to NED") -> dict[str, Any]:
-    """Estimated roll, pitch and heading (filter, time, 3) [rad]."""
-    return array(
-        "estimate",
-        values,
-        "euler",
-        unit="rad",
-        long_name=f"estimated roll, pitch, heading{whose}",
-        frame=frame,
-        axes=("roll", "pitch", "heading"),
-        display_unit="deg",
-    )
 
 
 def place_arrays(

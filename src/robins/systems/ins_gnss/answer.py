@@ -16,7 +16,7 @@ from robins.results import array, variable
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log
 from robins.systems.ins_gnss.setup import SENSORS, state_blocks
-from robins.systems.tables import Seen, block_array, euler_array, innovation_tables, place_arrays
+from robins.systems.tables import EULER, Seen, block_array, innovation_tables, place_arrays
 
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
@@ -107,7 +107,8 @@ def replay_solution(flight: Flight, answers: dict[str, Answer], parameters: Repl
         if block.name not in ("attitude", "position"):
             found = _stack(answers, lambda a, b=block: _estimate(a, b.name))
             data |= block_array("estimate", block, found)
-    data |= euler_array(_stack(answers, lambda a: np.stack(a.belief.mean.q_nb.as_euler(), -1)))
+    euler = _stack(answers, lambda a: np.stack(a.belief.mean.q_nb.as_euler(), -1))
+    data |= block_array("estimate", EULER, euler, "estimated roll, pitch, heading")
     data |= _fixes(flight.log)
     return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, flight.epoch_s))
 

@@ -18,7 +18,7 @@ from robins.systems.marg.model import MAGNETOMETER, MargState
 from robins.systems.marg.prepare import Prepared
 from robins.systems.marg.setup import BLOCKS, SENSORS
 from robins.systems.system import StateBlock
-from robins.systems.tables import Seen, block_array, euler_array, innovation_tables
+from robins.systems.tables import EULER, Seen, block_array, innovation_tables
 
 
 class Update(NamedTuple):
@@ -124,7 +124,8 @@ def solution(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> xr.
             found = np.stack([_estimate(a, block.name) for a in answers.values()])
             data |= block_array("estimate", block, found)
     euler = [np.stack(to_euler(jnp.asarray(a.mean.q_nb.wxyz)), axis=-1) for a in answers.values()]
-    data |= euler_array(np.stack(euler), frame="body to NED")
+    turned = EULER._replace(frame="body to NED")
+    data |= block_array("estimate", turned, np.stack(euler), "estimated roll, pitch, heading")
     if dataset.attitude is not None:
         data |= _error_tables(dataset, log, answers)
     data |= array(

@@ -19,6 +19,7 @@ from robins.systems.rocket.parameters import FieldVector, Flight, MagneticAttitu
 from robins.systems.rocket.unobserved import sentence, unobserved
 from robins.systems.rocket.world import Course, lay_out, simulate
 from robins.systems.system import Norm, Problem, SensorAxes, StateBlock
+from robins.systems.tables import block_array
 
 BODY = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
@@ -97,15 +98,8 @@ def _problem(given: Flight, course: Course, seed: int, **own: Any) -> Problem:
 def _context(course: Course) -> xr.Dataset:
     """The path and the field, for figures."""
     height = array("context", course.alt_m, "height", unit="m", display_unit="km")
-    field = array(
-        "context",
-        course.field_n,
-        "field_n",
-        unit="T",
-        long_name="geomagnetic field",
-        frame="launch NED",
-        axes=("north", "east", "down"),
-        dims="time axis_field_n",
-        display_unit="uT",
-    )
+    axes = ("north", "east", "down")
+    block = StateBlock("field_n", slice(0, 3), "T", "uT", "launch NED", axes)
+    about = {"long_name": "geomagnetic field", "dims": "time axis_field_n"}
+    field = block_array("context", block, course.field_n, **about)
     return xr.Dataset(height | field)

@@ -14,7 +14,7 @@ from robins.filters import Belief, Code, StepInfo, Tally
 from robins.filters.consistency import grand_mean_nis
 from robins.results import array, variable
 from robins.systems.system import SensorAxes, StateBlock
-from robins.systems.tables import Seen, block_array, euler_array, innovation_tables, place_arrays
+from robins.systems.tables import EULER, Seen, block_array, innovation_tables, place_arrays
 from robins.systems.transfer_alignment.product import ATTITUDE, POSITION, VELOCITY
 
 _NED, _FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -151,7 +151,7 @@ def solution_of(recorded: Recorded, answers: Mapping[str, Answer]) -> xr.Dataset
                 values = np.stack([blank if row is None else row for row in rows])
                 data |= block_array(role, block, values)
     euler = stack(lambda a: np.stack(a.belief.mean.ins.q_nb.as_euler(), -1))
-    data |= euler_array(euler, " of the slave")
+    data |= block_array("estimate", EULER, euler, "estimated roll, pitch, heading of the slave")
     data |= array("bounds", np.array([a.bounds for a in answers.values()], dtype=np.int8))
     path = (master.lat_rad, master.lon_rad, master.alt_m)
     data |= place_arrays("reference", path, "{} of the master", dims=mt)
