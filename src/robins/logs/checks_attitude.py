@@ -15,7 +15,7 @@ from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding
 from robins.logs.motion import signed_permutations
 from robins.logs.ordering import increasing
-from robins.logs.quiet import Signal, finding, signal_of, windows_of
+from robins.logs.quiet import Signal, error, signal_of, warning, windows_of
 from robins.logs.steps import Steps, steps_of
 from robins.logs.unit_length import TOLERANCE
 
@@ -34,9 +34,8 @@ def check_attitude(imu: ImuTable, attitude: AttitudeTable) -> Iterator[Finding]:
     """Findings about attitudes beside an IMU that is sound; see the module."""
     known = np.abs(np.linalg.norm(attitude.q_nb, axis=1) - 1.0) < TOLERANCE
     if not known.any():
-        yield finding(
+        yield warning(
             attitude,
-            "warning",
             "attitude_missing",
             len(attitude),
             "there is not one attitude in it, so nothing can be compared.",
@@ -67,9 +66,8 @@ def _turning(
     for words, (order, sign) in _ORDERS.items():
         other = q[:, order] * [1.0, sign, sign, sign]
         if (left := _left_over(steps, time_s, other)[0]) < good:
-            yield finding(
+            yield error(
                 attitude,
-                "error",
                 "attitude_order",
                 float(as_is),
                 f"{shown}, but they do ({left:.0%}) if the quaternions are {words}.",
@@ -80,18 +78,16 @@ def _turning(
     left = _left_over(steps, time_s, q, maps)
     k = int(np.argmin(left))
     if left[k] < good:
-        yield finding(
+        yield error(
             attitude,
-            "error",
             "attitude_axes",
             float(as_is),
             f"{shown}, but they do ({left[k]:.0%}) with the gyros {words_of(maps[k], 'gyro')}. "
             "They are those of a body with other axes than the sensor's; turn one into the other.",
         )
         return
-    yield finding(
+    yield warning(
         attitude,
-        "warning",
         "attitude_disagrees",
         float(as_is),
         f"{shown}, whatever order, sense or axes are tried. They are of another body or another "
@@ -132,9 +128,8 @@ def _upright(
         if up < -_UPRIGHT
         else "The frame they refer to does not stand upright, or is of another body"
     )
-    yield finding(
+    yield error(
         attitude,
-        "error",
         "attitude_frame",
         float(up),
         f"at rest the specific force points along ({x:+.2f}, {y:+.2f}, {z:+.2f}) by these "

@@ -8,7 +8,7 @@ import numpy as np
 
 from robins.dataset import ImuTable
 from robins.logs.findings import Finding
-from robins.logs.quiet import finding, usual_step_s
+from robins.logs.quiet import error, usual_step_s, warning
 
 _STUCK_S = 2.0
 _STUCK_SAMPLES = 100
@@ -34,9 +34,8 @@ def check_columns(imu: ImuTable) -> Iterator[Finding]:
             if np.count_nonzero(good) < 10:
                 continue
             if np.ptp(column[good]) == 0.0:
-                yield finding(
+                yield error(
                     imu,
-                    "error",
                     "axis_stuck",
                     float(column[good][0]),
                     f"{name} is {column[good][0]:g} in every sample. A real sensor always has "
@@ -52,17 +51,15 @@ def _missing(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> 
     first = int(np.argmin(good))
     bad = int(np.count_nonzero(~good))
     if bad == len(imu):
-        return finding(
+        return error(
             imu,
-            "error",
             "column_missing",
             bad,
             f"{name} is {column[0]} in every sample. The sensor was not recorded, or the columns "
             "are in another order; without it there is no inertial navigation.",
         )
-    return finding(
+    return warning(
         imu,
-        "warning",
         "not_finite",
         bad,
         f"{name} is {column[first]} here, and not a number in {bad} samples in all. The sensor or "
@@ -84,9 +81,8 @@ def longest_run(same: np.ndarray) -> tuple[int, int]:
 def _stuck(imu: ImuTable, name: str, column: np.ndarray, step_s: float) -> Iterator[Finding]:
     start, length = longest_run(np.diff(column) == 0.0)
     if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
-        yield finding(
+        yield warning(
             imu,
-            "warning",
             "axis_stuck_for_a_while",
             length,
             f"{name} stays at {column[start]:g} for {length + 1} samples ({length * step_s:.1f} s) "
@@ -115,9 +111,8 @@ def _saturated(
         unit = "rad/s" if sensor == "gyro" else "m/s^2"
         usual = abs(abs(extreme) / near - 1.0) < 0.03
         range_ = f", a usual full scale ({near:.4g} {unit})" if usual else ""
-        yield finding(
+        yield warning(
             imu,
-            "warning",
             "saturated",
             extreme,
             f"{name} stops at {extreme:.6g}{range_} in {total} samples, {length} in a row here. "
@@ -134,9 +129,8 @@ def _coarse(imu: ImuTable, name: str, column: np.ndarray, good: np.ndarray) -> I
     distinct = np.unique(values)
     if len(distinct) <= _COARSE:
         step = float(np.median(np.diff(distinct)))
-        yield finding(
+        yield warning(
             imu,
-            "warning",
             "coarse",
             step,
             f"{name} takes only {len(distinct)} different values, {step:.3g} apart. The recording "

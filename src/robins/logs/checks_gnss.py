@@ -9,7 +9,7 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding
 from robins.logs.limits import ALT_LIMIT_M, LAT_LIMIT, LON_LIMIT, SPEED_LIMIT
-from robins.logs.quiet import finding, median_of
+from robins.logs.quiet import error, finding, median_of, note, warning
 
 _AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
 
@@ -44,8 +44,8 @@ def _missing(gnss: GnssTable) -> Iterator[Finding]:
             # Phones know speed and bearing, but no vertical velocity, and need none.
             never = name.startswith("velocity") and bool(np.isnan(column).all())
             yield finding(
-                gnss,
                 "note" if never else "error" if bad.all() else "warning",
+                gnss,
                 "gnss_missing",
                 int(bad.sum()),
                 f"{name} is {column[k]:g} here, missing or impossible in {bad.sum()} of "
@@ -70,9 +70,8 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
             cause = "They are degrees where radians are needed; convert them (numpy.deg2rad)"
         else:
             cause = "The columns are not latitude and longitude, or scaled (1e-7 deg?); check them"
-        yield finding(
+        yield error(
             gnss,
-            "error",
             "position_unit",
             float(lat_deg),
             f"latitude {lat_deg:.6g} deg, longitude {lon_deg:.6g} deg is no place on Earth "
@@ -82,9 +81,8 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
         return
     zero = known & (lat == 0.0) & (lon == 0.0)
     if zero.any():
-        yield finding(
+        yield error(
             gnss,
-            "error",
             "no_fix_as_zero",
             int(zero.sum()),
             f"latitude and longitude are both exactly 0 in {zero.sum()} of {len(gnss)} fixes. The "
@@ -94,9 +92,8 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
     elif np.all(np.abs(np.rad2deg(lat[known])) <= np.pi / 2) and np.all(
         np.abs(np.rad2deg(lon[known])) <= np.pi
     ):
-        yield finding(
+        yield warning(
             gnss,
-            "warning",
             "position_in_radians",
             float(np.rad2deg(lat[known][0])),
             f"all places lie within latitude {np.rad2deg(lat[known][0]):.5f} deg, longitude "
@@ -110,8 +107,8 @@ def _height(gnss: GnssTable) -> Iterator[Finding]:
     if alt < -500.0 or alt > 12_000.0:
         hidden = alt < -12_000.0 or alt > 2_000_000.0
         yield finding(
-            gnss,
             "error" if hidden else "warning",
+            gnss,
             "height",
             alt,
             f"the median height is {alt:.6g} m, where nobody drives, sails or flies by air. The "
@@ -130,9 +127,8 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
         if bad.any():
             k = int(np.argmax(bad))
             shown = ", ".join(f"{s:g}" for s in sigma[k])
-            yield finding(
+            yield error(
                 gnss,
-                "error",
                 "sigma_not_positive",
                 int(bad.sum()),
                 f"the {what} sigmas are ({shown}) {unit} here, and not all positive in {bad.sum()} "
@@ -141,9 +137,8 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
                 k,
             )
         if np.isfinite(values).any() and np.isnan(sigma).all():
-            yield finding(
+            yield error(
                 gnss,
-                "error",
                 "sigma_missing",
                 len(gnss),
                 f"the {what} has no sigma in any fix. A filter cannot weigh it; write real sigmas "
@@ -151,9 +146,8 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
             )
         typical = median_of(sigma[sigma > 0.0])
         if typical < 1e-3 or typical > 1e3:
-            yield finding(
+            yield warning(
                 gnss,
-                "warning",
                 "sigma_absurd",
                 typical,
                 f"the {what} sigmas are {typical:.3g} {unit} (median), which no receiver has. "
@@ -174,9 +168,8 @@ def _quality(gnss: GnssTable) -> Iterator[Finding]:
     if 0.0 < unsure < 1.5 * sure:
         ratio = unsure / sure
         share = "the sigma" if abs(ratio - 1.0) < 0.05 else f"{ratio:.2g} times the sigma"
-        yield finding(
+        yield warning(
             gnss,
-            "warning",
             "float_sigma",
             ratio,
             f"{other.sum()} of {len(gnss)} fixes are float or worse (Q > 1), the first of them "
@@ -194,9 +187,8 @@ def _resolution(gnss: GnssTable) -> Iterator[Finding]:
     step_m = float(np.min(np.diff(lat_deg))) * 111_000.0
     sigma = median_of(gnss.sigma_m[:, 0])
     if step_m > sigma > 0.0:
-        yield finding(
+        yield note(
             gnss,
-            "note",
             "position_resolution",
             step_m,
             f"latitude is written in steps of {step_m * 1e3:.1f} mm, its sigma is "

@@ -9,7 +9,7 @@ import numpy as np
 
 from robins.dataset import ImuTable
 from robins.logs.findings import Finding
-from robins.logs.quiet import Signal, Windows, finding, signal_of, windows_of
+from robins.logs.quiet import Signal, Windows, error, finding, note, signal_of, warning, windows_of
 
 G = 9.80665
 EARTH_RATE = 7.292115e-5  # rad/s
@@ -36,9 +36,8 @@ def check_imu(imu: ImuTable, in_vehicle: bool = True) -> Iterator[Finding]:
     """
     signal = signal_of(imu)
     if signal is None:
-        yield finding(
+        yield error(
             imu,
-            "error",
             "no_samples",
             len(imu),
             "fewer than ten samples have all six numbers; units and axes cannot be judged.",
@@ -60,9 +59,8 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
     if _GRAVITY[0] <= measured <= _GRAVITY[1]:
         return
     if abs(measured / G - 1.0) < _BIASED:
-        yield finding(
+        yield note(
             imu,
-            "note",
             "gravity_bias",
             measured,
             f"{where} the specific force is {measured:.3f} m/s^2, gravity is 9.76 to 9.83. The "
@@ -76,18 +74,16 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
     causes = [*_increments_for_rates(imu, signal.step_s, measured), *causes]
     shown = f"{where} the specific force is {measured:.4g} m/s^2 where gravity is 9.8"
     if causes:
-        yield finding(
+        yield error(
             imu,
-            "error",
             causes[0][0],
             measured,
             f"{shown}. {' Or '.join(f'{cause}.' for _, cause in causes)}",
             row,
         )
     elif measured < 0.5:
-        yield finding(
+        yield error(
             imu,
-            "error",
             "gravity_missing",
             measured,
             f"{shown}. Gravity was taken off: these are 'linear accelerations' of a phone or of "
@@ -95,9 +91,8 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
             row,
         )
     elif windows.at_rest.any():
-        yield finding(
+        yield error(
             imu,
-            "error",
             "gravity_unknown",
             measured,
             f"{shown}, and no usual unit makes it that. A scale factor is missing (counts of the "
@@ -105,9 +100,8 @@ def _gravity(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Findin
             row,
         )
     else:
-        yield finding(
+        yield warning(
             imu,
-            "warning",
             "gravity_not_seen",
             measured,
             f"{shown}, and the log has no second at rest. Unless the vehicle really accelerated "
@@ -174,9 +168,8 @@ def _direction(windows: Windows) -> np.ndarray:
 def _free(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
     x, y, z = _direction(windows)
     if (z if imu.body == "FRD" else -z) > -0.7:
-        yield finding(
+        yield note(
             imu,
-            "note",
             "sensor_axes",
             float(z),
             f"at rest the specific force lies along ({x:+.2f}, {y:+.2f}, {z:+.2f}) of x, y, z. The "
@@ -192,9 +185,8 @@ def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
     axes = "forward-right-down" if imu.body == "FRD" else "right-forward-up"
     sign = "-" if imu.body == "FRD" else "+"
     if down > 0.7:
-        yield finding(
+        yield error(
             imu,
-            "error",
             "z_axis_reversed",
             float(direction[2]),
             f"gravity shows as {direction[2] * 9.8:+.1f} m/s^2 on accel_z, in {axes} axes a level "
@@ -204,9 +196,8 @@ def _up(imu: ImuTable, windows: Windows) -> Iterator[Finding]:
         )
     elif down > -0.7:
         k = int(np.argmax(np.abs(direction)))
-        yield finding(
+        yield warning(
             imu,
-            "warning",
             "not_level",
             float(direction[k]),
             f"gravity lies along ({direction[0]:+.2f}, {direction[1]:+.2f}, {direction[2]:+.2f}) "
@@ -225,8 +216,8 @@ def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]
     size = float(np.linalg.norm(mean))
     if len(rest) >= 30 and (unit := _earth_rate_in(rest, size)):
         yield finding(
-            imu,
             "error" if size > _REST_RATE else "warning",
+            imu,
             "gyro_unit",
             size,
             f"at rest the mean rate is {size:.4g} rad/s, just the Earth's 15.04 deg/h in {unit}. "
@@ -243,9 +234,8 @@ def _rates(imu: ImuTable, signal: Signal, windows: Windows) -> Iterator[Finding]
         )
         # More than 4500 deg/s is beyond the range of gyros as well, so then it is deg/h.
         unit, mend = ("deg/s", "pi/180") if most < 4500.0 else ("deg/h", "pi/180/3600")
-        yield finding(
+        yield error(
             imu,
-            "error",
             "gyro_unit",
             most,
             f"{shown}, too much for the gyro of a vehicle. The columns are probably in {unit}: "

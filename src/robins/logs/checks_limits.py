@@ -19,7 +19,7 @@ from robins.logs.limits import (
     SPEED_LIMIT,
     few_beyond,
 )
-from robins.logs.quiet import finding
+from robins.logs.quiet import warning
 from robins.logs.tables import Table
 
 _PLACE = {"lat_rad": LAT_LIMIT, "lon_rad": LON_LIMIT}
@@ -49,9 +49,8 @@ def check_limits(table: Table) -> Iterator[Finding]:
         if rows.any():
             k = int(np.argmax(rows))
             worst = float(np.ravel(values[k])[np.nanargmax(np.abs(values[k]))])
-            yield finding(
+            yield warning(
                 table,
-                "warning",
                 "absurd",
                 int(rows.sum()),
                 f"{name} is {worst:g} here, which no vehicle has; {rows.sum()} of {len(table)} "

@@ -14,7 +14,7 @@ from robins.dataset import MagTable
 from robins.logs.checks_columns import longest_run
 from robins.logs.findings import Finding, Severity
 from robins.logs.limits import FIELD_LIMIT_T, few_beyond
-from robins.logs.quiet import finding, usual_step_s
+from robins.logs.quiet import error, finding, note, usual_step_s, warning
 
 EARTH_T = (20e-6, 70e-6)
 _FEW = 10  # samples below which nothing is judged
@@ -79,9 +79,8 @@ def _missing(mag: MagTable, good: np.ndarray) -> Finding:
     first, bad = int(np.argmin(good)), int(np.count_nonzero(~good))
     lacking = [a for a, c in zip("xyz", mag.field_t.T, strict=True) if not np.isfinite(c).any()]
     whole = f"; of {', '.join(f'field_{a}' for a in lacking)} there is nothing at all"
-    return finding(
+    return warning(
         mag,
-        "warning",
         "field_missing",
         bad,
         f"{bad} of {len(mag)} samples ({bad / len(mag):.1%}) of the magnetic field are not numbers"
@@ -95,8 +94,8 @@ def _zero(mag: MagTable, zero: np.ndarray) -> Finding:
     count = int(np.count_nonzero(zero))
     everywhere = count == len(mag)
     return finding(
-        mag,
         "error" if everywhere else "warning",
+        mag,
         "field_zero",
         count,
         f"the magnetic field is exactly 0 0 0 in {count} of {len(mag)} samples"
@@ -108,9 +107,8 @@ def _zero(mag: MagTable, zero: np.ndarray) -> Finding:
 
 def _dead(mag: MagTable, axes: list[str], field: np.ndarray) -> Finding:
     value = float(field["xyz".index(axes[0])])
-    return finding(
+    return error(
         mag,
-        "error",
         "field_stuck",
         value,
         f"field_{', field_'.join(axes)} never changes ({value * 1e6:.4g} uT in every sample). A "
@@ -122,13 +120,12 @@ def _unit(mag: MagTable, size: float) -> Iterator[Finding]:
     shown = f"the magnetic field is {size * 1e6:.4g} uT strong where the Earth's is 20 to 70"
     for shift, (severity, cause, mend) in _SHIFTS.items():
         if EARTH_T[0] <= size / 10.0**shift <= EARTH_T[1]:
-            yield finding(mag, severity, "field_unit", size, f"{shown}. {cause}: {mend}.")
+            yield finding(severity, mag, "field_unit", size, f"{shown}. {cause}: {mend}.")
             return
     # Iron in the casing of a cheap sensor is often stronger than the Earth's field.
     if not EARTH_T[0] / 2 <= size <= 10 * EARTH_T[1]:
-        yield finding(
+        yield error(
             mag,
-            "error",
             "field_unit",
             size,
             f"{shown}, and no usual unit makes it that. These are counts of a converter, or other "
@@ -140,9 +137,8 @@ def _stuck(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Findi
     start, length = longest_run(~fresh)
     step_s = usual_step_s(mag.time_ns)
     if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
-        yield finding(
+        yield warning(
             mag,
-            "warning",
             "field_stuck_for_a_while",
             length,
             f"the magnetic field does not change at all for {length + 1} samples "
@@ -156,9 +152,8 @@ def _repeated(mag: MagTable, fresh: np.ndarray) -> Iterator[Finding]:
     share = 1.0 - float(fresh.mean())
     if share > _REPEATED and fresh.sum() > _FEW:
         rate = 1.0 / usual_step_s(mag.time_ns)
-        yield finding(
+        yield note(
             mag,
-            "note",
             "field_repeated",
             share,
             f"{share:.0%} of the samples of the magnetic field repeat the one before: the sensor "
@@ -177,9 +172,8 @@ def _stopped(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Fin
             if abs(extreme) < _STOP_T or length < _STOPPED:
                 continue
             total = int(np.count_nonzero(column == extreme))
-            yield finding(
+            yield warning(
                 mag,
-                "warning",
                 "field_saturated",
                 extreme,
                 f"field_{axis} stops at {extreme * 1e6:.6g} uT in {total} readings, {length} in a "
@@ -203,9 +197,8 @@ def _iron(
         steadied = left.std() / left.mean() < 0.5 * size.std() / size.mean()
         if steadied and np.linalg.norm(centre) > 0.1:
             offset = ", ".join(f"{c:+.1f}" for c in centre * usual * 1e6)
-            yield finding(
+            yield warning(
                 mag,
-                "warning",
                 "field_offset",
                 float(np.linalg.norm(centre)) * usual,
                 f"the size of the magnetic field changes while the sensor turns, {shown}, and it "
@@ -215,9 +208,8 @@ def _iron(
             )
             return
     if (high - low) / usual > _SPREAD:
-        yield finding(
+        yield warning(
             mag,
-            "warning",
             "field_varies",
             float((high - low) / usual),
             f"the size of the magnetic field changes {shown}. That is hard or soft iron that turns "
@@ -225,9 +217,8 @@ def _iron(
             "magnets, against which only a filter helps that refuses such samples.",
         )
     elif off.any():
-        yield finding(
+        yield note(
             mag,
-            "note",
             "field_disturbed",
             float(off.mean()),
             f"the magnetic field is {_FAR:.0%} weaker or stronger than usual in "

@@ -19,7 +19,7 @@ from robins.logs.findings import Finding
 from robins.logs.limits import FIELD_LIMIT_T, few_beyond
 from robins.logs.motion import at, signed_permutations
 from robins.logs.ordering import increasing
-from robins.logs.quiet import finding, signal_of
+from robins.logs.quiet import error, signal_of
 from robins.logs.steps import steps_of
 
 _WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change left unexplained
@@ -41,9 +41,8 @@ def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
     k = int(np.argmin(left))
     if left[0] < _WRONG or left[k] > min(_RIGHT, _BETTER * left[0]):
         return
-    yield finding(
+    yield error(
         mag,
-        "error",
         "field_axes",
         float(left[0]),
         f"the magnetic field does not turn as the gyros say ({left[0]:.0%} of its change is left "

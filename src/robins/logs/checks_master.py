@@ -29,7 +29,7 @@ from robins.logs.pair_motion import (
     turned,
     turned_by_gyros,
 )
-from robins.logs.quiet import finding, name_of, usual_step_s
+from robins.logs.quiet import error, finding, name_of, note, usual_step_s
 
 _LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; below it noise of the attitudes is all there is
 _WELL, _BETTER = 0.3, 0.1  # shares of the turning left unexplained
@@ -44,14 +44,6 @@ _CONVENTIONS = {
     "pitch": ((1, -1, 1), "positive with the nose down: turn its sign"),
     "roll": ((1, 1, -1), "positive with the right wing up: turn its sign"),
 }
-# What an IMU alone is judged by, at rest or nearly so; a master tells more, in any motion.
-BY_REST = frozenset(
-    (
-        *("gravity_unit", "gravity_unknown", "gravity_bias", "gravity_not_seen"),
-        *("gravity_missing", "z_axis_reversed", "not_level"),
-        *("rates_as_increments", "increments_as_rates"),
-    )
-)
 
 
 def check_master(imu: ImuTable, master: Trajectory, delay_s: float = 0.0) -> Iterator[Finding]:
@@ -111,8 +103,8 @@ def _missing(master: Trajectory) -> Iterator[Finding]:
         if bad.any():
             k = int(np.argmax(bad))
             yield finding(
-                master,
                 "error" if bad.all() else "warning",
+                master,
                 "master_missing",
                 int(bad.sum()),
                 f"the {name} is not whole here, nor in {bad.sum()} of {len(master)} records. The "
@@ -128,9 +120,8 @@ def _turning(
     of_master = of_master - of_master.mean(axis=0)
     length = 1.0 if shared is None else float(np.median(shared.length_s))
     if shared is None or np.sqrt(np.mean(np.sum(of_master**2, axis=1))) < _LEAST_RATE * length:
-        yield finding(
+        yield note(
             imu,
-            "note",
             "turning_not_checked",
             0,
             f"gyro unit, axes and time offset could not be checked against {name_of(master)}: the "
@@ -150,9 +141,8 @@ def _turning(
     if found is not None:
         yield found
     elif as_is.share > _WELL:
-        yield finding(
+        yield error(
             imu,
-            "error",
             "turning_disagrees",
             as_is.share,
             f"{shown}), whatever unit, axis or shift of a second is tried. The files are of "
@@ -187,9 +177,8 @@ def _other_attitudes(
     words = min(fits, key=lambda w: fits[w].share)
     if not fits[words].share < min(_BETTER, _HALVED * as_is.share):
         return None
-    return finding(
+    return error(
         master,
-        "error",
         "attitude_sign",
         fits[words].share,
         f"its attitudes turn as the gyros of {name_of(imu)} do only {words}: that leaves "
@@ -215,9 +204,7 @@ def _other_gyros(imu: ImuTable, shared: Shared, as_is: Turning, shown: str) -> F
         scale = float(tried[k][0, 0])
         unit, mend = SCALES.get(scale, ("of the attitudes in another unit", "check both files"))
         cause = f"They are probably {unit}: {mend}"
-    return finding(
-        imu, "error", code, float(left[k]), f"{shown}, with other gyros {left[k]:.0%}). {cause}."
-    )
+    return error(imu, code, float(left[k]), f"{shown}, with other gyros {left[k]:.0%}). {cause}.")
 
 
 def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Finding:
@@ -229,8 +216,8 @@ def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Fi
         else f"Add {-total_s:.3f} s to their stamps, and state no delay"
     )
     return finding(
-        master,
         "error" if abs(fit.late_s) > _TOO_LATE_S else "warning",
+        master,
         "master_late",
         fit.late_s,
         f"its attitudes are {1e3 * abs(fit.late_s):.0f} ms (one sigma {1e3 * fit.sigma_s:.1f} ms) "
@@ -247,9 +234,8 @@ def _velocity_sign(imu: ImuTable, master: Trajectory, shared: Shared) -> Iterato
     for k, (name, other) in enumerate((("north", "south"), ("east", "west"), ("down", "up"))):
         left = fit_velocity(shared.v_n * np.where(np.arange(3) == k, -1.0, 1.0), shared)
         if left is not None and left[k] < _THIRD * as_is[k]:
-            yield finding(
+            yield error(
                 master,
-                "error",
                 "velocity_sign",
                 name,
                 f"its velocity {name} changes against what the accelerometers of {name_of(imu)} "
@@ -262,9 +248,8 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
     """Accelerometers against what the master's velocities and attitudes ask for."""
     forces = None if shared is None else forces_of(shared)
     if forces is None:
-        yield finding(
+        yield note(
             imu,
-            "note",
             "force_not_checked",
             0,
             f"the accelerometers could not be checked against {name_of(master)}: too few seconds "
@@ -303,9 +288,8 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
         code = "accel_axes"
         fit = words_of(maps[k], "accel")
         cause = f"They fit as {fit}: correct the nominal mounting or the axes"
-    yield finding(
+    yield error(
         imu,
-        "error",
         code,
         float(left[k]),
         f"the accelerometers do not feel what the velocities and attitudes of {name_of(master)} "

@@ -19,7 +19,7 @@ from robins.logs.motion import (
     unexplained,
     unexplained_but_for_biases,
 )
-from robins.logs.quiet import Signal, finding, name_of, signal_of, windows_of
+from robins.logs.quiet import Signal, error, finding, name_of, note, signal_of, warning, windows_of
 
 _WELL = 0.05  # share left unexplained by data about which there is no question
 _GOOD = 0.5  # most that data which fit may leave
@@ -40,9 +40,8 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         return
     pair = _pair(imu, gnss, signal, track)
     if pair is None:
-        yield finding(
+        yield note(
             imu,
-            "note",
             "motion_not_checked",
             0,
             "gyro unit, axes and time offset could not be checked against GNSS: there are no "
@@ -90,8 +89,8 @@ def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Findin
     lag = float(np.median(clear))
     if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())):
         yield finding(
-            gnss,
             "error" if abs(lag) > 1.0 else "warning",
+            gnss,
             "time_offset",
             lag,
             f"the motion fits {name_of(imu)} best if {lag:+.2f} s is added to the stamps of this "
@@ -109,9 +108,8 @@ def _forward(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
     angle = float(np.rad2deg(np.angle(mean)))
     off = (angle - forward + 180.0) % 360.0 - 180.0
     if np.abs(mean) > 0.85 and abs(off) > 30.0:
-        yield finding(
+        yield warning(
             imu,
-            "warning",
             "forward_axis",
             off,
             f"by the velocities of {name_of(gnss)} the vehicle travels {angle:+.0f} deg from x "
@@ -139,9 +137,8 @@ def _diagnosis(
     if left[best] > min(_GOOD, _BETTER * as_is):
         if as_is < _GOOD:
             return None
-        return finding(
+        return warning(
             imu,
-            "warning",
             "motion_disagrees",
             as_is,
             f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(as_is)} of their "
@@ -191,9 +188,8 @@ def _late(imu: ImuTable, gnss: GnssTable, lags: np.ndarray, fit: Fit, share: str
         if leap
         else "The clocks were never set together"
     )
-    return finding(
+    return error(
         gnss,
-        "error",
         "leap_seconds" if leap else "time_offset",
         lag,
         f"the motion fits {name_of(imu)} only if {lag:+.2f} s is added to the stamps of this file "
@@ -208,9 +204,8 @@ def _unit(imu: ImuTable, scale: float, step_s: float, share: str) -> Finding:
         unit, mend = "rates where increments are expected", f"multiply by {step_s:g} s"
     else:
         unit, mend = "increments where rates are expected", f"divide by {step_s:g} s"
-    return finding(
+    return error(
         imu,
-        "error",
         "gyro_unit",
         scale,
         f"turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
@@ -222,9 +217,8 @@ def _axes(imu: ImuTable, fit: Fit, share: str) -> Finding:
     left = _mean(fit)
     mirrored, k = np.unravel_index(int(np.nanargmin(left)), left.shape)
     code, cause = _meaning(signed_permutations()[k], bool(mirrored))
-    return finding(
+    return error(
         imu,
-        "error",
         code,
         _least(left),
         "gyros and accelerometers together do not explain the GNSS velocities, with other axes "

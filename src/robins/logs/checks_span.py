@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from robins.dataset import ImuTable
 from robins.logs.findings import Finding
-from robins.logs.quiet import finding, name_of
+from robins.logs.quiet import error, name_of, warning
 from robins.logs.tables import Table
 from robins.logs.timebase import GPS_EPOCH_S, WEEK_S
 
 _LEAP = 18.0
 
 
-def check_span(imu: ImuTable, other: Table) -> Iterator[Finding]:
-    """Findings about how another table's time lies against the IMU's."""
+def check_span(imu: ImuTable, others: Sequence[Table]) -> Iterator[Finding]:
+    """Findings about how the times of other tables lie against the IMU's."""
+    for other in others:
+        yield from _span_of(imu, other)
+
+
+def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
     if not len(imu) or not len(other):
         return
     (a, b), (c, d) = _span(imu), _span(other)
     overlap = min(b, d) - max(a, c)
     if overlap <= 0:
         cause = _offset(a, b, c, d)
-        yield finding(
+        yield error(
             other,
-            "error",
             "no_overlap",
             c - a,
             f"covers {c:.3f} to {d:.3f} s, {name_of(imu)} covers {a:.3f} to {b:.3f} s: no common "
@@ -33,9 +37,8 @@ def check_span(imu: ImuTable, other: Table) -> Iterator[Finding]:
         )
         return
     if abs(abs(c - a) - _LEAP) < 1.0 and abs(abs(d - b) - _LEAP) < 1.0 and (c - a) * (d - b) > 0:
-        yield finding(
+        yield warning(
             other,
-            "warning",
             "leap_seconds",
             c - a,
             f"begins {c - a:+.3f} s and ends {d - b:+.3f} s against {name_of(imu)}. Both were "
@@ -43,9 +46,8 @@ def check_span(imu: ImuTable, other: Table) -> Iterator[Finding]:
             "is 18 s ahead since 2017; shift one of them.",
         )
     if overlap < 0.5 * (d - c):
-        yield finding(
+        yield warning(
             other,
-            "warning",
             "little_overlap",
             overlap,
             f"only {overlap:.1f} s of {d - c:.1f} s are covered by {name_of(imu)} "

@@ -9,7 +9,7 @@ import numpy as np
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs.findings import Finding
 from robins.logs.ordering import increasing
-from robins.logs.quiet import finding, place, usual_step_s
+from robins.logs.quiet import error, finding, place, usual_step_s, warning
 from robins.logs.tables import Table
 
 # Steps a clock makes, in seconds, and what makes them.
@@ -44,11 +44,11 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
         unit_known: the format says in which unit its stamps are, so slow ones are just that.
     """
     if len(table) < 2:
-        yield finding(table, "error", "too_short", len(table), _SHORT.format(n=len(table)))
+        yield error(table, "too_short", len(table), _SHORT.format(n=len(table)))
         return
     usual = usual_step_s(table.time_ns)
     if not np.isfinite(usual):
-        yield finding(table, "error", "time_stands", 0.0, _STANDS)
+        yield error(table, "time_stands", 0.0, _STANDS)
         return
     yield from _slow(table, usual) if unit_known else _unit(table, usual)
     keep = increasing(table.time_ns)
@@ -65,9 +65,8 @@ _STANDS = "time never goes forward. The time column is constant or another one; 
 def _slow(table: Table, usual: float) -> Iterator[Finding]:
     """Stamps whose unit is beyond doubt: inertial samples too far apart to navigate by."""
     if isinstance(table, ImuTable) and usual > _SLOWEST_IMU_S:
-        yield finding(
+        yield warning(
             table,
-            "warning",
             "time_slow",
             usual,
             f"inertial samples are {usual:.4g} s apart. The log was thinned out or its logger is "
@@ -88,9 +87,8 @@ def _unit(table: Table, usual: float) -> Iterator[Finding]:
     slowest, fastest = _limits_s(table)
     for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if usual > slowest and fastest < usual * factor < slowest:
-            yield finding(
+            yield error(
                 table,
-                "error",
                 "time_unit",
                 usual,
                 f"samples are {usual:g} s apart, one every {usual * factor:g} s if the time column "
@@ -98,9 +96,8 @@ def _unit(table: Table, usual: float) -> Iterator[Finding]:
             )
             return
     if usual > slowest or usual < fastest:
-        yield finding(
+        yield error(
             table,
-            "error",
             "time_unit",
             usual,
             f"samples are {usual:g} s apart, which no such sensor does. The time column is in "
@@ -117,9 +114,8 @@ def _duplicates(table: Table) -> Iterator[Finding]:
             if share > 0.05
             else "A line was written twice, or time is rounded too coarsely"
         )
-        yield finding(
+        yield warning(
             table,
-            "warning",
             "time_duplicate",
             len(again),
             f"{len(again)} samples ({share:.1%}) repeat the time of the sample before, this one "
@@ -139,9 +135,8 @@ def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
             continue
         size = float(-step[k]) + usual
         cause = _named(size, usual, _WRAPS | _STEPS) or "The clock was set, or the logger restarted"
-        yield finding(
+        yield error(
             table,
-            "error",
             "clock_set_back",
             float(step[k]),
             f"time goes back by {-step[k]:.6g} s and goes on from there. {cause}. `clean` refuses "
@@ -151,9 +146,8 @@ def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         )
     if slips:
         sizes = -step[slips]
-        yield finding(
+        yield warning(
             table,
-            "warning",
             "time_backward",
             len(slips),
             f"time goes back by {sizes.max():.6g} s for a sample or so ({len(slips)} such places, "
@@ -192,8 +186,8 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
     for k in jumps:
         size = step[k] - usual
         yield finding(
-            table,
             "error" if size > 1.5 else "warning",
+            table,
             "time_jump",
             size,
             f"time jumps ahead by {size:.6g} s. {_jump(size, usual)}, unless exactly that much was "
@@ -212,8 +206,8 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         "and after about a second its heading and position are no longer worth much"
     )
     yield finding(
-        table,
         "note" if harmless or total < 0.05 else "warning",
+        table,
         "gap_long" if step[worst] >= 1.0 else "gap_short",
         float(step[worst]),
         f"no sample for {step[worst]:.6g} s before this one, where {usual:.6g} s is usual "
@@ -236,8 +230,8 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
     if scatter > 0.1:
         low, high = np.percentile(step, [0.5, 99.5])
         yield finding(
-            table,
             "warning" if scatter > 0.5 else "note",
+            table,
             "time_jitter",
             scatter,
             f"steps of time scatter from {low * 1e3:.3g} to {high * 1e3:.3g} ms (mean "

@@ -14,7 +14,7 @@ from robins.dataset import ImuTable
 from robins.logs.checks_motion import SCALES, words_of
 from robins.logs.findings import Finding
 from robins.logs.motion import GRAVITY, at_the_spot, signed_permutations, unexplained
-from robins.logs.quiet import finding, signal_of, windows_of
+from robins.logs.quiet import error, signal_of, windows_of
 
 _WRONG, _RIGHT, _BETTER = 0.1, 0.1, 0.2  # shares of gravity left unexplained
 
@@ -46,9 +46,8 @@ def check_turning(imu: ImuTable) -> Iterator[Finding]:
         f"({as_is:.0%} of it is left over"
     )
     code, cause = _meaning(maps[k], float(scales[k - 48]) if k >= 48 else None)
-    yield finding(
+    yield error(
         imu,
-        "error",
         code,
         float(left[k]),
         f"{shown}, with other gyro columns {left[k]:.0%}). {cause}.",

@@ -9,7 +9,7 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding
 from robins.logs.gnss_motion import Steps, Track, lateness, steps_of, track_of
-from robins.logs.quiet import finding, median_of
+from robins.logs.quiet import error, median_of, warning
 
 _AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
 _SCALES = {
@@ -45,9 +45,8 @@ def check_velocity(gnss: GnssTable) -> Iterator[Finding]:
     # East, north, up for north, east, down reverses the third axis too; said once is enough.
     if "exchanged" not in change and _vertical_reversed(steps, track):
         names = ("down", "up") if gnss.nav == "NED" else ("up", "down")
-        yield finding(
+        yield error(
             gnss,
-            "error",
             "velocity_sign",
             "vertical",
             f"the height changes against the vertical velocity. The third component is probably "
@@ -58,9 +57,8 @@ def check_velocity(gnss: GnssTable) -> Iterator[Finding]:
 
 
 def _disagreement(gnss: GnssTable, left: float) -> Finding:
-    return finding(
+    return warning(
         gnss,
-        "warning",
         "velocity_disagrees",
         left,
         "the velocities do not describe the motion of the positions, in whatever order, sign or "
@@ -81,9 +79,8 @@ def _wrong_axes(gnss: GnssTable, change: str) -> Finding:
         )
     else:
         cause = "A sign convention differs (south or west positive); turn that sign"
-    return finding(
+    return error(
         gnss,
-        "error",
         "velocity_axes",
         change,
         f"the positions move as the velocities say only with {change}. {cause}.",
@@ -98,9 +95,8 @@ def _late(gnss: GnssTable, track: Track, late: float) -> Finding:
         if half
         else ""
     )
-    return finding(
+    return warning(
         gnss,
-        "warning",
         "velocity_late",
         late,
         f"the velocities are {abs(late):.2f} s {'older' if late > 0 else 'younger'} than their "
@@ -160,9 +156,8 @@ def _wrong_scale(gnss: GnssTable, ratio: float) -> Finding:
         cause = "The positions are radians that were read as degrees: convert them"
     else:
         cause = "A unit or a column is wrong; compare with a known speed"
-    return finding(
+    return error(
         gnss,
-        "error",
         "velocity_unit",
         ratio,
         f"velocities are {ratio:.3g} times what the positions say. {cause}.",

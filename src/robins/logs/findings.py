@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
-_ORDER: dict[str, int] = {"error": 0, "warning": 1, "note": 2}
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
@@ -78,4 +78,4 @@ def report(findings: list[Finding] | None, finding: Finding) -> None:
 
 def by_severity(findings: list[Finding]) -> list[Finding]:
     """Errors first, then warnings, then notes; otherwise in the order they were made."""
-    return sorted(findings, key=lambda f: _ORDER[f.severity])
+    return sorted(findings, key=lambda f: SEVERITIES.index(f.severity))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.ins.intervals import own_intervals
-from robins.logs.findings import Finding, Severity
+from robins.logs.findings import SEVERITIES, Finding, Severity
 from robins.logs.ordering import increasing
 from robins.logs.tables import Table
 
@@ -40,8 +41,8 @@ def place(table: Table, row: int) -> str:
 
 
 def finding(
-    table: Table,
     severity: Severity,
+    table: Table,
     code: str,
     value: float | int | str,
     sentence: str,
@@ -51,6 +52,9 @@ def finding(
     where = "" if row is None else place(table, row)
     begin = f"{name_of(table)} {where}".rstrip()
     return Finding(severity, code, table.source, where, value, f"{begin}: {sentence}")
+
+
+error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def usual_step_s(time_ns: np.ndarray) -> float:
