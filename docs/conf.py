@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "room_pages",
+    "finding_tables",
     "plain_docstrings",
     "role_table",
 ]
