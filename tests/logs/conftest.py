@@ -1,7 +1,9 @@
-"""Logs that several tests look at."""
+"""Logs that several tests look at, and who found what in them."""
 
 import pytest
-from made_logs import make_drive
+from made_spoilt import drive as make_drive
+
+from robins.logs.checks import Check
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +16,20 @@ def drive():
 def walk_files(data_dir):
     """The GNSS_IMU walk: IMU and GNSS file."""
     return [data_dir / "gnssimu_walk_imu.csv.xz", data_dir / "gnssimu_walk_gnss.pos.xz"]
+
+
+@pytest.fixture(autouse=True)
+def told(monkeypatch):
+    """Which check found what in this test; one that its row does not declare fails the test."""
+    heard = []
+    ask = Check.ask
+
+    def checked(check, things):
+        found = ask(check, things)
+        for f in found:
+            assert any(f.code == code.name and f.severity in code.severity for code in check.codes)
+        heard.extend((check.find.__name__, f) for f in found)
+        return found
+
+    monkeypatch.setattr(Check, "ask", checked)
+    return heard

@@ -1,0 +1,191 @@
+"""Ways to spoil a healthy log: one table of it, some rows of that, some of their columns."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from made_logs import GNSS_HZ, IMU_HZ, START_NS, TOTAL_S, make_drive, rows_of
+from made_nine_axis import tumble_dataset
+from made_pair import attitudes, make_by_hand, make_pair
+from scipy.spatial.transform import Rotation
+
+from robins.dataset import Dataset, ImuTable, Trajectory
+
+S = 1_000_000_000
+N, M = round(TOTAL_S * IMU_HZ) + 1, round(TOTAL_S * GNSS_HZ) + 1
+WEEK = START_NS // S - (START_NS // S - 315_964_800) % 604_800
+
+drive, tumble, by_hand = cache(make_drive), cache(tumble_dataset), cache(make_by_hand)
+pair, exact_pair = cache(partial(make_pair, 1)), cache(partial(make_pair, 1, noise_m=0.02))
+
+
+class Spoilt(NamedTuple):
+    """A code, a log in which it is found, and what is found."""
+
+    code: str
+    log: Callable[[], Any]
+    says: str  # "severity where: parts of ... the sentence"
+    value: Any = None
+    beside: str = ""  # codes of other errors in the same log
+    alone: bool = False  # there is not even a warning or a note beside it
+    count: int = 1  # findings with this code
+
+
+def spoil(base, part="", whole=False, rows=None, **columns):
+    """Makes a log with some rows of a table, its columns replaced or changed by a function."""
+
+    def make():
+        log = base()
+        table = getattr(log, part) if part else log
+        table = table if rows is None else rows_of(table, rows)
+        new = {k: v(getattr(table, k)) if callable(v) else v for k, v in columns.items()}
+        table = dataclasses.replace(table, **new)
+        return dataclasses.replace(log, **{part: table}) if whole else table
+
+    return make
+
+
+imu, gnss = partial(spoil, drive, "imu"), partial(spoil, drive, "gnss")
+with_imu, with_gnss = partial(imu, whole=True), partial(gnss, whole=True)
+mag, attitude, sensor = (partial(spoil, tumble, k, True) for k in ("mag", "attitude", "imu"))
+master, slave = partial(spoil, pair, "master", True), partial(spoil, pair, "imu", True)
+exact, hand = partial(spoil, exact_pair, "master", True), partial(spoil, by_hand)
+
+
+def put(rows, value):
+    """A change of some rows to a value."""
+
+    def change(column):
+        new = column.copy()
+        new[rows] = value
+        return new
+
+    return change
+
+
+def shift(rows, ns):
+    """A change of some stamps."""
+    return lambda time_ns: put(rows, time_ns[rows] + ns)(time_ns)
+
+
+def times(factor):
+    """A change by a factor, one for all or one for each column."""
+    return lambda column: column * np.asarray(factor)
+
+
+def plus(offset):
+    """A change by an offset, one for all or one for each column."""
+    return lambda column: column + np.asarray(offset)
+
+
+def columns(*order):
+    """Columns in another order."""
+    return lambda column: column[:, list(order)]
+
+
+def turned(C):
+    """Both triads along other axes."""
+
+    def turn(triad):
+        return triad @ np.transpose(C)
+
+    return {"gyro": turn, "accel": turn}
+
+
+def about_vertical(degrees):
+    """Both triads turned about z."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return turned([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def without(first, count, n):
+    """All rows but some."""
+    return np.delete(np.arange(n), np.arange(first, first + count))
+
+
+def two(imu_ns=None, gnss_ns=None):
+    """IMU at rest, so that motion has no say, and GNSS; their stamps changed by functions."""
+
+    def make():
+        tables = zip((drive().imu, drive().gnss), (imu_ns, gnss_ns), strict=True)
+        return [
+            dataclasses.replace(rest, time_ns=change(rest.time_ns)) if change else rest
+            for table, change in tables
+            for rest in [rows_of(table, slice(0, len(table) // 8))]
+        ]
+
+    return make
+
+
+def since_start(factor=1, offset_ns=0):
+    """Stamps counted from the start, in another unit."""
+    return lambda time_ns: (time_ns - START_NS + offset_ns) * factor
+
+
+def good_gyro(factor=1.0):
+    """Two minutes of rest of a gyro that sees the Earth turn."""
+    rng = np.random.default_rng(4)
+    n = 12_000
+    earth = 7.292115e-5 * np.array([np.cos(0.8), 0.0, -np.sin(0.8)])
+    gyro = earth + 2e-6 * rng.standard_normal((n, 3))
+    accel = np.array([0.0, 0.0, -9.81]) + 1e-3 * rng.standard_normal((n, 3))
+    return ImuTable(np.arange(n) * S // 100, factor * gyro, accel, "rate", source="drive_imu.csv")
+
+
+def known_slow():
+    """A file that states its unit of time, with samples half a second apart."""
+    table = rows_of(drive().imu, slice(None, None, 50))
+    return Dataset("slow", table, meta={"time_unit_known": [table.source]})
+
+
+def a_path(source="path.csv"):
+    """The fixes of the drive as a path, level and to the north."""
+    g = drive().gnss
+    q_nb = np.tile([1.0, 0.0, 0.0, 0.0], (M, 1))
+    return Trajectory(g.time_ns, g.lat_rad, g.lon_rad, g.alt_m, g.v_n, q_nb, source=source)
+
+
+def with_signs(signs):
+    """A change of attitudes: heading, pitch, roll with other signs."""
+
+    def change(q_nb):
+        angles = Rotation.from_quat(q_nb, scalar_first=True).as_euler("ZYX") * signs
+        return attitudes(*angles.T[::-1])
+
+    return change
+
+
+def late(delay_s, stated_s=0.0):
+    """A master that is late, and says by how much."""
+
+    def make():
+        log = master(time_ns=plus(round(1e9 * delay_s)))()
+        return dataclasses.replace(log, meta={"master_delay_s": stated_s})
+
+    return make
+
+
+def magnet(field_t):
+    """A field that a magnet drives to the stop of the sensor."""
+    strong = put((slice(2000, 2030), 2), field_t[2000:2030, 2] - 500e-6)(field_t)
+    return np.maximum(strong, -400e-6)
+
+
+def bump(field_t):
+    """A magnet that passes by."""
+    near_by = np.exp(-(((np.arange(len(field_t)) - 2500) / 20.0) ** 2))
+    return field_t + near_by[:, None] * [40e-6, 0.0, 0.0]
+
+
+def tipped(q_nb):
+    """Attitudes to a frame that lies on its side: (1, 0, 1, 0) times each."""
+    w, x, y, z = q_nb.T
+    return np.sqrt(0.5) * np.stack([w - y, x + z, y + w, z - x], axis=1)
+
+
+def yawed(q_nb):
+    """Attitudes of a body whose x is the sensor's y, and y its -x."""
+    w, x, y, z = q_nb.T
+    return np.sqrt(0.5) * np.stack([w - z, x + y, y - x, z + w], axis=1)

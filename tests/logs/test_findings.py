@@ -1,0 +1,153 @@
+"""The laws of the doctor's table: each finding has a way to be caused; a healthy log has none."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from finding_tables import findings as documented
+from made_spoilt import tumble
+from made_ulog import flight
+from spoilt import HEALTHY, SPOILT
+
+import robins.logs
+from robins.logs import clean, examine, open_log
+from robins.logs.checks import ALONE, OF_READERS, REFUSALS, TOGETHER
+from robins.logs.findings import SEVERITIES
+
+CHECKS = (*ALONE, *TOGETHER)
+ROWS = [(finder, row) for finder, rows in SPOILT.items() for row in rows]
+PARTS = ("", " (magnetic field)", " (attitude)")
+FIX = "2025/08/28 17:30:39.749 40.5 -105.25 1601 1 25 0.01 0.02 0.03 0 0 0 0 9"
+POS = "% GPST latitude(deg) longitude(deg) height(m) Q ns sdn sde sdu sdne sdeu sdun age ratio"
+PATH = "time_s,lat_deg,lon_deg,height_m,v_north_m_s,v_east_m_s,v_down_m_s,"
+SAMPLES = "".join(f"456300.{k:03d} 1e-5 2e-5 -3e-5 1e-3 2e-3 -4.9e-2\n" for k in range(0, 100, 5))
+STEPS = "time,dt,theta_x,theta_y,theta_z,dv_x,dv_y,dv_z\n"
+
+# What readers tell: code, what is found, the file.
+FILES = (
+    ("ends_early", "warning line 20: the last line has no line end", SAMPLES[:-5]),
+    ("begins_midway", "warning line 1: has fewer fields than the next", SAMPLES[15:]),
+    (
+        "no_place",
+        "note: positions are local metres",
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
+        "q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]"
+        "\n1403636580838555648,4.6,-1.7,0.7,1,0,0,0,0,0,0,0\n",
+    ),
+    (
+        "no_velocity",
+        "note: RTKLIB did not solve for them; they are left out",
+        f"{POS} vn ve vu sdvn sdve sdvu sdvne sdveu sdvun\n{FIX}{' 0' * 9}\n",
+    ),
+    (
+        "height_above_geoid",
+        "warning header: heights are above the geoid",
+        f"% (lat/lon/height=WGS84/geodetic,Q=1:fix,2:float,ns=# of satellites)\n{POS}\n{FIX}\n",
+    ),
+    (
+        "dt_disagrees",
+        "warning line 4: dt is 0.01 s but the time has grown by 0.02 s (1 such rows)",
+        STEPS + "".join(f"{t},0.01,0,0,0,0,0,-0.098\n" for t in (1.0, 1.01, 1.03, 1.04)),
+    ),
+    (
+        "several_instances",
+        "note: sensor_combined was logged of 2 sensors; the first",
+        flight(0.1)[0],
+    ),
+    (
+        "angle_range",
+        "warning line 4: heading_deg is 10000, beyond +-400 deg",
+        f"{PATH}roll_deg,pitch_deg,heading_deg\n"
+        + "".join(f"{t},48,11,0,1,2,3,0,0,{1e4 if t == 2 else 30}\n" for t in range(5)),
+    ),
+    (
+        "quaternion_length",
+        "warning line 3: the quaternion q_w .. q_z has length",
+        f"{PATH}q_w,q_x,q_y,q_z\n"
+        + "".join(f"{t},48,11,0,1,2,3,{7 if t == 1 else 0.8},0,0.6,0\n" for t in range(4)),
+    ),
+)
+
+
+def outcomes(codes):
+    """Each code with each of the severities that its row declares."""
+    return {(c.name, severity) for c in codes for severity in SEVERITIES if severity in c.severity}
+
+
+def test_every_finding_has_a_way_to_be_caused():
+    """One row of SPOILT for each code and severity that a check declares, and for no other."""
+    assert list(SPOILT) == [check.find.__name__ for check in CHECKS]
+    for check in CHECKS:
+        spoilt = {(row.code, re.split("[: ]", row.says)[0]) for row in SPOILT[check.find.__name__]}
+        assert spoilt == outcomes(check.codes)
+    assert {(code, says.split()[0].strip(":")) for code, says, _ in FILES} == outcomes(OF_READERS)
+
+
+@pytest.mark.parametrize(("finder", "row"), ROWS, ids=[f"{f}-{row.code}" for f, row in ROWS])
+def test_a_spoilt_log_has_its_finding(finder, row, told):
+    findings = examine(row.log())
+    kind, _, words = row.says.partition(": ")
+    severity, _, where = kind.partition(" ")
+    caused = [f for by, f in told if (by, f.code, f.severity) == (finder, row.code, severity)]
+    f = caused[0]
+    assert len(caused) == row.count
+    assert set(caused) <= set(findings)
+    assert f.where.startswith(where)
+    assert row.value is None or f.value == row.value
+    assert all(part in f.sentence for part in words.split(" ... "))
+    # a whole sentence that begins with file and place
+    assert f.sentence.split(": ")[0] in [f"{f.file}{part} {f.where}".rstrip() for part in PARTS]
+    assert f.sentence.endswith((".", "?"))
+    assert len(f.sentence) > 60
+    assert "\n" not in f.sentence
+    # nothing else is blamed
+    errors = {g.code for g in findings if g.severity == "error"}
+    assert errors == {*row.beside.split(), *([row.code] if severity == "error" else [])}
+    assert not row.alone or findings == caused
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_a_healthy_log_has_none(name):
+    assert examine(HEALTHY[name]()) == []
+
+
+@pytest.mark.parametrize(("code", "says", "content"), FILES, ids=[code for code, *_ in FILES])
+def test_what_a_reader_leaves_out_is_found(tmp_path, code, says, content):
+    if code == "several_instances":
+        pytest.importorskip("pyulog", reason="the extra `logs` is not installed")
+    path = tmp_path / "log.txt"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    found = []
+    open_log(path, findings=found)
+    (f,) = found
+    kind, _, words = says.partition(": ")
+    assert (f.code, f"{f.severity} {f.where}".strip()) == (code, kind)
+    assert f.file == str(path)
+    assert f.sentence.startswith("log.txt")
+    assert words in f.sentence
+    assert f.sentence.endswith(".")
+
+
+def test_every_code_in_the_source_is_declared():
+    declared = {c.name for codes in (OF_READERS, *(c.codes for c in CHECKS)) for c in codes}
+    makers = {"Finding", "finding", *SEVERITIES}
+    said = set()
+    for path in Path(robins.logs.__file__).parent.glob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(call, ast.Call) and getattr(call.func, "id", "") in makers:
+                code = call.args[2 if call.func.id == "finding" else 1]
+                said |= {node.value for node in ast.walk(code) if is_text(node)}
+    assert len(said) > 60
+    assert said <= declared
+
+
+def is_text(node):
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def test_every_finding_and_refusal_is_documented():
+    rows = re.findall(r"^\| `(\w+)` \| ([\w, ]+) \| ([^|]+) \|$", documented(), re.MULTILINE)
+    codes = (code for codes in (OF_READERS, *(check.codes for check in CHECKS)) for code in codes)
+    assert sorted(rows) == sorted(codes)
+    assert {key.partition("_")[2] for key in clean(tumble()).counts} <= set(REFUSALS)
