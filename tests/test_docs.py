@@ -1,6 +1,5 @@
 """The documents are true: their examples run, and their docstrings show what was typed."""
 
-import ast
 import doctest
 import importlib
 import itertools
@@ -109,37 +108,12 @@ def test_the_documented_summary_is_one():
     assert made | {"files": shown["files"]} == shown
 
 
-def finding_codes(tree: ast.AST) -> set[str]:
-    """Codes of findings that a module makes: the text that follows a severity."""
-    found = set()
-    for node in ast.walk(tree):
-        args = node.args if isinstance(node, ast.Call) else []
-        for severity, code in itertools.pairwise(args):
-            if {"error", "warning", "note"} & texts_in(severity):
-                found |= {text for text in texts_in(code) if re.fullmatch(r"[a-z_]+", text)}
-    return found
-
-
-def texts_in(tree: ast.AST) -> set[str]:
-    return {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and type(n.value) is str}
-
-
 def rows_of(page: Path, heading: str) -> list[list[str]]:
     """Cells of the tables below a heading, down to the next of its rank."""
     rank = heading.split()[0]
     part = page.read_text("utf-8").split(f"\n{heading}\n")[1].split(f"\n{rank} ")[0]
     rows = [line.strip("|").split("|") for line in part.splitlines() if line.startswith("| `")]
     return [[cell.strip() for cell in row] for row in rows]
-
-
-def test_every_finding_of_the_doctor_is_documented():
-    trees = [ast.parse(p.read_text("utf-8")) for p in (SOURCE / "logs").glob("*.py")]
-    listed = " ".join(
-        row[0] for row in rows_of(ROOT / "docs" / "logs.md", "## What the doctor finds")
-    )
-    documented = set(re.findall(r"`(\w+)`", listed))
-    assert set().union(*map(finding_codes, trees)) <= documented
-    assert documented <= set().union(*map(texts_in, trees))
 
 
 def test_every_format_is_documented():

@@ -28,16 +28,18 @@ class Spoilt(NamedTuple):
     log: Callable[[], Any]
     says: str  # "severity where: parts of ... the sentence"
     value: Any = None
-    beside: str = ""  # codes of other errors in the same log
-    alone: bool = False  # there is not even a warning or a note beside it
+    beside: str = ""  # codes of all other findings in the same log
     count: int = 1  # findings with this code
 
 
 def spoil(base, part="", whole=False, rows=None, **columns):
-    """Makes a log with some rows of a table, its columns replaced or changed by a function."""
+    """Makes a log with some rows of a table, its columns replaced or changed by a function.
 
-    def make():
-        log = base()
+    It is the base's log that is spoilt, or the one that is given.
+    """
+
+    def make(log=None):
+        log = base() if log is None else log
         table = getattr(log, part) if part else log
         table = table if rows is None else rows_of(table, rows)
         new = {k: v(getattr(table, k)) if callable(v) else v for k, v in columns.items()}
@@ -160,8 +162,8 @@ def with_signs(signs):
 def late(delay_s, stated_s=0.0):
     """A master that is late, and says by how much."""
 
-    def make():
-        log = master(time_ns=plus(round(1e9 * delay_s)))()
+    def make(log=None):
+        log = master(time_ns=plus(round(1e9 * delay_s)))(log)
         return dataclasses.replace(log, meta={"master_delay_s": stated_s})
 
     return make

@@ -17,6 +17,7 @@ from made_spoilt import (
     about_vertical,
     attitude,
     bump,
+    by_hand,
     columns,
     drive,
     exact,
@@ -52,6 +53,7 @@ near = pytest.approx
 G = 9.80665
 ALL = slice(None)
 FLOAT = 1 + (np.arange(M) > 300)
+UNCHECKED = "turning_not_checked force_not_checked"
 STOP = np.deg2rad(250.0)  # rad/s
 JITTER = np.random.default_rng(0).integers(-3_000_000, 3_000_000, N)
 
@@ -89,8 +91,8 @@ TIME = (
             31.4: "The clock was set, or the logger restarted",
         }.items()
     ),
-    *(  # a jump, not a gap
-        Spoilt("time_jump", imu(time_ns=shift(slice(5000, None), ahead_s * S)), says, alone=True)
+    *(
+        Spoilt("time_jump", imu(time_ns=shift(slice(5000, None), ahead_s * S)), says)
         for ahead_s, says in {
             1: "warning line 5002: a leap second",
             18: "error line 5002: 18 leap",
@@ -129,7 +131,8 @@ COLUMNS = (
         "saturated",
         imu(gyro=lambda gyro: np.clip(gyro * [1, 1, 40], -STOP, STOP)),
         "warning: a usual full scale (4.363 rad/s)",
-        near(STOP, abs=5e-4),
+        near([STOP, -STOP], abs=5e-4),
+        "axis_stuck_for_a_while",
         count=2,
     ),
     Spoilt(
@@ -137,7 +140,13 @@ COLUMNS = (
         imu(accel=put((slice(3000, 3005), 2), 4 * G)),
         "warning line 3002: in 5 samples, 5 in a row",
     ),
-    Spoilt("coarse", imu(accel=np.round), "warning", count=3),
+    Spoilt(
+        "coarse",
+        imu(accel=np.round),
+        "warning",
+        beside="axis_stuck_for_a_while gravity_bias",
+        count=3,
+    ),
 )
 
 IMU = (
@@ -181,17 +190,17 @@ IMU = (
         for unit, factor in (("m/s", 0.01), ("g s", 0.01 / G))
     ),
     *(
-        Spoilt("z_axis_reversed", imu(**turned(C)), "error: +9.8 m/s^2 on accel_z", alone=True)
+        Spoilt("z_axis_reversed", imu(**turned(C)), "error: +9.8 m/s^2 on accel_z")
         for C in (np.diag([1, -1, -1]), np.diag([1, 1, -1]), [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
     ),
-    Spoilt("z_axis_reversed", imu(body="RFU"), "error", alone=True),
+    Spoilt("z_axis_reversed", imu(body="RFU"), "error"),
     Spoilt(
         "not_level",
         imu(**turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])),
         "warning",
         near(1.0, abs=0.01),
     ),
-    Spoilt("sensor_axes", tumble, "note: (-0.00, +0.00, +1.00) of x, y, z", alone=True),
+    Spoilt("sensor_axes", tumble, "note: (-0.00, +0.00, +1.00) of x, y, z"),
     Spoilt("gyro_unit", imu(gyro=times(60 * 180 / np.pi)), "error: in deg/s: multiply by pi/180."),
     Spoilt("gyro_unit", imu(gyro=times(3600 * 180 / np.pi)), "error: in deg/h: multiply by pi/180"),
     Spoilt(
@@ -209,9 +218,7 @@ GNSS = (
     Spoilt("gnss_missing", gnss(alt_m=np.full(M, 1e300)), "error: is 1e+300 here", M, "height"),
     Spoilt("gnss_missing", gnss(v_n=times([1, 1, np.nan])), "note: velocity down is nan", M),
     *(
-        Spoilt(
-            "position_unit", gnss(lat_rad=lat, lon_rad=lon), f"error line 3: {cause}", alone=True
-        )
+        Spoilt("position_unit", gnss(lat_rad=lat, lon_rad=lon), f"error line 3: {cause}")
         for lat, lon, cause in (
             (np.rad2deg, np.rad2deg, "degrees where radians are needed"),
             (plus(np.deg2rad(-149)), plus(np.deg2rad(39)), "Latitude and longitude are exchanged"),
@@ -255,6 +262,7 @@ VELOCITY = (
         "velocity_unit",
         gnss(lat_rad=np.deg2rad, lon_rad=np.deg2rad),
         "error: The positions are radians that were read as degrees",
+        beside="position_in_radians",
     ),
     *(
         Spoilt("velocity_unit", gnss(v_n=times(k)), f"error: probably in {unit}", near(k, rel=0.01))
@@ -267,7 +275,6 @@ VELOCITY = (
         "velocity_axes",
         gnss(v_n=lambda v: v[:, [1, 0, 2]] * [1, 1, -1]),
         "error: probably east, north, up, not north, east, down",
-        alone=True,
     ),
     Spoilt("velocity_axes", gnss(nav="ENU"), "error: probably north, east, down, not east, north"),
     Spoilt(
@@ -278,7 +285,7 @@ VELOCITY = (
     Spoilt("velocity_axes", gnss(v_n=times([1, -1, 1])), "error: reversed east. A sign convention"),
     Spoilt("velocity_axes", gnss(v_n=times([-1, -1, 1])), "error: reversed north and east. A sign"),
     Spoilt("velocity_sign", gnss(v_n=times([1, 1, -1])), "error: is probably up, not down"),
-    Spoilt("velocity_disagrees", gnss(v_n=partial(np.roll, shift=130, axis=0)), "warning", alone=1),
+    Spoilt("velocity_disagrees", gnss(v_n=partial(np.roll, shift=130, axis=0)), "warning"),
     Spoilt(
         "velocity_late",
         gnss(v_n=velocity_ned(np.maximum(np.arange(M) / GNSS_HZ - 0.1, 0.0))),
@@ -329,6 +336,7 @@ MAG = (
         mag(field_t=magnet),
         "warning 20.000 s after the start: stops at -400 uT in 30 readings, 30 in a row",
         -400e-6,
+        "field_offset",
     ),
     Spoilt("field_varies", mag(field_t=times([1.3, 0.8, 1.0])), "warning: `robins calibrate`"),
     Spoilt("field_offset", mag(field_t=plus([3e-5, -1e-5, 5e-6])), "warning: `robins calibrate`"),
@@ -361,10 +369,15 @@ SPAN = (
         "no_overlap",
         lambda: [imu(rows=slice(0, 1000))(), spoil(a_path, time_ns=plus(-(10**15)))()],
         "error",
-        alone=True,
     ),
-    Spoilt("no_overlap", master(time_ns=plus(10**12)), "error"),
-    Spoilt("little_overlap", two(imu_ns=plus(7 * S)), "warning", near(2.7, abs=0.3)),
+    Spoilt("no_overlap", master(time_ns=plus(10**12)), "error", beside=UNCHECKED),
+    Spoilt(
+        "little_overlap",
+        two(imu_ns=plus(7 * S)),
+        "warning",
+        near(2.7, abs=0.3),
+        "motion_not_checked",
+    ),
     Spoilt(
         "leap_seconds",
         with_gnss(time_ns=plus(18 * S), v_n=None, sigma_v=None),
@@ -376,7 +389,9 @@ SPAN = (
 
 MASTER = (
     Spoilt("master_missing", master(lat_rad=put(5, np.nan)), "warning: position is not whole", 1),
-    Spoilt("master_missing", master(q_nb=times(np.nan)), "error: the attitude is not whole", 800),
+    Spoilt(
+        "master_missing", master(q_nb=times(np.nan)), "error: attitude is not whole", 800, UNCHECKED
+    ),
     Spoilt(
         "velocity_unit",
         master(lat_rad=np.deg2rad, lon_rad=np.deg2rad),
@@ -409,7 +424,7 @@ MASTER = (
     Spoilt("gyro_axes", slave(gyro=times(-1)), "error: (-gyro_x, -gyro_y, -gyro_z)"),
     Spoilt("turning_disagrees", slave(gyro=partial(np.roll, shift=700, axis=0)), "error"),
     *(
-        Spoilt("master_late", late(total_s), f"error: {mend}", near(total_s, abs=0.004), alone=True)
+        Spoilt("master_late", late(total_s), f"error: {mend}", near(total_s, abs=0.004))
         for total_s, mend in ((0.08, 'State that: master.delay = "0.08'), (-0.05, "Add 0.05"))
     ),
     Spoilt("master_late", late(0.015), "warning"),
@@ -428,7 +443,6 @@ MOTION = (
             "gyro_unit",
             with_imu(gyro=times(factor)),
             f"error: turns by the gyros ... {words}",
-            alone=True,
         )
         for factor, words in {
             180 / np.pi: "probably deg/s: multiply by pi/180",
@@ -457,9 +471,8 @@ MOTION = (
             with_imu(**about_vertical(angle)),
             "warning",
             near(angle, abs=3.0),
-            alone=True,
         )
-        for angle in (90, -90, -50)
+        for angle in (90, 180, -50)
     ),
     *(
         Spoilt(
@@ -471,13 +484,14 @@ MOTION = (
         "leap_seconds",
         with_imu(time_ns=plus(18 * S)),
         "error: only if +18.0 ... That is the leap seconds between UTC and GPS time",
+        beside="leap_seconds",
     ),
     Spoilt(
         "motion_disagrees",
         with_imu(gyro=lambda gyro: gyro[::-1], accel=lambda accel: accel[::-1]),
         "warning",
     ),
-    Spoilt("motion_not_checked", with_imu(rows=slice(0, 1100)), "note"),
+    Spoilt("motion_not_checked", with_imu(rows=slice(0, 1100)), "note", 0, "little_overlap"),
 )
 
 TURNING = (
@@ -502,9 +516,7 @@ ATTITUDE = (
             (lambda q: q[:, [1, 2, 3, 0]] * [-1, -1, -1, 1], "scalar last and navigation to body"),
         )
     ),
-    Spoilt(
-        "attitude_axes", attitude(q_nb=yawed), "error: with the gyros (gyro_y, -gyro_x, gyro_z)"
-    ),
+    Spoilt("attitude_axes", attitude(q_nb=yawed), "error: gyros (gyro_y, -gyro_x, gyro_z)"),
     Spoilt("attitude_frame", attitude(nav="NED"), "error: where NED has up at ... to ENU."),
     Spoilt("attitude_frame", attitude(q_nb=tipped), "error: along (+1.00, ... not stand upright"),
     Spoilt("attitude_disagrees", attitude(q_nb=lambda q: q[::-1]), "warning"),
@@ -544,4 +556,5 @@ HEALTHY = {
     "pair of increments": partial(make_pair, 1, "increment"),
     "stated delay": late(0.1, stated_s=0.1),
     "small delay": late(0.004),
+    "turned by hand": by_hand,
 }

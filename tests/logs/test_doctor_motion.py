@@ -4,15 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_logs import found, rows_of, the, with_gnss, with_imu
+from made_logs import found, rows_of, with_gnss, with_imu
 
 from robins.dataset import Dataset
 from robins.logs import Finding, LogError, Mounting, examine, load_dataset
-
-
-def test_a_healthy_log_is_silent(drive):
-    assert examine(drive) == []
-    assert examine([drive.imu, drive.gnss]) == []
 
 
 def test_the_walk_has_no_error_and_its_flaws_are_told(walk_files):
@@ -36,71 +31,6 @@ def test_the_walk_without_its_mounting(walk_files):
     assert findings["forward_axis"].value == pytest.approx(-90.0, abs=15.0)
 
 
-@pytest.mark.parametrize(
-    ("factor", "words"),
-    [
-        (180 / np.pi, "probably deg/s: multiply by pi/180"),
-        (180 / np.pi * 3600, "probably deg/h: multiply by pi/180/3600"),
-        (np.pi / 180, "probably rad/s converted to radians once more"),
-        (0.01, "probably increments where rates are expected: divide by 0.01 s"),
-    ],
-)
-def test_the_unit_of_the_gyros_by_the_turns(drive, factor, words):
-    spoilt = with_imu(drive, gyro=factor * drive.imu.gyro)
-    assert found(spoilt) == ["gyro_unit"]
-    f = the(spoilt, "gyro_unit")
-    assert f.severity == "error"
-    assert "turns by the gyros fit those of the GNSS velocity" in f.sentence
-    assert words in f.sentence
-
-
-@pytest.mark.parametrize(
-    "M", [np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]]), np.diag([1, -1, 1])], ids=["x y", "-y"]
-)
-def test_left_handed_triads(drive, M):
-    spoilt = with_imu(drive, gyro=drive.imu.gyro @ M, accel=drive.imu.accel @ M)
-    assert the(spoilt, "left_handed").severity == "error"
-
-
-@pytest.mark.parametrize(
-    ("columns", "signs", "words"),
-    [
-        ([0, 1, 2], [-1, 1, 1], "(-gyro_x, gyro_y, gyro_z)"),
-        ([0, 1, 2], [1, 1, -1], "(gyro_x, gyro_y, -gyro_z)"),
-        ([1, 0, 2], [1, 1, 1], "(gyro_y, gyro_x, gyro_z)"),
-        ([1, 2, 0], [1, 1, 1], "(gyro_z, gyro_x, gyro_y)"),
-    ],
-)
-def test_gyro_axes_that_are_not_those_of_the_accelerometers(drive, columns, signs, words):
-    f = the(with_imu(drive, gyro=drive.imu.gyro[:, columns] * signs), "gyro_axes")
-    assert f.severity == "error"
-    assert f"take them as {words}" in f.sentence
-
-
-def test_gyros_of_the_opposite_sense(drive):
-    f = the(with_imu(drive, gyro=-drive.imu.gyro), "gyro_reversed")
-    assert str(f) == f"error: {f.sentence}"
-
-
-def test_accelerometer_axes_that_are_not_those_of_the_gyros(drive):
-    f = the(with_imu(drive, accel=drive.imu.accel * [1, -1, 1]), "accel_axes")
-    assert "take them as (accel_x, -accel_y, accel_z)" in f.sentence
-
-
-def test_gravity_in_place_of_specific_force(drive):
-    codes = found(with_imu(drive, accel=-drive.imu.accel), "error")
-    assert codes == ["z_axis_reversed", "accel_reversed"]
-
-
-@pytest.mark.parametrize("angle", [90, 180, -50])
-def test_a_sensor_turned_about_the_vertical(drive, angle):
-    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    spoilt = with_imu(drive, gyro=drive.imu.gyro @ turn, accel=drive.imu.accel @ turn)
-    assert found(spoilt) == ["forward_axis"]
-    assert abs((the(spoilt, "forward_axis").value - angle + 180) % 360 - 180) < 3.0
-
-
 def test_without_gnss_velocities_positions_serve(drive):
     by_place = with_gnss(drive, v_n=None, sigma_v=None)
     assert examine(by_place) == []
@@ -116,30 +46,6 @@ def test_large_biases_are_no_wrong_axes(drive):
         accel=imu.accel + np.array([0.2, 0.1, 0]),
     )
     assert set(found(Dataset("moving", biased, gnss))) <= {"gravity_bias"}
-
-
-@pytest.mark.parametrize("seconds", [0.3, -2.5, 8.0])
-def test_a_time_offset_is_measured(drive, seconds):
-    f = the(with_imu(drive, time_ns=drive.imu.time_ns + round(seconds * 1e9)), "time_offset")
-    assert f.severity in ("warning", "error")
-    assert f.value == pytest.approx(seconds, abs=0.06)
-
-
-def test_leap_seconds_between_the_files(drive):
-    late = examine(with_imu(drive, time_ns=drive.imu.time_ns + 18 * 10**9))
-    assert (late[0].severity, late[0].code) == ("error", "leap_seconds")
-    assert "only if +18.0" in late[0].sentence
-    assert "That is the leap seconds between UTC and GPS time" in late[0].sentence
-
-
-def test_files_of_two_recordings(drive):
-    other = dataclasses.replace(drive.imu, gyro=drive.imu.gyro[::-1], accel=drive.imu.accel[::-1])
-    assert "motion_disagrees" in found(dataclasses.replace(drive, imu=other), "warning")
-
-
-def test_too_little_motion_is_said(drive):
-    rest = rows_of(drive.imu, slice(0, 1100))
-    assert found(dataclasses.replace(drive, imu=rest), "note") == ["motion_not_checked"]
 
 
 # ---------------------------------------------------------------------------------- manners

@@ -90,21 +90,21 @@ def test_a_spoilt_log_has_its_finding(finder, row, told):
     kind, _, words = row.says.partition(": ")
     severity, _, where = kind.partition(" ")
     caused = [f for by, f in told if (by, f.code, f.severity) == (finder, row.code, severity)]
-    f = caused[0]
     assert len(caused) == row.count
     assert set(caused) <= set(findings)
-    assert f.where.startswith(where)
-    assert row.value is None or f.value == row.value
-    assert all(part in f.sentence for part in words.split(" ... "))
-    # a whole sentence that begins with file and place
-    assert f.sentence.split(": ")[0] in [f"{f.file}{part} {f.where}".rstrip() for part in PARTS]
-    assert f.sentence.endswith((".", "?"))
-    assert len(f.sentence) > 60
-    assert "\n" not in f.sentence
-    # nothing else is blamed
-    errors = {g.code for g in findings if g.severity == "error"}
-    assert errors == {*row.beside.split(), *([row.code] if severity == "error" else [])}
-    assert not row.alone or findings == caused
+    values = [f.value for f in caused]
+    assert row.value is None or (values if row.count > 1 else values[0]) == row.value
+    assert caused[0].where.startswith(where)
+    for f in caused:
+        assert all(part in f.sentence for part in words.split(" ... "))
+        # a whole sentence that begins with file and place
+        assert f.sentence.split(": ")[0] in [f"{f.file}{part} {f.where}".rstrip() for part in PARTS]
+        assert f.sentence.endswith((".", "?"))
+        assert len(f.sentence) > 60
+        assert "\n" not in f.sentence
+    # nothing else is blamed; how the sensor lies is told of all logs that tumble
+    others = {g.code for g in findings if g not in caused} - {"sensor_axes"}
+    assert others == set(row.beside.split())
 
 
 @pytest.mark.parametrize("name", HEALTHY)
