@@ -121,17 +121,6 @@ def rows_of(table, keep):
     return dataclasses.replace(table, **arrays)
 
 
-def the(subject, code):
-    """The one finding with this code; it must be a whole sentence that names its file and place."""
-    (f,) = [f for f in examine(subject) if f.code == code]
-    assert f.file in ("drive_imu.csv", "drive_gnss.pos")
-    assert f.sentence.startswith(f"{f.file} {f.where}".rstrip() + ": ")
-    assert f.sentence.endswith((".", "?"))
-    assert len(f.sentence) > 60
-    assert "\n" not in f.sentence
-    return f
-
-
 def found(subject, severity=None):
     """Codes of all findings, or of those of one severity."""
     return [f.code for f in examine(subject) if severity in (None, f.severity)]

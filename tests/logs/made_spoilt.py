@@ -1,9 +1,7 @@
 """Ways to spoil a healthy log: one table of it, some rows of that, some of their columns."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
 
 import numpy as np
 from made_logs import GNSS_HZ, IMU_HZ, START_NS, TOTAL_S, make_drive, rows_of
@@ -19,17 +17,6 @@ WEEK = START_NS // S - (START_NS // S - 315_964_800) % 604_800
 
 drive, tumble, by_hand = cache(make_drive), cache(tumble_dataset), cache(make_by_hand)
 pair, exact_pair = cache(partial(make_pair, 1)), cache(partial(make_pair, 1, noise_m=0.02))
-
-
-class Spoilt(NamedTuple):
-    """A code, a log in which it is found, and what is found."""
-
-    code: str
-    log: Callable[[], Any]
-    says: str  # "severity where: parts of ... the sentence"
-    value: Any = None
-    beside: str = ""  # codes of all other findings in the same log
-    count: int = 1  # findings with this code
 
 
 def spoil(base, part="", whole=False, rows=None, **columns):

@@ -1,4 +1,8 @@
-"""For every code in the doctor's table a way to spoil a healthy log so that it is found."""
+"""For every code in the doctor's table a way to spoil a healthy log so that it is found.
+
+A row is a log, "severity where: parts of ... the sentence", and, where they are known, the value,
+the codes of all other findings in this log, and how many findings have this one.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -12,7 +16,6 @@ from made_spoilt import (
     M,
     N,
     S,
-    Spoilt,
     a_path,
     about_vertical,
     attitude,
@@ -57,28 +60,28 @@ UNCHECKED = "turning_not_checked force_not_checked"
 STOP = np.deg2rad(250.0)  # rad/s
 JITTER = np.random.default_rng(0).integers(-3_000_000, 3_000_000, N)
 
-TIME = (
-    Spoilt("too_short", imu(rows=slice(0, 1)), "error: only 1 sample(s)", 1, "no_samples"),
-    Spoilt("time_stands", imu(time_ns=times(0)), "error: never goes forward", 0, "no_samples"),
-    *(
-        Spoilt("time_unit", table(time_ns=since_start(k)), f"error: is in {unit}", None, beside)
-        for table, beside in ((imu, ""), (gnss, "velocity_unit"))
-        for unit, k in (("milliseconds", 1000), ("microseconds", 10**6))
-    ),
-    Spoilt("time_unit", imu(time_ns=lambda t: (t - START_NS) // 1000), "error: unit than seconds"),
-    Spoilt("time_slow", known_slow, "warning: samples are 0.5 s apart", 0.5),
-    Spoilt("time_duplicate", imu(time_ns=shift([100, 200], -S // 100)), "warning line 102", 2),
-    Spoilt("time_duplicate", imu(rows=np.arange(2 * N) // 2), "warning: faster than the sensor", N),
-    *(
-        Spoilt("time_backward", imu(time_ns=shift([500, 900], -back)), "warning line 502", 2)
+TIME = {
+    "too_short": [(imu(rows=slice(0, 1)), "error: only 1 sample(s)", 1, "no_samples")],
+    "time_stands": [(imu(time_ns=times(0)), "error: never goes forward", 0, "no_samples")],
+    "time_unit": [
+        *(
+            (table(time_ns=since_start(k)), f"error: is in {unit}", None, beside)
+            for table, beside in ((imu, ""), (gnss, "velocity_unit"))
+            for unit, k in (("milliseconds", 1000), ("microseconds", 10**6))
+        ),
+        (imu(time_ns=lambda t: (t - START_NS) // 1000), "error: unit than seconds"),
+    ],
+    "time_slow": [(known_slow, "warning: samples are 0.5 s apart", 0.5)],
+    "time_duplicate": [
+        (imu(time_ns=shift([100, 200], -S // 100)), "warning line 102", 2),
+        (imu(rows=np.arange(2 * N) // 2), "warning: faster than the sensor", N),
+    ],
+    "time_backward": [
+        (imu(time_ns=shift([500, 900], -back)), "warning line 502", 2)
         for back in (15_000_000, S, 3600 * S)
-    ),
-    *(
-        Spoilt(
-            "clock_set_back",
-            imu(time_ns=shift(slice(5000, None), -round(back_s * 1e9))),
-            f"error line 5002: {cause}",
-        )
+    ],
+    "clock_set_back": [
+        (imu(time_ns=shift(slice(5000, None), -round(back_s * 1e9))), f"error line 5002: {cause}")
         for back_s, cause in {
             1.0: "This is a leap second",
             7200.0: "a change of time zone",
@@ -90,70 +93,66 @@ TIME = (
             2**32 * 1e-3: "a 32-bit counter of milliseconds",
             31.4: "The clock was set, or the logger restarted",
         }.items()
-    ),
-    *(
-        Spoilt("time_jump", imu(time_ns=shift(slice(5000, None), ahead_s * S)), says)
+    ],
+    "time_jump": [
+        (imu(time_ns=shift(slice(5000, None), ahead_s * S)), says)
         for ahead_s, says in {
             1: "warning line 5002: a leap second",
             18: "error line 5002: 18 leap",
             3600: "error line 5002: zone",
         }.items()
-    ),
-    Spoilt("gap_short", imu(rows=without(5000, 3, N)), "note line 5005", near(0.04)),
-    Spoilt("gap_short", imu(rows=without(5000, 50, N)), "warning line 5052", near(0.51)),
-    Spoilt("gap_long", imu(rows=without(5000, 1234, N)), "warning line 6236", near(12.35)),
-    Spoilt(
-        "gap_short",
-        imu(rows=np.delete(np.arange(N), np.r_[5000:5020, 6000:6040])),
-        "warning: (2 gaps, 0.62 s in all, the first at line 5001)",
-    ),
-    Spoilt("gap_long", gnss(rows=without(200, 40, M)), "note"),
-    Spoilt("gap_short", mag(rows=without(700, 20, 4000)), "note: is held by the gyros meanwhile"),
-    Spoilt("time_jitter", imu(time_ns=shift(ALL, JITTER)), "note: 100 Hz"),
-    Spoilt("time_jitter", imu(time_ns=shift(slice(0, None, 2), 8_000_000)), "warning"),
-)
+    ],
+    "gap_short": [
+        (imu(rows=without(5000, 3, N)), "note line 5005", near(0.04)),
+        (imu(rows=without(5000, 50, N)), "warning line 5052", near(0.51)),
+        (
+            imu(rows=np.delete(np.arange(N), np.r_[5000:5020, 6000:6040])),
+            "warning: (2 gaps, 0.62 s in all, the first at line 5001)",
+        ),
+        (mag(rows=without(700, 20, 4000)), "note: is held by the gyros meanwhile"),
+    ],
+    "gap_long": [
+        (imu(rows=without(5000, 1234, N)), "warning line 6236", near(12.35)),
+        (gnss(rows=without(200, 40, M)), "note"),
+    ],
+    "time_jitter": [
+        (imu(time_ns=shift(ALL, JITTER)), "note: 100 Hz"),
+        (imu(time_ns=shift(slice(0, None, 2), 8_000_000)), "warning"),
+    ],
+}
 
-LIMITS = (Spoilt("absurd", imu(accel=put((50, 1), 1e308)), "warning line 52: accel is 1e+308", 1),)
+LIMITS = {"absurd": [(imu(accel=put((50, 1), 1e308)), "warning line 52: accel is 1e+308", 1)]}
 
-COLUMNS = (
-    Spoilt("column_missing", imu(gyro=put((ALL, 2), np.nan)), "error", N, "no_samples"),
-    Spoilt("not_finite", imu(gyro=put(([10, 20], 2), [np.nan, np.inf])), "warning line 12", 2),
-    Spoilt("axis_stuck", imu(gyro=put((ALL, 1), 0.0)), "error: gyro_y is 0 in every sample", 0.0),
-    Spoilt(
-        "axis_stuck", imu(gyro=put((ALL, 1), 0.37)), "error: gyro_y is 0.37 in", 0.37, "gyro_unit"
-    ),
-    Spoilt(
-        "axis_stuck_for_a_while",
-        imu(accel=put((slice(5000, 5300), 0), 0.25)),
-        "warning line 5002: for 300 samples (3.0 s)",
-    ),
-    Spoilt(
-        "saturated",
-        imu(gyro=lambda gyro: np.clip(gyro * [1, 1, 40], -STOP, STOP)),
-        "warning: a usual full scale (4.363 rad/s)",
-        near([STOP, -STOP], abs=5e-4),
-        "axis_stuck_for_a_while",
-        count=2,
-    ),
-    Spoilt(
-        "saturated",
-        imu(accel=put((slice(3000, 3005), 2), 4 * G)),
-        "warning line 3002: in 5 samples, 5 in a row",
-    ),
-    Spoilt(
-        "coarse",
-        imu(accel=np.round),
-        "warning",
-        beside="axis_stuck_for_a_while gravity_bias",
-        count=3,
-    ),
-)
+COLUMNS = {
+    "column_missing": [(imu(gyro=put((ALL, 2), np.nan)), "error", N, "no_samples")],
+    "not_finite": [(imu(gyro=put(([10, 20], 2), [np.nan, np.inf])), "warning line 12", 2)],
+    "axis_stuck": [
+        (imu(gyro=put((ALL, 1), 0.0)), "error: gyro_y is 0 in every sample", 0.0),
+        (imu(gyro=put((ALL, 1), 0.37)), "error: gyro_y is 0.37 in", 0.37, "gyro_unit"),
+    ],
+    "axis_stuck_for_a_while": [
+        (imu(accel=put((slice(5000, 5300), 0), 0.25)), "warning line 5002: for 300 samples (3.0 s)")
+    ],
+    "saturated": [
+        (
+            imu(gyro=lambda gyro: np.clip(gyro * [1, 1, 40], -STOP, STOP)),
+            "warning: a usual full scale (4.363 rad/s)",
+            near([STOP, -STOP], abs=5e-4),
+            "axis_stuck_for_a_while",
+            2,
+        ),
+        (
+            imu(accel=put((slice(3000, 3005), 2), 4 * G)),
+            "warning line 3002: in 5 samples, 5 in a row",
+        ),
+    ],
+    "coarse": [(imu(accel=np.round), "warning", None, "axis_stuck_for_a_while gravity_bias", 3)],
+}
 
-IMU = (
-    Spoilt("no_samples", imu(gyro=times(np.nan)), "error", N, "column_missing"),
-    *(
-        Spoilt(
-            "gravity_unit",
+IMU = {
+    "no_samples": [(imu(gyro=times(np.nan)), "error", N, "column_missing")],
+    "gravity_unit": [
+        (
             imu(accel=times(factor)),
             f"error line 2: where gravity is 9.8 ... {mend}",
             near(9.8 * factor, rel=0.01),
@@ -164,139 +163,140 @@ IMU = (
             1 / 0.3048: "ft/s^2: multiply by 0.3048",
             1e3: "mm/s^2: divide by 1000",
         }.items()
-    ),
-    Spoilt("gravity_unknown", imu(accel=times(3.5)), "error: no usual unit"),
-    Spoilt("gravity_missing", imu(accel=plus([0, 0, 9.75])), "error: 'linear accelerations'"),
-    Spoilt("gravity_bias", imu(accel=plus([0, 0, -0.15])), "note: off by +0.15 m/s^2 (+15 mg)"),
-    Spoilt(
-        "gravity_not_seen",
-        imu(rows=slice(1800, None), accel=times(3.5)),
-        "warning: the log has no second at rest",
-    ),
-    *(
-        Spoilt(
-            "rates_as_increments",
+    ],
+    "gravity_unknown": [(imu(accel=times(3.5)), "error: no usual unit")],
+    "gravity_missing": [(imu(accel=plus([0, 0, 9.75])), "error: 'linear accelerations'")],
+    "gravity_bias": [(imu(accel=plus([0, 0, -0.15])), "note: off by +0.15 m/s^2 (+15 mg)")],
+    "gravity_not_seen": [
+        (imu(rows=slice(1800, None), accel=times(3.5)), "warning: the log has no second at rest")
+    ],
+    "rates_as_increments": [
+        (
             imu(kind="increment", accel=times(factor)),
             f"error: rates in {unit}, not increments over 10 ms: multiply",
         )
         for unit, factor in (("m/s^2", 1.0), ("g", 1 / G))
-    ),
-    *(
-        Spoilt(
-            "increments_as_rates",
+    ],
+    "increments_as_rates": [
+        (
             imu(gyro=times(0.01), accel=times(factor)),
             f"error: increments over 10 ms in {unit}, not rates: divide",
         )
         for unit, factor in (("m/s", 0.01), ("g s", 0.01 / G))
-    ),
-    *(
-        Spoilt("z_axis_reversed", imu(**turned(C)), "error: +9.8 m/s^2 on accel_z")
-        for C in (np.diag([1, -1, -1]), np.diag([1, 1, -1]), [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-    ),
-    Spoilt("z_axis_reversed", imu(body="RFU"), "error"),
-    Spoilt(
-        "not_level",
-        imu(**turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])),
-        "warning",
-        near(1.0, abs=0.01),
-    ),
-    Spoilt("sensor_axes", tumble, "note: (-0.00, +0.00, +1.00) of x, y, z"),
-    Spoilt("gyro_unit", imu(gyro=times(60 * 180 / np.pi)), "error: in deg/s: multiply by pi/180."),
-    Spoilt("gyro_unit", imu(gyro=times(3600 * 180 / np.pi)), "error: in deg/h: multiply by pi/180"),
-    Spoilt(
-        "gyro_unit",
-        imu(rows=slice(0, 1100), gyro=np.rad2deg),
-        "error line 2: at rest the gyros show 0.2",
-    ),
-    Spoilt("gyro_unit", partial(good_gyro, 180 / np.pi), "warning: Earth's 15.04 deg/h in deg/s"),
-    Spoilt("gyro_unit", partial(good_gyro, 648e3 / np.pi), "error: Earth's 15.04 deg/h in deg/h"),
-)
+    ],
+    "z_axis_reversed": [
+        *(
+            (imu(**turned(C)), "error: +9.8 m/s^2 on accel_z")
+            for C in (np.diag([1, -1, -1]), np.diag([1, 1, -1]), [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+        ),
+        (imu(body="RFU"), "error"),
+    ],
+    "not_level": [
+        (imu(**turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])), "warning", near(1.0, abs=0.01))
+    ],
+    "sensor_axes": [(tumble, "note: (-0.00, +0.00, +1.00) of x, y, z")],
+    "gyro_unit": [
+        (imu(gyro=times(60 * 180 / np.pi)), "error: in deg/s: multiply by pi/180."),
+        (imu(gyro=times(3600 * 180 / np.pi)), "error: in deg/h: multiply by pi/180"),
+        (imu(rows=slice(0, 1100), gyro=np.rad2deg), "error line 2: at rest the gyros show 0.2"),
+        (partial(good_gyro, 180 / np.pi), "warning: Earth's 15.04 deg/h in deg/s"),
+        (partial(good_gyro, 648e3 / np.pi), "error: Earth's 15.04 deg/h in deg/h"),
+    ],
+}
 
-GNSS = (
-    Spoilt("gnss_missing", gnss(alt_m=put(3, np.nan)), "warning line 6", 1),
-    Spoilt("gnss_missing", gnss(lat_rad=times(np.nan)), "error", M),
-    Spoilt("gnss_missing", gnss(alt_m=np.full(M, 1e300)), "error: is 1e+300 here", M, "height"),
-    Spoilt("gnss_missing", gnss(v_n=times([1, 1, np.nan])), "note: velocity down is nan", M),
-    *(
-        Spoilt("position_unit", gnss(lat_rad=lat, lon_rad=lon), f"error line 3: {cause}")
+GNSS = {
+    "gnss_missing": [
+        (gnss(alt_m=put(3, np.nan)), "warning line 6", 1),
+        (gnss(lat_rad=times(np.nan)), "error", M),
+        (gnss(alt_m=np.full(M, 1e300)), "error: is 1e+300 here", M, "height"),
+        (gnss(v_n=times([1, 1, np.nan])), "note: velocity down is nan", M),
+    ],
+    "position_unit": [
+        (gnss(lat_rad=lat, lon_rad=lon), f"error line 3: {cause}")
         for lat, lon, cause in (
             (np.rad2deg, np.rad2deg, "degrees where radians are needed"),
             (plus(np.deg2rad(-149)), plus(np.deg2rad(39)), "Latitude and longitude are exchanged"),
             (times(1e7), times(1), "scaled (1e-7 deg?)"),
         )
-    ),
-    Spoilt(
-        "no_fix_as_zero",
-        gnss(lat_rad=put([5, 6, 7], 0.0), lon_rad=put([5, 6, 7], 0.0)),
-        "error line 8",
-        3,
-    ),
-    Spoilt(
-        "position_in_radians",
-        gnss(lat_rad=np.deg2rad, lon_rad=np.deg2rad),
-        "warning",
-        beside="velocity_unit",
-    ),
-    Spoilt("height", gnss(alt_m=plus(430e3)), "warning"),
-    Spoilt("height", gnss(alt_m=plus(-20e3)), "error"),
-    Spoilt("height", gnss(alt_m=plus(-1e3)), "warning"),
-    Spoilt("sigma_not_positive", gnss(sigma_m=put((7, 1), 0.0)), "error line 10", 1),
-    Spoilt("sigma_not_positive", gnss(sigma_v=put((7, 1), 0.0)), "error line 10", 1),
-    Spoilt("sigma_not_positive", gnss(sigma_m=times(-1)), "error line 3", M),
-    Spoilt("sigma_not_positive", gnss(sigma_v=times(-1)), "error line 3", M),
-    Spoilt("sigma_missing", gnss(sigma_m=times(np.nan)), "error: the position has no sigma"),
-    Spoilt("sigma_missing", gnss(sigma_v=times(np.nan)), "error: the velocity has no sigma"),
-    Spoilt("sigma_absurd", gnss(sigma_m=times(1e-3)), "warning", near(2e-5)),
-    Spoilt("sigma_absurd", gnss(sigma_m=times(1e6)), "warning", near(2e4)),
-    Spoilt("float_sigma", gnss(quality=FLOAT), "warning line 304"),
-    Spoilt(
-        "position_resolution",
-        gnss(lat_rad=lambda lat: np.deg2rad(np.round(np.rad2deg(lat), 6))),
-        "note",
-        near(0.111, rel=0.01),
-    ),
-)
+    ],
+    "no_fix_as_zero": [
+        (gnss(lat_rad=put([5, 6, 7], 0.0), lon_rad=put([5, 6, 7], 0.0)), "error line 8", 3)
+    ],
+    "position_in_radians": [
+        (gnss(lat_rad=np.deg2rad, lon_rad=np.deg2rad), "warning", None, "velocity_unit")
+    ],
+    "height": [
+        (gnss(alt_m=plus(430e3)), "warning"),
+        (gnss(alt_m=plus(-20e3)), "error"),
+        (gnss(alt_m=plus(-1e3)), "warning"),
+    ],
+    "sigma_not_positive": [
+        (gnss(sigma_m=put((7, 1), 0.0)), "error line 10", 1),
+        (gnss(sigma_v=put((7, 1), 0.0)), "error line 10", 1),
+        (gnss(sigma_m=times(-1)), "error line 3", M),
+        (gnss(sigma_v=times(-1)), "error line 3", M),
+    ],
+    "sigma_missing": [
+        (gnss(sigma_m=times(np.nan)), "error: the position has no sigma"),
+        (gnss(sigma_v=times(np.nan)), "error: the velocity has no sigma"),
+    ],
+    "sigma_absurd": [
+        (gnss(sigma_m=times(1e-3)), "warning", near(2e-5)),
+        (gnss(sigma_m=times(1e6)), "warning", near(2e4)),
+    ],
+    "float_sigma": [(gnss(quality=FLOAT), "warning line 304")],
+    "position_resolution": [
+        (
+            gnss(lat_rad=lambda lat: np.deg2rad(np.round(np.rad2deg(lat), 6))),
+            "note",
+            near(0.111, rel=0.01),
+        )
+    ],
+}
 
-VELOCITY = (
-    Spoilt(
-        "velocity_unit",
-        gnss(lat_rad=np.deg2rad, lon_rad=np.deg2rad),
-        "error: The positions are radians that were read as degrees",
-        beside="position_in_radians",
-    ),
-    *(
-        Spoilt("velocity_unit", gnss(v_n=times(k)), f"error: probably in {unit}", near(k, rel=0.01))
-        for unit, k in {
-            **{"km/h": 3.6, "knots": 1 / 0.514444, "ft/s": 1 / 0.3048},
-            **{"cm/s": 100, "mm/s": 1e3},
-        }.items()
-    ),
-    Spoilt(
-        "velocity_axes",
-        gnss(v_n=lambda v: v[:, [1, 0, 2]] * [1, 1, -1]),
-        "error: probably east, north, up, not north, east, down",
-    ),
-    Spoilt("velocity_axes", gnss(nav="ENU"), "error: probably north, east, down, not east, north"),
-    Spoilt(
-        "velocity_axes",
-        lambda: gnss(lat_rad=drive().gnss.lon_rad, lon_rad=drive().gnss.lat_rad)(),
-        "error: Latitude and longitude are exchanged",
-    ),
-    Spoilt("velocity_axes", gnss(v_n=times([1, -1, 1])), "error: reversed east. A sign convention"),
-    Spoilt("velocity_axes", gnss(v_n=times([-1, -1, 1])), "error: reversed north and east. A sign"),
-    Spoilt("velocity_sign", gnss(v_n=times([1, 1, -1])), "error: is probably up, not down"),
-    Spoilt("velocity_disagrees", gnss(v_n=partial(np.roll, shift=130, axis=0)), "warning"),
-    Spoilt(
-        "velocity_late",
-        gnss(v_n=velocity_ned(np.maximum(np.arange(M) / GNSS_HZ - 0.1, 0.0))),
-        "warning: half an epoch",
-        near(0.1, abs=0.02),
-    ),
-)
+VELOCITY = {
+    "velocity_unit": [
+        (
+            gnss(lat_rad=np.deg2rad, lon_rad=np.deg2rad),
+            "error: The positions are radians that were read as degrees",
+            None,
+            "position_in_radians",
+        ),
+        *(
+            (gnss(v_n=times(k)), f"error: probably in {unit}", near(k, rel=0.01))
+            for unit, k in {
+                **{"km/h": 3.6, "knots": 1 / 0.514444, "ft/s": 1 / 0.3048},
+                **{"cm/s": 100, "mm/s": 1e3},
+            }.items()
+        ),
+    ],
+    "velocity_axes": [
+        (
+            gnss(v_n=lambda v: v[:, [1, 0, 2]] * [1, 1, -1]),
+            "error: probably east, north, up, not north, east, down",
+        ),
+        (gnss(nav="ENU"), "error: probably north, east, down, not east, north"),
+        (
+            lambda: gnss(lat_rad=drive().gnss.lon_rad, lon_rad=drive().gnss.lat_rad)(),
+            "error: Latitude and longitude are exchanged",
+        ),
+        (gnss(v_n=times([1, -1, 1])), "error: reversed east. A sign convention"),
+        (gnss(v_n=times([-1, -1, 1])), "error: reversed north and east. A sign"),
+    ],
+    "velocity_sign": [(gnss(v_n=times([1, 1, -1])), "error: is probably up, not down")],
+    "velocity_disagrees": [(gnss(v_n=partial(np.roll, shift=130, axis=0)), "warning")],
+    "velocity_late": [
+        (
+            gnss(v_n=velocity_ned(np.maximum(np.arange(M) / GNSS_HZ - 0.1, 0.0))),
+            "warning: half an epoch",
+            near(0.1, abs=0.02),
+        )
+    ],
+}
 
-MAG = (
-    *(
-        Spoilt("field_unit", mag(field_t=times(k)), says, near(48.6e-6 * k, rel=0.01))
+MAG = {
+    "field_unit": [
+        (mag(field_t=times(k)), says, near(48.6e-6 * k, rel=0.01))
         for k, says in {
             1e6: "error: probably in uT: multiply by 1e-6",
             1e9: "error: probably in nT: multiply by 1e-9",
@@ -310,217 +310,213 @@ MAG = (
             1e-3: "error: in uT where nT is said, or mT where uT: multiply by 1000",
             3e11: "error: no usual unit makes it that. These are counts of a converter",
         }.items()
-    ),
-    Spoilt(
-        "field_missing",
-        mag(field_t=put((slice(100, 140), 1), np.nan)),
-        "warning 1.000 s after the start: 40 of 4000 samples (1.0%)",
-        40,
-    ),
-    Spoilt("field_missing", mag(field_t=put((ALL, 2), np.nan)), "warning: of field_z there is"),
-    Spoilt("field_zero", mag(field_t=put(slice(25), 0.0)), "warning: 0 0 0 in 25 of 4000", 25),
-    Spoilt("field_zero", mag(field_t=times(0.0)), "error", 4000),
-    Spoilt("field_stuck", mag(field_t=put((ALL, 1), 12e-6)), "error: field_y never changes (12 uT"),
-    Spoilt(
-        "field_stuck_for_a_while",
-        mag(field_t=lambda field_t: put(slice(1200, 1500), field_t[1200])(field_t)),
-        "warning 12.000 s after the start: for 300 samples (3.0 s)",
-    ),
-    Spoilt(
-        "field_repeated",
-        mag(field_t=lambda field_t: np.repeat(field_t[::5], 5, axis=0)),
-        "note: 80% of the samples ... about 20 times a second, the log has 100 rows",
-    ),
-    Spoilt(
-        "field_saturated",
-        mag(field_t=magnet),
-        "warning 20.000 s after the start: stops at -400 uT in 30 readings, 30 in a row",
-        -400e-6,
-        "field_offset",
-    ),
-    Spoilt("field_varies", mag(field_t=times([1.3, 0.8, 1.0])), "warning: `robins calibrate`"),
-    Spoilt("field_offset", mag(field_t=plus([3e-5, -1e-5, 5e-6])), "warning: `robins calibrate`"),
-    Spoilt("field_disturbed", mag(field_t=bump), "note 24."),
-)
+    ],
+    "field_missing": [
+        (
+            mag(field_t=put((slice(100, 140), 1), np.nan)),
+            "warning 1.000 s after the start: 40 of 4000 samples (1.0%)",
+            40,
+        ),
+        (mag(field_t=put((ALL, 2), np.nan)), "warning: of field_z there is"),
+    ],
+    "field_zero": [
+        (mag(field_t=put(slice(25), 0.0)), "warning: 0 0 0 in 25 of 4000", 25),
+        (mag(field_t=times(0.0)), "error", 4000),
+    ],
+    "field_stuck": [(mag(field_t=put((ALL, 1), 12e-6)), "error: field_y never changes (12 uT")],
+    "field_stuck_for_a_while": [
+        (
+            mag(field_t=lambda field_t: put(slice(1200, 1500), field_t[1200])(field_t)),
+            "warning 12.000 s after the start: for 300 samples (3.0 s)",
+        )
+    ],
+    "field_repeated": [
+        (
+            mag(field_t=lambda field_t: np.repeat(field_t[::5], 5, axis=0)),
+            "note: 80% of the samples ... about 20 times a second, the log has 100 rows",
+        )
+    ],
+    "field_saturated": [
+        (
+            mag(field_t=magnet),
+            "warning 20.000 s after the start: stops at -400 uT in 30 readings, 30 in a row",
+            -400e-6,
+            "field_offset",
+        )
+    ],
+    "field_varies": [(mag(field_t=times([1.3, 0.8, 1.0])), "warning: `robins calibrate`")],
+    "field_offset": [(mag(field_t=plus([3e-5, -1e-5, 5e-6])), "warning: `robins calibrate`")],
+    "field_disturbed": [(mag(field_t=bump), "note 24.")],
+}
 
-SPAN = (
-    *(
-        Spoilt("no_overlap", two(imu_ns=plus(seconds * S)), f"error: {words}")
-        for seconds, words in {
-            -WEEK: f"if GPS week 2288 ({WEEK} s) is added to the IMU's",
-            -315_964_800: "counted from 1970, the IMU's from 1980",
-            18: "in UTC, the IMU's in GPS time, 18 s ahead: they fit if +18 s is added",
-            2 * 3600: "They fit if +2 h is added: one clock is in local time",
-            -777_777: "No usual offset explains it",
-        }.items()
-    ),
-    Spoilt(
-        "no_overlap",
-        two(gnss_ns=plus(-WEEK * S)),
-        f"error: are seconds of the GPS week ... fit if GPS week 2288 ({WEEK} s) is added.",
-    ),
-    Spoilt(
-        "no_overlap",
-        two(since_start(1000, 20 * S), since_start(1, 20 * S)),
-        "error: They fit if the IMU's times are milliseconds",
-        beside="time_unit",
-    ),
-    Spoilt(
-        "no_overlap",
-        lambda: [imu(rows=slice(0, 1000))(), spoil(a_path, time_ns=plus(-(10**15)))()],
-        "error",
-    ),
-    Spoilt("no_overlap", master(time_ns=plus(10**12)), "error", beside=UNCHECKED),
-    Spoilt(
-        "little_overlap",
-        two(imu_ns=plus(7 * S)),
-        "warning",
-        near(2.7, abs=0.3),
-        "motion_not_checked",
-    ),
-    Spoilt(
-        "leap_seconds",
-        with_gnss(time_ns=plus(18 * S), v_n=None, sigma_v=None),
-        "warning: begins +18.000 s and ends",
-        near(18.0),
-        beside="leap_seconds",
-    ),
-)
+SPAN = {
+    "no_overlap": [
+        *(
+            (two(imu_ns=plus(seconds * S)), f"error: {words}")
+            for seconds, words in {
+                -WEEK: f"if GPS week 2288 ({WEEK} s) is added to the IMU's",
+                -315_964_800: "counted from 1970, the IMU's from 1980",
+                18: "in UTC, the IMU's in GPS time, 18 s ahead: they fit if +18 s is added",
+                2 * 3600: "They fit if +2 h is added: one clock is in local time",
+                -777_777: "No usual offset explains it",
+            }.items()
+        ),
+        (
+            two(gnss_ns=plus(-WEEK * S)),
+            f"error: are seconds of the GPS week ... fit if GPS week 2288 ({WEEK} s) is added.",
+        ),
+        (
+            two(since_start(1000, 20 * S), since_start(1, 20 * S)),
+            "error: They fit if the IMU's times are milliseconds",
+            None,
+            "time_unit",
+        ),
+        (lambda: [imu(rows=slice(0, 1000))(), spoil(a_path, time_ns=plus(-(10**15)))()], "error"),
+        (master(time_ns=plus(10**12)), "error", None, UNCHECKED),
+    ],
+    "little_overlap": [
+        (two(imu_ns=plus(7 * S)), "warning", near(2.7, abs=0.3), "motion_not_checked")
+    ],
+    "leap_seconds": [
+        (
+            with_gnss(time_ns=plus(18 * S), v_n=None, sigma_v=None),
+            "warning: begins +18.000 s and ends",
+            near(18.0),
+            "leap_seconds",
+        )
+    ],
+}
 
-MASTER = (
-    Spoilt("master_missing", master(lat_rad=put(5, np.nan)), "warning: position is not whole", 1),
-    Spoilt(
-        "master_missing", master(q_nb=times(np.nan)), "error: attitude is not whole", 800, UNCHECKED
-    ),
-    Spoilt(
-        "velocity_unit",
-        master(lat_rad=np.deg2rad, lon_rad=np.deg2rad),
-        "error: radians that were read as degrees",
-    ),
-    Spoilt("velocity_axes", exact(v_n=columns(1, 0, 2)), "error"),
-    Spoilt("velocity_disagrees", exact(v_n=partial(np.roll, shift=300, axis=0)), "warning"),
-    Spoilt("velocity_late", exact(v_n=partial(np.roll, shift=3, axis=0)), "warning"),
-    *(
-        Spoilt(
-            "velocity_sign",
+MASTER = {
+    "master_missing": [
+        (master(lat_rad=put(5, np.nan)), "warning: position is not whole", 1),
+        (master(q_nb=times(np.nan)), "error: attitude is not whole", 800, UNCHECKED),
+    ],
+    "velocity_unit": [
+        (master(lat_rad=np.deg2rad, lon_rad=np.deg2rad), "error: radians that were read as degrees")
+    ],
+    "velocity_axes": [(exact(v_n=columns(1, 0, 2)), "error")],
+    "velocity_disagrees": [(exact(v_n=partial(np.roll, shift=300, axis=0)), "warning")],
+    "velocity_late": [(exact(v_n=partial(np.roll, shift=3, axis=0)), "warning")],
+    "velocity_sign": [
+        (
             master(v_n=times(1 - 2 * np.eye(3)[k])),
             f"error: It is probably positive {other}: turn its sign",
             name,
         )
         for k, (name, other) in enumerate((("north", "south"), ("east", "west"), ("down", "up")))
-    ),
-    *(
-        Spoilt("attitude_sign", master(q_nb=change), f"error: {words}")
+    ],
+    "attitude_sign": [
+        (master(q_nb=change), f"error: {words}")
         for change, words in (
             (with_signs([-1, 1, 1]), "Heading is probably counted counterclockwise: count it"),
             (with_signs([1, -1, 1]), "Pitch is probably positive with the nose down: turn its"),
             (with_signs([1, 1, -1]), "Roll is probably positive with the right wing up: turn its"),
             (times([1, -1, -1, -1]), "navigation to body axes: give their conjugates"),
         )
-    ),
-    Spoilt("turning_not_checked", master(q_nb=lambda q_nb: q_nb * 0 + q_nb[:1]), "note"),
-    Spoilt("gyro_unit", slave(gyro=np.rad2deg), "error: deg/s: multiply by pi/180"),
-    Spoilt("gyro_axes", slave(gyro=columns(1, 2, 0)), "error: (gyro_z, gyro_x, gyro_y)"),
-    Spoilt("gyro_axes", slave(gyro=times(-1)), "error: (-gyro_x, -gyro_y, -gyro_z)"),
-    Spoilt("turning_disagrees", slave(gyro=partial(np.roll, shift=700, axis=0)), "error"),
-    *(
-        Spoilt("master_late", late(total_s), f"error: {mend}", near(total_s, abs=0.004))
-        for total_s, mend in ((0.08, 'State that: master.delay = "0.08'), (-0.05, "Add 0.05"))
-    ),
-    Spoilt("master_late", late(0.015), "warning"),
-    Spoilt("force_not_checked", master(v_n=times(np.nan)), "note", beside="master_missing"),
-    Spoilt("gravity_unit", slave(accel=times(1 / G)), "error: probably g: multiply by 9.80665"),
-    Spoilt("rates_as_increments", slave(kind="increment"), "error", None, "turning_disagrees"),
-    Spoilt("increments_as_rates", slave(accel=times(0.01)), "error: They are probably increments"),
-    Spoilt("accel_reversed", slave(accel=times(-1)), "error: opposite sign", None, "velocity_sign"),
-    Spoilt("accel_axes", slave(accel=columns(0, 2, 1)), "error: as (accel_x, accel_z, accel_y)"),
-    Spoilt("force_disagrees", slave(accel=plus([0, 0, 9.81])), "error: or gravity taken off"),
-)
+    ],
+    "turning_not_checked": [(master(q_nb=lambda q_nb: q_nb * 0 + q_nb[:1]), "note")],
+    "gyro_unit": [(slave(gyro=np.rad2deg), "error: deg/s: multiply by pi/180")],
+    "gyro_axes": [
+        (slave(gyro=columns(1, 2, 0)), "error: (gyro_z, gyro_x, gyro_y)"),
+        (slave(gyro=times(-1)), "error: (-gyro_x, -gyro_y, -gyro_z)"),
+    ],
+    "turning_disagrees": [(slave(gyro=partial(np.roll, shift=700, axis=0)), "error")],
+    "master_late": [
+        *(
+            (late(total_s), f"error: {mend}", near(total_s, abs=0.004))
+            for total_s, mend in ((0.08, 'State that: master.delay = "0.08'), (-0.05, "Add 0.05"))
+        ),
+        (late(0.015), "warning"),
+    ],
+    "force_not_checked": [(master(v_n=times(np.nan)), "note", None, "master_missing")],
+    "gravity_unit": [(slave(accel=times(1 / G)), "error: probably g: multiply by 9.80665")],
+    "rates_as_increments": [(slave(kind="increment"), "error", None, "turning_disagrees")],
+    "increments_as_rates": [(slave(accel=times(0.01)), "error: They are probably increments")],
+    "accel_reversed": [(slave(accel=times(-1)), "error: opposite sign", None, "velocity_sign")],
+    "accel_axes": [(slave(accel=columns(0, 2, 1)), "error: as (accel_x, accel_z, accel_y)")],
+    "force_disagrees": [(slave(accel=plus([0, 0, 9.81])), "error: or gravity taken off")],
+}
 
-MOTION = (
-    *(
-        Spoilt(
-            "gyro_unit",
-            with_imu(gyro=times(factor)),
-            f"error: turns by the gyros ... {words}",
-        )
+MOTION = {
+    "gyro_unit": [
+        (with_imu(gyro=times(factor)), f"error: turns by the gyros ... {words}")
         for factor, words in {
             180 / np.pi: "probably deg/s: multiply by pi/180",
             180 / np.pi * 3600: "probably deg/h: multiply by pi/180/3600",
             np.pi / 180: "probably rad/s converted to radians once more",
             0.01: "probably increments where rates are expected: divide by 0.01 s",
         }.items()
-    ),
-    Spoilt("left_handed", with_imu(**turned([[0, 1, 0], [1, 0, 0], [0, 0, 1]])), "error"),
-    Spoilt("left_handed", with_imu(**turned(np.diag([1, -1, 1]))), "error"),
-    *(
-        Spoilt("gyro_axes", with_imu(gyro=change), f"error: take them as {words}")
+    ],
+    "left_handed": [
+        (with_imu(**turned([[0, 1, 0], [1, 0, 0], [0, 0, 1]])), "error"),
+        (with_imu(**turned(np.diag([1, -1, 1]))), "error"),
+    ],
+    "gyro_axes": [
+        (with_imu(gyro=change), f"error: take them as {words}")
         for change, words in (
             (times([-1, 1, 1]), "(-gyro_x, gyro_y, gyro_z)"),
             (times([1, 1, -1]), "(gyro_x, gyro_y, -gyro_z)"),
             (columns(1, 0, 2), "(gyro_y, gyro_x, gyro_z)"),
             (columns(1, 2, 0), "(gyro_z, gyro_x, gyro_y)"),
         )
-    ),
-    Spoilt("gyro_reversed", with_imu(gyro=times(-1)), "error"),
-    Spoilt("accel_axes", with_imu(accel=times([1, -1, 1])), "error: (accel_x, -accel_y, accel_z)"),
-    Spoilt("accel_reversed", with_imu(accel=times(-1)), "error", beside="z_axis_reversed"),
-    *(
-        Spoilt(
-            "forward_axis",
-            with_imu(**about_vertical(angle)),
-            "warning",
-            near(angle, abs=3.0),
-        )
+    ],
+    "gyro_reversed": [(with_imu(gyro=times(-1)), "error")],
+    "accel_axes": [(with_imu(accel=times([1, -1, 1])), "error: (accel_x, -accel_y, accel_z)")],
+    "accel_reversed": [(with_imu(accel=times(-1)), "error", None, "z_axis_reversed")],
+    "forward_axis": [
+        (with_imu(**about_vertical(angle)), "warning", near(angle, abs=3.0))
         for angle in (90, 180, -50)
-    ),
-    *(
-        Spoilt(
-            "time_offset", with_imu(time_ns=plus(round(offset * S))), kind, near(offset, abs=0.06)
-        )
+    ],
+    "time_offset": [
+        (with_imu(time_ns=plus(round(offset * S))), kind, near(offset, abs=0.06))
         for offset, kind in {0.3: "warning", -2.5: "error", 8.0: "error"}.items()
-    ),
-    Spoilt(
-        "leap_seconds",
-        with_imu(time_ns=plus(18 * S)),
-        "error: only if +18.0 ... That is the leap seconds between UTC and GPS time",
-        beside="leap_seconds",
-    ),
-    Spoilt(
-        "motion_disagrees",
-        with_imu(gyro=lambda gyro: gyro[::-1], accel=lambda accel: accel[::-1]),
-        "warning",
-    ),
-    Spoilt("motion_not_checked", with_imu(rows=slice(0, 1100)), "note", 0, "little_overlap"),
-)
+    ],
+    "leap_seconds": [
+        (
+            with_imu(time_ns=plus(18 * S)),
+            "error: only if +18.0 ... That is the leap seconds between UTC and GPS time",
+            None,
+            "leap_seconds",
+        )
+    ],
+    "motion_disagrees": [
+        (with_imu(gyro=lambda gyro: gyro[::-1], accel=lambda accel: accel[::-1]), "warning")
+    ],
+    "motion_not_checked": [(with_imu(rows=slice(0, 1100)), "note", 0, "little_overlap")],
+}
 
-TURNING = (
-    Spoilt("gyro_unit", hand(gyro=np.rad2deg), "error: deg/s: multiply by pi/180"),
-    Spoilt("gyro_unit", hand(gyro=np.deg2rad), "error: rad/s converted to radians once"),
-    Spoilt("left_handed", hand(gyro=times(-1)), "error"),
-    Spoilt("left_handed", hand(**turned(np.diag([1, -1, 1]))), "error"),
-    Spoilt("gyro_axes", hand(gyro=columns(1, 0, 2)), "error: fit as (gyro_y, gyro_x, gyro_z)"),
-)
+TURNING = {
+    "gyro_unit": [
+        (hand(gyro=np.rad2deg), "error: deg/s: multiply by pi/180"),
+        (hand(gyro=np.deg2rad), "error: rad/s converted to radians once"),
+    ],
+    "left_handed": [
+        (hand(gyro=times(-1)), "error"),
+        (hand(**turned(np.diag([1, -1, 1]))), "error"),
+    ],
+    "gyro_axes": [(hand(gyro=columns(1, 0, 2)), "error: fit as (gyro_y, gyro_x, gyro_z)")],
+}
 
-MAG_AXES = (
-    Spoilt("field_axes", mag(field_t=columns(1, 2, 0)), "error: (field_z, field_x, field_y)"),
-)
+MAG_AXES = {"field_axes": [(mag(field_t=columns(1, 2, 0)), "error: (field_z, field_x, field_y)")]}
 
-ATTITUDE = (
-    Spoilt("attitude_missing", attitude(q_nb=times(np.nan)), "warning"),
-    *(
-        Spoilt("attitude_order", attitude(q_nb=change), f"error: {words}")
+ATTITUDE = {
+    "attitude_missing": [(attitude(q_nb=times(np.nan)), "warning")],
+    "attitude_order": [
+        (attitude(q_nb=change), f"error: {words}")
         for change, words in (
             (columns(1, 2, 3, 0), "scalar last (x, y, z, w): put the last column first"),
             (times([1, -1, -1, -1]), "navigation to body: turn the sign of x, y and z"),
             (lambda q: q[:, [1, 2, 3, 0]] * [-1, -1, -1, 1], "scalar last and navigation to body"),
         )
-    ),
-    Spoilt("attitude_axes", attitude(q_nb=yawed), "error: gyros (gyro_y, -gyro_x, gyro_z)"),
-    Spoilt("attitude_frame", attitude(nav="NED"), "error: where NED has up at ... to ENU."),
-    Spoilt("attitude_frame", attitude(q_nb=tipped), "error: along (+1.00, ... not stand upright"),
-    Spoilt("attitude_disagrees", attitude(q_nb=lambda q: q[::-1]), "warning"),
-)
+    ],
+    "attitude_axes": [(attitude(q_nb=yawed), "error: gyros (gyro_y, -gyro_x, gyro_z)")],
+    "attitude_frame": [
+        (attitude(nav="NED"), "error: where NED has up at ... to ENU."),
+        (attitude(q_nb=tipped), "error: along (+1.00, ... not stand upright"),
+    ],
+    "attitude_disagrees": [(attitude(q_nb=lambda q: q[::-1]), "warning")],
+}
 
 SPOILT = {
     "check_time": TIME,
