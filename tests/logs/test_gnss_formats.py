@@ -82,13 +82,6 @@ def test_columns_are_found_by_name(pos):
     assert gnss.sigma_m.tolist() == [[1.0, 2.0, 3.0]]
 
 
-def test_heights_above_the_geoid_are_told(pos):
-    findings = []
-    comment = "% (lat/lon/height=WGS84/geodetic,Q=1:fix,2:float,ns=# of satellites)"
-    read_rtklib(pos(comment, HEADER, FIX.format(q=1)), findings)
-    assert [(f.severity, f.code) for f in findings] == [("warning", "height_above_geoid")]
-
-
 @pytest.mark.parametrize(
     ("lines", "message"),
     [

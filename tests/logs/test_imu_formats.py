@@ -271,16 +271,6 @@ def test_pyins_columns_in_any_order_with_a_nameless_index(tmp_path):
     assert table.accel[1].tolist() == [4.5, 5.5, 0.5]
 
 
-def test_increments_whose_dt_disagrees_with_time_are_told(tmp_path):
-    path = tmp_path / "imu.csv"
-    rows = "".join(f"{t},0.01,0,0,0,0,0,-0.098\n" for t in (1.0, 1.01, 1.03, 1.04))
-    path.write_text("time,dt,theta_x,theta_y,theta_z,dv_x,dv_y,dv_z\n" + rows)
-    findings = []
-    read_pyins(path, findings)
-    (f,) = findings
-    assert (f.severity, f.code, f.where, f.value) == ("warning", "dt_disagrees", "line 4", 0.01)
-
-
 def test_pyins_columns_that_lack(tmp_path):
     path = tmp_path / "imu.csv"
     path.write_text("time,gyro_x,gyro_y,gyro_z,accel_x,accel_y\n0,1,2,3,4,5\n")
