@@ -178,3 +178,37 @@ def test_every_finding_and_refusal_is_documented():
     codes = (code for codes in (OF_READERS, *(check.codes for check in CHECKS)) for code in codes)
     assert sorted(rows) == sorted(codes)
     assert {key.partition("_")[2] for key in clean(tumble()).counts} <= set(REFUSALS)
+
+
+def test_what_is_asked_beside_what():
+    """Two sensors are compared only where neither is known to be wrong, and by the better judge."""
+
+    def asked(things, *found):
+        asked = [c for c in TOGETHER if c.is_asked(dict.fromkeys(things.split()), set(found))]
+        return [c.find.__name__.removeprefix("check_") for c in asked]
+
+    whole = "imu gnss mag attitude others"
+    assert asked(whole) == ["span", "motion", "mag_axes", "attitude"]
+    assert asked(f"{whole} master delay_s") == ["span", "master"]
+    assert asked("imu others master delay_s") == ["span", "master"]
+    assert asked("imu others") == ["span", "turning"]
+    assert asked("imu gnss others", "motion_not_checked") == ["span", "motion", "turning"]
+    for code in ("gyro_unit", "gyro_axes", "gyro_reversed", "left_handed"):
+        assert asked(whole, code) == ["span", "motion"]
+    for code in ("field_unit", "field_stuck"):
+        assert asked(whole, code) == ["span", "motion", "attitude"]
+    for code in (
+        *("no_overlap", "rates_as_increments", "increments_as_rates", "time_unit", "time_slow"),
+        *("velocity_axes", "velocity_unit", "velocity_sign", "position_unit", "no_fix_as_zero"),
+    ):
+        assert asked(whole, code) == asked("imu others", code) == ["span"]
+    _, master, motion, turning, *_ = TOGETHER
+    for check in (motion, turning):
+        assert check.outdated({"gyro_unit"}) == {"gyro_unit"}
+        assert check.outdated({"left_handed"}) == set()
+    by_rest = {
+        *("gravity_unit", "gravity_unknown", "gravity_bias", "gravity_not_seen", "not_level"),
+        *("gravity_missing", "z_axis_reversed", "rates_as_increments", "increments_as_rates"),
+    }
+    assert master.outdated({"gyro_unit"}) == by_rest
+    assert master.outdated({"force_not_checked"}) == set()
