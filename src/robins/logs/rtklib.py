@@ -66,7 +66,7 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     width = len(data[0][1].split("," if comma else None)) - texts
     names = names or (_WITH_VELOCITY if width >= len(_WITH_VELOCITY) else _POSITION)
     time_names = ("date", "time")[-texts:] if calendar else ("week", "time of week")
-    layout = Layout((*time_names, *names), "," if comma else None, texts)
+    layout = Layout((*time_names, *names), "," if comma else None, tuple(range(texts)))
     columns = read_columns(path, layout, findings)
     if missing := [n for n in _NEEDED if n not in names]:
         raise LogError(

@@ -16,6 +16,7 @@ import io
 import os
 import re
 from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ from robins.logs.opening import Source
 _PARSE_BYTES = 1 << 22
 _LONGEST_LINE = 1 << 16
 _TEXT_BYTES = 40
+_TEXT, _NUMBER_TYPE, _UNREAD = f"S{_TEXT_BYTES}", "f8", "S1"
 _BOM, _LF = b"\xef\xbb\xbf", b"\n"
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.I)
 COMMENTS = ("#", "%")
@@ -35,23 +37,30 @@ COMMENTS = ("#", "%")
 class Layout(NamedTuple):
     """How to read the lines of a file.
 
-    The first `texts` columns, at least one, are kept as text (time stamps are read from their
-    digits); the others are numbers. Further columns than those named may follow; all lines must
-    have as many as the first ones have.
+    Columns at the places `texts`, at least one, are kept as text (time stamps are read from their
+    digits), those at the places `numbers` are numbers, others may hold anything. Further columns
+    than those named may follow; all lines must have as many as the first ones have.
     """
 
     names: tuple[str, ...]
     delimiter: str | None  # None: blanks
-    texts: int = 1
+    texts: tuple[int, ...] = (0,)
+    numbers: tuple[int, ...] | None = None  # in ascending order; None: all that are not text
     skip: int = 0  # header lines
     all_named: bool = False  # no columns follow those named: more fields are decimal commas
+
+    def number(self, place: int) -> int:
+        """Where in `Columns.values` the column at this place lies."""
+        if self.numbers is not None:
+            return self.numbers.index(place)
+        return place - sum(text < place for text in self.texts)
 
 
 class Columns(NamedTuple):
     """What was read: n rows of text columns and number columns, and their line numbers."""
 
     texts: np.ndarray  # (n, texts) bytes
-    values: np.ndarray  # (n, width - texts) float64
+    values: np.ndarray  # (n, numbers) float64
     rows: np.ndarray  # (n,) line numbers, from 1
 
 
@@ -212,13 +221,14 @@ class _Reader:
 
     def __init__(self, file: str, layout: Layout, width: int):
         self.file, self.layout, self.width = file, layout, width
-        self.numbers = width - layout.texts
-        self.dtype = np.dtype(
-            [
-                ("texts", f"S{_TEXT_BYTES}", (layout.texts,)),
-                ("values", np.float64, (self.numbers,)),
-            ]
-        )
+        numbers = range(width) if layout.numbers is None else layout.numbers
+        self.kinds = [
+            _TEXT if k in layout.texts else _NUMBER_TYPE if k in numbers else _UNREAD
+            for k in range(width)
+        ]
+        runs = [(kind, len(list(run))) for kind, run in groupby(self.kinds)]
+        self.dtype = np.dtype([(str(k), kind, (n,)) for k, (kind, n) in enumerate(runs)])
+        self.runs = [kind for kind, _ in runs]
 
     def read(self, block: bytes, line: int, cut_first: tuple[int, str] | None) -> Columns:
         """Columns of a block whose first line has this number."""
@@ -235,17 +245,22 @@ class _Reader:
             table = None
         if table is None or len(table) != block.count(_LF):
             return self._line_by_line(block, line, cut_first)
-        texts = np.ascontiguousarray(table["texts"])
+        texts = self._joined(table, _TEXT)
         if np.any(texts.view(np.uint8)[:, _TEXT_BYTES - 1 :: _TEXT_BYTES]):
             return self._line_by_line(block, line, cut_first)
         rows = np.arange(line, line + len(table))
-        return Columns(texts, np.ascontiguousarray(table["values"]), rows)
+        return Columns(texts, self._joined(table, _NUMBER_TYPE), rows)
+
+    def _joined(self, table: np.ndarray, kind: str) -> np.ndarray:
+        """The columns of one kind side by side."""
+        runs = [table[str(k)] for k, own in enumerate(self.runs) if own == kind]
+        return np.hstack(runs) if runs else np.zeros((len(table), 0))
 
     def _line_by_line(self, block: bytes, line: int, cut_first: tuple[int, str] | None) -> Columns:
         comments = tuple(c.encode() for c in COMMENTS)
         texts, values, rows = [], [], []
         for number, raw in enumerate(block.removesuffix(_LF).split(_LF), start=line):
-            text = raw.strip()
+            text = raw.strip(b" \r" if self.layout.delimiter == "\t" else None)
             if not text or text.startswith(comments):
                 continue
             if cut_first is not None and number == cut_first[0]:
@@ -253,23 +268,26 @@ class _Reader:
             fields = _fields(text, self.layout.delimiter)
             if len(fields) != self.width:
                 raise self._wrong_width(number, fields)
-            texts.append(fields[: self.layout.texts])
-            values.append(
-                [self._number(number, k, f) for k, f in enumerate(fields)][-self.numbers :]
-            )
+            texts.append([self._text(number, k, fields[k]) for k in self._places(_TEXT)])
+            values.append([self._number(number, k, fields[k]) for k in self._places(_NUMBER_TYPE)])
             rows.append(number)
         return Columns(
-            np.array(texts, f"S{_TEXT_BYTES}").reshape(-1, self.layout.texts),
-            np.array(values, np.float64).reshape(-1, self.numbers),
+            np.array(texts, _TEXT).reshape(len(rows), self.kinds.count(_TEXT)),
+            np.array(values, np.float64).reshape(len(rows), self.kinds.count(_NUMBER_TYPE)),
             np.array(rows, np.int64),
         )
 
+    def _places(self, kind: str) -> list[int]:
+        return [k for k, own in enumerate(self.kinds) if own == kind]
+
+    def _text(self, line: int, k: int, field: bytes) -> bytes:
+        field = field.strip()
+        if len(field) >= _TEXT_BYTES:
+            raise self._no_number(line, k, field, "is too long for a time stamp")
+        return field
+
     def _number(self, line: int, k: int, field: bytes) -> float:
         field = field.strip()
-        if k < self.layout.texts:
-            if len(field) >= _TEXT_BYTES:
-                raise self._no_number(line, k, field, "is too long for a time stamp")
-            return 0.0
         if not field:
             return np.nan
         if not _NUMBER.fullmatch(field):
