@@ -38,8 +38,8 @@ def write_log(folder: Path) -> list[Path]:
     drive = scenario.parse(Drive, head + legs * count, ['imu_rate="200 Hz"'])
     log = drive_dataset(drive, seed=0)
     files = [folder / "imu.txt", folder / "gnss.txt", folder / "replay.toml"]
-    logs.write_kfgins_imu(files[0], log.imu)
-    logs.write_kfgins_gnss(files[1], log.gnss)
+    logs.write_log(files[0], log.imu, "kfgins-imu")
+    logs.write_log(files[1], log.gnss, "kfgins-gnss")
     sensors = text[text.index("[imu]") : text.index("[gnss]")]
     files[2].write_text(CONFIGURATION + sensors)
     print(f"{len(log.imu)} samples, {log.imu.time_ns[-1] * 1e-9:.0f} s, ", end="")

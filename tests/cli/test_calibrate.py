@@ -147,7 +147,7 @@ def test_gaps_and_needless_calibrations_are_told():
 def test_what_cannot_be_calibrated_is_told_in_a_line(robins, folder, log, tmp_path):
     flat = write(folder / "flat.npz", tumbling() * [1.0, 0.0, 0.0])
     imu = tmp_path / "imu.csv"
-    logs.write_euroc_imu(imu, logs.open_log(log).imu)
+    logs.write_log(imu, logs.open_log(log).imu, "euroc-imu")
     for arguments, says in (
         ((flat,), "turned about one axis only"),
         ((imu,), "holds no magnetic field"),

@@ -34,14 +34,14 @@ def a_still_imu(seconds=60.0, gravity=-9.81, kind="rate"):
 @pytest.fixture(scope="module")
 def still_log(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / "still.csv"
-    logs.write_euroc_imu(path, a_still_imu())
+    logs.write_log(path, a_still_imu(), "euroc-imu")
     return path
 
 
 @pytest.fixture(scope="module")
 def upside_down(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / "upside down.csv"
-    logs.write_euroc_imu(path, a_still_imu(gravity=9.81))
+    logs.write_log(path, a_still_imu(gravity=9.81), "euroc-imu")
     return path
 
 
@@ -231,8 +231,8 @@ def test_people_see_the_parameters_with_their_units(robins, still_log):
 
 def test_increments_give_what_rates_give(tmp_path):
     rates, increments = tmp_path / "rates.csv", tmp_path / "increments.csv"
-    logs.write_pyins(rates, a_still_imu(10.0))
-    logs.write_pyins(increments, a_still_imu(10.0, kind="increment"))
+    logs.write_log(rates, a_still_imu(10.0), "pyins-imu")
+    logs.write_log(increments, a_still_imu(10.0, kind="increment"), "pyins-imu")
     one, other = stability.still(rates), stability.still(increments)
     np.testing.assert_allclose(one.rates["gyro"], other.rates["gyro"], rtol=1e-9)
     np.testing.assert_allclose(one.rates["accel"], other.rates["accel"], rtol=1e-9)
@@ -243,7 +243,7 @@ def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(tmp_path):
     keep = np.ones(len(table), bool)
     keep[1000:1050] = False
     gapped = ImuTable(table.time_ns[keep], table.gyro[keep], table.accel[keep], "rate")
-    logs.write_euroc_imu(tmp_path / "gapped.csv", gapped)
+    logs.write_log(tmp_path / "gapped.csv", gapped, "euroc-imu")
     found = stability.still(tmp_path / "gapped.csv")
     assert len(found.time_ns) == 1950
     np.testing.assert_allclose(found.rates["gyro"], table.gyro[1050:], atol=1e-9)
@@ -271,8 +271,10 @@ def test_a_moving_sensor_is_noticed(tmp_path):
     table = a_still_imu(10.0)
     turning = table.gyro.copy()
     turning[400:600, 2] += 0.2
-    logs.write_euroc_imu(tmp_path / "a.csv", ImuTable(table.time_ns, turning, table.accel, "rate"))
-    logs.write_euroc_imu(tmp_path / "b.csv", table)
+    logs.write_log(
+        tmp_path / "a.csv", ImuTable(table.time_ns, turning, table.accel, "rate"), "euroc-imu"
+    )
+    logs.write_log(tmp_path / "b.csv", table, "euroc-imu")
     assert any("turned" in note for note in stability.still(tmp_path / "a.csv").notes)
     assert not any("turned" in note for note in stability.still(tmp_path / "b.csv").notes)
 
@@ -280,7 +282,7 @@ def test_a_moving_sensor_is_noticed(tmp_path):
 def test_a_stuck_sensor_is_refused(robins, tmp_path):
     table = a_still_imu(10.0)
     stuck = ImuTable(table.time_ns, np.zeros_like(table.gyro), table.accel, "rate")
-    logs.write_euroc_imu(tmp_path / "stuck.csv", stuck)
+    logs.write_log(tmp_path / "stuck.csv", stuck, "euroc-imu")
     answer = robins("allan", "stuck.csv")
     assert answer.status == 2
     assert answer.err.startswith("robins: stuck.csv: gyro: axis 0 is constant")
@@ -288,7 +290,7 @@ def test_a_stuck_sensor_is_refused(robins, tmp_path):
 
 
 def test_a_short_log_gives_its_curve_and_the_reason_why_no_parameters(tmp_path):
-    logs.write_euroc_imu(tmp_path / "short.csv", a_still_imu(2.0))
+    logs.write_log(tmp_path / "short.csv", a_still_imu(2.0), "euroc-imu")
     heard = []
     solution, summary, notes = stability.analysed(
         tmp_path / "short.csv", "QNBKR", lambda share, what: heard.append(share)

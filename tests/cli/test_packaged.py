@@ -236,7 +236,7 @@ def folder(tmp_path_factory):
     imu, gnss = (
         replace(t, time_ns=t.time_ns + 1_700_000_000_000_000_000) for t in (drive.imu, drive.gnss)
     )
-    logs.write_named(here / "imu.csv", imu)
+    logs.write_log(here / "imu.csv", imu)
     write_pos(here / "gnss.pos", gnss)
     lever_arm = 'lever_arm = ["0.5 m", "-0.2 m", "-1 m"]'
     unit = car[car.index("[imu]") : car.index("[gnss]")]
@@ -247,12 +247,12 @@ def folder(tmp_path_factory):
     rng = np.random.default_rng(2)
     still = rng.normal(size=(2, 3000, 3)) * [[[1e-3]], [[5e-3]]] + [[[0, 0, 0]], [[0, 0, -9.81]]]
     stamps = np.arange(3000) * 10_000_000
-    logs.write_named(here / "still.csv", ImuTable(stamps, still[0], still[1], "rate"))
+    logs.write_log(here / "still.csv", ImuTable(stamps, still[0], still[1], "rate"))
     pair = configurations("transfer-alignment")["replay"].read_text()
     (here / "my-pair.toml").write_text(pair)
     dataset = pair_dataset(scenario.parse(Replay, pair, ["slave.rate=20 Hz"]), seed=3)
-    logs.write_named(here / "master.csv", dataset.master)
-    logs.write_named(here / "slave.csv", dataset.imu)
+    logs.write_log(here / "master.csv", dataset.master)
+    logs.write_log(here / "slave.csv", dataset.imu)
     problem = ROOT / "src/robins/cli/problems/baro-height.toml"
     (here / "my-problem.toml").write_text(problem.read_text())
     return here

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from robins.logs import LogError, open_log, read_rtklib
+from robins.logs import LogError, open_log
+from robins.logs.rtklib import read_rtklib
 
 HEADER = (
     "%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) "

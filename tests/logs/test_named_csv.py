@@ -9,8 +9,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import Dataset, ImuTable, Trajectory
-from robins.ins.frames import to_enu_rfu, to_ned_frd
-from robins.logs import LogError, LogWarning, clean, examine, load_pair, open_log, write_named
+from robins.ins.frames import to_ned_frd
+from robins.logs import LogError, LogWarning, clean, examine, load_pair, open_log, write_log
 from robins.logs.registry import recognise
 
 RNG = np.random.default_rng(8)
@@ -68,38 +68,6 @@ def same_attitude(a, b):
 # ----------------------------------------------------------------------------- writing and reading
 
 
-@pytest.mark.parametrize("kind", ["rate", "increment"])
-@pytest.mark.parametrize("body", ["FRD", "RFU"])
-def test_samples_come_back_bit_by_bit(tmp_path, kind, body):
-    imu = ImuTable(IMU.time_ns, IMU.gyro, IMU.accel, kind, body)
-    write_named(tmp_path / "imu.csv", imu)
-    back = open_log(tmp_path / "imu.csv")
-    assert (back.kind, back.body) == (kind, body)
-    for field in ("time_ns", "gyro", "accel"):
-        np.testing.assert_array_equal(getattr(back, field), getattr(imu, field))
-
-
-@pytest.mark.parametrize("turn", [to_ned_frd, to_enu_rfu])
-@pytest.mark.parametrize("rates", [True, False])
-def test_a_path_comes_back(tmp_path, turn, rates):
-    path = turn(copy.deepcopy(FLIGHT))
-    if not rates:
-        path = dataclasses.replace(path, omega_ib_b=None)
-    path.lat_rad[3] = path.v_n[4, 1] = np.nan
-    path.q_nb[5] = np.nan
-    write_named(tmp_path / "master.csv.xz", path)
-    back = open_log(tmp_path / "master.csv.xz")
-    assert (back.nav, back.body) == (path.nav, path.body)
-    for field in ("time_ns", "lat_rad", "lon_rad", "alt_m", "v_n"):
-        np.testing.assert_allclose(getattr(back, field), getattr(path, field), rtol=1e-15)
-    assert np.isnan(back.q_nb[5]).all()
-    assert same_attitude(np.delete(back.q_nb, 5, 0), np.delete(path.q_nb, 5, 0))
-    if rates:
-        np.testing.assert_array_equal(back.omega_ib_b, path.omega_ib_b)
-    else:
-        assert back.omega_ib_b is None
-
-
 def test_a_file_by_hand_means_what_its_header_says(tmp_path):
     path = tmp_path / "m.csv"
     path.write_text(
@@ -118,17 +86,6 @@ def test_a_file_by_hand_means_what_its_header_says(tmp_path):
     np.testing.assert_allclose(north_b, [0, 1, 0], atol=1e-15)  # forward is east
     assert np.isnan(table.q_nb[1]).all()
     assert table.rows.tolist() == [4, 5]
-
-
-def test_units_of_samples(tmp_path):
-    path = tmp_path / "i.csv"
-    path.write_text(
-        "time_s,gyro_x_deg_s,gyro_y_deg_s,gyro_z_rad_s,accel_x_g,accel_y_m_s2,accel_z_g\n"
-        "0.01,180,90,1,0.5,2,-1\n"
-    )
-    table = open_log(path)
-    np.testing.assert_allclose(table.gyro, [[np.pi, np.pi / 2, 1]])
-    np.testing.assert_allclose(table.accel, [[4.903325, 2, -9.80665]])
 
 
 def test_euler_angles_are_of_the_vehicle_in_both_pairs_of_frames(tmp_path):
@@ -150,17 +107,6 @@ def refusal(tmp_path, text):
     with pytest.raises(LogError) as caught:
         open_log(path)
     return str(caught.value)
-
-
-def test_a_missing_column_is_named_and_so_are_those_there_are(tmp_path):
-    told = refusal(tmp_path, HEADER.replace(",heading_deg", "") + "\n0,1,2,3,4,5,6,7,8\n")
-    assert "line 1: the header lacks heading_deg or heading_rad; it has time_s, lat_deg" in told
-    told = refusal(tmp_path, "time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_g\n0,1,2,3,4\n")
-    assert "lacks accel_y_m_s2 or accel_y_g, accel_z_m_s2 or accel_z_g" in told
-    told = refusal(tmp_path, HEADER + ",omega_x_rad_s\n" + "0,1,2,3,4,5,6,7,8,9,10\n")
-    assert "of the turn rate there is only omega_x_rad_s" in told
-    told = refusal(tmp_path, HEADER + ",lat_rad\n" + "0,1,2,3,4,5,6,7,8,9,10\n")
-    assert "lat_deg and lat_rad are the same thing" in told
 
 
 def test_frames_that_nobody_knows(tmp_path):
@@ -227,8 +173,8 @@ def test_a_file_of_both_kinds_is_read_for_what_is_wanted(tmp_path):
 
 
 def test_exchanged_files_are_told(tmp_path):
-    write_named(tmp_path / "m.csv", FLIGHT)
-    write_named(tmp_path / "s.csv", IMU)
+    write_log(tmp_path / "m.csv", FLIGHT)
+    write_log(tmp_path / "s.csv", IMU)
     pair = load_pair(tmp_path / "m.csv", tmp_path / "s.csv")
     assert (pair.name, len(pair.master), len(pair.imu)) == ("s", len(FLIGHT), len(IMU))
     with pytest.raises(LogError, match="were master and slave exchanged"):

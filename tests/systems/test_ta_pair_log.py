@@ -71,8 +71,8 @@ def log(run, tmp_path_factory):
     """The pair as it is read from two files."""
     folder = tmp_path_factory.mktemp("pair")
     dataset = recorded(run, "made")
-    logs.write_named(folder / "master.csv", dataset.master)
-    logs.write_named(folder / "slave.csv", dataset.imu)
+    logs.write_log(folder / "master.csv", dataset.master)
+    logs.write_log(folder / "slave.csv", dataset.imu)
     return logs.load_pair(folder / "master.csv", folder / "slave.csv")
 
 

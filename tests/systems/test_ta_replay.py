@@ -79,8 +79,8 @@ RUNS = 8
 
 
 def read_back(dataset, folder):
-    logs.write_named(folder / "master.csv", dataset.master)
-    logs.write_named(folder / "slave.csv", dataset.imu)
+    logs.write_log(folder / "master.csv", dataset.master)
+    logs.write_log(folder / "slave.csv", dataset.imu)
     return logs.load_pair(folder / "master.csv", folder / "slave.csv")
 
 
@@ -368,10 +368,10 @@ def test_a_filter_that_is_not_there_is_named(pairs):
 def files(runs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     dataset = recorded(runs[0], "made")
-    logs.write_named(folder / "master.csv", dataset.master)
-    logs.write_named(folder / "slave.csv", dataset.imu)
+    logs.write_log(folder / "master.csv", dataset.master)
+    logs.write_log(folder / "slave.csv", dataset.imu)
     imu = dataset.imu
-    logs.write_named(folder / "late.csv", replace(imu, time_ns=imu.time_ns + 10**13))
+    logs.write_log(folder / "late.csv", replace(imu, time_ns=imu.time_ns + 10**13))
     (folder / "mine.toml").write_text('system = "transfer-alignment"\nstudy = "product"\n' + TEXT)
     return folder
 

@@ -12,6 +12,9 @@ from robins.logs.findings import Finding, LogError
 from robins.logs.mounting import Mounting, turned
 from robins.logs.registry import fitting, open_log
 from robins.logs.tables import Table, kind_of, tables_of
+from robins.logs.text_format import TextFormat
+
+Formats = Mapping[str, str | TextFormat]
 
 
 def load_dataset(
@@ -19,7 +22,7 @@ def load_dataset(
     *,
     name: str | None = None,
     mounting: Mounting | None = None,
-    formats: Mapping[str, str] | None = None,
+    formats: Formats | None = None,
 ) -> Dataset:
     """Read IMU, and whatever else there is, as it is in the files; see `clean`.
 
@@ -28,7 +31,7 @@ def load_dataset(
             file of its own is the truth.
         name: of the dataset; by default the name of the file with the IMU.
         mounting: turns the sensor's axes to forward-right-down and says where the antenna is.
-        formats: path -> name of its format, for files that are not recognised by content.
+        formats: path -> its format, for files that are not recognised by content.
 
     Returns:
         The dataset. ``meta["files"]`` maps imu, gnss, truth, mag, attitude to paths,
@@ -81,15 +84,17 @@ def load_pair(
     *,
     name: str | None = None,
     delay_s: float = 0.0,
+    formats: Formats | None = None,
 ) -> Dataset:
     """Read what a master INS reported and the samples of the IMU to be aligned to it.
 
     Args:
-        master: a path in any known format; `named_csv` can also hold turn rates.
+        master: a path in any known format; ``named-path`` can also hold turn rates.
         slave: inertial samples in any known format, along the axes of that IMU.
         name: of the dataset; by default the IMU file's name.
         delay_s: by how much the records of the master are older than their stamps, for the doctor
             to compare; the stamps stay as they are.
+        formats: as `load_dataset`.
 
     Returns:
         The dataset, as it is in the files; see `clean`. ``meta["files"]`` maps imu and master to
@@ -100,8 +105,8 @@ def load_pair(
         LogError: as `open_log`; or a file holds something else.
     """
     findings: list[Finding] = []
-    path = _open_as(master, "trajectory", findings)
-    imu = _open_as(slave, "imu", findings)
+    path = _open_as(master, "trajectory", findings, formats)
+    imu = _open_as(slave, "imu", findings, formats)
     if not isinstance(path, Trajectory):
         raise _exchanged(master, "no path of a master INS", "--master")
     if not isinstance(imu, ImuTable):
@@ -119,11 +124,14 @@ def load_pair(
 
 
 def _open_as(
-    path: str | os.PathLike[str], kind: str, findings: list[Finding]
+    path: str | os.PathLike[str], kind: str, findings: list[Finding], formats: Formats | None
 ) -> Table | Dataset | None:
     """A file that holds several kinds of columns is read for the kind that is wanted."""
-    names = [f.name for f in fitting(path)[1] if f.holds == kind]
-    opened = open_log(path, names[0] if len(names) == 1 else None, findings)
+    format = (formats or {}).get(os.fspath(path))
+    if format is None:
+        names = [f.name for f in fitting(path)[1] if f.holds == (kind,)]
+        format = names[0] if len(names) == 1 else None
+    opened = open_log(path, format, findings)
     if isinstance(opened, Dataset):
         return opened.imu if kind == "imu" else opened.truth
     return opened

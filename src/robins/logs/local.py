@@ -10,6 +10,7 @@ import numpy as np
 from robins import rotation
 from robins.dataset import Trajectory
 from robins.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
+from robins.logs.findings import LogError
 
 # Exchanges east-north-up and north-east-down; its own inverse.
 SWAP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -30,6 +31,19 @@ class Origin(NamedTuple):
     lat_deg: float
     lon_deg: float
     alt_m: float
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Origin:
+        """The first point of a trajectory.
+
+        Raises:
+            LogError: it has no points.
+        """
+        if not len(trajectory):
+            name = trajectory.source or "trajectory"
+            raise LogError(name, "the trajectory has no points", "give an origin")
+        lat, lon = (float(np.rad2deg(a[0])) for a in (trajectory.lat_rad, trajectory.lon_rad))
+        return cls(lat, lon, float(trajectory.alt_m[0]))
 
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
         """C_el and the Earth-fixed position of the origin."""

@@ -1,227 +1,81 @@
-"""The formats of logs, recognised by content, and `open_log`, which reads any of them."""
+"""The formats of logs, recognised by content: `open_log` reads them, `write_log` writes text.
+
+Text is described by the rows of `robins.logs.text_formats`; what is no table of numbers has a
+reader of its own and a row here.
+"""
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from robins.dataset import Dataset
-from robins.logs import (
-    broad,
-    euroc,
-    gnss_imu,
-    kfgins,
-    named_csv,
-    phone,
-    pyins_csv,
-    rtklib,
-    ulog,
-    xio,
-)
+from robins.logs import broad, phone, rtklib, ulog
 from robins.logs.findings import Finding, LogError
+from robins.logs.local import Origin
 from robins.logs.opening import beginning
-from robins.logs.tables import Table
+from robins.logs.quantities import words_of
+from robins.logs.read_text import read_text
+from robins.logs.tables import Table, kind_in_text, tables_of
 from robins.logs.text import Head, peek
+from robins.logs.text_format import TextFormat
+from robins.logs.text_formats import TEXT_FORMATS
+from robins.logs.write_text import write_text
 
 
 class Format(NamedTuple):
     """One kind of file."""
 
     name: str
-    holds: str  # "imu", "gnss", "trajectory", or "several" tables, which make a `Dataset`
+    holds: tuple[str, ...]  # kinds of tables; several make a `Dataset`
     about: str
     recognise: Callable[[Head], bool]
     read: Callable[..., Table | Dataset]
     binary: bool = False
+    text: TextFormat | None = None  # its row, by which it is also written
 
 
-def _numbers(head: Head, delimiter: str | None, lines: int = 20) -> list[list[float]]:
-    """The first data lines as numbers; empty if they are not all numbers, or not of one width."""
-    try:
-        rows = [[float(x) for x in text.split(delimiter)] for _, text in head.data(lines)]
-    except ValueError:
-        return []
-    rows = rows[1:] if len({len(row) for row in rows[:2]}) == 2 else rows  # began mid-line
-    return rows if len({len(row) for row in rows}) == 1 else []
-
-
-def _is_gnss_imu(head: Head) -> bool:
-    rows = _numbers(head, ",")
-    # Seconds since 1970 between 1990 and 2100; specific force of one g or so, not ten.
-    return (
-        bool(rows)
-        and len(rows[0]) >= 7
-        and all(6e8 < row[0] < 4.2e9 for row in rows)
-        and sorted(sum(a * a for a in row[1:4]) for row in rows)[len(rows) // 2] < 25.0
-    )
-
-
-def _is_rtklib(head: Head) -> bool:
-    header = any(line.startswith("%") and " ns " in line for line in head.lines)
-    stamp = re.compile(r"\d{4}/\d\d/\d\d[ ,]+\d\d:\d\d:\d\d")
-    return header or any(stamp.match(text) for _, text in head.data(1))
-
-
-def _spacing(rows: list[list[float]]) -> float:
-    steps = sorted(abs(b[0] - a[0]) for a, b in itertools.pairwise(rows))
-    return steps[len(steps) // 2] if steps else 0.0
-
-
-def _is_kfgins_imu(head: Head) -> bool:
-    rows = _numbers(head, None)
-    if not rows or len(rows[0]) != 7:
-        return False
-    small = all(abs(x) < 10.0 for row in rows for x in row[1:])  # increments of one sample
-    return small and 0.0 < _spacing(rows) < 0.2
-
-
-def _is_kfgins_gnss(head: Head) -> bool:
-    rows = _numbers(head, None)
-    if not rows or len(rows[0]) != 7 or _is_kfgins_imu(head):
-        return False
-    return all(
-        abs(row[1]) <= 90 and abs(row[2]) <= 360 and min(row[4:7]) >= 0 for row in rows
-    ) and all(abs(a - b) < 0.1 for a, b in zip(rows[0][1:3], rows[-1][1:3], strict=True))
-
-
-def _is_kfgins_nav(head: Head) -> bool:
-    rows = _numbers(head, None)
-    return (
-        bool(rows)
-        and len(rows[0]) == 11
-        and all(row[0] == int(row[0]) and 0 <= row[0] < 5000 for row in rows)
-        and all(0 <= row[1] < 700_000 and abs(row[2]) <= 90 for row in rows)
-    )
-
-
-def _is_pyins(*tables: str) -> Callable[[Head], bool]:
-    return lambda head: pyins_csv.table_of(pyins_csv.header(head)) in tables
-
-
-def _is_named(kind: str) -> Callable[[Head], bool]:
-    return lambda head: named_csv.holds(head, kind)
-
-
-def _is_euroc(column: str) -> Callable[[Head], bool]:
-    def recognise(head: Head) -> bool:
-        first, *others = head.lines[0].split(",")
-        return first.startswith("#timestamp") and any(n.strip().startswith(column) for n in others)
-
-    return recognise
+def _of_text(row: TextFormat) -> Format:
+    return Format(row.name, row.kinds, row.about, row.recognise, partial(read_text, row), text=row)
 
 
 FORMATS: tuple[Format, ...] = (
+    *map(_of_text, TEXT_FORMATS),
     Format(
         "rtklib-pos",
-        "gnss",
-        "RTKLIB solution .pos, latitude/longitude/height",
-        _is_rtklib,
+        ("gnss",),
+        "RTKLIB: .pos with latitude, longitude, height in degrees; GPST or UTC",
+        rtklib.is_rtklib,
         rtklib.read_rtklib,
     ),
     Format(
-        "gnss-imu",
-        "imu",
-        "CSV of GNSS_IMU: Unix-like time, acceleration [g], rate [rad/s], no header",
-        _is_gnss_imu,
-        gnss_imu.read_gnss_imu,
-    ),
-    Format(
-        "kfgins-imu",
-        "imu",
-        "KF-GINS IMU text: t, dtheta [rad], dv [m/s]",
-        _is_kfgins_imu,
-        kfgins.read_kfgins_imu,
-    ),
-    Format(
-        "kfgins-gnss",
-        "gnss",
-        "KF-GINS GNSS text: t, lat, lon [deg], height, sigmas [m]",
-        _is_kfgins_gnss,
-        kfgins.read_kfgins_gnss,
-    ),
-    Format(
-        "kfgins-nav",
-        "trajectory",
-        "KF-GINS navigation text: week, t, lat, lon, height, velocity, roll, pitch, yaw",
-        _is_kfgins_nav,
-        kfgins.read_kfgins_nav,
-    ),
-    Format(
-        "pyins-imu",
-        "imu",
-        "pyins CSV: time, gyro_x .. accel_z, or dt, theta_x .. dv_z",
-        _is_pyins("Imu", "Increments"),
-        pyins_csv.read_pyins,
-    ),
-    Format(
-        "pyins-trajectory",
-        "trajectory",
-        "pyins CSV: time, lat lon alt VN VE VD roll pitch heading",
-        _is_pyins("Trajectory"),
-        pyins_csv.read_pyins,
-    ),
-    Format(
-        "euroc-imu",
-        "imu",
-        "EuRoC/ASL CSV: #timestamp [ns], w_RS_S_x .. a_RS_S_z",
-        _is_euroc("w_RS_S_x"),
-        euroc.read_euroc_imu,
-    ),
-    Format(
-        "euroc-truth",
-        "trajectory",
-        "EuRoC/ASL CSV: #timestamp, p_RS_R_x .. q_RS_w .. v_RS_R_z",
-        _is_euroc("p_RS_R_x"),
-        euroc.read_euroc_truth,
-    ),
-    Format(
-        "named-imu",
-        "imu",
-        "CSV with units in its header: time_s, gyro_x_rad_s .. accel_z_m_s2, or dtheta .. dv",
-        _is_named("imu"),
-        named_csv.read_named_imu,
-    ),
-    Format(
-        "named-path",
-        "trajectory",
-        "CSV with units in its header: time_s, lat_deg .. v_down_m_s, roll_deg .. or q_w ..",
-        _is_named("trajectory"),
-        named_csv.read_named_path,
-    ),
-    Format(
-        "xio-csv",
-        "several",
-        "CSV of x-io and Fusion: Time (s), Gyroscope X (deg/s) .. Magnetometer Z (uT)",
-        xio.is_xio,
-        xio.read_xio,
-    ),
-    Format(
         "phone-csv",
-        "several",
-        "CSV of a phone, as of strapdown-rs: time, latitude, acc_x, gyro_x, mag_x, ..",
+        ("imu", "mag", "gnss"),
+        "phones, as strapdown-rs keeps their drives: CSV, UTC dates, Android's axes",
         phone.is_phone,
         phone.read_phone,
     ),
     Format(
         "broad-npz",
-        "several",
-        "NumPy archive of BROAD: imu_gyr, imu_acc, imu_mag, opt_quat, movement, sampling_rate",
+        ("imu", "mag", "attitude"),
+        "BROAD, the orientation benchmark of Laidig et al. (2021): NumPy archives",
         broad.is_archive,
         broad.read_broad,
         binary=True,
     ),
     Format(
         "px4-ulog",
-        "several",
-        "PX4 ULog: sensor_combined, vehicle_magnetometer, vehicle_gps_position",
+        ("imu", "mag", "gnss"),
+        "PX4: .ulg; needs the extra, pip install 'robins[logs]'",
         ulog.is_ulog,
         ulog.read_ulog,
         binary=True,
     ),
 )
+"""All of them."""
 
 
 def fitting(path: str | os.PathLike[str]) -> tuple[Head, list[Format]]:
@@ -251,7 +105,7 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     mend = (
         "write numbers with a decimal point, not a comma"
         if commas
-        else "name the format, or convert the file to one of these"
+        else "name the format, or declare your columns (--columns); these are known"
     )
     candidates = found or FORMATS
     width = max(len(f.name) for f in candidates)
@@ -266,16 +120,19 @@ def recognise(path: str | os.PathLike[str]) -> Format:
 
 def open_log(
     path: str | os.PathLike[str],
-    format: str | None = None,
+    format: str | TextFormat | None = None,
     findings: list[Finding] | None = None,
+    *,
+    origin: Origin | None = None,
 ) -> Table | Dataset:
     """Read a log.
 
     Args:
         path: the file, plain or compressed (.xz, .gz).
-        format: a name in `FORMATS`; by default it is recognised by content.
+        format: a name in `FORMATS`, or a row of your own; by default it is recognised by content.
         findings: receives what the reader left out or doubts; without it that is issued as
             `LogWarning`.
+        origin: where a path in local metres is put on the Earth.
 
     Returns:
         An `ImuTable` along the axes of the sensor, a `GnssTable` or a `Trajectory`; a `Dataset` if
@@ -284,11 +141,75 @@ def open_log(
     Raises:
         LogError: unknown format, unreadable file, a line or number that is not what it should be.
     """
-    if format is None:
-        return recognise(path).read(path, findings)
-    named = {f.name: f for f in FORMATS}
-    if format not in named:
+    if isinstance(format, TextFormat):
+        known = _of_text(format)
+    else:
+        known = recognise(path) if format is None else _called(format, FORMATS, path)
+    if origin is None:
+        return known.read(path, findings)
+    if known.text is None or not known.text.local:
         raise LogError(
-            str(path), f"no format is called {format!r}", f"choose one of {', '.join(named)}"
+            str(path), f"{known.name} has no local metres to put at an origin", "give no origin"
         )
-    return named[format].read(path, findings)
+    return known.read(path, findings, origin)
+
+
+def write_log(
+    path: str | os.PathLike[str],
+    table: Table | Dataset,
+    format: str | TextFormat | None = None,
+    *,
+    week: int | None = None,
+    origin: Origin | None = None,
+) -> None:
+    """Write a table as text that is read back as it was: every number, but for conversions.
+
+    Args:
+        path: the file; compressed if its name ends in .xz or .gz.
+        table: what the format holds; several tables as a dataset.
+        format: a name in `FORMATS`, or a row of your own; by default ``named-imu`` for inertial
+            samples and ``named-path`` for a path.
+        week: where time is that of a GPS week: the week whose beginning absolute stamps are counted
+            from, by default that of the first (give the same for the files of one run), and that
+            which other stamps are of.
+        origin: where places are metres: the point they are from, by default the first.
+
+    Raises:
+        LogError: the format holds something else, or the file cannot be written; no part of it is
+            left behind.
+    """
+    if isinstance(format, TextFormat):
+        row = format
+    else:
+        written = [f for f in FORMATS if f.text is not None]
+        row = _called(format or _usual(path, table), written, path).text
+    assert row is not None
+    write_text(row, path, table, week=week, origin=origin)
+
+
+def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
+    kinds = tuple(map(kind_in_text, tables_of(table)))
+    for name in ("named-imu", "named-path"):
+        if kinds == _called(name, FORMATS, path).holds:
+            return name
+    raise LogError(
+        str(path),
+        f"no named format holds {' and '.join(map(words_of, kinds))}",
+        f"choose a format: {', '.join(f.name for f in FORMATS if f.text)}",
+    )
+
+
+def _called(name: str, among: Sequence[Format], path: str | os.PathLike[str]) -> Format:
+    named = {f.name: f for f in among}
+    if name not in named:
+        raise LogError(
+            str(path), f"no format is called {name!r}", f"choose one of {', '.join(named)}"
+        )
+    return named[name]
+
+
+def markdown() -> str:
+    """The table of formats as documentation."""
+    lines = ["| name | holds | written by |", "|---|---|---|"]
+    lines += [f"| `{f.name}` | {', '.join(map(words_of, f.holds))} | {f.about} |" for f in FORMATS]
+    return "\n".join(lines) + "\n"

@@ -8,6 +8,7 @@ not kept.
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,13 @@ _UNSUPPORTED = {
     "d'\"": ("latitudes are in degrees, minutes, seconds", "out-degform = deg"),
     "JST": ("times are Japan standard time", "out-timesys = gpst"),
 }
+
+
+def is_rtklib(head: Head) -> bool:
+    """Whether a header names the columns of a solution, or a line begins with a date."""
+    header = any(line.startswith("%") and " ns " in line for line in head.lines)
+    stamp = re.compile(r"\d{4}/\d\d/\d\d[ ,]+\d\d:\d\d:\d\d")
+    return header or any(stamp.match(text) for _, text in head.data(1))
 
 
 def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = None) -> GnssTable:

@@ -21,6 +21,12 @@ def kind_of(table: Table) -> str:
     return KINDS[type(table)]
 
 
+def kind_in_text(table: Table) -> str:
+    """The kind of a table among those of `robins.logs.quantities`: a path is a trajectory."""
+    kind = kind_of(table)
+    return "trajectory" if kind == "truth" else kind
+
+
 def tables_of(opened: Table | Dataset) -> list[Table]:
     """What a reader returned, as a list; of a dataset all tables but the master's."""
     if not isinstance(opened, Dataset):

@@ -119,11 +119,13 @@ def stamps_to_ns(
     return time_ns
 
 
-def ns_to_decimal(time_ns: int) -> str:
-    """Seconds as exact decimal text: at least three decimals, no more than needed."""
+def ns_to_decimal(time_ns: int, exponent: int = 9) -> str:
+    """Nanoseconds over 10**exponent as exact decimal text: three decimals, more where needed."""
+    if not exponent:
+        return str(time_ns)
     sign = "-" if time_ns < 0 else ""
-    whole, part = divmod(abs(time_ns), _NS)
-    decimals = f"{part:09d}".rstrip("0").ljust(3, "0")
+    whole, part = divmod(abs(time_ns), 10**exponent)
+    decimals = f"{part:0{exponent}d}".rstrip("0").ljust(3, "0")
     return f"{sign}{whole}.{decimals}"
 
 

@@ -1,0 +1,157 @@
+"""A format of one's own in TOML: the row of a log that nobody else writes.
+
+    separator = ";"                              # "," unless stated; " " is any number of blanks
+    body = "FLU"                                 # where x, y, z point: forward, left, up
+
+    [columns]
+    time = { name = "t", unit = "ms" }
+    gyro_x = { name = "wx", unit = "deg/s" }     # the name in the header
+    accel_x = { place = 5, unit = "g" }          # or the place from 1, where there is no header
+    mag_x = { name = "mx", unit = "uT", scale = 0.15 }    # counts of 0.15 uT; -1 reverses an axis
+
+Units are those of `robins.units`, quantities those of `robins.logs.quantities`. Columns that are
+not stated may hold anything. Where no header names the columns, `skip` lines come before the rows.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterable
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from robins.logs.findings import LogError
+from robins.logs.quantities import QUANTITIES
+from robins.logs.text import Head, peek
+from robins.logs.text_format import Column, TextFormat, columns_of, header_of
+from robins.units import KINDS
+
+Paths = Iterable[str | os.PathLike[str]]
+_KEYS: dict[str, tuple[type, ...]] = {
+    "columns": (dict,),
+    "separator": (str,),
+    "skip": (int,),
+    "body": (str,),
+    "nav": (str,),
+}
+_COLUMN: dict[str, tuple[type, ...]] = {
+    "name": (str,),
+    "place": (int,),
+    "unit": (str,),
+    "scale": (int, float),
+}
+_WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
+
+
+def columns_from(path: str | os.PathLike[str]) -> TextFormat:
+    """Read a format from a TOML file.
+
+    Raises:
+        LogError: the file cannot be read or is no TOML; a key, quantity or unit is unknown; columns
+            are missing. File and key are named.
+    """
+    file = os.fspath(path)
+    try:
+        text = Path(path).read_text("utf-8")
+        content = tomllib.loads(text)
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise LogError(file, f"cannot be read: {why}", "check path and permissions") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise LogError(file, f"is no TOML: {error}", "repair it") from error
+    _checked(file, "", content, _KEYS)
+    if not content.get("columns"):
+        mend = 'state them, such as time = { name = "t", unit = "ms" }'
+        raise LogError(file, "states no columns", mend, where="columns")
+    columns = tuple(_column(file, *item) for item in content.pop("columns").items())
+    if content.get("skip", 0) < 0:
+        raise LogError(
+            file, "is less than 0", "count lines from 0", field="skip", value=content["skip"]
+        )
+    name = Path(path).name.split(".")[0]
+    row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
+    # a file of several sensors has gaps where one is slower
+    return replace(row, sparse=len(row.kinds) > 1)
+
+
+def _column(file: str, quantity: str, stated: Any) -> Column:
+    key = f"columns.{quantity}"
+    if not isinstance(stated, dict):
+        mend = 'write it like { name = "t", unit = "ms" }'
+        raise LogError(file, "is not a table of name and unit", mend, where=key, value=stated)
+    _checked(file, f"{key}.", stated, _COLUMN)
+    if ("name" in stated) == ("place" in stated):
+        mend = "state the name in the header, or the place from 1 where there is none"
+        both = "both name and place" if "name" in stated else "neither name nor place"
+        raise LogError(file, f"has {both}", mend, where=key)
+    if stated.get("place", 1) < 1:
+        raise LogError(
+            file, "is less than 1", "count columns from 1", where=key, field="place",
+            value=stated["place"],
+        )  # fmt: skip
+    kind = QUANTITIES.get(quantity, "ratio")
+    if kind != "ratio" and "unit" not in stated:
+        mend = f"state one of {', '.join(KINDS[kind])}"
+        raise LogError(file, "has no unit", mend, where=key)
+    return Column(
+        quantity,
+        stated.get("name", f"column {stated.get('place')}"),
+        (stated["unit"],) if "unit" in stated else (),
+        float(stated.get("scale", 1.0)),
+        stated.get("place", 0),
+    )
+
+
+def _checked(file: str, at: str, table: dict[str, Any], allowed: dict[str, tuple[type, ...]]):
+    """Refuse keys and types that are not allowed."""
+    for key, value in table.items():
+        if key not in allowed:
+            near = get_close_matches(key, allowed, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            mend = f"choose of {', '.join(allowed)}"
+            raise LogError(file, f"is no key{hint}", mend, where=f"{at}{key}")
+        if not isinstance(value, allowed[key]) or isinstance(value, bool):
+            words = _WORDS[allowed[key][-1]]
+            raise LogError(
+                file, f"is not {words}", f"give {words}", where=f"{at}{key}", value=value
+            )
+
+
+def formats_of(files: Paths, columns: Paths) -> dict[str, TextFormat]:
+    """Which of the files are in formats declared in TOML files: path -> its row.
+
+    Args:
+        files: of a log.
+        columns: TOML files, see `columns_from`; each must fit one of the files.
+
+    Raises:
+        LogError: as `columns_from`; a declaration fits none of the files, or two fit one.
+    """
+    heads = list(filter(None, map(_head, files))) if (columns := list(columns)) else []
+    out: dict[str, TextFormat] = {}
+    for row in map(columns_from, columns):
+        fitting = [head for head in heads if row.recognise(head)]
+        for head in fitting:
+            if head.file in out:
+                mend = "give the columns of each file once"
+                raise LogError(
+                    head.file, f"fits both {out[head.file].source} and {row.source}", mend
+                )
+            out[head.file] = row
+        if not fitting and heads:
+            columns_of(row, heads[0].file, header_of(row, heads[0]))
+        if not fitting:
+            mend = "check separator, skip and places"
+            raise LogError(row.source, "its columns fit none of the files", mend)
+    return out
+
+
+def _head(path: str | os.PathLike[str]) -> Head | None:
+    """How a text file begins; one of another kind cannot be in a declared format."""
+    try:
+        return peek(path)
+    except LogError:
+        return None

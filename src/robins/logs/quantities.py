@@ -1,0 +1,121 @@
+"""What a column of a log may hold, and which of them make a table.
+
+A column holds one quantity; those that belong together, such as three axes, are a group. A table
+of `robins.dataset` needs one of several sets of groups and may have more.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Group(NamedTuple):
+    """Quantities that are given together or not at all."""
+
+    kinds: dict[str, str]  # quantity -> kind of its unit in `robins.units`
+    text: str
+
+
+class Makeup(NamedTuple):
+    """The groups of a table."""
+
+    text: str
+    needs: tuple[tuple[str, ...], ...]  # any of these sets makes it
+    more: tuple[str, ...] = ()
+
+
+def _parts(stem: str, ends: str, kind: str) -> dict[str, str]:
+    return {f"{stem}_{end}": kind for end in ends.split()}
+
+
+_XYZ, _NED = "x y z", "north east down"
+
+GROUPS: dict[str, Group] = {
+    "time": Group({"time": "time"}, "time of the row"),
+    "time_of_week": Group({"time_of_week": "time"}, "second of the GPS week, goes on at its end"),
+    "week": Group({"week": "ratio"}, "GPS week; time counts from the beginning of the first"),
+    "gyro": Group(_parts("gyro", _XYZ, "angle rate"), "turn rate"),
+    "accel": Group(_parts("accel", _XYZ, "specific force"), "specific force"),
+    "dtheta": Group(_parts("dtheta", _XYZ, "angle"), "turn since the row before"),
+    "dv": Group(_parts("dv", _XYZ, "speed"), "specific force summed up since the row before"),
+    "dt": Group(
+        {"dt": "time"}, "time over which dtheta and dv are, compared with that of the rows"
+    ),
+    "mag": Group(_parts("mag", _XYZ, "magnetic field"), "magnetic field"),
+    "place": Group(
+        {"lat": "angle", "lon": "angle", "height": "length"}, "place, above the WGS-84 ellipsoid"
+    ),
+    "local": Group(dict.fromkeys(("east", "north", "up"), "length"), "place, from an origin"),
+    "velocity": Group(_parts("v", _NED, "speed"), "velocity"),
+    "sigma": Group(_parts("sigma", _NED, "length"), "sigma of the place"),
+    "sigma_v": Group(_parts("sigma_v", _NED, "speed"), "sigma of the velocity"),
+    "quality": Group({"quality": "ratio"}, "1 fixed, 2 float, 5 single, as RTKLIB counts"),
+    "euler": Group(dict.fromkeys(("roll", "pitch", "heading"), "angle"), "of the vehicle"),
+    "quaternion": Group(_parts("q", "w x y z", "ratio"), "turns body into navigation axes"),
+    "omega": Group(_parts("omega", _XYZ, "angle rate"), "turn rate against inertial space"),
+}
+"""Every group by its name."""
+
+TABLES: dict[str, Makeup] = {
+    "imu": Makeup("inertial samples", (("gyro", "accel"), ("dtheta", "dv")), ("dt",)),
+    "mag": Makeup("magnetic field", (("mag",),)),
+    "gnss": Makeup("fixes", (("place",),), ("sigma", "velocity", "sigma_v", "quality")),
+    "trajectory": Makeup(
+        "path",
+        (
+            ("place", "velocity", "euler"),
+            ("place", "velocity", "quaternion"),
+            ("local", "quaternion"),
+        ),
+        ("velocity", "omega"),
+    ),
+    "attitude": Makeup("attitude", (("quaternion",), ("euler",))),
+}
+"""Every table by its kind."""
+
+QUANTITIES: dict[str, str] = {q: kind for g in GROUPS.values() for q, kind in g.kinds.items()}
+"""The kind of unit of every quantity."""
+
+CLOCKS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+"""Units of time stamps, and how many decimals of them a nanosecond is."""
+
+_GROUP_OF = {q: name for name, g in GROUPS.items() for q in g.kinds}
+
+
+def parts(groups: tuple[str, ...] | str) -> list[str]:
+    """The quantities of groups, or of one."""
+    names = (groups,) if isinstance(groups, str) else groups
+    return [q for name in names for q in GROUPS[name].kinds]
+
+
+def groups_of(quantities: set[str]) -> set[str]:
+    """The groups of which there is something."""
+    return {_GROUP_OF[q] for q in quantities}
+
+
+def tables_of_groups(groups: set[str]) -> tuple[str, ...]:
+    """Which tables columns of these groups make: a place with an attitude is a path."""
+    placed, turned = groups & {"place", "local"}, groups & {"euler", "quaternion"}
+    has = {
+        "imu": groups & {"gyro", "accel", "dtheta", "dv"},
+        "mag": groups & {"mag"},
+        "gnss": placed and not turned,
+        "trajectory": placed and turned,
+        "attitude": turned and not placed,
+    }
+    return tuple(kind for kind in TABLES if has[kind])
+
+
+def words_of(kind: str) -> str:
+    """A table in words."""
+    return TABLES[kind].text
+
+
+def markdown() -> str:
+    """The table as documentation."""
+    lines = ["| quantities | kind of unit | meaning |", "|---|---|---|"]
+    for group in GROUPS.values():
+        names = " ".join(f"`{q}`" for q in group.kinds)
+        kinds = ", ".join(dict.fromkeys(group.kinds.values()))
+        lines.append(f"| {names} | {kinds} | {group.text} |")
+    return "\n".join(lines) + "\n"

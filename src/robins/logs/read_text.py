@@ -1,0 +1,375 @@
+"""Reading a text log of any format: the columns of its row become tables in SI units."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from robins import rotation
+from robins.dataset import (
+    AttitudeTable,
+    BodyFrame,
+    Dataset,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    NavFrame,
+    Trajectory,
+)
+from robins.ins.frames import swap, swap_q
+from robins.logs.axes import Axes
+from robins.logs.findings import Finding, LogError, report
+from robins.logs.local import LocalPath, Origin, from_local
+from robins.logs.quantities import QUANTITIES, parts, words_of
+from robins.logs.tables import Table, kind_of
+from robins.logs.text import COMMENTS, Head, Layout, peek, read_columns
+from robins.logs.text_format import PAIRS, Found, TextFormat, columns_of, decimals_of, header_of
+from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, weeks_of
+from robins.logs.unit_length import unit_quaternions
+from robins.units import from_si, to_si, unit
+
+NOWHERE = Origin(0.0, 0.0, 0.0)
+_TEXTS = ("time", "time_of_week", "week")
+# Beyond these an angle is in another unit or another column; a heading may be unwrapped a little.
+_LIMIT_DEG = {"lat": 90.0, "lon": 400.0, "roll": 400.0, "pitch": 90.0, "heading": 400.0}
+_NUMBER = r"([-+.\deE]+)"
+_ORIGIN = re.compile(rf"\borigin: {_NUMBER} deg,? {_NUMBER} deg,? {_NUMBER} m\b")
+
+
+class Read(NamedTuple):
+    """What the columns of a file hold."""
+
+    file: str
+    columns: dict[str, Found]
+    values: dict[str, np.ndarray]  # by quantity, SI
+    time_ns: np.ndarray
+    rows: np.ndarray
+    nav: NavFrame
+    body: BodyFrame
+    findings: list[Finding] | None
+
+    def has(self, group: str) -> bool:
+        """Whether there is such a group of columns."""
+        return parts(group)[0] in self.values
+
+    def stack(self, group: str) -> np.ndarray:
+        """Its columns side by side; NaN if there are none."""
+        missing = np.full(len(self.rows), np.nan)
+        return np.stack([self.values.get(q, missing) for q in parts(group)], axis=-1)
+
+    def of(self, rows: np.ndarray) -> Read:
+        """Some of the rows."""
+        values = {q: v[rows] for q, v in self.values.items()}
+        return self._replace(values=values, time_ns=self.time_ns[rows], rows=self.rows[rows])
+
+
+def read_text(
+    format: TextFormat,
+    path: str | os.PathLike[str],
+    findings: list[Finding] | None = None,
+    origin: Origin | None = None,
+) -> Table | Dataset:
+    """Read a log of this format.
+
+    Args:
+        format: what its columns hold.
+        path: the file, plain or compressed.
+        findings: receives what was left out or is doubted; without it that is issued as
+            `LogWarning`.
+        origin: where local metres are put on the Earth, by default where a comment says.
+
+    Returns:
+        The one table that it makes, or a dataset of several.
+
+    Raises:
+        LogError: columns are missing, named twice, of another unit, or not numbers.
+    """
+    file, head = str(path), peek(path)
+    header = header_of(format, head)
+    columns = columns_of(format, file, header)
+    texts = {q: f for q, f in columns.items() if q in _TEXTS}
+    numbers = {q: f for q, f in columns.items() if q not in _TEXTS}
+    layout = Layout(
+        tuple(header.names),
+        format.delimiter,
+        texts=tuple(sorted({f.place for f in texts.values()})),
+        numbers=tuple(sorted({f.place for f in numbers.values()})) if format.others else None,
+        skip=header.line,
+        all_named=header.all_named,
+    )
+    table = read_columns(path, layout, findings)
+    stamps = {q: table.texts[:, layout.texts.index(f.place)] for q, f in texts.items()}
+    nav, body = _frames(format, head)
+    read = Read(
+        file,
+        numbers,
+        {q: _si(f, table.values[:, layout.number(f.place)]) for q, f in numbers.items()},
+        _times(file, texts, stamps, table.rows),
+        table.rows,
+        nav,
+        body,
+        findings,
+    )
+    if format.body not in ("FRD", "RFU"):
+        for group in ("gyro", "accel", "dtheta", "dv", "mag", "omega"):
+            if read.has(group):
+                turned = Axes.of(format.body).to_frd(read.stack(group))
+                read.values.update(zip(parts(group), turned.T, strict=True))
+    if format.local:
+        origin = origin or _origin(head)
+    return _tables(format, read, origin, known=any(f.sure for f in texts.values()))
+
+
+def _si(found: Found, values: np.ndarray) -> np.ndarray:
+    scale = found.column.scale
+    scaled = values if scale == 1.0 else values * scale + 0.0  # no minus zero
+    return to_si(scaled, unit(found.unit, QUANTITIES[found.column.holds])).copy()
+
+
+def _times(
+    file: str, texts: dict[str, Found], stamps: dict[str, np.ndarray], rows: np.ndarray
+) -> np.ndarray:
+    clock = "time" if "time" in texts else "time_of_week"
+    found = texts[clock]
+    time_ns = stamps_to_ns(file, found.name, stamps[clock], rows, decimals_of(found))
+    if clock == "time":
+        return time_ns
+    if "week" in stamps:
+        week = weeks_of(file, texts["week"].name, stamps["week"], rows)
+        time_ns = time_ns + (week - week[0]) * WEEK_NS
+    return unrolled(time_ns)
+
+
+def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
+    """Those of the format, or what a comment above the rows says.
+
+    Raises:
+        LogError: it says something else than NED FRD or ENU RFU.
+    """
+    own: tuple[NavFrame, BodyFrame] = (format.nav, "RFU" if format.body == "RFU" else "FRD")
+    for number, text in _comments(head) if format.says_frames else ():
+        said = re.search(r"\bframes?:\s*(.+)", text)
+        if said is None:
+            continue
+        words = set(re.findall(r"[A-Z]{3}", said[1]))
+        fitting = [pair for pair in PAIRS if words and words <= set(pair)]
+        if len(fitting) != 1:
+            raise LogError(
+                head.file,
+                "is neither NED FRD nor ENU RFU",
+                "convert the columns to one of the two and say which",
+                where=f"line {number}",
+                field="frames",
+                value=said[1].strip(),
+            )
+        return fitting[0]
+    return own
+
+
+def _origin(head: Head) -> Origin | None:
+    said = (_ORIGIN.search(text) for _, text in _comments(head))
+    return next((Origin(*map(float, found.groups())) for found in said if found), None)
+
+
+def _comments(head: Head) -> list[tuple[int, str]]:
+    """Those before the first line of data."""
+    first = (head.data(1) or [(len(head.lines) + 1, "")])[0][0]
+    lines = enumerate(head.lines[: first - 1], start=1)
+    return [(k, text) for k, text in lines if text.lstrip().startswith(COMMENTS)]
+
+
+def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) -> Table | Dataset:
+    made = []
+    for kind in format.kinds:
+        own = {q for groups in _GROUPS_READ[kind] for q in parts(groups)} & set(read.values)
+        if not own:
+            continue
+        part = read
+        if format.sparse:
+            part = read.of(np.any([np.isfinite(read.values[q]) for q in own], axis=0))
+            if not len(part.rows):
+                raise LogError(read.file, f"no line has {words_of(kind)}", "record that as well")
+        made.append(_path(part, origin) if kind == "trajectory" else _MAKERS[kind](part))
+    if len(format.kinds) == 1 or len(made) == 1:
+        return made[0]
+    return Dataset(
+        name=Path(read.file).name.split(".")[0],
+        **{kind_of(table): table for table in made},
+        meta={"time_unit_known": (read.file,)} if known else {},
+    )
+
+
+def _imu(read: Read) -> ImuTable:
+    if read.has("dt"):
+        _compare_dt(read)
+    rate = read.has("gyro")
+    gyro, accel = ("gyro", "accel") if rate else ("dtheta", "dv")
+    return ImuTable(
+        time_ns=read.time_ns,
+        gyro=read.stack(gyro),
+        accel=read.stack(accel),
+        kind="rate" if rate else "increment",
+        body=read.body,
+        source=read.file,
+        rows=read.rows,
+    )
+
+
+def _mag(read: Read) -> MagTable:
+    return MagTable(read.time_ns, read.stack("mag"), read.body, read.file, read.rows)
+
+
+def _gnss(read: Read) -> GnssTable:
+    quality = read.values.get("quality")
+    if quality is not None:
+        quality = np.where(np.abs(quality) < 100.0, quality, 0.0).astype(np.int64)
+    moves = read.has("velocity")
+    return GnssTable(
+        time_ns=read.time_ns,
+        lat_rad=read.values["lat"],
+        lon_rad=read.values["lon"],
+        alt_m=read.values["height"],
+        sigma_m=read.stack("sigma"),
+        v_n=read.stack("velocity") if moves else None,
+        sigma_v=read.stack("sigma_v") if moves else None,
+        quality=quality,
+        source=read.file,
+        rows=read.rows,
+    )
+
+
+def _attitude(read: Read) -> AttitudeTable:
+    q_nb = _quaternions(read)
+    return AttitudeTable(read.time_ns, q_nb, read.nav, read.body, source=read.file, rows=read.rows)
+
+
+def _path(read: Read, origin: Origin | None) -> Trajectory:
+    for quantity in _LIMIT_DEG:
+        _within_limits(read, quantity)
+    q_nb, v_n = _quaternions(read), read.stack("velocity")
+    omega = read.stack("omega") if read.has("omega") else None
+    if read.has("local"):
+        if origin is None:
+            report(read.findings, _no_place(read.file))
+        local = LocalPath(read.time_ns, read.stack("local"), swap(v_n), q_nb)
+        path = from_local(local, origin or NOWHERE, source=read.file)
+        return Trajectory(
+            **{**vars(path), "body": read.body, "omega_ib_b": omega, "rows": read.rows}
+        )
+    return Trajectory(
+        time_ns=read.time_ns,
+        lat_rad=read.values["lat"],
+        lon_rad=read.values["lon"],
+        alt_m=read.values["height"],
+        v_n=swap(v_n) if read.nav == "ENU" else v_n,
+        q_nb=q_nb,
+        nav=read.nav,
+        body=read.body,
+        source=read.file,
+        omega_ib_b=omega,
+        rows=read.rows,
+    )
+
+
+_MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude}
+_GROUPS_READ = {
+    "imu": ("gyro", "accel", "dtheta", "dv"),
+    "mag": ("mag",),
+    "gnss": ("place",),
+    "trajectory": ("place", "local", "euler", "quaternion"),
+    "attitude": ("euler", "quaternion"),
+}
+
+
+def _quaternions(read: Read) -> np.ndarray:
+    """As recorded, or from roll, pitch and heading, the same in both pairs of frames."""
+    if read.has("quaternion"):
+        names = [read.columns[q].name for q in parts("quaternion")]
+        q = read.stack("quaternion")
+        return unit_quaternions(
+            read.file, f"{names[0]} .. {names[-1]}", q, read.rows, read.findings
+        )
+    q = np.asarray(rotation.from_euler(*map(jnp.asarray, read.stack("euler").T)))
+    return np.asarray(swap_q(q)) if read.nav == "ENU" else q
+
+
+def _within_limits(read: Read, quantity: str) -> None:
+    """Take out angles that cannot be; refuse the column if they are many.
+
+    Raises:
+        LogError: more than half of the angles are beyond the limit.
+    """
+    if quantity not in read.values:
+        return
+    values, limit, found = read.values[quantity], _LIMIT_DEG[quantity], read.columns[quantity]
+    beyond = np.abs(values) > np.deg2rad(limit) * (1.0 + 1e-9)
+    if not beyond.any():
+        return
+    k = int(np.argmax(beyond))
+    shown = float(from_si(values[k], found.unit))
+    allowed = f"+-{from_si(np.deg2rad(limit), found.unit):.4g} {found.unit}"
+    count = f"{beyond.sum()} of {np.isfinite(values).sum()} rows"
+    if 2 * beyond.sum() > np.isfinite(values).sum():
+        radians = found.unit == "rad"
+        other = "degrees under a name that says radians" if radians else "another unit"
+        raise LogError(
+            read.file,
+            f"beyond {allowed}, as in {count}: probably {other}, or another column",
+            "name the column with the unit it is in",
+            where=f"line {read.rows[k]}",
+            field=found.name,
+            value=shown,
+        )
+    values[beyond] = np.nan
+    report(
+        read.findings,
+        Finding(
+            "warning",
+            "angle_range",
+            read.file,
+            f"line {read.rows[k]}",
+            shown,
+            f"{Path(read.file).name} line {read.rows[k]}: {found.name} is {shown:g}, beyond "
+            f"{allowed} ({count}). What cannot be is taken as missing.",
+        ),
+    )
+
+
+def _compare_dt(read: Read) -> None:
+    """An increment is taken to be over the time since the row before: say where dt disagrees."""
+    dt, elapsed = read.values["dt"], np.diff(read.time_ns) * 1e-9
+    off = np.flatnonzero(np.abs(dt[1:] - elapsed) > 0.01 * np.abs(dt[1:]))
+    if len(off):
+        first = int(off[0]) + 1
+        report(
+            read.findings,
+            Finding(
+                "warning",
+                "dt_disagrees",
+                read.file,
+                f"line {read.rows[first]}",
+                float(dt[first]),
+                f"{Path(read.file).name} line {read.rows[first]}: dt is {dt[first]:g} s but the "
+                f"time has grown by {elapsed[first - 1]:g} s ({len(off)} such rows). Increments "
+                "are taken over the time since the row before; rows are missing, or dt belongs to "
+                "the next row.",
+            ),
+        )
+
+
+def _no_place(file: str) -> Finding:
+    return Finding(
+        "note",
+        "no_place",
+        file,
+        "",
+        "0 0 0",
+        f"{Path(file).name}: positions are local metres; they are put at latitude 0, longitude 0, "
+        "height 0, x to the east. Gravity and Earth rate there are not those of the recording; "
+        "give an origin if that matters.",
+    )

@@ -1,0 +1,368 @@
+"""A format of text logs as data: its columns, and where they are found in a file.
+
+`robins.logs.text_formats` lists the formats, `read_text` and `write_text` read and write any of
+them, `robins.logs.columns` reads one from a TOML file. A column is found by its name in the header,
+which is the first line that is no comment or a comment before it; or by its place, where the column
+has one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cached_property
+from typing import NamedTuple
+
+from robins.dataset import BodyFrame, NavFrame
+from robins.logs.axes import Axes
+from robins.logs.findings import LogError
+from robins.logs.quantities import CLOCKS, QUANTITIES, TABLES, groups_of, parts, tables_of_groups
+from robins.logs.text import COMMENTS, Head
+from robins.units import KINDS, UnitError, unit
+
+ANY = "*"
+"""As the name of the time, any name of the first column; among units, any of the right kind."""
+
+PAIRS: tuple[tuple[NavFrame, BodyFrame], ...] = (("NED", "FRD"), ("ENU", "RFU"))
+"""Frames that belong together."""
+
+Looks = Callable[[list[list[float]]], bool]
+
+
+class Column(NamedTuple):
+    """One column: value = number * scale * unit.
+
+    In the name, ``{unit}`` stands for the unit, ``{unit_}`` for one that can be part of a name
+    (rad/s is rad_s); names separated by `` | `` are alternatives, of which the first is written.
+    """
+
+    holds: str  # one of `QUANTITIES`
+    name: str
+    units: tuple[str, ...] = ()  # it may be in, the first is written; by default that of the SI
+    scale: float = 1.0
+    place: int = 0  # from 1, where columns have places and no names
+
+    @property
+    def unit(self) -> str:
+        """The unit that is written."""
+        return self.units[0] if self.units else KINDS[QUANTITIES[self.holds]][0]
+
+    @property
+    def names(self) -> list[str]:
+        """The name in every unit."""
+        units = [u for u in self.units or (self.unit,) if u != ANY]
+        return [_named(template, u) for template in self.name.split(" | ") for u in units]
+
+    def unit_of(self, name: str) -> str | None:
+        """The unit that a column of this name is in; None if it is not this column."""
+        for template in self.name.split(" | "):
+            if template == name:
+                return self.unit
+            for symbol in self.units:
+                if symbol != ANY and _named(template, symbol) == name:
+                    return symbol
+            before, stands, after = template.partition("{unit}")
+            if stands and ANY in self.units and name.startswith(before) and name.endswith(after):
+                return name[len(before) : len(name) - len(after)]
+        return None
+
+
+def _named(template: str, symbol: str) -> str:
+    plain = symbol.replace("/", "_").replace("^", "")
+    return template.replace("{unit}", symbol).replace("{unit_}", plain)
+
+
+@dataclass(frozen=True)
+class TextFormat:
+    """One format of text logs, as `robins.logs.open_log` and `robins.logs.write_log` take it."""
+
+    name: str
+    about: str  # one line for people
+    columns: tuple[Column, ...]
+    separator: str = ","  # " ": any number of blanks
+    skip: int = 0  # lines before the first row, where columns have places
+    body: str = "FRD"  # ways of the axes x, y, z; other than FRD and RFU are turned to FRD
+    nav: NavFrame = "NED"  # to which attitudes turn
+    says_frames: bool = False  # a comment "frames: ENU RFU" says so, and is written
+    commented: bool = False  # the header is written as a comment
+    choice: bool = False  # a file has one whole set of these columns, or more
+    whole: bool = False  # its readers know no missing components
+    sparse: bool = False  # a row belongs to the tables of which it has a number
+    others: bool = False  # columns that are not named may hold anything
+    looks: Looks | None = None  # whether rows of numbers, where there are no names, are such a log
+    source: str = ""  # the file in which it was declared
+
+    def __post_init__(self):
+        """Check the row.
+
+        Raises:
+            LogError: an unknown quantity, unit or way of axes; columns that make no whole table.
+        """
+        _check(self)
+
+    @cached_property
+    def quantities(self) -> set[str]:
+        """What its columns hold."""
+        return {column.holds for column in self.columns}
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The tables that it makes, of `TABLES`."""
+        return tables_of_groups(groups_of(self.quantities))
+
+    @property
+    def named(self) -> bool:
+        """Whether columns are found by their names."""
+        return not any(column.place for column in self.columns)
+
+    @property
+    def local(self) -> bool:
+        """Whether places are metres from an origin."""
+        return "east" in self.quantities
+
+    @property
+    def delimiter(self) -> str | None:
+        """For `Layout`."""
+        return None if self.separator == " " else self.separator
+
+    def recognise(self, head: Head) -> bool:
+        """Whether a file begins like this.
+
+        One column beside the time is enough, so that what lacks is told; all are needed where the
+        time may have any name.
+        """
+        if not self.named:
+            rows = self._rows_of_numbers(head)
+            return bool(rows) and (self.looks is None or self.looks(rows))
+        found = {f.column.holds: f for f in header_by_name(self, head).found}
+        clock = found.get("time") or found.get("time_of_week")
+        if clock is None or len(found) < 2:
+            return False
+        return ANY not in clock.column.name.split(" | ") or not sort_out(self, set(found))[1]
+
+    def _rows_of_numbers(self, head: Head, lines: int = 20) -> list[list[float]]:
+        """The first rows that lack nothing; none if some are not numbers, or not of one width."""
+        data = [text for k, text in head.data(self.skip + lines) if k > self.skip]
+        rows = [text.split(self.delimiter) for text in data]
+        if len({len(row) for row in rows[:2]}) == 2:  # began mid-line
+            rows = rows[1:]
+        if len({len(row) for row in rows}) != 1 or len(rows[0]) < max(
+            c.place for c in self.columns
+        ):
+            return []
+        places = [c.place - 1 for c in self.columns] if self.others else range(len(rows[0]))
+        try:
+            numbers = [[float(row[k].strip() or "nan") for k in places] for row in rows]
+        except ValueError:
+            return []
+        return [row for row in numbers if not any(map(math.isnan, row))]
+
+
+class Found(NamedTuple):
+    """A column in a file."""
+
+    column: Column
+    place: int  # from 0
+    name: str
+    unit: str
+
+    @property
+    def sure(self) -> bool:
+        """Whether the file itself says the unit."""
+        return "{unit" in self.column.name
+
+
+class Header(NamedTuple):
+    """The line that names the columns, or what stands for it."""
+
+    line: int  # its number, or that of the last line before the rows
+    names: list[str]  # of the columns
+    found: list[Found]
+    all_named: bool = False  # a comment need not name every column
+
+
+def header_by_name(format: TextFormat, head: Head) -> Header:
+    """The line that names most columns: the first that is no comment, or a comment before."""
+    first = (head.data(1) or [(len(head.lines), "")])[0][0]
+    candidates = [
+        _header(format, k, text, all_named=k == first)
+        for k, text in enumerate(head.lines[:first], start=1)
+        if k == first or text.lstrip().startswith(COMMENTS)
+    ]
+    return max(candidates, key=lambda header: len(header.found))
+
+
+def header_of(format: TextFormat, head: Head) -> Header:
+    """The columns of a format in a file; those of a header that is a comment may do without it."""
+    if format.named:
+        header = header_by_name(format, head)
+        if header.found or not format.commented:
+            return header
+    places = [
+        Found(column, (column.place or k) - 1, column.names[0], column.unit)
+        for k, column in enumerate(format.columns, start=1)
+    ]
+    names = [f"column {k}" for k in range(1, 2 + max(f.place for f in places))]
+    for f in places:
+        names[f.place] = f.name
+    return Header(format.skip, names, places)
+
+
+def _header(format: TextFormat, line: int, text: str, all_named: bool) -> Header:
+    stripped = (
+        text.strip().lstrip("".join(COMMENTS)) if text.lstrip().startswith(COMMENTS) else text
+    )
+    names = [name.strip().strip('"') for name in stripped.split(format.delimiter)]
+    found = []
+    for place, name in enumerate(names):
+        plain = name.replace("µ", "u").replace("μ", "u")
+        for column in format.columns:
+            symbol = column.unit_of(plain)
+            if symbol is None and place == 0 and ANY in column.name.split(" | "):
+                symbol = column.unit
+            if symbol is not None:
+                found.append(Found(column, place, name, symbol))
+    return Header(line, names, found, all_named)
+
+
+def sort_out(format: TextFormat, found: set[str]) -> tuple[set[str], set[str]]:
+    """Which of the quantities in a file are used, and which it lacks."""
+    if not format.choice:
+        return found, format.quantities - found
+    return whole_sets(format.kinds, format.quantities, found)
+
+
+def whole_sets(
+    kinds: tuple[str, ...], offered: set[str], found: set[str]
+) -> tuple[set[str], set[str]]:
+    """Of each table the set of columns that is nearest to whole; the first table must be there."""
+    used, lacking = found & {"time", "time_of_week", "week"}, set()
+    for k, kind in enumerate(kinds):
+        sets = [set(parts(groups)) for groups in TABLES[kind].needs]
+        best = min((s for s in sets if s <= offered), key=lambda s: len(s - found))
+        if k and not best & found:
+            continue
+        more = [set(parts(group)) & offered for group in TABLES[kind].more]
+        wanted = best.union(*(group for group in more if group & found))
+        used, lacking = used | wanted & found, lacking | wanted - found
+    return used, lacking
+
+
+def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found]:
+    """Quantity -> the column that holds it.
+
+    Raises:
+        LogError: columns are missing, two hold the same, or a unit is none.
+    """
+    where = f"line {header.line}"
+    out: dict[str, Found] = {}
+    for f in header.found:
+        if (other := out.get(f.column.holds)) is not None:
+            raise LogError(
+                file, f"{other.name} and {f.name} are the same thing", "keep one", where=where
+            )
+        out[f.column.holds] = f
+    used, lacking = sort_out(format, set(out))
+    clocks = {"time", "time_of_week"} & format.quantities
+    lacking |= clocks if not clocks & set(out) else set()
+    if lacking:
+        wanted = ", ".join(
+            " or ".join(name for name in c.names if name != ANY)
+            for c in format.columns
+            if c.holds in lacking
+        )
+        mend = "name the columns so, with their units"
+        if format.source:
+            between = next((s for s in ";\t|," if s in header.names[0]), "")
+            mend = f"state separator = {between!r}" if between else "state the names that it has"
+            mend += f" in {format.source}"
+        raise LogError(
+            file, f"the header lacks {wanted}; it has {', '.join(header.names)}", mend, where=where
+        )
+    out = {q: f for q, f in out.items() if q in used}
+    for quantity, f in out.items():
+        try:
+            unit(f.unit, QUANTITIES[quantity])
+        except UnitError as error:
+            raise LogError(file, str(error), "state the unit", where=where, field=f.name) from error
+    return out
+
+
+def _check(format: TextFormat) -> None:
+    """Raise if a row cannot be one."""
+
+    def refused(where: str, cause: str, mend: str, field: str = "", value: object = "") -> LogError:
+        file = format.source or f"format {format.name}"
+        return LogError(file, cause, mend, where=where, field=field, value=value)
+
+    for column in format.columns:
+        quantity, where = column.holds, f"columns.{column.holds}"
+        clock = quantity in ("time", "time_of_week")
+        if quantity not in QUANTITIES:
+            near = get_close_matches(quantity, QUANTITIES, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            allowed = f"choose of {', '.join(QUANTITIES)}"
+            raise refused(where, f"is no quantity that a column holds{hint}", allowed)
+        for symbol in column.units:
+            try:
+                plain = symbol if symbol == ANY else unit(symbol, QUANTITIES[quantity]).symbol
+            except UnitError as error:
+                raise refused(where, str(error), "state one of these", "unit", symbol) from error
+            if clock and plain not in CLOCKS:
+                mend = f"record it in one of {', '.join(CLOCKS)}"
+                raise refused(where, "is no unit of time stamps", mend, "unit", symbol)
+        if not (math.isfinite(column.scale) and column.scale):
+            mend = "give a number other than 0, such as -1"
+            raise refused(where, "cannot scale anything", mend, "scale", column.scale)
+        if column.scale != 1.0 and (clock or quantity == "week"):
+            raise refused(
+                where, "is not for time stamps", "state their unit", "scale", column.scale
+            )
+    held = [column.holds for column in format.columns]
+    if twice := [q for q in held if held.count(q) > 1]:
+        raise refused(f"columns.{twice[0]}", "is held by two columns", "keep one")
+    if len({column.place > 0 for column in format.columns}) > 1:
+        raise refused("columns", "some have names and some have places", "give all the same way")
+    if len({"time", "time_of_week"} & format.quantities) != 1:
+        raise refused("columns", "there is no time, or there are two", "state one column as time")
+    if "week" in format.quantities and "time" in format.quantities:
+        raise refused("columns.week", "needs the second of that week", "state time_of_week")
+    kinds = format.kinds
+    if not kinds or (len(kinds) > 1 and "imu" not in kinds):
+        what = f"make {' and '.join(kinds)} alone" if kinds else "make no table"
+        mend = f"state whole sets of them: {'; '.join(map(_told, TABLES))}"
+        raise refused("columns", f"{what}, where several need an IMU" if kinds else what, mend)
+    used, lacking = whole_sets(kinds, set(QUANTITIES), format.quantities)
+    if lacking:
+        told = ", ".join(q for q in QUANTITIES if q in lacking)
+        mend = f"state them too; a table needs {'; '.join(map(_told, kinds))}"
+        raise refused("columns", f"{told} are not stated", mend)
+    if not format.choice and (idle := format.quantities - used):
+        told = ", ".join(q for q in QUANTITIES if q in idle)
+        raise refused("columns", f"{told} have no use in {' and '.join(kinds)}", "leave them out")
+    if len(format.separator) != 1 or format.separator.isalnum() or format.separator in '+-."#%':
+        mend = 'give one character, such as "," ";" "\\t" or " "'
+        raise refused("", "cannot separate numbers", mend, "separator", format.separator)
+    try:
+        Axes.of(format.body)
+    except ValueError as error:
+        raise refused("", str(error), "name the ways of x, y, z", "body", format.body) from error
+    if format.nav not in ("NED", "ENU"):
+        raise refused("", "is neither NED nor ENU", "choose one", "nav", format.nav)
+    turned = groups_of(format.quantities) & {"euler", "quaternion"}
+    if turned and not format.local and (format.nav, format.body) not in PAIRS:
+        mend = "use NED with FRD or ENU with RFU where there are attitudes"
+        raise refused("", f"does not go with nav {format.nav}", mend, "body", format.body)
+
+
+def _told(kind: str) -> str:
+    """What a table needs, in words."""
+    sets = (" ".join(parts(groups)) for groups in TABLES[kind].needs)
+    return f"{kind}: {', or '.join(sets)}"
+
+
+def decimals_of(found: Found) -> int:
+    """How many decimals of the unit of a time column a nanosecond is."""
+    return CLOCKS[unit(found.unit).symbol]

@@ -1,0 +1,244 @@
+"""Every format of text logs in one table: what is recognised, read, written and documented.
+
+A new format is a row here and a sample of it in `tests/logs/log_samples.py`. What is no table of
+numbers has a reader of its own, see `robins.logs.registry`.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+from robins.logs.text_format import ANY, Column, TextFormat
+
+_CLOCKS = ("s", "ms", "us", "ns")
+_RATE, _FORCE, _TURN, _ANGLE = ("rad/s", "deg/s"), ("m/s^2", "g"), ("rad", "deg"), ("deg", "rad")
+
+
+def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
+    """Columns of these units; @ stands for x, y, z in a name and in what it holds."""
+    pairs = [
+        (name.replace("@", axis), quantity.replace("@", axis))
+        for name, quantity in zip(names.split(", "), holds.split(), strict=True)
+        for axis in ("xyz" if "@" in quantity else " ")
+    ]
+    return tuple(Column(quantity, name, units) for name, quantity in pairs)
+
+
+def _placed(*columns: Column) -> tuple[Column, ...]:
+    """The same columns, found by their order."""
+    return tuple(column._replace(place=k) for k, column in enumerate(columns, start=1))
+
+
+# ------------------------------------------------------- how rows of numbers without names look
+
+Rows = list[list[float]]
+
+
+def _gnss_imu(rows: Rows) -> bool:
+    """Seconds since 1970 between 1990 and 2100; specific force of one g or so, not ten."""
+    size = sorted(sum(a * a for a in row[1:4]) for row in rows)[len(rows) // 2]
+    return all(6e8 < row[0] < 4.2e9 for row in rows) and size < 25.0
+
+
+def _kfgins_imu(rows: Rows) -> bool:
+    """Increments of one sample, less than 0.2 s apart."""
+    steps = sorted(abs(b[0] - a[0]) for a, b in itertools.pairwise(rows))
+    spacing = steps[len(steps) // 2] if steps else 0.0
+    small = all(abs(x) < 10.0 for row in rows for x in row[1:])
+    return len(rows[0]) == 7 and small and 0.0 < spacing < 0.2
+
+
+def _kfgins_gnss(rows: Rows) -> bool:
+    """Degrees that hardly change, and sigmas."""
+    return (
+        len(rows[0]) == 7
+        and not _kfgins_imu(rows)
+        and all(abs(r[1]) <= 90 and abs(r[2]) <= 360 and min(r[4:7]) >= 0 for r in rows)
+        and all(abs(a - b) < 0.1 for a, b in zip(rows[0][1:3], rows[-1][1:3], strict=True))
+    )
+
+
+def _kfgins_nav(rows: Rows) -> bool:
+    """A week, its second, a latitude."""
+    return (
+        len(rows[0]) == 11
+        and all(row[0] == int(row[0]) and 0 <= row[0] < 5000 for row in rows)
+        and all(0 <= row[1] < 700_000 and abs(row[2]) <= 90 for row in rows)
+    )
+
+
+# ----------------------------------------------------------------------------------- the table
+
+_PLACE = (
+    *_columns("latitude [deg], longitude [deg]", "lat lon", "deg"),
+    *_columns("height [m]", "height", "m"),
+)
+_EULER = "roll pitch heading"
+_SECOND = _columns("time of week [s]", "time_of_week", "s")
+_NAMED = _columns("time_{unit_}", "time", *_CLOCKS)
+
+TEXT_FORMATS: tuple[TextFormat, ...] = (
+    TextFormat(
+        "gnss-imu",
+        "GNSS_IMU: CSV without header; seconds since 1970 in GPS time, axes of the sensor",
+        _placed(
+            *_columns("time [s]", "time", "s"),
+            *_columns("acc_@ [g]", "accel_@", "g"),
+            *_columns("gyro_@ [rad/s]", "gyro_@", "rad/s"),
+        ),
+        looks=_gnss_imu,
+    ),
+    TextFormat(
+        "kfgins-imu",
+        "KF-GINS: increments, forward-right-down",
+        _placed(
+            *_SECOND,
+            *_columns("dtheta_@ [rad]", "dtheta_@", "rad"),
+            *_columns("dv_@ [m/s]", "dv_@", "m/s"),
+        ),
+        separator=" ",
+        looks=_kfgins_imu,
+    ),
+    TextFormat(
+        "kfgins-gnss",
+        "KF-GINS: fixes, which lack no component",
+        _placed(
+            *_SECOND,
+            *_PLACE,
+            *_columns(
+                "sigma_N [m], sigma_E [m], sigma_D [m]", "sigma_north sigma_east sigma_down", "m"
+            ),
+        ),
+        separator=" ",
+        whole=True,
+        looks=_kfgins_gnss,
+    ),
+    TextFormat(
+        "kfgins-nav",
+        "KF-GINS: navigation result; counted from the week of the first line",
+        _placed(
+            *_columns("week", "week"),
+            *_SECOND,
+            *_PLACE,
+            *_columns("vN [m/s], vE [m/s], vD [m/s]", "v_north v_east v_down", "m/s"),
+            *_columns("roll [deg], pitch [deg], yaw [deg]", _EULER, "deg"),
+        ),
+        separator=" ",
+        looks=_kfgins_nav,
+    ),
+    TextFormat(
+        "pyins-imu",
+        "pyins: CSV of Imu or Increments, a DataFrame whose index is the time",
+        (
+            *_columns(f"time | {ANY}", "time", "s"),
+            *_columns("gyro_@", "gyro_@", "rad/s"),
+            *_columns("accel_@", "accel_@", "m/s^2"),
+            *_columns("dt", "dt", "s"),
+            *_columns("theta_@", "dtheta_@", "rad"),
+            *_columns("dv_@", "dv_@", "m/s"),
+        ),
+        choice=True,
+    ),
+    TextFormat(
+        "pyins-trajectory",
+        "pyins: CSV of Trajectory, a DataFrame whose index is the time",
+        (
+            *_columns(f"time | {ANY}", "time", "s"),
+            *_columns("lat, lon", "lat lon", "deg"),
+            *_columns("alt", "height", "m"),
+            *_columns("VN, VE, VD", "v_north v_east v_down", "m/s"),
+            *_columns("roll, pitch, heading", _EULER, "deg"),
+        ),
+    ),
+    TextFormat(
+        "euroc-imu",
+        "EuRoC and ASL: imu0/data.csv, axes of the sensor",
+        (
+            *_columns("timestamp [ns] | timestamp", "time", "ns"),
+            *_columns("w_RS_S_@ [rad s^-1] | w_RS_S_@", "gyro_@", "rad/s"),
+            *_columns("a_RS_S_@ [m s^-2] | a_RS_S_@", "accel_@", "m/s^2"),
+        ),
+        commented=True,
+    ),
+    TextFormat(
+        "euroc-truth",
+        "EuRoC and ASL: ground truth in local metres, taken as east, north, up",
+        (
+            *_columns("timestamp [ns] | timestamp", "time", "ns"),
+            *_columns(
+                "p_RS_R_x [m] | p_RS_R_x, p_RS_R_y [m] | p_RS_R_y, p_RS_R_z [m] | p_RS_R_z",
+                "east north up",
+                "m",
+            ),
+            *_columns(
+                "q_RS_w [] | q_RS_w, q_RS_x [] | q_RS_x, q_RS_y [] | q_RS_y, q_RS_z [] | q_RS_z",
+                "q_w q_x q_y q_z",
+            ),
+            Column("v_east", "v_RS_R_x [m s^-1] | v_RS_R_x"),
+            Column("v_north", "v_RS_R_y [m s^-1] | v_RS_R_y"),
+            Column("v_down", "v_RS_R_z [m s^-1] | v_RS_R_z", scale=-1.0),
+        ),
+        nav="ENU",
+        commented=True,
+    ),
+    TextFormat(
+        "tum",
+        "TUM, for evo: metres east, north, up of an origin, rotation with the scalar last",
+        (
+            *_columns("timestamp", "time", "s"),
+            *_columns("tx, ty, tz", "east north up", "m"),
+            *_columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
+        ),
+        separator=" ",
+        nav="ENU",
+        commented=True,
+    ),
+    TextFormat(
+        "named-imu",
+        "anyone: CSV with units in its header; rates, or increments since the line before",
+        (
+            *_NAMED,
+            *_columns("gyro_@_{unit_}", "gyro_@", *_RATE),
+            *_columns("accel_@_{unit_}", "accel_@", *_FORCE),
+            *_columns("dtheta_@_{unit_}", "dtheta_@", *_TURN),
+            *_columns("dv_@_{unit_}", "dv_@", "m/s"),
+        ),
+        says_frames=True,
+        choice=True,
+    ),
+    TextFormat(
+        "named-path",
+        "anyone: CSV with units in its header; with angles or quaternions, maybe turn rates",
+        (
+            *_NAMED,
+            *_columns("lat_{unit_}, lon_{unit_}", "lat lon", *_ANGLE),
+            *_columns("height_{unit_}", "height", "m"),
+            *_columns(
+                "v_north_{unit_}, v_east_{unit_}, v_down_{unit_}", "v_north v_east v_down", "m/s"
+            ),
+            *_columns("roll_{unit_}, pitch_{unit_}, heading_{unit_}", _EULER, *_ANGLE),
+            *_columns("q_w, q_x, q_y, q_z", "q_w q_x q_y q_z"),
+            *_columns("omega_@_{unit_}", "omega_@", *_RATE),
+        ),
+        says_frames=True,
+        choice=True,
+    ),
+    TextFormat(
+        "xio-csv",
+        "x-io sensors and Fusion: CSV with any units in its header, axes of the sensor",
+        (
+            *_columns("Time ({unit}) | Timestamp ({unit})", "time", *_CLOCKS),
+            *(
+                Column(f"{stem}_{axis}", f"{sensor} {axis.upper()} ({{unit}})", (symbol, ANY))
+                for sensor, stem, symbol in (
+                    ("Gyroscope", "gyro", "deg/s"),
+                    ("Accelerometer", "accel", "g"),
+                    ("Magnetometer", "mag", "uT"),
+                )
+                for axis in "xyz"
+            ),
+        ),
+        choice=True,
+    ),
+)
+"""All of them."""

@@ -1,0 +1,281 @@
+"""Writing a table as a text log of any format; numbers are those that read back the same."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from robins import rotation
+from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.ins.frames import swap
+from robins.logs.axes import Axes
+from robins.logs.findings import LogError
+from robins.logs.local import Origin, to_local
+from robins.logs.quantities import CLOCKS, parts, words_of
+from robins.logs.tables import Table, kind_in_text, tables_of
+from robins.logs.text_format import ANY, PAIRS, Column, TextFormat
+from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS, ns_to_decimal
+from robins.logs.writing import write_lines
+from robins.units import from_si, unit
+
+_ROWS = 50_000
+_STEEP = 1.5  # rad; nearer to the vertical roll and heading lose digits
+Values = dict[str, np.ndarray]  # by quantity, SI
+
+
+def write_text(
+    format: TextFormat,
+    path: str | os.PathLike[str],
+    table: Table | Dataset,
+    *,
+    week: int | None = None,
+    origin: Origin | None = None,
+) -> None:
+    """Write a log of this format; `robins.logs.write_log` says more of the arguments.
+
+    Raises:
+        LogError: the format does not hold such a table, or the file cannot be written.
+    """
+    tables = tables_of(table)
+    for one in tables:
+        _check(format, path, one)
+    if format.local and origin is None:
+        (trajectory,) = tables
+        origin = Origin.of(trajectory)
+    time_ns, values = _together(format, path, [(t, _values(format, t, origin)) for t in tables])
+    columns = [c for c in format.columns if not format.choice or _wanted(c, values)]
+    if format.whole:
+        _refuse_missing(format, path, time_ns, columns, values)
+    comments = []
+    if format.says_frames:
+        frames = tables[0]
+        comments.append(f"# frames: {getattr(frames, 'nav', '')} {frames.body}".replace("  ", " "))
+    if origin is not None and format.local:
+        comments.append("# origin: {!r} deg, {!r} deg, {!r} m".format(*map(float, origin)))
+    write_lines(path, _blocks(format, comments, columns, _cells(columns, time_ns, values, week)))
+
+
+def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> None:
+    """Refuse what the format does not hold."""
+    kind = kind_in_text(table)
+    if kind not in format.kinds:
+        held = " and ".join(map(words_of, format.kinds))
+        cause = f"{format.name} holds {held}, not {words_of(kind)}"
+        raise LogError(str(path), cause, "choose another format")
+    if isinstance(table, ImuTable):
+        wanted = {"rate": "gyro_x", "increment": "dtheta_x"}[table.kind]
+        if wanted not in format.quantities:
+            wants, are, mend = (
+                ("rates", "increments", "divide them by their dt first")
+                if table.kind == "increment"
+                else ("increments", "rates", "integrate them first")
+            )
+            raise LogError(str(path), f"{format.name} wants {wants}, these are {are}", mend)
+    if format.says_frames:
+        if isinstance(table, Trajectory) and (table.nav, table.body) not in PAIRS:
+            raise LogError(
+                str(path),
+                f"frames {table.nav} and {table.body} do not belong together",
+                "convert the table first",
+            )
+        return
+    body = "RFU" if format.body == "RFU" else "FRD"
+    nav = format.nav if isinstance(table, Trajectory | AttitudeTable | GnssTable) else None
+    for what, has, wants in (
+        ("body", getattr(table, "body", body), body),
+        ("nav", getattr(table, "nav", nav), "NED" if isinstance(table, GnssTable) else nav),
+    ):
+        if has != wants and not (format.local and what == "nav"):
+            raise LogError(
+                str(path),
+                f"{format.name} wants {what} frame {wants}, this table is in {has}",
+                "convert the table first",
+            )
+
+
+def _values(format: TextFormat, table: Any, origin: Origin | None) -> Values:
+    groups: dict[str, np.ndarray | None]
+    if isinstance(table, ImuTable):
+        elapsed = np.diff(table.time_ns) * 1e-9
+        # The first row has no row before it; the usual interval stands in.
+        usual = [np.median(elapsed) if len(elapsed) else np.nan]
+        groups = (
+            {"gyro": table.gyro, "accel": table.accel}
+            if table.kind == "rate"
+            else {
+                "dtheta": table.gyro,
+                "dv": table.accel,
+                "dt": np.concatenate([usual, elapsed])[: len(table), None],
+            }
+        )
+    elif isinstance(table, MagTable):
+        groups = {"mag": table.field_t}
+    elif isinstance(table, GnssTable):
+        quality = None if table.quality is None else np.asarray(table.quality, float)[:, None]
+        groups = {
+            "place": np.stack([table.lat_rad, table.lon_rad, table.alt_m], axis=-1),
+            "sigma": table.sigma_m,
+            "velocity": table.v_n,
+            "sigma_v": table.sigma_v,
+            "quality": quality,
+        }
+    elif isinstance(table, AttitudeTable):
+        groups = _turned(format, table.q_nb, table.nav)
+    else:
+        groups = _path(format, table, origin)
+    if format.body not in ("FRD", "RFU"):
+        axes = Axes.of(format.body)
+        for group in set(groups) & {"gyro", "accel", "dtheta", "dv", "mag", "omega"}:
+            if (v := groups[group]) is not None:
+                groups[group] = axes.from_frd(v)
+    return {
+        quantity: column
+        for group, v in groups.items()
+        if v is not None
+        for quantity, column in zip(parts(group), np.asarray(v).T, strict=True)
+    }
+
+
+def _path(format: TextFormat, table: Trajectory, origin: Origin | None) -> dict[str, Any]:
+    if format.local and origin is not None:
+        local = to_local(table, origin)
+        return {
+            "local": local.r_l,
+            "velocity": swap(local.v_l),
+            "quaternion": local.q_lb,
+            "omega": table.omega_ib_b,
+        }
+    v_n = np.asarray(table.v_n)
+    return {
+        "place": np.stack([table.lat_rad, table.lon_rad, table.alt_m], axis=-1),
+        "velocity": swap(v_n) if table.nav == "ENU" else v_n,
+        "omega": table.omega_ib_b,
+        **_turned(format, table.q_nb, table.nav),
+    }
+
+
+def _turned(format: TextFormat, q_nb: np.ndarray, nav: str) -> dict[str, Any]:
+    """As quaternions where the format has them and angles would lose digits, else as angles."""
+    q = jnp.asarray(q_nb)
+    if "roll" not in format.quantities:
+        return {"quaternion": q_nb}
+    # roll, pitch and heading are those of the vehicle, the same in both pairs of frames
+    roll, pitch, heading = map(np.asarray, rotation.to_euler(q))
+    angles = np.stack([roll, pitch, np.mod(heading, 2.0 * np.pi)], axis=-1)
+    steep = np.nanmax(np.abs(angles[:, 1]), initial=0.0) > _STEEP
+    if "q_w" in format.quantities and (nav == "ENU" or steep):
+        return {"quaternion": q_nb}
+    return {"euler": angles}
+
+
+def _together(
+    format: TextFormat, path: str | os.PathLike[str], parts_: list[tuple[Table, Values]]
+) -> tuple[np.ndarray, Values]:
+    """Stamps and values of all tables, row by row."""
+    times = [table.time_ns for table, _ in parts_]
+    if all(np.array_equal(t, times[0]) for t in times):
+        return times[0], {q: v for _, values in parts_ for q, v in values.items()}
+    if not format.sparse:
+        raise LogError(
+            str(path),
+            f"{format.name} has one time for all, these tables have different times",
+            "write them to files of their own",
+        )
+    stamps = np.concatenate(times)
+    order = np.argsort(stamps, kind="stable")
+    ends = np.cumsum([0, *map(len, times)])
+    out: Values = {}
+    for k, (_, values) in enumerate(parts_):
+        for quantity, v in values.items():
+            column = np.full(len(stamps), np.nan)
+            column[ends[k] : ends[k + 1]] = v
+            out[quantity] = column[order]
+    return stamps[order], out
+
+
+def _wanted(column: Column, values: Values) -> bool:
+    return column.holds in values or column.holds in ("time", "time_of_week", "week")
+
+
+def _refuse_missing(
+    format: TextFormat,
+    path: str | os.PathLike[str],
+    time_ns: np.ndarray,
+    columns: list[Column],
+    values: Values,
+) -> None:
+    held = [values[c.holds] for c in columns if c.holds in values]
+    good = np.all([np.isfinite(v) for v in held], axis=0)
+    if not good.all():
+        at = ns_to_decimal(int(time_ns[np.argmin(good)]))
+        raise LogError(
+            str(path),
+            f"{format.name} cannot hold a missing component",
+            "leave out the rows that are not complete",
+            where=f"time {at} s",
+        )
+
+
+def _cells(
+    columns: list[Column], time_ns: np.ndarray, values: Values, week: int | None
+) -> dict[int, Any]:
+    """By place from 0: what is written as it is, integers of a week or nanoseconds, floats."""
+    absolute = len(time_ns) > 0 and bool(time_ns[0] >= GPS_EPOCH_NS)
+    since_ns = time_ns - GPS_EPOCH_NS if absolute else time_ns
+    weeks = since_ns // WEEK_NS + (0 if absolute else week or 0)
+    if any(column.holds == "week" for column in columns):
+        of_week_ns = since_ns % WEEK_NS
+    elif absolute:
+        of_week_ns = since_ns - (since_ns[0] // WEEK_NS if week is None else week) * WEEK_NS
+    else:
+        of_week_ns = time_ns
+    stamps = {"time": time_ns, "time_of_week": of_week_ns, "week": weeks}
+    missing = np.full(len(time_ns), np.nan)
+    out: dict[int, Any] = {}
+    names: dict[str, int] = {}
+    for column in columns:
+        place = names.setdefault(column.name, column.place - 1 if column.place else len(names))
+        if column.holds in stamps:
+            out[place] = (stamps[column.holds], column)
+        elif place not in out:
+            in_units = from_si(values.get(column.holds, missing), unit(column.unit))
+            scaled = in_units if column.scale == 1.0 else in_units / column.scale + 0.0
+            out[place] = (scaled, column)
+    return out
+
+
+def _blocks(
+    format: TextFormat, comments: list[str], columns: list[Column], cells: dict[int, Any]
+) -> Iterator[str]:
+    separator = format.separator
+    if format.named:
+        names = [column.names[0] for _, (_, column) in sorted(cells.items())]
+        line = separator.join(name for name in names if name != ANY)
+        header = f"#{' ' if separator == ' ' else ''}{line}" if format.commented else line
+        comments = [header, *comments] if format.commented else [*comments, header]
+    else:
+        comments = comments + ["#"] * format.skip
+    yield "".join(f"{comment}\n" for comment in comments)
+    width = 1 + max(cells)
+    rows = len(cells[min(cells)][0])
+    for start in range(0, rows, _ROWS):
+        block = slice(start, start + _ROWS)
+        texts = [
+            _texts(*cells[k], block) if k in cells else itertools.repeat("nan")
+            for k in range(width)
+        ]
+        count = min(_ROWS, rows - start)
+        lines = itertools.islice(zip(*texts, strict=False), count)
+        yield "".join(f"{separator.join(line)}\n" for line in lines)
+
+
+def _texts(values: np.ndarray, column: Column, block: slice) -> list[str]:
+    numbers = values[block].tolist()
+    if column.holds in ("time", "time_of_week"):
+        return [ns_to_decimal(ns, CLOCKS[column.unit]) for ns in numbers]
+    return list(map(str if column.holds == "week" else repr, numbers))
