@@ -261,6 +261,7 @@ def replay_log(
     system: str = "ins-gnss",
     filters: Sequence[str] = (),
     settings: Iterable[str] = (),
+    columns: Sequence[str | os.PathLike[str]] = (),
     seed: int = 0,
     command: str = "",
     progress: Progress | None = None,
@@ -274,6 +275,7 @@ def replay_log(
         system: which system navigates it.
         filters: names; by default those of the configuration.
         settings: "path=value" texts that change the configuration.
+        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
         seed: recorded in the result; a replay draws nothing.
         command: how to make the result again.
         progress: called with the share done and what is being done.
@@ -304,7 +306,8 @@ def replay_log(
     with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "reading")
         angles = np.degrees(chosen_system.orientation(parameters))
-        dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles))
+        formats = logs.formats_of(files, columns)
+        dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
         _examine(dataset, findings)
         dataset = logs.clean(dataset)
         try:
@@ -325,6 +328,7 @@ def align_pair(
     out: str | os.PathLike[str],
     filters: Sequence[str] = (),
     settings: Iterable[str] = (),
+    columns: Sequence[str | os.PathLike[str]] = (),
     seed: int = 0,
     command: str = "",
     progress: Progress | None = None,
@@ -339,6 +343,7 @@ def align_pair(
         out: the result folder.
         filters: names; by default those of the scenario.
         settings: "path=value" texts that change the scenario.
+        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
         seed: recorded in the result; nothing is drawn.
         command: how to make the result again.
         progress: called with the share done and what is being done.
@@ -365,7 +370,9 @@ def align_pair(
     chosen = _check_filters(label, alignment.filters, filters or parameters.filters)
     with results.rescued(out) as keep, _writer(out, text, settings, command) as writer:
         tell(0.0, "reading")
-        dataset = logs.load_pair(master, slave, delay_s=parameters.master.delay)
+        formats = logs.formats_of((master, slave), columns)
+        delay_s = parameters.master.delay
+        dataset = logs.load_pair(master, slave, delay_s=delay_s, formats=formats)
         # the doctor looks along the master's axes, the filter along those of the slave
         turn = logs.Mounting(*np.degrees(system.orientation(parameters)))
         _examine(replace(dataset, imu=turn.turn(to_ned_frd(dataset.imu))), findings)
