@@ -15,7 +15,7 @@ from plain_docstrings import plain
 from robins import scenario
 from robins.bench.run.setup import Setup
 from robins.cli import Status, app
-from robins.logs import FORMATS
+from robins.logs import columns_from, quantities, registry, text_formats
 from robins.results.summary import checked
 from robins.systems import SYSTEMS
 
@@ -116,19 +116,10 @@ def rows_of(page: Path, heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in row] for row in rows]
 
 
-def test_every_format_is_documented():
-    rows = rows_of(ROOT / "docs" / "logs.md", "## Formats")
-    holds = {"imu": "inertial samples", "gnss": "GNSS fixes", "trajectory": "a path"}
-    tables = {"samples", "magnetic field", "fixes", "true attitude"}
-    assert sorted(row[0] for row in rows) == sorted(f"`{f.name}`" for f in FORMATS)
-    told = {row[0].strip("`"): row[1] for row in rows}
-    for known in FORMATS:
-        if known.holds == "several":
-            several = told[known.name].split(", ")
-            assert len(several) > 1
-            assert set(several) <= tables
-        else:
-            assert told[known.name] == holds[known.holds]
+def test_every_format_and_quantity_is_documented():
+    page = (ROOT / "docs" / "logs.md").read_text("utf-8")
+    for table in (registry, text_formats, quantities):
+        assert table.markdown() in page
 
 
 def test_the_contract_names_every_command_option_and_status():
@@ -152,16 +143,21 @@ def test_the_contract_names_every_command_option_and_status():
     assert [int(status) for status in statuses] == sorted(Status)
 
 
-def test_the_configurations_shown_can_be_read():
+def test_the_configurations_shown_can_be_read(tmp_path):
     shown = [
-        scenario.mapping_of(code)
+        code
         for page in pages()
         for _, language, code in blocks(page.read_text("utf-8"))
         if language == "toml"
     ]
-    assert shown
-    assert any("bench" in mapping for mapping in shown)
-    for mapping in shown:
+    assert any("[columns]" in code for code in shown)
+    assert any("bench" in scenario.mapping_of(code) for code in shown)
+    for code in shown:
+        mapping = scenario.mapping_of(code)
+        if "columns" in mapping:
+            (tmp_path / "shown.toml").write_text(code)
+            columns_from(tmp_path / "shown.toml")
+            continue
         if "bench" in mapping:
             scenario.validate(Setup, mapping)
             continue

@@ -244,6 +244,10 @@ def folder(tmp_path_factory):
     write_nine_axes(here / "turned.csv")
     for name in ("nine_axes.csv", "flight.csv"):
         (here / name).write_bytes((here / "turned.csv").read_bytes())
+    page = (ROOT / "docs" / "logs.md").read_text("utf-8").split("### A format of your own")[1]
+    (here / "logger.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    turned = logs.open_log(here / "turned.csv")
+    logs.write_log(here / "my.csv", turned, logs.columns_from(here / "logger.toml"))
     rng = np.random.default_rng(2)
     still = rng.normal(size=(2, 3000, 3)) * [[[1e-3]], [[5e-3]]] + [[[0, 0, 0]], [[0, 0, -9.81]]]
     stamps = np.arange(3000) * 10_000_000

@@ -22,7 +22,7 @@ from robins.ins.magnetometer_calibration import (
     calibrate,
     calibrated,
 )
-from robins.logs import open_log
+from robins.logs import formats_of, open_log
 from robins.logs.clean_mag import clean_mag
 from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
@@ -45,7 +45,9 @@ class Turned(NamedTuple):
     notes: list[str]
 
 
-def samples(log: Sequence[Path], begin_s: float, end_s: float) -> Turned:
+def samples(
+    log: Sequence[Path], begin_s: float, end_s: float, columns: Sequence[Path] = ()
+) -> Turned:
     """Read and clean the field of a log between two times from its first sample.
 
     Raises:
@@ -53,12 +55,13 @@ def samples(log: Sequence[Path], begin_s: float, end_s: float) -> Turned:
         BadInput: no file or more than one holds a magnetic field, or none of it lies in between.
     """
     mounting = mounting_of([path for path in log if path.suffix == ".toml"])
+    files = [path for path in log if path.suffix != ".toml"]
+    formats = formats_of(files, columns)
     findings: list[Any] = []
     tables = [
         table
-        for path in log
-        if path.suffix != ".toml"
-        for table in tables_of(open_log(path, None, findings))
+        for path in files
+        for table in tables_of(open_log(path, formats.get(str(path)), findings))
         if isinstance(table, MagTable)
     ]
     names = ", ".join(map(str, log))
@@ -170,6 +173,7 @@ def magnetometer(
     end: str | None,
     out: Path,
     as_json: bool,
+    columns: Sequence[Path] = (),
 ) -> None:
     """Calibrate the magnetometer of a log, named after its first file, write and print it."""
     try:
@@ -185,7 +189,7 @@ def magnetometer(
         results.ResultWriter(out, command=command) as writer,
     ):
         progress(0.1, "reading")
-        given = samples(log, begin_s, end_s)
+        given = samples(log, begin_s, end_s, columns)
         progress(0.4, "fitting the ellipsoid")
         try:
             found = calibrate(given.field_t, strength)

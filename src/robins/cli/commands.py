@@ -14,6 +14,7 @@ from robins.cli.options import (
     LOGS,
     as_names,
     choices,
+    columns_option,
     debug_option,
     examples,
     folder_name,
@@ -98,12 +99,18 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
 @_RUNS
 @option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
 @option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
+@columns_option
 @choices
 @out_option
 @json_option
 @debug_option
 def run(
-    scenario: str, out: Path | None, master: Path | None, slave: Path | None, **options: Any
+    scenario: str,
+    out: Path | None,
+    master: Path | None,
+    slave: Path | None,
+    columns: tuple[Path, ...],
+    **options: Any,
 ) -> None:
     """Simulate SCENARIO, a name that `robins list` tells or a TOML file, with several filters.
 
@@ -114,6 +121,8 @@ def run(
     from robins.cli import work
 
     if master is None and slave is None:
+        if columns:
+            raise BadInput(f"--columns {columns[0]}: goes with --master and --slave, with logs.")
         work.simulate(scenario, out=out or Path("results") / folder_name(scenario), **options)
         return
     if master is None or slave is None:
@@ -121,9 +130,8 @@ def run(
     runs = options.pop("runs")
     if runs not in (None, 1):
         raise BadInput(f"--runs {runs}: a recorded pair is one run; leave the option away.")
-    work.align(
-        scenario, master, slave, out=out or Path("results") / slave.name.split(".")[0], **options
-    )
+    out = out or Path("results") / slave.name.split(".")[0]
+    work.align(scenario, master, slave, out=out, columns=columns, **options)
 
 
 @app.command(
@@ -162,11 +170,13 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
     epilog=examples(
         "robins replay imu.csv gnss.pos --out walk",
         'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
+        "robins replay my.csv --columns logger.toml --system marg",
     ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
 @_RUNS
 @option("--system", default="ins-gnss", show_default=True, help="What navigates the log.")
+@columns_option
 @choices
 @out_option
 @json_option
@@ -174,7 +184,8 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
 def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
     """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
 
-    A file that ends in .toml says what the log does not: noise, mounting, lever arm.
+    A file that ends in .toml says what the log does not: noise, mounting, lever arm. That of
+    --columns declares the columns of a log that is in no known format.
     """
     from robins.cli.work import navigate
 
@@ -191,9 +202,10 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
     epilog=examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
+@columns_option
 @json_option
 @debug_option
-def doctor(log: tuple[Path, ...], as_json: bool) -> int:
+def doctor(log: tuple[Path, ...], columns: tuple[Path, ...], as_json: bool) -> int:
     """Judge a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
     Exit status 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... tells how
@@ -202,8 +214,8 @@ def doctor(log: tuple[Path, ...], as_json: bool) -> int:
     from robins.cli.examine import examined, told
 
     with only_json(as_json):
-        found = examined(log)
-    return told(found, log, as_json)
+        found = examined(log, columns)
+    return told(found, log, columns, as_json)
 
 
 @app.command(
@@ -212,10 +224,13 @@ def doctor(log: tuple[Path, ...], as_json: bool) -> int:
 )
 @click.argument("log", type=LOGS)
 @option("--terms", default="NBK", show_default=True, help="Noises to fit, of Q, N, B, K, R.")
+@columns_option
 @out_option
 @json_option
 @debug_option
-def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
+def allan(
+    log: Path, terms: str, columns: tuple[Path, ...], out: Path | None, as_json: bool
+) -> None:
     """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
 
     Q quantisation, N random walk, B bias instability, K rate random walk, R rate ramp.
@@ -223,7 +238,7 @@ def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
     from robins.cli.stability import stability
 
     name = f"allan-{log.name.split('.')[0]}"
-    stability(log, terms, out or Path("results") / name, as_json)
+    stability(log, terms, out or Path("results") / name, as_json, columns)
 
 
 @app.command(
@@ -237,6 +252,7 @@ def allan(log: Path, terms: str, out: Path | None, as_json: bool) -> None:
 @option("--field", metavar="FIELD", help='Its size at the place, "48.5 uT"; sets the scale.')
 @option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
 @option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
+@columns_option
 @out_option
 @json_option
 @debug_option

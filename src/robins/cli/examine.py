@@ -30,7 +30,7 @@ class Examined(NamedTuple):
     findings: list[Any]  # errors first
 
 
-def examined(log: Sequence[Path]) -> Examined:
+def examined(log: Sequence[Path], columns: Sequence[Path] = ()) -> Examined:
     """Have the files of a log examined.
 
     Raises:
@@ -46,10 +46,11 @@ def examined(log: Sequence[Path]) -> Examined:
     if not files:
         raise BadInput(f"{log[0]}: is a configuration; give the files of the log beside it.")
     mounting = mounting_of([path for path in log if path.suffix == ".toml"])
+    formats = logs.formats_of(files, columns)
     findings: list[Any] = []
     opened = []
     for path in files:
-        part = logs.open_log(path, None, findings)
+        part = logs.open_log(path, formats.get(str(path)), findings)
         opened.append(turned(part, mounting) if mounting else part)
     tables = [_described(table) for part in opened for table in tables_of(part)]
     return Examined(tables, by_severity(findings + logs.examine(opened)))
@@ -89,7 +90,7 @@ def mounting_of(configurations: Sequence[Path]) -> Any:
     return logs.Mounting(*np.degrees(system.orientation(parameters)).tolist())
 
 
-def told(answer: Examined, log: Sequence[Path], as_json: bool) -> Status:
+def told(answer: Examined, log: Sequence[Path], columns: Sequence[Path], as_json: bool) -> Status:
     """Print what there is and the findings; bad input if a run on this log would be wrong."""
     findings = answer.findings
     count = Counter(finding.severity for finding in findings)
@@ -119,5 +120,7 @@ def told(answer: Examined, log: Sequence[Path], as_json: bool) -> Status:
             # Without fixes there is no position, but with a magnetic field an attitude.
             kinds = {table["kind"] for table in answer.tables}
             system = " --system marg" if "mag" in kinds and "gnss" not in kinds else ""
-            click.echo(f"Next:   robins replay {shlex.join(map(str, log))}{system}")
+            declared = [word for path in columns for word in ("--columns", path)]
+            words = shlex.join(map(str, [*log, *declared]))
+            click.echo(f"Next:   robins replay {words}{system}")
     return Status.BAD_INPUT if count["error"] else Status.DONE

@@ -33,6 +33,17 @@ def json_option(command: Callable) -> Callable:
     )(command)
 
 
+def columns_option(command: Callable) -> Callable:
+    """For logs in a format of one's own."""
+    return option(
+        "--columns",
+        type=LOGS,
+        multiple=True,
+        metavar="TOML",
+        help="Says what the columns of a log are that is in no known format; may be repeated.",
+    )(command)
+
+
 def out_option(command: Callable) -> Callable:
     """Where the result goes."""
     return option(

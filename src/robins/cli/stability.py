@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from robins.cli.frame import BadInput, command_line, only_json
 from robins.cli.progress import Progress
 from robins.dataset import Dataset, ImuTable
 from robins.ins import allan
-from robins.logs import open_log
+from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_imu
 from robins.results import array, variable
 
@@ -40,7 +41,7 @@ class Still(NamedTuple):
     body: str
 
 
-def still(path: Path) -> Still:
+def still(path: Path, columns: Sequence[Path] = ()) -> Still:
     """Read and clean the log of a resting IMU; increments become rates.
 
     Raises:
@@ -48,7 +49,7 @@ def still(path: Path) -> Still:
         BadInput: it holds no inertial samples.
     """
     findings: list[Any] = []
-    opened = open_log(path, None, findings)
+    opened = open_log(path, formats_of([path], columns).get(str(path)), findings)
     table = opened.imu if isinstance(opened, Dataset) else opened
     if not isinstance(table, ImuTable):
         raise BadInput(f"{path}: holds no inertial samples; give the log of an IMU.")
@@ -132,13 +133,15 @@ def _metrics(sensor: str, fitted: allan.AllanFit) -> dict[str, dict[str, Any]]:
     return by_axis
 
 
-def analysed(path: Path, terms: str, progress: Any) -> tuple[xr.Dataset, dict[str, Any], list[str]]:
+def analysed(
+    path: Path, terms: str, progress: Any, columns: Sequence[Path] = ()
+) -> tuple[xr.Dataset, dict[str, Any], list[str]]:
     """Solution, summary and notes of the Allan analysis of a log.
 
     Raises:
         BadInput: the log is too short, not even, or constant.
     """
-    given = still(path)
+    given = still(path, columns)
     notes = list(given.notes)
     arrays: dict[str, Any] = {}
     columns: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
@@ -173,7 +176,9 @@ def analysed(path: Path, terms: str, progress: Any) -> tuple[xr.Dataset, dict[st
     return solution, summary, notes
 
 
-def stability(path: Path, terms: str, out: Path, as_json: bool) -> None:
+def stability(
+    path: Path, terms: str, out: Path, as_json: bool, columns: Sequence[Path] = ()
+) -> None:
     """Analyse a log, write the result, print it."""
     if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):
         raise BadInput(f"--terms {terms}: give different letters out of {', '.join(_NAMES)}.")
@@ -183,7 +188,7 @@ def stability(path: Path, terms: str, out: Path, as_json: bool) -> None:
         Progress() as progress,
         results.ResultWriter(out, command=command) as writer,
     ):
-        solution, summary, notes = analysed(path, terms, progress)
+        solution, summary, notes = analysed(path, terms, progress, columns)
         writer.save_solution(solution)
         writer.save_summary(summary)
         report.add(writer, lambda done, total, what: progress(0.7, what), notes)

@@ -81,7 +81,7 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
     key = f"columns.{quantity}"
     if not isinstance(stated, dict):
         mend = 'write it like { name = "t", unit = "ms" }'
-        raise LogError(file, "is not a table of name and unit", mend, where=key, value=stated)
+        raise LogError(file, "is not a table of name and unit", mend, field=key, value=stated)
     _checked(file, f"{key}.", stated, _COLUMN)
     if ("name" in stated) == ("place" in stated):
         mend = "state the name in the header, or the place from 1 where there is none"
@@ -116,7 +116,7 @@ def _checked(file: str, at: str, table: dict[str, Any], allowed: dict[str, tuple
         if not isinstance(value, allowed[key]) or isinstance(value, bool):
             words = _WORDS[allowed[key][-1]]
             raise LogError(
-                file, f"is not {words}", f"give {words}", where=f"{at}{key}", value=value
+                file, f"is not {words}", f"give {words}", field=f"{at}{key}", value=value
             )
 
 

@@ -151,7 +151,8 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
     Raises:
         LogError: it says something else than NED FRD or ENU RFU.
     """
-    own: tuple[NavFrame, BodyFrame] = (format.nav, "RFU" if format.body == "RFU" else "FRD")
+    nav: NavFrame = "ENU" if format.nav == "ENU" else "NED"
+    body: BodyFrame = "RFU" if format.body == "RFU" else "FRD"
     for number, text in _comments(head) if format.says_frames else ():
         said = re.search(r"\bframes?:\s*(.+)", text)
         if said is None:
@@ -168,7 +169,7 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
                 value=said[1].strip(),
             )
         return fitting[0]
-    return own
+    return nav, body
 
 
 def _origin(head: Head) -> Origin | None:

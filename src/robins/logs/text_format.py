@@ -84,7 +84,7 @@ class TextFormat:
     separator: str = ","  # " ": any number of blanks
     skip: int = 0  # lines before the first row, where columns have places
     body: str = "FRD"  # ways of the axes x, y, z; other than FRD and RFU are turned to FRD
-    nav: NavFrame = "NED"  # to which attitudes turn
+    nav: str = "NED"  # or ENU, to which attitudes turn
     says_frames: bool = False  # a comment "frames: ENU RFU" says so, and is written
     commented: bool = False  # the header is written as a comment
     choice: bool = False  # a file has one whole set of these columns, or more

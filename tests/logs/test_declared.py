@@ -1,0 +1,242 @@
+"""Formats of one's own, in TOML and Python: read, written, or refused with the key (F30)."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
+from robins.logs import (
+    Column,
+    LogError,
+    TextFormat,
+    columns_from,
+    formats_of,
+    load_dataset,
+    open_log,
+    write_log,
+)
+
+TOML = """
+separator = ";"
+body = "FLU"
+[columns]
+time = { name = "t", unit = "ms" }
+gyro_x = { name = "wx", unit = "deg/s" }
+gyro_y = { name = "wy", unit = "deg/s" }
+gyro_z = { name = "wz", unit = "deg/s" }
+accel_x = { name = "ax", unit = "g" }
+accel_y = { name = "ay", unit = "g" }
+accel_z = { name = "az", unit = "mg", scale = 0.5 }
+"""
+MAG = "".join(f'mag_{a} = {{ name = "m{a}", unit = "uT" }}\n' for a in "xyz")
+FIXES = """
+lat = { name = "lat", unit = "deg" }
+lon = { name = "lon", unit = "deg" }
+height = { name = "h", unit = "m" }
+"""
+LOG = '"t";"wx";"mode";"wy";"wz";"ax";"ay";"az"\n' + "".join(
+    f"{10 * k}.25;{k};run;90;180;0.5;-1;2000\n" for k in range(5)
+)
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Write a declaration and a log; their paths."""
+
+    def write(toml=TOML, log=LOG):
+        (tmp_path / "own.toml").write_text(toml)
+        (tmp_path / "log.csv").write_text(log)
+        return tmp_path / "own.toml", tmp_path / "log.csv"
+
+    return write
+
+
+def test_a_newcomers_log_is_read_as_declared(own):
+    declared, log = own()
+    imu = open_log(log, columns_from(declared))
+    assert isinstance(imu, ImuTable)
+    assert imu.time_ns.tolist() == [250_000 + 10_000_000 * k for k in range(5)]
+    # x forward, y left, z up: y and z of forward-right-down are reversed
+    np.testing.assert_allclose(np.rad2deg(imu.gyro[3]), [3.0, -90.0, -180.0], rtol=1e-15)
+    np.testing.assert_allclose(imu.accel[0] / 9.80665, [0.5, 1.0, -1.0], rtol=1e-15)
+    assert (imu.kind, imu.body, imu.rows.tolist()) == ("rate", "FRD", [2, 3, 4, 5, 6])
+    assert load_dataset([log], formats=formats_of([log], [declared])).name == "log"
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("FRD", [1, 2, 3]),
+        ("FLU", [1, -2, -3]),
+        ("LBU", [-2, -1, -3]),
+        ("DFR", [2, 3, 1]),
+        ("BRU", [-1, 2, -3]),
+    ],
+)
+def test_axes_are_turned_to_forward_right_down(own, body, expected):
+    row = columns_from(own(TOML.replace("FLU", body).replace("mg", "g").replace("0.5", "1"))[0])
+    log = own(log=LOG.splitlines()[0] + "\n0;57;a;0;0;1;2;3\n0;0;a;0;0;1;2;3\n")[1]
+    np.testing.assert_allclose(open_log(log, row).accel[0] / 9.80665, expected, rtol=1e-15)
+
+
+def test_places_count_from_one_where_there_is_no_header(own):
+    places = {"t": 2, "wx": 3, "wy": 4, "wz": 6, "ax": 7, "ay": 8, "az": 9}
+    toml = "skip = 2\n" + TOML
+    for name, place in places.items():
+        toml = toml.replace(f'name = "{name}"', f"place = {place}")
+    log = "my logger\nv 1.2\n" + "".join(f"A;{k};1;2;?;3;0;0;2000;\n" for k in range(4))
+    declared, path = own(toml, log)
+    imu = load_dataset([path], formats=formats_of([path], [declared])).imu
+    np.testing.assert_allclose(np.rad2deg(imu.gyro[0]), [1.0, -2.0, -3.0])
+    path.write_text(log.replace("A;2;1;2", "A;2;1;two"))
+    with pytest.raises(LogError, match=r"line 5: column 4 = 'two': is not a number"):
+        open_log(path, columns_from(declared))
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " ", "|"])
+def test_any_separator_and_cells_that_are_empty(own, separator):
+    toml = TOML.replace('";"', repr(separator).replace("'", '"'))
+    missing = "nan" if separator == " " else ""
+    rows = [
+        [str(k), missing if k == 1 else "1", "m", "2", "3", "0", "0", missing] for k in range(3)
+    ]
+    log = "\n".join(separator.join(row) for row in [LOG.split("\n")[0].split(";"), *rows]) + "\n"
+    imu = open_log(own(log=log)[1], columns_from(own(toml, log)[0]))
+    assert np.isnan(imu.gyro[:, 0]).tolist() == [False, True, False]
+    assert np.isnan(imu.accel[:, 2]).all()
+
+
+def test_a_row_belongs_to_the_tables_of_which_it_has_a_number(own):
+    header = LOG.split("\n")[0] + ";mx;my;mz;lat;lon;h\n"
+    rows = [f"{k};1;a;2;3;0;0;2000;" + ("1;2;3;" if k % 2 else ";;;") for k in range(6)]
+    rows = [r + ("47;8;400" if k == 4 else ";;") for k, r in enumerate(rows)]
+    declared, path = own(TOML + MAG + FIXES, header + "\n".join(rows) + "\n")
+    row = columns_from(declared)
+    data = open_log(path, row)
+    assert isinstance(data, Dataset)
+    assert (data.imu.rows.tolist(), data.mag.rows.tolist()) == ([2, 3, 4, 5, 6, 7], [3, 5, 7])
+    assert data.gnss.rows.tolist() == [6]
+    assert data.gnss.v_n is None
+    assert np.isnan(data.gnss.sigma_m).all()
+    np.testing.assert_allclose(data.mag.field_t[0], [1e-6, -2e-6, -3e-6], rtol=1e-14)
+    again = path.parent / "again.csv"
+    write_log(again, data, row)
+    back = open_log(again, row)
+    for kind in ("imu", "mag", "gnss"):
+        one, other = getattr(back, kind), getattr(data, kind)
+        np.testing.assert_array_equal(one.time_ns, other.time_ns)
+    np.testing.assert_allclose(back.mag.field_t, data.mag.field_t, rtol=5e-16)
+    np.testing.assert_allclose(back.imu.accel, data.imu.accel, rtol=5e-16)
+
+
+@pytest.mark.parametrize(
+    ("columns", "kind"),
+    [
+        ("dtheta_x dtheta_y dtheta_z dv_x dv_y dv_z", ImuTable),
+        ("mag_x mag_y mag_z", MagTable),
+        ("lat lon height sigma_north sigma_east sigma_down v_north v_east v_down", GnssTable),
+        ("lat lon height quality", GnssTable),
+        ("lat lon height v_north v_east v_down roll pitch heading", Trajectory),
+        ("east north up q_w q_x q_y q_z omega_x omega_y omega_z", Trajectory),
+        ("roll pitch heading", AttitudeTable),
+    ],
+)
+def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
+    names = columns.split()
+    row = TextFormat("own", "mine", tuple(Column(q, q) for q in ["time", *names]))
+    path = tmp_path / "log.csv"
+    cells = {"q_w": "1", "q_x": "0", "q_y": "0", "q_z": "0"}
+    line = ",".join(cells.get(q, "0.5") for q in names)
+    path.write_text("# origin: 47.0 deg, 8.0 deg, 0.0 m\n" + ",".join(["time", *names]) + "\n")
+    with path.open("a") as file:
+        file.writelines(f"{k},{line}\n" for k in range(3))
+    table = open_log(path, row)
+    assert type(table) is kind
+    again = tmp_path / "again.csv"
+    write_log(again, table, row)
+    back = open_log(again, row)
+    for field in dataclasses.fields(table):
+        one, other = getattr(back, field.name), getattr(table, field.name)
+        if isinstance(other, np.ndarray) and field.name != "rows":
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("separator", "seperator"), r"own.toml seperator: is no key; did you mean separator\?"),
+        (('";"', "1"), "own.toml: separator = 1: is not text; give text"),
+        (('";"', '"ab"'), "own.toml: separator = 'ab': cannot separate numbers; give one char"),
+        (('"FLU"', '"FLD"'), "own.toml: body = 'FLD': is left-handed; give a right-handed"),
+        (('"FLU"', '"FFU"'), "own.toml: body = 'FFU': names one axis twice"),
+        (('"FLU"', '"XYZ"'), "own.toml: body = 'XYZ': is not three of the ways F, B, R, L, D, U"),
+        (("body", 'nav = "EUN"\nbody'), "own.toml: nav = 'EUN': is neither NED nor ENU"),
+        (("body", "skip = -1\nbody"), "own.toml: skip = -1: is less than 0; count lines from 0"),
+        (("gyro_x", "gryo_x"), r"columns.gryo_x: is no quantity .*; did you mean gyro_x\?; choose"),
+        (('"deg/s"', '"deg/sec"'), r"columns.gyro_x: unit = 'deg/sec': .*did you mean deg/s"),
+        (('"deg/s"', '"g"'), "columns.gyro_x: unit = 'g': g is a.*; an angle rate"),
+        (('"ms"', '"min"'), "columns.time: unit = 'min': is no unit of time stamps; .*s, ms, us, ns"),
+        ((', unit = "g" }', " }"), "columns.accel_x: has no unit; state one of m/s"),
+        (("scale = 0.5", "scale = 0"), "columns.accel_z: scale = 0.0: cannot scale anything"),
+        (("scale = 0.5", "scale = true"), "columns.accel_z.scale = True: is not a number"),
+        (("scale = 0.5", "offset = 2"), "columns.accel_z.offset: is no key; .*name, place, unit"),
+        (('name = "wx"', 'nam = "wx"'), r"columns.gyro_x.nam: is no key; did you mean name\?"),
+        (('name = "wx"', "place = 0"), "columns.gyro_x: place = 0: is less than 1; count"),
+        (('name = "wx"', "place = 3"), "columns: some have names and some have places"),
+        (('name = "wx"', 'name = "a", place = 3'), "columns.gyro_x: has both name and place"),
+        (('name = "wx", ', ""), "columns.gyro_x: has neither name nor place"),
+        (('{ name = "wx", unit = "deg/s" }', '"wx"'), "columns.gyro_x = 'wx': is not a table of name and unit; write"),
+        (("gyro_z", "gyro_y"), "own.toml: is no TOML: .*; repair it"),
+        (('gyro_z = { name = "wz", unit = "deg/s" }\n', ""), "columns: gyro_z are not stated; state"),
+        (("gyro_z = {", "dt = {"), "columns.dt: unit = 'deg/s': .*a time"),
+        (("time =", "week ="), "columns.week: unit = 'ms': ms is a time; a ratio"),
+        (("[columns]", "[cols]"), "own.toml cols: is no key; did you mean columns"),
+        ((TOML, ""), "own.toml columns: states no columns; state them, such as time = "),
+        ((TOML[TOML.index("gyro_x") :], FIXES + MAG), "make mag and gnss alone, where several need"),
+        ((TOML[TOML.index("gyro_x") :], ""), "own.toml columns: make no table; state whole sets"),
+        ((TOML[TOML.index("gyro_x") :], MAG + 'quality = { name = "q" }'), "quality have no use in"),
+        ((TOML[TOML.index("gyro_x") :], "".join(f'{q} = {{ name = "{q}", unit = "deg" }}\n'
+          for q in ("roll", "pitch", "heading"))), "body = 'FLU': does not go with nav NED; use NED"),
+    ],
+)  # fmt: skip
+def test_a_declaration_that_is_refused_names_file_and_key(own, change, message):
+    assert change[0] in TOML
+    with pytest.raises(LogError, match=message) as caught:
+        columns_from(own(TOML.replace(*change, 1))[0])
+    assert str(caught.value).startswith(str(own()[0]))
+
+
+def test_a_declaration_that_cannot_be_read(tmp_path, own):
+    with pytest.raises(LogError, match="none.toml: cannot be read: No such file"):
+        columns_from(tmp_path / "none.toml")
+    own()[0].write_bytes(b"\xff\xfe")
+    with pytest.raises(LogError, match="own.toml: is no TOML: "):
+        columns_from(tmp_path / "own.toml")
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        (TOML.replace('"wx"', '"gx"'), 'log.csv line 1: the header lacks gx; it has t, wx, mode, .*'
+         "; state the names that it has in .*own.toml"),
+        (TOML.replace('";"', '","'), "the header lacks t, wx, .*; state separator = ';' in .*own"),
+    ],
+)  # fmt: skip
+def test_a_declaration_that_does_not_fit_is_told_with_what_lacks(own, toml, message):
+    declared, log = own(toml)
+    with pytest.raises(LogError, match=message):
+        open_log(log, formats_of([log], [declared])[str(log)])
+
+
+def test_each_declaration_fits_one_file(own, tmp_path):
+    declared, log = own()
+    with pytest.raises(LogError, match=r"log.csv: fits both .*own.toml and .*own.toml; give"):
+        formats_of([log], [declared, declared])
+    (tmp_path / "image").write_bytes(b"\0\1\2")
+    with pytest.raises(LogError, match="own.toml: its columns fit none of the files"):
+        formats_of([tmp_path / "image"], [declared])
+    assert formats_of([log], []) == {}
