@@ -21,6 +21,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "room_pages",
     "finding_tables",
+    "format_tables",
     "plain_docstrings",
     "role_table",
 ]

@@ -15,7 +15,7 @@ from plain_docstrings import plain
 from robins import scenario
 from robins.bench.run.setup import Setup
 from robins.cli import Status, app
-from robins.logs import columns_from, quantities, registry, text_formats
+from robins.logs import columns_from
 from robins.results.summary import checked
 from robins.systems import SYSTEMS
 
@@ -114,12 +114,6 @@ def rows_of(page: Path, heading: str) -> list[list[str]]:
     part = page.read_text("utf-8").split(f"\n{heading}\n")[1].split(f"\n{rank} ")[0]
     rows = [line.strip("|").split("|") for line in part.splitlines() if line.startswith("| `")]
     return [[cell.strip() for cell in row] for row in rows]
-
-
-def test_every_format_and_quantity_is_documented():
-    page = (ROOT / "docs" / "logs.md").read_text("utf-8")
-    for table in (registry, text_formats, quantities):
-        assert table.markdown() in page
 
 
 def test_the_contract_names_every_command_option_and_status():

@@ -144,7 +144,7 @@ def analysed(
     given = still(path, columns)
     notes = list(given.notes)
     arrays: dict[str, Any] = {}
-    columns: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
+    by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
     tau_s = np.zeros(0)
     for done, (sensor, rate) in enumerate(given.rates.items()):
         progress(0.1 + 0.3 * done, f"{sensor}: Allan deviation")
@@ -159,7 +159,7 @@ def analysed(
             notes.append(f"No parameters of the {sensor}: {error}.")
         else:
             for axis, found in _metrics(sensor, fitted).items():
-                columns[axis] |= found
+                by_axis[axis] |= found
         arrays |= _arrays(sensor, curve, fitted, given.body)
         tau_s = curve.tau_s
     solution = xr.Dataset(arrays | {"tau": variable("tau", tau_s, "s", "averaging time")})
@@ -169,7 +169,7 @@ def analysed(
         "scenario": f"allan/{path.name.split('.')[0]}",
         "seed": 0,
         "runs": 1,
-        "filters": columns,
+        "filters": by_axis,
         "claims": [],
         "counts": given.counts,
     }

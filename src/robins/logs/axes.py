@@ -19,7 +19,7 @@ _WAYS = {
 class Axes(NamedTuple):
     """For each axis x, y, z the component along forward, right, down that it is, and its sign."""
 
-    index: tuple[int, ...]
+    component: tuple[int, ...]
     sign: tuple[float, ...]
 
     @classmethod
@@ -44,9 +44,9 @@ class Axes(NamedTuple):
     def to_frd(self, v: np.ndarray) -> np.ndarray:
         """Components (n, 3) along these axes as those along forward, right, down; exact."""
         out = np.empty_like(v)
-        out[:, self.index] = v * self.sign
+        out[:, self.component] = v * self.sign
         return out
 
     def from_frd(self, v: np.ndarray) -> np.ndarray:
         """The inverse of `to_frd`."""
-        return v[:, self.index] * self.sign
+        return v[:, self.component] * self.sign

@@ -109,13 +109,3 @@ def tables_of_groups(groups: set[str]) -> tuple[str, ...]:
 def words_of(kind: str) -> str:
     """A table in words."""
     return TABLES[kind].text
-
-
-def markdown() -> str:
-    """The table as documentation."""
-    lines = ["| quantities | kind of unit | meaning |", "|---|---|---|"]
-    for group in GROUPS.values():
-        names = " ".join(f"`{q}`" for q in group.kinds)
-        kinds = ", ".join(dict.fromkeys(group.kinds.values()))
-        lines.append(f"| {names} | {kinds} | {group.text} |")
-    return "\n".join(lines) + "\n"

@@ -206,10 +206,3 @@ def _called(name: str, among: Sequence[Format], path: str | os.PathLike[str]) ->
             str(path), f"no format is called {name!r}", f"choose one of {', '.join(named)}"
         )
     return named[name]
-
-
-def markdown() -> str:
-    """The table of formats as documentation."""
-    lines = ["| name | holds | written by |", "|---|---|---|"]
-    lines += [f"| `{f.name}` | {', '.join(map(words_of, f.holds))} | {f.about} |" for f in FORMATS]
-    return "\n".join(lines) + "\n"

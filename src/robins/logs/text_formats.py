@@ -242,18 +242,3 @@ TEXT_FORMATS: tuple[TextFormat, ...] = (
     ),
 )
 """All of them."""
-
-
-def markdown() -> str:
-    """The columns of every format as documentation."""
-    lines = ["| format | columns | in this order, or by name | units beside those |"]
-    lines.append("|---|---|---|---|")
-    for row in TEXT_FORMATS:
-        names = ", ".join(f"`{column.names[0]}`" for column in row.columns)
-        others = dict.fromkeys(
-            "any" if symbol == ANY else symbol for c in row.columns for symbol in c.units[1:]
-        )
-        found = "by name" if row.named else "in order"
-        between = "blanks" if row.separator == " " else f"`{row.separator}`"
-        lines.append(f"| `{row.name}` | {names} | {found}, {between} | {', '.join(others)} |")
-    return "\n".join(lines) + "\n"

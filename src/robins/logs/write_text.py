@@ -26,6 +26,7 @@ from robins.units import from_si, unit
 _ROWS = 50_000
 _STEEP = 1.5  # rad; nearer to the vertical roll and heading lose digits
 Values = dict[str, np.ndarray]  # by quantity, SI
+Cells = tuple[np.ndarray, Column]
 
 
 def write_text(
@@ -45,16 +46,15 @@ def write_text(
     for one in tables:
         _check(format, path, one)
     if format.local and origin is None:
-        (trajectory,) = tables
-        origin = Origin.of(trajectory)
+        origin = next(Origin.of(one) for one in tables if isinstance(one, Trajectory))
     time_ns, values = _together(format, path, [(t, _values(format, t, origin)) for t in tables])
     columns = [c for c in format.columns if not format.choice or _wanted(c, values)]
     if format.whole:
         _refuse_missing(format, path, time_ns, columns, values)
     comments = []
     if format.says_frames:
-        frames = tables[0]
-        comments.append(f"# frames: {getattr(frames, 'nav', '')} {frames.body}".replace("  ", " "))
+        said = (getattr(tables[0], which, "") for which in ("nav", "body"))
+        comments.append(f"# frames: {' '.join(filter(None, said))}")
     if origin is not None and format.local:
         comments.append("# origin: {!r} deg, {!r} deg, {!r} m".format(*map(float, origin)))
     write_lines(path, _blocks(format, comments, columns, _cells(columns, time_ns, values, week)))
@@ -223,7 +223,7 @@ def _refuse_missing(
 
 def _cells(
     columns: list[Column], time_ns: np.ndarray, values: Values, week: int | None
-) -> dict[int, Any]:
+) -> dict[int, Cells]:
     """By place from 0: what is written as it is, integers of a week or nanoseconds, floats."""
     absolute = len(time_ns) > 0 and bool(time_ns[0] >= GPS_EPOCH_NS)
     since_ns = time_ns - GPS_EPOCH_NS if absolute else time_ns
@@ -236,7 +236,7 @@ def _cells(
         of_week_ns = time_ns
     stamps = {"time": time_ns, "time_of_week": of_week_ns, "week": weeks}
     missing = np.full(len(time_ns), np.nan)
-    out: dict[int, Any] = {}
+    out: dict[int, Cells] = {}
     names: dict[str, int] = {}
     for column in columns:
         place = names.setdefault(column.name, column.place - 1 if column.place else len(names))
@@ -250,7 +250,7 @@ def _cells(
 
 
 def _blocks(
-    format: TextFormat, comments: list[str], columns: list[Column], cells: dict[int, Any]
+    format: TextFormat, comments: list[str], columns: list[Column], cells: dict[int, Cells]
 ) -> Iterator[str]:
     separator = format.separator
     if format.named:
@@ -266,15 +266,15 @@ def _blocks(
     for start in range(0, rows, _ROWS):
         block = slice(start, start + _ROWS)
         texts = [
-            _texts(*cells[k], block) if k in cells else itertools.repeat("nan")
-            for k in range(width)
+            _texts(cells[k], block) if k in cells else itertools.repeat("nan") for k in range(width)
         ]
         count = min(_ROWS, rows - start)
         lines = itertools.islice(zip(*texts, strict=False), count)
         yield "".join(f"{separator.join(line)}\n" for line in lines)
 
 
-def _texts(values: np.ndarray, column: Column, block: slice) -> list[str]:
+def _texts(cells: Cells, block: slice) -> list[str]:
+    values, column = cells
     numbers = values[block].tolist()
     if column.holds in ("time", "time_of_week"):
         return [ns_to_decimal(ns, CLOCKS[column.unit]) for ns in numbers]
