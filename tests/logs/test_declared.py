@@ -195,12 +195,12 @@ def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
         (("gyro_z = {", "dt = {"), "columns.dt: unit = 'deg/s': .*a time"),
         (("time =", "week ="), "columns.week: unit = 'ms': ms is a time; a ratio"),
         (("[columns]", "[cols]"), "own.toml cols: is no key; did you mean columns"),
-        ((TOML, ""), "own.toml columns: states no columns; state them, such as time = "),
-        ((TOML[TOML.index("gyro_x") :], FIXES + MAG), "make mag and gnss alone, where several need"),
+        ((TOML, ""), "own.toml columns: states no columns; state them, such"),
+        ((TOML[TOML.index("gyro_x") :], FIXES + MAG), "make mag and gnss alone, where"),
         ((TOML[TOML.index("gyro_x") :], ""), "own.toml columns: make no table; state whole sets"),
-        ((TOML[TOML.index("gyro_x") :], MAG + 'quality = { name = "q" }'), "quality have no use in"),
+        ((TOML[TOML.index("gyro_x") :], MAG + 'quality = { name = "q" }'), "quality have no use"),
         ((TOML[TOML.index("gyro_x") :], "".join(f'{q} = {{ name = "{q}", unit = "deg" }}\n'
-          for q in ("roll", "pitch", "heading"))), "body = 'FLU': does not go with nav NED; use NED"),
+          for q in ("roll", "pitch", "heading"))), "body = 'FLU': does not go with nav NED"),
     ],
 )  # fmt: skip
 def test_a_declaration_that_is_refused_names_file_and_key(own, change, message):
@@ -211,10 +211,10 @@ def test_a_declaration_that_is_refused_names_file_and_key(own, change, message):
 
 
 def test_a_declaration_that_cannot_be_read(tmp_path, own):
-    with pytest.raises(LogError, match="none.toml: cannot be read: No such file"):
+    with pytest.raises(LogError, match=r"none.toml: cannot be read: No such file"):
         columns_from(tmp_path / "none.toml")
     own()[0].write_bytes(b"\xff\xfe")
-    with pytest.raises(LogError, match="own.toml: is no TOML: "):
+    with pytest.raises(LogError, match=r"own.toml: is no TOML: "):
         columns_from(tmp_path / "own.toml")
 
 
@@ -237,6 +237,6 @@ def test_each_declaration_fits_one_file(own, tmp_path):
     with pytest.raises(LogError, match=r"log.csv: fits both .*own.toml and .*own.toml; give"):
         formats_of([log], [declared, declared])
     (tmp_path / "image").write_bytes(b"\0\1\2")
-    with pytest.raises(LogError, match="own.toml: its columns fit none of the files"):
+    with pytest.raises(LogError, match=r"own.toml: its columns fit none of the files"):
         formats_of([tmp_path / "image"], [declared])
     assert formats_of([log], []) == {}
