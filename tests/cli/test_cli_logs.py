@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robins import logs, results, scenario
-from robins.cli import stability
+from robins.cli import Status, stability
 from robins.dataset import ImuTable
 from robins.ins import allan
 from robins.ins.allan_noise import moments
@@ -343,3 +343,42 @@ def test_every_unit_of_the_fit_can_be_told():
     for sensor in allan._FIELD_UNITS.values():
         for name, (_, unit) in sensor.items():
             assert numbers.label(f"{name}_{stability.suffix(unit)}").unit != ""
+
+
+LOGGER = """
+separator = ";"
+[columns]
+time = { name = "t", unit = "us" }
+""" + "".join(
+    f'{holds}_{axis} = {{ name = "{name}{axis}", unit = "{unit}" }}\n'
+    for holds, name, unit in (("gyro", "w", "deg/s"), ("accel", "a", "g"))
+    for axis in "xyz"
+)
+
+
+def test_declared_columns_are_read_by_the_commands_and_refused_with_their_key(robins, tmp_path):
+    declared, log = tmp_path / "logger.toml", tmp_path / "my.csv"
+    declared.write_text(LOGGER)
+    table = a_still_imu(20.0)
+    logs.write_log(log, table, logs.columns_from(declared))
+    np.testing.assert_allclose(
+        stability.still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12
+    )
+    answer = robins("doctor", log, "--columns", declared)
+    assert answer.status == Status.DONE, answer.err
+    assert f"robins replay {log} --columns {declared}" in answer.out
+    answer = robins("calibrate", log, "--columns", declared)
+    assert "holds no magnetic field" in answer.err
+    answer = robins("run", "transfer-alignment/s0", "--columns", declared)
+    assert answer.status == Status.BAD_INPUT
+    assert "goes with --master and --slave" in answer.err
+    slave = ("--master", log, "--slave", log)
+    answer = robins("run", "transfer-alignment/replay", *slave, "--columns", declared)
+    assert answer.status == Status.BAD_INPUT
+    assert "holds no path of a master INS" in answer.err
+    declared.write_text(LOGGER.replace("gyro_y", "gyro_w"))
+    for command in (("doctor",), ("allan",), ("replay",), ("calibrate",)):
+        answer = robins(*command, log, "--columns", declared)
+        assert answer.status == Status.BAD_INPUT
+        assert f"{declared} columns.gyro_w: is no quantity" in answer.err.replace("\n", " ")
+        assert "did you mean gyro_" in answer.err

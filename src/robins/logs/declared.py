@@ -130,7 +130,8 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, TextFormat]:
     Raises:
         LogError: as `columns_from`; a declaration fits none of the files, or two fit one.
     """
-    heads = list(filter(None, map(_head, files))) if (columns := list(columns)) else []
+    columns = list(columns)
+    heads = list(filter(None, map(_head, dict.fromkeys(files)))) if columns else []
     out: dict[str, TextFormat] = {}
     for row in map(columns_from, columns):
         fitting = [head for head in heads if row.recognise(head)]
