@@ -62,6 +62,8 @@ def test_a_newcomers_log_is_read_as_declared(own):
     np.testing.assert_allclose(imu.accel[0] / 9.80665, [0.5, 1.0, -1.0], rtol=1e-15)
     assert (imu.kind, imu.body, imu.rows.tolist()) == ("rate", "FRD", [2, 3, 4, 5, 6])
     assert load_dataset([log], formats=formats_of([log], [declared])).name == "log"
+    declared, log = own("skip = 2\n" + TOML, "my logger\nt;0.5\n" + LOG)
+    np.testing.assert_array_equal(open_log(log, columns_from(declared)).gyro, imu.gyro)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@
     mag_x = { name = "mx", unit = "uT", scale = 0.15 }    # counts of 0.15 uT; -1 reverses an axis
 
 Units are those of `robins.units`, quantities those of `robins.logs.quantities`. Columns that are
-not stated may hold anything. Where no header names the columns, `skip` lines come before the rows.
+not stated may hold anything. `skip` lines come before the header, or before the rows without one.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from robins.ins.frames import swap, swap_q
 from robins.logs.axes import Axes
 from robins.logs.findings import Finding, LogError, report
 from robins.logs.local import LocalPath, Origin, from_local
-from robins.logs.quantities import QUANTITIES, parts, words_of
+from robins.logs.quantities import QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of
 from robins.logs.text import COMMENTS, Head, Layout, peek, read_columns
 from robins.logs.text_format import PAIRS, Found, TextFormat, columns_of, decimals_of, header_of
@@ -37,7 +37,7 @@ NOWHERE = Origin(0.0, 0.0, 0.0)
 _TEXTS = ("time", "time_of_week", "week")
 # Beyond these an angle is in another unit or another column; a heading may be unwrapped a little.
 _LIMIT_DEG = {"lat": 90.0, "lon": 400.0, "roll": 400.0, "pitch": 90.0, "heading": 400.0}
-_NUMBER = r"([-+.\deE]+)"
+_NUMBER = r"([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?)"
 _ORIGIN = re.compile(rf"\borigin: {_NUMBER} deg,? {_NUMBER} deg,? {_NUMBER} m\b")
 
 
@@ -187,7 +187,7 @@ def _comments(head: Head) -> list[tuple[int, str]]:
 def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) -> Table | Dataset:
     made = []
     for kind in format.kinds:
-        own = {q for groups in _GROUPS_READ[kind] for q in parts(groups)} & set(read.values)
+        own = {q for need in TABLES[kind].needs for q in parts(need)} & set(read.values)
         if not own:
             continue
         part = read
@@ -278,13 +278,6 @@ def _path(read: Read, origin: Origin | None) -> Trajectory:
 
 
 _MAKERS = {"imu": _imu, "mag": _mag, "gnss": _gnss, "attitude": _attitude}
-_GROUPS_READ = {
-    "imu": ("gyro", "accel", "dtheta", "dv"),
-    "mag": ("mag",),
-    "gnss": ("place",),
-    "trajectory": ("place", "local", "euler", "quaternion"),
-    "attitude": ("euler", "quaternion"),
-}
 
 
 def _quaternions(read: Read) -> np.ndarray:

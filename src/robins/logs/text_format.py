@@ -82,7 +82,7 @@ class TextFormat:
     about: str  # one line for people
     columns: tuple[Column, ...]
     separator: str = ","  # " ": any number of blanks
-    skip: int = 0  # lines before the first row, where columns have places
+    skip: int = 0  # lines before the header, or before the rows where there is none
     body: str = "FRD"  # ways of the axes x, y, z; other than FRD and RFU are turned to FRD
     nav: str = "NED"  # or ENU, to which attitudes turn
     says_frames: bool = False  # a comment "frames: ENU RFU" says so, and is written
@@ -185,7 +185,8 @@ class Header(NamedTuple):
 
 def header_by_name(format: TextFormat, head: Head) -> Header:
     """The line that names most columns: the first that is no comment, or a comment before."""
-    first = (head.data(1) or [(len(head.lines), "")])[0][0]
+    data = [k for k, _ in head.data(format.skip + 1) if k > format.skip]
+    first = data[0] if data else len(head.lines)
     candidates = [
         _header(format, k, text, all_named=k == first)
         for k, text in enumerate(head.lines[:first], start=1)
