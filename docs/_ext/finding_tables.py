@@ -1,4 +1,4 @@
-"""The tables of the doctor's findings and of what `clean` refuses, as `robins.logs.checks` has them."""
+"""The tables of the doctor's findings and of what `clean` refuses, from `robins.logs.checks`."""
 
 from pathlib import Path
 
