@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from robins.workbench import run_scenario
+from robins.workbench import publish, run
 
 HERE = Path(__file__).parent
 DRIVE = {"drive_position.png": "error_position.png", "drive_track.png": "track.png"}
@@ -14,8 +14,8 @@ SHOWN = ("ukf", "raukf", "cukf-wind-states", "product")
 
 def main():
     with tempfile.TemporaryDirectory() as name:
-        drive = run_scenario("ins-gnss/drive", out=Path(name) / "drive")
-        airship = run_scenario("airship/s1", out=Path(name) / "airship", filters=SHOWN)
+        drive = publish(run("ins-gnss/drive"), Path(name) / "drive")
+        airship = publish(run("airship/s1", filters=SHOWN), Path(name) / "airship")
         for done, pictures in ((drive, DRIVE), (airship, AIRSHIP)):
             for picture, figure in pictures.items():
                 shutil.copyfile(done.path / "figures" / figure, HERE / picture)

@@ -8,13 +8,11 @@ and the verdict of each claim.
 """
 
 import sys
-import tempfile
-from pathlib import Path
 
 import jax
 
-from robins import results
-from robins.workbench import run_scenario
+from robins.results.summary import plain
+from robins.workbench import run
 
 BANK_TURN = ("s0", "s0r", "s1", "s2", "s3")  # east, north, up
 S_TURN = ("a", "b", "c", "d", "e")  # all axes
@@ -22,9 +20,7 @@ S_TURN = ("a", "b", "c", "d", "e")  # all axes
 
 def summary_of(name: str) -> dict:
     """What a scenario finds."""
-    with tempfile.TemporaryDirectory() as folder:
-        done = run_scenario(f"transfer-alignment/{name}", out=Path(folder) / name)
-        return results.read(done.path).summary
+    return plain(run(f"transfer-alignment/{name}").summary)
 
 
 def cell(metrics: dict | None, by_axis: bool) -> str:

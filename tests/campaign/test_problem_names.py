@@ -69,8 +69,8 @@ def failing(statistics):
 
 def test_statistics_that_nothing_can_be_made_of_are_kept(tmp_path):
     with pytest.raises(results.NotWritten, match="numbers are kept in") as error:  # noqa: SIM117
-        with results.rescued(tmp_path / "out") as keep:
-            simulate(a_problem(metrics=failing), 3, keep=keep)
+        with results.rescued(tmp_path / "out"):
+            simulate(a_problem(metrics=failing), 3)
     (kept,) = tmp_path.iterdir()
     assert str(kept / "arrays.npz") in str(error.value)
     assert "a metric that a study forgot" in str(error.value)
@@ -83,8 +83,8 @@ def test_statistics_that_nothing_can_be_made_of_are_kept(tmp_path):
 
 def test_a_disk_that_takes_nothing_is_told_as_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "savez", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(KeyError), results.rescued(tmp_path / "out") as keep:  # noqa: PT012
-        keep({"a": np.ones(2)})
+    kept = {"a": np.ones(2)}
+    with pytest.raises(KeyError), results.rescued(tmp_path / "out"), results.keeping(kept):
         raise KeyError("first")
 
 

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from robins import results
+from robins import report, results
 from robins.cli import main
 from robins.systems import catalogue
+from robins.workbench import part, publishing
 
 Answer = namedtuple("Answer", "status out err")
-Done = namedtuple("Done", "path summary notes")
 
 
 @pytest.fixture
@@ -29,7 +29,9 @@ def robins(capsys, monkeypatch, tmp_path):
 
 
 class Workbench:
-    """In the place of `robins.workbench`: notes what it is asked, writes a result or raises."""
+    """In the place of `robins.workbench`: notes what it is asked, computes nothing or raises."""
+
+    part, publishing = staticmethod(part), staticmethod(publishing)
 
     def __init__(self):
         self.asked = {}
@@ -38,40 +40,41 @@ class Workbench:
         self.findings = []
         self.warnings = []
 
-    def run_scenario(self, name, **asked):
+    def run(self, name, **asked):
         return self._work(name, asked)
 
-    def replay_log(self, paths, *, findings, **asked):
+    def replay(self, paths, *, findings, **asked):
         findings(self.findings)
         return self._work("ins-gnss/log", asked | {"paths": paths})
+
+    def align(self, name, master, slave, *, findings, **asked):
+        return self._work(name, asked | {"master": master, "slave": slave})
 
     def _work(self, name, asked):
         self.asked = asked | {"name": name}
         print("noise of some library on standard output")
         asked["progress"](0.5, "half way")
+        if self.error is not None:
+            raise self.error
         claim = {"id": "C1", "text": "it holds", "value": 1.0, "band": [0.0, 2.0]}
-        summary = {
-            "scenario": name,
-            "seed": asked["seed"],
-            "runs": asked.get("runs") or 1,
-            "filters": {"ekf": {"horizontal_rms_m": 0.25, "worst_m": float("nan")}},
-            "claims": [claim | {"verdict": self.verdict}] if self.verdict else [],
-            "counts": {"imu_nan": 2},
-            "warnings": self.warnings,
-        }
-        with results.ResultWriter(asked["out"], command=asked["command"]) as writer:
-            writer.save_summary(summary)
-            writer.save_report("<p>")
-            if self.error is not None:
-                raise self.error
-        path = Path(asked["out"])
-        return Done(path, results.read(path).summary, ("A note for the reader.",))
+        return results.Outcome(
+            metrics={"ekf": {"horizontal_rms_m": 0.25, "worst_m": float("nan")}},
+            claims=[claim | {"verdict": self.verdict}] if self.verdict else [],
+            counts={"imu_nan": 2},
+            notes=["A note for the reader."],
+            warnings=self.warnings,
+            scenario=name,
+            seed=asked.get("seed", 0),
+            runs=asked.get("runs") or 1,
+            last_lines=["Next:   look into {out}"],
+        )
 
 
 @pytest.fixture
 def workbench(monkeypatch):
     made = Workbench()
     monkeypatch.setitem(sys.modules, "robins.workbench", made)
+    monkeypatch.setattr(report, "add", lambda writer, *_: writer.save_report("<p>"))
     return made
 
 

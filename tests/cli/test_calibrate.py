@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins import logs, report, results, scenario
-from robins.cli import calibrate as command
 from robins.ins.magnetometer_calibration import calibrate
 from robins.sim.magnetometer import observe_field
 from robins.systems import SYSTEMS
+from robins.workbench import magnetometer as command
 
 RATE_HZ, COUNT = 50.0, 2000
 FIELD_N = np.array([20e-6, 0.0, 43e-6])

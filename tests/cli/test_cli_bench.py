@@ -18,8 +18,8 @@ from robins.bench.run.session import Session
 from robins.bench.run.setup import NODES, built_in
 from robins.bench.wire.c_header import c_header
 from robins.cli import app
-from robins.cli.bench_work import _flight
 from robins.results import ResultWriter
+from robins.workbench.benches import flight_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "bench.md").read_text("utf-8")
@@ -192,14 +192,14 @@ def test_a_run_that_cannot_be_is_refused_with_the_mend(robins, given, told, tmp_
 
 def test_an_option_of_nought_is_given(tmp_path):
     (tmp_path / "mine.toml").write_text('bench = "satellite"\nseed = 5\n')
-    read = partial(_flight, str(tmp_path / "mine.toml"), ())
+    read = partial(flight_of, str(tmp_path / "mine.toml"), ())
     assert [read({"seed": seed}).setup.seed for seed in (0, None, 7)] == [0, 5, 7]
 
 
 def test_a_second_bench_with_the_same_folder_is_refused(robins, tmp_path):
     out = tmp_path / "out"
     first = ResultWriter(out)
-    record = first.beside("record.mcap")
+    record = Path(f"{out}.record.mcap")
     record.write_text("of the first")
     answer = robins("bench", "up", SATELLITE, "--out", out)
     assert (answer.status, answer.out) == (2, "")

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from robins import logs, results, scenario
-from robins.cli import Status, stability
+from robins.cli import Status
 from robins.dataset import ImuTable
 from robins.ins import allan
 from robins.ins.allan_noise import moments
 from robins.report import numbers
+from robins.workbench import allan as find_noise
+from robins.workbench import still
 
 RATE_HZ = 100.0
 GYRO_NOISE = np.deg2rad(0.3) / 60.0  # rad/sqrt(s), 0.3 deg/sqrt(h)
@@ -123,7 +125,16 @@ def test_the_mounting_of_a_configuration_is_heeded(robins, upside_down, monkeypa
     assert refused.status == 2
     assert refused.err.startswith('robins: other.toml: write system = "..." into it')
     assert robins("doctor", upside_down, "unit.toml", "other.toml").status == 2
-    assert robins("doctor", "unit.toml").status == 2
+
+
+@pytest.mark.parametrize("command", ["doctor", "replay", "calibrate"])
+def test_a_configuration_alone_is_no_log(robins, command):
+    answer = robins(command, "unit.toml")
+    assert answer.status == 2
+    assert answer.err == (
+        "robins: unit.toml: is a configuration; give the files of the log beside it.\n"
+    )
+    assert not list(Path().iterdir())
 
 
 @pytest.fixture
@@ -233,7 +244,7 @@ def test_increments_give_what_rates_give(tmp_path):
     rates, increments = tmp_path / "rates.csv", tmp_path / "increments.csv"
     logs.write_log(rates, a_still_imu(10.0), "pyins-imu")
     logs.write_log(increments, a_still_imu(10.0, kind="increment"), "pyins-imu")
-    one, other = stability.still(rates), stability.still(increments)
+    one, other = still.still(rates), still.still(increments)
     np.testing.assert_allclose(one.rates["gyro"], other.rates["gyro"], rtol=1e-9)
     np.testing.assert_allclose(one.rates["accel"], other.rates["accel"], rtol=1e-9)
 
@@ -244,7 +255,7 @@ def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(tmp_path):
     keep[1000:1050] = False
     gapped = ImuTable(table.time_ns[keep], table.gyro[keep], table.accel[keep], "rate")
     logs.write_log(tmp_path / "gapped.csv", gapped, "euroc-imu")
-    found = stability.still(tmp_path / "gapped.csv")
+    found = still.still(tmp_path / "gapped.csv")
     assert len(found.time_ns) == 1950
     np.testing.assert_allclose(found.rates["gyro"], table.gyro[1050:], atol=1e-9)
     (note,) = found.notes
@@ -264,7 +275,7 @@ def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(tmp_path):
 )
 def test_the_longest_stretch(steps, bounds):
     time_ns = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
-    assert stability.longest_stretch(time_ns) == bounds
+    assert still.longest_stretch(time_ns) == bounds
 
 
 def test_a_moving_sensor_is_noticed(tmp_path):
@@ -275,8 +286,8 @@ def test_a_moving_sensor_is_noticed(tmp_path):
         tmp_path / "a.csv", ImuTable(table.time_ns, turning, table.accel, "rate"), "euroc-imu"
     )
     logs.write_log(tmp_path / "b.csv", table, "euroc-imu")
-    assert any("turned" in note for note in stability.still(tmp_path / "a.csv").notes)
-    assert not any("turned" in note for note in stability.still(tmp_path / "b.csv").notes)
+    assert any("turned" in note for note in still.still(tmp_path / "a.csv").notes)
+    assert not any("turned" in note for note in still.still(tmp_path / "b.csv").notes)
 
 
 def test_a_stuck_sensor_is_refused(robins, tmp_path):
@@ -292,16 +303,16 @@ def test_a_stuck_sensor_is_refused(robins, tmp_path):
 def test_a_short_log_gives_its_curve_and_the_reason_why_no_parameters(tmp_path):
     logs.write_log(tmp_path / "short.csv", a_still_imu(2.0), "euroc-imu")
     heard = []
-    solution, summary, notes = stability.analysed(
-        tmp_path / "short.csv", "QNBKR", lambda share, what: heard.append(share)
+    found = find_noise(
+        tmp_path / "short.csv", terms="QNBKR", progress=lambda share, what: heard.append(share)
     )
-    assert [note[:53] for note in notes] == [
+    assert [note[:53] for note in found.notes] == [
         "No parameters of the gyro: too short for the 5 terms ",
         "No parameters of the accel: too short for the 5 terms",
     ]
-    assert "process" not in solution.sizes
-    assert np.isfinite(solution["allan_gyro"]).all()
-    assert summary["filters"] == {"x": {}, "y": {}, "z": {}}
+    assert "process" not in found.solution.sizes
+    assert np.isfinite(found.solution["allan_gyro"]).all()
+    assert found.metrics == {"x": {}, "y": {}, "z": {}}
     assert heard == sorted(heard)
 
 
@@ -314,7 +325,7 @@ def curve():
 def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
     fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), 1, terms, 0.95)
-    parts = stability.expected(fitted, curve.tau_s)
+    parts = still.expected(fitted, curve.tau_s)
     assert "".join(parts) == terms
     mean = moments(curve.clusters, curve.n_samples, curve.dt_s).mean
     for term, part in parts.items():
@@ -335,14 +346,14 @@ def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ],
 )
 def test_units_survive_the_name_of_a_metric(unit, ending, shown):
-    assert stability.suffix(unit) == ending
-    assert numbers.label(f"x_{stability.suffix(unit)}") == ("X", shown)
+    assert still.suffix(unit) == ending
+    assert numbers.label(f"x_{still.suffix(unit)}") == ("X", shown)
 
 
 def test_every_unit_of_the_fit_can_be_told():
     for sensor in allan._FIELD_UNITS.values():
         for name, (_, unit) in sensor.items():
-            assert numbers.label(f"{name}_{stability.suffix(unit)}").unit != ""
+            assert numbers.label(f"{name}_{still.suffix(unit)}").unit != ""
 
 
 LOGGER = """
@@ -362,7 +373,7 @@ def test_declared_columns_are_read_by_the_commands_and_refused_with_their_key(ro
     table = a_still_imu(20.0)
     logs.write_log(log, table, logs.columns_from(declared))
     np.testing.assert_allclose(
-        stability.still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12
+        still.still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12
     )
     answer = robins("doctor", log, "--columns", declared)
     assert answer.status == Status.DONE, answer.err

@@ -42,15 +42,12 @@ def test_what_computes_nothing_is_there_in_a_blink(argument):
 
 
 SLOW = """
-import time, types
-from pathlib import Path
-from robins import results
-def run_scenario(name, *, out, **asked):
-    with results.ResultWriter(out) as writer:
-        writer.save_file("large.bin", b"x" * 1000)
-        print("writing", flush=True)
-        time.sleep(60)
-sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
+import time
+from robins import workbench
+def run(name, **asked):
+    print("computing", flush=True)
+    time.sleep(60)
+workbench.run = run
 """
 
 
@@ -64,7 +61,7 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
-    assert process.stdout.readline() == "writing\n"
+    assert process.stdout.readline() == "computing\n"
     assert len(list(tmp_path.iterdir())) == 3  # the result, the next one, and its lock
     process.send_signal(number)
     _, err = process.communicate(timeout=30)
@@ -85,7 +82,7 @@ def test_a_terminal_that_is_closed_is_an_interrupt(tmp_path):
         stderr=keyboard,
     )
     os.close(keyboard)
-    assert process.stdout.readline() == "writing\n"
+    assert process.stdout.readline() == "computing\n"
     os.close(screen)
     process.send_signal(signal.SIGHUP)
     process.communicate(timeout=30)
@@ -104,8 +101,9 @@ def test_nohup_is_respected():
 
 
 DEAF = """
-import gc, os, signal, time, types
-def run_scenario(name, *, progress, **asked):
+import gc, os, signal, time
+from robins import workbench
+def run(name, *, progress, **asked):
     def _xla_gc_callback(phase, info):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.01)
@@ -113,12 +111,13 @@ def run_scenario(name, *, progress, **asked):
     gc.collect()
     gc.callbacks.clear()
     time.sleep(30)
-sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
+workbench.run = run
 """
 
 SWALLOWED = """
-import os, signal, time, types
-def run_scenario(name, *, progress, **asked):
+import os, signal, time
+from robins import workbench
+def run(name, *, progress, **asked):
     try:
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(1)
@@ -126,7 +125,7 @@ def run_scenario(name, *, progress, **asked):
         pass
     progress(0.5, "on and on")
     time.sleep(30)
-sys.modules["robins.workbench"] = types.SimpleNamespace(run_scenario=run_scenario)
+workbench.run = run
 """
 
 
@@ -155,7 +154,7 @@ main = lambda arguments: main_of_the_process()
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
-    assert process.stdout.readline() == "writing\n"
+    assert process.stdout.readline() == "computing\n"
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 3

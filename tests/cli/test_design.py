@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from robins import report, results
-from robins.cli import problem as reading
-from robins.cli.design import as_text
 from robins.filters.synthesis import certify, riccati
+from robins.workbench import problem as reading
+from robins.workbench.contents import designs
+from robins.workbench.gains import as_text
 
 METHODS = ("riccati", "lmi-common", "retuned-slack")
 TWO_STATES = """
@@ -145,7 +146,7 @@ def test_json_is_the_summary_and_nothing_else(robins):
     assert set(told["files"]["other"]) >= {"gains.json", "trade_off.csv"}
 
 
-@pytest.mark.parametrize("name", reading.examples())
+@pytest.mark.parametrize("name", designs())
 def test_every_example_is_designed(robins, name):
     answer = robins("design", name, "--methods", "riccati")
     assert answer.status == 0, answer.err

@@ -257,7 +257,7 @@ def folder(tmp_path_factory):
     dataset = pair_dataset(scenario.parse(Replay, pair, ["slave.rate=20 Hz"]), seed=3)
     logs.write_log(here / "master.csv", dataset.master)
     logs.write_log(here / "slave.csv", dataset.imu)
-    problem = ROOT / "src/robins/cli/problems/baro-height.toml"
+    problem = ROOT / "src/robins/workbench/problems/baro-height.toml"
     (here / "my-problem.toml").write_text(problem.read_text())
     return here
 

@@ -313,7 +313,9 @@ def test_the_second_writer_of_a_folder_is_refused_at_once(earlier):
     link.symlink_to(earlier)
     first = ResultWriter(earlier)
     first.save_summary(a_summary(seed=2))
-    first.beside("record").write_text("what the first has so far")
+    record = earlier.with_name("out.record")
+    record.write_text("what the first has so far")
+    first.save_file("record", record)
     for path in (earlier, link):
         with pytest.raises(ResultError, match="is being written by process") as refused:
             ResultWriter(path)
@@ -322,8 +324,10 @@ def test_the_second_writer_of_a_folder_is_refused_at_once(earlier):
     with pytest.raises(ResultError, match="is being written by process"):
         results.extend(read(earlier))
     write(earlier.with_name("other"), a_summary())
+    assert record.exists()
     first.commit()
     assert read(earlier).summary["seed"] == 2
+    assert (earlier / "record").read_text() == "what the first has so far"
     write(earlier, a_summary(seed=3))
     assert read(earlier).summary["seed"] == 3
     assert names(earlier.parent) == ["latest", "other", "out"]

@@ -257,17 +257,15 @@ def test_velocity_gained_in_a_window_is_that_of_a_plain_sum(log):
 
 
 def test_the_walk_meets_its_figures(data_dir):
-    import tempfile
     from pathlib import Path
 
     import robins.systems.ins_gnss as here
-    from robins.workbench import replay_log as replay_files
+    from robins.workbench import replay as replay_files
 
     walk = Path(here.__file__).parent / "scenarios" / "walk.toml"
     files = [data_dir / "gnssimu_walk_imu.csv.xz", data_dir / "gnssimu_walk_gnss.pos.xz", walk]
-    with tempfile.TemporaryDirectory() as folder:
-        summary = replay_files(files, out=Path(folder) / "walk").summary
-    ekf, smoothed = summary["filters"]["ekf"], summary["filters"]["ekf+rts"]
+    found = replay_files(files).metrics
+    ekf, smoothed = found["ekf"], found["ekf+rts"]
     assert ekf["aided_horizontal_rms_m"] <= 0.030
     assert ekf["aided_vertical_rms_m"] <= 0.018
     assert smoothed["outage_horizontal_rms_m"] <= 0.20

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
 
-from robins import logs, results, scenario
+from robins import logs, scenario
 from robins.ins.state import InsState
 from robins.manifold import local
 from robins.results.solution import check
@@ -29,7 +29,8 @@ from robins.systems.transfer_alignment.pair_replay import (
 )
 from robins.systems.transfer_alignment.product import ATTITUDE, VELOCITY, ProductState
 from robins.systems.transfer_alignment.product_filters import product_contender
-from robins.workbench import InputError, align_pair
+from robins.workbench import InputError, publish
+from robins.workbench import align as align_pair
 
 # Blocks as long as the master's interval: whatever is missing, one shape, so one compilation.
 TEXT = """
@@ -378,25 +379,24 @@ def files(runs, tmp_path_factory):
 
 def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
     heard = []
-    done = align_pair(
+    outcome = align_pair(
         str(files / "mine.toml"),
         files / "master.csv",
         files / "slave.csv",
-        out=files / "result",
         settings=('title="Mine"',),
         findings=heard.extend,
     )
-    assert done.summary["scenario"] == "transfer-alignment/slave"
-    found, want = done.summary["filters"]["product"], clean.metrics["product"]
+    result = publish(outcome, files / "result")
+    assert result.summary["scenario"] == "transfer-alignment/slave"
+    found, want = result.summary["filters"]["product"], clean.metrics["product"]
     assert found["mounting_arcmin"] == pytest.approx(want["mounting_arcmin"])
     assert found["nis_master_attitude_band"] == pytest.approx(want["nis_master_attitude_band"])
-    result = results.read(files / "result")
     assert {"estimate_mounting", "estimate_gyro_bias", "innovation_master_attitude"} <= set(
         result.figures
     )
     assert "Mounting" in result.report.read_text("utf-8")
     assert [f.code for f in heard if f.severity == "error"] == []
-    assert "Aligned from" in done.notes[0]
+    assert "Aligned from" in outcome.notes[0]
 
 
 def refused(files, name=None, master="master.csv", slave="slave.csv", settings=()):
@@ -405,10 +405,8 @@ def refused(files, name=None, master="master.csv", slave="slave.csv", settings=(
             str(name or files / "mine.toml"),
             files / master,
             files / slave,
-            out=files / "refused",
             settings=settings,
         )
-    assert not (files / "refused").exists()
     return str(caught.value)
 
 

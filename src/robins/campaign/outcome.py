@@ -13,8 +13,8 @@ from robins.campaign.bound import bound_sigma
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
-from robins.results import array, variable
-from robins.systems.system import Outcome, Problem
+from robins.results import Outcome, Progress, array, keeping, silent, variable
+from robins.systems.system import Problem
 from robins.systems.tables import Seen, block_array, innovation_tables
 
 
@@ -22,8 +22,7 @@ def simulate(
     problem: Problem,
     runs: int,
     chunk: int = CHUNK,
-    progress: Callable[[float, str], None] | None = None,
-    keep: Callable[[Any], None] | None = None,
+    progress: Progress = silent,
 ) -> Outcome:
     """Run every filter of a problem over the same runs and compare them.
 
@@ -32,9 +31,10 @@ def simulate(
         runs: how many runs of each filter.
         chunk: runs per batch.
         progress: called with the share done in 0..1 and what is being done.
-        keep: called with all arrays of the statistics, by filter, before anything is made of them.
+
+    An error while something is made of the statistics takes their arrays along, by filter, for
+    `robins.results.rescued` to write.
     """
-    tell = progress if progress is not None else (lambda share, what: None)
     names = list(problem.contenders)
     p = problem
     found = {
@@ -48,7 +48,7 @@ def simulate(
         last = min(done + chunk, runs)
         share = (done + (last - done) * step / (1 + len(names))) / max(runs, 1)
         verb = "compiling, " if done == 0 else ""
-        tell(share, f"{what}: {verb}runs {done + 1} to {last} of {runs}")
+        progress(share, f"{what}: {verb}runs {done + 1} to {last} of {runs}")
 
     stage("simulation", 0)
     for batch, count in worlds(problem, runs, chunk):
@@ -63,8 +63,12 @@ def simulate(
         done += count
         if done < runs:
             stage("simulation", 0)
-    if keep is not None:
-        keep({name: vars(s) for name, s in found.items()})
+    with keeping({name: vars(s) for name, s in found.items()}):
+        return _outcome(problem, found, bound)
+
+
+def _outcome(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
+    """What the statistics say."""
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
     metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
     if bound is not None:

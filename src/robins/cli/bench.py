@@ -6,17 +6,22 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click import option
 
+from robins.cli import cache
+from robins.cli.frame import Status, only_json
 from robins.cli.options import (
+    DEBUG,
     LOGS,
+    RESULTS,
     SETTINGS,
-    debug_option,
+    answers,
     examples,
     folder_name,
-    json_option,
-    option,
-    out_option,
+    publishes,
 )
+from robins.cli.progress import Progress
+from robins.cli.tell import carry_out, say
 
 
 @click.group(
@@ -76,10 +81,8 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Of the attitude de
 @option("--port", type=click.IntRange(0, 65535), default=8321, show_default=True, help="Same.")
 @SETTINGS
 @_SEED
-@out_option
-@json_option
-@debug_option
-def up(scenario: str, out: Path | None, **options: Any) -> int:
+@publishes
+def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> int:
     """Run SCENARIO on the bench: one of the satellite, one of the bench, or a file of either.
 
     Plant, rate table, gyro, star sensor, attitude determination, control and actuators are
@@ -90,19 +93,27 @@ def up(scenario: str, out: Path | None, **options: Any) -> int:
     Scenarios of the bench: killed-adm, lost-star, lost-wheel, noisy-line, sign-star, stuck-star,
     wrong-star.
     """
-    from robins.cli.bench_work import bring_up
-
-    return bring_up(scenario, out or Path("results") / f"bench-{folder_name(scenario)}", **options)
+    out = out or RESULTS / f"bench-{folder_name(scenario)}"
+    outcome = carry_out(
+        "bench_up",
+        scenario,
+        out=out,
+        filter=filter_,
+        record=f"{out}.record.mcap",
+        opened=lambda url: click.echo(f"Page:   {url}", err=True),
+        **options,
+    )
+    return Status.FAILED if outcome.failure else Status.DONE
 
 
 @bench.command(short_help="How the benches of this machine are.")
-@json_option
-@debug_option
+@answers
 def status(as_json: bool) -> None:
     """Tell the benches that run on this machine: step, processes, links."""
-    from robins.cli.bench_work import tell_status
+    from robins.bench.status import running, table
 
-    tell_status(as_json)
+    found = running()
+    say({"benches": found}, table(found), as_json)
 
 
 @bench.command(
@@ -117,28 +128,34 @@ def status(as_json: bool) -> None:
 @option("--node", required=True, metavar="PART", help="Which part.")
 @_FILTER
 @option("--diff", type=LOGS, metavar="RECORD", help="Compare with what the part says in another.")
-@json_option
-@debug_option
-def replay(record: Path, **options: Any) -> int:
+@answers
+def replay(record: Path, as_json: bool, **options: Any) -> int:
     """Start a part alone and let it hear RECORD, the record.mcap of a run, again.
 
     The same part says the same bytes; exit status 1 if it does not. With --filter another filter
     hears the same, and with --diff the part of two records is compared, field by field; then
     differences are what was asked for, and no failure.
     """
-    from robins.cli.bench_work import hear_again
+    cache.enable()
+    with only_json(as_json), Progress() as progress:
+        from robins.workbench import bench_replay
 
-    return hear_again(record, **options)
+        found = bench_replay(record, progress=progress, **options)
+    for damage in found.damages:
+        click.echo(damage, err=as_json)
+    say(found.data, found.text, as_json)
+    asked = options["filter_"] is not None or options["diff"] is not None
+    return Status.DONE if (found.same or asked) and found.whole else Status.FAILED
 
 
 @bench.command(short_help="The serial ports of this machine.")
-@json_option
-@debug_option
+@answers
 def ports(as_json: bool) -> None:
     """Name the serial ports of this machine, and whether we may use them."""
-    from robins.cli.bench_work import tell_ports
+    from robins.bench.ports.listing import list_ports, table
 
-    tell_ports(as_json)
+    found = list_ports()
+    say({"ports": [port._asdict() for port in found]}, table(found), as_json)
 
 
 @bench.command(
@@ -150,25 +167,28 @@ def ports(as_json: bool) -> None:
 @click.argument("scenario")
 @_FILTER
 @_SEED
-@debug_option
+@DEBUG
 def node(part: str, port: str, scenario: str, **options: Any) -> None:
     """Be PART of SCENARIO at PORT until the bench says stop, as its process would be.
 
     For a part on another machine, at the other end of a serial cable: there `robins bench up
     SCENARIO --node PART=PORT` runs with the same seed.
     """
-    from robins.cli.bench_work import be_node
+    cache.enable()
+    from robins.workbench import bench_node
 
-    be_node(part, port, scenario, **options)
+    says = f"'{part}' of {scenario} at {port}, until the bench says stop (Ctrl-C ends it)"
+    bench_node(part, port, scenario, opened=lambda: click.echo(says), **options)
+    click.echo("The bench has said stop.")
 
 
 @bench.command(
     short_help="The wire as a C header, for firmware.",
     epilog=examples("robins bench header > robins_wire.h"),
 )
-@debug_option
+@DEBUG
 def header() -> None:
     """Print robins_wire.h: every message, frames, a receiver; C99 or C++11, no heap."""
-    from robins.cli.bench_work import print_header
+    from robins.bench.wire.c_header import c_header
 
-    print_header()
+    click.echo(c_header(), nl=False)

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+from click import option
 
 from robins import __version__
 from robins.cli.bench import bench
-from robins.cli.frame import BadInput, Status, only_json
+from robins.cli.doctor import judge
+from robins.cli.frame import BadInput, Status
+from robins.cli.listing import listing
 from robins.cli.options import (
+    COLUMNS,
     LOGS,
+    RESULTS,
+    answers,
     as_names,
     choices,
-    columns_option,
-    debug_option,
     examples,
     folder_name,
-    json_option,
-    option,
-    out_option,
+    log_name,
+    publishes,
 )
+from robins.cli.tell import carry_out
 
 DEMO = "ins-gnss/drive"
 
@@ -62,21 +67,30 @@ def app() -> None:
     """Robust inertial navigation: simulate, navigate real logs, compare filters, show how good."""
 
 
+def warn(findings: Sequence[Any]) -> None:
+    """Tell what the doctor says of a log at once; errors end the command and are told there."""
+    for finding in findings:
+        if finding.severity != "error":
+            click.echo(f"robins: {finding}", err=True)
+
+
+def one_run(runs: int | None, what: str) -> None:
+    """Refuse more runs than one of what was recorded."""
+    if runs not in (None, 1):
+        raise BadInput(f"--runs {runs}: a recorded {what} is one run; omit the option.")
+
+
 _RUNS = option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
 
 
 @app.command(short_help="Simulate a drive and navigate it; ends with PASS or FAIL.")
 @_RUNS
-@out_option
-@json_option
-@debug_option
+@publishes
 def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
     """Simulate a drive with a GNSS outage and navigate it; ends with PASS or FAIL."""
-    from robins.cli.work import simulate
-
-    out = out or Path("results") / "demo"
-    summary = simulate(DEMO, runs=runs, seed=0, filters=(), settings=(), out=out, as_json=as_json)
-    verdicts = {claim["id"]: claim["verdict"] for claim in summary["claims"]}
+    out = out or RESULTS / "demo"
+    outcome = carry_out("run", DEMO, runs=runs, out=out, as_json=as_json)
+    verdicts = {claim["id"]: claim["verdict"] for claim in outcome.claims}
     failed = [name for name, verdict in verdicts.items() if verdict != "reproduced"]
     passed = bool(verdicts) and not failed
     if not as_json and passed:
@@ -99,11 +113,9 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
 @_RUNS
 @option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
 @option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
-@columns_option
+@COLUMNS
 @choices
-@out_option
-@json_option
-@debug_option
+@publishes
 def run(
     scenario: str,
     out: Path | None,
@@ -118,20 +130,17 @@ def run(
 
     With --master and --slave a recorded pair takes the place of the simulation.
     """
-    from robins.cli import work
-
     if master is None and slave is None:
         if columns:
             raise BadInput(f"--columns {columns[0]}: goes with --master and --slave, with logs.")
-        work.simulate(scenario, out=out or Path("results") / folder_name(scenario), **options)
+        carry_out("run", scenario, out=out or RESULTS / folder_name(scenario), **options)
         return
     if master is None or slave is None:
         raise BadInput("--master and --slave belong together: give both files, or neither.")
-    runs = options.pop("runs")
-    if runs not in (None, 1):
-        raise BadInput(f"--runs {runs}: a recorded pair is one run; leave the option away.")
-    out = out or Path("results") / slave.name.split(".")[0]
-    work.align(scenario, master, slave, out=out, columns=columns, **options)
+    one_run(options.pop("runs"), "pair")
+    out = out or RESULTS / slave.name.split(".")[0]
+    options |= {"columns": columns, "findings": warn}
+    carry_out("align", scenario, master, slave, out=out, **options)
 
 
 @app.command(
@@ -147,9 +156,7 @@ def run(
 @option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
 @option("--at", multiple=True, metavar="TIME", help='Tell that time, "200 s"; may be repeated.')
 @choices
-@out_option
-@json_option
-@debug_option
+@publishes
 def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: Any) -> None:
     """Covariance bound and observability of SCENARIO: no filter with this model can do better.
 
@@ -157,12 +164,10 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
     the simulated truth. Tells the best sigma of each state over time, which states the sensors
     see, what each sensor buys, and which directions are least observable.
     """
-    from robins.cli.bound import tell_bound
-
     if len(filters) > 1:
         raise BadInput(f"--filters {','.join(filters)}: a bound is that of one model; name one.")
-    out = out or Path("results") / f"bound-{folder_name(scenario)}"
-    tell_bound(scenario, filter_name="".join(filters), out=out, **options)
+    out = out or RESULTS / f"bound-{folder_name(scenario)}"
+    carry_out("bound", scenario, filter_name="".join(filters), out=out, **options)
 
 
 @app.command(
@@ -176,25 +181,17 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
 @click.argument("log", nargs=-1, required=True, type=LOGS)
 @_RUNS
 @option("--system", default="ins-gnss", show_default=True, help="What navigates the log.")
-@columns_option
+@COLUMNS
 @choices
-@out_option
-@json_option
-@debug_option
+@publishes
 def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
     """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
 
     A file that ends in .toml says what the log does not: noise, mounting, lever arm. That of
     --columns declares the columns of a log that is in no known format.
     """
-    from robins.cli.work import navigate
-
-    if runs not in (None, 1):
-        raise BadInput(f"--runs {runs}: a recorded log is one run; leave the option away.")
-    files = [path for path in log if path.suffix != ".toml"]
-    if not files:
-        raise BadInput(f"{log[0]}: is a configuration; give the files of the log beside it.")
-    navigate(log, out=out or Path("results") / files[0].name.split(".")[0], **options)
+    one_run(runs, "log")
+    carry_out("replay", log, out=out or RESULTS / log_name(log), findings=warn, **options)
 
 
 @app.command(
@@ -202,20 +199,15 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
     epilog=examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
-@columns_option
-@json_option
-@debug_option
+@COLUMNS
+@answers
 def doctor(log: tuple[Path, ...], columns: tuple[Path, ...], as_json: bool) -> int:
     """Judge a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
     Exit status 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... tells how
     the sensor is mounted, as for `robins replay`.
     """
-    from robins.cli.examine import examined, told
-
-    with only_json(as_json):
-        found = examined(log, columns)
-    return told(found, log, columns, as_json)
+    return judge(log, columns, as_json)
 
 
 @app.command(
@@ -224,21 +216,15 @@ def doctor(log: tuple[Path, ...], columns: tuple[Path, ...], as_json: bool) -> i
 )
 @click.argument("log", type=LOGS)
 @option("--terms", default="NBK", show_default=True, help="Noises to fit, of Q, N, B, K, R.")
-@columns_option
-@out_option
-@json_option
-@debug_option
-def allan(
-    log: Path, terms: str, columns: tuple[Path, ...], out: Path | None, as_json: bool
-) -> None:
+@COLUMNS
+@publishes
+def allan(log: Path, out: Path | None, **options: Any) -> None:
     """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
 
     Q quantisation, N random walk, B bias instability, K rate random walk, R rate ramp.
     """
-    from robins.cli.stability import stability
-
-    name = f"allan-{log.name.split('.')[0]}"
-    stability(log, terms, out or Path("results") / name, as_json, columns)
+    out = out or RESULTS / f"allan-{log_name([log])}"
+    carry_out("allan", log, out=out, **options)
 
 
 @app.command(
@@ -252,10 +238,8 @@ def allan(
 @option("--field", metavar="FIELD", help='Its size at the place, "48.5 uT"; sets the scale.')
 @option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
 @option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
-@columns_option
-@out_option
-@json_option
-@debug_option
+@COLUMNS
+@publishes
 def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
 
@@ -263,13 +247,8 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     Earth's field wherever the sensor points. A .toml file among LOG... tells how the sensor is
     mounted, as for `robins replay`, which takes the calibration.toml of the result.
     """
-    from robins.cli.calibrate import magnetometer
-
-    files = [path for path in log if path.suffix != ".toml"]
-    if not files:
-        raise BadInput(f"{log[0]}: is a configuration; give the log beside it.")
-    name = f"calibrate-{files[0].name.split('.')[0]}"
-    magnetometer(log, files[0], out=out or Path("results") / name, **options)
+    out = out or RESULTS / f"calibrate-{log_name(log)}"
+    carry_out("calibrate", log, out=out, **options)
 
 
 @app.command(
@@ -282,19 +261,16 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
 @click.argument("problem")
 @option("--gamma", metavar="a,b", help="Bounds on the H-infinity norm. [default: a range]")
 @option("--methods", callback=as_names, metavar="a,b", help="Which methods to compare.")
-@out_option
-@json_option
-@debug_option
-def design(problem: str, gamma: str | None, **options: Any) -> None:
+@publishes
+def design(problem: str, out: Path | None, **options: Any) -> None:
     """Constant-gain filters for PROBLEM, a TOML file with the matrices of a plant or an example.
 
     Compares methods that keep the gain from a modelling error to the estimate below gamma: how much
     noise each lets through, by true norms. Examples: attitude-axis, attitude-axis-drift,
     baro-height, two-states.
     """
-    from robins.cli.design import design as compare
-
-    compare(problem, gamma, **options)
+    out = out or RESULTS / f"design-{Path(problem).name.removesuffix('.toml')}"
+    carry_out("design", problem, out=out, **options)
 
 
 app.add_command(bench)
@@ -306,13 +282,10 @@ app.add_command(bench)
     epilog=examples("robins list", "robins list ins-gnss", "robins list --json"),
 )
 @click.argument("system", required=False)
-@json_option
-@debug_option
+@answers
 def list_(system: str | None, as_json: bool) -> None:
     """Name the systems and their scenarios, or tell the filters and claims of SYSTEM.
 
     With --json everything there is, or SYSTEM alone.
     """
-    from robins.cli.listing import listing
-
     listing(system, as_json)

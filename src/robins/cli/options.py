@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import click
+from click import option
 
 LOGS = click.Path(path_type=Path)
+RESULTS = Path("results")
 
 
 def examples(*lines: str) -> str:
@@ -16,39 +17,28 @@ def examples(*lines: str) -> str:
     return "\n".join(("\b", "Examples:", *(f"  {line}" for line in lines)))
 
 
-def option(*names: str, **settings: Any) -> Callable[[Callable], Callable]:
-    """An option of a command."""
-    return click.option(*names, **settings)
+DEBUG = option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
+JSON = option(
+    "--json", "as_json", is_flag=True, help="Print one JSON object, nothing else, to stdout."
+)
+OUT = option("--out", type=LOGS, metavar="DIR", help="Result folder. [default: results/<name>]")
+COLUMNS = option(
+    "--columns",
+    type=LOGS,
+    multiple=True,
+    metavar="TOML",
+    help="Says what the columns of a log are that is in no known format; may be repeated.",
+)
 
 
-def debug_option(command: Callable) -> Callable:
-    """With tracebacks."""
-    return option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")(command)
+def answers(command: Callable) -> Callable:
+    """Options of every command that tells something."""
+    return JSON(DEBUG(command))
 
 
-def json_option(command: Callable) -> Callable:
-    """For scripts."""
-    return option(
-        "--json", "as_json", is_flag=True, help="Print one JSON object, nothing else, to stdout."
-    )(command)
-
-
-def columns_option(command: Callable) -> Callable:
-    """For logs in a format of one's own."""
-    return option(
-        "--columns",
-        type=LOGS,
-        multiple=True,
-        metavar="TOML",
-        help="Says what the columns of a log are that is in no known format; may be repeated.",
-    )(command)
-
-
-def out_option(command: Callable) -> Callable:
-    """Where the result goes."""
-    return option(
-        "--out", type=LOGS, metavar="DIR", help="Result folder. [default: results/<name>]"
-    )(command)
+def publishes(command: Callable) -> Callable:
+    """Options of every command that writes a result."""
+    return OUT(answers(command))
 
 
 def as_names(_context: click.Context, _given: click.Parameter, text: str | None) -> tuple[str, ...]:
@@ -96,3 +86,9 @@ def choices(command: Callable) -> Callable:
 def folder_name(scenario: str) -> str:
     """Of the result folder of a scenario."""
     return Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
+
+
+def log_name(log: Sequence[Path]) -> str:
+    """Of the result folder of a log, after its first file that is no configuration."""
+    first = next((path for path in log if path.suffix != ".toml"), log[0])
+    return first.name.split(".")[0]

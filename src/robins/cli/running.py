@@ -17,6 +17,8 @@ from robins.cli import interrupts
 from robins.cli.commands import app
 from robins.cli.frame import Status
 
+_OF_THE_BENCH = ("serial", "cobs", "fastcrc", "mcap")  # packages of an extra
+
 
 class _Output:
     """Standard output that takes any character and remembers if it could not be written to.
@@ -86,7 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status = app.main(given, prog_name="robins", standalone_mode=False, obj=given)
             output.flush()
             return status if isinstance(status, int) else Status.DONE
-        except (click.Abort, KeyboardInterrupt):
+        except (click.Abort, KeyboardInterrupt) as stop:
+            for note in getattr(stop.__cause__ or stop, "__notes__", ()):  # click wraps Ctrl-C
+                _tell(note)
             return _interrupted(for_good=arguments is None)
         except Exception as error:
             if interrupts.asked():  # and turned into this on its way, as by a terminal that is gone
@@ -136,6 +140,12 @@ def _told(error: Exception) -> Status:
         return Status(error.exit_code)
     if _is_refusal(error):
         _tell(str(error))
+        return Status.BAD_INPUT
+    if isinstance(error, ModuleNotFoundError) and error.name in _OF_THE_BENCH:
+        _tell(
+            f"the bench needs the extra 'bench': pip install 'robins[bench]' ({error.name} is "
+            "missing)"
+        )
         return Status.BAD_INPUT
     if isinstance(error, MemoryError):
         _tell("out of memory; ask for fewer runs or filters at a time.")

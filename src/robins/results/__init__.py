@@ -39,8 +39,9 @@ Bands of consistency figures follow from ``degrees_of_freedom`` and ``runs`` at 
 
 from robins.results.errors import ResultError
 from robins.results.manifest import SCHEMA_VERSION, versions
+from robins.results.outcome import Outcome, Progress, silent
 from robins.results.reader import Result, read
-from robins.results.rescue import NotWritten, rescued
+from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import array, variable
 from robins.results.summary import VERDICTS
@@ -51,14 +52,18 @@ __all__ = [
     "SCHEMA_VERSION",
     "VERDICTS",
     "NotWritten",
+    "Outcome",
+    "Progress",
     "Result",
     "ResultError",
     "ResultWriter",
     "array",
     "extend",
     "find",
+    "keeping",
     "read",
     "rescued",
+    "silent",
     "variable",
     "versions",
     "write",

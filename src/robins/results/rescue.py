@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from robins.results import folder
 
 ARRAYS = "arrays.npz"
+_KEPT = "computed"  # the attribute of an error that takes numbers along
 
 
 class NotWritten(RuntimeError):
@@ -21,26 +22,33 @@ class NotWritten(RuntimeError):
 
 
 @contextmanager
-def rescued(path: str | os.PathLike[str]) -> Iterator[Callable[[Any], None]]:
-    """Keep what was computed if the result folder at `path` cannot be written.
+def keeping(tree: Any) -> Iterator[None]:
+    """Let any error that leaves this block take along what was computed, for `rescued` to write.
 
-    Yields:
-        A function that is told what is worth keeping, any tree of arrays; the last call counts. The
-        arrays are written only if an error follows, into a new folder beside the result, or among
-        the temporary files where nothing can be written there.
+    Args:
+        tree: of arrays; in blocks inside each other that of the inner one counts.
+    """
+    try:
+        yield
+    except Exception as error:
+        vars(error).setdefault(_KEPT, tree)
+        raise
+
+
+@contextmanager
+def rescued(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Write what an error takes along (`keeping`) where no result folder can be made at `path`.
+
+    The arrays go into a new folder beside the result, or among the temporary files where nothing
+    can be written there.
 
     Raises:
         NotWritten: in place of the error, where something was kept.
     """
-    held: list[Any] = []
-
-    def keep(tree: Any) -> None:
-        held[:] = [tree]
-
     try:
-        yield keep
+        yield
     except Exception as error:
-        kept = _saved(Path(path), held[0]) if held else None
+        kept = _saved(Path(path), vars(error)[_KEPT]) if _KEPT in vars(error) else None
         if kept is None:
             raise
         raise NotWritten(

@@ -57,7 +57,7 @@ class ResultWriter:
         self.summary: dict[str, Any] | None = None
         self.solution: xr.Dataset | None = None
         self._began = monotonic()
-        self._beside: list[Path] = []
+        self._moved: list[Path] = []
         _check_replaceable(self.path)
         try:
             self._stage = folder.stage(self.path)
@@ -104,8 +104,12 @@ class ResultWriter:
         """Store the page as `report.html`."""
         self.save_file(REPORT, html.encode())
 
-    def save_file(self, name: str, content: bytes) -> None:
+    def save_file(self, name: str, content: bytes | Path) -> None:
         """Store anything else, e.g. the trajectory in another program's format.
+
+        Args:
+            name: inside the folder.
+            content: what it holds; or the file to move in, which stays until the result is there.
 
         Raises:
             ValueError: the name leads out of the folder or is one of robins' own.
@@ -115,6 +119,9 @@ class ResultWriter:
             raise ValueError(f"{name!r} does not lie inside a result folder")
         if name in (SOLUTION, SUMMARY, manifest.NAME):
             raise ValueError(f"{name} is written by robins itself")
+        if isinstance(content, Path):
+            self._moved.append(content)
+            content = content.read_bytes()
         self._write(name, content)
 
     def _write(self, name: str, content: bytes) -> None:
@@ -125,14 +132,6 @@ class ResultWriter:
             path.write_bytes(content)
         except OSError as error:
             raise cannot(self.path, f"write {name}", error) from error
-
-    def beside(self, name: str) -> Path:
-        """The path of a file beside the folder, ``PATH.NAME``, for what a killed run is to leave.
-
-        It is this writer's alone, as the folder is; it is deleted when the result is in its place.
-        """
-        self._beside.append(Path(f"{self.path}.{name}"))
-        return self._beside[-1]
 
     def commit(self) -> Path:
         """Make the result appear; the last call.
@@ -158,7 +157,7 @@ class ResultWriter:
             folder.commit(self._stage)
         except OSError as error:
             raise cannot(self.path, "put the result in its place", error) from error
-        for path in self._beside:
+        for path in self._moved:
             path.unlink(missing_ok=True)
         self.discard()
         return self.path

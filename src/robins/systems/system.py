@@ -7,7 +7,7 @@ came from.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +17,10 @@ from jaxtyping import Array
 
 from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
+from robins.results import Outcome
 from robins.scenario import Parameters
 from robins.systems.catalogue import listed
 from robins.systems.limits import Names, Runs
-
-Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
 
 
 class StateBlock(NamedTuple):
@@ -170,19 +169,6 @@ class Problem:
                         f"{len(self.sensors[sensor].axes)} declared axes; sensors that differ "
                         "need names of their own"
                     )
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a run, a campaign or a replay found."""
-
-    solution: xr.Dataset
-    metrics: dict[str, dict[str, Any]]  # by filter
-    claims: list[dict[str, Any]] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
-    files: dict[str, bytes] = field(default_factory=dict)  # more to put into the result folder
-    notes: list[str] = field(default_factory=list)  # sentences for the reader of the report
-    warnings: list[str] = field(default_factory=list)  # why a reader should doubt the figures
 
 
 class Scenario(Parameters):

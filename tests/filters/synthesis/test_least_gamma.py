@@ -38,7 +38,7 @@ def test_a_gamma_that_a_gain_meets_is_not_refused():
     assert not exact.Bn.any()
     assert np.abs(np.linalg.eigvals(exact.A)).max() < 1.0
     found = trade_off(p, [0.5], ["riccati"])
-    (made,) = found.outcomes
+    (made,) = found.attempts
     assert made.design.hinf == pytest.approx(0.5, rel=1e-6)
     assert (found.least.proved, found.least.reached, found.least.step) == (0.0, 0.0, 0)
     assert riccati(p, 1e-3).hinf <= 1e-3

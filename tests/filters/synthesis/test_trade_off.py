@@ -30,7 +30,7 @@ def test_every_method_is_its_own_design(found):
     assert found.gammas == (1.0, 0.7)
     assert found.kalman.h2 == kalman_design(p).h2
     assert found.least.reached == pytest.approx(0.594542, abs=1e-6)
-    by_name = {(o.method, o.gamma): o for o in found.outcomes}
+    by_name = {(o.method, o.gamma): o for o in found.attempts}
     assert list(found.left_out) == ["closed-form"]
     assert len(by_name) == 2 * (len(METHODS) - 1)
     alone = {
@@ -47,7 +47,7 @@ def test_every_method_is_its_own_design(found):
 
 
 def test_the_table_of_the_specification(found):
-    h2 = {(o.method, o.gamma): o.design.h2 for o in found.outcomes if o.design is not None}
+    h2 = {(o.method, o.gamma): o.design.h2 for o in found.attempts if o.design is not None}
     printed = {
         ("lmi-common", 1.0): 0.9838,
         ("lmi-slack", 1.0): 0.9539,
@@ -62,7 +62,7 @@ def test_the_table_of_the_specification(found):
 
 
 def test_what_cannot_be_had_says_why(found):
-    (refused,) = [o for o in found.outcomes if o.design is None]
+    (refused,) = [o for o in found.attempts if o.design is None]
     assert (refused.method, refused.gamma) == ("riccati", 0.7)
     assert refused.least == least_riccati_gamma(two_states())
     assert "cannot reach gamma 0.7" in refused.why
@@ -71,8 +71,8 @@ def test_what_cannot_be_had_says_why(found):
 def test_of_equals_the_simplest_is_the_best():
     # The Riccati design, the closed form and both retuned LMIs all find the same gain.
     found = trade_off(quaternion(), [1.0], ["retuned-slack", "closed-form", "riccati"])
-    assert [o.method for o in found.outcomes] == ["riccati", "closed-form", "retuned-slack"]
-    assert max(o.design.h2 for o in found.outcomes) < 4.1634
+    assert [o.method for o in found.attempts] == ["riccati", "closed-form", "retuned-slack"]
+    assert max(o.design.h2 for o in found.attempts) < 4.1634
     assert found.best(1.0).method == "riccati"
     assert found.best(0.9) is None
 
@@ -95,7 +95,7 @@ def test_nothing_to_gain():
     # n is seen at once and kept out by the Kalman filter itself, as far as any gain can.
     p = plant([[0.5]], [[1.0, 0.0]], [[0.0]], [[1.0]], [[0.0, 1.0]])
     found = trade_off(p)
-    assert (found.gammas, found.outcomes) == ((), [])
+    assert (found.gammas, found.attempts) == ((), [])
     # and a filter whose gain is the safest there is: hardly any room between it and the least
     p = plant([[0.9]], [[1.0, 0.0]], [[1.0]], [[1.0]], [[0.0, 0.1]])
     found = trade_off(p, methods=["riccati"])
@@ -112,7 +112,7 @@ def test_every_gamma_below_the_least_is_refused_with_the_least():
 def test_without_the_packages_of_the_lmi_the_others_are_made(monkeypatch):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     found = trade_off(two_states(), [1.0, 0.7])
-    assert [(o.method, o.gamma) for o in found.outcomes] == [("riccati", 1.0), ("riccati", 0.7)]
+    assert [(o.method, o.gamma) for o in found.attempts] == [("riccati", 1.0), ("riccati", 0.7)]
     assert found.least.proved == pytest.approx(0.594542, abs=1e-6)  # which asks for no solver
     left_out = {name for name, why in found.left_out.items() if "robins[lmi]" in why}
     assert left_out == {name for name in METHODS if "lmi" in name or "retuned" in name} | {
@@ -123,7 +123,7 @@ def test_without_the_packages_of_the_lmi_the_others_are_made(monkeypatch):
 def test_a_plant_that_is_not_stable_has_no_filter_of_full_order():
     found = trade_off(attitude_axis(), [2.0], ["full-order", "riccati"])
     assert "A has spectral radius 1" in found.left_out["full-order"]
-    assert [o.method for o in found.outcomes] == ["riccati"]
+    assert [o.method for o in found.attempts] == ["riccati"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,10 @@ from robins.bench.run import telemetry
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, counted_from
 from robins.bench.run.telemetry import ARCSEC, Flown, flag
-from robins.results import array, variable
+from robins.results import Outcome, array, variable
+from robins.results.summary import dumps, plain
+
+RECORD, ACCOUNT = "record.mcap", "bench.json"
 
 _EVENTS = 200  # told; all are in the record
 _AXES = ("x", "y", "z (boresight)")
@@ -84,19 +88,57 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
     }
 
 
-def summary(flight: Flight, told: dict[str, Any]) -> dict[str, Any]:
-    """The same as the summary of a result folder."""
+def outcome(flight: Flight, ran: Ran, loop: Flown | None, record: Path | None) -> Outcome:
+    """All that a result folder says of the run.
+
+    Args:
+        flight: what was asked for.
+        ran: what came of it.
+        loop: the same run inside one program; None where there is none to compare with.
+        record: what went over the lines, to be moved into the folder.
+    """
+    told = figures(flight, ran, loop)
     names = ("attitude_rms_arcsec", "attitude_peak_arcsec")
     names += ("pointing_rms_arcsec", "pointing_peak_arcsec", "cycles_per_s")
-    return {
-        "scenario": f"bench/{flight.name}",
-        "seed": flight.setup.seed,
-        "runs": 1,
-        "filters": {flight.setup.filter: {name: told[name] for name in names}},
-        "claims": [],
-        "counts": {k: v for k, v in told["counts"].items() if v},
-        "warnings": told["warnings"],
-    }
+    files: dict[str, bytes | Path] = {ACCOUNT: dumps(plain(told)).encode()}
+    last_lines = []
+    if record is not None:
+        files[RECORD] = record
+        last_lines = [
+            f"Record: {{out}}/{RECORD}   (opens in MCAP viewers too)",
+            f"Next:   robins bench replay {{out}}/{RECORD} --node adm",
+        ]
+    return Outcome(
+        solution(flight, ran) if ran.steps else None,
+        {flight.setup.filter: {name: told[name] for name in names}},
+        counts={k: v for k, v in told["counts"].items() if v},
+        files=files,
+        notes=notes(flight, told),
+        warnings=told["warnings"],
+        scenario=f"bench/{flight.name}",
+        seed=flight.setup.seed,
+        parameters=flight.text or f'bench = "satellite"\nflies = "{flight.setup.flies}"\n',
+        tables=[text(told, ran)],
+        last_lines=last_lines,
+        for_scripts=ACCOUNT,
+        failure=told["failure"],
+    )
+
+
+def text(told: dict[str, Any], ran: Ran) -> str:
+    """The figures for a terminal: errors, the wire, how late parts were, what happened."""
+    lines = [
+        f"{name.replace('_', ' '):<16}{told[f'{name}_arcsec']:10.2f} arcsec"
+        for name in ("attitude_rms", "attitude_peak", "pointing_rms", "pointing_peak")
+    ]
+    wire = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in told["counts"].items() if v)
+    lines += [f"{'wire':<16}{wire}\n", ran.latencies.table()]
+    lines += [
+        f"  {event['time_s']:9.2f} s  {event['text']}"
+        for event in told["events"]
+        if event["kind"] != "missed"
+    ]
+    return "\n".join(lines)
 
 
 def warnings(ran: Ran, error: np.ndarray) -> list[str]:

@@ -35,10 +35,11 @@ from robins.filters.synthesis.riccati import (
     riccati,
 )
 from robins.filters.synthesis.search import retuned
-from robins.filters.synthesis.trade_off import METHODS, Outcome, TradeOff, trade_off
+from robins.filters.synthesis.trade_off import METHODS, Attempt, TradeOff, trade_off
 
 __all__ = [
     "METHODS",
+    "Attempt",
     "Design",
     "ErrorSystem",
     "EveryStep",
@@ -47,7 +48,6 @@ __all__ = [
     "LeastGamma",
     "MissingExtra",
     "NotCertified",
-    "Outcome",
     "Plant",
     "TradeOff",
     "Unreachable",

@@ -33,7 +33,7 @@ _DEEPEST = 0.1  # of the Kalman filter's own norm: how far down such a range goe
 Progress = Callable[[int, int, str], None]
 
 
-class Outcome(NamedTuple):
+class Attempt(NamedTuple):
     """What one method made of one gamma."""
 
     method: str
@@ -47,15 +47,15 @@ class TradeOff(NamedTuple):
     """All methods over all gammas."""
 
     kalman: Design  # no bound at all
-    least: LeastGamma  # `reached` counts the designs of `outcomes` in
+    least: LeastGamma  # `reached` counts the designs of `attempts` in
     gammas: tuple[float, ...]  # falling
-    outcomes: list[Outcome]  # every method for the first gamma, then for the next
+    attempts: list[Attempt]  # every method for the first gamma, then for the next
     left_out: dict[str, str]  # methods that do not apply, and why
 
-    def best(self, gamma: Number) -> Outcome | None:
+    def best(self, gamma: Number) -> Attempt | None:
         """The least H2 norm for a gamma; of equals (to 1e-4) that of the simplest method."""
         made = [
-            (o, o.design.h2) for o in self.outcomes if o.gamma == gamma and o.design is not None
+            (o, o.design.h2) for o in self.attempts if o.gamma == gamma and o.design is not None
         ]
         least = min((h2 for _, h2 in made), default=np.nan)
         return next((o for o, h2 in made if h2 <= least * (1.0 + 1e-4)), None)
@@ -98,24 +98,24 @@ def trade_off(
         chosen = tuple(sorted({float(gamma) for gamma in gammas}, reverse=True))
         least.refuse(max(chosen, default=np.inf))
     used = [name for name in METHODS if name in methods and name not in left_out]
-    outcomes: list[Outcome] = []
+    attempts: list[Attempt] = []
     total = len(chosen) * len(used)
     for gamma in chosen:
         for name in used:
-            tell(len(outcomes), total, f"{name}, gamma {gamma:.4g}")
-            outcomes.append(_outcome(plant, gamma, name))
-            if (made := outcomes[-1].design) is not None:
+            tell(len(attempts), total, f"{name}, gamma {gamma:.4g}")
+            attempts.append(_attempt(plant, gamma, name))
+            if (made := attempts[-1].design) is not None:
                 least = least.with_(made)
-    return TradeOff(kalman, least, chosen, outcomes, left_out)
+    return TradeOff(kalman, least, chosen, attempts, left_out)
 
 
-def _outcome(plant: Plant, gamma: float, name: str) -> Outcome:
+def _attempt(plant: Plant, gamma: float, name: str) -> Attempt:
     try:
-        return Outcome(name, gamma, _DESIGNERS[name](plant, gamma), "", np.nan)
+        return Attempt(name, gamma, _DESIGNERS[name](plant, gamma), "", np.nan)
     except Unreachable as error:
-        return Outcome(name, gamma, None, str(error), error.least)
+        return Attempt(name, gamma, None, str(error), error.least)
     except NotCertified as error:
-        return Outcome(name, gamma, None, str(error), np.nan)
+        return Attempt(name, gamma, None, str(error), np.nan)
 
 
 def _why_not(plant: Plant, name: str) -> str:

@@ -14,12 +14,12 @@ from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.filters import Solution, rts_smoother, run
 from robins.ins.state import InsState
+from robins.results import Outcome, Progress, silent
 from robins.systems.ins_gnss.answer import Answer, Flight, replay_metrics, replay_solution
 from robins.systems.ins_gnss.model import ROAD, STANDSTILL, STILL_RATE, Mount, read_position
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log, Prepared, on_one_clock, pieces, prepare
 from robins.systems.ins_gnss.setup import SMOOTHED, make_filter, model_of, mount_of
-from robins.systems.system import Outcome, Progress
 from robins.systems.tables import doubts_told_at_the_end, replay_warnings, together
 
 CAUSES = (
@@ -103,7 +103,7 @@ def replay(
     dataset: Dataset,
     parameters: Replay,
     filters: tuple[str, ...] = (),
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Outcome:
     """Navigate a log with the filters named and say how good they are.
 
@@ -116,7 +116,6 @@ def replay(
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
-    tell = progress if progress is not None else (lambda share, what: None)
     wanted = tuple(filters) or parameters.filters
     log = on_one_clock(dataset, parameters)
     found = pieces(log, parameters.update.longest_gap)
@@ -124,7 +123,7 @@ def replay(
     answers: dict[str, list[Answer]] = {name: [] for name in wanted}
     notes, problems = [], []
     for number, piece in enumerate(found):
-        tell(number / len(found), f"piece {number + 1} of {len(found)}")
+        progress(number / len(found), f"piece {number + 1} of {len(found)}")
         span = f"{log.time_s[piece.start]:.1f} to {log.time_s[piece.stop - 1]:.1f} s"
         try:
             part = prepare(log, piece, parameters)

@@ -10,13 +10,13 @@ import numpy as np
 from robins.dataset import Dataset
 from robins.filters import Belief, Code, Filter, Model, StepInfo, rts_smoother, run
 from robins.filters.run import Step
+from robins.results import Outcome, Progress, silent
 from robins.systems.marg.answer import Answer, Update, metrics, sentences, solution
 from robins.systems.marg.blocks import causal_attitudes, smoothed_attitudes
 from robins.systems.marg.model import REST_RATE, TRAVEL
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.prepare import Prepared, prepare
 from robins.systems.marg.setup import CAUSAL, SMOOTHED, filter_of, model_of
-from robins.systems.system import Outcome, Progress
 from robins.systems.tables import doubts_told_at_the_end, replay_warnings
 
 CAUSES = (
@@ -104,7 +104,7 @@ def replay(
     dataset: Dataset,
     parameters: Replay,
     filters: tuple[str, ...] = (),
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Outcome:
     """Find the orientation over a log and say how good it is.
 
@@ -117,13 +117,12 @@ def replay(
     Raises:
         ValueError: the log cannot be used; the sentence says why.
     """
-    tell = progress if progress is not None else (lambda share, what: None)
     wanted = tuple(dict.fromkeys(tuple(filters) or parameters.filters))
-    tell(0.0, "integrating blocks")
+    progress(0.0, "integrating blocks")
     log = prepare(dataset, parameters)
-    tell(0.2, "filtering")
+    progress(0.2, "filtering")
     answers, failed = orient(log, filter_of(parameters), model_of(parameters), wanted)
-    tell(0.9, "measuring")
+    progress(0.9, "measuring")
     notes = sentences(log, answers)
     if dataset.mag is None:
         notes.append("There is no magnetometer in this log: the heading is that of the gyros.")

@@ -21,9 +21,10 @@ from robins import linalg
 from robins.dataset import Dataset
 from robins.filters import Belief, Model, Motion, run
 from robins.ins.frames import to_ned_frd
+from robins.results import Outcome, Progress, silent
 from robins.rotation import Rotation
 from robins.systems.limits import Names
-from robins.systems.system import Alignment, Contender, Outcome, Progress
+from robins.systems.system import Alignment, Contender
 from robins.systems.tables import doubts_told_at_the_end, replay_warnings, together
 from robins.systems.transfer_alignment.pair_answer import (
     Answer,
@@ -152,7 +153,7 @@ def align(
     parameters: PairParameters,
     recording: Recording,
     contenders: Mapping[str, Contender],
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Outcome:
     """Align the slave of a recorded pair with each filter.
 
@@ -166,11 +167,10 @@ def align(
     Raises:
         ValueError: the pair cannot be aligned; the sentence says why.
     """
-    tell = progress if progress is not None else (lambda share, what: None)
     pieces, problems = pieces_of(dataset, parameters, recording)
     answers: dict[str, Answer] = {}
     for i, (name, contender) in enumerate(contenders.items()):
-        tell(i / len(contenders), f"aligning with {name}")
+        progress(i / len(contenders), f"aligning with {name}")
         answers[name] = _joined([aligned(p, contender, parameters) for p in pieces])
     assert dataset.master is not None
     master = to_ned_frd(dataset.master)
@@ -204,7 +204,7 @@ def replay(
     dataset: Dataset,
     parameters: Replay,
     filters: tuple[str, ...] = (),
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Outcome:
     """Align a recorded pair with the filters named; see `align`.
 

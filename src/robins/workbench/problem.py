@@ -8,8 +8,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robins.cli.frame import BadInput
 from robins.filters.synthesis import Plant, current_form, plant
+from robins.workbench.contents import designs
+from robins.workbench.errors import InputError
 
 _FORMS = {
     "prediction": ("A", "Bw", "Bn", "C", "Dw", "Dn", "L"),
@@ -40,42 +41,34 @@ class Problem(NamedTuple):
         return f"{self.unit_z}/({self.unit_n})"
 
 
-def examples() -> list[str]:
-    """Names of the problems that come with robins."""
-    folder = files("robins.cli") / "problems"
-    return sorted(
-        f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")
-    )
-
-
 def read_problem(given: str) -> Problem:
     """Read a problem by the path of its file or by its name.
 
     Raises:
-        BadInput: there is no such file or example, it is not TOML, or something in it does not fit;
-            the message names the block and its shape.
+        InputError: there is no such file or example, it is not TOML, or something in it does not
+            fit; the message names the block and its shape.
     """
     path = Path(given)
-    if given in examples():
-        text = (files("robins.cli") / "problems" / f"{given}.toml").read_text("utf-8")
+    if given in designs():
+        text = (files("robins.workbench") / "problems" / f"{given}.toml").read_text("utf-8")
     else:
         try:
             text = path.read_text("utf-8")
         except FileNotFoundError as error:
-            known = ", ".join(examples())
-            raise BadInput(
+            known = ", ".join(designs())
+            raise InputError(
                 f"{given}: no such file, and no example of that name; there are {known}."
             ) from error
         except (OSError, UnicodeDecodeError) as error:
-            raise BadInput(f"{given}: cannot be read: {error}.") from error
+            raise InputError(f"{given}: cannot be read: {error}.") from error
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"{given}: is not TOML: {error}.") from error
+        raise InputError(f"{given}: is not TOML: {error}.") from error
     try:
         return _problem(path.name.removesuffix(".toml"), table, text)
     except (ValueError, TypeError) as error:
-        raise BadInput(f"{given}: {error}.") from error
+        raise InputError(f"{given}: {error}.") from error
 
 
 def _problem(name: str, table: Mapping[str, Any], text: str) -> Problem:

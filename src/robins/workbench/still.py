@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import click
 import numpy as np
 import xarray as xr
 
-from robins import report, results
-from robins.cli.frame import BadInput, command_line, only_json
-from robins.cli.progress import Progress
 from robins.dataset import Dataset, ImuTable
-from robins.ins import allan
+from robins.ins.allan import Allan, AllanFit, deviation, fit, in_field_units
 from robins.logs import formats_of, open_log
 from robins.logs.clean import clean_imu
-from robins.results import array, variable
+from robins.results import Outcome, Progress, array, silent, variable
+from robins.workbench.errors import InputError, refusing
 
 _NAMES = {
     "Q": "quantisation",
@@ -41,18 +39,18 @@ class Still(NamedTuple):
     body: str
 
 
-def still(path: Path, columns: Sequence[Path] = ()) -> Still:
+def still(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> Still:
     """Read and clean the log of a resting IMU; increments become rates.
 
     Raises:
         robins.logs.LogError: the file cannot be read.
-        BadInput: it holds no inertial samples.
+        InputError: it holds no inertial samples.
     """
     findings: list[Any] = []
     opened = open_log(path, formats_of([path], columns).get(str(path)), findings)
     table = opened.imu if isinstance(opened, Dataset) else opened
     if not isinstance(table, ImuTable):
-        raise BadInput(f"{path}: holds no inertial samples; give the log of an IMU.")
+        raise InputError(f"{path}: holds no inertial samples; give the log of an IMU.")
     cleaned, counts, _ = clean_imu(table)
     notes = [str(finding) for finding in findings]
     begin, end = longest_stretch(cleaned.time_ns)
@@ -96,7 +94,7 @@ def suffix(unit: str) -> str:
     return plain.replace("/", "_per_")
 
 
-def expected(fitted: allan.AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]:
+def expected(fitted: AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]:
     """Allan deviation (T, axes) of each fitted term by itself, as in IEEE Std 952, Annex C."""
     tau = tau_s[:, None]
     shape = {
@@ -109,7 +107,7 @@ def expected(fitted: allan.AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]
     return {term: shape[term] * getattr(fitted.value, term) for term in fitted.terms}
 
 
-def _arrays(sensor: str, curve: allan.Allan, fitted: allan.AllanFit | None, body: str) -> dict:
+def _arrays(sensor: str, curve: Allan, fitted: AllanFit | None, body: str) -> dict:
     si, shown = _UNITS[sensor]
     about: dict[str, Any] = {"unit": si, "frame": body, "axes": _AXES, "display_unit": shown}
     made = array("allan", curve.deviation, sensor, confidence=curve.confidence, **about)
@@ -122,10 +120,10 @@ def _arrays(sensor: str, curve: allan.Allan, fitted: allan.AllanFit | None, body
     return made
 
 
-def _metrics(sensor: str, fitted: allan.AllanFit) -> dict[str, dict[str, Any]]:
+def _metrics(sensor: str, fitted: AllanFit) -> dict[str, dict[str, Any]]:
     """Parameters and their intervals by axis."""
     by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
-    for name, found in allan.in_field_units(fitted, sensor).items():  # type: ignore[arg-type]
+    for name, found in in_field_units(fitted, sensor).items():  # type: ignore[arg-type]
         unit = suffix(found.unit)
         for k, axis in enumerate(_AXES):
             by_axis[axis][f"{sensor}_{name}_{unit}"] = found.value[k]
@@ -133,28 +131,40 @@ def _metrics(sensor: str, fitted: allan.AllanFit) -> dict[str, dict[str, Any]]:
     return by_axis
 
 
-def analysed(
-    path: Path, terms: str, progress: Any, columns: Sequence[Path] = ()
-) -> tuple[xr.Dataset, dict[str, Any], list[str]]:
-    """Solution, summary and notes of the Allan analysis of a log.
+def allan(
+    log: str | os.PathLike[str],
+    *,
+    terms: str = "NBK",
+    columns: Sequence[str | os.PathLike[str]] = (),
+    progress: Progress = silent,
+) -> Outcome:
+    """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
+
+    Args:
+        log: a file in any format of `robins.logs` with inertial samples.
+        terms: noises to fit, of Q, N, B, K, R.
+        columns: TOML files that declare formats of the file, see `robins.logs.columns_from`.
+        progress: called with the share done and what is being done.
 
     Raises:
-        BadInput: the log is too short, not even, or constant.
+        InputError: the terms are not letters of these, or the log is too short, not even, constant.
+        robins.logs.LogError: the file cannot be read.
     """
+    if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):
+        raise InputError(f"--terms {terms}: give different letters out of {', '.join(_NAMES)}.")
+    path = Path(log)
     given = still(path, columns)
     notes = list(given.notes)
     arrays: dict[str, Any] = {}
     by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
     tau_s = np.zeros(0)
     for done, (sensor, rate) in enumerate(given.rates.items()):
-        progress(0.1 + 0.3 * done, f"{sensor}: Allan deviation")
-        try:
-            curve = allan.deviation(rate, time_ns=given.time_ns)
-        except ValueError as error:
-            raise BadInput(f"{path}: {sensor}: {error}") from error
+        progress(0.1 + 0.5 * done, f"{sensor}: Allan deviation")
+        with refusing(f"{path}: {sensor}"):
+            curve = deviation(rate, time_ns=given.time_ns)
         fitted = None
         try:
-            fitted = allan.fit(curve, terms)
+            fitted = fit(curve, terms)
         except (ValueError, ArithmeticError) as error:
             notes.append(f"No parameters of the {sensor}: {error}.")
         else:
@@ -165,42 +175,13 @@ def analysed(
     solution = xr.Dataset(arrays | {"tau": variable("tau", tau_s, "s", "averaging time")})
     if "process" in solution.sizes:
         solution = solution.assign_coords(process=[_NAMES[term] for term in terms])
-    summary = {
-        "scenario": f"allan/{path.name.split('.')[0]}",
-        "seed": 0,
-        "runs": 1,
-        "filters": by_axis,
-        "claims": [],
-        "counts": given.counts,
-    }
-    return solution, summary, notes
-
-
-def stability(
-    path: Path, terms: str, out: Path, as_json: bool, columns: Sequence[Path] = ()
-) -> None:
-    """Analyse a log, write the result, print it."""
-    if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):
-        raise BadInput(f"--terms {terms}: give different letters out of {', '.join(_NAMES)}.")
-    command = command_line()
-    with (
-        only_json(as_json),
-        Progress() as progress,
-        results.ResultWriter(out, command=command) as writer,
-    ):
-        solution, summary, notes = analysed(path, terms, progress, columns)
-        writer.save_solution(solution)
-        writer.save_summary(summary)
-        report.add(writer, lambda done, total, what: progress(0.7, what), notes)
-    if as_json:
-        click.echo((out / "summary.json").read_text("utf-8"), nl=False)
-        return
-    from rich.console import Console
-
-    Console().print(report.table(results.read(out).summary))
-    for note in notes:
-        click.echo(note)
-    click.echo(f"\nResult: {out}\nReport: {out / 'report.html'}   (open it in a browser)")
-    click.echo(
-        "Next:   put these numbers into the [imu] of a scenario or of a replay's configuration"
+    return Outcome(
+        solution,
+        by_axis,
+        counts=given.counts,
+        notes=notes,
+        scenario=f"allan/{path.name.split('.')[0]}",
+        last_lines=[
+            "Next:   put these numbers into the [imu] of a scenario or of a replay's configuration"
+        ],
     )

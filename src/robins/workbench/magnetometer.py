@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import click
 import numpy as np
 import xarray as xr
 
-from robins import report, results
-from robins.cli.examine import mounting_of
-from robins.cli.frame import BadInput, command_line, only_json
-from robins.cli.progress import Progress
 from robins.dataset import MagTable
 from robins.ins.frames import to_ned_frd
-from robins.ins.magnetometer_calibration import (
-    Calibration,
-    CalibrationError,
-    calibrate,
-    calibrated,
-)
+from robins.ins.magnetometer_calibration import Calibration, calibrated
+from robins.ins.magnetometer_calibration import calibrate as fitted
 from robins.logs import formats_of, open_log
 from robins.logs.clean_mag import clean_mag
 from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
-from robins.results import array, variable
-from robins.units import UnitError, parse
+from robins.results import Outcome, Progress, array, silent, variable
+from robins.units import parse
+from robins.workbench.errors import InputError, refusing
+from robins.workbench.examination import mounting_of, parted
 
 FILE = "calibration.toml"
 _AXES = ("x", "y", "z")
@@ -46,16 +39,19 @@ class Turned(NamedTuple):
 
 
 def samples(
-    log: Sequence[Path], begin_s: float, end_s: float, columns: Sequence[Path] = ()
+    log: Sequence[str | os.PathLike[str]],
+    begin_s: float,
+    end_s: float,
+    columns: Sequence[str | os.PathLike[str]] = (),
 ) -> Turned:
     """Read and clean the field of a log between two times from its first sample.
 
     Raises:
         robins.logs.LogError: a file cannot be read.
-        BadInput: no file or more than one holds a magnetic field, or none of it lies in between.
+        InputError: no file or more than one holds a magnetic field, or none of it lies in between.
     """
-    mounting = mounting_of([path for path in log if path.suffix == ".toml"])
-    files = [path for path in log if path.suffix != ".toml"]
+    files, configuration = parted(log)
+    mounting = mounting_of(configuration)
     formats = formats_of(files, columns)
     findings: list[Any] = []
     tables = [
@@ -67,7 +63,7 @@ def samples(
     names = ", ".join(map(str, log))
     if len(tables) != 1:
         held = "hold magnetic field more than once" if tables else "holds no magnetic field"
-        raise BadInput(f"{names}: {held}; give the log of one magnetometer.")
+        raise InputError(f"{names}: {held}; give the log of one magnetometer.")
     table, counts = clean_mag(tables[0])
     table = to_ned_frd(turned(table, mounting) if mounting else table)
     time_s = (table.time_ns - table.time_ns[:1]) * 1e-9
@@ -75,7 +71,7 @@ def samples(
     if not inside.any():
         last = time_s[-1] if len(time_s) else 0.0
         until = f"to {end_s:g} s" if np.isfinite(end_s) else "on"
-        raise BadInput(
+        raise InputError(
             f"{names}: no sample from {begin_s:g} s {until}; the log ends at {last:g} s."
         )
     told = {reason: count for reason, count in counts.items() if count}
@@ -114,12 +110,12 @@ def advice(found: Calibration) -> list[str]:
     return notes
 
 
-def as_toml(found: Calibration, command: str) -> str:
+def as_toml(found: Calibration, source: str) -> str:
     """A configuration for `robins replay`."""
     offset = ", ".join(f'"{value:.4f} uT"' for value in found.offset_t * _UT)
     rows = ", ".join(f"[{', '.join(f'{x:.6f}' for x in row)}]" for row in found.matrix)
     return (
-        f"# Hard and soft iron, forward-right-down; made by: {command}\n"
+        f"# Hard and soft iron, forward-right-down, of {source}\n"
         'system = "marg"\n\n'
         "[magnetometer]\n"
         f"offset = [{offset}]\n"
@@ -127,15 +123,19 @@ def as_toml(found: Calibration, command: str) -> str:
     )
 
 
-def analysed(given: Turned, found: Calibration, name: str) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Solution and summary of a calibration."""
+def solution_of(given: Turned, found: Calibration) -> xr.Dataset:
+    """The field before and after."""
     about: dict[str, Any] = {"frame": "FRD", "axes": _AXES, "display_unit": "uT"}
     after = calibrated(given.field_t, found.offset_t, found.matrix)
-    solution = xr.Dataset(
+    return xr.Dataset(
         array("field_measured", given.field_t, **about)
         | array("field_calibrated", after, strength=found.field_t, **about),
         {"time": variable("time", given.time_s, "s", "time since the first sample")},
     )
+
+
+def metrics_of(found: Calibration) -> dict[str, dict[str, Any]]:
+    """Offset and matrix by axis, and how good they are."""
     columns: dict[str, dict[str, Any]] = {
         axis: {
             "offset_ut": found.offset_t[k] * _UT,
@@ -154,60 +154,50 @@ def analysed(given: Turned, found: Calibration, name: str) -> tuple[xr.Dataset, 
         "largest_gap_deg": np.degrees(found.gap_rad),
         "outliers_percent": 100.0 * found.outliers,
     }
-    summary = {
-        "scenario": f"calibrate/{name}",
-        "seed": 0,
-        "runs": 1,
-        "filters": columns,
-        "claims": [],
-        "counts": given.counts,
-    }
-    return solution, summary
+    return columns
 
 
-def magnetometer(
-    log: Sequence[Path],
-    first: Path,
-    field: str | None,
-    begin: str | None,
-    end: str | None,
-    out: Path,
-    as_json: bool,
-    columns: Sequence[Path] = (),
-) -> None:
-    """Calibrate the magnetometer of a log, named after its first file, write and print it."""
-    try:
-        strength = None if field is None else parse(field, "magnetic field")
-        begin_s = 0.0 if begin is None else parse(begin, "time")
-        end_s = np.inf if end is None else parse(end, "time")
-    except UnitError as error:
-        raise BadInput(f"{error}.") from error
-    command = command_line()
-    with (
-        only_json(as_json),
-        Progress() as progress,
-        results.ResultWriter(out, command=command) as writer,
-    ):
-        progress(0.1, "reading")
-        given = samples(log, begin_s, end_s, columns)
-        progress(0.4, "fitting the ellipsoid")
-        try:
-            found = calibrate(given.field_t, strength)
-        except CalibrationError as error:
-            raise BadInput(f"{first}: {error}.") from error
-        solution, summary = analysed(given, found, first.name.split(".")[0])
-        notes = given.notes + advice(found)
-        writer.save_solution(solution)
-        writer.save_summary(summary)
-        writer.save_file(FILE, as_toml(found, command).encode())
-        report.add(writer, lambda done, total, what: progress(0.7, what), notes)
-    if as_json:
-        click.echo((out / "summary.json").read_text("utf-8"), nl=False)
-        return
-    from rich.console import Console
+def calibrate(
+    log: Sequence[str | os.PathLike[str]],
+    *,
+    field: str | None = None,
+    begin: str | None = None,
+    end: str | None = None,
+    columns: Sequence[str | os.PathLike[str]] = (),
+    progress: Progress = silent,
+) -> Outcome:
+    """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
 
-    Console().print(report.table(results.read(out).summary))
-    for note in notes:
-        click.echo(note)
-    click.echo(f"\nResult: {out}\nReport: {out / 'report.html'}   (open it in a browser)")
-    click.echo(f"Next:   robins replay {first} {out / FILE} --system marg   navigates with it")
+    Args:
+        log: its files; one that ends in .toml tells how the sensor is mounted.
+        field: its size at the place, "48.5 uT"; by default the mean scale of the sensor is kept.
+        begin: use samples from "20 s" after the first one on.
+        end: use samples up to "80 s" after the first one.
+        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError: the log cannot be calibrated with; the sentence says why.
+        robins.units.UnitError: a field or a time without its unit.
+        robins.logs.LogError: a file cannot be read.
+    """
+    strength = None if field is None else parse(field, "magnetic field")
+    begin_s = 0.0 if begin is None else parse(begin, "time")
+    end_s = np.inf if end is None else parse(end, "time")
+    progress(0.1, "reading")
+    first = parted(log)[0][0]
+    given = samples(log, begin_s, end_s, columns)
+    progress(0.5, "fitting the ellipsoid")
+    with refusing(first):
+        found = fitted(given.field_t, strength)
+    return Outcome(
+        solution_of(given, found),
+        metrics_of(found),
+        counts=given.counts,
+        files={FILE: as_toml(found, first.name).encode()},
+        notes=given.notes + advice(found),
+        scenario=f"calibrate/{first.name.split('.')[0]}",
+        last_lines=[
+            f"Next:   robins replay {first} {{out}}/{FILE} --system marg   navigates with it"
+        ],
+    )

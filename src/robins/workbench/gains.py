@@ -5,20 +5,16 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import xarray as xr
 
-from robins import report, results
-from robins.cli.frame import BadInput, command_line, only_json
-from robins.cli.problem import Problem, read_problem
-from robins.cli.progress import Progress
-from robins.filters.synthesis import METHODS, Design, Outcome, TradeOff, trade_off
-from robins.results import array, variable
+from robins.filters.synthesis import METHODS, Attempt, Design, TradeOff, trade_off
+from robins.results import Outcome, Progress, array, silent, variable
 from robins.results.summary import dumps, plain
+from robins.workbench.errors import InputError, refusing
+from robins.workbench.problem import Problem, read_problem
 
 GAINS, TABLE = "gains.json", "trade_off.csv"
 _NUMBERS = ("h2", "hinf", "hinf_sweep", "bound", "radius", "lambda_", "seconds")
@@ -34,44 +30,37 @@ def as_text(gammas: Sequence[float]) -> list[str]:
     return [repr(gamma) for gamma in gammas]
 
 
-def cell(outcome: Outcome) -> Any:
+def cell(attempt: Attempt) -> Any:
     """What a table says where a method has no design."""
-    if np.isfinite(outcome.least):
-        return f"cannot, least {outcome.least:.4g}"
+    if np.isfinite(attempt.least):
+        return f"cannot, least {attempt.least:.4g}"
     return "not certified"
 
 
-def summary_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
+def metrics_of(found: TradeOff) -> dict[str, dict[str, Any]]:
     """Norms by method and gamma."""
     columns: dict[str, dict[str, Any]] = {
         "kalman": {"h2": found.kalman.h2, "hinf": found.kalman.hinf}
     }
     for gamma, text in zip(found.gammas, as_text(found.gammas), strict=True):
-        for outcome in (o for o in found.outcomes if o.gamma == gamma):
-            column = columns.setdefault(outcome.method, {})
-            made = outcome.design
-            column[f"h2_at_gamma_{text}"] = cell(outcome) if made is None else made.h2
+        for attempt in (a for a in found.attempts if a.gamma == gamma):
+            column = columns.setdefault(attempt.method, {})
+            made = attempt.design
+            column[f"h2_at_gamma_{text}"] = cell(attempt) if made is None else made.h2
             column[f"hinf_at_gamma_{text}"] = None if made is None else made.hinf
-    return {
-        "scenario": f"design/{problem.name}",
-        "seed": 0,
-        "runs": 1,
-        "filters": columns,
-        "claims": [],
-        "counts": {},
-    }
+    return columns
 
 
 def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
     """Norms as arrays (design, gamma); the first is the method."""
-    methods = list(dict.fromkeys(outcome.method for outcome in found.outcomes))
+    methods = list(dict.fromkeys(a.method for a in found.attempts))
 
     def numbers(name: str) -> np.ndarray:
         values = np.full((len(methods), len(found.gammas)), np.nan)
-        for outcome in found.outcomes:
-            if outcome.design is not None:
-                at = methods.index(outcome.method), found.gammas.index(outcome.gamma)
-                values[at] = getattr(outcome.design, name)
+        for a in found.attempts:
+            if a.design is not None:
+                at = methods.index(a.method), found.gammas.index(a.gamma)
+                values[at] = getattr(a.design, name)
         return values
 
     z, gain, least = problem.unit_z, problem.unit_gain, found.least.reached
@@ -89,8 +78,8 @@ def solution_of(problem: Problem, found: TradeOff) -> xr.Dataset:
 def gains_of(problem: Problem, found: TradeOff) -> dict[str, Any]:
     """Every gain with full digits, and what could not be had."""
     made = [("kalman", found.kalman)]
-    made += [(o.method, o.design) for o in found.outcomes if o.design is not None]
-    refused = [o for o in found.outcomes if o.design is None]
+    made += [(o.method, o.design) for o in found.attempts if o.design is not None]
+    refused = [o for o in found.attempts if o.design is None]
     return {
         "problem": problem.name,
         "form": problem.form,
@@ -122,8 +111,8 @@ def table_of(found: TradeOff) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["method", "gamma", *(n.rstrip("_") for n in _NUMBERS), "not_reached"])
-    kalman = Outcome("kalman", np.inf, found.kalman, "", np.nan)
-    for o in (kalman, *found.outcomes):
+    kalman = Attempt("kalman", np.inf, found.kalman, "", np.nan)
+    for o in (kalman, *found.attempts):
         numbers = [repr(float(getattr(o.design, n))) if o.design else "" for n in _NUMBERS]
         writer.writerow([o.method, repr(o.gamma), *numbers, o.why])
     return text.getvalue()
@@ -175,59 +164,62 @@ def _unit(unit: str) -> str:
 
 
 def gammas_of(text: str | None) -> list[float] | None:
-    """Gammas of an option, "1, 0.8".
+    """Gammas of a text, "1, 0.8".
 
     Raises:
-        BadInput: one of them is not a number.
+        InputError: one of them is not a number.
     """
     if text is None:
         return None
     try:
         return [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise BadInput(f'--gamma {text!r}: give numbers, such as "1, 0.8".') from error
+        raise InputError(f'--gamma {text!r}: give numbers, such as "1, 0.8".') from error
 
 
 def design(
-    given: str, gamma: str | None, methods: Sequence[str], out: Path | None, as_json: bool
-) -> None:
-    """Design filters for a problem, write and print them."""
-    command = command_line()
-    asked = gammas_of(gamma)
-    with only_json(as_json), Progress() as progress:
-        problem = read_problem(given)
-        out = out or Path("results") / f"design-{problem.name}"
-        writer = results.ResultWriter(out, command=command, scenario_text=problem.text)
-        with writer:
-            try:
-                found = trade_off(
-                    problem.plant,
-                    problem.gammas if asked is None else asked,
-                    methods or METHODS,
-                    lambda done, total, what: progress(0.9 * done / max(total, 1), what),
-                )
-            except ValueError as error:
-                raise BadInput(f"{given}: {error}.") from error
-            notes = advice(problem, found)
-            writer.save_solution(solution_of(problem, found))
-            writer.save_summary(summary_of(problem, found))
-            writer.save_file(GAINS, dumps(plain(gains_of(problem, found))).encode())
-            writer.save_file(TABLE, table_of(found).encode())
-            report.add(writer, lambda done, total, what: progress(0.95, what), notes)
-    if as_json:
-        click.echo((out / "summary.json").read_text("utf-8"), nl=False)
-        return
-    from rich.console import Console
+    given: str,
+    *,
+    gamma: str | None = None,
+    methods: Sequence[str] = (),
+    progress: Progress = silent,
+) -> Outcome:
+    """Constant-gain filters for a problem, and what a bound on the worst case costs.
 
-    console = Console()
-    click.secho(f"{problem.title}\n", bold=True)
-    console.print(report.table(results.read(out).summary, console.width))
-    click.echo()
-    for note in notes:
-        click.echo(note)
-    click.echo(f"\nResult: {out}\nGains:  {out / GAINS}   (every digit; {TABLE} has the curve)")
-    click.echo(f"Report: {out / 'report.html'}   (open it in a browser)")
-    click.echo(_next(given, problem, found))
+    Args:
+        given: the path of a problem, or the name of an example.
+        gamma: bounds on the H-infinity norm, "1, 0.8"; by default those of the problem, or a range.
+        methods: to compare; by default all.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError: the problem, a gamma or a method cannot be used.
+    """
+    asked = gammas_of(gamma)
+    problem = read_problem(given)
+    with refusing(given):
+        found = trade_off(
+            problem.plant,
+            problem.gammas if asked is None else asked,
+            methods or METHODS,
+            lambda done, total, what: progress(done / max(total, 1), what),
+        )
+    return Outcome(
+        solution_of(problem, found),
+        metrics_of(found),
+        files={
+            GAINS: dumps(plain(gains_of(problem, found))).encode(),
+            TABLE: table_of(found).encode(),
+        },
+        notes=advice(problem, found),
+        scenario=f"design/{problem.name}",
+        parameters=problem.text,
+        title=problem.title,
+        last_lines=[
+            f"Gains:  {{out}}/{GAINS}   (every digit; {TABLE} has the curve)",
+            _next(given, problem, found),
+        ],
+    )
 
 
 def _next(given: str, problem: Problem, found: TradeOff) -> str:
@@ -237,7 +229,7 @@ def _next(given: str, problem: Problem, found: TradeOff) -> str:
         return f'Next:   robins design {given} --gamma "{within}"   is in reach'
     inflated = [
         o.design
-        for o in found.outcomes
+        for o in found.attempts
         if o.method == "riccati" and o.design is not None and o.design.lambda_ > 0.0
     ]
     if inflated and not np.any(problem.blocks.get("Dn", 0.0)):

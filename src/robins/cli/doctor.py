@@ -1,0 +1,55 @@
+"""The command `doctor`: what a log holds and what is wrong with it, in colours."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from robins.cli.frame import Status, only_json
+from robins.cli.tell import say
+
+_COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
+_KINDS = {
+    "imu": "inertial samples",
+    "gnss": "GNSS fixes",
+    "truth": "path",
+    "mag": "magnetic field",
+    "attitude": "true attitude",
+}
+
+
+def judge(log: Sequence[Path], columns: Sequence[Path], as_json: bool) -> Status:
+    """Print what there is and the findings; bad input if a run on this log would be wrong."""
+    with only_json(as_json):
+        from robins.workbench import examine
+
+        found = examine(log, columns)
+    say(found.data if as_json else None, _text(found, log, columns), as_json)
+    return Status.BAD_INPUT if found.counts["error"] else Status.DONE
+
+
+def _text(found: Any, log: Sequence[Path], columns: Sequence[Path]) -> str:
+    lines = []
+    for table in found.tables:
+        rate = f" at {table['rate_hz']:.4g} Hz" if table["rate_hz"] else ""
+        held = f"{table['samples']} rows{rate}, {table['span_s']:.1f} s"
+        lines.append(f"{_KINDS[table['kind']]:<17}{held}  ({Path(table['file']).name})")
+    for finding in found.findings:
+        severity = click.style(f"{finding.severity}:", fg=_COLOURS[finding.severity], bold=True)
+        lines.append(f"{severity} {finding.sentence}")
+    told = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in found.counts.items()]
+    lines.append(f"{', '.join(told)}.")
+    if found.counts["error"]:
+        return "\n".join(
+            [*lines, "Next:   mend the errors; a run on this log would be wrong or meaningless"]
+        )
+    # Without fixes there is no position, but with a magnetic field an attitude.
+    kinds = {table["kind"] for table in found.tables}
+    system = " --system marg" if "mag" in kinds and "gnss" not in kinds else ""
+    declared = [word for path in columns for word in ("--columns", path)]
+    words = shlex.join(map(str, [*log, *declared]))
+    return "\n".join([*lines, f"Next:   robins replay {words}{system}"])

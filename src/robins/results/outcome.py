@@ -1,0 +1,60 @@
+"""What a command found, before any of it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
+
+
+def silent(share: float, what: str) -> None:
+    """Progress that nobody wants to hear of."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command found: all that its result folder, its report and its last lines say.
+
+    Who computes (a system, a campaign) fills in the first part; who was asked for it
+    (`robins.workbench`) adds the rest. In `last_lines`, ``{out}`` stands for the folder.
+    """
+
+    solution: xr.Dataset | None = None  # None: there is nothing to draw
+    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # by filter, or by axis
+    claims: list[dict[str, Any]] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    files: dict[str, bytes | Path] = field(default_factory=dict)  # more; a path is moved in
+    notes: list[str] = field(default_factory=list)  # sentences for the reader
+    warnings: list[str] = field(default_factory=list)  # why a reader should doubt the figures
+
+    # what was asked
+    scenario: str = ""  # its name
+    seed: int = 0
+    runs: int = 1
+    parameters: str = ""  # TOML, with what the command line changed
+    device: str = "cpu"
+
+    # how it is told
+    title: str = ""
+    tables: list[Any] = field(default_factory=list)  # else that of the metrics; texts, or for rich
+    last_lines: list[str] = field(default_factory=list)  # where else to look, what to do next
+    for_scripts: str = "summary.json"  # the file that --json prints
+    failure: str = ""  # why it is not whole; what there is of it is a result all the same
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` says."""
+        return {
+            "scenario": self.scenario,
+            "seed": self.seed,
+            "runs": self.runs,
+            "filters": self.metrics,
+            "claims": self.claims,
+            "counts": self.counts,
+            "warnings": self.warnings,
+        }

@@ -1,0 +1,48 @@
+"""What every command does: one function a command, from what is asked to an `Outcome`.
+
+::
+
+    outcome = run("ins-gnss/drive", runs=20)
+    result = publish(outcome, "results/drive")
+
+The first line writes nothing; `publish` makes a result folder of any outcome, with its report.
+Where computing takes long, `publishing` refuses a folder that cannot be written before it begins.
+
+A function is imported when it is asked for: the doctor of logs does not wait for the systems, nor a
+list of scenarios for JAX. A new command is a function in a module here, and its row below.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_WHERE = {
+    "InputError": "errors",
+    "align": "recorded",
+    "allan": "still",
+    "bench_node": "benches",
+    "bench_replay": "benches",
+    "bench_up": "benches",
+    "bound": "simulated",
+    "calibrate": "magnetometer",
+    "design": "gains",
+    "examine": "examination",
+    "inventory": "contents",
+    "overview": "contents",
+    "part": "publication",
+    "publish": "publication",
+    "publishing": "publication",
+    "replay": "recorded",
+    "run": "simulated",
+}
+
+__all__ = list(_WHERE)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(importlib.import_module(f"{__name__}.{_WHERE[name]}"), name)
+    globals()[name] = found
+    return found

@@ -1,0 +1,268 @@
+"""The commands of the test bench: a run part by part, a part heard again, a part by hand."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from robins.bench.parts.satellite import BUILD, Kit
+from robins.bench.parts.satellite.preparing import kit_for
+from robins.bench.parts.station import Station, ready, serve
+from robins.bench.ports.port import address, open_port
+from robins.bench.recording import read_record
+from robins.bench.recording.differences import FieldDifference, differences, table
+from robins.bench.recording.replay import Start, recorded, replay
+from robins.bench.run.one_program import in_process
+from robins.bench.run.outcome import outcome
+from robins.bench.run.session import Session
+from robins.bench.run.setup import NODES, Flight, changed, read, recorded_flight
+from robins.bench.run.watching import Looking, page_for, starting
+from robins.bench.status import Status
+from robins.results import Outcome, Progress, silent
+from robins.results.summary import plain
+from robins.workbench.errors import InputError
+from robins.workbench.publication import part
+
+
+def bench_up(
+    scenario: str,
+    *,
+    settings: Sequence[str] = (),
+    record: str | os.PathLike[str] | None = None,
+    live: bool = False,
+    paused: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 8321,
+    opened: Callable[[str], None] = print,
+    progress: Progress = silent,
+    **options: Any,
+) -> Outcome:
+    """Run a scenario on the bench: each part a process or a board on a serial line.
+
+    Args:
+        scenario: of the satellite, of the bench, or a file of either.
+        settings: "path=value" texts that change it.
+        record: a file for what goes over the lines, moved into the result folder in the end; what
+            interrupts the run leaves it there.
+        live: serve a page that shows the run.
+        paused: wait for the start that the page gives.
+        host: of the page.
+        port: of the page.
+        opened: called with the address of the page.
+        progress: called with the share done and what is being done.
+        **options: fields of `robins.bench.run.setup.Setup` that take the place of the scenario's;
+            None leaves one as it is.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+        robins.bench.ports.port.PortError: a port cannot be opened.
+    """
+    if paused and not live:
+        raise InputError("--paused waits for the page's Start: give --live too.")
+    flight = flight_of(scenario, settings, options)
+    file = None if record is None else Path(record)
+    with _onlooker(flight, live, host, port, opened) as watch:
+        session = Session(flight, file, watch, part(progress, 0.0, 0.95), paused)
+        try:
+            ran = session.run()
+        except KeyboardInterrupt as interrupt:
+            if file is not None:
+                interrupt.add_note(f"what was flown is in {file}")
+            raise
+    loop = None
+    if flight.setup.clock == "lockstep" and ran.steps and not flight.setup.ports:
+        progress(0.97, "the same inside one program")
+        loop = in_process(flight, ran.kit)
+    return outcome(flight, ran, loop, file)
+
+
+def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> Flight:
+    """The run that is asked for; options that were not given stay as the scenario has them.
+
+    Raises:
+        robins.scenario.ScenarioError: there is no such scenario, or an option does not fit.
+    """
+    # a 0 is one that was given, though it equals False
+    given = {k: v for k, v in options.items() if v is not None and v is not False and v != {}}
+    return changed(read(scenario, tuple(settings)), given)
+
+
+def _kit(flight: Flight) -> Kit:
+    setup = flight.setup
+    table = setup.table.table() if setup.table else None
+    return kit_for(flight.loop, setup.filter, setup.seed, table=table)
+
+
+@contextlib.contextmanager
+def _onlooker(
+    flight: Flight, live: bool, host: str, port: int, opened: Callable[[str], None]
+) -> Iterator[Looking]:
+    """The status file, and the page if it is wanted."""
+    with contextlib.ExitStack() as stack:
+        status = stack.enter_context(Status())
+        status.tell(starting(flight))
+        page = None
+        if live:
+            try:
+                title = flight.setup.title or flight.name
+                page = page_for(title, os.getpid(), len(flight.loop.wheels.axes), host, port)
+            except ImportError as error:
+                raise InputError(str(error)) from error
+            except OSError as error:
+                raise InputError(f"--host {host} --port {port}: {error}; try --port 0") from error
+            stack.callback(page.close)
+            opened(page.url)
+        yield Looking(page, status)
+
+
+class Compared(NamedTuple):
+    """What a part said twice, compared."""
+
+    node: str
+    frames: int  # that it said the second time
+    same: bool  # byte for byte
+    differences: list[FieldDifference]
+    whole: bool  # neither record was cut or damaged
+    damages: list[str]  # why not, a sentence a record
+    until_s: float  # what was compared ends there
+    planned_s: float  # the run was to end there
+    told: str  # the first difference, in words, where the part was run again
+    compared: int  # frames
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The comparison in the types of JSON."""
+        rows = [vars(difference) for difference in self.differences]
+        said = {"node": self.node, "frames": self.frames, "same": self.same, "differences": rows}
+        said |= {"whole": self.whole, "until_s": self.until_s, "planned_s": self.planned_s}
+        return plain(said)
+
+    @property
+    def text(self) -> str:
+        """The comparison for people."""
+        lines, so_far = [], ""
+        if not self.whole:
+            span = f"up to {self.until_s:g} s of a run of {self.planned_s:g} s"
+            lines.append(f"Compared, and no more: {self.compared} frames, {span}.")
+            so_far = "as far as the record goes, "
+        if self.same:
+            said = f"'{self.node}' says the same {self.frames} frames, byte for byte."
+            lines.append(f"Same: {so_far}{said}")
+        else:
+            lines += [f"Different: {self.told or 'see below'}\n", table(self.differences)]
+        return "\n".join(lines)
+
+
+def bench_replay(
+    record: str | os.PathLike[str],
+    *,
+    node: str,
+    filter_: str | None = None,
+    diff: str | os.PathLike[str] | None = None,
+    progress: Progress = silent,
+) -> Compared:
+    """Let a part hear a record again and compare what it says; or compare it in two records.
+
+    Args:
+        record: of a run, as the bench wrote it.
+        node: which part.
+        filter_: another filter for it to run.
+        diff: another record to compare with, in place of running the part.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: no such part or filter, or both are given.
+        ValueError: a file is not a record.
+    """
+    if filter_ and diff:
+        raise InputError("--filter and --diff: the one runs a filter, the other compares records")
+    if node not in NODES:
+        raise InputError(f"--node: there is no part '{node}', only {', '.join(NODES)}")
+    first, second = read_record(record), None if diff is None else read_record(diff)
+    step_ns, told = int(first.header["step_ns"]), None
+    if second is None:
+        with _starter(recorded_flight(first.header, filter_), node) as start:
+            heard = replay(
+                first, node, start, progress=lambda k, n: progress(k / max(n, 1), "hearing")
+            )
+        a, b, same, told = heard.recorded, heard.frames, heard.same, heard.first_difference
+    else:
+        a, b = recorded(first, node), recorded(second, node)
+        same = not differences(a, b)
+    damages = [
+        f"{path} is not whole: {one.why}"
+        for path, one in ((record, first), (diff, second))
+        if one is not None and not one.whole
+    ]
+    return Compared(
+        node=node,
+        frames=len(b),
+        same=same,
+        differences=differences(a, b, step_ns),
+        whole=not damages,
+        damages=damages,
+        until_s=min(max((f.header.time_ns for f in x), default=0) for x in (a, b)) * 1e-9,
+        planned_s=int(first.header["steps"]) * step_ns * 1e-9,
+        told=told or "",
+        compared=min(len(a), len(b)),
+    )
+
+
+@contextlib.contextmanager
+def _starter(flight: Flight, part: str) -> Iterator[Start]:
+    """What starts a part of a recorded run on a path."""
+    with tempfile.TemporaryDirectory(prefix="robins-bench-") as folder:
+        path = Path(folder) / "kit.pickle"
+        path.write_bytes(pickle.dumps(_kit(flight)))
+
+        @contextlib.contextmanager
+        def start(port: str) -> Iterator[subprocess.Popen]:
+            command = [sys.executable, "-m", "robins.bench.parts.node", part, port, str(path)]
+            process = subprocess.Popen(command, start_new_session=True)
+            try:
+                yield process
+            finally:
+                process.kill()
+                process.wait()
+
+        yield start
+
+
+def bench_node(
+    name: str,
+    port: str,
+    scenario: str,
+    *,
+    filter_: str | None = None,
+    seed: int | None = None,
+    opened: Callable[[], None] = lambda: None,
+) -> None:
+    """Be a part of a scenario at a port until the bench says stop, as its process would be.
+
+    Args:
+        name: of the part.
+        port: where the bench is, "/dev/ttyUSB0,460800".
+        scenario: as for `bench_up`, with the same seed.
+        filter_: of the attitude determination.
+        seed: of all noise.
+        opened: called when the port is open.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: no such part or scenario.
+        robins.bench.ports.port.PortError: the port cannot be opened.
+    """
+    if name not in BUILD:
+        raise InputError(f"no part '{name}', only {', '.join(NODES)}")
+    at = address(port)
+    kit = _kit(flight_of(scenario, (), {"filter": filter_, "seed": seed}))
+    made = Station(ready(BUILD[name](kit), kit.frames))
+    with open_port(at, timeout_s=None) as line:
+        opened()
+        serve(line, made)

@@ -1,0 +1,78 @@
+"""The command `list`: what there is to run, told without importing a system."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib.resources import files
+from typing import Any
+
+from robins import systems
+from robins.systems import catalogue
+from robins.workbench.errors import InputError
+
+
+def overview() -> dict[str, tuple[str, dict[str, str]]]:
+    """A sentence on every system, on the bench and on design, and titles of what each can run."""
+    told = {name: (text, titles(name)) for name, text in catalogue.SUMMARIES.items()}
+    bench = "the satellite part by part over serial lines, `robins bench up`"
+    design = "gains between H2 and H-infinity, `robins design`"
+    return told | {"bench": (bench, _benches()), "design": (design, designs())}
+
+
+def inventory(system: str | None = None) -> dict[str, Any]:
+    """What there is, or what a system has: scenarios, filters, claims, whether it replays logs.
+
+    Raises:
+        InputError: there is no such system.
+    """
+    if system is not None:
+        if system not in catalogue.SUMMARIES:
+            known = ", ".join(catalogue.SUMMARIES)
+            raise InputError(f"no system '{system}'; there are {known}.")
+        return _told(system)
+    told = [_told(name) for name in catalogue.SUMMARIES]
+    return {
+        "scenarios": [name for one in told for name in one["scenarios"]],
+        "systems": told,
+        "filters": list(dict.fromkeys(name for one in told for name in one["filters"])),
+        "claims": [claim | {"system": one["name"]} for one in told for claim in one["claims"]],
+        "bench": list(_benches()),
+        "designs": list(designs()),
+    }
+
+
+def _told(name: str) -> dict[str, Any]:
+    system = systems.SYSTEMS[name]
+    return {
+        "name": system.name,
+        "summary": catalogue.SUMMARIES[name],
+        "scenarios": list(titles(name)),
+        "filters": list(system.filters),
+        "claims": [{"id": claim["id"], "text": claim["text"]} for claim in system.claims],
+        "replays": system.replay is not None,
+    }
+
+
+def titles(system: str) -> dict[str, str]:
+    """Titles of the scenarios of a system, by the names that `run` takes."""
+    return {f"{system}/{k}": one.title for k, one in catalogue.listed(system).items()}
+
+
+def _benches() -> dict[str, str]:
+    """Looked up without the bench: its packages are an extra."""
+    return _packaged("bench", "run", "scenarios")
+
+
+def designs() -> dict[str, str]:
+    """Titles of the problems of design that come with robins."""
+    return _packaged("workbench", "problems")
+
+
+def _packaged(*folder: str) -> dict[str, str]:
+    """Titles of the files in a folder of the package, by their names."""
+    found = {
+        file.name.removesuffix(".toml"): tomllib.loads(file.read_text("utf-8"))["title"]
+        for file in files("robins").joinpath(*folder).iterdir()
+        if file.name.endswith(".toml")
+    }
+    return dict(sorted(found.items()))

@@ -1,0 +1,122 @@
+"""The command `doctor`: a log judged before anyone navigates it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins import logs, scenario, systems
+from robins.logs.findings import by_severity
+from robins.logs.mounting import turned
+from robins.logs.quiet import usual_step_s
+from robins.logs.tables import kind_of, tables_of
+from robins.workbench.errors import InputError
+
+SEVERITIES = ("error", "warning", "note")
+
+
+class Examined(NamedTuple):
+    """What the files of a log hold, and what the doctor says of it."""
+
+    files: list[str]
+    tables: list[dict[str, Any]]  # "kind", "file", "samples", "span_s", "rate_hz"
+    findings: list[logs.Finding]  # errors first
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Findings by severity."""
+        return {s: sum(f.severity == s for f in self.findings) for s in SEVERITIES}
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """All of it in the types of JSON."""
+        from robins.results.summary import plain  # people do not wait for what writes results
+
+        return {
+            "files": self.files,
+            "tables": plain(self.tables),
+            "findings": plain([asdict(finding) for finding in self.findings]),
+            **{f"{severity}s": count for severity, count in self.counts.items()},
+        }
+
+
+def examine(
+    paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
+) -> Examined:
+    """Have the files of a log examined; one that ends in .toml tells how the sensor is mounted.
+
+    Args:
+        paths: the files.
+        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
+
+    Raises:
+        InputError: there is no log beside the configuration, or more than one of these.
+        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be read.
+    """
+    files, configuration = parted(paths)
+    mounting = mounting_of(configuration)
+    formats = logs.formats_of(files, columns)
+    findings: list[logs.Finding] = []
+    opened = []
+    for path in files:
+        log = logs.open_log(path, formats.get(str(path)), findings)
+        opened.append(turned(log, mounting) if mounting else log)
+    tables = [_described(table) for log in opened for table in tables_of(log)]
+    return Examined(
+        [str(path) for path in paths], tables, by_severity(findings + logs.examine(opened))
+    )
+
+
+def _described(table: Any) -> dict[str, Any]:
+    step_s = usual_step_s(table.time_ns)
+    return {
+        "kind": kind_of(table),
+        "file": table.source,
+        "samples": len(table),
+        "span_s": float(table.time_ns.max() - table.time_ns.min()) * 1e-9 if len(table) else 0.0,
+        "rate_hz": 1.0 / step_s if step_s > 0.0 else None,
+    }
+
+
+def parted(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | None]:
+    """The files of a log, and the configuration among them, if there is one.
+
+    Raises:
+        InputError: there is no log, or more than one configuration.
+    """
+    given = [Path(path) for path in paths]
+    files = [path for path in given if path.suffix != ".toml"]
+    configurations = [path for path in given if path.suffix == ".toml"]
+    if not files:
+        raise InputError(
+            f"{given[0]}: is a configuration; give the files of the log beside it."
+            if given
+            else "no file is given; give those of a log"
+        )
+    if len(configurations) > 1:
+        raise InputError(f"one configuration is wanted, got {', '.join(map(str, configurations))}")
+    return files, next(iter(configurations), None)
+
+
+def mounting_of(configuration: Path | None) -> logs.Mounting | None:
+    """How the sensor sits in the vehicle, as a replay would read it from the same file.
+
+    Raises:
+        InputError: the file names no system that replays logs.
+        robins.scenario.ScenarioError: it cannot be used.
+    """
+    if configuration is None:
+        return None
+    text = scenario.read_text(configuration)
+    name = str(scenario.mapping_of(text).get("system"))
+    system = systems.SYSTEMS.get(name)
+    if system is None or system.replay_parameters is None:
+        known = ", ".join(systems.SYSTEMS)
+        raise InputError(f'{configuration}: write system = "..." into it, one of {known}.')
+    parameters = scenario.parse(system.replay_parameters, text, (), source=str(configuration))
+    return logs.Mounting(*np.degrees(system.orientation(parameters)).tolist())

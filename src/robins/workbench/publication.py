@@ -1,0 +1,82 @@
+"""From an outcome to a result folder with its report: for every command the same way."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+from robins import report, results
+from robins.results import Outcome, Progress, Result, silent
+
+
+@contextmanager
+def publishing(
+    out: str | os.PathLike[str], *, command: str = "", progress: Progress = silent
+) -> Iterator[Callable[[Outcome], Result]]:
+    """Hold a result folder while something is computed for it.
+
+    The folder is refused at once if it could not be written. Without an outcome, or with an error,
+    what was there stays as it was. What was computed and cannot be written is kept beside it.
+
+        with publishing("results/walk") as publish:
+            result = publish(replay(["imu.csv", "gnss.pos"]))
+
+    Args:
+        out: the folder.
+        command: how to make the result again, for its report.
+        progress: called with the share done and what is being done while it is written.
+
+    Yields:
+        A function that writes an outcome into the folder and returns the result read back.
+
+    Raises:
+        robins.results.ResultError: the folder cannot be written.
+        robins.results.NotWritten: neither could what was computed, which is kept elsewhere.
+    """
+    with results.rescued(out):
+        writer = results.ResultWriter(out, command=command)
+        try:
+            yield partial(_write, writer, progress)
+        finally:
+            writer.discard()  # nothing is left to do after a commit
+
+
+def publish(
+    outcome: Outcome,
+    out: str | os.PathLike[str],
+    *,
+    command: str = "",
+    progress: Progress = silent,
+) -> Result:
+    """Write an outcome as a result folder with figures and a page; see `publishing`.
+
+    Raises:
+        robins.results.ResultError, robins.results.NotWritten: as for `publishing`.
+    """
+    with publishing(out, command=command, progress=progress) as write:
+        return write(outcome)
+
+
+def _write(writer: results.ResultWriter, progress: Progress, outcome: Outcome) -> Result:
+    variables = {} if outcome.solution is None else outcome.solution.variables
+    arrays = {str(name): variable.values for name, variable in variables.items()}
+    with results.keeping({"solution": arrays, "metrics": outcome.metrics}):
+        writer.scenario_text, writer.device = outcome.parameters, outcome.device
+        writer.save_summary(outcome.summary)
+        if outcome.solution is not None:
+            writer.save_solution(outcome.solution)
+        for name, content in outcome.files.items():
+            writer.save_file(name, content)
+
+        def drawing(done: int, total: int, what: str) -> None:
+            progress(done / max(total, 1), what)
+
+        report.add(writer, drawing, outcome.notes)
+        return results.read(writer.commit())
+
+
+def part(progress: Progress, low: float, high: float) -> Progress:
+    """The progress of a part, whose 0 and 1 are `low` and `high` of the whole."""
+    return lambda share, what: progress(low + (high - low) * share, what)

@@ -1,0 +1,159 @@
+"""The commands `replay` and `align`: a recorded log navigated, a recorded pair aligned."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from robins import _float64, logs, scenario, systems
+from robins.dataset import Dataset
+from robins.ins.frames import to_ned_frd
+from robins.logs import Finding
+from robins.results import Outcome, Progress, silent
+from robins.workbench.errors import InputError, refusing
+from robins.workbench.examination import parted
+from robins.workbench.publication import part
+from robins.workbench.scenarios import asked, check_filters, find_scenario
+
+Findings = Callable[[Sequence[Finding]], None]
+
+
+def unheard(findings: Sequence[Finding]) -> None:
+    """What the doctor says, where nobody wants to hear it."""
+
+
+def replay(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    system: str = "ins-gnss",
+    filters: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    columns: Sequence[str | os.PathLike[str]] = (),
+    seed: int = 0,
+    progress: Progress = silent,
+    findings: Findings = unheard,
+) -> Outcome:
+    """Navigate a recorded log: doctor, clean, align, filter, smooth, measure.
+
+    Args:
+        paths: the log's files; one that ends in .toml is the configuration.
+        system: which system navigates it.
+        filters: names; by default those of the configuration.
+        settings: "path=value" texts that change the configuration.
+        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
+        seed: recorded in the result; a replay draws nothing.
+        progress: called with the share done and what is being done.
+        findings: called with what the doctor says.
+
+    Raises:
+        InputError: the log or what was asked of it cannot be used.
+        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
+    """
+    _float64.require()
+    if system not in systems.SYSTEMS:
+        raise InputError(f"no system '{system}'; there are {', '.join(systems.SYSTEMS)}")
+    chosen_system = systems.SYSTEMS[system]
+    if chosen_system.replay is None or chosen_system.replay_parameters is None:
+        raise InputError(f"{system} does not replay logs")
+    files, configuration = parted(paths)
+    path = configuration or chosen_system.replay_default
+    text = scenario.read_text(path) if path is not None else ""
+    source = os.fspath(configuration or "the default configuration")
+    parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
+    chosen = check_filters(system, chosen_system.replay_filters, filters)
+    progress(0.0, "reading")
+    angles = np.degrees(chosen_system.orientation(parameters))
+    formats = logs.formats_of(files, columns)
+    dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
+    _examine(dataset, findings)
+    dataset = logs.clean(dataset)
+    with refusing(dataset.name):
+        found = chosen_system.replay(dataset, parameters, chosen, part(progress, 0.1, 1.0))
+    return replace(
+        found,
+        scenario=f"{system}/{dataset.name}",
+        seed=seed,
+        last_lines=[
+            "Next:   robins allan STILL_LOG   finds the noise of your unit, if it is not set"
+        ],
+        **asked(text, settings),
+    )
+
+
+def align(
+    name: str,
+    master: str | os.PathLike[str],
+    slave: str | os.PathLike[str],
+    *,
+    filters: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    columns: Sequence[str | os.PathLike[str]] = (),
+    seed: int = 0,
+    progress: Progress = silent,
+    findings: Findings = unheard,
+) -> Outcome:
+    """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
+
+    Args:
+        name: "system/name" or the path of a TOML file: what is believed of the two units.
+        master: what the master reported, a path in any format of `robins.logs`.
+        slave: inertial samples, along the axes of the slave.
+        filters: names; by default those of the scenario.
+        settings: "path=value" texts that change the scenario.
+        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
+        seed: recorded in the result; nothing is drawn.
+        progress: called with the share done and what is being done.
+        findings: called with what the doctor says.
+
+    Raises:
+        InputError: the pair or what was asked of it cannot be used.
+        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
+    """
+    _float64.require()
+    system, label, text = find_scenario(name, recorded=True)
+    alignment = system.alignment
+    study = scenario.mapping_of(text).get("study")
+    if alignment is None or study != alignment.study:
+        every = systems.SYSTEMS.values()
+        able = [f"{s.name}, study {s.alignment.study!r}" for s in every if s.alignment]
+        raise InputError(
+            f"{label} cannot be given a recorded master and slave: it is of {system.name}, study "
+            f"{study!r}; what can is {', '.join(able) or 'nothing'}"
+        )
+    parameters: Any = scenario.parse(alignment.parameters, text, settings, source=name)
+    chosen = check_filters(label, alignment.filters, filters or parameters.filters)
+    progress(0.0, "reading")
+    formats = logs.formats_of((master, slave), columns)
+    dataset = logs.load_pair(master, slave, delay_s=parameters.master.delay, formats=formats)
+    # the doctor looks along the master's axes, the filter along those of the slave
+    turn = logs.Mounting(*np.degrees(system.orientation(parameters)))
+    _examine(replace(dataset, imu=turn.turn(to_ned_frd(dataset.imu))), findings)
+    dataset = logs.clean(dataset)
+    with refusing(dataset.name):
+        found = alignment.align(dataset, parameters, chosen, part(progress, 0.1, 1.0))
+    return replace(
+        found,
+        scenario=f"{system.name}/{dataset.name}",
+        seed=seed,
+        last_lines=[
+            f"Next:   robins run COPY   simulates such a pair; COPY is {name} with your units"
+        ],
+        **asked(text, settings),
+    )
+
+
+def _examine(dataset: Dataset, findings: Findings) -> None:
+    """Ask the doctor.
+
+    Raises:
+        InputError: there are errors; the message has all of them.
+    """
+    found = logs.examine(dataset)
+    findings(found)
+    errors = [f for f in found if f.severity == "error"]
+    if errors:
+        raise InputError("\n".join(f.sentence for f in errors))

@@ -1,0 +1,98 @@
+"""Scenarios and configurations: found by name, and what is recorded of them in a result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from robins import scenario, systems
+from robins.systems import Study, System
+from robins.systems.catalogue import configurations, listed
+from robins.workbench.errors import InputError, hint
+
+
+def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
+    """System, name and text of a packaged scenario "system/name", or of a TOML file.
+
+    A file says its system in the key ``system``.
+
+    Args:
+        name: of the scenario, or a path that ends in .toml.
+        recorded: a recorded pair takes the place of the simulation.
+
+    Raises:
+        InputError: there is no such scenario or file, the file names no system, or only a
+            recorded pair fits it.
+    """
+    known = systems.SYSTEMS
+    packaged = {f"{s}/{k}": (s, one.path) for s in known for k, one in listed(s).items()}
+    others = {f"{s}/{k}": (s, path) for s in known for k, path in configurations(s).items()}
+    if recorded:
+        packaged |= others
+    elif name in others:
+        path = others[name][1]
+        raise InputError(
+            f"{name} describes what is recorded and simulates nothing. A recorded pair is given "
+            f"with --master and --slave, another log with `robins replay LOG... {path}`. To "
+            "simulate a pair, put your units into a copy of that file and run the copy"
+        )
+    if name in packaged:
+        system, path = packaged[name]
+        return known[system], name, path.read_text("utf-8")
+    if not name.endswith(".toml"):
+        raise InputError(
+            f"no scenario '{name}'{hint(name, packaged)} `robins list` names those there are; "
+            "a path must end in .toml"
+        )
+    text = scenario.read_text(name)
+    chosen = scenario.mapping_of(text).get("system")
+    if not isinstance(chosen, str) or chosen not in known:
+        raise InputError(
+            f'{name}: write system = "..." into its first lines, one of {", ".join(known)}; '
+            f"it says {chosen!r}"
+        )
+    return known[chosen], Path(name).stem, text
+
+
+def study_of(system: System, text: str, source: str) -> Study:
+    """The study that a scenario is of.
+
+    Raises:
+        InputError: it names none of the system, which has several.
+    """
+    names = ", ".join(system.studies)
+    chosen = scenario.mapping_of(text).get("study")
+    if chosen is None and len(system.studies) == 1:
+        return next(iter(system.studies.values()))
+    if not isinstance(chosen, str) or chosen not in system.studies:
+        raise InputError(
+            f'{source}: write study = "..." into its first lines, one of {names}; it says '
+            f"{chosen!r}"
+        )
+    return system.studies[chosen]
+
+
+def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
+    """The filters wanted, each once.
+
+    Raises:
+        InputError: one of them is not among the known.
+    """
+    for name in wanted:
+        if name not in known:
+            raise InputError(
+                f"no filter '{name}' in {where}{hint(name, known)} It has {', '.join(known)}"
+            )
+    return tuple(dict.fromkeys(wanted))
+
+
+def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:
+    """Fields of an outcome: the scenario as it was run, and what ran it."""
+    effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
+    return {
+        "parameters": effective if settings else text,
+        "device": jax.devices()[0].device_kind,
+    }

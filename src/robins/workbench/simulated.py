@@ -1,0 +1,107 @@
+"""The commands `run` and `bound`: a scenario simulated, and what its sensors allow at best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from robins import _float64, scenario, units
+from robins.campaign import simulate
+from robins.campaign.bound import bound as bound_of
+from robins.report import bounds
+from robins.results import Outcome, Progress, silent
+from robins.workbench.errors import refusing
+from robins.workbench.scenarios import asked, check_filters, find_scenario, study_of
+
+
+def run(
+    name: str,
+    *,
+    runs: int | None = None,
+    seed: int = 0,
+    filters: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    progress: Progress = silent,
+) -> Outcome:
+    """Simulate a scenario with several filters on the same random numbers.
+
+    Args:
+        name: "system/name" or the path of a TOML file.
+        runs: how many; by default what the scenario says.
+        seed: of the random streams.
+        filters: names; by default those of the scenario.
+        settings: "path=value" texts that change the scenario.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+    """
+    _float64.require()
+    system, label, text = find_scenario(name)
+    study = study_of(system, text, name)
+    more = settings if runs is None else (*settings, f"runs={runs}")
+    parameters = scenario.parse(study.parameters, text, more, source=name)
+    chosen = check_filters(label, study.filters, filters or parameters.filters)
+    progress(0.0, "setting up the simulation")
+    with refusing(name):
+        problem = study.problem(parameters, chosen, seed)
+    return replace(
+        simulate(problem, parameters.runs, progress=progress),
+        scenario=label,
+        seed=seed,
+        runs=parameters.runs,
+        last_lines=[f"Next:   robins run {name} --seed {seed + 1}   repeats it with other noise"],
+        **asked(text, settings),
+    )
+
+
+def bound(
+    name: str,
+    *,
+    filter_name: str = "",
+    runs: int = 1,
+    seed: int = 0,
+    without: Sequence[str] = (),
+    at: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    progress: Progress = silent,
+) -> Outcome:
+    """Tell what the sensors of a scenario allow at best, with the model of one of its filters.
+
+    Args:
+        name: "system/name" or the path of a TOML file.
+        filter_name: whose model; by default that of the scenario's first filter.
+        runs: over how many simulated trajectories to average.
+        seed: of the random streams.
+        without: sensors to leave out altogether.
+        at: times to tell, such as "200 s"; by default the quarters.
+        settings: "path=value" texts that change the scenario.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError, robins.units.UnitError: what was asked for cannot
+            be computed.
+    """
+    _float64.require()
+    system, label, text = find_scenario(name)
+    study = study_of(system, text, name)
+    parameters = scenario.parse(study.parameters, text, (*settings, f"runs={runs}"), source=name)
+    wanted = filter_name or next(iter(parameters.filters or study.filters))
+    chosen = check_filters(label, study.filters, [wanted])
+    times = [units.parse(time, "time") for time in at]
+    progress(0.0, "linearising along the truth")
+    with refusing(name):
+        solution = bound_of(study.problem(parameters, chosen, seed), wanted, runs, without)
+        epochs = bounds.epochs(solution, times)
+    return Outcome(
+        solution,
+        {wanted: bounds.metrics(solution)},
+        files={"bound.csv": bounds.csv(solution).encode()},
+        notes=bounds.sentences(solution),
+        scenario=label,
+        seed=seed,
+        runs=runs,
+        tables=[bounds.table(solution, epochs)],
+        last_lines=[f"Next:   robins run {name}   shows how near the filters come"],
+        **asked(text, settings),
+    )
