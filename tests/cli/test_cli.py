@@ -359,3 +359,11 @@ def test_statuses_are_those_of_the_contract():
         "INTERRUPTED": 3,
     }
     assert running.main is cli.main
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_computed(robins, workbench):
+    Path("out").write_text("a thesis")
+    answer = robins("run", "car/town", "--out", "out")
+    assert answer.status == Status.BAD_INPUT
+    assert answer.err == "robins: out: is a file, not a folder; choose a new folder\n"
+    assert workbench.asked == {}
