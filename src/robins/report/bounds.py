@@ -240,7 +240,7 @@ _STYLES = {"seen": "green", "hardly seen": "yellow", "not seen": "red", "known":
 
 
 def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
-    """The rows as something rich can print, and below them what is least observable."""
+    """The rows as something rich can print; `sentences` tell what is least observable."""
     time = np.asarray(solution["time"], float)
     made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     made.add_column("sigma at best", no_wrap=True)
@@ -262,7 +262,7 @@ def table(solution: xr.Dataset, at: Sequence[int]) -> Group:
             *(_short(v) for v in (*row.without, row.unaided)),
         )
     told = f"On the right, what sigma would be at {last} without one of the sensors, and with none."
-    return Group(made, Text(), Text(told), *(Text(s) for s in sentences(solution)))
+    return Group(made, Text(), Text(told))
 
 
 def _short(value: float) -> str:

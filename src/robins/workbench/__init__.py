@@ -37,7 +37,7 @@ _WHERE = {
     "run": "simulated",
 }
 
-__all__ = list(_WHERE)
+__all__ = list(_WHERE)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

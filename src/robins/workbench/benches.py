@@ -35,7 +35,7 @@ def bench_up(
     scenario: str,
     *,
     settings: Sequence[str] = (),
-    record: str | os.PathLike[str] | None = None,
+    record: str | Path | None = None,
     live: bool = False,
     paused: bool = False,
     host: str = "127.0.0.1",
@@ -161,11 +161,11 @@ class Compared(NamedTuple):
 
 
 def bench_replay(
-    record: str | os.PathLike[str],
+    record: str | Path,
     *,
     node: str,
     filter_: str | None = None,
-    diff: str | os.PathLike[str] | None = None,
+    diff: str | Path | None = None,
     progress: Progress = silent,
 ) -> Compared:
     """Let a part hear a record again and compare what it says; or compare it in two records.
