@@ -58,9 +58,7 @@ def measure(job: str) -> dict[str, float]:
 
     simulate, (world, count) = spent(lambda: next(worlds(problem, RUNS)))
     first, _ = spent(lambda: record(problem, JOBS[job], world, count))
-    again = min(
-        spent(lambda: record(problem, JOBS[job], world, count))[0] for _ in range(REPEATS)
-    )
+    again = min(spent(lambda: record(problem, JOBS[job], world, count))[0] for _ in range(REPEATS))
     return {"world": simulate, "compile": first - again, "run": again}
 
 

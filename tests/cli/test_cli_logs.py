@@ -372,9 +372,7 @@ def test_declared_columns_are_read_by_the_commands_and_refused_with_their_key(ro
     declared.write_text(LOGGER)
     table = a_still_imu(20.0)
     logs.write_log(log, table, logs.columns_from(declared))
-    np.testing.assert_allclose(
-        still.still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12
-    )
+    np.testing.assert_allclose(still.still(log, [declared]).rates["gyro"], table.gyro, rtol=1e-12)
     answer = robins("doctor", log, "--columns", declared)
     assert answer.status == Status.DONE, answer.err
     assert f"robins replay {log} --columns {declared}" in answer.out
