@@ -1,4 +1,4 @@
-"""The tables of the doctor's findings and of what `clean` refuses, from `robins.logs.checks`."""
+"""Tables of the doctor's findings and of what `clean` refuses, out of `robins.logs.checks`."""
 
 from pathlib import Path
 
