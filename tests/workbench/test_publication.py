@@ -85,9 +85,9 @@ def test_numbers_that_cannot_be_written_are_kept(tmp_path, monkeypatch, where):
         workbench.publish(an_outcome(seed=2), tmp_path / "out")
     (kept,) = tmp_path.glob("out-not-written-*")
     assert str(kept / "arrays.npz") in str(told.value)
-    arrays = np.load(kept / "arrays.npz")
-    np.testing.assert_array_equal(arrays["solution.outage"], [0, 1, 0])
-    assert arrays["metrics.kf.rms_m"] == 0.5
+    with np.load(kept / "arrays.npz") as arrays:
+        np.testing.assert_array_equal(arrays["solution.outage"], [0, 1, 0])
+        assert arrays["metrics.kf.rms_m"] == 0.5
     assert results.read(tmp_path / "out").summary["seed"] == 1
 
 
