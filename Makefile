@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt --edita
 READY := $(VENV)/.ready
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test lint docs bench clean
+.PHONY: install demo lint docs check test certify costs bench clean
 
 install: $(STAMP)
 
@@ -34,8 +34,23 @@ lint: install
 docs: install
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
+# Of the tests three tiers, by cost; tests/tiers.py says which is in which.
+PYTEST = $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+
+check: lint
+	$(PYTEST) -m fast
+
 test: lint docs
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(PYTEST)
+
+certify: install
+	$(PYTEST) -m "certify or hypothesis" --hypothesis-profile=thousand
+
+# What each test costs, from an empty cache: 40 minutes.
+costs: install
+	rm -rf .pytest_cache/jax .pytest_cache/costs
+	$(PYTEST) -m "" --costs .pytest_cache/costs
+	$(BIN)/python tests/tiers.py .pytest_cache/costs
 
 bench: install
 	$(BIN)/python benchmarks/run.py

@@ -1,8 +1,12 @@
 """What the command promises: statuses, streams, errors in a line, nothing left behind."""
 
+import importlib.machinery
+import importlib.metadata
+import importlib.util
 import json
 import os
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -334,6 +338,40 @@ def test_compiled_filters_are_kept_where_the_user_keeps_caches(monkeypatch, tmp_
     cache.enable()
     assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) != folder
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+
+
+@pytest.mark.parametrize(
+    ("user", "jaxlib", "plugins", "platform", "chosen"),
+    [
+        (None, "0.10.2", False, None, True),
+        ("", "0.10.2", False, None, False),
+        (None, "0.11.0", False, None, False),
+        (None, "0.10.2", True, None, False),
+        (None, "0.10.2", True, "cpu", True),
+    ],
+    ids=["bare", "told by the user", "never tried", "a GPU", "a GPU unused"],
+)
+def test_the_compiler_is_set_up_where_that_is_known_to_pay(
+    monkeypatch, user, jaxlib, plugins, platform, chosen
+):
+    monkeypatch.delitem(sys.modules, "jax")
+    for name, value in (("XLA_FLAGS", user), ("JAX_PLATFORMS", platform)):
+        monkeypatch.setenv(name, "put back afterwards")
+        monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
+    monkeypatch.setattr(importlib.metadata, "version", {"jaxlib": jaxlib}.get)
+    found = importlib.machinery.ModuleSpec("jax_plugins", None) if plugins else None
+    monkeypatch.setattr(importlib.util, "find_spec", {"jax_plugins": found}.get)
+    cache.enable()
+    assert os.environ.get("XLA_FLAGS") == (cache._XLA_FLAGS if chosen else user)
+
+
+def test_the_compiler_knows_its_settings():
+    """It ends the process otherwise."""
+    code = "from robins.cli import cache; cache.enable(); import os, jax.numpy as n; n.ones(1) + 1"
+    bare = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    told = [sys.executable, "-c", f"{code}; print(os.environ['XLA_FLAGS'])"]
+    done = subprocess.run(told, env=bare, capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout == f"{cache._XLA_FLAGS}\n"
 
 
 @pytest.mark.parametrize("why", ["told by the user", "jax is there", "no home"])

@@ -78,9 +78,9 @@ def imm(
             one. When a run begins: a mode brings a sensor that the model does not have.
     """
     all_ = bank(modes)
-    if not all_.count:
+    if not all_.size:
         raise ValueError("imm needs at least one mode")
-    count = all_.count
+    count = all_.size
     even = np.full(count, 1.0 / count)
     first = _probabilities("start", even if start is None else start, (count,))
     with np.errstate(divide="ignore"):

@@ -60,7 +60,7 @@ class Bank(NamedTuple):
     """The modes as one: states are kept as the layout likes, beliefs have a leading axis of modes.
 
     Attributes:
-        count: of the modes.
+        size: number of modes.
         init: ``(belief, dims) -> states``.
         beliefs: ``states -> Belief``.
         restart: ``(states, beliefs, alone) -> states``: each goes on from its belief, unless it is
@@ -71,7 +71,7 @@ class Bank(NamedTuple):
         audit: as of `Filter`, of the states; None where no mode has anything to report.
     """
 
-    count: int
+    size: int
     init: Callable[[Belief, Mapping[str, int]], Any]
     beliefs: Callable[[Any], Belief]
     restart: Callable[[Any, Belief, Array], Any]

@@ -20,6 +20,7 @@ from collections.abc import Hashable, Iterable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
@@ -32,7 +33,7 @@ _MOST = 512  # remembered; the least recently used are forgotten
 _HOUSE = __name__.partition(".")[0] + "."
 _first: OrderedDict[Hashable, Any] = OrderedDict()
 _PLAIN = (str, bytes, bool, int, type(None), enum.Enum, type)
-_Compiled = type(jax.jit(lambda: None))
+_COMPILED: type = type(jax.jit(lambda: None))
 
 
 class _Traced(Exception):
@@ -103,16 +104,19 @@ def _content(x: Any, met: dict[int, tuple[int, Any]]) -> Hashable:
     if isinstance(x, float):
         return float, x.hex()  # neither is 0.0 the same as -0.0, nor is nan another
     if isinstance(x, (np.ndarray, np.generic, jax.Array)):
-        key = jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
-        data = np.asarray(jax.random.key_data(x) if key else x)
-        weak = getattr(x, "weak_type", False)
-        digest = hashlib.sha256(data.tobytes()).digest()
-        return type(x), str(x.dtype), x.shape, weak, digest
+        return type(x), *_array(x)
     if id(x) in met:
         return "met", met[id(x)][0]
     met[id(x)] = len(met), x
     parts = _parts(x)
     return _Itself(x) if parts is None else (type(x), *(_content(part, met) for part in parts))
+
+
+def _array(x: Any) -> tuple[Hashable, ...]:
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    data = np.asarray(jax.random.key_data(x) if is_key else x)
+    weak = getattr(x, "weak_type", False)
+    return str(x.dtype), x.shape, weak, hashlib.sha256(data.tobytes()).digest()
 
 
 def _parts(x: Any) -> Iterable[Any] | None:
@@ -127,8 +131,8 @@ def _parts(x: Any) -> Iterable[Any] | None:
         x = inspect.unwrap(x)  # annotations are checked where tests run, by a wrapper each
         held = [cell.cell_contents for cell in x.__closure__ or ()]
         return x.__code__, x.__defaults__, x.__kwdefaults__, held  # code is shared, so itself
-    if isinstance(x, _Compiled) and _is_made(x.__wrapped__):
-        return (x.__wrapped__,)
+    if isinstance(x, _COMPILED) and _is_made(inspect.unwrap(x)):
+        return (inspect.unwrap(x),)
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         return [getattr(x, f.name) for f in dataclasses.fields(x)]
     return None
