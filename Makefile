@@ -49,7 +49,7 @@ certify: install
 # What each test costs, from an empty cache: 40 minutes.
 costs: install
 	rm -rf .pytest_cache/jax .pytest_cache/costs
-	$(PYTEST) -m "" --costs .pytest_cache/costs
+	TEST_COSTS=.pytest_cache/costs $(PYTEST) -m ""
 	$(BIN)/python tests/tiers.py .pytest_cache/costs
 
 bench: install

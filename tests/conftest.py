@@ -92,13 +92,9 @@ def pytest_runtest_teardown(item):
         ctypes.CDLL(None).malloc_trim(0)  # else what was freed stays with the process
 
 
-def pytest_addoption(parser):
-    parser.addoption("--costs", metavar="FOLDER", help="write what each test cost into a folder")
-
-
 def pytest_configure(config):
-    if config.getoption("--costs"):
-        config.pluginmanager.register(tiers.Meter(config.getoption("--costs")))
+    if folder := os.environ.get("TEST_COSTS"):
+        config.pluginmanager.register(tiers.Meter(folder))
 
 
 def pytest_collection_modifyitems(items):
