@@ -95,6 +95,8 @@ def pytest_runtest_teardown(item):
 def pytest_configure(config):
     if folder := os.environ.get("TEST_COSTS"):
         config.pluginmanager.register(tiers.Meter(folder))
+    if (page := os.environ.get("CERTIFICATE")) and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(tiers.Certificate(page))
 
 
 def pytest_collection_modifyitems(items):

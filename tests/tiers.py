@@ -12,8 +12,10 @@ for at every push, which promise it guards, and which tests of `make test` stand
 import json
 import os
 import re
+import subprocess
 import time
 import tomllib
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,11 @@ def certified() -> list[dict[str, str]]:
     return tomllib.loads(CERTIFY.read_text("utf-8"))["moved"]
 
 
+def costs() -> dict[str, float]:
+    """Seconds of processor of costly tests, without their parameters."""
+    return json.loads(COSTS.read_text("utf-8"))
+
+
 def meant(entry: dict[str, str], node: str) -> bool:
     """Whether an entry means a test: its name, alone or with parameters that match ``only``."""
     name, _, parameters = node.partition("[")
@@ -42,7 +49,7 @@ def meant(entry: dict[str, str], node: str) -> bool:
 
 def mark(items: list[pytest.Item]) -> None:
     """Give each test its tier."""
-    costly, moved = set(json.loads(COSTS.read_text("utf-8"))), certified()
+    costly, moved = costs(), certified()
     for item in items:
         node = item.nodeid.removeprefix("tests/")
         if any(meant(entry, node) for entry in moved):
@@ -78,6 +85,26 @@ def _processor() -> float:
 def _mib() -> int:
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[1]) * 4096 >> 20 if statm.exists() else 0
+
+
+class Certificate:
+    """Writes what came of `make certify` where the documents tell it."""
+
+    def __init__(self, page: str):
+        self.page, self.begun = Path(page), time.monotonic()
+
+    def pytest_terminal_summary(self, terminalreporter):
+        """The commit, how many tests passed and failed, and how long they took."""
+        ask = ["git", "describe", "--always", "--dirty", "--abbrev=7"]
+        commit = subprocess.run(ask, capture_output=True, text=True, cwd=HERE, check=True).stdout
+        counts = {k: len(terminalreporter.stats.get(k, ())) for k in ("passed", "failed", "error")}
+        told = ", ".join(f"{n} {k}" for k, n in counts.items())
+        minutes = (time.monotonic() - self.begun) / 60.0
+        self.page.write_text(
+            f"Commit `{commit.strip()}`, {date.today()}: {told}, in {minutes:.0f} minutes on "
+            f"{os.cpu_count()} cores.\n",
+            "utf-8",
+        )
 
 
 def write_costs(folder: str) -> None:
