@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt --edita
 READY := $(VENV)/.ready
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo lint docs check test certify costs bench clean
+.PHONY: install demo lint docs check test certify costs bench watch profile clean
 
 install: $(STAMP)
 
@@ -55,5 +55,19 @@ costs: install
 bench: install
 	$(BIN)/python benchmarks/run.py
 
+# At every save the fast tests that run what was changed; the first round runs them all.
+watch: install
+	@mkdir -p .pytest_cache
+	TESTMON_DATAFILE=.pytest_cache/testmon $(BIN)/watchfiles --filter python \
+		'$(BIN)/python -m pytest -q -m fast --testmon-forceselect' src tests
+
+# Where a command of robins spends its time: make profile CMD="run satellite/s1 --runs 2"
+profile: PAGE := profiles/$(shell date +%Y-%m-%d-%H%M%S).html
+profile: install
+	$(if $(CMD),,$(error Say what to profile: make profile CMD="run satellite/s1 --runs 2"))
+	@mkdir -p profiles
+	$(BIN)/pyinstrument --renderer html --outfile $(PAGE) $(BIN)/robins $(CMD)
+	@echo 'Wrote $(PAGE): open it in a browser.'
+
 clean:
-	rm -rf $(VENV) docs/_build docs/_generated .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) docs/_build docs/_generated .pytest_cache .ruff_cache .hypothesis profiles
