@@ -223,7 +223,7 @@ def test_planted_linear_algebra_is_found(code):
 
 def own_files() -> list[Path]:
     """Text of the project, whether or not it lies in a git clone."""
-    folders = ("src", "tests", "docs", "benchmarks", ".ci")
+    folders = ("src", "tests", "docs", "benchmarks", "changelog.d", ".ci", ".github")
     built = {"__pycache__", "_build", "_generated"}
     files = [p for p in ROOT.iterdir() if p.is_file()]
     for folder in folders:
@@ -327,9 +327,35 @@ def test_an_undocumented_name_is_found():
     assert undocumented(package) == ["package.Bare"]
 
 
-def test_the_changelog_begins_with_this_version():
-    headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+def test_one_version_everywhere():
+    """The tag gives it; the fallback stands for the tag in a clone that has none."""
+    version = tomllib.loads(text_of(ROOT / "pyproject.toml"))["tool"]["hatch"]["version"]
+    cited = re.findall(r"^version: (\S+)$", text_of(ROOT / "CITATION.cff"), re.MULTILINE)
+    headings = re.findall(r"^## (\S+)", text_of(ROOT / "CHANGELOG.md"), re.MULTILINE)
     assert headings[0] == robins.__version__
+    assert headings[0] == version["fallback-version"]
+    assert [headings[0]] == cited
+
+
+def test_a_source_that_was_never_installed_has_a_version():
+    code = f"import sys; sys.path.insert(0, {str(SOURCE.parent)!r}); import robins"
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", f"{code}; print(robins.__version__)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "0+unknown\n"
+
+
+def test_every_make_command_that_is_named_exists():
+    workflows = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *workflows]
+    targets = set(re.findall(r"^([a-z]+):", text_of(ROOT / "Makefile"), re.MULTILINE))
+    commands = r"(?:^|`|- run: )make ([a-z]+)"
+    named = {n for page in pages for n in re.findall(commands, text_of(page), re.MULTILINE)}
+    assert {"check", "docs", "install", "watch"} <= named
+    assert named <= targets
 
 
 def test_types_are_shipped():

@@ -15,8 +15,12 @@ Conventions, everywhere unless a name says otherwise:
 """
 
 import os
+from importlib.metadata import PackageNotFoundError, version
 
-__version__ = "0.1.0"
+try:
+    __version__ = version("robins")
+except PackageNotFoundError:  # run from its source, never installed
+    __version__ = "0+unknown"
 
 # Two batched QR factorisations at once, each waiting for the others' threads to do its share, stop
 # jaxlib 0.10 for ever; with one worker each does its own. Read when JAX makes its first array.
