@@ -22,6 +22,8 @@ from collections.abc import Iterable
 from numbers import Real
 from typing import NamedTuple
 
+from robins.errors import RobinsError
+
 _DEG = math.pi / 180.0
 _ARCMIN = _DEG / 60.0
 _ARCSEC = _DEG / 3600.0
@@ -178,7 +180,7 @@ KINDS: dict[str, tuple[str, ...]] = {kind: tuple(scales) for kind, scales in _TA
 """The units of every kind, that of the SI first."""
 
 
-class UnitError(ValueError):
+class UnitError(RobinsError, ValueError):
     """A quantity that cannot be read: unknown unit, unit of another kind, no unit, no number."""
 
 

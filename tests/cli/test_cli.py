@@ -16,6 +16,7 @@ import pytest
 from robins import cli, results
 from robins.cli import Status, cache, commands, running
 from robins.logs import Finding, LogError
+from robins.results.errors import cannot
 from robins.scenario import ScenarioError
 from robins.units import UnitError
 
@@ -133,9 +134,7 @@ def refused_result():
 
 
 def full_disk():
-    error = results.ResultError("out", "cannot write", "free some space")
-    error.__cause__ = OSError(28, "No space left on device")
-    return error
+    return cannot("out", "write", OSError(28, "No space left on device"))
 
 
 @pytest.mark.parametrize(
@@ -146,7 +145,7 @@ def full_disk():
         (UnitError("deg is an angle"), 2, ["deg is an angle"]),
         (LogError("imu.csv", "is empty", "give another"), 2, ["imu.csv: is empty; give another"]),
         (refused_result(), 2, ["out: is a file, not a folder; choose a new folder"]),
-        (full_disk(), 1, ["out: cannot write; free some space"]),
+        (full_disk(), 1, ["out: cannot write: No space left on device; free some space"]),
         (MemoryError(), 1, ["out of memory; ask for fewer runs or filters at a time."]),
         (OSError(13, "Permission denied", "x"), 1, ["failed: PermissionError: [Errno 13] "]),
         (ValueError("shapes\nand more"), 1, ["failed: ValueError: shapes", "this may be a fault"]),

@@ -172,7 +172,7 @@ def test_status_where_none_runs(robins):
         ([SATELLITE, "--node", "gyro"], r"'--node': 'gyro' is not PART=PORT, such as gyro=/dev/"),
         ([SATELLITE, "--node", "=/dev/x"], r"'--node': '=/dev/x' is not PART=PORT"),
         ([SATELLITE, "--node", "gyro=/dev/none-such"], r"'/dev/none-such'.*no such path"),
-        ([SATELLITE, "--paused"], r"--paused waits for the page's Start: give --live too"),
+        ([SATELLITE, "--paused"], r"--paused waits for the page's Start; give --live too"),
         ([SATELLITE, "--rate", "100"], r'rate: .*lock-step has none; choose the clock "realtime"'),
         ([SATELLITE, "--filter", "mekff"], r"no filter 'mekff' .*did you mean 'mekf"),
         ([SATELLITE, "--seconds", "1e6"], r"seconds: 1e\+06 s .*to the end .* \(1500 s\)"),

@@ -24,7 +24,7 @@ def test_one_half_of_a_pair_is_refused(robins, workbench, given):
     answer = robins("run", "car/town", *given)
     assert answer.status == 2
     assert answer.err == (
-        "robins: --master and --slave belong together: give both files, or neither.\n"
+        "robins: --master and --slave belong together; give both files, or neither.\n"
     )
     assert not workbench.asked
 

@@ -229,7 +229,7 @@ def test_a_cell_that_is_no_number_is_named(tmp_path, row):
         path.write_text("\n".join([*lines[:-4], wrong, *lines[-3:]]) + "\n")
         with pytest.raises(LogError) as caught:
             open_log(path, row.name, [])
-        assert caught.value.where == f"line {len(lines) - 3}"
+        assert caught.value.where == f"{path} line {len(lines) - 3}"
         assert caught.value.field == (names[k] if names else row.columns[k].name)
         assert caught.value.value == f"{cell}x"
 
@@ -361,7 +361,7 @@ def test_a_column_that_lacks_or_is_there_twice_is_named(tmp_path, row):
             path.write_text(sheet.text([*sheet.names[:at], "other", *sheet.names[at + 1 :]]))
             with pytest.raises(LogError, match="the header lacks ") as caught:
                 open_log(path, row.name, [])
-            assert name in caught.value.cause.split("; it has ")[0]
+            assert name in caught.value.what.split("; it has ")[0]
             path.write_text(sheet.text([*sheet.names, name]))
             with pytest.raises(LogError, match="are the same thing; keep one"):
                 open_log(path, row.name, [])

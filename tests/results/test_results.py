@@ -212,7 +212,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         with pytest.raises(ResultError, match=reason) as caught:
             read(tmp_path / name)
         assert caught.value.path == tmp_path / name
-        assert caught.value.mend in str(caught.value)
+        assert caught.value.fix in str(caught.value)
 
 
 def rewrite_manifest(path, **changes):

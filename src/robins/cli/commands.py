@@ -12,7 +12,7 @@ from click import option
 from robins import __version__
 from robins.cli.bench import bench
 from robins.cli.doctor import judge
-from robins.cli.frame import BadInput, Status
+from robins.cli.frame import Status
 from robins.cli.listing import listing
 from robins.cli.options import (
     COLUMNS,
@@ -27,6 +27,7 @@ from robins.cli.options import (
     publishes,
 )
 from robins.cli.tell import carry_out
+from robins.workbench import InputError
 
 DEMO = "ins-gnss/drive"
 
@@ -77,7 +78,7 @@ def warn(findings: Sequence[Any]) -> None:
 def one_run(runs: int | None, what: str) -> None:
     """Refuse more runs than one of what was recorded."""
     if runs not in (None, 1):
-        raise BadInput(f"--runs {runs}: a recorded {what} is one run; omit the option.")
+        raise InputError(f"a recorded {what} is one run", f"--runs {runs}", "omit the option.")
 
 
 _RUNS = option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs. [default: as given]")
@@ -132,11 +133,13 @@ def run(
     """
     if master is None and slave is None:
         if columns:
-            raise BadInput(f"--columns {columns[0]}: goes with --master and --slave, with logs.")
+            raise InputError(
+                "goes with --master and --slave, with logs.", f"--columns {columns[0]}"
+            )
         carry_out("run", scenario, out=out or RESULTS / folder_name(scenario), **options)
         return
     if master is None or slave is None:
-        raise BadInput("--master and --slave belong together: give both files, or neither.")
+        raise InputError("--master and --slave belong together", fix="give both files, or neither.")
     one_run(options.pop("runs"), "pair")
     out = out or RESULTS / slave.name.split(".")[0]
     options |= {"columns": columns, "findings": warn}
@@ -165,7 +168,9 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
     see, what each sensor buys, and which directions are least observable.
     """
     if len(filters) > 1:
-        raise BadInput(f"--filters {','.join(filters)}: a bound is that of one model; name one.")
+        raise InputError(
+            "a bound is that of one model", f"--filters {','.join(filters)}", "name one."
+        )
     out = out or RESULTS / f"bound-{folder_name(scenario)}"
     carry_out("bound", scenario, filter_name="".join(filters), out=out, **options)
 

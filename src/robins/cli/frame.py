@@ -20,12 +20,6 @@ class Status(enum.IntEnum):
     INTERRUPTED = 3  # the same command, run again, goes on or starts anew
 
 
-class BadInput(click.ClickException):
-    """Something the user gave cannot be used; the message says what, where and the mend."""
-
-    exit_code = Status.BAD_INPUT
-
-
 @contextlib.contextmanager
 def only_json(wanted: bool) -> Iterator[None]:
     """While a command works, turn what anything prints to standard error if JSON is wanted."""

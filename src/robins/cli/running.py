@@ -16,6 +16,7 @@ import click
 from robins.cli import interrupts
 from robins.cli.commands import app
 from robins.cli.frame import Status
+from robins.errors import RobinsError
 
 _OF_THE_BENCH = ("serial", "cobs", "fastcrc", "mcap")  # packages of an extra
 
@@ -138,9 +139,9 @@ def _told(error: Exception) -> Status:
     if isinstance(error, click.ClickException):
         _tell(error.format_message())
         return Status(error.exit_code)
-    if _is_refusal(error):
+    if isinstance(error, RobinsError):
         _tell(str(error))
-        return Status.BAD_INPUT
+        return Status.BAD_INPUT if error.bad_input else Status.FAILED
     if isinstance(error, ModuleNotFoundError) and error.name in _OF_THE_BENCH:
         _tell(
             f"the bench needs the extra 'bench': pip install 'robins[bench]' ({error.name} is "
@@ -150,30 +151,10 @@ def _told(error: Exception) -> Status:
     if isinstance(error, MemoryError):
         _tell("out of memory; ask for fewer runs or filters at a time.")
         return Status.FAILED
-    if _is_ours(error):
-        _tell(str(error))
-        return Status.FAILED
     first = (str(error).strip().splitlines() or [""])[0]
     _tell(f"failed: {type(error).__name__}: {first}")
     _tell("this may be a fault of robins; run it again with --debug to see where.")
     return Status.FAILED
-
-
-def _is_ours(error: Exception) -> bool:
-    return type(error).__module__.split(".")[0] == "robins"
-
-
-def _is_refusal(error: Exception) -> bool:
-    """Whether robins refused what it was given, rather than failed to do it.
-
-    Its rooms say so by errors of their own, all of them ValueErrors. A bare ValueError may come
-    from anywhere below and tells of a fault. A result folder is refused, unless the disk did it.
-    """
-    if not _is_ours(error):
-        return False
-    if isinstance(error, ValueError):
-        return True
-    return type(error).__name__ == "ResultError" and not isinstance(error.__cause__, OSError)
 
 
 def _tell(text: str) -> None:

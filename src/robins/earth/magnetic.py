@@ -30,6 +30,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import dcm_en, ecef_from_geodetic
+from robins.errors import RobinsError
 
 RADIUS_M = 6371200.0  # a, the reference radius of WMM and IGRF
 LIFE_YEARS = 5.0
@@ -37,7 +38,7 @@ LOWEST_M, HIGHEST_M = -1e3, 850e3  # where a model claims to hold
 _NT = 1e-9
 
 
-class MagneticModelError(ValueError):
+class MagneticModelError(RobinsError, ValueError):
     """A model that cannot be read, or a date or place outside what a model covers."""
 
 
@@ -101,8 +102,9 @@ def wmm_for(decimal_year: float) -> MagneticModel:
         if model.life[0] <= decimal_year <= model.life[1]:
             return model
     raise MagneticModelError(
-        f"decimal_year {decimal_year:g}: the World Magnetic Models here hold from 2020 to 2030; "
-        "read the coefficient file of another with read_cof"
+        "the World Magnetic Models here hold from 2020 to 2030",
+        f"decimal_year {decimal_year:g}",
+        "read the coefficient file of another with read_cof",
     )
 
 
@@ -137,8 +139,9 @@ def read_cof(path: str | Path) -> MagneticModel:
         epoch, name = float(head[0]), head[1]
     except (IndexError, ValueError):
         raise MagneticModelError(
-            f"{path}, line 1: a coefficient file begins with epoch and name, as in '2025.0 "
-            f"WMM-2025 11/13/2024', got {lines[0][:60] if lines else ''!r}"
+            "a coefficient file begins with epoch and name, as in '2025.0 WMM-2025 11/13/2024', "
+            f"got {lines[0][:60] if lines else ''!r}",
+            f"{path}, line 1",
         ) from None
     rows = {}
     for number, line in enumerate(lines[1:], start=2):
@@ -150,16 +153,17 @@ def read_cof(path: str | Path) -> MagneticModel:
             n, m, values = 0, 0, []
         if not (0 <= m <= n and n >= 1 and np.all(np.isfinite(values))):
             raise MagneticModelError(
-                f"{path}, line {number}: expected degree, order and four coefficients [nT], "
-                f"got {line[:60]!r}"
+                f"expected degree, order and four coefficients [nT], got {line[:60]!r}",
+                f"{path}, line {number}",
             )
         rows[int(n), int(m)] = values
     degree = max((n for n, _ in rows), default=0)
     missing = [(n, m) for n in range(1, degree + 1) for m in range(n + 1) if (n, m) not in rows]
     if missing or not degree:
         raise MagneticModelError(
-            f"{path}: the coefficients of (degree, order) {missing[:3] or (1, 0)} are missing; "
-            "the file is not whole"
+            f"the coefficients of (degree, order) {missing[:3] or (1, 0)} are missing; the file is "
+            "not whole",
+            path,
         )
     table = np.zeros((4, degree + 1, degree + 1))
     for place, values in rows.items():

@@ -28,6 +28,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
+from robins.errors import RobinsError
+
 FEWEST = 50  # samples
 MOST = 20_000  # that are looked at, spread evenly over the log; neighbours tell hardly more
 _ENDS = (0.2, 99.8)  # per cent between which the samples' extent is taken, against single spikes
@@ -47,8 +49,8 @@ _NO_ELLIPSOID = (
 _PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # the six numbers of a symmetric matrix
 
 
-class CalibrationError(ValueError):
-    """Samples from which no calibration follows; the message says why and what to do."""
+class CalibrationError(RobinsError, ValueError):
+    """Samples from which no calibration follows."""
 
 
 class Calibration(NamedTuple):
@@ -143,8 +145,8 @@ def _refuse_flat(z: np.ndarray) -> None:
     if extent[2] < _FLAT * extent[0]:
         raise CalibrationError(
             f"the samples lie in a plane (their extent across it is {extent[2] / extent[0]:.2g} of "
-            "that along it): the sensor was turned about one axis only; turn it about two more, so "
-            "that each of its axes points up and down once"
+            "that along it): the sensor was turned about one axis only",
+            fix="turn it about two more, so that each of its axes points up and down once",
         )
 
 
@@ -313,8 +315,8 @@ def _refuse_uncertain(sigma: np.ndarray, field_t: float) -> None:
     if not worst < _VAGUE:
         raise CalibrationError(
             f"the samples do not tell the ellipsoid (one sigma is {worst:.0%} of the field): too "
-            "few directions, or a field that changed meanwhile; turn the sensor away from iron, so "
-            "that each of its axes points up and down once"
+            "few directions, or a field that changed meanwhile",
+            fix="turn the sensor away from iron, so that each of its axes points up and down once",
         )
 
 

@@ -9,6 +9,8 @@ import warnings
 from dataclasses import dataclass
 from typing import Literal
 
+from robins.errors import RobinsError
+
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
@@ -32,36 +34,28 @@ class Finding:
         return f"{self.severity}: {self.sentence}"
 
 
-class LogError(ValueError):
-    """A log was refused.
+class LogError(RobinsError, ValueError):
+    """A log was refused; `where` names the file, and line or time if not all of it is meant.
 
     Attributes:
         file: the file, or what stood in its place.
-        where: line or time; empty when the whole file is meant.
         field: name of the column; empty when the whole line is meant.
         value: the offending text or number.
-        cause: what is wrong.
-        mend: what to do about it.
     """
 
     def __init__(
         self,
         file: str,
-        cause: str,
-        mend: str,
+        what: str,
+        fix: str,
         *,
         where: str = "",
         field: str = "",
         value: object = "",
     ):
-        super().__init__(file, where, field, value, cause, mend)
-        self.file, self.where, self.field = file, where, field
-        self.value, self.cause, self.mend = value, cause, mend
-
-    def __str__(self) -> str:
-        at = f"{self.file} {self.where}".strip()
-        what = self.field if self.value == "" else f"{self.field} = {self.value!r}"
-        return f"{': '.join(part for part in (at, what, self.cause) if part)}; {self.mend}"
+        cell = field if value == "" else f"{field} = {value!r}"
+        super().__init__(f"{cell}: {what}" if cell else what, f"{file} {where}".strip(), fix)
+        self.file, self.field, self.value = file, field, value
 
 
 class LogWarning(UserWarning):

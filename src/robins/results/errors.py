@@ -6,7 +6,9 @@ import errno
 import os
 from pathlib import Path
 
-_MENDS = {
+from robins.errors import RobinsError
+
+_FIXES = {
     errno.ENOSPC: "free some space or write elsewhere",
     errno.EDQUOT: "free some of your quota or write elsewhere",
     errno.EFBIG: "raise the file size limit (`ulimit -f`) or write elsewhere",
@@ -19,26 +21,23 @@ _MENDS = {
 }
 
 
-class ResultError(Exception):
-    """A result folder was refused, or could not be written.
+class ResultError(RobinsError):
+    """A result folder was refused, or could not be read or written.
 
     Attributes:
         path: the folder.
-        reason: what is wrong.
-        mend: what to do about it.
     """
 
-    def __init__(self, path: str | os.PathLike[str], reason: str, mend: str):
-        super().__init__(path, reason, mend)
-        self.path, self.reason, self.mend = Path(path), reason, mend
-
-    def __str__(self) -> str:
-        return f"{self.path}: {self.reason}; {self.mend}"
+    def __init__(self, path: str | os.PathLike[str], what: str, fix: str):
+        self.path = Path(path)
+        super().__init__(what, self.path, fix)
 
 
 def cannot(path: str | os.PathLike[str], doing: str, error: Exception) -> ResultError:
     """The `ResultError` for a failure of the file system or of a library that writes files."""
     code = error.errno if isinstance(error, OSError) else None
     why = (error.strerror if isinstance(error, OSError) else None) or str(error)
-    mend = _MENDS.get(code, "check the disk and the permissions") if code else "check the disk"
-    return ResultError(path, f"cannot {doing}: {why or type(error).__name__}", mend)
+    fix = _FIXES.get(code, "check the disk and the permissions") if code else "check the disk"
+    made = ResultError(path, f"cannot {doing}: {why or type(error).__name__}", fix)
+    made.bad_input = not isinstance(error, OSError)
+    return made

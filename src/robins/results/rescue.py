@@ -11,14 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from robins.errors import RobinsError
 from robins.results import folder
 
 ARRAYS = "arrays.npz"
 _KEPT = "computed"  # the attribute of an error that takes numbers along
 
 
-class NotWritten(RuntimeError):
+class NotWritten(RobinsError, RuntimeError):
     """A result was computed and could not be written; the message tells where its numbers are."""
+
+    bad_input = False
 
 
 @contextmanager

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from robins.errors import RobinsError
 
-class ScenarioError(ValueError):
+
+class ScenarioError(RobinsError, ValueError):
     """A scenario that cannot be used; `faults` has one line for each thing that is wrong."""
 
     def __init__(self, faults: Iterable[str]):

@@ -65,7 +65,7 @@ def bench_up(
         robins.bench.ports.port.PortError: a port cannot be opened.
     """
     if paused and not live:
-        raise InputError("--paused waits for the page's Start: give --live too.")
+        raise InputError("--paused waits for the page's Start", fix="give --live too.")
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
     with _onlooker(flight, live, host, port, opened) as watch:
@@ -116,7 +116,9 @@ def _onlooker(
             except ImportError as error:
                 raise InputError(str(error)) from error
             except OSError as error:
-                raise InputError(f"--host {host} --port {port}: {error}; try --port 0") from error
+                raise InputError(
+                    str(error), f"--host {host} --port {port}", "try --port 0"
+                ) from error
             stack.callback(page.close)
             opened(page.url)
         yield Looking(page, status)
@@ -182,9 +184,9 @@ def bench_replay(
         ValueError: a file is not a record.
     """
     if filter_ and diff:
-        raise InputError("--filter and --diff: the one runs a filter, the other compares records")
+        raise InputError("the one runs a filter, the other compares records", "--filter and --diff")
     if node not in NODES:
-        raise InputError(f"--node: there is no part '{node}', only {', '.join(NODES)}")
+        raise InputError(f"there is no part '{node}', only {', '.join(NODES)}", "--node")
     first, second = read_record(record), None if diff is None else read_record(diff)
     step_ns, told = int(first.header["step_ns"]), None
     if second is None:

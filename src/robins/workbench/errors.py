@@ -6,9 +6,11 @@ import contextlib
 import difflib
 from collections.abc import Iterable, Iterator
 
+from robins.errors import RobinsError
 
-class InputError(ValueError):
-    """Something the user gave cannot be used; the message names it, says why and what to do."""
+
+class InputError(RobinsError, ValueError):
+    """Something a command was given cannot be used."""
 
 
 @contextlib.contextmanager
@@ -21,7 +23,7 @@ def refusing(what: object) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise InputError(f"{what}: {error}") from error
+        raise InputError(str(error), what) from error
 
 
 def hint(word: str, among: Iterable[str]) -> str:

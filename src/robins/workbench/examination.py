@@ -94,9 +94,9 @@ def parted(paths: Sequence[str | os.PathLike[str]]) -> tuple[list[Path], Path | 
     configurations = [path for path in given if path.suffix == ".toml"]
     if not files:
         raise InputError(
-            f"{given[0]}: is a configuration; give the files of the log beside it."
-            if given
-            else "no file is given; give those of a log"
+            "is a configuration" if given else "no file is given",
+            given[0] if given else "",
+            "give the files of the log beside it." if given else "give those of a log",
         )
     if len(configurations) > 1:
         raise InputError(f"one configuration is wanted, got {', '.join(map(str, configurations))}")
@@ -117,6 +117,6 @@ def mounting_of(configuration: Path | None) -> logs.Mounting | None:
     system = systems.SYSTEMS.get(name)
     if system is None or system.replay_parameters is None:
         known = ", ".join(systems.SYSTEMS)
-        raise InputError(f'{configuration}: write system = "..." into it, one of {known}.')
+        raise InputError(f'write system = "..." into it, one of {known}.', configuration)
     parameters = scenario.parse(system.replay_parameters, text, (), source=str(configuration))
     return logs.Mounting(*np.degrees(system.orientation(parameters)).tolist())

@@ -174,7 +174,7 @@ def gammas_of(text: str | None) -> list[float] | None:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise InputError(f'--gamma {text!r}: give numbers, such as "1, 0.8".') from error
+        raise InputError('give numbers, such as "1, 0.8".', f"--gamma {text!r}") from error
 
 
 def design(

@@ -63,7 +63,7 @@ def samples(
     names = ", ".join(map(str, log))
     if len(tables) != 1:
         held = "hold magnetic field more than once" if tables else "holds no magnetic field"
-        raise InputError(f"{names}: {held}; give the log of one magnetometer.")
+        raise InputError(held, names, "give the log of one magnetometer.")
     table, counts = clean_mag(tables[0])
     table = to_ned_frd(turned(table, mounting) if mounting else table)
     time_s = (table.time_ns - table.time_ns[:1]) * 1e-9
@@ -72,7 +72,7 @@ def samples(
         last = time_s[-1] if len(time_s) else 0.0
         until = f"to {end_s:g} s" if np.isfinite(end_s) else "on"
         raise InputError(
-            f"{names}: no sample from {begin_s:g} s {until}; the log ends at {last:g} s."
+            f"no sample from {begin_s:g} s {until}; the log ends at {last:g} s.", names
         )
     told = {reason: count for reason, count in counts.items() if count}
     return Turned(time_s[inside], table.field_t[inside], told, [str(f) for f in findings])

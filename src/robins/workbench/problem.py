@@ -57,18 +57,18 @@ def read_problem(given: str) -> Problem:
         except FileNotFoundError as error:
             known = ", ".join(designs())
             raise InputError(
-                f"{given}: no such file, and no example of that name; there are {known}."
+                f"no such file, and no example of that name; there are {known}.", given
             ) from error
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{given}: cannot be read: {error}.") from error
+            raise InputError(f"cannot be read: {error}.", given) from error
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{given}: is not TOML: {error}.") from error
+        raise InputError(f"is not TOML: {error}.", given) from error
     try:
         return _problem(path.name.removesuffix(".toml"), table, text)
     except (ValueError, TypeError) as error:
-        raise InputError(f"{given}: {error}.") from error
+        raise InputError(f"{error}.", given) from error
 
 
 def _problem(name: str, table: Mapping[str, Any], text: str) -> Problem:

@@ -51,8 +51,9 @@ def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
     chosen = scenario.mapping_of(text).get("system")
     if not isinstance(chosen, str) or chosen not in known:
         raise InputError(
-            f'{name}: write system = "..." into its first lines, one of {", ".join(known)}; '
-            f"it says {chosen!r}"
+            f'write system = "..." into its first lines, one of {", ".join(known)}; it says '
+            f"{chosen!r}",
+            name,
         )
     return known[chosen], Path(name).stem, text
 
@@ -69,8 +70,7 @@ def study_of(system: System, text: str, source: str) -> Study:
         return next(iter(system.studies.values()))
     if not isinstance(chosen, str) or chosen not in system.studies:
         raise InputError(
-            f'{source}: write study = "..." into its first lines, one of {names}; it says '
-            f"{chosen!r}"
+            f'write study = "..." into its first lines, one of {names}; it says {chosen!r}', source
         )
     return system.studies[chosen]
 

@@ -50,7 +50,7 @@ def still(path: Path, columns: Sequence[str | os.PathLike[str]] = ()) -> Still:
     opened = open_log(path, formats_of([path], columns).get(str(path)), findings)
     table = opened.imu if isinstance(opened, Dataset) else opened
     if not isinstance(table, ImuTable):
-        raise InputError(f"{path}: holds no inertial samples; give the log of an IMU.")
+        raise InputError("holds no inertial samples", path, "give the log of an IMU.")
     cleaned, counts, _ = clean_imu(table)
     notes = [str(finding) for finding in findings]
     begin, end = longest_stretch(cleaned.time_ns)
@@ -151,7 +151,7 @@ def allan(
         robins.logs.LogError: the file cannot be read.
     """
     if len(set(terms)) != len(terms) or not terms or not set(terms) <= set(_NAMES):
-        raise InputError(f"--terms {terms}: give different letters out of {', '.join(_NAMES)}.")
+        raise InputError(f"give different letters out of {', '.join(_NAMES)}.", f"--terms {terms}")
     path = Path(log)
     given = still(path, columns)
     notes = list(given.notes)

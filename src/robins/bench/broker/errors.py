@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from robins.errors import RobinsError
 
-class BenchError(RuntimeError):
+
+class BenchError(RobinsError, RuntimeError):
     """A run on the bench that cannot go on; says which part, when and why."""
+
+    bad_input = False
 
 
 class LinkLost(BenchError):

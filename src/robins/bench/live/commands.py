@@ -6,11 +6,13 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from robins.errors import RobinsError
+
 PLAIN = ("start", "pause", "stop")
 LONGEST_S = 3600.0  # of a fault; without a length it lasts until it is cleared
 
 
-class CommandError(ValueError):
+class CommandError(RobinsError, ValueError):
     """What the page sent is no command; the text is for the page."""
 
 

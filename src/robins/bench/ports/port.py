@@ -19,15 +19,19 @@ from typing import NamedTuple
 import serial
 from serial.tools import list_ports
 
+from robins.errors import RobinsError
+
 BAUD = 460800
 
 
-class PortError(ValueError):
+class PortError(RobinsError, ValueError):
     """A port that cannot be had; says which, why, and what to do."""
 
 
-class PortLostError(ConnectionError):
+class PortLostError(RobinsError, ConnectionError):
     """The far end of an open port is gone: pulled out, switched off, or its program ended."""
+
+    bad_input = False
 
 
 class Address(NamedTuple):
@@ -48,9 +52,9 @@ def address(text: str) -> Address:
         path, speed = speed, str(BAUD)
     path, speed = path.strip(), speed.strip()
     if not (speed.isascii() and speed.isdigit() and int(speed) > 0):
-        raise PortError(f"port '{text}': '{speed}' is no speed in baud; write {path},{BAUD}")
+        raise PortError(f"'{speed}' is no speed in baud", f"port '{text}'", f"write {path},{BAUD}")
     if why := obstacle(path):
-        raise PortError(f"port '{path}': {why}")
+        raise PortError(why, f"port '{path}'")
     return Address(path, int(speed))
 
 
@@ -94,16 +98,16 @@ def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
         PortError: it cannot be opened, is in use by another program, or cannot be so fast.
     """
     if why := obstacle(at.path):
-        raise PortError(f"port '{at.path}': {why}")
+        raise PortError(why, f"port '{at.path}'")
     try:
         port = serial.Serial(at.path, at.baud, timeout=timeout_s, exclusive=True)
     except (OSError, ValueError, termios.error) as error:
         if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):
             raise PortError(
-                f"port '{at.path}' is in use by another program; end it first "
-                f"(fuser -v {at.path} names it)"
+                f"port '{at.path}' is in use by another program",
+                fix=f"end it first (fuser -v {at.path} names it)",
             ) from None
-        raise PortError(f"port '{at.path}' at {at.baud} baud: {error}") from None
+        raise PortError(str(error), f"port '{at.path}' at {at.baud} baud") from None
     # USB adapters gather bytes for up to 16 ms unless asked not to; ports that gather nothing
     # refuse to be asked.
     with contextlib.suppress(AttributeError, OSError, ValueError):
@@ -120,7 +124,7 @@ def receive(port: serial.Serial) -> bytes:
     try:
         return port.read(max(1, port.in_waiting))
     except (OSError, termios.error) as error:
-        raise PortLostError(f"port '{port.port}': the far end is gone ({error})") from None
+        raise PortLostError(f"the far end is gone ({error})", f"port '{port.port}'") from None
 
 
 def send(port: serial.Serial, data: bytes) -> None:
@@ -132,7 +136,7 @@ def send(port: serial.Serial, data: bytes) -> None:
     try:
         port.write(data)
     except (OSError, termios.error) as error:
-        raise PortLostError(f"port '{port.port}': the far end is gone ({error})") from None
+        raise PortLostError(f"the far end is gone ({error})", f"port '{port.port}'") from None
 
 
 @dataclass

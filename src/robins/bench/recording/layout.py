@@ -16,6 +16,7 @@ import fastcrc
 from mcap.records import Schema
 
 from robins.bench.wire.schema import VERSION, markdown
+from robins.errors import RobinsError
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "robins-bench"
@@ -39,7 +40,7 @@ _EVENT = {
 }
 
 
-class RecordingError(ValueError):
+class RecordingError(RobinsError, ValueError):
     """A record that cannot be begun or read; says what, where and the mend."""
 
 

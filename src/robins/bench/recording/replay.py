@@ -24,6 +24,7 @@ from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.records import RecordError, decode, size_of
 from robins.bench.wire.schema import FIRST_DATA, NUMBERS, PARTS, message
+from robins.errors import RobinsError
 
 PATIENCE_S = 60.0  # a part may compile its filter before it answers
 _LOOK_S = 0.1  # at whether the part still lives
@@ -36,8 +37,10 @@ Start = Callable[[str], AbstractContextManager[Any]]
 have ``poll()``, as `subprocess.Popen` has, which tells a part that has died from a slow one."""
 
 
-class ReplayError(RuntimeError):
+class ReplayError(RobinsError, RuntimeError):
     """A replay that cannot be done, or a part that did not go through with it."""
+
+    bad_input = False
 
 
 class Replayed(NamedTuple):

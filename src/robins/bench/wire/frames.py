@@ -17,6 +17,7 @@ import fastcrc
 from cobs import cobs
 
 from robins.bench.wire.schema import VERSION
+from robins.errors import RobinsError
 
 EDGE = b"\x00"
 _HEADER = struct.Struct("<BBIIQ")
@@ -25,7 +26,7 @@ LEAST = _HEADER.size + _CRC.size  # bytes of an empty frame before COBS
 MOST_PAYLOAD = 4096
 
 
-class FrameError(ValueError):
+class FrameError(RobinsError, ValueError):
     """Bytes that are no frame; `why` is one of the names of `robins.bench.wire.receiver.Counts`."""
 
     def __init__(self, why: str, text: str):

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.bench.wire.schema import SIZES, Field, message
+from robins.errors import RobinsError
 
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f64": "d"}
 
 
-class RecordError(ValueError):
+class RecordError(RobinsError, ValueError):
     """Values or bytes that are not those of the message."""
 
 

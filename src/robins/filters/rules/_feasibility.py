@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
+from robins.errors import RobinsError
 from robins.filters.rules._inflation import inflated, local_bound
 
 
-class Infeasible(ValueError):
+class Infeasible(RobinsError, ValueError):
     """No H-infinity filter exists for the gamma asked for.
 
     Attributes:
@@ -39,9 +40,9 @@ class Infeasible(ValueError):
         whole = "" if gamma_min is None else f"; the whole run needs gamma = {gamma_min:.6g}"
         super().__init__(
             f"no H-infinity filter with gamma = {gamma:.6g} exists at step {step}{when}: the local "
-            f"bound sqrt(lambda_max(L P L')) is {local_bound:.6g} there{whole}. Give a larger "
-            "gamma, or policy='raise_gamma' or 'compensate'; gamma has the units of L x over those "
-            "of whitened noise, so look at the units of weight, R and P0 too"
+            f"bound sqrt(lambda_max(L P L')) is {local_bound:.6g} there{whole}",
+            fix="give a larger gamma, or policy='raise_gamma' or 'compensate'; gamma has the units "
+            "of L x over those of whitened noise, so look at the units of weight, R and P0 too",
         )
 
 

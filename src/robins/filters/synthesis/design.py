@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from robins.errors import RobinsError
 from robins.filters.synthesis.norms import (
     Number,
     h2_norm,
@@ -20,11 +21,11 @@ _GAMMA = 1e-6  # by how much the true H-infinity norm may exceed gamma
 _AGREE = 1e-6  # and differ from the sweep
 
 
-class NotCertified(ValueError):
+class NotCertified(RobinsError, ValueError):
     """The true norms of a filter are not what its design promised."""
 
 
-class Unreachable(ValueError):
+class Unreachable(RobinsError, ValueError):
     """No filter of the form asked for meets gamma; the message names the least one can have.
 
     Attributes:

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from robins.errors import RobinsError
 from robins.filters.synthesis import inequalities
 from robins.filters.synthesis.inequalities import Aim
 from robins.filters.synthesis.plant import Plant
@@ -27,8 +28,10 @@ _CLARABEL = {"iterative_refinement_max_iter": 30, "iterative_refinement_stop_rat
 _LOCK = Lock()  # a program's parameters belong to one solve at a time
 
 
-class MissingExtra(ImportError):
+class MissingExtra(RobinsError, ImportError):
     """A design by LMI was asked for without the packages that solve one."""
+
+    bad_input = False
 
 
 class Answer(NamedTuple):
