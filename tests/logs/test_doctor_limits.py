@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from log_samples import PHONE, RTKLIB
 from made_nine_axis import tumble_dataset
-from test_log_registry import PHONE, RTKLIB
 
 from robins.dataset import Trajectory
 from robins.logs import LogError, clean, examine, open_log
