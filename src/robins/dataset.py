@@ -8,12 +8,13 @@ They are plain records: the *doctor* (`robins.logs.doctor`) judges them, the sys
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 NavFrame = Literal["NED", "ENU"]
 BodyFrame = Literal["FRD", "RFU"]
+Severity = Literal["error", "warning", "note"]
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,25 @@ class AttitudeTable:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """One thing worth saying about a log.
+
+    An *error* means a run on these data would be wrong or meaningless, a *warning* that it will be
+    worse than it could be or that samples were refused, a *note* that someone should know.
+    """
+
+    severity: Severity
+    code: str  # for programs: "gravity_unit", "time_gap", ...
+    file: str
+    where: str  # "line 12", "lines 12-40", "time 3.250 s", "" for the whole file
+    value: float | int | str
+    sentence: str  # for people; complete without the other fields
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.sentence}"
+
+
+@dataclass(frozen=True)
 class Dataset:
     """Everything a run starts from."""
 
@@ -125,4 +145,9 @@ class Dataset:
     mag: MagTable | None = None
     attitude: AttitudeTable | None = None  # true attitude, where nothing else is known
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
-    meta: dict[str, Any] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)  # of the readers: what they left out
+    time_unit_known: tuple[str, ...] = ()  # files that say in which unit their stamps are
+    imu_gaps: list[tuple[int, int]] = field(default_factory=list)  # (start_ns, end_ns), by `clean`
+    master_delay_s: float = 0.0  # by how much records of the master are older than their stamps
+    # from the IMU to the GNSS antenna, forward, right, down; None where nobody told it
+    lever_arm_b_m: tuple[float, float, float] | None = None

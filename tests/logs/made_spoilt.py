@@ -126,7 +126,7 @@ def good_gyro(factor=1.0):
 def known_slow():
     """A file that states its unit of time, with samples half a second apart."""
     table = rows_of(drive().imu, slice(None, None, 50))
-    return Dataset("slow", table, meta={"time_unit_known": [table.source]})
+    return Dataset("slow", table, time_unit_known=(table.source,))
 
 
 def a_path(source="path.csv"):
@@ -151,7 +151,7 @@ def late(delay_s, stated_s=0.0):
 
     def make(log=None):
         log = master(time_ns=plus(round(1e9 * delay_s)))(log)
-        return dataclasses.replace(log, meta={"master_delay_s": stated_s})
+        return dataclasses.replace(log, master_delay_s=stated_s)
 
     return make
 

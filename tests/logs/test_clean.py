@@ -91,7 +91,7 @@ def test_one_bad_imu_sample_anywhere(kind, at, axis, pick):
     assert_same(got.imu, clean(DATA).imu)
     # A step back by one sample meets the stamp before the last: an earlier time all the same.
     assert refused(got.counts) == {f"imu_{reason}": 1}
-    assert got.meta["imu_gaps"] == []
+    assert got.imu_gaps == []
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +163,7 @@ def test_a_clock_set_back_is_refused_until_time_passes_and_declared_as_a_gap():
     keep = np.r_[0:120, 140:N]
     assert_same(got.imu, rows_of(dataclasses.replace(IMU, time_ns=time_ns), keep))
     assert refused(got.counts) == {"imu_duplicate": 1, "imu_backward": 19}
-    assert got.meta["imu_gaps"] == [(time_ns[119], time_ns[140])]
+    assert got.imu_gaps == [(time_ns[119], time_ns[140])]
 
 
 def test_a_restart_costs_the_shorter_part_never_everything_after_it():
@@ -191,7 +191,7 @@ def test_gaps_are_declared(kind, lost, declared):
     keep[100 : 100 + lost] = False
     got = clean(dataclasses.replace(DATA, imu=rows_of(dataclasses.replace(IMU, kind=kind), keep)))
     gap = (int(IMU.time_ns[99]), int(IMU.time_ns[100 + lost]))
-    assert got.meta["imu_gaps"] == ([gap] if declared else [])
+    assert got.imu_gaps == ([gap] if declared else [])
 
 
 def test_ten_nan_in_a_row_are_one_gap():
@@ -199,7 +199,7 @@ def test_ten_nan_in_a_row_are_one_gap():
     gyro[40:50] = np.nan
     got = clean(with_imu(DATA, gyro=gyro))
     assert refused(got.counts) == {"imu_nan": 10}
-    assert got.meta["imu_gaps"] == [(IMU.time_ns[39], IMU.time_ns[50])]
+    assert got.imu_gaps == [(IMU.time_ns[39], IMU.time_ns[50])]
 
 
 def test_nan_for_ever_is_refused_with_the_reason():

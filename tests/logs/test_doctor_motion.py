@@ -53,9 +53,7 @@ def test_large_biases_are_no_wrong_axes(drive):
 
 def test_errors_come_first_and_those_of_readers_are_brought_along(drive):
     cut = Finding("warning", "ends_early", "f", "line 9", "", "f ends early at line 9: it was cut.")
-    data = dataclasses.replace(
-        drive, imu=rows_of(drive.imu, slice(0, 1100)), meta={"findings": [cut]}
-    )
+    data = dataclasses.replace(drive, imu=rows_of(drive.imu, slice(0, 1100)), findings=[cut])
     sigma = data.gnss.sigma_m * 0.0
     codes = found(with_gnss(data, sigma_m=sigma))
     assert codes == ["sigma_not_positive", "ends_early", "little_overlap", "motion_not_checked"]

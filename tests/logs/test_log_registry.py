@@ -68,22 +68,32 @@ def test_files_of_one_recording_become_one_dataset(three):
     paths = [three["kfgins-nav"], str(three["kfgins-imu"]), three["kfgins-gnss"]]
     data = load_dataset(paths, mounting=Mounting(180.0, lever_arm_b_m=(0.1, 0.2, 0.3)))
     assert data.name == "kfgins-imu"
-    assert data.meta["files"] == {
-        "imu": str(three["kfgins-imu"]),
-        "gnss": str(three["kfgins-gnss"]),
-        "truth": str(three["kfgins-nav"]),
-    }
-    assert data.meta["lever_arm_b_m"] == (0.1, 0.2, 0.3)
-    assert data.meta["findings"] == []
+    assert data.imu.source == str(three["kfgins-imu"])
+    assert data.gnss.source == str(three["kfgins-gnss"])
+    assert data.truth.source == str(three["kfgins-nav"])
+    assert data.lever_arm_b_m == (0.1, 0.2, 0.3)
+    assert data.findings == []
     plain = load_dataset(paths, name="mine")
-    assert plain.name == "mine"
+    assert (plain.name, plain.lever_arm_b_m) == ("mine", None)
     np.testing.assert_array_equal(data.imu.gyro, plain.imu.gyro * [1, -1, -1])
+
+
+@pytest.mark.parametrize(
+    ("names", "arm", "why"),
+    [
+        (["kfgins-imu"], (0.1, 0.2, 0.3), "has no GNSS fixes, but is given a lever arm"),
+        (["kfgins-imu", "kfgins-gnss"], (0.1, np.nan, 0.3), r"lever arm of \(0.1, nan, 0.3\) m"),
+    ],
+)
+def test_a_lever_arm_that_cannot_be_used_is_refused(three, names, arm, why):
+    with pytest.raises(LogError, match=why):
+        load_dataset([three[name] for name in names], mounting=Mounting(lever_arm_b_m=arm))
 
 
 def test_findings_of_readers_come_along(three):
     path = Path(three["kfgins-imu"])
     path.write_text(path.read_text()[:-3])
-    assert [f.code for f in load_dataset([path]).meta["findings"]] == ["ends_early"]
+    assert [f.code for f in load_dataset([path]).findings] == ["ends_early"]
 
 
 def test_a_named_format_overrides_recognition(three):

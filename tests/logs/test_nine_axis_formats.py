@@ -211,7 +211,7 @@ def test_two_trials_make_no_dataset(tmp_path):
     with pytest.raises(LogError, match=r"b.npz: is a second file of the kind of .*a.npz \(imu\)"):
         load_dataset(paths)
     data = load_dataset(paths[:1])
-    assert data.meta["files"] == dict.fromkeys(("imu", "mag", "attitude"), str(paths[0]))
+    assert {data.imu.source, data.mag.source, data.attitude.source} == {str(paths[0])}
     assert data.gnss is None
     assert data.truth is None
 

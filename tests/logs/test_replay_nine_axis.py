@@ -48,7 +48,7 @@ def test_field_and_attitude_arrive_clean_and_turned(tmp_path, seen):
     found = workbench.replay([path], system="compass", filters=["plain"], findings=told.extend)
     (data,) = seen
     assert data.gnss is None
-    assert data.meta["imu_gaps"] == []
+    assert data.imu_gaps == []
     turn = np.array([1.0, -1.0, -1.0])
     np.testing.assert_allclose(data.imu.gyro, arrays["imu_gyr"] * turn, rtol=1e-15)
     assert np.isnan(data.mag.field_t).all(axis=1).tolist() == [k == 5 for k in range(800)]

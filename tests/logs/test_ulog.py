@@ -158,7 +158,7 @@ def test_readers_warn_where_nobody_listens(tmp_path):
 def test_the_sample_of_pyulog(data_dir):
     data = load_dataset([data_dir / "pyulog_sample_log_small.ulg.xz"])
     assert (len(data.imu), len(data.mag), len(data.gnss)) == (1298, 319, 32)
-    assert data.meta["findings"] == []
+    assert data.findings == []
     assert data.imu.time_ns[0] == 20_326_716_000
     force = np.median(data.imu.accel, axis=0)  # it stands: specific force points up, z down
     assert abs(np.linalg.norm(force) - 9.8) < 0.25

@@ -344,8 +344,7 @@ def test_the_doctor_sees_the_slave_along_the_axes_of_the_master(pairs):
 def test_the_doctor_has_nothing_to_say_of_healthy_pairs_with_their_delay_stated(pairs):
     turn = logs.Mounting(*np.degrees(orientation(PAIR)))
     for pair in pairs:
-        stated = pair.meta | {"master_delay_s": PAIR.master.delay}
-        turned = replace(pair, imu=turn.turn(pair.imu), meta=stated)
+        turned = replace(pair, imu=turn.turn(pair.imu), master_delay_s=PAIR.master.delay)
         assert logs.examine(turned) == []
         heading, pitch, roll = (
             SciRotation.from_quat(pair.master.q_nb, scalar_first=True).as_euler("ZYX").T

@@ -46,7 +46,7 @@ def clean(dataset: Dataset) -> Dataset:
     not a positive number, a 1 that nobody uses. A fix with no component left is refused whole.
     Magnetic field and attitude keep their rows, NaN where something is missing.
 
-    ``meta["imu_gaps"]`` lists (start_ns, end_ns) between which IMU samples are missing.
+    ``imu_gaps`` lists the times between which IMU samples are missing.
 
     Raises:
         LogError: arrays that are no tables (F04), fewer than two IMU samples left, or a GNSS
@@ -59,8 +59,7 @@ def clean(dataset: Dataset) -> Dataset:
             tables[kind], more = cleaner(table)
             counts |= more
     total = {k: dataset.counts.get(k, 0) + counts.get(k, 0) for k in dataset.counts | counts}
-    meta = {**dataset.meta, "imu_gaps": gaps}
-    return dataclasses.replace(dataset, **tables, counts=total, meta=meta)
+    return dataclasses.replace(dataset, **tables, counts=total, imu_gaps=gaps)
 
 
 def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, int]]]:

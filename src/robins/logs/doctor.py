@@ -38,10 +38,8 @@ def examine(subject: Subject) -> list[Finding]:
     """Judge a dataset, or tables by themselves.
 
     Args:
-        subject: as it was read, before `clean`, so that everything is seen. A dataset brings the
-            findings of its readers along (``meta["findings"]``), the names of files that say in
-            which unit their stamps are (``meta["time_unit_known"]``), and by how much the records
-            of its master are older than their stamps (``meta["master_delay_s"]``).
+        subject: as it was read, before `clean`, so that everything is seen. Of a dataset count too
+            the findings of its readers, its ``time_unit_known`` and its ``master_delay_s``.
 
     Returns:
         Errors first, then warnings, then notes; empty for a log without a flaw.
@@ -50,9 +48,9 @@ def examine(subject: Subject) -> list[Finding]:
         LogError: arrays that are no tables: other lengths, types, shapes.
     """
     parts = subject if isinstance(subject, Sequence) else [subject]
-    metas = [part.meta for part in parts if isinstance(part, Dataset)]
-    findings = [f for meta in metas for f in meta.get("findings", ())]
-    unit_known = {file for meta in metas for file in meta.get("time_unit_known", ())}
+    datasets = [part for part in parts if isinstance(part, Dataset)]
+    findings = [finding for dataset in datasets for finding in dataset.findings]
+    unit_known = {file for dataset in datasets for file in dataset.time_unit_known}
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
         tables = [_CHECKED[type(table)](table) for part in parts for table in _tables(part)]
         all_of_them: dict[str, Any] = {"others": [t for t in tables if not isinstance(t, ImuTable)]}
@@ -63,8 +61,8 @@ def examine(subject: Subject) -> list[Finding]:
             findings += _asked(ALONE, things, [])
             all_of_them[kind_of(table)] = table
         if isinstance(subject, Dataset) and subject.master is not None:
-            delay_s = float(subject.meta.get("master_delay_s", 0.0))
-            all_of_them |= {"master": checked_truth(subject.master), "delay_s": delay_s}
+            master, delay_s = checked_truth(subject.master), subject.master_delay_s
+            all_of_them |= {"master": master, "delay_s": delay_s}
         return by_severity(_asked(TOGETHER, all_of_them, findings))
 
 

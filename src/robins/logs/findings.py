@@ -6,32 +6,11 @@ Both name the file, the line or time, the value, the likely cause and the mend, 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from typing import Literal
 
+from robins.dataset import Finding, Severity
 from robins.errors import RobinsError
 
-Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing worth saying about a log.
-
-    An *error* means a run on these data would be wrong or meaningless, a *warning* that it will be
-    worse than it could be or that samples were refused, a *note* that someone should know.
-    """
-
-    severity: Severity
-    code: str  # for programs: "gravity_unit", "time_gap", ...
-    file: str
-    where: str  # "line 12", "lines 12-40", "time 3.250 s", "" for the whole file
-    value: float | int | str
-    sentence: str  # for people; complete without the other fields
-
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.sentence}"
 
 
 class LogError(RobinsError, ValueError):

@@ -34,12 +34,10 @@ def load_dataset(
         formats: path -> its format, for files that are not recognised by content.
 
     Returns:
-        The dataset. ``meta["files"]`` maps imu, gnss, truth, mag, attitude to paths,
-        ``meta["findings"]`` lists what the readers left out, ``meta["time_unit_known"]`` the files
-        that say in which unit their stamps are, ``meta["lever_arm_b_m"]`` is that of the mounting.
+        The dataset, with the findings of the readers; the ``source`` of a table is its file.
 
     Raises:
-        LogError: as `open_log`; no IMU log, or two tables of one kind.
+        LogError: as `open_log`; no IMU log, two tables of one kind, or a lever arm without GNSS.
     """
     paths = [os.fspath(p) for p in paths]
     if unknown := set(formats or {}) - set(paths):
@@ -52,7 +50,7 @@ def load_dataset(
     for path in paths:
         opened = open_log(path, (formats or {}).get(path), findings)
         if isinstance(opened, Dataset):
-            known += opened.meta.get("time_unit_known", ())
+            known += opened.time_unit_known
         for table in tables_of(opened):
             kind = kind_of(table)
             if kind in held:
@@ -66,16 +64,13 @@ def load_dataset(
         raise LogError(
             ", ".join(paths) or "(no file)", "no IMU log among the files", "give one IMU log"
         )
-    return Dataset(
+    dataset = Dataset(
         name=name or Path(held["imu"].source).name.split(".")[0],
-        **{kind: turned(table, mounting) for kind, table in held.items()},
-        meta={
-            "files": {kind: table.source for kind, table in held.items()},
-            "findings": findings,
-            "time_unit_known": tuple(known),
-            "lever_arm_b_m": mounting.lever_arm_b_m if mounting else (0.0, 0.0, 0.0),
-        },
+        **held,
+        findings=findings,
+        time_unit_known=tuple(known),
     )
+    return turned(dataset, mounting)
 
 
 def load_pair(
@@ -97,9 +92,7 @@ def load_pair(
         formats: as `load_dataset`.
 
     Returns:
-        The dataset, as it is in the files; see `clean`. ``meta["files"]`` maps imu and master to
-        paths, ``meta["findings"]`` lists what the readers left out, ``meta["master_delay_s"]`` is
-        the delay.
+        The dataset, as it is in the files, with the findings of the readers; see `clean`.
 
     Raises:
         LogError: as `open_log`; or a file holds something else.
@@ -115,11 +108,8 @@ def load_pair(
         name=name or Path(imu.source).name.split(".")[0],
         imu=imu,
         master=path,
-        meta={
-            "files": {"imu": imu.source, "master": path.source},
-            "findings": findings,
-            "master_delay_s": delay_s,
-        },
+        findings=findings,
+        master_delay_s=delay_s,
     )
 
 

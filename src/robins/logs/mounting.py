@@ -12,6 +12,7 @@ import numpy as np
 from robins import rotation
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.ins.frames import to_ned_frd
+from robins.logs.findings import LogError
 
 OnBoard = TypeVar("OnBoard", bound=ImuTable | MagTable | AttitudeTable)
 
@@ -28,8 +29,8 @@ class Mounting:
     roll_deg: float = 0.0
     pitch_deg: float = 0.0
     yaw_deg: float = 0.0
-    lever_arm_b_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """From the IMU to the antenna, forward, right, down."""
+    lever_arm_b_m: tuple[float, float, float] | None = None
+    """From the IMU to the antenna, forward, right, down; None leaves it to who uses the log."""
 
     def dcm_bs(self) -> np.ndarray:
         """(3, 3) C_bs: maps sensor axes to body axes; exact where the angles are right angles.
@@ -72,16 +73,35 @@ class Mounting:
 def turned(opened: Any, mounting: Mounting | None) -> Any:
     """A table or dataset with all that lies along sensor axes turned to the body's.
 
-    Fixes and paths stay as they are, and so does everything where there is no mounting.
+    Fixes and paths stay as they are, and so does everything where there is no mounting. A dataset
+    takes the lever arm along.
+
+    Raises:
+        LogError: a dataset without GNSS is given a lever arm, or one that is not finite.
     """
     if mounting is None:
         return opened
     if isinstance(opened, Dataset):
         on_board = {k: turned(getattr(opened, k), mounting) for k in ("imu", "mag", "attitude")}
-        return dataclasses.replace(opened, **on_board)
+        return dataclasses.replace(opened, **on_board, lever_arm_b_m=_lever_arm(opened, mounting))
     if isinstance(opened, ImuTable | MagTable | AttitudeTable):
         return mounting.turn(opened)
     return opened
+
+
+def _lever_arm(dataset: Dataset, mounting: Mounting) -> tuple[float, float, float] | None:
+    arm = mounting.lever_arm_b_m
+    if arm is None:
+        return dataset.lever_arm_b_m
+    if dataset.gnss is None:
+        raise LogError(
+            dataset.name,
+            "has no GNSS fixes, but is given a lever arm to their antenna",
+            "give the log of the receiver too, or omit the lever arm",
+        )
+    if not np.all(np.isfinite(arm)):
+        raise LogError(dataset.name, f"is given a lever arm of {arm} m", "give finite numbers")
+    return arm
 
 
 def _relabelled(table: OnBoard) -> OnBoard:

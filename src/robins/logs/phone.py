@@ -115,7 +115,7 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
         gnss=_fixes(
             file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], columns.rows[gnss]
         ),
-        meta={"time_unit_known": (file,)},
+        time_unit_known=(file,),
     )
 
 

@@ -201,7 +201,7 @@ def _tables(format: TextFormat, read: Read, origin: Origin | None, known: bool) 
     return Dataset(
         name=Path(read.file).name.split(".")[0],
         **{kind_of(table): table for table in made},
-        meta={"time_unit_known": (read.file,)} if known else {},
+        time_unit_known=(read.file,) if known else (),
     )
 
 

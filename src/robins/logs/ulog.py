@@ -90,7 +90,7 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         ),
         mag=None if mag is None else _field(file, mag),
         gnss=None if gnss is None else _fixes(file, gnss),
-        meta={"time_unit_known": (file,)},
+        time_unit_known=(file,),
     )
 
 
