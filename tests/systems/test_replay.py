@@ -116,6 +116,19 @@ def test_the_filter_is_far_better_than_the_fixes_and_the_smoother_better_still(c
     assert np.all(smoothed <= heading * (1 + 1e-9))
 
 
+def test_a_lever_arm_told_with_the_log_is_that_of_the_configuration(log, clean_outcome):
+    told = replace(logs.clean(log), lever_arm_b_m=(0.5, -0.2, -1.0))
+    for settings in ((), ('gnss.lever_arm="0 m"',)):
+        outcome = replay_log(told, configuration(*settings), ("ekf",))
+        here = outcome.solution.lat_rad.sel(filter="ekf").values
+        np.testing.assert_array_equal(here, clean_outcome.solution.lat_rad.sel(filter="ekf").values)
+    other = replace(told, lever_arm_b_m=(0.5, 0.2, -1.0))
+    with pytest.raises(
+        ValueError, match=r"loaded with a lever arm of .* gnss.lever_arm is .*; give"
+    ):
+        replay_log(other, configuration(), ("ekf",))
+
+
 def test_a_replay_that_contradicts_its_sigmas_ends_with_the_likely_causes(log, clean_outcome):
     assert clean_outcome.warnings == []
     sure = replace(log, gnss=replace(log.gnss, sigma_m=0.05 * log.gnss.sigma_m))

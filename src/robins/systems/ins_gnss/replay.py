@@ -99,6 +99,24 @@ def _flight(log: Log, parts: list[Prepared]) -> Flight:
     return Flight(log, np.concatenate(epoch), np.concatenate(withheld), fix_epoch)
 
 
+def _with_lever_arm(dataset: Dataset, parameters: Replay) -> Replay:
+    """The parameters with the lever arm that the dataset was loaded with.
+
+    Raises:
+        ValueError: the parameters have another.
+    """
+    arm, other = dataset.lever_arm_b_m, parameters.gnss.lever_arm
+    if arm is None:
+        return parameters
+    if any(other) and not np.allclose(arm, other, rtol=0.0, atol=1e-6):
+        raise ValueError(
+            f"the log was loaded with a lever arm of {arm} m, and gnss.lever_arm is {other} m; "
+            "give one of the two"
+        )
+    gnss = parameters.gnss.model_copy(update={"lever_arm": arm})
+    return parameters.model_copy(update={"gnss": gnss})
+
+
 def replay(
     dataset: Dataset,
     parameters: Replay,
@@ -117,6 +135,7 @@ def replay(
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
     wanted = tuple(filters) or parameters.filters
+    parameters = _with_lever_arm(dataset, parameters)
     log = on_one_clock(dataset, parameters)
     found = pieces(log, parameters.update.longest_gap)
     parts: list[Prepared] = []
