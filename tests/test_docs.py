@@ -15,6 +15,7 @@ from plain_docstrings import plain
 from robins import scenario
 from robins.bench.run.setup import Setup
 from robins.cli import Status, app
+from robins.filters import Filter, Rule
 from robins.logs import columns_from
 from robins.results.summary import checked
 from robins.systems import SYSTEMS
@@ -90,6 +91,21 @@ def test_examples_in_docstrings_give_their_results(name):
 def test_the_readme_shows_the_library():
     languages = [language for _, language, _ in blocks((ROOT / "README.md").read_text("utf-8"))]
     assert "python" in languages
+
+
+@pytest.mark.parametrize("page", ["architecture.md", "filters/index.md", "filters/protocol.md"])
+def test_the_pages_name_all_functions_of_a_filter(page):
+    text = (ROOT / "docs" / page).read_text("utf-8")
+    told = re.search(r"A filter is its functions.*?\.\s", text, re.DOTALL)
+    assert told
+    assert tuple(re.findall(r"`(\w+)", told[0])) == Filter._fields
+
+
+def test_the_protocol_names_all_hooks_of_a_rule():
+    text = (ROOT / "docs" / "filters" / "protocol.md").read_text("utf-8")
+    table = text.partition("## The hooks of a rule")[2].partition("## ")[0]
+    told = re.findall(r"^\| `(\w+)\(", table, re.MULTILINE)
+    assert sorted([*told, "name"]) == sorted(Rule._fields)
 
 
 def test_no_example_escapes_by_its_spelling():

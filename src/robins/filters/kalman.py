@@ -51,7 +51,7 @@ Again = Callable[[FilterState], FilterState]  # a run once more, from another fi
 
 
 class Filter(NamedTuple):
-    """Pure functions; a run, a campaign, a bench or a user's loop calls them alike.
+    """Functions, pure but for `audit`; a run, a campaign, a bench or a loop of yours calls them.
 
     Attributes:
         init: ``(belief, dims) -> state``; dims maps sensor names to dimensions (`Model.dims`).

@@ -42,7 +42,7 @@ def keep_belief(memory: Memory, belief: Belief) -> tuple[Memory, Belief, int]:
 
 
 class Rule(NamedTuple):
-    """One adaptation; every hook is pure and defaults to identity.
+    """One adaptation; every hook in compiled code is pure, and by default the identity.
 
     Attributes:
         init: ``(belief, dims) -> memory``; dims maps each sensor's name to its dimension, in the
