@@ -120,6 +120,9 @@ def drawn() -> dict[str, set[str]]:
 
 def test_the_drawing_names_the_rooms_there_are(drawn):
     assert set(drawn) == rooms_in(SOURCE)
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    rooms = re.findall(r"^\| `(\w+(?:\.py|/))`", text, re.MULTILINE)
+    assert [room for room in rooms if not (SOURCE / room).exists()] == []
 
 
 def test_imports_point_down(drawn):
