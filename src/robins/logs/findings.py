@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import warnings
 
-from robins.dataset import Finding, Severity
+from robins.dataset import Finding as Finding  # where datasets hold them; read from here too
+from robins.dataset import Severity as Severity
 from robins.errors import RobinsError
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
