@@ -1,0 +1,193 @@
+"""What every rule promises, over the table of rules: see rule_table.py."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rule_table import (
+    ACTING,
+    AROUND,
+    BASE,
+    CIRCLE,
+    FACING,
+    GONE,
+    HOLDING,
+    LEARNING,
+    MISTYPED,
+    MISUSED,
+    NEARLY_OFF,
+    NO_SLOPE,
+    OFF,
+    QUIET,
+    QUIET_WHEN_OFF,
+    RULES,
+    SEAM,
+    START,
+    M,
+    T,
+    Y,
+    line,
+)
+
+from robins.filters import Code, OnlineFilter, kalman, run, taylor, unscented
+from robins.filters.rules import gate
+from robins.manifold import Angle
+
+MODEL = line()
+FILTERS = ACTING | HOLDING
+EACH = pytest.mark.parametrize("name", FILTERS)
+WAYS = {
+    "taylor": (taylor(), "sqrt"),
+    "joseph": (taylor(), "joseph"),
+    "sigma points": (unscented(), "sqrt"),
+}
+_RUNS = {}
+
+
+def ran(name):
+    """The run of a filter of the table, once."""
+    if name not in _RUNS:
+        _RUNS[name] = run(kalman(rules=FILTERS[name]), MODEL, START, Y)
+    return _RUNS[name]
+
+
+def equal(a, b, **close):
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        if close:
+            np.testing.assert_allclose(one, other, **close)
+        else:
+            np.testing.assert_array_equal(one, other)
+
+
+def test_each_rule_is_in_a_filter_where_it_acts():
+    there = {rule.name for rules in FILTERS.values() for rule in rules}
+    assert there >= {name.split()[0] for name in RULES} - {"projection"}
+    quiet = dict(QUIET)
+    for name in FILTERS:
+        for note, value in ran(name).steps.info["y"].notes.items():
+            if note in quiet and np.any(np.asarray(value) != quiet[note]):
+                del quiet[note]
+    assert not quiet, "nothing happens to these"
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_rules_turned_off_are_the_kalman_filter_bit_for_bit(way):
+    # All in one filter, which is one program; if they are not, one after the other, to name it.
+    linearise, form = WAYS[way]
+    plain = run(kalman(linearise, form=form), MODEL, START, Y)
+
+    def is_plain(rules):
+        got = run(kalman(linearise, rules, form), MODEL, START, Y)
+        notes = got.steps.info["y"].notes
+        said = {note: quiet for note, quiet in QUIET_WHEN_OFF.items() if note in notes}
+        return (
+            np.array_equal(got.mean, plain.mean)
+            and np.array_equal(got.steps.posterior.factor, plain.steps.posterior.factor)
+            and float(got.log_likelihood) == float(plain.log_likelihood)
+            and all(np.all(np.asarray(notes[note]) == quiet) for note, quiet in said.items())
+        )
+
+    if not is_plain(list(OFF.values())):
+        pytest.fail(f"not off: {[name for name, rule in OFF.items() if not is_plain([rule])]}")
+
+
+def test_rules_whose_limit_is_approached_come_near_the_kalman_filter():
+    plain = run(kalman(), MODEL, START, Y)
+    got = run(kalman(rules=list(NEARLY_OFF.values())), MODEL, START, Y)
+    np.testing.assert_allclose(got.mean, plain.mean, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(got.covariance, plain.covariance, rtol=1e-11, atol=1e-12)
+
+
+@EACH
+def test_a_stream_is_its_run_and_what_is_not_measured_moves_nothing(name):
+    whole, one = ran(name), kalman(rules=FILTERS[name])
+    live, without = OnlineFilter(one, MODEL, START), OnlineFilter(one, MODEL, START)
+    for k, row in enumerate(Y):
+        live.predict()
+        without.predict()
+        before = live.belief
+        info = live.update(row)
+        equal(live.belief.mean, whole.mean[k], rtol=1e-9, atol=1e-11)
+        if k not in GONE:
+            without.update(row)
+            continue
+        assert int(info.code) == Code.MISSING
+        assert not np.any(info.gain)
+        for note in QUIET.keys() & info.notes.keys():
+            assert float(info.notes[note]) == QUIET[note], note
+        if name not in HOLDING:
+            equal(live.belief, before)
+    equal(live.state, whole.final, rtol=1e-9, atol=1e-10)
+    if name not in HOLDING:
+        equal(without.state, live.state)
+
+
+@EACH
+def test_sigma_points_in_josephs_form_on_a_circle_say_what_derivatives_on_a_line_do(name):
+    want = ran(name)
+    got = run(kalman(unscented(), FILTERS[name], "joseph"), CIRCLE, FACING, AROUND)
+    assert np.nanmax(AROUND[0].rad) > 3.1 > -3.1 > np.nanmin(AROUND[0].rad)
+    np.testing.assert_allclose(got.mean["rest"], want.mean[:, 1:], rtol=1e-6, atol=1e-7)
+    turned = Angle(want.mean[:, 0] + SEAM).local(got.mean["heading"])
+    np.testing.assert_allclose(turned, np.zeros((T, 1)), atol=1e-7)
+    np.testing.assert_allclose(got.covariance, want.covariance, rtol=1e-6, atol=1e-7)
+    one, other = got.steps.info["y"], want.steps.info["y"]
+    np.testing.assert_array_equal(one.code, other.code)
+    for note, value in other.notes.items():
+        np.testing.assert_allclose(one.notes[note], value, rtol=1e-5, atol=1e-6, err_msg=note)
+
+
+@pytest.mark.parametrize("name", [name for name in FILTERS if name not in NO_SLOPE])
+def test_a_batch_is_its_runs_and_slopes_are_right(name):
+    one, step = kalman(rules=FILTERS[name]), 1e-6
+
+    def total(scale, y):
+        solution = run(one, line(scale), START, y)
+        return solution.log_likelihood, solution.mean
+
+    scales = jnp.array([1.0, 1.0 - step, 1.0 + step, 2.0])
+    others = jnp.asarray(Y).at[3].set(jnp.nan)
+    many = jnp.stack([Y, Y, Y, others])
+    slopes = jax.jit(jax.vmap(jax.value_and_grad(total, has_aux=True)))
+    (value, mean), slope = slopes(scales, many)
+    assert np.all(np.isfinite(slope))
+    equal(mean[0], ran(name).mean, rtol=1e-9, atol=1e-10)
+    assert float(value[0]) == pytest.approx(float(ran(name).log_likelihood), rel=1e-10)
+    assert np.any(mean[3] != mean[0])
+    assert float(slope[0]) == pytest.approx(float(value[2] - value[1]) / (2 * step), rel=1e-5)
+
+
+def test_what_is_refused_or_missing_teaches_nothing_component_by_component():
+    one = kalman(rules=[gate(0.99), *LEARNING])
+    update = jax.jit(one.update)
+    state, _ = update(one.init(START, MODEL.dims), MODEL.sensors[0], jnp.array(Y[1]))
+    for y, code in ((jnp.nan, Code.MISSING), (1e4, Code.REFUSED)):
+        after, info = update(state, MODEL.sensors[0], jnp.full(M, y))
+        assert int(info.code) == code
+        equal(after.memory[1:], state.memory[1:])
+        equal(after.belief, state.belief)
+    after, info = update(state, MODEL.sensors[0], jnp.array([np.nan, 1.0, np.nan]))
+    assert int(info.code) == Code.PARTLY_MISSING
+    for rule, new, old in zip(LEARNING, after.memory[1:], state.memory[1:], strict=True):
+        moved = [
+            np.any(np.asarray(a != b).reshape(M, -1), axis=1)
+            for a, b in zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
+            if jnp.shape(a)[:1] == (M,)
+        ]
+        assert np.any(moved, axis=0).tolist() == [False, True, False], rule.name
+
+
+REFUSED = [(*row, ValueError) for row in MISUSED] + [(*row, TypeError) for row in MISTYPED]
+
+
+@pytest.mark.parametrize(
+    ("rule", "wrong", "words", "error"),
+    REFUSED,
+    ids=[f"{rule.__name__}-{'-'.join(wrong)}" for rule, wrong, *_ in REFUSED],
+)
+def test_arguments_that_make_no_sense_are_refused(rule, wrong, words, error):
+    # A wrong literal is caught by the type check in tests, by the rule itself elsewhere.
+    with pytest.raises(error, match=words):
+        inspect.unwrap(rule)(**(BASE.get(rule, {}) | wrong)).init(START, MODEL.dims)
