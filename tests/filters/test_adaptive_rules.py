@@ -4,26 +4,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense_kalman import kalman_filter, random_system, simulate, times
+from dense_kalman import random_system, simulate, times
 from jax.tree_util import Partial
 
 from robins.filters import (
-    Belief,
     Code,
     Model,
     Motion,
-    OnlineFilter,
     Rule,
     Sensor,
     kalman,
     run,
-    unscented,
 )
 from robins.filters.observation import Observation
 from robins.filters.rules.gate import gate
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.variational_bayes import variational_bayes
-from robins.manifold import Angle
 
 T = 30
 SYSTEM = random_system(2)
@@ -215,41 +211,6 @@ def test_variational_bayes_takes_later_weights_for_the_nominal_noise():
 
 # ------------------------------------------------------------------------------------------ laws
 
-EVERYTHING = [sage_husa(adapt="QR"), variational_bayes()]
-
-
-def test_a_band_of_nothing_is_the_kalman_filter():
-    fixed = [sage_husa(0.9, "QR", 1.0, 1.0), variational_bayes(0.9, 2, 5.0, 1.0, 1.0)]
-    got, want = (run(kalman(rules=r), MODEL, START, Y) for r in (fixed, []))
-    np.testing.assert_array_equal(got.mean, want.mean)
-    np.testing.assert_array_equal(got.covariance, want.covariance)
-    np.testing.assert_allclose(got.mean, kalman_filter(SYSTEM, Y)[0], rtol=1e-9, atol=1e-10)
-
-
-def learnt(state) -> list:
-    """What each rule of EVERYTHING knows of the components of the sensor."""
-    (sensors, _), gammas, *_ = state.memory
-    return [*sensors["y"], *gammas["y"]]
-
-
-def test_nothing_measured_or_refused_teaches_nothing():
-    one = kalman(rules=[gate(0.99), *EVERYTHING])
-    update = jax.jit(one.update)
-    known = lambda state: learnt(state._replace(memory=state.memory[1:]))  # noqa: E731
-    state, _ = update(one.init(START, MODEL.dims), MODEL.sensors[0], jnp.array(Y[1]))
-    gone, info = update(state, MODEL.sensors[0], jnp.full(3, jnp.nan))
-    assert int(info.code) == Code.MISSING
-    for a, b in zip(jax.tree.leaves(gone), jax.tree.leaves(state), strict=True):
-        np.testing.assert_array_equal(a, b)
-    refused, info = update(state, MODEL.sensors[0], jnp.full(3, 1e4))
-    assert int(info.code) == Code.REFUSED
-    for a, b in zip(known(refused), known(state), strict=True):
-        np.testing.assert_array_equal(a, b)
-    in_part, info = update(state, MODEL.sensors[0], jnp.array([np.nan, 1.0, np.nan]))
-    assert int(info.code) == Code.PARTLY_MISSING
-    for a, b in zip(known(in_part), known(state), strict=True):
-        assert (a == b).tolist() == [True, False, True]
-
 
 def test_what_a_later_gate_refuses_does_not_reach_variational_bayes():
     one = kalman(rules=[variational_bayes(ceiling=2.0), gate(0.99)])
@@ -258,57 +219,3 @@ def test_what_a_later_gate_refuses_does_not_reach_variational_bayes():
     assert int(info.code) == Code.REFUSED
     for a, b in zip(after.memory[0]["y"], state.memory[0]["y"], strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_forms_and_ways_agree_and_stream():
-    base = run(kalman(rules=EVERYTHING), MODEL, START, Y)
-    sigma = kalman(unscented(), EVERYTHING, form="joseph")
-    other = run(sigma, MODEL, START, Y)
-    np.testing.assert_allclose(other.mean, base.mean, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(other.covariance, base.covariance, rtol=1e-8, atol=1e-9)
-    live = OnlineFilter(sigma, MODEL, START)
-    for row in Y:
-        live.predict()
-        live.update(row)
-    for a, b in zip(jax.tree.leaves(live.state), jax.tree.leaves(other.final), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11)
-
-
-def turning(start_rad):
-    """A heading that is measured while it turns; noise of another size than is said."""
-    step = lambda x, u: {"heading": x["heading"].retract(0.2 * x["rate"]), "rate": x["rate"]}  # noqa: E731
-    sensor = Sensor(lambda x, aux: x["heading"], jnp.array([0.05]), 1)
-    model = Model(Motion(step, jnp.array([0.01, 0.01])), (sensor,))
-    mean = {"heading": Angle(jnp.array(start_rad)), "rate": jnp.array([1.0])}
-    t = 0.2 * np.arange(1, 41)
-    noise = 0.15 * np.random.default_rng(1).normal(size=40)
-    return model, Belief.of(mean, np.diag([0.01, 0.04])), t + noise
-
-
-def test_an_angle_that_wraps_teaches_what_one_that_does_not_would():
-    one = kalman(rules=[sage_husa(adapt="Q"), variational_bayes()])
-    scales = []
-    for start_rad in (0.0, 3.0):  # crossing pi after 16 steps and after 1
-        model, start, seen_rad = turning(start_rad)
-        y = Angle(np.angle(np.exp(1j * (seen_rad + start_rad))))
-        solution = run(one, model, start, y)
-        scales.append(solution.steps.info["y"].notes)
-    for name, values in scales[0].items():
-        np.testing.assert_allclose(values, scales[1][name], rtol=1e-9)
-    assert float(scales[0]["variational_bayes.r_scale.0"][-1]) > 3.0
-
-
-def test_gradients_are_right_with_components_missing():
-    rules = [sage_husa(0.9, "QR", 0.01, 100.0), variational_bayes(0.9)]
-    one = kalman(rules=rules, form="joseph")
-    y = np.array([[0.5, 1.0], [np.nan, 2.0], [np.nan, np.nan], [3.0, 2.5]])
-
-    @jax.jit
-    def surprise(size):
-        motion = Motion(lambda x, u: jnp.stack([x[0] + x[1], x[1]]), size * jnp.array([0.1, 0.2]))
-        model = Model(motion, (Sensor(lambda x, aux: x, size * jnp.array([1.0, 0.5]), 2),))
-        return run(one, model, Belief(jnp.zeros(2), jnp.eye(2)), y).log_likelihood
-
-    at, h = jnp.array(1.3), 1e-5
-    by_difference = (surprise(at + h) - surprise(at - h)) / (2 * h)
-    assert float(jax.jit(jax.grad(surprise))(at)) == pytest.approx(float(by_difference), rel=1e-6)

@@ -173,17 +173,3 @@ def test_gains_are_data():
         with_gains(begun, {"seen": np.zeros((3, 1))})
     with pytest.raises(ValueError, match="no constant_gain rule"):
         with_gains(kalman().init(START, MODEL.dims), {"seen": GAIN})
-
-
-@pytest.mark.parametrize(
-    ("gains", "words"),
-    [
-        ({}, "give at least one gain"),
-        ({"seen": [[np.nan], [0.0]]}, "gain of 'seen' has entries that are not finite"),
-        ({"heard": GAIN}, r"no sensor 'heard'; this model has \['seen'\]"),
-        ({"seen": np.zeros((3, 1))}, r"is \(3, 1\), state and sensor need \(2, 1\)"),
-    ],
-)
-def test_gains_that_do_not_fit(gains, words):
-    with pytest.raises(ValueError, match=words):
-        kalman(rules=[constant_gain(gains)]).init(START, MODEL.dims)

@@ -1,6 +1,5 @@
 """Schmidt's filter, against its partitioned equations and against many true errors."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -97,14 +96,6 @@ def test_the_covariance_is_that_of_the_errors_and_above_the_best():
     assert np.trace(P) > 1.05 * np.trace(best[-1])
 
 
-def test_none_considered_is_the_kalman_filter_bit_for_bit():
-    plain = run(kalman(), MODEL, START, Y)
-    for none in ([], np.zeros(4, bool)):
-        solution = run(kalman(rules=[consider(none)]), MODEL, START, Y)
-        np.testing.assert_array_equal(solution.mean, plain.mean)
-        np.testing.assert_array_equal(solution.steps.posterior.factor, plain.steps.posterior.factor)
-
-
 def test_an_exact_sensor_an_infinite_start_and_another_rule():
     # P0 = 1e12, R = 1e-12: K times S_y must not lose what was put back.
     start = Belief.of(jnp.zeros(3), np.diag([1e12, 1e12, 4.0]))
@@ -138,31 +129,3 @@ def test_a_considered_bias_beside_a_rotation():
     np.testing.assert_allclose(solution.sigma[:, 3:], 0.02, rtol=1e-12)
     # More looks at the same stars do not make the attitude better than the bias lets it.
     assert np.all(solution.sigma[-1, :3] > 0.015)
-
-
-def test_a_run_is_differentiable_through_gaps():
-    one = kalman(rules=[consider(HELD)])
-
-    def total(scale):
-        sensor = Sensor(MODEL.sensors[0].read, SYSTEM.W * scale, 3)
-        return run(one, Model(MODEL.motion, (sensor,)), START, Y).log_likelihood
-
-    step = 1e-6
-    value, slope = jax.jit(jax.vmap(jax.value_and_grad(total)))(1.0 + step * jnp.arange(-1.0, 2.0))
-    assert float(slope[1]) == pytest.approx(float(value[2] - value[0]) / (2 * step), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("states", "said"),
-    [
-        ([-1], "different indices"),
-        ([0, 0], "different indices"),
-        ([0.5], "different indices"),
-        ([[0, 1]], "different indices"),
-        ([4], "has state 4, the last one is 3"),
-        ([True, False], r"mask is \(2,\)"),
-    ],
-)
-def test_states_that_are_not_there(states, said):
-    with pytest.raises(ValueError, match=said):
-        consider(states).init(START, MODEL.dims)

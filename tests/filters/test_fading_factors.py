@@ -1,6 +1,5 @@
 """Fading by the innovations of a window, and by age, against recursions and least squares."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from robins.filters import (
     Code,
     Model,
     Motion,
-    OnlineFilter,
     Sensor,
     StepWarning,
     kalman,
@@ -22,11 +20,9 @@ from robins.filters import (
 )
 from robins.filters.observation import Observation
 from robins.filters.rules.fading_memory import fading_memory, per_step
-from robins.filters.rules.gate import gate
 from robins.filters.rules.innovation_fading import innovation_fading
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.variational_bayes import variational_bayes
-from robins.manifold import Angle
 
 T = 30
 SYSTEM = random_system(2)
@@ -141,19 +137,6 @@ def test_a_step_is_faded_once():
     np.testing.assert_array_equal(again.factor, faded.factor)
 
 
-def test_nothing_measured_or_refused_moves_no_window():
-    one = kalman(rules=[gate(0.99), innovation_fading()])
-    update = jax.jit(one.update)
-    state, _ = update(one.init(START, MODEL.dims), MODEL.sensors[0], jnp.ones(3))
-    for y, code in ((jnp.nan, Code.MISSING), (1e4, Code.REFUSED)):
-        after, info = update(state, MODEL.sensors[0], jnp.full(3, y))
-        assert int(info.code) == code
-        assert float(info.notes["innovation_fading.lambda"]) == 1.0
-        for a, b in zip(after.memory[1].windows["y"], state.memory[1].windows["y"], strict=True):
-            np.testing.assert_array_equal(a, b)
-        np.testing.assert_array_equal(after.belief.factor, state.belief.factor)
-
-
 # --------------------------------------------------------------------------------- fading memory
 
 
@@ -201,61 +184,6 @@ def test_a_time_constant_is_what_it_says():
     assert per_step(np.inf, 0.1) == 1.0
 
 
-# ------------------------------------------------------------------------------------------ both
-
-BOTH = [fading_memory(1.05), innovation_fading(5, 4.0)]
-
-
-def test_limits_that_are_the_kalman_filter():
-    one = kalman(rules=[fading_memory(1), innovation_fading(limit=1)])
-    got, want = run(one, MODEL, START, Y), run(kalman(), MODEL, START, Y)
-    np.testing.assert_array_equal(got.mean, want.mean)
-    np.testing.assert_array_equal(got.covariance, want.covariance)
-
-
-def test_fading_streams_as_it_runs():
-    one = kalman(unscented(), BOTH)
-    whole = run(one, MODEL, START, Y)
-    live = OnlineFilter(one, MODEL, START)
-    for row in Y:
-        live.predict()
-        live.update(row)
-    for a, b in zip(jax.tree.leaves(live.state), jax.tree.leaves(whole.final), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11)
-
-
-def test_an_angle_that_wraps_fades_as_one_that_does_not():
-    step = lambda x, u: {"heading": x["heading"].retract(0.2 * x["rate"]), "rate": x["rate"]}  # noqa: E731
-    sensor = Sensor(lambda x, aux: x["heading"], jnp.array([0.05]), 1)
-    model = Model(Motion(step, jnp.array([0.01, 0.01])), (sensor,))
-    t = 0.2 * np.arange(1, 41)
-    seen_rad = t + 0.3 * (t > 4.0) + 0.05 * np.random.default_rng(1).normal(size=40)
-    one, found = kalman(rules=BOTH), []
-    for start_rad in (0.0, 3.0):
-        mean = {"heading": Angle(jnp.array(start_rad)), "rate": jnp.array([1.0])}
-        start = Belief.of(mean, np.diag([0.01, 0.04]))
-        y = Angle(np.angle(np.exp(1j * (seen_rad + start_rad))))
-        solution = run(one, model, start, y)
-        found.append(np.asarray(solution.steps.info["y"].notes["innovation_fading.lambda"]))
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
-    assert found[0].max() == 4.0
-
-
-def test_gradients_are_right_with_components_missing():
-    one = kalman(rules=[fading_memory(1.05), innovation_fading(2, 50.0)], form="joseph")
-    y = np.array([[3.0, 1.0], [np.nan, 2.0], [np.nan, np.nan], [6.0, 2.5]])
-
-    @jax.jit
-    def surprise(size):
-        motion = Motion(lambda x, u: jnp.stack([x[0] + x[1], x[1]]), size * jnp.array([0.1, 0.2]))
-        model = Model(motion, (Sensor(lambda x, aux: x, size * jnp.array([1.0, 0.5]), 2),))
-        return run(one, model, Belief(jnp.zeros(2), jnp.eye(2)), y).log_likelihood
-
-    at, h = jnp.array(0.9), 1e-5
-    by_difference = (surprise(at + h) - surprise(at - h)) / (2 * h)
-    assert float(jax.jit(jax.grad(surprise))(at)) == pytest.approx(float(by_difference), rel=1e-6)
-
-
 # ------------------------------------------------------------------- everything, against the worst
 
 
@@ -289,25 +217,3 @@ def test_all_that_adapts_survives_the_worst():
     codes = np.asarray(solution.steps.info["y"].code)
     assert np.flatnonzero(codes == Code.NOT_FINITE).tolist() == [700]
     assert not np.any(codes == Code.INDEFINITE)
-
-
-# ------------------------------------------------------------------------------------- bad input
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: innovation_fading(0), "innovation_fading window must be 1 sample or more, got 0"),
-        (lambda: innovation_fading(limit=0.5), "innovation_fading limit must be finite and not"),
-        (lambda: innovation_fading(limit=np.inf), "innovation_fading limit must"),
-        (lambda: innovation_fading(limit=np.nan), "innovation_fading limit must"),
-        (lambda: fading_memory(0.99), "fading_memory factor must be finite and not below 1"),
-        (lambda: fading_memory(np.inf), "fading_memory factor must"),
-        (lambda: fading_memory(np.nan), "fading_memory factor must"),
-        (lambda: per_step(0.0, 1.0), "fading_memory memory_s must be positive"),
-        (lambda: per_step(1.0, 0.0), "fading_memory step_s must be positive and finite"),
-    ],
-)
-def test_parameters_that_make_no_sense(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()

@@ -1,6 +1,5 @@
 """The gate: what it refuses and how it recovers, against a recursion written with inverses."""
 
-import inspect
 import itertools
 
 import jax
@@ -318,38 +317,3 @@ def test_each_sensor_has_a_count_of_its_own_and_streams_as_it_runs():
             jax.tree.map(np.testing.assert_array_equal, live.state.memory[0], before)
     np.testing.assert_allclose(live.belief.mean, whole.mean[8], rtol=1e-10)
     np.testing.assert_allclose(live.belief.covariance, whole.covariance[8], rtol=1e-9, atol=1e-12)
-
-
-def test_gradients_are_finite_and_right_where_a_gate_recovers():
-    y = jnp.array(Y[:30])
-
-    one = kalman(rules=[gate(P_GATE, PATIENCE, "reinitialise")])
-
-    def likelihood(scale):
-        sensor = MODEL.sensors[0]
-        wide = Sensor(sensor.read, scale * sensor.noise, sensor.dim)
-        return run(one, Model(MODEL.motion, (wide,)), START, y).log_likelihood
-
-    step = 1e-6
-    points = jnp.array([1.0, 1.0 + step, 1.0 - step])
-    value, gradient = jax.jit(jax.vmap(jax.value_and_grad(likelihood)))(points)
-    difference = float(value[1] - value[2]) / (2 * step)
-    assert float(gradient[0]) == pytest.approx(difference, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"probability": 0.0}, "gate probability must lie between 0 and 1, got 0.0"),
-        ({"probability": 1.0}, "gate probability must"),
-        ({"probability": np.nan}, "gate probability must"),
-        ({"patience": -1}, "gate patience must be at least 0 to accept, got -1"),
-        ({"patience": 0, "recovery": "reinitialise"}, "gate patience must be at least 1"),
-        ({"recovery": "hope"}, "gate recovery must be one of .*inflate.*, got 'hope'"),
-        ({"scope": "half"}, "gate scope must be one of .*component.*, got 'half'"),
-    ],
-)
-def test_a_gate_that_makes_no_sense(wrong, said):
-    # A wrong literal is caught by the type check in tests, by the gate itself elsewhere.
-    with pytest.raises(ValueError, match=said):
-        inspect.unwrap(gate)(**wrong)

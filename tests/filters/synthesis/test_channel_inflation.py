@@ -56,15 +56,6 @@ def test_one_prediction_by_hand_for_sigma_points_and_a_channel_that_turns_with_t
         np.testing.assert_allclose(state.belief.covariance, wanted, rtol=1e-13)
 
 
-def test_lambda_zero_is_the_kalman_filter_bit_for_bit():
-    plain = run(kalman(), MODEL, START, Y)
-    none = run(kalman(rules=[channel_inflation(0, BN)]), MODEL, START, Y)
-    assert np.array_equal(plain.mean, none.mean)
-    assert np.array_equal(plain.covariance, none.covariance)
-    notes = none.steps.info["y"].notes
-    assert np.array_equal(notes["channel_inflation.lambda"], np.zeros(len(Y)))
-
-
 def test_an_attitude_whose_rate_is_in_doubt():
     rate = jnp.array([0.1, -0.2, 0.3])
     motion = Motion(lambda q, u: manifold.retract(q, rate), 1e-3 * jnp.eye(3))
@@ -103,20 +94,3 @@ def test_the_likelihood_has_a_gradient_in_the_channel():
     white = scipy.linalg.solve_triangular(root, y, lower=True)
     log_det = 2.0 * np.sum(np.log(np.diag(root)))
     assert value == pytest.approx(-0.5 * (white @ white + log_det + len(y) * np.log(2 * np.pi)))
-
-
-@pytest.mark.parametrize(
-    ("lambda_", "B", "why"),
-    [
-        (-1.0, BN, "lambda must be a number from 0 on, got -1.0"),
-        (np.inf, BN, "got inf"),
-        (np.nan, BN, "got nan"),
-        (1.0, [0.0, 1.0], r"B has shape \(2,\), \(n, q\)"),
-        (1.0, [[np.nan], [1.0]], "not finite"),
-        (1.0, np.ones((3, 1)), r"B is \(3, 1\), the state needs \(2, q\)"),
-        (1.0, lambda mean: mean, r"B is \(2,\), the state needs \(2, q\)"),
-    ],
-)
-def test_bad_input(lambda_, B, why):
-    with pytest.raises(ValueError, match=why):
-        kalman(rules=[channel_inflation(lambda_, B)]).init(START, MODEL.dims)
