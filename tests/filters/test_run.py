@@ -86,6 +86,8 @@ def test_a_filter_is_compiled_once_for_equal_shapes():
             once = after
     assert 0 < once == after
     run(kalman(), m, s.start(), simulate(s, 2, T)[1])
+    assert len(traced) == after  # made again, it is the same
+    run(kalman(form="joseph"), m, s.start(), simulate(s, 2, T)[1])
     assert len(traced) > after  # the count does count
 
 
