@@ -417,7 +417,7 @@ def test_what_cannot_be_aligned_is_told_in_a_sentence(files):
     text = (files / "slave.csv").read_text()
     (files / "no_axis.csv").write_text(text.replace("dtheta_y_rad,", "yaw_rate,"))
     told = refused(files, slave="no_axis.csv")
-    assert "lacks dtheta_y_deg or dtheta_y_rad; it has time_s, dtheta_x_rad" in told
+    assert "lacks dtheta_y_rad or dtheta_y_deg; it has time_s, dtheta_x_rad" in told
     (files / "degrees.csv").write_text(text.replace("_rad", "_deg"))
     told = refused(files, slave="degrees.csv")
     assert "the gyros do not turn as the attitudes of master.csv do" in told
