@@ -51,7 +51,7 @@ def test_hypotheses_multiply_the_noise_they_are_about():
     walk = np.zeros((24, 24))
     walk[9:12, 9:12] = (5.0 * 2.0) ** 2 * np.eye(3)  # gyro noise is 2 on each axis
     np.testing.assert_allclose(covariance(drifting), expected + walk, rtol=1e-12, atol=1e-12)
-    assert drifting.spread is plain.spread
+    np.testing.assert_array_equal(drifting.spread, plain.spread)
 
 
 def test_a_stiff_structure_has_no_flexure():
