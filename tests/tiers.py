@@ -4,7 +4,7 @@
     make test       all but `certify`
     make certify    those of `certify.toml`, and every property with a thousand examples
 
-`costs.json` holds the seconds of processor of each test that takes a second or more, with what it
+`costs.json` holds the seconds of processor of each test that takes a fifth of a second or more, with what it
 compiles, from an empty cache; `make costs` writes it. `certify.toml` names what is too long to wait
 for at every push, which promise it guards, and which tests of `make test` stand for it meanwhile.
 """
@@ -22,7 +22,7 @@ import pytest
 
 HERE = Path(__file__).parent
 COSTS, CERTIFY = HERE / "costs.json", HERE / "certify.toml"
-LEAST_S = 1.0  # of a cost worth writing down
+LEAST_S = 0.2  # of a cost worth writing down
 
 
 def plain(node: str) -> str:
