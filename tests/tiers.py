@@ -4,7 +4,7 @@
     make test       all but `certify`
     make certify    those of `certify.toml`, and every property with a thousand examples
 
-`costs.json` holds the seconds of processor of each test that takes a fifth of a second or more, with
+`costs.json` holds the seconds of processor of each test that takes 0.2 s or more, with
 what it compiles, from an empty cache; `make costs` writes it. `certify.toml` names what is too long
 to wait for at every push, which promise it guards, and which tests of `make test` stand for it
 meanwhile.
