@@ -18,21 +18,27 @@ import tiers
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Set in the environment, not by calls, so that processes started by tests inherit it. A run on an
-# accelerator is asked for by JAX_PLATFORMS; figures never need a screen.
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ["MPLBACKEND"] = "Agg"
-# Most of a test run is compiling what runs for a moment: code is generated without LLVM's
-# optimisation, by the older of XLA's emitters of loops, in one piece. That takes less than half of
-# the time. XLA_FLAGS= tests what users run.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+# Processes started by tests inherit these; a run on an accelerator is asked for by JAX_PLATFORMS;
+# figures never need a screen. Most of a test run is compiling what runs for a moment: code is
+# generated without LLVM's optimisation, by the older of XLA's emitters of loops, in one piece. That
+# takes less than half of the time (XLA_FLAGS= tests what users run). What was compiled once serves
+# every worker and the next run; where it is kept is not a cost.
+SETTINGS = {
+    "JAX_PLATFORMS": "cpu",
+    "MPLBACKEND": "Agg",
+    "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_cpu_parallel_codegen_split_count=1",
+    "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
+}
+os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
+# JAX was imported above, by then it has read what is there.
+jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs",
+    float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"]),
 )
-# What was compiled once serves every worker and the next run; where it is kept is not a cost.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 # A shell starts what runs in the background deaf to interrupts, `nohup` to the end of a terminal;
 # processes that tests start and interrupt would inherit that.
 for number, handler in (
@@ -101,6 +107,12 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     tiers.mark(items)
+
+
+def pytest_collection_finish():
+    """What was imported stays: the collector of garbage need not look through it again."""
+    gc.collect()
+    gc.freeze()
 
 
 def outside(variable: str, folder: str) -> Path:
