@@ -44,10 +44,10 @@ def measure(job: str) -> dict[str, float]:
     """Seconds of processor to compile and to run once more, for the world and the filter."""
     from robins import scenario
     from robins.campaign.monte_carlo import record, worlds
-    from robins.workbench import _study_of, find_scenario
+    from robins.workbench.scenarios import find_scenario, study_of
 
     system, _, text = find_scenario(job)
-    study = _study_of(system, text, job)
+    study = study_of(system, text, job)
     parameters = scenario.parse(study.parameters, text, [f"runs={RUNS}"], source=job)
     problem = study.problem(parameters, (JOBS[job],), 0)
 
@@ -64,7 +64,7 @@ def measure(job: str) -> dict[str, float]:
 
 def of(setting: str, job: str) -> dict[str, float]:
     """`measure` in a process of its own."""
-    told = {"JAX_ENABLE_COMPILATION_CACHE": "false", "ROBINS_XLA": "off"}
+    told = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     done = subprocess.run(
         [sys.executable, __file__, "--one", job],
         env=os.environ | told | {"XLA_FLAGS": SETTINGS[setting]},
