@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt --edita
 READY := $(VENV)/.ready
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo lint docs check test certify costs bench watch profile clean
+.PHONY: install demo lint docs pages fast check test certify costs bench watch profile clean
 
 install: $(STAMP)
 
@@ -31,16 +31,25 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+SPHINX = $(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees
 docs: install
-	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	$(SPHINX) -b html docs docs/_build/html
+
+# The documents read and their links resolved, without writing pages.
+pages: install
+	$(SPHINX) -b dummy docs docs/_build/dummy
 
 # Of the tests three tiers, by cost; tests/tiers.py says which is in which.
-PYTEST = $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+PYTEST = $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-check: lint
+fast: install
 	$(PYTEST) -m fast
 
-test: lint docs
+check: install
+	$(MAKE) --jobs 2 lint fast
+
+test: install
+	$(MAKE) --jobs 2 lint pages
 	$(PYTEST)
 
 certify: install

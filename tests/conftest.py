@@ -107,6 +107,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     tiers.mark(items)
+    items[:] = tiers.arrange(items, os.environ.get("PART", "1/1"))
 
 
 def pytest_collection_finish():

@@ -1,8 +1,11 @@
 """The table of tiers means tests that exist, and what is moved away has others to stand for it."""
 
 import ast
+import random
 import re
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import tiers
@@ -10,10 +13,15 @@ import tiers
 HERE = Path(__file__).parent
 
 
+@cache
+def parsed(file):
+    return ast.parse(file.read_text("utf-8"))
+
+
 def defined(name):
     """Whether a file of tests defines the function of a name, "room/test_x.py::test_y"."""
     file, *path = name.split("::")
-    tree = ast.parse((HERE / file).read_text("utf-8"))
+    tree = parsed(HERE / file)
     inner = {n.name: n for n in tree.body if isinstance(n, (ast.ClassDef, ast.FunctionDef))}
     for part in path[:-1]:
         inner = {n.name: n for n in inner[part].body if hasattr(n, "name")}
@@ -45,6 +53,30 @@ def test_a_test_is_meant_by_its_name_and_parameters():
     ):
         assert tiers.meant(every, node) == of_every
         assert tiers.meant(some, node) == of_some
+
+
+class Item(NamedTuple):
+    nodeid: str
+
+
+def by_file(items):
+    costs, load = tiers.costs(), {}
+    for item in items:
+        file = item.nodeid.partition("::")[0]
+        load[file] = load.get(file, 0.0) + costs[item.nodeid.removeprefix("tests/")]
+    return load
+
+
+def test_parts_hold_every_test_once_in_whole_files_and_cost_alike():
+    items = [Item(f"tests/{node}") for node in tiers.costs()]
+    random.Random(1).shuffle(items)
+    parts = [tiers.arrange(items, f"{k}/3") for k in (1, 2, 3)]
+    assert sorted(item for part in parts for item in part) == sorted(items)
+    files = [by_file(part) for part in parts]
+    assert sum(map(len, files)) == len({name for names in files for name in names})
+    spent = [sum(file.values()) for file in files]
+    largest = max(cost for file in files for cost in file.values())
+    assert max(spent) <= max(1.1 * min(spent), largest)
 
 
 def test_tiers_are_not_marked_by_hand():
