@@ -16,7 +16,6 @@ from robins.filters import (
     Model,
     Motion,
     Sensor,
-    StepWarning,
     kalman,
     run,
 )
@@ -278,8 +277,7 @@ def test_star_frames_wrong_by_ten_degrees_do_not_turn_an_attitude():
     frames = jax.vmap(lambda x, d: x.retract(d))(truth, jnp.asarray(fault))
     start = {"attitude": Rotation.identity(), "bias": jnp.zeros(3)}
     belief = Belief.of(start, np.diag([1e-4] * 3 + [1e-8] * 3))
-    rules = (huber(), igg3(), student_t(), correntropy())
-    robust, plain = (run(kalman(rules=r), TUMBLING, belief, frames) for r in (rules, ()))
+    robust, plain = (run(kalman(rules=r), TUMBLING, belief, frames) for r in ([huber()], []))
     worst = [
         float(np.max(np.linalg.norm(s.mean["attitude"].local(truth), axis=1)[5:]))
         for s in (robust, plain)
@@ -287,39 +285,3 @@ def test_star_frames_wrong_by_ten_degrees_do_not_turn_an_attitude():
     assert worst[0] < 3e-4
     assert worst[1] > 0.03  # contrast
     assert np.all(np.abs(robust.mean["bias"][-1] - bias) < 5 * robust.sigma[-1, 3:])
-
-
-# ------------------------------------------------------------------- extremes
-
-ALL = (huber(), igg3(), student_t(), correntropy())
-CHAIN = kalman(rules=(*ALL, student_t(whose="both"), gate(recovery="reinitialise", patience=2)))
-
-
-def test_extremes_leave_a_covariance():
-    # Nothing known, everything known, exact and repeated measurements, and outliers among them.
-    rng = np.random.default_rng(4)
-    steps, n, m = 1500, 4, 3
-    A = rng.normal(size=(m, n))
-    sensors = np.array([A, 0 * A, A[[0, 0, 0]], A[[0, 0, 1]], np.vstack([A[:2], A[0] - A[1]])])
-    H = sensors[rng.integers(len(sensors), size=steps)]
-    W = np.array([0.0, 1e-6, 1.0])[rng.integers(3, size=(steps, m))][:, :, None] * np.eye(m)
-    y = 10.0 ** rng.uniform(-3, 9, (steps, m)) * rng.normal(size=(steps, m))
-    y[rng.random(y.shape) < 0.1] = np.nan
-    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
-    noise = np.where(rng.random((steps, 1)) < 0.1, 1.0, 0.0) * np.ones(n)
-    model = Model(
-        Motion(lambda x, u: jnp.asarray(turn) @ x, lambda x, u: u),
-        (Sensor(lambda x, aux: aux[0] @ x, lambda x, aux: aux[1], m),),
-    )
-    for P0 in (0.0, 1e12):
-        start = Belief.of(jnp.zeros(n), P0 * np.eye(n))
-        with pytest.warns(StepWarning, match="CONTRADICTED"):  # exact sensors that read anything
-            solution = run(CHAIN, model, start, y, noise, {"y": (H, W)})
-        P = np.asarray(solution.covariance)
-        assert np.all(np.isfinite(solution.mean))
-        assert np.all(np.isfinite(P))
-        least, greatest = np.linalg.eigvalsh(P)[:, [0, -1]].T
-        assert np.all(least >= -1e-15 * greatest)
-        codes = set(np.unique(solution.steps.info["y"].code).tolist())
-        taken = {Code.DONE, Code.MISSING, Code.PARTLY_MISSING, Code.REFUSED, Code.CONTRADICTED}
-        assert codes <= taken
