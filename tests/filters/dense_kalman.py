@@ -124,3 +124,14 @@ def posterior(F, Q, H, R, m0, P0, y) -> tuple:
     P = P - K @ S @ K.T
     blocks = np.stack([P[k * n : (k + 1) * n, k * n : (k + 1) * n] for k in range(T)])
     return mean.reshape(T, n), blocks
+
+
+SPLIT_W = np.diag([0.5, 0.7, 2.0])
+
+
+def split(system: System) -> Model:
+    """A system of three measurements as two sensors, near and far, of the noise `SPLIT_W`."""
+    F, G, H = (jnp.array(a) for a in system[:3])
+    near = Sensor(Partial(times, H[:2]), jnp.array([0.5, 0.7]), 2, "near")
+    far = Sensor(Partial(times, H[2:]), jnp.array([2.0]), 1, "far")
+    return Model(Motion(Partial(times, F), G), (near, far))

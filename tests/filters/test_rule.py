@@ -11,7 +11,6 @@ from robins.filters import (
     Code,
     Model,
     Motion,
-    OnlineFilter,
     Rule,
     Sensor,
     kalman,
@@ -20,7 +19,6 @@ from robins.filters import (
     taylor,
     unscented,
 )
-from robins.filters.rules import gate
 
 T = 20
 SYSTEM = random_system(2)
@@ -147,30 +145,6 @@ def test_a_prior_that_is_left_alone_is_not_seen_again():
     once = count([])
     assert count([Rule(), Rule()]) == once
     assert count([Rule(before=lambda m, p, o: (m, Belief(*p), o))]) == 2 * once
-
-
-def test_after_inflates_learns_and_notes():
-    # H-infinity in its simplest form: the posterior covariance times four, and a note of each step.
-    def init(belief, dims):
-        return jnp.zeros((), int)
-
-    def after(memory, posterior, info, o):
-        notes = {**info.notes, "toy.step": memory, "toy.noise": o.noise[0, 0]}
-        wide = posterior._replace(factor=2.0 * posterior.factor)
-        return memory + 1, wide, info._replace(notes=notes)
-
-    solution = run(kalman(rules=[Rule(init=init, after=after, name="toy")]), MODEL, START, Y)
-    notes = solution.steps.info["y"].notes
-    assert notes["toy.step"].tolist() == list(range(T))
-    np.testing.assert_array_equal(notes["toy.noise"], np.full(T, SYSTEM.W[0, 0]))
-    assert int(solution.final.memory[0]) == T
-    m, P = SYSTEM.m0, SYSTEM.P0
-    for k in range(T):
-        step = SYSTEM._replace(m0=m, P0=P)
-        means, covariances, _, _ = kalman_filter(step, Y[k : k + 1])
-        m, P = means[0], 4.0 * covariances[0]
-        np.testing.assert_allclose(solution.mean[k], m, rtol=1e-8, atol=1e-10)
-        np.testing.assert_allclose(solution.covariance[k], P, rtol=1e-8, atol=1e-9)
 
 
 def test_after_sees_the_observation_and_the_prior_that_were_used():
@@ -307,18 +281,6 @@ def test_memory_may_hold_keys_and_counters():
     solution = run(kalman(rules=[Rule(init=init, process=process)]), MODEL, START, Y)
     by_the_book(solution, SYSTEM, Y)
     assert int(solution.final.memory[0]["count"]) == T
-
-
-def test_rules_stream_as_they_run():
-    rules = [count_outcomes(), gate(0.9)]
-    one = kalman(rules=rules)
-    whole = run(one, MODEL, START, Y)
-    live = OnlineFilter(one, MODEL, START)
-    for row in Y:
-        live.predict()
-        live.update(row)
-    for a, b in zip(jax.tree.leaves(live.state), jax.tree.leaves(whole.final), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
 # ------------------------------------------------------------------------- judging an innovation

@@ -9,19 +9,15 @@ from dense_kalman import System, kalman_filter, random_system, simulate
 from test_cases import cases, check, given, linear
 
 from robins.filters import (
-    Belief,
     Model,
-    Motion,
     Rule,
     Sensor,
     kalman,
     run,
     taylor,
-    unscented,
 )
 from robins.filters.kalman import Form
 from robins.filters.rules.strong_tracking import strong_tracking
-from robins.manifold import Angle
 
 T = 30
 SYSTEM = random_system(5)
@@ -265,37 +261,3 @@ def test_only_the_first_sensor_of_a_step_knows_the_process_noise_apart():
         P = P_moved + Q
         np.testing.assert_allclose(solution.mean[k], m, rtol=1e-8, atol=1e-9)
     assert min(np.max(x) for x in noted.values()) > 1.5
-
-
-def test_an_angle_that_jumps_across_the_cut_is_followed():
-    def turn(x, u):
-        heading, rate = x
-        return heading.retract(0.1 * rate), rate
-
-    def direction(x, aux):
-        return jnp.cos(x[0].rad)[None], jnp.sin(x[0].rad)[None]
-
-    rate = jnp.where(jnp.arange(100) < 50, 0.2, -1.5)
-    true = 3.0 + 0.1 * jnp.cumsum(rate)
-    rng = np.random.default_rng(3)
-    noise = 0.05 * jnp.array(rng.normal(size=(3, 100)))
-    y = {
-        "compass": Angle(true + noise[0]),
-        "pointer": ((jnp.cos(true) + noise[1])[:, None], (jnp.sin(true) + noise[2])[:, None]),
-    }
-    model = Model(
-        Motion(turn, jnp.array([1e-3, 1e-3])),
-        (
-            Sensor(lambda x, aux: x[0], jnp.array([0.05]), 1, "compass"),
-            Sensor(direction, jnp.array([0.05, 0.05]), 2, "pointer"),
-        ),
-    )
-    start = Belief.of((Angle(3.0), jnp.array([0.2])), np.diag([0.01, 0.01]))
-
-    rules = [strong_tracking(form="multiple", weights=[1, 1])]
-    solution = run(kalman(unscented(), rules), model, start, y)
-    error = np.asarray(Angle(true).local(solution.mean[0])[:, 0])
-    assert np.max(np.abs(error[60:])) < 0.2  # four sigma of a single reading; one period is 6.28
-    assert np.min(true) < -np.pi < np.pi < np.max(true)
-    assert np.max(np.asarray(solution.steps.info["compass"].notes[LAMBDA])) > 10.0
-    assert np.all(np.isfinite(solution.covariance))

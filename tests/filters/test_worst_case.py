@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from attitude_matching import in_unit, run_with
 from dense_h_infinity import greatest, h_infinity_filter
-from dense_kalman import random_system, simulate, times
-from jax.tree_util import Partial
+from dense_kalman import SPLIT_W, random_system, simulate, split
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
@@ -172,19 +171,15 @@ def test_the_operator_moves_errors_as_the_filter_does():
 
 
 def test_sensors_in_sequence_are_one():
-    W = np.diag([0.5, 0.7, 2.0])
-    F, G, H = (jnp.array(a) for a in SYSTEM[:3])
-    near = Sensor(Partial(times, H[:2]), jnp.array([0.5, 0.7]), 2, "near")
-    far = Sensor(Partial(times, H[2:]), jnp.array([2.0]), 1, "far")
-    two, one = Model(Motion(Partial(times, F), G), (near, far)), SYSTEM._replace(W=W).model()
+    two, one = split(SYSTEM), SYSTEM._replace(W=SPLIT_W).model()
     raising = h_infinity(1.0, L, policy="raise_gamma", estimate="predictor")  # gamma by sensor
     members = {"a-priori": MEMBERS["a-priori"], "predictor": kalman(rules=[raising])}
     for estimate, member in members.items():
         gamma = {"a-priori": 9.0, "predictor": 1.0}[estimate]
         state = with_gamma(member.init(START, two.dims), gamma)
-        split = run(member, two, state, {"near": Y[:, :2], "far": Y[:, 2:]})
+        parts = run(member, two, state, {"near": Y[:, :2], "far": Y[:, 2:]})
         whole = run(member, one, with_gamma(member.init(START, one.dims), gamma), Y)
-        got = worst_case_gain(two, START, split, L, estimate=estimate)
+        got = worst_case_gain(two, START, parts, L, estimate=estimate)
         want = worst_case_gain(one, START, whole, L, estimate=estimate)
         assert got == pytest.approx(want, rel=1e-9)
 
