@@ -16,6 +16,7 @@ from robins.manifold import Angle
 
 C, DRAWS = 4, 60
 CLIP = jax.jit(jax.vmap(lambda m, S, D, low, high: clip(Belief(m, S), D, low, high)))
+one_clip = jax.jit(clip, static_argnums=4)
 
 
 def by_enumeration(m, V, D, low, high):
@@ -72,24 +73,24 @@ def test_the_nearest_state_inside(n):
 def test_far_outside_and_known_exactly():
     S = jnp.diag(jnp.array([1e-6, 1.0, 0.0]))
     m = jnp.array([-1.0, 5.0, -2.0])  # a million deviations off; and off without doubt
-    kept = clip(Belief(m, S), jnp.eye(3), jnp.zeros(3), jnp.array([np.inf, 4.0, np.inf]))
+    bounds = jnp.eye(3), jnp.zeros(3), jnp.array([np.inf, 4.0, np.inf])
+    kept = one_clip(Belief(m, S), *bounds)
     np.testing.assert_allclose(kept.belief.mean, [0.0, 4.0, -2.0], atol=1e-12)
     assert not bool(kept.infeasible)
-    again = clip(kept.belief, jnp.eye(3), jnp.zeros(3), jnp.array([np.inf, 4.0, np.inf]))
+    again = one_clip(kept.belief, *bounds)
     np.testing.assert_array_equal(again.belief.mean, kept.belief.mean)
-    cut = truncate(Belief(m, S), jnp.eye(3), jnp.zeros(3), jnp.array([np.inf, 4.0, np.inf]))
+    cut = jax.jit(truncate)(Belief(m, S), *bounds)
     assert np.all(np.isfinite(cut.belief.factor))
     want = [0.0, stats.truncnorm(-5.0, -1.0, loc=5.0).mean(), -2.0]
     np.testing.assert_allclose(cut.belief.mean, want, rtol=1e-12, atol=1e-11)
 
 
-def test_the_metric_may_be_another():
-    P = np.array([[1.0, 0.9], [0.9, 1.0]])
-    belief = Belief.of(np.array([-1.0, 0.0]), P)
-    plain = clip(belief, [[1.0, 0.0]], [0.0], [np.inf]).belief.mean
-    near = clip(belief, [[1.0, 0.0]], [0.0], [np.inf], "identity").belief.mean
-    np.testing.assert_allclose(plain, [0.0, 0.9], atol=1e-14)
-    np.testing.assert_allclose(near, [0.0, 0.0], atol=1e-14)
+@pytest.mark.parametrize(("metric", "want"), [("covariance", 0.9), ("identity", 0.0)])
+def test_the_metric_may_be_another(metric, want):
+    belief = Belief.of(np.array([-1.0, 0.0, 0.0]), np.array([[1, 0.9, 0], [0.9, 1, 0], [0, 0, 1]]))
+    bounds = jnp.eye(3), jnp.array([0.0, -np.inf, -np.inf]), jnp.full(3, np.inf)
+    kept = one_clip(belief, *bounds, metric).belief.mean
+    np.testing.assert_allclose(kept, [0.0, want, 0.0], atol=1e-14)
 
 
 # ------------------------------------------------------------------------------------ truncation
@@ -119,7 +120,7 @@ def test_one_cut_is_the_density_inside():
     P, D = A @ A.T, np.array([[1.0, -0.5, 0.3]])
     low, high = D @ m + 0.3, D @ m + 2.5
     cut = truncate(Belief.of(m, P), D, low, high).belief
-    x = rng.multivariate_normal(m, P, size=2_000_000)
+    x = rng.multivariate_normal(m, P, size=500_000)
     x = x[(x @ D[0] >= low[0]) & (x @ D[0] <= high[0])]
     sigma = np.sqrt(np.diag(P))
     many = np.sqrt(len(x))
@@ -162,11 +163,7 @@ D = np.array([[1.0, 0.0, 0.5, 0.0]])
 
 @pytest.mark.parametrize(
     ("method", "way", "form"),
-    [
-        ("active-set", None, "joseph"),
-        ("active-set", unscented(), "sqrt"),
-        ("truncation", None, "sqrt"),
-    ],
+    [("active-set", unscented(), "joseph"), ("truncation", None, "sqrt")],
 )
 def test_a_rule_keeps_its_bounds(method, way, form):
     rule = inequality(D, [0.2], [0.6], method)
@@ -195,12 +192,11 @@ def test_a_rule_keeps_its_bounds(method, way, form):
         np.testing.assert_allclose(solution.covariance[k], P, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("method", ["active-set", "truncation"])
-def test_a_height_on_a_manifold_and_its_gradient(method):
+def test_a_height_on_a_manifold_and_its_gradient():
     def height(x):
         return x["height"] + 0.1 * jnp.cos(x["heading"].rad)
 
-    one = kalman(rules=[inequality(height, [0.0], method=method)])
+    one = kalman(rules=[inequality(height, [0.0])])
     start = Belief.of({"heading": Angle(3.1), "height": jnp.array([0.3])}, 0.04 * np.eye(2))
     motion = Motion(lambda x, u: x, jnp.full(2, 0.05))
     y = jnp.array([[-0.4], [jnp.nan], [0.2]])

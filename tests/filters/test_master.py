@@ -20,7 +20,6 @@ from robins.filters import (
     distributed,
     federated,
     guarded,
-    intersecting,
     kalman,
     run,
 )
@@ -35,6 +34,7 @@ FIRST = tuple(
     Sensor(Partial(times, jnp.array(S.H[r])), jnp.array(S.W[r, r]), r.stop - r.start, k)
     for k, r in ROWS.items()
 )
+JOINED = distributed(CHANNELS)
 DATA_OF_LOCALS = by_sensor(Y[0, :STEPS])
 DATA = DATA_OF_LOCALS | {"held": HELD}
 
@@ -91,17 +91,16 @@ def test_a_federated_filter_shares_out_what_its_master_measured():
 
 def test_without_its_sensor_it_is_the_joined_filter():
     silent = DATA | {"held": np.full_like(HELD, np.nan)}
-    one = intersecting(CHANNELS, [0.3, 0.7])
-    got = run(at_master(one, ["held"]), model(), START, silent)
-    want = run(one, Model(model().motion, FIRST), START, DATA_OF_LOCALS)
+    got = run(at_master(JOINED, ["held"]), model(), START, silent)
+    want = run(JOINED, Model(model().motion, FIRST), START, DATA_OF_LOCALS)
     np.testing.assert_array_equal(got.mean, want.mean)
     np.testing.assert_array_equal(got.steps.posterior.factor, want.steps.posterior.factor)
 
 
 def test_rules_of_the_master_judge_what_was_fused():
-    one = at_master(distributed(CHANNELS), "held", kalman(rules=[gate(0.9, patience=STEPS)]))
+    one = at_master(JOINED, "held", kalman(rules=[gate(0.9, patience=STEPS)]))
     got = run(one, model(), START, DATA)
-    fused = run(distributed(CHANNELS), Model(model().motion, FIRST), START, DATA_OF_LOCALS)
+    fused = run(JOINED, Model(model().motion, FIRST), START, DATA_OF_LOCALS)
     expected = np.einsum("i,tij,j->t", D[0], fused.covariance, D[0]) + SIGMA**2
     far = (HELD[:, 0] - fused.mean @ D[0]) ** 2 > stats.chi2.ppf(0.9, 1) * expected
     assert 0 < np.sum(far) < np.sum(np.isfinite(HELD))
@@ -114,9 +113,7 @@ def test_rules_of_the_master_judge_what_was_fused():
 
 
 def test_a_guard_takes_over_below_the_master():
-    one = guarded(
-        at_master(distributed(CHANNELS), "held"), distributed(CHANNELS), "held", ["a", "b"]
-    )
+    one = guarded(at_master(JOINED, "held"), JOINED, "held", ["a", "b"])
     wrong = DATA | {"held": HELD + 1e3}
     got = run(one, model(1e-3), START, wrong)
     watch = got.final.memory
@@ -146,10 +143,10 @@ def test_audits_of_both_are_heard():
 
 def test_bad_input():
     with pytest.raises(ValueError, match="name at least one"):
-        at_master(distributed(CHANNELS), ())
+        at_master(JOINED, ())
     with pytest.raises(ValueError, match="no sensor 'wind'"):
-        at_master(distributed(CHANNELS), "wind").init(START, model().dims)
+        at_master(JOINED, "wind").init(START, model().dims)
     with pytest.raises(ValueError, match=r"sensor 'b' comes after .*put \['held'\] last"):
-        at_master(distributed(CHANNELS), "held").init(START, model(order=(0, 2, 1)).dims)
+        at_master(JOINED, "held").init(START, model(order=(0, 2, 1)).dims)
     with pytest.raises(ValueError, match="without locals"):
         at_master(kalman(), "held").init(START, model().dims)

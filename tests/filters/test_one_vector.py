@@ -4,6 +4,7 @@ An attitude known to 30 deg about a field and to half a degree across it; the fi
 five times the error expected.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,30 +32,34 @@ def belief(q) -> Belief:
     return Belief(Rotation(q), jnp.asarray(np.linalg.cholesky(P)))
 
 
+RULES = {
+    "strong tracking": strong_tracking(form="projected"),
+    "discriminator": discriminator(patience=1, threshold=0.0, rho=0.5),
+    "gate inflates": gate(0.999, 0, "inflate"),
+    "gate re-opens": gate(0.999, 1, "reinitialise"),
+}
+
+
 @pytest.mark.parametrize("way", [taylor(), unscented(0.5)], ids=["taylor", "unscented"])
-@pytest.mark.parametrize(
-    "rule",
-    [
-        strong_tracking(form="projected"),
-        discriminator(patience=1, threshold=0.0, rho=0.5),
-        gate(0.999, 0, "inflate"),
-        gate(0.999, 1, "reinitialise"),
-    ],
-    ids=["strong tracking", "discriminator", "gate inflates", "gate re-opens"],
-)
-def test_what_one_vector_does_not_show_stays_as_known_as_it_was(way, rule):
+def test_what_one_vector_does_not_show_stays_as_known_as_it_was(way):
     """Whichever way the sensor's axes lie: rounding differs with them."""
-    filter_ = kalman(way, [rule])
+    off = jnp.asarray(np.cross(ABOUT, [0.0, 0.0, 1.0]))
+    turned = rotate(from_rotvec(0.1 * off), FIELD)
+
+    @jax.jit
+    def seen(q):
+        start, found = belief(q), {}
+        for name, rule in RULES.items():
+            filter_ = kalman(way, [rule])
+            state = filter_.init(start, {"field": 3})
+            for _ in range(2):  # two that agree, for the gate that asks for them
+                state = filter_.reset(state, start)
+                state, info = filter_.update(state, SENSOR, rotate(conjugate(q), turned), FIELD)
+            found[name] = jnp.sqrt(ABOUT @ state.belief.covariance @ ABOUT), info.nis
+        return found
+
     for euler in ((0.1, 0.7, 2.0), (0.0, 0.0, 0.0), (-2.0, 1.2, -0.4), (1.5, -0.3, 3.0)):
-        q = from_euler(*euler)
-        start = belief(q)
-        off = jnp.asarray(np.cross(ABOUT, [0.0, 0.0, 1.0]))
-        turned = rotate(from_rotvec(0.1 * off), FIELD)
-        state = filter_.init(start, {"field": 3})
-        for _ in range(2):  # two that agree, for the gate that asks for them
-            state = filter_.reset(state, start)
-            state, info = filter_.update(state, SENSOR, rotate(conjugate(q), turned), FIELD)
-        found = np.sqrt(ABOUT @ np.asarray(state.belief.covariance) @ ABOUT)
-        assert info.nis > 0.0
-        # sigma points see the curve of 30 deg: what they make of it is a share, not a multiple
-        assert 29.0 * DEG < found < 31.0 * DEG
+        for name, (sigma, nis) in seen(from_euler(*euler)).items():
+            assert nis > 0.0, name
+            # sigma points see the curve of 30 deg: what they make of it is a share, not a multiple
+            assert 29.0 * DEG < sigma < 31.0 * DEG, name

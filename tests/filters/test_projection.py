@@ -1,5 +1,6 @@
 """Constraints that come with data, against dense projections; rules that see some sensors alone."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,11 +57,10 @@ def by_the_book(root, weight, project=True):
 
 CASES = [
     ("covariance", L, True, taylor()),
-    ("covariance", 0 * L, True, unscented()),
-    ("identity", L, True, unscented()),
+    ("covariance", 0 * L, True, taylor()),
+    ("identity", L, True, taylor()),
     ("matrix", L, True, taylor()),
     ("identity", 0 * L, True, taylor()),
-    ("covariance", L, False, taylor()),
     ("identity", L, False, unscented()),
 ]
 
@@ -87,7 +87,7 @@ def test_what_was_refused_is_not_met():
     far = HELD + 1e4
     one = kalman(rules=[only("held", gate(patience=T)), projection("held")])
     got = run(one, model(jnp.asarray(L)), S.start(), {"seen": Y, "held": far})
-    plain = run(kalman(), model(jnp.asarray(L)), S.start(), {"seen": Y})
+    plain = run(kalman(), model(jnp.asarray(L)), S.start(), {"seen": Y, "held": np.nan * HELD})
     np.testing.assert_array_equal(got.mean, plain.mean)
 
 
@@ -95,16 +95,17 @@ def test_exact_ones_twice_in_joseph_form_and_in_a_local_filter():
     exact = model(jnp.zeros((2, 2)))
     held = Sensor(exact.sensors[1].read, jnp.zeros((2, 2)), 2, "again")
     rule = projection(["held", "again"])
-    one, state = kalman(rules=[rule]), None
-    state, _ = one.update(one.init(S.start(), {"held": 2}), exact.sensors[1], HELD[0], None)
+    one = kalman(rules=[rule])
+    update = jax.jit(one.update)
+    state, _ = update(one.init(S.start(), {"held": 2}), exact.sensors[1], HELD[0], None)
     assert np.linalg.matrix_rank(np.asarray(state.belief.factor)) == 2
-    twice, _ = one.update(state, held, HELD[0], None)
+    twice, _ = update(state, held, HELD[0], None)
     np.testing.assert_array_equal(twice.belief.mean, state.belief.mean)
     np.testing.assert_array_equal(twice.belief.factor, state.belief.factor)
 
     joseph = kalman(form="joseph")
     start = joseph.init(state.belief, {"seen": 3})
-    assert int(joseph.update(start, SEEN, Y[0], None)[1].code) == Code.INDEFINITE
+    assert int(jax.jit(joseph.update)(start, SEEN, Y[0], None)[1].code) == Code.INDEFINITE
 
     locals_ = distributed([channel("held", one), channel("seen")])
     with pytest.raises(ValueError, match="'held' was singular"):
@@ -134,7 +135,7 @@ def deaf():
 def test_a_rule_for_one_sensor_leaves_the_others_alone():
     noise, data = jnp.asarray(L), {"seen": Y, "held": HELD}
     got = run(kalman(rules=[only("seen", deaf())]), model(noise), S.start(), data)
-    want = run(kalman(), model(noise), S.start(), {"held": HELD})
+    want = run(kalman(), model(noise), S.start(), {"seen": np.nan * Y, "held": HELD})
     np.testing.assert_array_equal(got.mean, want.mean)
     assert set(got.steps.info["seen"].code.tolist()) == {Code.REFUSED}
     np.testing.assert_array_equal(got.steps.info["held"].code, want.steps.info["held"].code)
@@ -150,9 +151,9 @@ def test_hooks_of_a_step_stay_and_one_rule_serves_several_filters():
     alone = distributed([channel("seen", kalman(rules=[sage_husa()])), channel("held")])
     got, want = (run(f, model(noise), S.start(), data).mean for f in (joined, alone))
     np.testing.assert_array_equal(got, want)
-    both = run(
-        kalman(rules=[only("seen", huber()), only("held", igg3())]), model(noise), S.start(), data
-    )
+    several = kalman(rules=[only("seen", huber()), only("held", igg3())])
+    given = model(noise), S.start()
+    both = jax.eval_shape(lambda y: run(several, *given, y), data)
     notes = {k: set(v.notes) for k, v in both.steps.info.items()}
     assert all(name.startswith("huber") for name in notes["seen"])
     assert all(name.startswith("igg3") for name in notes["held"])

@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import Partial
 
 from robins import linalg
-from robins.filters import Belief, Model, Motion, OnlineFilter, Sensor, kalman, run, unscented
+from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
 from robins.manifold import Angle
 
 N, M = 3, 2
@@ -63,18 +64,23 @@ def test_the_filter_is_the_one_that_is_printed(weights, form):
     means, covariances = (np.array(a) for a in zip(*as_printed(*weights), strict=True))
     np.testing.assert_allclose(solution.mean, means, atol=1e-13)
     np.testing.assert_allclose(solution.covariance, covariances, atol=1e-13)
-    drawn = run(kalman(unscented(*weights), form=form), model(), Belief.of(jnp.array(M0), P0), Y)
-    assert np.max(np.abs(drawn.mean - solution.mean)) > 1e-3  # it is another filter
+
+
+def moving(share, x, u):
+    return share * f(x) + (1.0 - share) * x
 
 
 def test_points_that_stay_where_they_are_are_those_that_would_be_drawn():
-    still = Model(Motion(lambda x, u: x, jnp.zeros(N)), model().sensors)
-    start = Belief.of(jnp.array(M0), P0)
-    again, drawn = (
-        run(kalman(unscented(redraw=redraw)), still, start, Y[:1]) for redraw in (False, True)
-    )
+    def both(share):
+        motion = Motion(Partial(moving, jnp.array(share)), share * jnp.array(linalg.factor(Q)))
+        given = Model(motion, model().sensors), Belief.of(jnp.array(M0), P0), Y[:1]
+        return (run(kalman(unscented(redraw=redraw)), *given) for redraw in (False, True))
+
+    again, drawn = both(0.0)
     np.testing.assert_allclose(again.mean, drawn.mean, atol=1e-14)
     np.testing.assert_allclose(again.covariance, drawn.covariance, atol=1e-14)
+    again, drawn = both(1.0)
+    assert np.max(np.abs(drawn.covariance - again.covariance)) > 1e-3  # it is another filter
 
 
 def test_the_second_sensor_of_a_step_draws():
@@ -94,18 +100,11 @@ def test_the_second_sensor_of_a_step_draws():
     np.testing.assert_allclose(solution.steps.posterior.factor[0], second.belief.factor, atol=1e-13)
 
 
-def test_it_streams_as_it_runs_and_skips_what_is_missing():
-    one, start = kalman(unscented(redraw=False)), Belief.of(jnp.array(M0), P0)
+def test_it_skips_what_is_missing():
     y = Y.copy()
     y[2], y[4, 0] = np.nan, np.nan
-    solution = run(one, model(), start, y)
-    live = OnlineFilter(one, model(), start)
-    for row in y:
-        live.predict()
-        live.update(row)
-    np.testing.assert_allclose(live.belief.mean, solution.mean[-1], rtol=1e-13)
-    predicted = solution.steps.prediction.belief
-    np.testing.assert_array_equal(solution.mean[2], predicted.mean[2])
+    solution = run(kalman(unscented(redraw=False)), model(), Belief.of(jnp.array(M0), P0), y)
+    np.testing.assert_array_equal(solution.mean[2], solution.steps.prediction.belief.mean[2])
 
 
 def test_weights_that_would_take_covariance_away_are_refused():
