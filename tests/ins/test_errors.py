@@ -50,7 +50,7 @@ def numerical(x, f_b, omega_b):
     return limit[:, :21], limit[:, 21:]
 
 
-CASES = [(0, 80.0), (1, -80.0), (2, 45.0), (3, 0.5), (4, None), (5, None)]
+CASES = [(0, 80.0), (1, -80.0), (3, 0.5), (4, None)]
 
 
 @pytest.mark.parametrize(("seed", "lat_deg"), CASES)

@@ -73,12 +73,13 @@ def test_free_motion_is_that_of_an_integrator():
         true[2] + 2.0 * x.accel_bias,
         true[3] + 2.0 * x.accel_bias,
     )
-    found = propagate(x, biased).pose
+    move = jax.jit(propagate)
+    found = move(x, biased).pose
     np.testing.assert_allclose(found.velocity, want[:3], atol=1e-9)
     np.testing.assert_allclose(found.position, want[3:], atol=1e-9)
     turned = (start * Turn.from_rotvec(rate * 2.0)).as_matrix()
     np.testing.assert_allclose(found.rotation.as_dcm(), turned, atol=1e-13)
-    plain = propagate(x, biased._replace(dr=None)).pose  # then half of dv dt
+    plain = move(x, biased._replace(dr=None)).pose  # then half of dv dt
     np.testing.assert_allclose(plain.velocity, want[:3], atol=1e-9)
     gap = x.pose.rotation.apply(true[2] - true[3])
     np.testing.assert_allclose(plain.position - found.position, gap, atol=1e-9)
@@ -87,38 +88,39 @@ def test_free_motion_is_that_of_an_integrator():
 @SIDES
 def test_transition_is_the_slope_of_propagate(side):
     x = state(2, side)
-    new, F, G = transition(x, INCREMENT)
-    for a, b in zip(jax.tree.leaves(new), jax.tree.leaves(propagate(x, INCREMENT)), strict=True):
+    (new, F, G), plain, (_, again, L) = jax.jit(
+        lambda x, u: (transition(x, u), propagate(x, u), invariant_motion(NOISE).linear(x, u))
+    )(x, INCREMENT)
+    for a, b in zip(jax.tree.leaves(new), jax.tree.leaves(plain), strict=True):
         np.testing.assert_array_equal(a, b)
 
     def moved(d):
-        return manifold.local(new, propagate(manifold.retract(x, d), INCREMENT))
+        """By errors of the state, and of what the sensors add."""
+        dv = INCREMENT.dv + d[18:]
+        dr = INCREMENT.dr + 0.5 * INCREMENT.dt * d[18:]
+        u = INCREMENT._replace(theta=INCREMENT.theta + d[15:18], dv=dv, dr=dr)
+        return manifold.local(new, propagate(manifold.retract(x, d[:15]), u))
 
-    np.testing.assert_allclose(F, jax.jit(jax.jacfwd(moved))(jnp.zeros(15)), atol=2e-12)
-
-    def driven(e):
-        dv = INCREMENT.dv + e[3:]
-        dr = INCREMENT.dr + 0.5 * INCREMENT.dt * e[3:]
-        u = INCREMENT._replace(theta=INCREMENT.theta + e[:3], dv=dv, dr=dr)
-        return manifold.local(new, propagate(x, u))
-
-    np.testing.assert_allclose(G, jax.jit(jax.jacfwd(driven))(jnp.zeros(6)), atol=1e-11)
+    slopes = jax.jit(jax.jacfwd(moved))(jnp.zeros(21))
+    np.testing.assert_allclose(F, slopes[:, :15], atol=2e-12)
+    np.testing.assert_allclose(G, slopes[:, 15:], atol=1e-11)
     # the filter is given the same, with the noise of the sensors and of their biases
-    _, again, L = invariant_motion(NOISE).linear(x, INCREMENT)
     np.testing.assert_array_equal(again, F)
     Q = 0.2 * (G[:, :3] @ G[:, :3].T * 4e-8 + G[:, 3:] @ G[:, 3:].T * 4e-6)
     Q = Q + 0.2 * np.diag(np.repeat([0.0, 1e-12, 1e-10], [9, 3, 3]))
     np.testing.assert_allclose(L @ L.T, Q, atol=1e-16)
-    np.testing.assert_array_equal(invariant_motion(NOISE).noise_factor(x, INCREMENT), L)
+    alone = jax.jit(invariant_motion(NOISE).noise_factor)(x, INCREMENT)
+    np.testing.assert_allclose(alone, L, rtol=1e-15)
 
 
 def test_the_error_law_of_the_right_side_knows_neither_path_nor_increments():
-    F = [transition(InvariantState.start(pose(seed, "right")), INCREMENT)[1] for seed in range(3)]
+    law = jax.jit(lambda x, u: transition(x, u)[1])
+    F = [law(InvariantState.start(pose(seed, "right")), INCREMENT) for seed in range(3)]
     other = INCREMENT._replace(theta=-2.0 * INCREMENT.theta, dv=5.0 * INCREMENT.dv)
-    F.append(transition(InvariantState.start(pose(4, "right")), other)[1])
+    F.append(law(InvariantState.start(pose(4, "right")), other))
     for one in F[1:]:
         np.testing.assert_array_equal(one[:9, :9], F[0][:9, :9])
-    left = [transition(InvariantState.start(pose(seed, "left")), INCREMENT)[1] for seed in (5, 6)]
+    left = [law(InvariantState.start(pose(seed, "left")), INCREMENT) for seed in (5, 6)]
     np.testing.assert_array_equal(left[0][:, :9], left[1][:, :9])
     np.testing.assert_allclose(left[0], left[1], atol=1e-15)  # of the biases too
 

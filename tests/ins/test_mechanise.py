@@ -275,22 +275,22 @@ def whole():
     return inc, mechanise(nav(), inc)
 
 
-def test_streaming_gives_the_same_numbers(whole):
+def test_streams_pieces_and_batches_give_the_same_numbers(whole):
     inc, path = whole
     one = jax.jit(step)
     state = nav()
     for k in range(50):
         state = one(state, jax.tree.map(lambda a, k=k: jnp.asarray(a[k]), inc))
-    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(path), strict=True):
-        np.testing.assert_allclose(a, b[49], rtol=1e-14)
-
-
-def test_chunks_give_the_same_numbers(whole):
-    inc, path = whole
     pieces = mechanise_chunked(nav(), inc, chunk=128)
-    for a, b in zip(jax.tree.leaves(pieces), jax.tree.leaves(path), strict=True):
-        assert isinstance(a, np.ndarray)
-        np.testing.assert_allclose(a, b, rtol=1e-14)
+    many = jax.tree.map(lambda a: jnp.stack([a, jnp.roll(a, 7, 0), a]), inc)
+    batch = jax.vmap(mechanise, (None, 0))(nav(), many)
+    found = (jax.tree.leaves(x) for x in (path, state, pieces, batch))
+    for want, streamed, piece, several in zip(*found, strict=True):
+        np.testing.assert_allclose(streamed, want[49], rtol=1e-14)
+        assert isinstance(piece, np.ndarray)
+        np.testing.assert_allclose(piece, want, rtol=1e-14)
+        np.testing.assert_allclose(several[2], want, rtol=1e-13)
+        assert not np.array_equal(several[1], several[0])
 
 
 def test_no_increments_make_an_empty_path():
@@ -298,15 +298,6 @@ def test_no_increments_make_an_empty_path():
     assert path.v_n.shape == (0, 3)
     with pytest.raises(ValueError, match="chunk = 0"):
         mechanise_chunked(nav(), shaken(3), chunk=0)
-
-
-def test_a_batch_gives_the_same_numbers(whole):
-    inc, path = whole
-    many = jax.tree.map(lambda a: jnp.stack([a, jnp.roll(a, 7, 0), a]), inc)
-    batch = jax.vmap(mechanise, (None, 0))(nav(), many)
-    for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(path), strict=True):
-        np.testing.assert_allclose(a[2], b, rtol=1e-13)
-        assert not np.array_equal(a[1], a[0])
 
 
 def test_one_kernel_is_the_plain_function():

@@ -29,8 +29,7 @@ def assert_factor(L, P, tolerance):
     assert np.all(np.abs(L @ L.T - P) <= tolerance * np.outer(size, size))
 
 
-@pytest.mark.parametrize("n", SIZES)
-@pytest.mark.parametrize("k", [1, 4, 12])
+@pytest.mark.parametrize(("n", "k"), [(1, 1), (1, 12), (3, 4), (8, 1), (8, 12)])
 @pytest.mark.parametrize("decades", [0.0, 20.0])
 def test_tria_is_a_factor_of_the_sum_of_squares(n, k, decades):
     A, B = draw(n + k, n, k, decades), draw(7, n, 2)
