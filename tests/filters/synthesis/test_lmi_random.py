@@ -64,8 +64,9 @@ def random_plants(count, seed):
         yield made, 0.5 * (least + kalman.hinf), kalman
 
 
-def test_on_random_plants_the_forms_are_ordered_and_no_promise_is_broken():
-    for made, gamma, kalman in random_plants(25, seed=10):
+@pytest.mark.parametrize("count", [4, 25])
+def test_on_random_plants_the_forms_are_ordered_and_no_promise_is_broken(count):
+    for made, gamma, kalman in random_plants(count, seed=10):
         own, common, slack = (
             full(made, gamma),
             observer(made, gamma),
