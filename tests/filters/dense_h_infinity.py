@@ -81,6 +81,22 @@ def h_infinity_filter(
     return Dense(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
+def least_gamma(system, y, L, estimate="a-posteriori", count_missing=False) -> float:
+    """For which the filter exists at every step that counts, by bisection to 1e-9."""
+    here = np.isfinite(y).any(axis=1) | count_missing
+
+    def exists(gamma):
+        done = h_infinity_filter(system, y, L, gamma, estimate, count_missing)
+        positive = np.linalg.eigvalsh(done.P_wide)[:, 0] > 0.0
+        return np.all(done.bound[here] < gamma) and np.all(positive)
+
+    low, high = 1e-3, 1e3
+    while high > low * (1.0 + 1e-9):
+        middle = np.sqrt(low * high)
+        low, high = (low, middle) if exists(middle) else (middle, high)
+    return high
+
+
 def joseph_riccati(F, Q, H, R, P0, L, gamma) -> np.ndarray:
     """(T, n, n) predicted P of a time-varying system: Joseph update, inflation, prediction."""
     P, n, out = P0, len(P0), []

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rule_table as table
 from attitude_matching import PERIOD_S, in_unit, run_with
 from dense_h_infinity import (
     compensated,
@@ -11,16 +12,14 @@ from dense_h_infinity import (
     h_infinity_filter,
     joseph_riccati,
     krein_riccati,
+    least_gamma,
 )
 from dense_kalman import SPLIT_W, kalman_filter, random_system, simulate, split
 
 from robins.filters import (
     Belief,
     Code,
-    Model,
-    Motion,
     OnlineFilter,
-    Sensor,
     kalman,
     run,
 )
@@ -58,17 +57,7 @@ def agrees(solution, dense, rtol=1e-9):
 @pytest.fixture(scope="module")
 def least():
     """Least gamma of the standard problem, from the dense recursion."""
-
-    def exists(gamma):
-        done = h_infinity_filter(SYSTEM, Y, L, gamma)
-        here = np.isfinite(Y).any(axis=1)
-        return np.all(done.bound[here] < gamma) and np.all(np.linalg.eigvalsh(done.P_wide) > 0.0)
-
-    low, high = 1e-3, 1e3
-    while high > low * (1.0 + 1e-9):
-        middle = np.sqrt(low * high)
-        low, high = (low, middle) if exists(middle) else (middle, high)
-    return high
+    return least_gamma(SYSTEM, Y, L)
 
 
 # ---------------------------------------------------------------------------------- the recursion
@@ -185,32 +174,17 @@ def test_several_sensors_are_one_step(estimate):
         assert np.all(first >= last * (1.0 - 1e-12))
 
 
-def test_an_angle_turns_through_pi():
-    # A heading that is measured and moved on across +-pi, against the same on a line.
-    dt, gamma = 0.5, 3.0
-    G = np.diag([0.05, 0.02])
-    weight = np.array([1.0, 0.5])
-    y = np.deg2rad(178.0) + 0.02 * np.arange(T) + 0.05 * np.sin(np.arange(T))
-    one = kalman(rules=[h_infinity(gamma, weight, estimate="a-priori")])
-    line = Model(
-        Motion(lambda x, u: jnp.stack([x[0] + dt * x[1], x[1]]), G),
-        (Sensor(lambda x, aux: x[:1], np.array([0.3]), 1),),
-    )
-    circle = Model(
-        Motion(lambda x, u: (Angle(x[0].rad + dt * x[1][0]), x[1]), G),
-        (Sensor(lambda x, aux: x[0], np.array([0.3]), 1),),
-    )
-    P0 = np.diag([0.2, 0.1])
-    flat = run(one, line, Belief.of(jnp.array([3.0, 0.1]), P0), y[:, None])
-    wrapped = (y + np.pi) % (2.0 * np.pi) - np.pi
-    assert np.ptp(wrapped) > 6.0
-    start = Belief.of((Angle(jnp.array(3.0)), jnp.array([0.1])), P0)
-    around = run(one, circle, start, Angle(wrapped))
-    turned = np.asarray(flat.mean[:, 0] - around.mean[0].rad) / (2.0 * np.pi)
-    np.testing.assert_allclose(turned, np.round(turned), atol=1e-12)
-    assert np.ptp(np.round(turned)) == 1
-    np.testing.assert_allclose(around.mean[1][:, 0], flat.mean[:, 1], rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(around.covariance, flat.covariance, rtol=1e-10, atol=1e-13)
+def test_an_a_priori_estimate_turns_through_pi():
+    # The others are held to it by test_rule_laws.py, on the same circle.
+    one = kalman(rules=[h_infinity(300.0, table.L, "raise_gamma", estimate="a-priori")])
+    flat = run(one, table.line(), table.START, table.Y)
+    around = run(one, table.CIRCLE, table.FACING, table.AROUND)
+    np.testing.assert_allclose(around.mean["rest"], flat.mean[:, 1:], rtol=1e-9, atol=1e-10)
+    turned = Angle(flat.mean[:, 0] + table.SEAM).local(around.mean["heading"])
+    np.testing.assert_allclose(turned, np.zeros((table.T, 1)), atol=1e-10)
+    np.testing.assert_allclose(around.covariance, flat.covariance, rtol=1e-9, atol=1e-12)
+    plain = flat.steps.prediction.origin.factor[1:] == flat.steps.posterior.factor[:-1]
+    assert not np.all(plain)  # it acts
 
 
 # ------------------------------------------------------------------------------------- infeasible

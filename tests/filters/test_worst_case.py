@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from attitude_matching import in_unit, run_with
-from dense_h_infinity import greatest, h_infinity_filter
+from dense_h_infinity import greatest, h_infinity_filter, least_gamma
 from dense_kalman import SPLIT_W, random_system, simulate, split
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
@@ -31,28 +31,13 @@ HERE = np.isfinite(Y).any(axis=1)
 KF = kalman()
 
 
-def dense_least(y, estimate="a-posteriori", count_missing=False):
-    here = np.isfinite(y).any(axis=1) | count_missing
-
-    def exists(gamma):
-        done = h_infinity_filter(SYSTEM, y, L, gamma, estimate, count_missing)
-        positive = np.linalg.eigvalsh(done.P_wide)[:, 0] > 0.0
-        return np.all(done.bound[here] < gamma) and np.all(positive)
-
-    low, high = 1e-3, 1e3
-    while high > low * (1.0 + 1e-9):
-        middle = np.sqrt(low * high)
-        low, high = (low, middle) if exists(middle) else (middle, high)
-    return high
-
-
 # --------------------------------------------------------------------------------- least gamma
 
 
 @pytest.mark.parametrize("estimate", ["a-posteriori", "a-priori"])
 def test_least_gamma_is_that_of_the_dense_recursion(estimate):
     found = gamma_min(MODEL, START, Y, L, rtol=1e-6, estimate=estimate)
-    want = dense_least(Y, estimate)
+    want = least_gamma(SYSTEM, Y, L, estimate)
     assert want * (1.0 - 1e-8) <= found <= want * (1.0 + 1.1e-6)
 
 
@@ -61,8 +46,8 @@ def test_an_outage_raises_least_gamma_only_if_it_counts():
     y[8:16] = np.nan
     left_out = gamma_min(MODEL, START, y, L)
     counted = gamma_min(MODEL, START, y, L, count_missing=True)
-    assert counted == pytest.approx(dense_least(y, count_missing=True), rel=1.1e-4)
-    assert left_out == pytest.approx(dense_least(y), rel=1.1e-4)
+    assert counted == pytest.approx(least_gamma(SYSTEM, y, L, count_missing=True), rel=1.1e-4)
+    assert left_out == pytest.approx(least_gamma(SYSTEM, y, L), rel=1.1e-4)
     assert counted > 1.05 * left_out
 
 
@@ -154,7 +139,7 @@ def test_members_whose_bound_changes_keep_it_step_by_step():
 def test_the_operator_moves_errors_as_the_filter_does():
     # Run the filter on what disturbances make of the truth: its errors are the operator's.
     one = MEMBERS["a-posteriori"]
-    state = with_gamma(one.init(START, MODEL.dims), 3.0 * dense_least(Y))
+    state = with_gamma(one.init(START, MODEL.dims), 3.0 * least_gamma(SYSTEM, Y, L))
     rng = np.random.default_rng(1)
     x0, w, v = rng.normal(size=4), rng.normal(size=(T, 4)), rng.normal(size=(T, 3))
     x, y, truth = SYSTEM.m0 + np.linalg.cholesky(SYSTEM.P0) @ x0, np.empty((T, 3)), []
@@ -239,7 +224,7 @@ def test_attitude_matching_has_the_published_worst_cases():
 
 def test_the_steady_filter_is_where_the_recursion_goes():
     y = np.zeros((2000, 3))
-    for gamma in (1.05 * dense_least(np.zeros((60, 3))), 30.0, np.inf):
+    for gamma in (1.05 * least_gamma(SYSTEM, np.zeros((60, 3)), L), 30.0, np.inf):
         done = h_infinity_filter(SYSTEM, y, L, gamma)
         steady = steady_h_infinity(SYSTEM.F, SYSTEM.Q, SYSTEM.H, SYSTEM.R, L, gamma)
         np.testing.assert_allclose(steady.P_pred, done.P_pred[-1], rtol=1e-8, atol=1e-9)
