@@ -296,7 +296,7 @@ def test_normalised_is_what_the_update_will_say():
     for way in (taylor(), unscented(), unscented(1.0, 0.0, -1.0)):
         one = kalman(way, [start])
         state = one.init(START, MODEL.dims)
-        state, info = one.update(state, MODEL.sensors[0], jnp.array(Y[0]))
+        state, info = jax.jit(one.update)(state, MODEL.sensors[0], jnp.array(Y[0]))
         (judged,) = state.memory
         np.testing.assert_allclose(judged.nis, info.nis, rtol=1e-12)
         np.testing.assert_allclose(judged.factor, info.factor, rtol=1e-12, atol=1e-14)
