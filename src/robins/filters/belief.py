@@ -13,6 +13,8 @@ from jaxtyping import Array, ArrayLike, Float
 from robins import linalg, manifold
 from robins.manifold import State
 
+Number = float | int  # where types are checked an int is no float
+
 
 class Belief(NamedTuple):
     """What is believed about the state at one instant.
@@ -118,6 +120,11 @@ class StepInfo(NamedTuple):
     log_likelihood: Float[Array, ""]
     code: Array  # a `Code`
     notes: dict[str, Any]  # what the rules add, by their names
+
+    def noted(self, rule: str, **notes: Any) -> StepInfo:
+        """With what a rule notes, each as ``rule.name``; a ``_`` at the end of a name is cut."""
+        own = {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
+        return self._replace(notes={**self.notes, **own})
 
     @property
     def sigma(self) -> Array:

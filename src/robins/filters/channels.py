@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.fusion import is_singular
 from robins.filters.kalman import Again, Filter, FilterState, Prediction, kalman
@@ -68,16 +69,14 @@ def owners(channels: Sequence[Channel]) -> dict[str, int]:
     Raises:
         ValueError: there is no channel, or a sensor belongs to two.
     """
-    if not channels:
-        raise ValueError("no channels: at least one local filter is wanted")
+    require(channels, "no channels: at least one local filter is wanted")
     owner: dict[str, int] = {}
     for i, one in enumerate(channels):
         for name in one.sensors:
-            if name in owner:
-                raise ValueError(
-                    f"sensor '{name}' belongs to two channels: what it measures would be counted "
-                    "twice"
-                )
+            require(
+                name not in owner,
+                f"sensor '{name}' belongs to two channels: what it measures would be counted twice",
+            )
             owner[name] = i
     return owner
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.chi_square import chi_square
 from robins.manifold import State
@@ -139,12 +140,10 @@ def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdic
     x = np.asarray(series, dtype=float)
     here = np.isfinite(x)
     count = int(np.sum(here))
-    if count < 3 * lags:
-        raise ValueError(f"whiteness over {lags} lags wants {3 * lags} samples, got {count}")
+    require(not count < 3 * lags, f"whiteness over {lags} lags wants {3 * lags} samples", count)
     x = np.where(here, x - np.mean(x[here]), 0.0)
     power = np.sum(x**2) / count
-    if power == 0.0:
-        raise ValueError("whiteness of a series that never changes")
+    require(power != 0.0, "whiteness of a series that never changes")
     total = 0.0
     for lag in range(1, lags + 1):
         pairs = int(np.sum(here[lag:] & here[:-lag]))

@@ -215,3 +215,21 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
         f"D has rank {len(kept)} for {np.sum(exact)} exact rows: "
         f"row {row}, counted from 0, {what} {mend}"
     )
+
+
+def check_weight(rule: str, weight: Weight, n: int | None = None) -> None:
+    """The metric W of a rule; with n, whether it fits a state of that dimension.
+
+    Raises:
+        ValueError: a name that is none, or a matrix that is not positive definite or not (n, n).
+    """
+    if isinstance(weight, str):
+        if weight not in ("covariance", "identity"):
+            raise ValueError(
+                f"{rule} weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
+            )
+    elif n is not None:
+        if np.shape(weight) != (n, n):
+            raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")
+    elif not np.all(np.diag(linalg.factor(np.asarray(weight, float), f"{rule} weight")) > 0.0):
+        raise ValueError(f"{rule} weight is not positive definite: each state wants a weight")

@@ -28,19 +28,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
+from robins.filters import channels as _channels
 from robins.filters.belief import Belief, Code
-from robins.filters.channels import (
-    Channel,
-    Joined,
-    Moved,
-    auditing,
-    concluded,
-    local_dims,
-    owners,
-    starting,
-    updating,
-    with_noise,
-)
+from robins.filters.channels import Channel, Joined, Moved, with_noise
 from robins.filters.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.kalman import Filter, FilterState, in_step, kalman
 from robins.filters.linearise import Linearisation, Number
@@ -105,7 +96,7 @@ def federated(
             `init`, a sensor without a channel.
     """
     channels = tuple(channels)
-    owners(channels)
+    _channels.owners(channels)
     if mode not in ("fusion-reset", "no-reset", "zero-reset", "rescale"):
         raise ValueError(
             "mode must be 'fusion-reset', 'no-reset', 'zero-reset' or 'rescale', got " + repr(mode)
@@ -131,11 +122,11 @@ def federated(
     filters = [*(c.filter for c in channels), *([centre] if has_master else [])]
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        given = [*local_dims(channels, dims), *([{}] if has_master else [])]
+        given = [*_channels.local_dims(channels, dims), *([{}] if has_master else [])]
         a = initial_shares(belief)
         parts = parted(belief, a)
         states = [f.init(p, d) for f, p, d in zip(filters, parts, given, strict=True)]
-        return starting(states, belief, a, count)
+        return _channels.starting(states, belief, a, count)
 
     def initial_shares(belief: Belief) -> Array:
         n = belief.factor.shape[0]
@@ -206,7 +197,7 @@ def federated(
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
         moved = (predict_together if late else predict_apart)(state, motion, u)
-        return concluded(state, moved)
+        return _channels.concluded(state, moved)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
         joined: Joined = state.memory
@@ -214,8 +205,8 @@ def federated(
         members = [f.reset(m, b) for f, m, b in zip(filters, joined.members, beliefs, strict=True)]
         return FilterState(belief, joined._replace(members=tuple(members)))
 
-    update = updating(channels, information_sum, "federated")
-    return in_step(Filter(init, predict, update, reset, auditing(channels)))
+    update = _channels.updating(channels, information_sum, "federated")
+    return in_step(Filter(init, predict, update, reset, _channels.auditing(channels)))
 
 
 def _is_plain(member: FilterState) -> bool:
@@ -258,10 +249,8 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
 
 
 def _check_master(mode: str, shares: Any, master: Number, keep: Number) -> None:
-    if not 0.0 <= master < 1.0:
-        raise ValueError(f"the master's share must lie from 0 to below 1, got {master}")
-    if not 0.0 < keep < 1.0:
-        raise ValueError(f"keep must lie between 0 and 1, got {keep}")
+    require(0.0 <= master < 1.0, "the master's share must lie from 0 to below 1", master)
+    require(0.0 < keep < 1.0, "keep must lie between 0 and 1", keep)
     if mode == "rescale" and master == 0.0:
         raise ValueError(
             "mode 'rescale' needs a master to take what the locals give away: give it a share"

@@ -34,14 +34,14 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief, Code, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.channels import Joined
 from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
 from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
 
-Number = float | int  # where types are checked an int is no float
 Groups = Sequence[Sequence[int]]
 
 # Harm that is not worth a word: a tenth of the reference's variance, 5 % of its deviation.
@@ -325,8 +325,6 @@ def _check(
         raise ValueError(f"guarded: {sorted(both)} cannot judge, it belongs to the assumption")
     if groups is not None and (not groups or not all(len(set(one)) for one in groups)):
         raise ValueError(f"guarded groups must each name a component, got {groups}")
-    if not ratio >= 1.0:
-        raise ValueError(f"guarded ratio must be at least 1, got {ratio}")
+    require(ratio >= 1.0, "guarded ratio must be at least 1", ratio)
     for name, value in (("limit", limit), ("patience", patience), ("leap", leap)):
-        if not value > 0.0:
-            raise ValueError(f"guarded {name} must be positive, got {value}")
+        require(value > 0.0, f"guarded {name} must be positive", value)

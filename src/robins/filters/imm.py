@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
 from robins.filters.mixture import innovation, log_normalised, matched
@@ -78,8 +79,7 @@ def imm(
             one. When a run begins: a mode brings a sensor that the model does not have.
     """
     all_ = bank(modes)
-    if not all_.size:
-        raise ValueError("imm needs at least one mode")
+    require(all_.size, "imm needs at least one mode")
     count = all_.size
     even = np.full(count, 1.0 / count)
     first = _probabilities("start", even if start is None else start, (count,))
@@ -151,8 +151,7 @@ def imm(
 
 def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:
     value = np.asarray(given, dtype=float)
-    if value.shape != shape:
-        raise ValueError(f"{name} of imm has shape {value.shape}, its modes need {shape}")
+    require(value.shape == shape, f"{name} of imm has shape {value.shape}, its modes need {shape}")
     total = value.sum(axis=-1)
     if not (np.all(value >= 0.0) and np.all(np.abs(total - 1.0) <= _ONE)):
         raise ValueError(

@@ -30,12 +30,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief
+from robins.filters.belief import Belief, Number
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.observation import Observation, innovation
 from robins.manifold import State
 
-Number = float | int  # where types are checked an int is no float
 NARROWEST = 1e3 * float(jnp.finfo(float).eps)  # (n + lambda) / n of sigma points
 
 

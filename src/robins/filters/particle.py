@@ -28,7 +28,8 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief, Code, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.kalman import (
     Filter,
     FilterState,
@@ -43,8 +44,6 @@ from robins.filters.model import Motion, Sensor
 from robins.filters.trees import finite, select
 
 _GENERATOR = "threefry2x32"  # named, so that a key gives the same draws whatever JAX is set to
-
-Number = float | int
 
 
 class Cloud(NamedTuple):
@@ -94,11 +93,9 @@ def particle(
             are negative or named twice. When a run begins: one is not of the state.
     """
     count = operator.index(count)
-    if count < 1:
-        raise ValueError(f"a particle filter needs a positive count of particles, got {count}")
+    require(count >= 1, "a particle filter needs a positive count of particles", count)
     for name, share in (("resample", resample), ("regularise", regularise)):
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(f"{name} of a particle filter must lie in 0..1, got {share}")
+        require(0.0 <= share <= 1.0, f"{name} of a particle filter must lie in 0..1", share)
     chosen = None if sampled is None else tuple(operator.index(i) for i in sampled)
     if chosen is not None and (len(set(chosen)) < len(chosen) or min(chosen, default=0) < 0):
         raise ValueError(f"sampled components must be different and not negative, got {chosen}")

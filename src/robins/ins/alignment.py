@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robins.earth import OMEGA_E, gravity
+from robins.errors import require
 from robins.ins.imu_errors import ImuErrorModel, mean_sigma
 from robins.rotation import Rotation
 
@@ -263,8 +264,7 @@ def heading_from_velocity(
     sigma = np.broadcast_to(np.asarray(sigma_v, float), v.shape)
     there = np.all(np.isfinite(v[:, :2]), axis=1)
     v, sigma = v[there], sigma[there]
-    if len(v) == 0:
-        raise ValueError("v_n holds no velocity, only missing values")
+    require(len(v) != 0, "v_n holds no velocity, only missing values")
     speed = np.hypot(v[:, 0], v[:, 1])
     if np.min(speed) < smallest_speed:
         raise ValueError(
@@ -275,8 +275,7 @@ def heading_from_velocity(
     # east differ, and the bias would not average out.
     first = np.arctan2(*v[:, 1::-1].sum(0))
     across = np.hypot(sigma[:, 0] * np.sin(first), sigma[:, 1] * np.cos(first))
-    if not np.all(across > 0.0):
-        raise ValueError(f"sigma_v must be positive, got {sigma_v}")
+    require(np.all(across > 0.0), "sigma_v must be positive", sigma_v)
     weight = across**-2
     north, east = weight @ v[:, :2]
     heading = float(np.arctan2(east, north))
@@ -371,10 +370,8 @@ def _hint_of_g(size: ArrayLike) -> str:
 
 
 def _refuse_bad_vectors(name: str, x: np.ndarray) -> None:
-    if x.shape[-1:] != (3,):
-        raise ValueError(f"{name} must have three components, got shape {x.shape}")
-    if not np.all(np.isfinite(x)):
-        raise ValueError(f"{name} must be finite, got {x}")
+    require(x.shape[-1:] == (3,), f"{name} must have three components, got shape {x.shape}")
+    require(np.all(np.isfinite(x)), f"{name} must be finite", x)
 
 
 def _tilt_of_force(f: np.ndarray, C_nb: np.ndarray) -> np.ndarray:

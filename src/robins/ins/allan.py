@@ -19,6 +19,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.special import chdtri, ndtri
 
+from robins.errors import require
 from robins.ins.allan_noise import TERMS, Moments, mean_variances, moments
 from robins.ins.imu_errors import FLICKER_FLAT, MARKOV_PEAK, TriadErrors
 from robins.units import from_si
@@ -116,8 +117,7 @@ def deviation(
         raise ValueError(
             f"an Allan deviation needs at least {2 * _FEWEST_CLUSTERS} samples, got {n}"
         )
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    require(0.0 < confidence < 1.0, "confidence must lie between 0 and 1", confidence)
     _refuse_bad_values(x)
     interval = _interval(dt_s, time_ns, n)
     sizes = _cluster_sizes(clusters, n)
@@ -170,8 +170,7 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
         raise ValueError(
             f"terms must be different letters out of {TERMS}, not R alone, got {terms!r}"
         )
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    require(0.0 < confidence < 1.0, "confidence must lie between 0 and 1", confidence)
     _refuse_short_curve(allan, terms)
     # Sizes closer than this carry next to no news and make the covariance nearly singular.
     keep = [0]
@@ -330,8 +329,7 @@ def _interval(dt_s: float | None, time_ns: ArrayLike | None, n: int) -> float:
     if (dt_s is None) == (time_ns is None):
         raise ValueError("give either dt_s, the sampling interval, or time_ns, the sampling times")
     if dt_s is not None:
-        if not (np.isfinite(dt_s) and dt_s > 0.0):
-            raise ValueError(f"dt_s must be a positive number of seconds, got {dt_s}")
+        require(np.isfinite(dt_s) and dt_s > 0.0, "dt_s must be a positive number of seconds", dt_s)
         return float(dt_s)
     time = np.asarray(time_ns)
     if time.shape != (n,) or not np.issubdtype(time.dtype, np.integer):

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 from robins.ins.records import checked_pytree
 from robins.units import UnitError, parse
 
@@ -142,8 +143,7 @@ def _checked(name: str, value: Any) -> Any:
         return x
     if not np.all(np.isfinite(x)):
         raise ValueError(f"{name} must be finite, got {value}; None stands for no such error")
-    if name not in _SIGNED and np.any(x < 0.0):
-        raise ValueError(f"{name} must not be negative, got {value}")
+    require(name in _SIGNED or not np.any(x < 0.0), f"{name} must not be negative", value)
     if name in _POSITIVE and np.any(x == 0.0):
         raise ValueError(f"{name} must be positive, got {value}; None stands for no such error")
     if name.startswith("misalignment") and np.any(np.diag(x) != 0.0):
@@ -188,8 +188,7 @@ def _from_figures(sensor: str, figures: Mapping[str, Any]) -> TriadErrors:
             hint = f"; did you mean {near[0]}?" if near else ""
             raise ValueError(f"{sensor}: no figure {figure!r}{hint} (known: {', '.join(known)})")
         name, kind, factor = known[figure]
-        if name in values:
-            raise ValueError(f"{sensor}.{figure}: {name} is given twice, by two figures")
+        require(name not in values, f"{sensor}.{figure}: {name} is given twice, by two figures")
         try:
             if isinstance(text, list | tuple):
                 values[name] = factor * np.array([parse(t, kind) for t in text])

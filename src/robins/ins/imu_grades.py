@@ -14,96 +14,40 @@ from typing import Any
 
 from robins.ins.imu_errors import ImuErrorModel
 
+# navigation: ring laser gyros and force-feedback pendulums of an airliner's inertial reference,
+# about one nautical mile per hour unaided, which is what 0.01 deg/h and 50 ug amount to. tactical:
+# fibre-optic gyros and quartz accelerometers of guided munitions and survey systems. industrial
+# MEMS: factory-calibrated modules, steady while on, a new bias at each switching on. consumer MEMS:
+# one-chip sensors of telephones and drones, not calibrated one by one.
+_GRADES = ("navigation", "tactical", "industrial MEMS", "consumer MEMS")
+_TABLE = {
+    "gyro": {
+        "bias": ("0.01 deg/h", "1 deg/h", "0.1 deg/s", "1 deg/s"),
+        "bias_instability": ("0.003 deg/h", "0.3 deg/h", "6 deg/h", "20 deg/h"),
+        "correlation_time": ("1 h", "300 s", "200 s", "100 s"),
+        "noise": ("0.002 deg/sqrt(h)", "0.1 deg/sqrt(h)", "0.3 deg/sqrt(h)", "0.01 deg/s/sqrt(Hz)"),
+        "scale_factor": ("5 ppm", "100 ppm", "0.3 %", "2 %"),
+        "misalignment": ("5 arcsec", "0.1 mrad", "0.05 deg", "1 deg"),
+        "g_sensitivity": (None, "0.1 deg/h/g", "0.01 deg/s/g", "0.1 deg/s/g"),
+        "full_scale": ("400 deg/s", "1000 deg/s", "450 deg/s", "2000 deg/s"),
+    },
+    "accel": {
+        "bias": ("50 ug", "1 mg", "5 mg", "40 mg"),
+        "bias_instability": ("5 ug", "50 ug", "100 ug", "500 ug"),
+        "correlation_time": ("1 h", "300 s", "200 s", "100 s"),
+        "noise": ("10 ug/sqrt(Hz)", "50 ug/sqrt(Hz)", "50 ug/sqrt(Hz)", "250 ug/sqrt(Hz)"),
+        "scale_factor": ("100 ppm", "300 ppm", "0.3 %", "2 %"),
+        "misalignment": ("5 arcsec", "0.1 mrad", "0.05 deg", "1 deg"),
+        "full_scale": ("20 g", "40 g", "18 g", "16 g"),
+    },
+}
 FIGURES: MappingProxyType[str, dict[str, dict[str, Any]]] = MappingProxyType(
     {
-        # Ring laser gyros and force-feedback pendulums of an airliner's inertial reference: about
-        # one nautical mile per hour unaided, which is what 0.01 deg/h and 50 ug amount to.
-        "navigation": {
-            "gyro": {
-                "bias": "0.01 deg/h",
-                "bias_instability": "0.003 deg/h",
-                "correlation_time": "1 h",
-                "noise": "0.002 deg/sqrt(h)",
-                "scale_factor": "5 ppm",
-                "misalignment": "5 arcsec",
-                "full_scale": "400 deg/s",
-            },
-            "accel": {
-                "bias": "50 ug",
-                "bias_instability": "5 ug",
-                "correlation_time": "1 h",
-                "noise": "10 ug/sqrt(Hz)",
-                "scale_factor": "100 ppm",
-                "misalignment": "5 arcsec",
-                "full_scale": "20 g",
-            },
-        },
-        # Fibre-optic gyros and quartz accelerometers of guided munitions and survey systems.
-        "tactical": {
-            "gyro": {
-                "bias": "1 deg/h",
-                "bias_instability": "0.3 deg/h",
-                "correlation_time": "300 s",
-                "noise": "0.1 deg/sqrt(h)",
-                "scale_factor": "100 ppm",
-                "misalignment": "0.1 mrad",
-                "g_sensitivity": "0.1 deg/h/g",
-                "full_scale": "1000 deg/s",
-            },
-            "accel": {
-                "bias": "1 mg",
-                "bias_instability": "50 ug",
-                "correlation_time": "300 s",
-                "noise": "50 ug/sqrt(Hz)",
-                "scale_factor": "300 ppm",
-                "misalignment": "0.1 mrad",
-                "full_scale": "40 g",
-            },
-        },
-        # Factory-calibrated MEMS modules: steady while on, a new bias at each switching on.
-        "industrial MEMS": {
-            "gyro": {
-                "bias": "0.1 deg/s",
-                "bias_instability": "6 deg/h",
-                "correlation_time": "200 s",
-                "noise": "0.3 deg/sqrt(h)",
-                "scale_factor": "0.3 %",
-                "misalignment": "0.05 deg",
-                "g_sensitivity": "0.01 deg/s/g",
-                "full_scale": "450 deg/s",
-            },
-            "accel": {
-                "bias": "5 mg",
-                "bias_instability": "100 ug",
-                "correlation_time": "200 s",
-                "noise": "50 ug/sqrt(Hz)",
-                "scale_factor": "0.3 %",
-                "misalignment": "0.05 deg",
-                "full_scale": "18 g",
-            },
-        },
-        # One-chip sensors of telephones and drones, not calibrated one by one.
-        "consumer MEMS": {
-            "gyro": {
-                "bias": "1 deg/s",
-                "bias_instability": "20 deg/h",
-                "correlation_time": "100 s",
-                "noise": "0.01 deg/s/sqrt(Hz)",
-                "scale_factor": "2 %",
-                "misalignment": "1 deg",
-                "g_sensitivity": "0.1 deg/s/g",
-                "full_scale": "2000 deg/s",
-            },
-            "accel": {
-                "bias": "40 mg",
-                "bias_instability": "500 ug",
-                "correlation_time": "100 s",
-                "noise": "250 ug/sqrt(Hz)",
-                "scale_factor": "2 %",
-                "misalignment": "1 deg",
-                "full_scale": "16 g",
-            },
-        },
+        grade: {
+            sensor: {figure: row[k] for figure, row in rows.items() if row[k] is not None}
+            for sensor, rows in _TABLE.items()
+        }
+        for k, grade in enumerate(_GRADES)
     }
 )
 """The figures of each grade, as `ImuErrorModel.from_datasheet` reads them."""

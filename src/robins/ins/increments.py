@@ -28,6 +28,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.dataset import ImuTable
+from robins.errors import require
 from robins.ins.frames import to_ned_frd
 from robins.ins.intervals import own_intervals
 
@@ -72,8 +73,7 @@ def from_imu(imu: ImuTable) -> tuple[Increments, np.ndarray]:
 
 def _check(imu: ImuTable, time: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> None:
     name = imu.source or "IMU table"
-    if len(time) < 2:
-        raise ValueError(f"{name}: {len(time)} sample(s); an interval needs two")
+    require(len(time) >= 2, f"{name}: {len(time)} sample(s); an interval needs two")
     for label, values in (("gyro", gyro), ("accel", accel)):
         if values.shape != (len(time), 3):
             raise ValueError(f"{name}: {label} has shape {values.shape}, not ({len(time)}, 3)")
@@ -183,8 +183,7 @@ def thin(increments: Increments, time_ns: np.ndarray, every: int) -> tuple[Incre
     Raises:
         ValueError: `every` is less than one.
     """
-    if every < 1:
-        raise ValueError(f"every = {every}: at least one increment goes into each new one")
+    require(every >= 1, f"every = {every}: at least one increment goes into each new one")
     n = len(increments.dt)
     groups = -(-n // every)
     dt, theta, dv, dr = (

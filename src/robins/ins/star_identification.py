@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from robins.earth.star_catalogue import Stars
+from robins.errors import require
 
 _WIDE = 4.0
 """Sigmas of a tolerance: one angle in 16 000 is beyond them, one direction in 3 000."""
@@ -80,8 +81,7 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
             over 90 deg.
     """
     field = float(field_rad)
-    if not 0.0 < field <= np.pi / 2.0:
-        raise ValueError(f"field_rad must be above 0 and at most pi/2, got {field_rad}")
+    require(0.0 < field <= np.pi / 2.0, "field_rad must be above 0 and at most pi/2", field_rad)
     unit = np.asarray(stars.unit_i, float)
     if unit.ndim != 2 or unit.shape[1] != 3 or len(unit) < 4:
         raise ValueError(f"unit_i must have shape (N, 3), N four at least, got {unit.shape}")
@@ -301,8 +301,7 @@ def _height(b: np.ndarray) -> float:
 
 def _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance):
     b, sigma = np.asarray(vectors_b, float), np.asarray(sigma_rad, float)
-    if b.ndim != 2 or b.shape[1] != 3:
-        raise ValueError(f"vectors_b must have shape (n, 3), got {b.shape}")
+    require(b.ndim == 2 and b.shape[1] == 3, "vectors_b must have shape (n, 3)", b.shape)
     b = np.where(np.isnan(b).any(1, keepdims=True), np.nan, b)
     off = np.flatnonzero(np.abs(np.linalg.norm(b, axis=1) - 1.0) >= 1e-3)
     if off.size:
@@ -316,8 +315,6 @@ def _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance):
     light = None if magnitude is None else np.asarray(magnitude, float)
     if light is not None and light.shape != (len(b),):
         raise ValueError(f"magnitude must have shape ({len(b)},), got {light.shape}")
-    if not magnitude_tolerance > 0.0:
-        raise ValueError(f"magnitude_tolerance must be positive, got {magnitude_tolerance}")
-    if not 0.0 < most_chance < 1.0:
-        raise ValueError(f"most_chance must be between 0 and 1, got {most_chance}")
+    require(magnitude_tolerance > 0.0, "magnitude_tolerance must be positive", magnitude_tolerance)
+    require(0.0 < most_chance < 1.0, "most_chance must be between 0 and 1", most_chance)
     return b, np.broadcast_to(sigma, (len(b),)), light

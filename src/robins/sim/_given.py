@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 
 
 def known(*values: Any) -> bool:
@@ -69,8 +70,7 @@ def count_of(name: str, value: int) -> int:
     Raises:
         ValueError: fewer.
     """
-    if value < 1:
-        raise ValueError(f"{name} is {value}; at least one is wanted")
+    require(value >= 1, f"{name} is {value}; at least one is wanted")
     return value
 
 
@@ -81,8 +81,7 @@ def rows(name: str, value: Any, *shape: int) -> jax.Array:
         ValueError: another shape.
     """
     x = jnp.asarray(value, float)
-    if x.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {x.shape}")
+    require(x.shape == shape, f"{name} must have shape {shape}", x.shape)
     return x
 
 

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 
 
 def outlier_factor(
@@ -27,10 +28,8 @@ def outlier_factor(
     Raises:
         ValueError: a share beyond 0 to 1, or a negative factor.
     """
-    if not 0.0 <= share <= 1.0:
-        raise ValueError(f"share is {share}; it must be from 0 to 1")
-    if not factor >= 0.0:
-        raise ValueError(f"factor is {factor}; it must not be negative")
+    require(0.0 <= share <= 1.0, f"share is {share}; it must be from 0 to 1")
+    require(factor >= 0.0, f"factor is {factor}; it must not be negative")
     struck = jax.random.uniform(key, tuple(shape)) < share
     return jnp.where(struck, float(factor), 1.0)
 
@@ -53,8 +52,7 @@ def student_t(key: Array, shape: Sequence[int], dof: float) -> Float[Array, "...
     Raises:
         ValueError: no more than two degrees of freedom, where there is no variance.
     """
-    if not dof > 2.0:
-        raise ValueError(f"dof is {dof}; Student's t has a variance only above 2")
+    require(dof > 2.0, f"dof is {dof}; Student's t has a variance only above 2")
     return jax.random.t(key, float(dof), tuple(shape)) * (1.0 - 2.0 / dof) ** 0.5
 
 

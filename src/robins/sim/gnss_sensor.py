@@ -30,6 +30,7 @@ from robins.earth import (
     ecef_from_geodetic,
     geodetic_from_ecef,
 )
+from robins.errors import require
 from robins.ins.records import checked_pytree
 from robins.rotation import rotate
 
@@ -112,8 +113,7 @@ class GnssErrorModel:
             if outages.ndim != 2 or outages.shape[1] != 2 or not np.all(np.isfinite(outages)):
                 raise ValueError(f"outages_s must be pairs of times [s], got {self.outages_s}")
             for begin, end in outages:
-                if not begin < end:
-                    raise ValueError(f"an outage from {begin:g} s to {end:g} s ends too early")
+                require(begin < end, f"an outage from {begin:g} s to {end:g} s ends too early")
             object.__setattr__(self, "outages_s", outages)
 
     def _vector(self, name: str, low: float = -np.inf, open_end: bool = False) -> None:
@@ -123,8 +123,7 @@ class GnssErrorModel:
         x = np.asarray(value, float)
         if x.shape not in ((), (3,)):
             raise ValueError(f"{name} must be a number or of shape (3,), got shape {x.shape}")
-        if not np.all(np.isfinite(x)):
-            raise ValueError(f"{name} must be finite, got {value}")
+        require(np.all(np.isfinite(x)), f"{name} must be finite", value)
         if np.any(x < low) or (open_end and np.any(x == low)):
             raise ValueError(
                 f"{name} must {'be positive' if open_end else 'not be negative'}, got {value}"
@@ -160,8 +159,7 @@ def fix_times(model: GnssErrorModel, start_s: float, end_s: float) -> FixTimes:
     Raises:
         ValueError: an end before the start.
     """
-    if not end_s >= start_s:
-        raise ValueError(f"fixes from {start_s} s to {end_s} s: the end is before the start")
+    require(end_s >= start_s, f"fixes from {start_s} s to {end_s} s: the end is before the start")
     # A stamp that is a multiple but for rounding counts as one.
     first = np.ceil(start_s * model.rate_hz - 1e-6)
     last = np.floor(end_s * model.rate_hz + 1e-6)

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.errors import require
 from robins.manifold import wrap
 from robins.rotation import conjugate, from_rotvec, normalise, rotate
 from robins.sim import _given
@@ -117,8 +118,7 @@ def observe_magnetic_attitude(
     count = len(jnp.asarray(euler_rad, float))
     true = _given.rows("euler_rad", euler_rad, count, 3)
     there = _given.presence(jnp.ones(count, bool) if present is None else present)
-    if len(there) != count:
-        raise ValueError(f"present must have shape ({count},), got {there.shape}")
+    require(len(there) == count, f"present must have shape ({count},)", there.shape)
     sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
     measured = true + sigma[None] * jax.random.normal(key, (count, 3))
     if disturbance_rad is not None:
@@ -172,8 +172,7 @@ def field_bursts(
 def _bursts(time_s, every_s, length_s, first_s) -> tuple[Array, Array]:
     """Whether each sample is in a burst, and the number of the last burst begun."""
     time = jnp.asarray(time_s, float)
-    if time.ndim != 1:
-        raise ValueError(f"time_s must have shape (E,), got {time.shape}")
+    require(time.ndim == 1, "time_s must have shape (E,)", time.shape)
     _given.number("every_s", every_s, 0.0, above=True, endless=True)
     _given.number("length_s", length_s, 0.0, above=True, endless=True)
     since = time - (every_s if first_s is None else first_s) + _ROUNDING_S

@@ -18,6 +18,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation as _Rotation
 
 from robins.earth import Geodetic, gravity
+from robins.errors import require
 from robins.sim.trajectory import Motion, along, from_velocity, quaternion
 
 _STEEPEST_RAD = np.deg2rad(85.0)
@@ -86,8 +87,7 @@ def fly(
         ValueError: no legs; a leg not longer than it takes to roll; a bank of 85 deg or more; a
             speed or a time that is not positive; a pole.
     """
-    if not banks:
-        raise ValueError("banks: the list is empty")
+    require(banks, "banks: the list is empty")
     _positive(speed_mps=speed_mps, roll_s=roll_s, knots_hz=knots_hz)
     for k, leg in enumerate(banks):
         if not leg.duration_s >= roll_s:
@@ -135,8 +135,7 @@ def sail(
         ValueError: a duration or period that is not positive, a negative speed, or a pole.
     """
     _positive(duration_s=duration_s, knots_hz=knots_hz)
-    if not speed_mps >= 0.0:
-        raise ValueError(f"speed_mps is {speed_mps}: a ground speed is not negative")
+    require(speed_mps >= 0.0, f"speed_mps is {speed_mps}: a ground speed is not negative")
     t = _times(duration_s, _dense(knots_hz, *sea))
     roll, pitch, yaw, heave = (_sum(waves, t) for waves in sea)
     v_n = np.empty((len(t), 3))
@@ -169,8 +168,7 @@ def _times(duration_s: float, knots_hz: float) -> np.ndarray:
 def _dense(knots_hz: float, *sums: Sequence[Wave]) -> float:
     waves = [wave for waves in sums for wave in waves]
     for wave in waves:
-        if not wave.period_s > 0.0:
-            raise ValueError(f"{wave}: the period must be positive")
+        require(wave.period_s > 0.0, f"{wave}: the period must be positive")
     return max([knots_hz, *(_KNOTS_A_PERIOD / wave.period_s for wave in waves)])
 
 
@@ -197,5 +195,4 @@ def _ease(u: np.ndarray) -> np.ndarray:
 
 def _positive(**values: float) -> None:
     for name, value in values.items():
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name} is {value}; it must be positive")
+        require(np.isfinite(value) and value > 0.0, f"{name} is {value}; it must be positive")

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth.magnetic import RADIUS_M, field_along, wmm_for
 from robins.earth.wgs84 import A_M, GM, OMEGA_E, dcm_en, geodetic_from_ecef
+from robins.errors import require
 from robins.sim import _given
 
 LOWEST_M = 100e3  # below it nothing goes round
@@ -55,8 +56,7 @@ def circular_orbit(
     _given.number("raan_rad", raan_rad)
     _given.number("arg_lat_rad", arg_lat_rad)
     time = jnp.asarray(time_s, float)
-    if time.ndim != 1:
-        raise ValueError(f"time_s must have shape (E,), got {time.shape}")
+    require(time.ndim == 1, "time_s must have shape (E,)", time.shape)
     _given.number("time_s", time)
     elements = (jnp.asarray(x, float) for x in (alt_m, incl_rad, raan_rad, arg_lat_rad))
     return Orbit(time, *_circular(*elements, time))
@@ -124,8 +124,7 @@ def field_along_orbit(
     angle = earth_angle_rad + OMEGA_E * orbit.time_s
     if model == "dipole":
         return dipole_field_i(orbit.r_i_m, angle)
-    if model != "wmm":
-        raise ValueError(f"the field models of an orbit are 'dipole' and 'wmm', not {model!r}")
+    require(model == "wmm", f"the field models of an orbit are 'dipole' and 'wmm', not {model!r}")
     lat, lon, alt = _geodetic(orbit.r_i_m, angle)
     b_n = field_along(
         wmm_for(decimal_year), lat, lon, alt, decimal_year, orbit.time_s, knot_s=knot_s

@@ -14,20 +14,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from robins.bench.recording.layout import (
-    CHUNK,
-    ENCODING,
-    EVENTS,
-    MAGIC,
-    MESSAGE,
-    METADATA,
-    PROFILE,
-    RECORD,
-    Entry,
-    Event,
-    RecordingError,
-    check_of,
-)
+from robins.bench.recording import layout
 from robins.bench.wire.schema import VERSION
 
 LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage, and no memory is asked for it
@@ -39,8 +26,8 @@ class Record(NamedTuple):
     """What was written down."""
 
     header: dict[str, Any]
-    entries: list[Entry]  # in the order in which they were written
-    events: list[Event]
+    entries: list[layout.Entry]  # in the order in which they were written
+    events: list[layout.Event]
     whole: bool  # closed, and every check of the file holds
     why: str  # it is not, or nothing
 
@@ -73,7 +60,7 @@ def read_record(path: str | Path) -> Record:
                 return Record(header, reader.entries, reader.events, False, str(damage))
             return Record(header, reader.entries, reader.events, True, "")
     except OSError as error:
-        raise RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from None
+        raise layout.RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from None
 
 
 def _header(path: str, reader: _Reader) -> dict[str, Any]:
@@ -82,32 +69,32 @@ def _header(path: str, reader: _Reader) -> dict[str, Any]:
     Raises:
         RecordingError: it is not there.
     """
-    if (magic := reader.take(len(MAGIC))) != MAGIC:
-        if MAGIC.startswith(magic):
-            raise RecordingError(f"'{path}' ends at byte {len(magic)}: nothing was recorded")
-        raise RecordingError(f"'{path}' is no MCAP file: give a record that the bench wrote")
+    if (magic := reader.take(len(layout.MAGIC))) != layout.MAGIC:
+        if layout.MAGIC.startswith(magic):
+            raise layout.RecordingError(f"'{path}' ends at byte {len(magic)}: nothing was recorded")
+        raise layout.RecordingError(f"'{path}' is no MCAP file: give a record that the bench wrote")
     try:
         opcode, body = reader.record()
         profile = mcap.Header.read(_stream(body)).profile if opcode == Opcode.HEADER else ""
     except _UNREADABLE as error:
-        raise RecordingError(f"'{path}' {error}, before the header of the run") from None
-    if profile != PROFILE:
-        raise RecordingError(
+        raise layout.RecordingError(f"'{path}' {error}, before the header of the run") from None
+    if profile != layout.PROFILE:
+        raise layout.RecordingError(
             f"'{path}' is an MCAP file of the profile '{profile}', not one that the bench wrote "
-            f"('{PROFILE}')"
+            f"('{layout.PROFILE}')"
         )
     try:
         opcode, body = reader.record()
         about = mcap.Metadata.read(_stream(body)) if opcode == Opcode.METADATA else None
     except _UNREADABLE as error:
-        raise RecordingError(f"'{path}' {error}, within the header of the run") from None
-    if about is None or about.name != METADATA or set(about.metadata) != _ABOUT:
-        raise RecordingError(f"'{path}' is damaged: no header of the run where it should be")
+        raise layout.RecordingError(f"'{path}' {error}, within the header of the run") from None
+    if about is None or about.name != layout.METADATA or set(about.metadata) != _ABOUT:
+        raise layout.RecordingError(f"'{path}' is damaged: no header of the run where it should be")
     wire, text = about.metadata["wire"], about.metadata["header"]
-    if check_of(wire + text) != about.metadata["check"]:
-        raise RecordingError(f"'{path}' is damaged: the header of the run fails its check")
+    if layout.check_of(wire + text) != about.metadata["check"]:
+        raise layout.RecordingError(f"'{path}' is damaged: the header of the run fails its check")
     if wire != str(VERSION):
-        raise RecordingError(
+        raise layout.RecordingError(
             f"'{path}' has version {wire} of the wire, this is version {VERSION}: read it with the "
             "robins that wrote it"
         )
@@ -118,8 +105,8 @@ class _Reader:
     """Goes through a file, record by record."""
 
     def __init__(self, file: BinaryIO) -> None:
-        self.entries: list[Entry] = []
-        self.events: list[Event] = []
+        self.entries: list[layout.Entry] = []
+        self.events: list[layout.Event] = []
         self._file = file
         self._at = self._check = self._before = 0
         self._topics: dict[int, tuple[str, Literal["to", "from"]] | None] = {}  # None: events
@@ -139,12 +126,12 @@ class _Reader:
             _Damage: there is none that is whole; the messages of half a chunk are taken.
         """
         at, self._before = self._at, self._check
-        head = self.take(RECORD.size)
-        opcode, size = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
+        head = self.take(layout.RECORD.size)
+        opcode, size = layout.RECORD.unpack(head) if len(head) == layout.RECORD.size else (0, 0)
         if size > LONGEST:
             raise _Damage(f"is damaged at byte {at}: a record of {size} bytes")
         body = self.take(size)
-        if len(head) < RECORD.size or len(body) < size:
+        if len(head) < layout.RECORD.size or len(body) < size:
             if opcode == Opcode.CHUNK:
                 self._chunk(at, head + body)
             raise _Damage(f"ends at byte {self._at} without having been closed")
@@ -159,7 +146,7 @@ class _Reader:
         at = self._at
         opcode, body = self.record()
         if opcode == Opcode.CHUNK:
-            self._chunk(at, RECORD.pack(opcode, len(body)) + body)
+            self._chunk(at, layout.RECORD.pack(opcode, len(body)) + body)
         elif opcode == Opcode.DATA_END:
             self._end(at, body)
         elif opcode not in (Opcode.SCHEMA, Opcode.MESSAGE_INDEX):
@@ -168,45 +155,54 @@ class _Reader:
 
     def _chunk(self, at: int, data: bytes) -> None:
         """The messages of a chunk whose end may be missing."""
-        if len(data) < CHUNK.size:
-            if at + len(data) == self._at and RECORD.unpack_from(data)[1] > len(data) - RECORD.size:
+        if len(data) < layout.CHUNK.size:
+            if (
+                at + len(data) == self._at
+                and layout.RECORD.unpack_from(data)[1] > len(data) - layout.RECORD.size
+            ):
                 return
             raise _Damage(f"is damaged at byte {at}: a chunk without a head")
-        _, size, _, _, plain, check, packed, inside = CHUNK.unpack_from(data)
-        if packed != 0 or plain != inside or CHUNK.size - RECORD.size + inside != size:
+        _, size, _, _, plain, check, packed, inside = layout.CHUNK.unpack_from(data)
+        if (
+            packed != 0
+            or plain != inside
+            or layout.CHUNK.size - layout.RECORD.size + inside != size
+        ):
             raise _Damage(f"is damaged at byte {at}: the sizes of a chunk do not agree")
-        body = data[CHUNK.size :]
+        body = data[layout.CHUNK.size :]
         if len(body) == inside and zlib.crc32(body) != check:
             raise _Damage(f"is damaged between the bytes {at} and {at + len(data)}")
         place = 0
-        while place + RECORD.size <= len(body):
-            opcode, length = RECORD.unpack_from(body, place)
-            end = place + RECORD.size + length
+        while place + layout.RECORD.size <= len(body):
+            opcode, length = layout.RECORD.unpack_from(body, place)
+            end = place + layout.RECORD.size + length
             if end > len(body):
                 break
             try:
                 self._inner(opcode, body[place:end])
             except _UNREADABLE as error:
-                raise _Damage(f"is damaged at byte {at + CHUNK.size + place}: {error}") from None
+                raise _Damage(
+                    f"is damaged at byte {at + layout.CHUNK.size + place}: {error}"
+                ) from None
             place = end
 
     def _inner(self, opcode: int, data: bytes) -> None:
         """Take a record within a chunk."""
         if opcode == Opcode.CHANNEL:
-            channel = mcap.Channel.read(_stream(data[RECORD.size :]))
+            channel = mcap.Channel.read(_stream(data[layout.RECORD.size :]))
             self._topics[channel.id] = _place(channel)
             return
         if opcode != Opcode.MESSAGE:
             raise _Damage(f"a record of kind {opcode}")
-        _, _, channel, number, log_ns, _ = MESSAGE.unpack_from(data)
+        _, _, channel, number, log_ns, _ = layout.MESSAGE.unpack_from(data)
         if number != self._count & 0xFFFFFFFF:
             raise _Damage(f"message {number} where number {self._count} should be")
-        place, content = self._topics[channel], data[MESSAGE.size :]
+        place, content = self._topics[channel], data[layout.MESSAGE.size :]
         if place is None:
             told = json.loads(content)
-            self.events.append(Event(log_ns, told["kind"], told["text"], told["fields"]))
+            self.events.append(layout.Event(log_ns, told["kind"], told["text"], told["fields"]))
         else:
-            self.entries.append(Entry(log_ns, *place, content))
+            self.entries.append(layout.Entry(log_ns, *place, content))
         self._count += 1
 
     def _end(self, at: int, body: bytes) -> None:
@@ -219,7 +215,7 @@ class _Reader:
             check = zlib.crc32(data[:-12], check)
             tail = data[-12:]
             self._at += len(block)
-        if tail[4:] != MAGIC:
+        if tail[4:] != layout.MAGIC:
             raise _Damage(f"ends at byte {self._at} without having been closed")
         if tail[:4] != struct.pack("<I", check):
             raise _Damage(f"is damaged after byte {at}: the check of its summary fails")
@@ -231,9 +227,9 @@ def _stream(body: bytes) -> ReadDataStream:
 
 def _place(channel: mcap.Channel) -> tuple[str, Literal["to", "from"]] | None:
     """Link and direction of a topic; None: events."""
-    if channel.topic == EVENTS:
+    if channel.topic == layout.EVENTS:
         return None
     empty, link, direction = channel.topic.split("/")
-    if empty or channel.message_encoding != f"{ENCODING}{VERSION}":
+    if empty or channel.message_encoding != f"{layout.ENCODING}{VERSION}":
         raise _Damage(f"topic '{channel.topic}' of messages '{channel.message_encoding}'")
     return link, _DIRECTIONS[direction]

@@ -18,25 +18,7 @@ from mcap import records as mcap
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from robins.bench.recording.layout import (
-    CHUNK,
-    ENCODING,
-    EVENTS,
-    EVENTS_SCHEMA,
-    FRAMES_SCHEMA,
-    INDEX,
-    MAGIC,
-    MESSAGE,
-    METADATA,
-    PROFILE,
-    RECORD,
-    Entry,
-    Event,
-    RecordingError,
-    check_of,
-    json_text,
-    schemas,
-)
+from robins.bench.recording import layout
 from robins.bench.wire.frames import FrameError, decode_frame
 from robins.bench.wire.schema import VERSION
 
@@ -70,7 +52,7 @@ class Recorder:
         """
         self.path = Path(path)
         self.messages = self.lost = 0
-        text = json_text(f"header of '{path}'", dict(header))
+        text = layout.json_text(f"header of '{path}'", dict(header))
         self._channels: dict[tuple[str, str], int] = {}
         self._topics: list[mcap.Channel] = []
         self._counts: dict[int, int] = {}  # messages on the disk, by channel
@@ -84,17 +66,17 @@ class Recorder:
             # unbuffered: what has been written outlives this process
             self._file = self.path.open("wb" if overwrite else "xb", buffering=0)
         except FileExistsError:
-            raise RecordingError(
+            raise layout.RecordingError(
                 f"'{path}' is there already: give another name, or say that it may be overwritten"
             ) from None
         out = RecordBuilder()
-        mcap.Header(PROFILE, "robins").write(out)
-        start = MAGIC + out.end()
+        mcap.Header(layout.PROFILE, "robins").write(out)
+        start = layout.MAGIC + out.end()
         wire = str(VERSION)
-        about = {"wire": wire, "header": text, "check": check_of(wire + text)}
-        mcap.Metadata(METADATA, about).write(out)
-        self._metadata = mcap.MetadataIndex(len(start), out.count, METADATA)
-        for schema in schemas():
+        about = {"wire": wire, "header": text, "check": layout.check_of(wire + text)}
+        mcap.Metadata(layout.METADATA, about).write(out)
+        self._metadata = mcap.MetadataIndex(len(start), out.count, layout.METADATA)
+        for schema in layout.schemas():
             schema.write(out)
         try:
             self._put(start + out.end())
@@ -108,7 +90,7 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def write(self, entry: Entry, time_ns: int | None = None) -> None:
+    def write(self, entry: layout.Entry, time_ns: int | None = None) -> None:
         """Take what went over a link.
 
         Args:
@@ -123,12 +105,14 @@ class Recorder:
         channel = self._channels.get((link, direction))
         if channel is None:
             topic = f"/{link}/{direction}"
-            channel = self._open(link, direction, topic, f"{ENCODING}{VERSION}", FRAMES_SCHEMA)
+            channel = self._open(
+                link, direction, topic, f"{layout.ENCODING}{VERSION}", layout.FRAMES_SCHEMA
+            )
         if time_ns is None:
             time_ns = _time_ns(data, received_ns)
         self._add(channel, received_ns, time_ns, data)
 
-    def event(self, event: Event) -> None:
+    def event(self, event: layout.Event) -> None:
         """Take what happened.
 
         Raises:
@@ -136,10 +120,10 @@ class Recorder:
             OSError: as `write`.
         """
         told = {"kind": event.kind, "text": event.text, "fields": event.fields}
-        text = json_text(f"event '{event.kind}'", told)
+        text = layout.json_text(f"event '{event.kind}'", told)
         channel = self._channels.get(("", ""))
         if channel is None:
-            channel = self._open("", "", EVENTS, "json", EVENTS_SCHEMA)
+            channel = self._open("", "", layout.EVENTS, "json", layout.EVENTS_SCHEMA)
         self._add(channel, event.received_ns, event.received_ns, text.encode())
 
     def flush(self) -> None:
@@ -153,9 +137,9 @@ class Recorder:
         body, first, last = bytes(self._body), self._first, self._last
         indices, taken, size = self._indices, self._taken, len(self._body)
         self._clean()
-        whole = CHUNK.size + size
-        head = CHUNK.pack(
-            Opcode.CHUNK, whole - RECORD.size, first, last, size, zlib.crc32(body), 0, size
+        whole = layout.CHUNK.size + size
+        head = layout.CHUNK.pack(
+            Opcode.CHUNK, whole - layout.RECORD.size, first, last, size, zlib.crc32(body), 0, size
         )
         index, places = bytearray(), {}
         for channel, places_in_chunk in indices.items():
@@ -184,7 +168,7 @@ class Recorder:
         begin, end = self._span or (first, last)
         self._span = min(begin, first), max(end, last)
         for channel, places_in_chunk in indices.items():
-            more = len(places_in_chunk) // INDEX.size
+            more = len(places_in_chunk) // layout.INDEX.size
             self._counts[channel] = self._counts.get(channel, 0) + more
 
     def close(self) -> None:
@@ -235,9 +219,9 @@ class Recorder:
         elif log_ns < self._first:
             self._first = log_ns
         self._taken += 1
-        index += INDEX.pack(log_ns, len(body))
-        size = MESSAGE.size - RECORD.size + len(data)
-        body += MESSAGE.pack(5, size, channel, number & 0xFFFFFFFF, log_ns, time_ns)
+        index += layout.INDEX.pack(log_ns, len(body))
+        size = layout.MESSAGE.size - layout.RECORD.size + len(data)
+        body += layout.MESSAGE.pack(5, size, channel, number & 0xFFFFFFFF, log_ns, time_ns)
         body += data
         if (
             self._last - self._first >= CHUNK_NS
@@ -266,7 +250,7 @@ class Recorder:
         start, parts, offsets = self._at + out.count, [out.end()], RecordBuilder()
         at = start
         for opcode, group in (
-            (Opcode.SCHEMA, _bytes_of(*schemas())),
+            (Opcode.SCHEMA, _bytes_of(*layout.schemas())),
             (Opcode.CHANNEL, _bytes_of(*self._topics)),
             (Opcode.STATISTICS, _bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, bytes(self._chunks)),
@@ -279,7 +263,7 @@ class Recorder:
         parts.append(offsets.end())
         foot = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, at)
         foot += struct.pack("<I", zlib.crc32(foot, zlib.crc32(b"".join(parts[1:]))))
-        return b"".join([*parts, foot, MAGIC])
+        return b"".join([*parts, foot, layout.MAGIC])
 
     def _statistics(self) -> mcap.Statistics:
         begin, end = self._span or (0, 0)
@@ -292,7 +276,7 @@ class Recorder:
             message_end_time=end,
             message_start_time=begin,
             metadata_count=1,
-            schema_count=len(schemas()),
+            schema_count=len(layout.schemas()),
         )
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg
+from robins.filters.belief import Number
 from robins.filters.observation import Observation
 
-Number = float | int  # where types are checked an int is no float
 Weights = ArrayLike | Sequence[Number] | None
 
 _SOLID = 1e-6  # pivots below this share of a state's deviation are not divided by just so

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -10,8 +11,8 @@ from robins.filters.belief import Belief
 from robins.filters.observation import Observation
 
 
-def reopened(prior: Belief, o: Observation, doubted: Array, root: Array) -> Belief:
-    r"""The prior with a covariance D added to what some components of a measurement see.
+def reopened(due: Array, prior: Belief, o: Observation, doubted: Array, root: Array) -> Belief:
+    r"""The prior with a covariance D added to what some components see, where that is due.
 
         P' = P + G D G',   G = P H' (H P H')^-1,   so that H G = I and H P' H' = H P H' + D,
 
@@ -20,12 +21,17 @@ def reopened(prior: Belief, o: Observation, doubted: Array, root: Array) -> Beli
     cannot be doubted: its column of G is 0.
 
     Args:
+        due: () bool; without it the prior stands.
         prior: the belief.
         o: the measurement as this belief sees it.
         doubted: (m,) bool, the components.
         root: (m, k) root of D; its other rows do not count.
     """
-    spread = jnp.where(doubted[:, None], o.spread, 0.0)
-    solid, _ = linalg.guard(spread, o.size)
-    G_root = prior.factor @ (spread.T @ linalg.solve_spd(solid, root))
-    return prior._replace(factor=linalg.tria(prior.factor, G_root))
+
+    def wider() -> Belief:
+        spread = jnp.where(doubted[:, None], o.spread, 0.0)
+        solid, _ = linalg.guard(spread, o.size)
+        G_root = prior.factor @ (spread.T @ linalg.solve_spd(solid, root))
+        return prior._replace(factor=linalg.tria(prior.factor, G_root))
+
+    return jax.lax.cond(due, wider, lambda: Belief(*prior))

@@ -9,9 +9,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from robins.errors import require
+from robins.filters.belief import Number
 from robins.filters.observation import Observation
-
-Number = float | int  # where types are checked an int is no float
 
 
 def variance(factor: Array) -> Array:
@@ -47,8 +47,7 @@ def check_forgetting(rule: str, forgetting: Number) -> None:
     Raises:
         ValueError: it is not in (0, 1].
     """
-    if not 0.0 < forgetting <= 1.0:
-        raise ValueError(f"{rule} forgetting must lie in (0, 1], got {forgetting}")
+    require(0.0 < forgetting <= 1.0, f"{rule} forgetting must lie in (0, 1]", forgetting)
 
 
 def check_band(rule: str, floor: Number, ceiling: Number) -> None:
@@ -57,7 +56,6 @@ def check_band(rule: str, floor: Number, ceiling: Number) -> None:
     Raises:
         ValueError: not 0 < floor <= 1 <= ceiling < infinity.
     """
-    if not 0.0 < floor <= 1.0:
-        raise ValueError(f"{rule} floor must lie in (0, 1], got {floor}")
+    require(0.0 < floor <= 1.0, f"{rule} floor must lie in (0, 1]", floor)
     if not 1.0 <= ceiling < float("inf"):
         raise ValueError(f"{rule} ceiling must be finite and not below 1, got {ceiling}")

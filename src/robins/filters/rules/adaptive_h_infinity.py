@@ -7,18 +7,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, Code, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._inflation import (
-    as_weight,
-    deflated,
-    inflated,
-    local_bound,
-    weighted_factor,
-)
-
-Number = float | int
+from robins.filters.rules import _inflation
 
 NAME = "adaptive_h_infinity"
 SHARE = 0.95  # of xi^2 that a compensated P is left with
@@ -79,13 +72,11 @@ def adaptive_h_infinity(
         ValueError: zeta is not positive, the window less than 1, floor not above 1, ceiling below
             floor, or the weight is not finite or of the wrong shape.
     """
-    if not zeta > 0.0:
-        raise ValueError(f"zeta must be positive, got {zeta}")
-    if window < 1:
-        raise ValueError(f"window must be at least one step, got {window}")
+    require(zeta > 0.0, "zeta must be positive", zeta)
+    require(window >= 1, "window must be at least one step", window)
     if not 1.0 < floor <= ceiling:
         raise ValueError(f"1 < floor <= ceiling is wanted, got floor {floor}, ceiling {ceiling}")
-    rows = as_weight(weight, NAME)
+    rows = _inflation.as_weight(weight, NAME)
 
     def choose(memory: AdaptiveMemory):
         dof = jnp.sum(memory.dof)
@@ -93,14 +84,14 @@ def adaptive_h_infinity(
         return q, jnp.clip(1.0 + 1.0 / (zeta * jnp.maximum(q - 1.0, 1e-6)), floor, ceiling)
 
     def init(belief: Belief, dims):
-        weighted_factor(rows, belief, NAME)
+        _inflation.weighted_factor(rows, belief, NAME)
         counts = jnp.zeros((), int)
         return AdaptiveMemory(jnp.zeros(window), jnp.zeros(window), counts, jnp.zeros(()), counts)
 
     def compensate(memory: AdaptiveMemory, factor: Array, weighted: Array):
         """The factor that allows the last xi, and whether it had to be made."""
-        asked = memory.inverse * local_bound(weighted) >= 1.0
-        shrunk, _ = deflated(factor, memory.inverse * weighted, SHARE)
+        asked = memory.inverse * _inflation.local_bound(weighted) >= 1.0
+        shrunk, _ = _inflation.deflated(factor, memory.inverse * weighted, SHARE)
         return jnp.where(asked, shrunk, factor), asked
 
     def after(memory: AdaptiveMemory, posterior: Belief, info: StepInfo, o: Observation):
@@ -109,28 +100,29 @@ def adaptive_h_infinity(
             nis=memory.nis.at[here].add(jnp.minimum(info.nis, LARGEST)),
             dof=memory.dof.at[here].add(info.dof.astype(float)),
         )
-        weighted = weighted_factor(rows, posterior, NAME)
-        bound = local_bound(weighted)
+        weighted = _inflation.weighted_factor(rows, posterior, NAME)
+        bound = _inflation.local_bound(weighted)
         q, alpha = choose(memory)
         notes = {"q": q, "alpha": alpha, "xi": jnp.sqrt(alpha) * bound, "bound": bound}
         if compensate_first:
             factor, asked = compensate(memory, posterior.factor, weighted)
-            left = local_bound(weighted_factor(rows, posterior._replace(factor=factor), NAME))
+            left = _inflation.local_bound(
+                _inflation.weighted_factor(rows, posterior._replace(factor=factor), NAME)
+            )
             notes |= {"xi": jnp.sqrt(alpha) * left, "compensated": asked & (memory.dof[here] > 0.0)}
-        named = {f"{NAME}.{key}": value for key, value in notes.items()}
-        return memory, posterior, info._replace(notes={**info.notes, **named})
+        return memory, posterior, info.noted(NAME, **notes)
 
     def settle(memory: AdaptiveMemory, belief: Belief):
         counts = memory.dof[memory.at] > 0.0
-        weighted = weighted_factor(rows, belief, NAME)
+        weighted = _inflation.weighted_factor(rows, belief, NAME)
         factor, asked = belief.factor, jnp.array(False)
         if compensate_first:
             factor, asked = compensate(memory, factor, weighted)
-            weighted = weighted_factor(rows, belief._replace(factor=factor), NAME)
-        alpha, bound = choose(memory)[1], local_bound(weighted)
+            weighted = _inflation.weighted_factor(rows, belief._replace(factor=factor), NAME)
+        alpha, bound = choose(memory)[1], _inflation.local_bound(weighted)
         xi = jnp.sqrt(alpha) * bound
         inverse = jnp.where(xi > 0.0, 1.0 / jnp.where(xi > 0.0, xi, 1.0), 0.0)
-        wide, exists = inflated(factor, inverse * weighted)
+        wide, exists = _inflation.inflated(factor, inverse * weighted)
         acts = counts & exists & (asked | (inverse > 0.0))
         following = jnp.where(counts, (memory.at + 1) % window, memory.at)
         memory = AdaptiveMemory(

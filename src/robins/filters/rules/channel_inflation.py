@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, StepInfo
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._variances import Number
 
 
 def channel_inflation(lambda_: Number, B: Any) -> Rule:
@@ -58,8 +57,8 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
         return memory, transition._replace(noise=noise)
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "channel_inflation.lambda": jnp.asarray(float(lambda_))}
-        return memory, posterior, info._replace(notes=notes)
+        said = jnp.asarray(float(lambda_))
+        return memory, posterior, info.noted("channel_inflation", lambda_=said)
 
     return Rule(init=init, process=process, after=after, name="channel_inflation")
 

@@ -53,8 +53,7 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
         held = _mask(chosen, posterior.factor.shape[0])
         if not np.any(held):
-            notes = {**info.notes, "consider.withheld": jnp.zeros(())}
-            return memory, posterior, info._replace(notes=notes)
+            return memory, posterior, info.noted("consider", withheld=jnp.zeros(()))
         some = jnp.any(info.used)
         column = jnp.asarray(held)[:, None]
         told = jnp.where(column, info.gain @ info.factor, 0.0)
@@ -64,11 +63,8 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
         sigma = o.prior.sigma
         share = jnp.where(held & (sigma > 0.0), jnp.abs(move), 0.0)
         withheld = jnp.max(share / jnp.where(sigma > 0.0, sigma, 1.0))
-        info = info._replace(
-            gain=jnp.where(column, 0.0, info.gain),
-            notes={**info.notes, "consider.withheld": withheld},
-        )
-        return memory, Belief(mean, factor), info
+        info = info._replace(gain=jnp.where(column, 0.0, info.gain))
+        return memory, Belief(mean, factor), info.noted("consider", withheld=withheld)
 
     return Rule(init=init, after=after, name="consider")
 

@@ -78,8 +78,8 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
             factor = linalg.downdate(factor, K @ deficit)
         belief = Belief(manifold.retract(memory.prior.mean, moved), factor)
         belief = select(jnp.any(used), belief, posterior)
-        notes = info.notes | {"constant_gain.moved": jnp.max(jnp.abs(moved))}
-        return memory, belief, info._replace(gain=K, notes=notes)
+        info = info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
+        return memory, belief, info
 
     return Rule(init=init, before=before, after=after, name="constant_gain")
 

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules._shares import shares
-
-Number = float | int  # where types are checked an int is no float
 
 
 def _least(e: Array) -> Array:
@@ -46,10 +45,8 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
     Raises:
         ValueError: the kernel is not positive, or there is no iteration.
     """
-    if not kernel > 0.0:
-        raise ValueError(f"correntropy kernel must be positive, got {kernel}")
-    if iterations < 1:
-        raise ValueError(f"correntropy iterations must be at least 1, got {iterations}")
+    require(kernel > 0.0, "correntropy kernel must be positive", kernel)
+    require(iterations >= 1, "correntropy iterations must be at least 1", iterations)
     sigma = float(kernel)
 
     def weights(o: Observation) -> Array:
@@ -78,7 +75,6 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
         return jnp.min(w), prior, o._replace(noise=o.noise / jnp.sqrt(w)[:, None])
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "correntropy.weight": memory}
-        return jnp.ones(()), posterior, info._replace(notes=notes)
+        return jnp.ones(()), posterior, info.noted("correntropy", weight=memory)
 
     return Rule(init=init, before=before, after=after, name="correntropy")

@@ -9,21 +9,12 @@ from typing import Literal, NamedTuple, get_args
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.chi_square import limits
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._fading import (
-    Number,
-    Weights,
-    averaged,
-    check_size,
-    checked_weights,
-    faded,
-    significant,
-    total,
-    whitened,
-)
+from robins.filters.rules import _fading
 from robins.filters.rules._quantile import scale_to_quantile
 
 Fade = Literal["projected", "multiple"]
@@ -64,7 +55,7 @@ def discriminator(
     robust: Robust = "huber",
     threshold: Number = 3.0,
     limit: Number = 1e3,
-    weights: Weights = None,
+    weights: _fading.Weights = None,
 ) -> Rule:
     r"""Short excess is a fault of the sensor, lasting excess one of the model (a rule of robins).
 
@@ -106,26 +97,21 @@ def discriminator(
         ValueError: an argument is out of its range; when the filter starts, if the weights are not
             one a state.
     """
-    if patience < 1:
-        raise ValueError(f"discriminator patience must be at least 1, got {patience}")
-    if not 0.0 < probability <= 1.0:
-        raise ValueError(f"discriminator probability must lie in (0, 1], got {probability}")
-    if not 0.0 < rho <= 1.0:
-        raise ValueError(f"discriminator rho must lie in (0, 1], got {rho}")
+    require(patience >= 1, "discriminator patience must be at least 1", patience)
+    require(0.0 < probability <= 1.0, "discriminator probability must lie in (0, 1]", probability)
+    require(0.0 < rho <= 1.0, "discriminator rho must lie in (0, 1]", rho)
     if fade not in get_args(Fade):
         raise ValueError(f"discriminator fade must be one of {get_args(Fade)}, got {fade!r}")
     if robust not in get_args(Robust):
         raise ValueError(f"discriminator robust must be one of {get_args(Robust)}, got {robust!r}")
-    if not threshold >= 0.0:
-        raise ValueError(f"discriminator threshold must not be negative, got {threshold}")
-    if not 1.0 <= limit < math.inf:
-        raise ValueError(f"discriminator limit must be at least 1 and finite, got {limit}")
+    require(threshold >= 0.0, "discriminator threshold must not be negative", threshold)
+    require(1.0 <= limit < math.inf, "discriminator limit must be at least 1 and finite", limit)
     if weights is not None and fade != "multiple":
         raise ValueError(f"discriminator weights are for fade 'multiple', not {fade!r}")
-    shares = checked_weights("discriminator", weights)
+    shares = _fading.checked_weights("discriminator", weights)
 
     def init(belief: Belief, dims):
-        check_size("discriminator", shares, belief.factor.shape[0])
+        _fading.check_size("discriminator", shares, belief.factor.shape[0])
         power = {name: jnp.ones(m) for name, m in dims.items()}
         return _Memory(power, {name: jnp.zeros((), int) for name in dims}, _nothing())
 
@@ -138,11 +124,11 @@ def discriminator(
         count = jnp.where(seen.dof == 0, count, longer)
         outlier = (seen.dof > 0) & (count > 0) & (count < patience)
 
-        white = whitened(o)
-        power = jnp.where(outlier, power, averaged(power, white, rho))
-        lasting = ~outlier & significant(total(power, white), white, rho, threshold)
-        N = jnp.where(lasting, total(power, white) - white.dof, 0.0)
-        S, factor = faded(prior.factor, white, N, fade, shares, limit)
+        white = _fading.whitened(o)
+        power = jnp.where(outlier, power, _fading.averaged(power, white, rho))
+        lasting = ~outlier & _fading.significant(_fading.total(power, white), white, rho, threshold)
+        N = jnp.where(lasting, _fading.total(power, white) - white.dof, 0.0)
+        S, factor = _fading.faded(prior.factor, white, N, fade, shares, limit)
 
         if robust == "gate":
             weight = jnp.where(outlier, 0.0, 1.0)
@@ -161,13 +147,9 @@ def discriminator(
         return memory, Belief(prior.mean, S), o
 
     def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {
-            **info.notes,
-            "discriminator.weight": memory.said.weight,
-            "discriminator.lambda": memory.said.factor,
-            "discriminator.counter": memory.counter[o.sensor],
-            "discriminator.state": memory.said.state,
-        }
-        return memory._replace(said=_nothing()), posterior, info._replace(notes=notes)
+        said, count = memory.said, memory.counter[o.sensor]
+        notes = {"weight": said.weight, "lambda": said.factor, "counter": count}
+        info = info.noted("discriminator", **notes, state=said.state)
+        return memory._replace(said=_nothing()), posterior, info
 
     return Rule(init=init, before=before, after=after, name="discriminator")

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins import linalg
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters import trees
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.chi_square import limits
 from robins.filters.constrain import (
     ITERATIONS,
@@ -18,13 +19,12 @@ from robins.filters.constrain import (
     Weight,
     as_sensor,
     check_rows,
+    check_weight,
     constrain,
 )
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-
-Number = float | int
 
 
 def equality(
@@ -69,10 +69,9 @@ def equality(
     """
     if gate is not None and not 0.0 < gate < 1.0:
         raise ValueError(f"equality gate must lie between 0 and 1, or be None, got {gate}")
-    if iterations < 1:
-        raise ValueError(f"equality iterations must be at least 1, got {iterations}")
+    require(iterations >= 1, "equality iterations must be at least 1", iterations)
     _check_finite(d=d, noise=noise)
-    _check_weight(weight)
+    check_weight("equality", weight)
     if not callable(g):
         _check_rows(g, d, noise)
     once = noise is not None
@@ -80,10 +79,8 @@ def equality(
     def init(belief: Belief, dims):
         sensor, _ = as_sensor(belief.mean, g, d, noise)
         n = belief.factor.shape[0]
-        if not isinstance(weight, str) and np.shape(weight) != (n, n):
-            raise ValueError(f"equality weight is {np.shape(weight)}, the state needs ({n}, {n})")
-        if sensor.dim > n:
-            raise ValueError(f"equality has {sensor.dim} components, the state only {n}")
+        check_weight("equality", weight, n)
+        require(not sensor.dim > n, f"equality has {sensor.dim} components, the state only {n}")
         return jnp.zeros((), bool)  # whether this step has used a noisy constraint
 
     def process(used, transition: Transition):
@@ -95,15 +92,10 @@ def equality(
         if gate is not None:
             refused = held.nis > jnp.asarray(limits(gate, len(held.residual)))[held.dof]
         skip = refused | used
-        belief = jax.tree_util.tree_map(
-            lambda new, old: linalg.where(skip, old, new), held.belief, posterior
-        )
-        notes = {
-            "equality.residual": jnp.max(jnp.abs(held.residual)),
-            "equality.nis": held.nis,
-            "equality.refused": refused,
-        }
-        return used | once, belief, info._replace(notes={**info.notes, **notes})
+        belief = trees.select(skip, posterior, held.belief)
+        worst = jnp.max(jnp.abs(held.residual))
+        info = info.noted("equality", residual=worst, nis=held.nis, refused=refused)
+        return used | once, belief, info
 
     return Rule(init=init, process=process, after=after, name="equality")
 
@@ -113,18 +105,6 @@ def _check_finite(**given) -> None:
         for leaf in jax.tree_util.tree_leaves(value):
             if not np.all(np.isfinite(np.asarray(leaf, float))):
                 raise ValueError(f"equality {name} has entries that are not finite numbers")
-
-
-def _check_weight(weight: Weight) -> None:
-    if isinstance(weight, str):
-        if weight not in ("covariance", "identity"):
-            raise ValueError(
-                f"equality weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
-            )
-        return
-    root = np.asarray(linalg.factor(np.asarray(weight, float), "equality weight"))
-    if not np.all(np.diag(root) > 0.0):
-        raise ValueError("equality weight is not positive definite: each state wants a weight")
 
 
 def _check_rows(g: Numbers, d: Any, noise: Numbers | None) -> None:

@@ -6,10 +6,10 @@ import math
 
 import jax.numpy as jnp
 
-from robins.filters.belief import Belief, Code, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._variances import Number
 
 
 def fading_memory(factor: Number = 1.01) -> Rule:
@@ -34,8 +34,7 @@ def fading_memory(factor: Number = 1.01) -> Rule:
     Raises:
         ValueError: the factor is not finite or below 1.
     """
-    if not 1.0 <= factor < math.inf:
-        raise ValueError(f"fading_memory factor must be finite and not below 1, got {factor}")
+    require(1.0 <= factor < math.inf, "fading_memory factor must be finite and not below 1", factor)
 
     def init(belief: Belief, dims):
         return jnp.asarray(float(factor))
@@ -44,8 +43,7 @@ def fading_memory(factor: Number = 1.01) -> Rule:
         return memory, belief._replace(factor=memory * belief.factor), int(Code.DONE)
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "fading_memory.factor": memory}
-        return memory, posterior, info._replace(notes=notes)
+        return memory, posterior, info.noted("fading_memory", factor=memory)
 
     return Rule(init=init, settle=settle, after=after, name="fading_memory")
 
@@ -60,8 +58,6 @@ def per_step(memory_s: Number, step_s: Number) -> float:
     Raises:
         ValueError: one of them is not positive, or the step is not finite.
     """
-    if not memory_s > 0.0:
-        raise ValueError(f"fading_memory memory_s must be positive, got {memory_s}")
-    if not 0.0 < step_s < math.inf:
-        raise ValueError(f"fading_memory step_s must be positive and finite, got {step_s}")
+    require(memory_s > 0.0, "fading_memory memory_s must be positive", memory_s)
+    require(0.0 < step_s < math.inf, "fading_memory step_s must be positive and finite", step_s)
     return math.exp(step_s / (2.0 * memory_s))

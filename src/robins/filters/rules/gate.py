@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.chi_square import limits
 from robins.filters.observation import Observation, normalised
@@ -69,12 +70,10 @@ def gate(
         ValueError: the probability is not between 0 and 1, patience is negative or too short to
             agree in, or recovery or scope is none of those above.
     """
-    if not 0.0 < probability < 1.0:
-        raise ValueError(f"gate probability must lie between 0 and 1, got {probability}")
+    require(0.0 < probability < 1.0, "gate probability must lie between 0 and 1", probability)
     if recovery not in get_args(Recovery):
         raise ValueError(f"gate recovery must be one of {get_args(Recovery)}, got {recovery!r}")
-    if scope not in get_args(Scope):
-        raise ValueError(f"gate scope must be one of {get_args(Scope)}, got {scope!r}")
+    require(scope in get_args(Scope), f"gate scope must be one of {get_args(Scope)}", repr(scope))
     agreeing = recovery == "reinitialise"
     if patience < int(agreeing):
         raise ValueError(
@@ -104,9 +103,7 @@ def gate(
             known = jnp.where(fresh, _push(known, used), known)
             agree = partial(_agree_as_one if joint else _agree_each, probability)
             due = jax.lax.cond(
-                jnp.any(due),
-                lambda: due & agree(residual, known, o.noise),
-                lambda: due,
+                jnp.any(due), lambda: due & agree(residual, known, o.noise), lambda: due
             )
         passed = ~over | due
         refused = jnp.where(judged, jnp.where(passed, 0, was.refused + 1), was.refused)
@@ -123,22 +120,14 @@ def gate(
             root = jump[:, None] if joint else jnp.diag(jump)
             if agreeing:
                 root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
-            prior = jax.lax.cond(
-                jnp.any(due),
-                lambda: reopened(prior, o, doubted, root),
-                lambda: Belief(*prior),
-            )
+            prior = reopened(jnp.any(due), prior, o, doubted, root)
         return {**memory, o.sensor: now}, prior, o._replace(accepted=o.accepted & passed)
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
         channel: _Channel = memory[o.sensor]
-        notes = {
-            **info.notes,
-            "gate.ratio": channel.ratio,
-            "gate.refused": jnp.max(channel.refused, initial=0),
-            "gate.recovered": channel.recovered,
-        }
-        return memory, posterior, info._replace(notes=notes)
+        most = jnp.max(channel.refused, initial=0)
+        notes = {"ratio": channel.ratio, "refused": most, "recovered": channel.recovered}
+        return memory, posterior, info.noted("gate", **notes)
 
     return Rule(init=init, before=before, after=after, name="gate")
 

@@ -4,27 +4,22 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from robins import manifold
+from robins.errors import require
+from robins.filters import trees
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
+from robins.filters.rules import _inflation
 from robins.filters.rules._feasibility import (
     HInfinityMemory,
     Infeasible,
     anew,
     raise_infeasible,
-)
-from robins.filters.rules._inflation import (
-    as_weight,
-    deflated,
-    inflated,
-    local_bound,
-    weighted_factor,
 )
 
 __all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
@@ -94,8 +89,7 @@ def h_infinity(
     ):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}; got {value!r}")
-    if not 0.0 < margin < 1.0:
-        raise ValueError(f"margin must lie between 0 and 1, got {margin}")
+    require(0.0 < margin < 1.0, "margin must lie between 0 and 1", margin)
     judges_prior = estimate == "a-priori"
     if judges_prior and policy == "compensate":
         raise ValueError(
@@ -103,7 +97,7 @@ def h_infinity(
             "before: use 'raise_gamma'"
         )
     moves_on = estimate != "a-posteriori"
-    rows = as_weight(weight, NAME)
+    rows = _inflation.as_weight(weight, NAME)
 
     def in_force(inverse, bound):
         """1 / gamma of this step, as the policy leaves it."""
@@ -113,7 +107,7 @@ def h_infinity(
         return jnp.where(bound > 0.0, jnp.minimum(inverse, (1.0 - margin) ** 0.5 / some), inverse)
 
     def init(belief: Belief, dims):
-        weighted = weighted_factor(rows, belief, NAME)
+        weighted = _inflation.weighted_factor(rows, belief, NAME)
         return HInfinityMemory(
             inverse=jnp.asarray(1.0 / asked),
             steps=jnp.zeros((), int),
@@ -133,16 +127,16 @@ def h_infinity(
 
     def before(memory: HInfinityMemory, prior: Belief, o: Observation):
         if judges_prior:
-            seen = weighted_factor(rows, prior, NAME)
+            seen = _inflation.weighted_factor(rows, prior, NAME)
             memory = memory._replace(weighted=jnp.where(memory.fresh, seen, memory.weighted))
         return memory._replace(fresh=jnp.array(False)), prior, o
 
     def after(memory: HInfinityMemory, posterior: Belief, info: StepInfo, o: Observation):
         if not judges_prior:
-            memory = memory._replace(weighted=weighted_factor(rows, posterior, NAME))
+            memory = memory._replace(weighted=_inflation.weighted_factor(rows, posterior, NAME))
         memory = memory._replace(measured=memory.measured | jnp.any(info.used))
         # Noted but not remembered, so that a run which does not keep it does not compute it.
-        bound = local_bound(memory.weighted)
+        bound = _inflation.local_bound(memory.weighted)
         inverse = in_force(memory.inverse, bound)
         left = 1.0 - (bound * inverse) ** 2
         notes = {"bound": bound, "gamma": 1.0 / inverse, "margin": left}
@@ -151,23 +145,22 @@ def h_infinity(
             notes["raised"] = counts & (inverse < memory.inverse)
         if policy == "compensate":
             notes["compensated"] = counts & (left < margin)
-        named = {f"{NAME}.{key}": value for key, value in notes.items()}
-        return memory, posterior, info._replace(notes={**info.notes, **named})
+        return memory, posterior, info.noted(NAME, **notes)
 
     def settle(memory: HInfinityMemory, belief: Belief):
         counts = memory.measured | (count_missing & (memory.steps > 0))
-        weighted = weighted_factor(rows, belief, NAME)
+        weighted = _inflation.weighted_factor(rows, belief, NAME)
         judged = jnp.where(memory.fresh, weighted, memory.weighted) if judges_prior else weighted
         inverse, factor, acted = memory.inverse, belief.factor, jnp.array(False)
         if policy == "raise_gamma":
-            inverse = in_force(memory.inverse, local_bound(judged))
+            inverse = in_force(memory.inverse, _inflation.local_bound(judged))
             acted = inverse < memory.inverse
         if policy == "compensate":
-            factor, acted = deflated(factor, inverse * weighted, 1.0 - margin)
-            weighted = weighted_factor(rows, belief._replace(factor=factor), NAME)
-        wide, exists = inflated(factor, inverse * weighted)
+            factor, acted = _inflation.deflated(factor, inverse * weighted, 1.0 - margin)
+            weighted = _inflation.weighted_factor(rows, belief._replace(factor=factor), NAME)
+        wide, exists = _inflation.inflated(factor, inverse * weighted)
         if judges_prior:
-            exists = exists & inflated(factor, inverse * judged)[1]
+            exists = exists & _inflation.inflated(factor, inverse * judged)[1]
         new = Belief(belief.mean, wide)
         if moves_on:
             # P~ L'L d / gamma^2 takes the mean on from P H'R^-1 r to P~ H'R^-1 r.
@@ -175,7 +168,7 @@ def h_infinity(
             L = inverse * rows(belief.mean)
             new = new._replace(mean=manifold.retract(belief.mean, wide @ ((L @ wide).T @ (L @ d))))
         active = counts & exists & (memory.inverse > 0.0)
-        new = jax.tree_util.tree_map(lambda a, b: jnp.where(active, a, b), new, belief)
+        new = trees.select(active, new, belief)
 
         missed = counts & ~exists
         acted = missed | (counts & acted)
@@ -212,8 +205,7 @@ def with_gamma(state: FilterState, gamma: Any) -> FilterState:
         ValueError: the filter has no `h_infinity` rule.
     """
     held = [isinstance(one, HInfinityMemory) for one in state.memory]
-    if not any(held):
-        raise ValueError("this filter has no h_infinity rule whose gamma could be exchanged")
+    require(any(held), "this filter has no h_infinity rule whose gamma could be exchanged")
     memory = tuple(
         anew(one, gamma) if here else one for one, here in zip(state.memory, held, strict=True)
     )

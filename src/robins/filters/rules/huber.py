@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.chi_square import limits
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._quantile import scale_to_quantile
-
-Number = float | int  # where types are checked an int is no float
 
 
 def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
@@ -35,10 +34,8 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
     Raises:
         ValueError: the probability is not in (0, 1], or the threshold not positive.
     """
-    if not 0.0 < probability <= 1.0:
-        raise ValueError(f"huber probability must lie in (0, 1], got {probability}")
-    if threshold is not None and not threshold > 0.0:
-        raise ValueError(f"huber threshold must be positive, got {threshold}")
+    require(0.0 < probability <= 1.0, "huber probability must lie in (0, 1]", probability)
+    require(threshold is None or threshold > 0.0, "huber threshold must be positive", threshold)
 
     def init(belief, dims):
         return jnp.ones(())  # of the update under way
@@ -53,7 +50,6 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
         return 1.0 / s, prior, o._replace(noise=jnp.sqrt(s) * o.noise)
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "huber.weight": memory}
-        return jnp.ones(()), posterior, info._replace(notes=notes)
+        return jnp.ones(()), posterior, info.noted("huber", weight=memory)
 
     return Rule(init=init, before=before, after=after, name="huber")

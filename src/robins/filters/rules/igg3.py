@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._reopen import reopened
-
-Number = float | int  # where types are checked an int is no float
 
 
 class _Memory(NamedTuple):
@@ -53,12 +51,9 @@ def igg3(
     Raises:
         ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
     """
-    if not 0.0 < k0 < k1 < math.inf:
-        raise ValueError(f"igg3 needs 0 < k0 < k1 < inf, got k0 = {k0}, k1 = {k1}")
-    if not 0.0 <= floor < 1.0:
-        raise ValueError(f"igg3 floor must lie in [0, 1), got {floor}")
-    if patience is not None and patience < 0:
-        raise ValueError(f"igg3 patience must not be negative, got {patience}")
+    require(0.0 < k0 < k1 < math.inf, f"igg3 needs 0 < k0 < k1 < inf, got k0 = {k0}, k1 = {k1}")
+    require(0.0 <= floor < 1.0, "igg3 floor must lie in [0, 1)", floor)
+    require(patience is None or patience >= 0, "igg3 patience must not be negative", patience)
 
     def init(belief, dims):
         doubted = {name: jnp.zeros((), int) for name in dims}
@@ -82,11 +77,7 @@ def igg3(
             recovered = hopeless & (before_ >= patience)
             a = jnp.max(jnp.where(far, 1.0 / k0**2 - 1.0 / beyond**2, 0.0))
             root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
-            prior = jax.lax.cond(
-                recovered,
-                lambda: reopened(prior, o, seen.used, root),
-                lambda: Belief(*prior),
-            )
+            prior = reopened(recovered, prior, o, seen.used, root)
         weight = jnp.where(recovered, 1.0, weight)
         count = jnp.where(hopeless & ~recovered, before_ + 1, 0)
         count = jnp.where(measured, count, before_)
@@ -95,12 +86,8 @@ def igg3(
         return now, prior, o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
 
     def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {
-            **info.notes,
-            "igg3.weight": memory.weight,
-            "igg3.recovered": memory.recovered,
-        }
+        info = info.noted("igg3", weight=memory.weight, recovered=memory.recovered)
         quiet = memory._replace(weight=jnp.ones(()), recovered=jnp.zeros((), bool))
-        return quiet, posterior, info._replace(notes=notes)
+        return quiet, posterior, info
 
     return Rule(init=init, before=before, after=after, name="igg3")

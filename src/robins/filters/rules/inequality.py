@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins import linalg
+from robins.filters import trees
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.constrain import Function, Numbers, as_sensor
 from robins.filters.interval import clip, truncate
@@ -73,15 +72,10 @@ def inequality(
         else:
             kept = truncate(posterior, g, low, high)
             skip = cut & ~jnp.any(info.used)
-            belief = jax.tree_util.tree_map(
-                lambda new, old: linalg.where(skip, old, new), kept.belief, posterior
-            )
+            belief = trees.select(skip, posterior, kept.belief)
             cut = jnp.ones((), bool)
-        notes = {
-            "inequality.outside": jnp.sum(kept.outside),
-            "inequality.infeasible": kept.infeasible,
-        }
-        return cut, belief, info._replace(notes={**info.notes, **notes})
+        notes = {"outside": jnp.sum(kept.outside), "infeasible": kept.infeasible}
+        return cut, belief, info.noted("inequality", **notes)
 
     return Rule(init=init, process=process, after=after, name="inequality")
 

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._variances import Number, ratio, reading_variance, variance
+from robins.filters.rules._variances import ratio, reading_variance, variance
 
 
 class Window(NamedTuple):
@@ -62,12 +63,10 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
     Raises:
         ValueError: a parameter is not of its range.
     """
-    if window < 1:
-        raise ValueError(f"innovation_fading window must be 1 sample or more, got {window}")
+    require(window >= 1, "innovation_fading window must be 1 sample or more", window)
     if not 1.0 <= limit < float("inf"):
         raise ValueError(f"innovation_fading limit must be finite and not below 1, got {limit}")
-    if not reach >= 1.0:
-        raise ValueError(f"innovation_fading reach must be at least 1, got {reach}")
+    require(reach >= 1.0, "innovation_fading reach must be at least 1", reach)
 
     def init(belief: Belief, dims) -> Memory:
         windows = {
@@ -103,7 +102,6 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
         return memory, prior._replace(factor=jnp.sqrt(factor) * prior.factor), o
 
     def after(memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "innovation_fading.lambda": memory.factor}
-        return memory, posterior, info._replace(notes=notes)
+        return memory, posterior, info.noted("innovation_fading", lambda_=memory.factor)
 
     return Rule(init=init, process=process, before=before, after=after, name="innovation_fading")

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.constrain import Weight, metric_of, nearest
+from robins.filters.constrain import Weight, check_weight, metric_of, nearest
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 
@@ -54,12 +53,11 @@ def projection(
     names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
     if not names:
         raise ValueError("projection: name at least one sensor whose measurements are constraints")
-    _check_weight(weight)
+    check_weight("projection", weight)
 
     def init(belief: Belief, dims: Mapping[str, int]):
         n = belief.factor.shape[0]
-        if not isinstance(weight, str) and np.shape(weight) != (n, n):
-            raise ValueError(f"projection weight is {np.shape(weight)}, the state needs ({n}, {n})")
+        check_weight("projection", weight, n)
         for name, m in dims.items():
             if name in names and m > n:
                 raise ValueError(f"sensor '{name}' has {m} components, the state only {n} to move")
@@ -69,9 +67,8 @@ def projection(
         if o.sensor not in names:
             return memory, posterior, info
         belief, gain, used = projected(o, weight, project_covariance)
-        notes = {**info.notes, "projection.residual": jnp.max(jnp.abs(o.residual))}
-        gain = jnp.where(used[None, :], gain, 0.0)
-        return memory, belief, info._replace(gain=gain, notes=notes)
+        info = info._replace(gain=jnp.where(used[None, :], gain, 0.0))
+        return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
 
     return Rule(init=init, after=after, name="projection")
 
@@ -102,15 +99,3 @@ def _slope(o: Observation) -> Array:
     """D, of which the spread D S is known: D = D S S' (S S')^-1."""
     solid, _ = linalg.guard(o.prior.factor)
     return linalg.solve_spd(solid, o.prior.factor @ o.spread.T).T
-
-
-def _check_weight(weight: Weight) -> None:
-    if isinstance(weight, str):
-        if weight not in ("covariance", "identity"):
-            raise ValueError(
-                f"projection weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
-            )
-        return
-    root = np.asarray(linalg.factor(np.asarray(weight, float), "projection weight"))
-    if not np.all(np.diag(root) > 0.0):
-        raise ValueError("projection weight is not positive definite: each state wants a weight")

@@ -8,20 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import manifold
-from robins.filters.belief import Belief, StepInfo
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._variances import (
-    Number,
-    check_band,
-    check_forgetting,
-    numbered,
-    ratio,
-    reading_variance,
-    scaled,
-    variance,
-)
+from robins.filters.rules import _variances
 
 
 class Scale(NamedTuple):
@@ -78,8 +69,8 @@ def sage_husa(
     Raises:
         ValueError: a parameter is not of its range.
     """
-    check_forgetting("sage_husa", forgetting)
-    check_band("sage_husa", floor, ceiling)
+    _variances.check_forgetting("sage_husa", forgetting)
+    _variances.check_band("sage_husa", floor, ceiling)
     if adapt not in ("R", "Q", "QR"):
         raise ValueError(f"sage_husa adapt must be 'R', 'Q' or 'QR', got {adapt!r}")
     of_sensor, of_motion = "R" in adapt, "Q" in adapt
@@ -106,34 +97,36 @@ def sage_husa(
 
     def process(memory, t: Transition):
         sensors, (scale, last) = memory
-        sample = ratio(last.correction**2 + last.posterior - last.moved, last.nominal)
+        sample = _variances.ratio(last.correction**2 + last.posterior - last.moved, last.nominal)
         scale = learn(scale, sample, last.measured & (last.nominal > 0.0))
-        moved = variance(t.spread) + variance(t.excess)
+        moved = _variances.variance(t.spread) + _variances.variance(t.excess)
         if t.deficit is not None:
             moved = moved - t.deficit**2
         nothing = jnp.zeros_like(moved)
-        last = LastStep(moved, variance(t.noise), nothing, nothing, jnp.zeros((), bool))
-        return (sensors, (scale, last)), t._replace(noise=scaled(t.noise, scale.ratio))
+        last = LastStep(moved, _variances.variance(t.noise), nothing, nothing, jnp.zeros((), bool))
+        return (sensors, (scale, last)), t._replace(noise=_variances.scaled(t.noise, scale.ratio))
 
     def before(memory, prior: Belief, o: Observation):
         sensors, motion = memory
-        R = variance(o.noise)
+        R = _variances.variance(o.noise)
         here = o.accepted & o.present & (R > 0.0)
         e = jnp.where(here, o.residual, 0.0)
-        scale = learn(sensors[o.sensor], ratio(e**2 - reading_variance(o), R), here)
-        o = o._replace(noise=scaled(o.noise, scale.ratio))
+        scale = learn(
+            sensors[o.sensor], _variances.ratio(e**2 - _variances.reading_variance(o), R), here
+        )
+        o = o._replace(noise=_variances.scaled(o.noise, scale.ratio))
         return ({**sensors, o.sensor: scale}, motion), prior, o
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
         sensors, motion = memory
         notes = dict(info.notes)
         if of_sensor:
-            notes |= numbered("sage_husa.r_scale", sensors[o.sensor].ratio)
+            notes |= _variances.numbered("sage_husa.r_scale", sensors[o.sensor].ratio)
         if of_motion:
             scale, last = motion
-            notes |= numbered("sage_husa.q_scale", scale.ratio)
+            notes |= _variances.numbered("sage_husa.q_scale", scale.ratio)
             last = last._replace(
-                posterior=variance(posterior.factor),
+                posterior=_variances.variance(posterior.factor),
                 correction=last.correction + manifold.local(o.prior.mean, posterior.mean),
                 measured=last.measured | jnp.any(info.used),
             )

@@ -10,24 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._fading import (
-    Number,
-    Weights,
-    White,
-    averaged,
-    check_size,
-    checked_weights,
-    faded,
-    ratio,
-    seen_by,
-    significant,
-    total,
-    whitened,
-)
+from robins.filters.rules import _fading
 
 Form = Literal["outside", "lumped", "multiple", "projected"]
 Power = Literal["classic", "ewma"]
@@ -49,7 +37,7 @@ def strong_tracking(
     power: Power = "classic",
     threshold: Number | None = None,
     limit: Number = 1e3,
-    weights: Weights = None,
+    weights: _fading.Weights = None,
 ) -> Rule:
     r"""Fade the prior so that the innovation is as large as expected (Zhou & Frank 1996).
 
@@ -95,28 +83,25 @@ def strong_tracking(
         ValueError: an argument is out of its range; when the filter starts, if the weights are not
             one a state.
     """
-    if not 0.0 < rho <= 1.0:
-        raise ValueError(f"strong_tracking rho must lie in (0, 1], got {rho}")
-    if not 1.0 <= beta < math.inf:
-        raise ValueError(f"strong_tracking beta must be at least 1 and finite, got {beta}")
+    require(0.0 < rho <= 1.0, "strong_tracking rho must lie in (0, 1]", rho)
+    require(1.0 <= beta < math.inf, "strong_tracking beta must be at least 1 and finite", beta)
     if form not in get_args(Form):
         raise ValueError(f"strong_tracking form must be one of {get_args(Form)}, got {form!r}")
     if power not in get_args(Power):
         raise ValueError(f"strong_tracking power must be one of {get_args(Power)}, got {power!r}")
     if threshold is not None and not threshold >= 0.0:
         raise ValueError(f"strong_tracking threshold must not be negative, got {threshold}")
-    if not 1.0 <= limit < math.inf:
-        raise ValueError(f"strong_tracking limit must be at least 1 and finite, got {limit}")
+    require(1.0 <= limit < math.inf, "strong_tracking limit must be at least 1 and finite", limit)
     if weights is not None and form != "multiple":
         raise ValueError(f"strong_tracking weights are for form 'multiple', not {form!r}")
-    shares = checked_weights("strong_tracking", weights)
+    shares = _fading.checked_weights("strong_tracking", weights)
     classic = power == "classic"
     keep = rho / (1.0 + rho) if classic else rho
     sigmas = threshold if classic or threshold is not None else 3.0
 
     def init(belief: Belief, dims):
         n = belief.factor.shape[0]
-        check_size("strong_tracking", shares, n)
+        _fading.check_size("strong_tracking", shares, n)
         return _Memory(
             power={name: jnp.ones(m) for name, m in dims.items()},
             begun={name: jnp.full(m, not classic) for name, m in dims.items()},
@@ -134,17 +119,17 @@ def strong_tracking(
         return memory._replace(moved=moved, noise=noise, fresh=jnp.array(True)), t
 
     def before(memory: _Memory, prior: Belief, o: Observation):
-        white = whitened(o)
+        white = _fading.whitened(o)
         V, begun = memory.power[o.sensor], memory.begun[o.sensor]
         first = white.counts & ~begun
-        V = jnp.where(first, white.residual**2, averaged(V, white, keep))
-        N = total(V, white) - beta * white.dof
+        V = jnp.where(first, white.residual**2, _fading.averaged(V, white, keep))
+        N = _fading.total(V, white) - beta * white.dof
         if sigmas is not None:
-            N = jnp.where(significant(total(V, white), white, keep, sigmas), N, 0.0)
+            N = jnp.where(_fading.significant(_fading.total(V, white), white, keep, sigmas), N, 0.0)
         if form == "outside":
             S, factor = _faded_outside(memory, prior.factor, white, N, limit)
         else:
-            S, factor = faded(prior.factor, white, N, form, shares, limit)
+            S, factor = _fading.faded(prior.factor, white, N, form, shares, limit)
         memory = memory._replace(
             power={**memory.power, o.sensor: V},
             begun={**memory.begun, o.sensor: begun | white.counts},
@@ -153,23 +138,22 @@ def strong_tracking(
         return memory, Belief(prior.mean, S), o
 
     def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        notes = {**info.notes, "strong_tracking.lambda": memory.factor}
         fresh = memory.fresh & ~jnp.any(info.used)
-        memory = memory._replace(fresh=fresh, factor=jnp.ones(()))
-        return memory, posterior, info._replace(notes=notes)
+        info = info.noted("strong_tracking", lambda_=memory.factor)
+        return memory._replace(fresh=fresh, factor=jnp.ones(())), posterior, info
 
     return Rule(init=init, process=process, before=before, after=after, name="strong_tracking")
 
 
-def _faded_outside(memory: _Memory, S: Array, white: White, N: Array, limit: Number):
+def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Number):
     """P + (lambda - 1) F P F', which is lambda F P F' + Q; P itself instead of F P F' once used."""
     n = len(S)
     whole = jnp.concatenate([S, linalg.zeros(n, memory.moved.shape[1] - n)], axis=1)
     moved = jnp.where(memory.fresh, memory.moved, whole)
     noise = jnp.where(memory.fresh, memory.noise, 0.0)
-    H = seen_by(white.spread, S)
+    H = _fading.seen_by(white.spread, S)
     M = jnp.sum((H @ moved) ** 2) + white.left_over
-    factor = ratio(N - jnp.sum((H @ noise) ** 2), M, limit)
+    factor = _fading.ratio(N - jnp.sum((H @ noise) ** 2), M, limit)
     more = factor > 1.0
     gain = jnp.sqrt(jnp.where(more, factor - 1.0, 1.0))
     return jax.lax.cond(more, lambda: linalg.tria(S, gain * moved), lambda: S), factor

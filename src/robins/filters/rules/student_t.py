@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters.belief import Belief, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules._quantile import MOST
 from robins.filters.rules._shares import shares
 
 Whose = Literal["R", "both"]
-Number = float | int  # where types are checked an int is no float
 
 
 def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rule:
@@ -46,10 +46,8 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
     Raises:
         ValueError: dof is not positive, there is no iteration, or whose is neither.
     """
-    if not dof > 0.0:
-        raise ValueError(f"student_t dof must be positive, got {dof}")
-    if iterations < 1:
-        raise ValueError(f"student_t iterations must be at least 1, got {iterations}")
+    require(dof > 0.0, "student_t dof must be positive", dof)
+    require(iterations >= 1, "student_t iterations must be at least 1", iterations)
     if whose not in get_args(Whose):
         raise ValueError(f"student_t whose must be one of {get_args(Whose)}, got {whose!r}")
     nu = float(dof)
@@ -89,7 +87,7 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
         weight, other = memory
-        notes = {**info.notes, "student_t.weight": weight, "student_t.prior": other}
-        return (jnp.ones(()), jnp.ones(())), posterior, info._replace(notes=notes)
+        info = info.noted("student_t", weight=weight, prior=other)
+        return (jnp.ones(()), jnp.ones(())), posterior, info
 
     return Rule(init=init, before=before, after=after, name="student_t")

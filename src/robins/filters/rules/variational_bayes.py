@@ -8,18 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters.belief import Belief, StepInfo
+from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
-from robins.filters.rules._variances import (
-    Number,
-    check_band,
-    check_forgetting,
-    numbered,
-    ratio,
-    scaled,
-    variance,
-)
+from robins.filters.rules import _variances
 
 
 class InverseGamma(NamedTuple):
@@ -83,8 +75,8 @@ def variational_bayes(
     Raises:
         ValueError: a parameter is not of its range.
     """
-    check_forgetting("variational_bayes", forgetting)
-    check_band("variational_bayes", floor, ceiling)
+    _variances.check_forgetting("variational_bayes", forgetting)
+    _variances.check_band("variational_bayes", floor, ceiling)
     if iterations < 1:
         raise ValueError(f"variational_bayes iterations must be 1 or more, got {iterations}")
     if not 0.0 < initial_dof < float("inf"):
@@ -105,30 +97,32 @@ def variational_bayes(
         scale = jnp.clip(b / a, floor, ceiling)
         spread, excess, noise, deficit, used = left_out(o._replace(accepted=o.accepted & o.present))
         reading = linalg.tria(spread, excess) if iterations > 1 else spread
-        e, nominal = jnp.where(used, o.residual, 0.0), variance(noise)
+        e, nominal = jnp.where(used, o.residual, 0.0), _variances.variance(noise)
         for _ in range(iterations - 1):
-            R_root = scaled(noise, jnp.where(used, scale, 1.0))
+            R_root = _variances.scaled(noise, jnp.where(used, scale, 1.0))
             S_root = linalg.tria(reading, R_root)
             if deficit is not None:
                 S_root = linalg.downdate(S_root, deficit)
-            left = ratio(_left(S_root, e, R_root), nominal)
+            left = _variances.ratio(_left(S_root, e, R_root), nominal)
             scale = jnp.clip((b + 0.5 * left) / a, floor, ceiling)
         scale = jnp.where(used, scale, known.scale)
         memory = {**memory, o.sensor: known._replace(scale=scale)}
-        return memory, prior, o._replace(noise=scaled(o.noise, scale))
+        return memory, prior, o._replace(noise=_variances.scaled(o.noise, scale))
 
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
         known = memory[o.sensor]
         # Rules behind this one may have weighed the noise again: that is part of the nominal one.
-        R = variance(o.noise)
+        R = _variances.variance(o.noise)
         here = info.used & (R > 0.0)
         noise = jnp.where(here[:, None], o.noise, 0.0)
-        left = ratio(_left(info.factor, jnp.where(here, o.residual, 0.0), noise), R / known.scale)
+        left = _variances.ratio(
+            _left(info.factor, jnp.where(here, o.residual, 0.0), noise), R / known.scale
+        )
         a, b = forgetting * known.shape + 0.5, forgetting * known.rate + 0.5 * left
         shape = jnp.where(here, a, known.shape)
         rate = jnp.where(here, jnp.clip(b, floor * a, ceiling * a), known.rate)
         memory = {**memory, o.sensor: InverseGamma(shape, rate, rate / shape)}
-        notes = info.notes | numbered("variational_bayes.r_scale", known.scale)
+        notes = info.notes | _variances.numbered("variational_bayes.r_scale", known.scale)
         return memory, posterior, info._replace(notes=notes)
 
     return Rule(init=init, before=before, after=after, name="variational_bayes")

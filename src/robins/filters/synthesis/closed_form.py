@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from robins.errors import require
 from robins.filters.synthesis.design import Design, Unreachable, certify
 from robins.filters.synthesis.norms import Number
 from robins.filters.synthesis.plant import Plant
@@ -82,8 +83,7 @@ def isotropic(plant: Plant) -> Isotropic:
     """
     n = len(plant.A)
     size = float(np.linalg.norm(plant.A, ord=2))
-    if size == 0.0:
-        raise ValueError("no closed form: A is zero")
+    require(size != 0.0, "no closed form: A is zero")
     spread = plant.Bw @ plant.Bw.T
     noise = plant.Dw @ plant.Dw.T
     sw2, ss2 = np.trace(spread) / n, np.trace(noise) / len(noise)
@@ -99,8 +99,7 @@ def isotropic(plant: Plant) -> Isotropic:
         (_same(each, np.trace(each) / n * eye), "L'L is no multiple of the identity"),
     )
     for met, why in demands:
-        if not met:
-            raise ValueError(f"no closed form: {why}")
+        require(met, f"no closed form: {why}")
     return Isotropic(
         size,
         plant.A / size,

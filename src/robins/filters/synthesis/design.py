@@ -7,13 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from robins.errors import RobinsError
-from robins.filters.synthesis.norms import (
-    Number,
-    h2_norm,
-    hinf_norm,
-    peak_gain,
-    spectral_radius,
-)
+from robins.filters.synthesis import norms
 from robins.filters.synthesis.plant import Plant, error_system
 
 _BOUND = 1e-3  # by how much, relatively, a solver's bound may lie below the true H2 norm
@@ -32,7 +26,7 @@ class Unreachable(RobinsError, ValueError):
         least: that gamma, nan where it is not known.
     """
 
-    def __init__(self, message: str, least: Number = np.nan):
+    def __init__(self, message: str, least: norms.Number = np.nan):
         super().__init__(message)
         self.least = float(least)
 
@@ -63,11 +57,11 @@ def certify(
     K: Any,
     *,
     method: str,
-    gamma: Number = np.inf,
-    bound: Number = np.nan,
-    lambda_: Number = np.nan,
+    gamma: norms.Number = np.inf,
+    bound: norms.Number = np.nan,
+    lambda_: norms.Number = np.nan,
     status: str = "",
-    seconds: Number = np.nan,
+    seconds: norms.Number = np.nan,
 ) -> Design:
     """The design of an observer gain, if its true norms are what was asked and promised.
 
@@ -89,10 +83,10 @@ def certify(
     error = error_system(plant, K)
     design = Design(
         method, float(gamma), np.array(K, float), "observer", None, float(bound),
-        h2_norm(error.A, error.Bw, error.L),
-        hinf_norm(error.A, error.Bn, error.L),
-        peak_gain(error.A, error.Bn, error.L),
-        spectral_radius(error.A), float(lambda_), status, float(seconds),
+        norms.h2_norm(error.A, error.Bw, error.L),
+        norms.hinf_norm(error.A, error.Bn, error.L),
+        norms.peak_gain(error.A, error.Bn, error.L),
+        norms.spectral_radius(error.A), float(lambda_), status, float(seconds),
     )  # fmt: skip
     return _checked(design)
 
@@ -102,10 +96,10 @@ def certify_full(
     filter_: tuple[Any, Any, Any],
     *,
     method: str,
-    gamma: Number = np.inf,
-    bound: Number = np.nan,
+    gamma: norms.Number = np.inf,
+    bound: norms.Number = np.nan,
     status: str = "",
-    seconds: Number = np.nan,
+    seconds: norms.Number = np.nan,
 ) -> Design:
     """The same for a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^.
 
@@ -131,8 +125,8 @@ def certify_full(
     C = np.hstack([plant.L, -Gh])
     design = Design(
         method, float(gamma), Bh, "full", (Ah, Bh, Gh), float(bound),
-        h2_norm(A, Bw, C), hinf_norm(A, Bn, C), peak_gain(A, Bn, C),
-        spectral_radius(A), np.nan, status, float(seconds),
+        norms.h2_norm(A, Bw, C), norms.hinf_norm(A, Bn, C), norms.peak_gain(A, Bn, C),
+        norms.spectral_radius(A), np.nan, status, float(seconds),
     )  # fmt: skip
     return _checked(design)
 

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robins.errors import require
+
 _MARGINAL = 1e-7  # eigenvalues of a defective block at 1 may be computed as far inside the circle
 _UNSEEN = 1e-9  # least singular value of the scaled Popov-Belevitch-Hautus matrix that counts as 0
 
@@ -62,10 +64,8 @@ def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: A
     named = ((A, "A"), (Bw, "Bw"), (Bn, "Bn"), (C, "C"))
     A, Bw, Bn, C = (_matrix(value, name) for value, name in named)
     n, m = A.shape[0], C.shape[0]
-    if A.shape[1] != n or n == 0:
-        raise ValueError(f"A is {A.shape}: the transition of a state must be square")
-    if m == 0:
-        raise ValueError(f"C is {C.shape}: nothing is measured")
+    require(A.shape[1] == n and n != 0, f"A is {A.shape}: the transition of a state must be square")
+    require(m != 0, f"C is {C.shape}: nothing is measured")
     if C.shape[1] != n:
         raise ValueError(f"C is {C.shape}, must be ({m}, {n}): A says that x has {n} components")
     for block, name in ((Bw, "Bw"), (Bn, "Bn")):

@@ -9,15 +9,9 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
+from robins.errors import require
+from robins.filters.synthesis import norms
 from robins.filters.synthesis.design import Design, Unreachable, certify
-from robins.filters.synthesis.norms import (
-    Levels,
-    Number,
-    gramian,
-    hinf_norm,
-    peak_gain,
-    spectral_radius,
-)
 from robins.filters.synthesis.plant import Plant, error_system
 from robins.filters.synthesis.steady import why_not_steady
 
@@ -54,18 +48,17 @@ def kalman_design(plant: Plant) -> Design:
     return certify(plant, K, method="kalman", lambda_=0.0, seconds=seconds)
 
 
-def inflated_gain(plant: Plant, lambda_: Number) -> np.ndarray:
+def inflated_gain(plant: Plant, lambda_: norms.Number) -> np.ndarray:
     """Kalman gain (n, m) for the noise [w, sqrt(lambda) n].
 
     Raises:
         ValueError: lambda is negative; or as `kalman_gain`.
     """
-    if not 0.0 <= lambda_ < np.inf:
-        raise ValueError(f"lambda must be a number from 0 on, got {lambda_}")
+    require(0.0 <= lambda_ < np.inf, "lambda must be a number from 0 on", lambda_)
     return _gain(plant, float(lambda_))
 
 
-def riccati(plant: Plant, gamma: Number) -> Design:
+def riccati(plant: Plant, gamma: norms.Number) -> Design:
     """The Kalman filter for noise [w, sqrt(lambda) n], with the least lambda that meets gamma.
 
     The modelling error n is taken for white noise, ever more of it until the true H-infinity norm
@@ -98,10 +91,9 @@ def least_riccati_gamma(plant: Plant) -> float:
     return _least(plant)[-1]
 
 
-def check_gamma(gamma: Number) -> None:
+def check_gamma(gamma: norms.Number) -> None:
     """Raise a ValueError unless gamma is a positive number or inf."""
-    if not gamma > 0.0:
-        raise ValueError(f"gamma must be positive, or inf for no bound; got {gamma}")
+    require(gamma > 0.0, f"gamma must be positive, or inf for no bound; got {gamma}")
 
 
 def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
@@ -109,9 +101,11 @@ def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
 
     def meets(K: np.ndarray) -> bool:
         e = error_system(plant, K)
-        if spectral_radius(e.A) >= 1.0:
+        if norms.spectral_radius(e.A) >= 1.0:
             return False
-        return not Levels.of(e.A, e.Bn, e.L, np.zeros((len(e.L), e.Bn.shape[1]))).reached(gamma)
+        return not norms.Levels.of(e.A, e.Bn, e.L, np.zeros((len(e.L), e.Bn.shape[1]))).reached(
+            gamma
+        )
 
     K = _gain(plant, 0.0)
     if np.isinf(gamma) or meets(K):
@@ -157,19 +151,19 @@ def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
 
     def norm(K: np.ndarray) -> float:
         e = error_system(plant, K)
-        return max(hinf_norm(e.A, e.Bn, e.L), peak_gain(e.A, e.Bn, e.L))
+        return max(norms.hinf_norm(e.A, e.Bn, e.L), norms.peak_gain(e.A, e.Bn, e.L))
 
     gains = [_gain(plant, 0.0)]
     grid = [0.0, *_grid(plant, gains[0])]
     for value in grid[1:]:
         gains.append(_gain(plant, float(value), gains[-1]))
-    norms, end = [norm(K) for K in gains], grid[-1]
-    while norms[-1] < (1.0 - _FALLS) * norms[-2] and grid[-1] < _FARTHEST * end:
+    reached, end = [norm(K) for K in gains], grid[-1]
+    while reached[-1] < (1.0 - _FALLS) * reached[-2] and grid[-1] < _FARTHEST * end:
         grid.append(_FARTHER * grid[-1])
         gains.append(_gain(plant, grid[-1], gains[-1]))
-        norms.append(norm(gains[-1]))
-    best = int(np.argmin(norms))
-    found = gains[best], grid[best], norms[best]
+        reached.append(norm(gains[-1]))
+    best = int(np.argmin(reached))
+    found = gains[best], grid[best], reached[best]
     if 1 < best < len(grid) - 1:
         ends = np.log(grid[best - 1]), np.log(grid[best + 1])
         fine = scipy.optimize.minimize_scalar(
@@ -177,7 +171,7 @@ def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
             bounds=ends, method="bounded", options={"xatol": 1e-9},
         )  # fmt: skip
         K = _gain(plant, lambda_ := float(np.exp(fine.x)), gains[best])
-        if (lowest := norm(K)) < norms[best]:
+        if (lowest := norm(K)) < reached[best]:
             found = K, lambda_, lowest
     return found
 
@@ -185,7 +179,7 @@ def _least(plant: Plant) -> tuple[np.ndarray, float, float]:
 def _grid(plant: Plant, K: np.ndarray) -> np.ndarray:
     """Values of lambda about the one that makes n as large as w in some state or output."""
     e = error_system(plant, K)
-    P = gramian(e.A, e.Bw)
+    P = norms.gramian(e.A, e.Bw)
     S = plant.C @ P @ plant.C.T + plant.Dw @ plant.Dw.T
     noise = np.concatenate([np.diagonal(P), np.diagonal(S)])[:, None]
     error = np.vstack([plant.Bn, plant.Dn]) ** 2
@@ -213,7 +207,7 @@ def _stabilising(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> 
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError(why_not_steady(A, B, C, D)) from error
     K = _update(A, B, C, D, P)
-    if not spectral_radius(A - K @ C) < 1.0:
+    if not norms.spectral_radius(A - K @ C) < 1.0:
         raise ValueError(why_not_steady(A, B, C, D))
     return K
 
@@ -224,11 +218,11 @@ def _polished(
     """Newton's iteration (Hewer 1971) from a stabilising gain, to the last digits."""
     change = np.inf
     for _ in range(_STEPS):
-        better = _update(A, B, C, D, gramian(A - K @ C, B - K @ D))
+        better = _update(A, B, C, D, norms.gramian(A - K @ C, B - K @ D))
         before, change = change, float(np.max(np.abs(better - K)))
         size = float(np.max(np.abs(K)))
         close = change < 1e-7 * size
-        if (close and change > 0.5 * before) or spectral_radius(A - better @ C) >= 1.0:
+        if (close and change > 0.5 * before) or norms.spectral_radius(A - better @ C) >= 1.0:
             break
         K = better
         if change <= 1e-15 * size:
