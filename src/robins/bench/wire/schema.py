@@ -53,6 +53,10 @@ def _size(name: str, length: int, unit: str, text: str, most: float) -> Field:
     return Field(name, "f64", length, unit, text, (0.0, most), True)
 
 
+def _message(number: int, name: str, text: str, *fields: Field) -> Message:
+    return Message(number, name, text, fields)
+
+
 PARTS = ("bench", "plant", "table", "gyro", "star", "adm", "acm", "actuators")
 """Who talks; the place in this table is the number of a part."""
 
@@ -77,119 +81,91 @@ _ACTUATORS = (
 )
 
 MESSAGES: tuple[Message, ...] = (
-    Message(
+    _message(
         1,
         "hello",
         "A part is there; its first message.",
-        (
-            Field("part", "u8", 1, "1", "number of the part"),
-            Field("schema", "u32", 1, "1", "CRC-32C of this table, so that both mean the same"),
-        ),
+        Field("part", "u8", 1, "1", "number of the part"),
+        Field("schema", "u32", 1, "1", "CRC-32C of this table, so that both mean the same"),
     ),
-    Message(
+    _message(
         2,
         "tick",
         "The clock lets a step begin. The time in the header is that of its end.",
-        (Field("step", "u32", 1, "1", "number of the step, from 0"),),
+        Field("step", "u32", 1, "1", "number of the step, from 0"),
     ),
-    Message(
+    _message(
         3,
         "done",
         "A part has sent all that it sends in a step.",
-        (
-            Field("step", "u32", 1, "1", "number of the step"),
-            Field("compute", "u32", 1, "ns", "time it took to compute"),
-        ),
+        Field("step", "u32", 1, "1", "number of the step"),
+        Field("compute", "u32", 1, "ns", "time it took to compute"),
     ),
-    Message(4, "stop", "The run is over.", ()),
-    Message(
+    _message(4, "stop", "The run is over."),
+    _message(
         5,
         "begin",
         "The bench answers a hello. All that follow have the number of the run in this header.",
-        (Field("step", "u64", 1, "ns", "length of a step"),),
+        Field("step", "u64", 1, "ns", "length of a step"),
     ),
-    Message(
+    _message(
         16,
         "motion",
         "The craft as it truly is, from the plant to the rate table.",
-        (
-            _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
-            _f64("omega_b", 3, "rad/s", "rate against inertial", _RATE),
-        ),
+        _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
+        _f64("omega_b", 3, "rad/s", "rate against inertial", _RATE),
     ),
-    Message(
+    _message(
         17,
         "mounted",
         "Attitude of the rate table, which its sensors have.",
-        (_f64("q_ib", 4, "1", _QUATERNION, _UNIT),),
+        _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
     ),
-    Message(
+    _message(
         18,
         "gyro",
         "A sample of the gyros.",
-        (
-            _f64(
-                "theta_b", 3, "rad", "turn over the step, NaN: no sample of this axis", _TURN, True
-            ),
-        ),
+        _f64("theta_b", 3, "rad", "turn over the step, NaN: no sample of this axis", _TURN, True),
     ),
-    Message(
+    _message(
         19,
         "star",
         "A frame of the star sensor.",
-        (
-            _f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved", _UNIT, True),
-            _f64(
-                "factor",
-                9,
-                "rad",
-                "L of its covariance L L', body axes, by rows; 0: unknown; NaN: not solved",
-                _TURN,
-                True,
-            ),
-            Field("stars", "u16", 1, "1", "used; 0: not told"),
+        _f64("q_ib", 4, "1", f"{_QUATERNION}; either sign; NaN: not solved", _UNIT, True),
+        _f64(
+            "factor",
+            9,
+            "rad",
+            "L of its covariance L L', body axes, by rows; 0: unknown; NaN: not solved",
+            _TURN,
+            True,
         ),
+        Field("stars", "u16", 1, "1", "used; 0: not told"),
     ),
-    Message(
+    _message(
         20,
         "estimate",
         "Attitude as determined.",
-        (
-            _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
-            _f64("gyro_bias", 3, "rad/s", "reported less true rate", _RATE),
-            _size("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes", _SIGMA),
-            Field("flags", "u8", 1, "1", _FLAGS, (0, 2 ** len(FLAGS) - 1)),
-        ),
+        _f64("q_ib", 4, "1", _QUATERNION, _UNIT),
+        _f64("gyro_bias", 3, "rad/s", "reported less true rate", _RATE),
+        _size("sigma", 6, "rad, rad/s", "stated of attitude and bias, body axes", _SIGMA),
+        Field("flags", "u8", 1, "1", _FLAGS, (0, 2 ** len(FLAGS) - 1)),
     ),
-    Message(
-        21,
-        "command",
-        "What control asks of the actuators.",
-        _ACTUATORS,
-    ),
-    Message(
-        22,
-        "actuation",
-        "What the actuators give.",
-        _ACTUATORS,
-    ),
-    Message(
+    _message(21, "command", "What control asks of the actuators.", *_ACTUATORS),
+    _message(22, "actuation", "What the actuators give.", *_ACTUATORS),
+    _message(
         23,
         "wheels",
         "Momenta of the wheels, from their speeds.",
-        (_f64("momentum", WHEELS, "N m s", "along each wheel's axis", _ACTS),),
+        _f64("momentum", WHEELS, "N m s", "along each wheel's axis", _ACTS),
     ),
-    Message(
+    _message(
         24,
         "innovation",
         "What the filter made of a frame of the star sensor, for who watches.",
-        (
-            _f64("innovation", 3, "rad", "measured less expected, body axes", _TURN, True),
-            _size("sigma", 3, "rad", "stated", _SIGMA),
-            _size(
-                "ratio", 1, "1", "squared and normalised, over its limit; above 1: refused", 1e30
-            ),
-        ),
+        _f64("innovation", 3, "rad", "measured less expected, body axes", _TURN, True),
+        _size("sigma", 3, "rad", "stated", _SIGMA),
+        _size("ratio", 1, "1", "squared and normalised, over its limit; above 1: refused", 1e30),
     ),
 )
 """All of them, by number."""
