@@ -17,8 +17,15 @@ BodyFrame = Literal["FRD", "RFU"]
 Severity = Literal["error", "warning", "note"]
 
 
+class _Rows:
+    time_ns: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
 @dataclass(frozen=True)
-class ImuTable:
+class ImuTable(_Rows):
     """Inertial samples.
 
     kind "increment": row k is the integral over (time[k-1], time[k]], or, where samples before it
@@ -34,12 +41,9 @@ class ImuTable:
     source: str = ""  # file or scenario the rows came from
     rows: np.ndarray | None = None  # (N,) line number of each row in its source, for messages
 
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
 
 @dataclass(frozen=True)
-class GnssTable:
+class GnssTable(_Rows):
     """Position and velocity fixes of a GNSS antenna; NaN where a component is missing.
 
     Velocities and sigmas are given along ``nav``; for ENU the components are east, north, up.
@@ -57,12 +61,9 @@ class GnssTable:
     source: str = ""
     rows: np.ndarray | None = None
 
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(_Rows):
     """A path: position, velocity and attitude over time (the truth, or what a system reported).
 
     As the report of a master INS it may have NaN where a component is missing, and turn rates.
@@ -80,12 +81,9 @@ class Trajectory:
     omega_ib_b: np.ndarray | None = None  # (K, 3) rad/s turn rate against inertial space, body axes
     rows: np.ndarray | None = None
 
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
 
 @dataclass(frozen=True)
-class MagTable:
+class MagTable(_Rows):
     """Magnetic field as a three-axis magnetometer reads it; NaN where a component is missing."""
 
     time_ns: np.ndarray  # (N,) int64
@@ -94,12 +92,9 @@ class MagTable:
     source: str = ""
     rows: np.ndarray | None = None
 
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
 
 @dataclass(frozen=True)
-class AttitudeTable:
+class AttitudeTable(_Rows):
     """Attitude over time, without a place on Earth, as motion capture gives it."""
 
     time_ns: np.ndarray  # (K,) int64
@@ -109,9 +104,6 @@ class AttitudeTable:
     moving: np.ndarray | None = None  # (K,) bool, phases that count where an author marked them
     source: str = ""
     rows: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
 
 
 @dataclass(frozen=True)

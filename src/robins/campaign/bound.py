@@ -14,8 +14,16 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.campaign.monte_carlo import contender, solved, worlds
-from robins.filters import Belief, Filter, Model, observability
+from robins.filters import Belief, Filter, Model
 from robins.filters.bound import bound_along, linearised, used_sensors
+from robins.filters.observability import (
+    NOTHING,
+    bits,
+    observability_along,
+    spectrum,
+    unobservable,
+    worded,
+)
 from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
 from robins.results import array, variable
@@ -159,7 +167,7 @@ def _bound(filter_, model, case: Partial, reported, subsets, world) -> _Found:
     def of(use):
         return _reported(rows, bound_along(line, start.factor, use).factor)
 
-    L = observability.observability_along(line, start.sigma, subsets[0])
+    L = observability_along(line, start.sigma, subsets[0])
     spoke = [jnp.array(False) if s is None else jnp.any(s.present) for s in line.sights]
     prior = _reported(first, start.factor)
     heard = jnp.stack(spoke)
@@ -225,14 +233,14 @@ def _information(names: list[str], sign: np.ndarray, L: np.ndarray, D: np.ndarra
     """Bits by state and time, and the directions of which least is known, in words."""
     (open_,) = np.nonzero(D > 0.0)  # what is known from the start has no information to gain
     told = [names[i] for i in open_]
-    values, vectors = observability.spectrum(L[-1][np.ix_(open_, open_)])
-    rank = int(np.sum(values >= observability.NOTHING))
-    hidden = observability.unobservable(values, vectors)
+    values, vectors = spectrum(L[-1][np.ix_(open_, open_)])
+    rank = int(np.sum(values >= NOTHING))
+    hidden = unobservable(values, vectors)
     rest = vectors[:, hidden.shape[1] :]
     most = min(max(_FEWEST, int(np.sum(values < FEW))), _MOST)
     shown = (sign[open_, None] * np.concatenate([hidden, rest], axis=1))[:, :most]
-    words = [f"{i + 1}: {observability.worded(v, told)}" for i, v in enumerate(shown.T)]
+    words = [f"{i + 1}: {worded(v, told)}" for i, v in enumerate(shown.T)]
     data: dict[str, Any] = {"state": ("state", told), "direction": ("direction", words)}
-    data |= array("information", observability.bits(L[:, open_]).T)
-    data |= array("gramian", values[: len(words)], nothing=observability.NOTHING)
+    data |= array("information", bits(L[:, open_]).T)
+    data |= array("gramian", values[: len(words)], nothing=NOTHING)
     return data | array("gramian_rank", rank)

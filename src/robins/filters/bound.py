@@ -35,15 +35,8 @@ class Bound(NamedTuple):
     predicted: Array  # (E, n, n) before the measurements of a step
     factor: Array  # (E, n, n) after them
 
-    @property
-    def covariance(self) -> Array:
-        """(..., n, n) after the measurements."""
-        return self.factor @ jnp.swapaxes(self.factor, -1, -2)
-
-    @property
-    def sigma(self) -> Array:
-        """(..., n) after the measurements, of each tangent component."""
-        return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))
+    covariance = Belief.covariance  # both after the measurements
+    sigma = Belief.sigma
 
 
 class Sight(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.fusion import is_singular
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, kalman
+from robins.filters.kalman import Again, Filter, FilterState, Prediction, kalman, not_taken
 from robins.filters.linearise import Transition
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.trees import equal, finite, select
@@ -125,18 +125,8 @@ def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
         singular = jnp.stack([is_singular(m.belief) for m in members])
         ok = same | (finite(belief) & ~jnp.any(singular))
         new = FilterState(belief, joined._replace(members=members, silent=silent))
-        info = info._replace(
-            used=info.used & ok,
-            nis=jnp.where(ok, info.nis, 0.0),
-            dof=jnp.where(ok, info.dof, 0),
-            log_likelihood=jnp.where(ok, info.log_likelihood, -jnp.inf),
-            code=jnp.where(ok, info.code, int(Code.NOT_FINITE)),
-            notes={
-                **info.notes,
-                f"{name}.share": jnp.mean(joined.shares[i]),
-                f"{name}.silent": silent[i],
-            },
-        )
+        info = not_taken(ok, info, jnp.asarray(int(Code.NOT_FINITE)))
+        info = info.noted(name, share=jnp.mean(joined.shares[i]), silent=silent[i])
         return select(ok, new, _refused(state, singular)), info
 
     return update
@@ -182,9 +172,8 @@ def auditing(channels: Sequence[Channel]):
 
     def rerun(start: FilterState, i: int, again: Again, first: FilterState) -> FilterState:
         members = (*start.memory.members[:i], first, *start.memory.members[i + 1 :])
-        return again(start._replace(memory=start.memory._replace(members=members))).memory.members[
-            i
-        ]
+        begun = start._replace(memory=start.memory._replace(members=members))
+        return again(begun).memory.members[i]
 
     def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
         for i, one in enumerate(channels):

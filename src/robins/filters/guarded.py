@@ -37,7 +37,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.channels import Joined
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
+from robins.filters.kalman import Filter, FilterState, Prediction, auditing, in_step
 from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
@@ -205,21 +205,9 @@ def guarded(
             )
         )
 
-    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        for side, one in (("filter", filter), ("reference", reference)):
-            if one.audit is None:
-                continue
-
-            def rerun(first: FilterState, side=side) -> FilterState:
-                assert again is not None
-                begun = start._replace(memory=start.memory._replace(**{side: first}))
-                return getattr(again(begun).memory, side)
-
-            once_more = None if again is None else rerun
-            one.audit(getattr(start.memory, side), getattr(final.memory, side), once_more, time)
-
-    audited = filter.audit is not None or reference.audit is not None
-    return in_step(Filter(init, predict, update, reset, audit if audited else None))
+    return in_step(
+        Filter(init, predict, update, reset, auditing(filter=filter, reference=reference))
+    )
 
 
 def _names(given: str | Sequence[str]) -> tuple[str, ...]:

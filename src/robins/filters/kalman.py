@@ -70,6 +70,24 @@ class Filter(NamedTuple):
     audit: Callable[[FilterState, FilterState, Again | None, Any], None] | None = None
 
 
+def auditing(**sides: Filter):
+    """The `audit` of a filter whose memory holds the states of others, by their names there."""
+
+    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
+        for side, one in sides.items():
+            if one.audit is not None:
+
+                def rerun(first: FilterState, side: str = side) -> FilterState:
+                    assert again is not None
+                    begun = start._replace(memory=start.memory._replace(**{side: first}))
+                    return getattr(again(begun).memory, side)
+
+                once_more = None if again is None else rerun
+                one.audit(getattr(start.memory, side), getattr(final.memory, side), once_more, time)
+
+    return audit if any(one.audit is not None for one in sides.values()) else None
+
+
 def compiled(filter_: Filter) -> Filter:
     """The same filter with `predict` and `update` compiled.
 
@@ -96,7 +114,7 @@ def in_step(filter_: Filter) -> Filter:
         new, info = filter_.update(state, sensor, y, aux)
         ok = state.current | (info.code == int(Code.MISSING))
         new = select(state.current, new, state)
-        return new, _not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
+        return new, not_taken(ok, info, jnp.asarray(int(Code.NOT_PREDICTED)))
 
     return compiled(filter_._replace(predict=predict, update=update))
 
@@ -189,7 +207,7 @@ def _failure(inputs: Any, factor: Array) -> Array:
     return jnp.where(indefinite, int(Code.INDEFINITE), int(Code.NOT_FINITE))
 
 
-def _not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
+def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
     """What an update that was not taken says of itself: nothing used, and utterly unlikely."""
     return info._replace(
         used=info.used & ok,
@@ -282,7 +300,7 @@ def kalman(
         ok = finite(new) & (finite(info.nis) | (info.code == int(Code.CONTRADICTED)))
         inputs = (prior, jnp.where(info.used, seen.residual, 0.0), *left_out(seen)[:3])
         why = _failure(inputs, posterior.factor)
-        return select(ok, new, state), _not_taken(ok, info, why)
+        return select(ok, new, state), not_taken(ok, info, why)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
         return FilterState(belief, state.memory, drawn(belief))

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.channels import Joined
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step, kalman
+from robins.filters.kalman import Filter, FilterState, Prediction, auditing, in_step, kalman
 from robins.filters.model import Motion, Sensor
 
 
@@ -90,17 +90,4 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
         joined = filter.reset(mastered.joined, belief)
         return FilterState(joined.belief, Mastered(joined, centre.reset(mastered.master, belief)))
 
-    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        for part, one in (("joined", filter), ("master", centre)):
-            if one.audit is None:
-                continue
-
-            def rerun(first: FilterState, part: str = part) -> FilterState:
-                assert again is not None
-                begun = start._replace(memory=start.memory._replace(**{part: first}))
-                return getattr(again(begun).memory, part)
-
-            once_more = None if again is None else rerun
-            one.audit(getattr(start.memory, part), getattr(final.memory, part), once_more, time)
-
-    return in_step(Filter(init, predict, update, reset, audit))
+    return in_step(Filter(init, predict, update, reset, auditing(joined=filter, master=centre)))

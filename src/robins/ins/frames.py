@@ -12,8 +12,9 @@ vehicle and the same in both.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +55,12 @@ def _turn_last(v):
     return v * sign.reshape((1,) * (v.ndim - 1) + sign.shape)
 
 
+_COLUMNS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {  # by the side that turns
+    "nav": {"v_n": swap, "sigma_m": lambda s: s[..., _ORDER], "sigma_v": lambda s: s[..., _ORDER]},
+    "body": {"gyro": swap, "accel": swap, "field_t": swap, "omega_ib_b": swap},
+}
+
+
 def to_ned_frd(table: Table) -> Table:
     """The same table in NED/FRD; see `to_enu_rfu`."""
     return _to(table, "NED", "FRD")
@@ -69,37 +76,19 @@ def to_enu_rfu(table: Table) -> Table:
 
 
 def _to(table: Table, nav: NavFrame, body: BodyFrame) -> Table:
-    if isinstance(table, ImuTable):
-        if table.body == body:
-            return table
-        return replace(table, gyro=swap(table.gyro), accel=swap(table.accel), body=body)
-    if isinstance(table, GnssTable):
-        if table.nav == nav:
-            return table
-        return replace(
-            table,
-            sigma_m=table.sigma_m[..., _ORDER],
-            v_n=None if table.v_n is None else swap(table.v_n),
-            sigma_v=None if table.sigma_v is None else table.sigma_v[..., _ORDER],
-            nav=nav,
-        )
-    if isinstance(table, MagTable):
-        if table.body == body:
-            return table
-        return replace(table, field_t=swap(table.field_t), body=body)
-    turn_nav, turn_body = table.nav != nav, table.body != body
-    q_nb = _turned(table.q_nb, turn_nav, turn_body)
-    if isinstance(table, AttitudeTable):
-        return replace(table, q_nb=q_nb, nav=nav, body=body)
-    omega = table.omega_ib_b
-    return replace(
-        table,
-        v_n=swap(table.v_n) if turn_nav else table.v_n,
-        q_nb=q_nb,
-        nav=nav,
-        body=body,
-        omega_ib_b=swap(omega) if turn_body and omega is not None else omega,
-    )
+    said = {side: to for side, to in (("nav", nav), ("body", body)) if hasattr(table, side)}
+    turns = {side for side, to in said.items() if getattr(table, side) != to}
+    if not turns:
+        return table
+    new: dict[str, Any] = {
+        name: turned(getattr(table, name))
+        for side, columns in _COLUMNS.items()
+        for name, turned in columns.items()
+        if side in turns and getattr(table, name, None) is not None
+    }
+    if isinstance(table, Trajectory | AttitudeTable):
+        new["q_nb"] = _turned(table.q_nb, "nav" in turns, "body" in turns)
+    return replace(table, **said, **new)
 
 
 def _turned(q, turn_nav: bool, turn_body: bool):

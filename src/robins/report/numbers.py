@@ -19,24 +19,8 @@ _PART = "|".join(sorted(_PARTS, key=len, reverse=True))
 _UNIT = re.compile(rf"_((?:{_PART})(?:_per_(?:{_PART}))*)$")
 _FEW = 4  # numbers of a list that are all shown
 _CAPITALS = {
-    *(
-        "rms",
-        "rmse",
-        "nis",
-        "nees",
-        "anees",
-        "gnss",
-        "imu",
-        "rts",
-        "ins",
-        "cep",
-        "kf",
-        "ekf",
-        "mekf",
-        "ukf",
-        "sar",
-    ),
-    *("rtk", "2d", "3d", "nhc", "zupt", "lmi"),
+    *("rms", "rmse", "nis", "nees", "anees", "gnss", "imu", "rts", "ins", "cep"),
+    *("kf", "ekf", "mekf", "ukf", "sar", "rtk", "2d", "3d", "nhc", "zupt", "lmi"),
 }
 
 _WORDS = {"euler": "Euler angles", "accel": "accelerometer"}

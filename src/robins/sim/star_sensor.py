@@ -15,8 +15,7 @@ double stars that melt into one are not simulated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -100,20 +99,7 @@ def read_star(
     return normalise(multiply(q_ib, from_rotvec(error)))
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=(
-        "field_rad",
-        "magnitude_limit",
-        "sigma_rad",
-        "sigma_magnitude",
-        "sigma_growth",
-        "magnitude_sigma",
-        "missed",
-        "q_bs",
-    ),
-    meta_fields=("most_stars", "false_stars"),
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StarCamera:
     """A camera that reports directions of stars. Its axes: boresight z.
@@ -131,8 +117,10 @@ class StarCamera:
     magnitude_sigma: Any = 0.0  # of the reported magnitude
     missed: Any = 0.0  # probability that a star in the field is not reported
     q_bs: Any = (1.0, 0.0, 0.0, 0.0)  # sensor axes to body axes
-    most_stars: int = 40  # the brightest are reported if there are more
-    false_stars: int = 0  # directions reported of no star, anywhere in the field
+    # the brightest are reported if there are more
+    most_stars: int = field(default=40, metadata={"static": True})
+    # directions reported of no star, anywhere in the field
+    false_stars: int = field(default=0, metadata={"static": True})
 
 
 class StarImage(NamedTuple):

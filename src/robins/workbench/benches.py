@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robins.bench.parts.satellite import BUILD, Kit
-from robins.bench.parts.satellite.preparing import kit_for
+from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import address, open_port
 from robins.bench.recording import read_record
@@ -21,7 +20,7 @@ from robins.bench.recording.differences import FieldDifference, differences, tab
 from robins.bench.recording.replay import Start, recorded, replay
 from robins.bench.run.one_program import in_process
 from robins.bench.run.outcome import outcome
-from robins.bench.run.session import Session
+from robins.bench.run.session import Session, kit_of
 from robins.bench.run.setup import NODES, Flight, changed, read, recorded_flight
 from robins.bench.run.watching import Looking, page_for, starting
 from robins.bench.status import Status
@@ -92,12 +91,6 @@ def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]
     # a 0 is one that was given, though it equals False
     given = {k: v for k, v in options.items() if v is not None and v is not False and v != {}}
     return changed(read(scenario, tuple(settings)), given)
-
-
-def _kit(flight: Flight) -> Kit:
-    setup = flight.setup
-    table = setup.table.table() if setup.table else None
-    return kit_for(flight.loop, setup.filter, setup.seed, table=table)
 
 
 @contextlib.contextmanager
@@ -222,7 +215,7 @@ def _starter(flight: Flight, part: str) -> Iterator[Start]:
     """What starts a part of a recorded run on a path."""
     with tempfile.TemporaryDirectory(prefix="robins-bench-") as folder:
         path = Path(folder) / "kit.pickle"
-        path.write_bytes(pickle.dumps(_kit(flight)))
+        path.write_bytes(pickle.dumps(kit_of(flight)))
 
         @contextlib.contextmanager
         def start(port: str) -> Iterator[subprocess.Popen]:
@@ -263,7 +256,7 @@ def bench_node(
     if name not in BUILD:
         raise InputError(f"no part '{name}', only {', '.join(NODES)}")
     at = address(port)
-    kit = _kit(flight_of(scenario, (), {"filter": filter_, "seed": seed}))
+    kit = kit_of(flight_of(scenario, (), {"filter": filter_, "seed": seed}))
     made = Station(ready(BUILD[name](kit), kit.frames))
     with open_port(at, timeout_s=None) as line:
         opened()

@@ -232,7 +232,7 @@ class Broker:
         try:
             catch_up(link, self._kept[name].told, begin, answered, patience_s, glance)
         except OSError as error:
-            raise LinkLost(name, f"the port of '{name}' is gone: {error}") from None
+            raise LinkLost(name, error) from None
 
     # ----------------------------------------------------------------------------------- the wire
 
@@ -258,7 +258,7 @@ class Broker:
             try:
                 found = link.read(_CLOCK_NS(), self.time_ns)
             except OSError as error:
-                raise LinkLost(link.name, f"the port of '{link.name}' is gone: {error}") from None
+                raise LinkLost(link.name, error) from None
             self._take(link.name, found)
         for fd in dict.fromkeys([*writable, *slow]):
             self._flush(by_fd[fd])
@@ -315,7 +315,7 @@ class Broker:
         try:
             link.flush(_CLOCK_NS())
         except OSError as error:
-            raise LinkLost(link.name, f"the port of '{link.name}' is gone: {error}") from None
+            raise LinkLost(link.name, error) from None
 
     # ------------------------------------------------------------------------------------- the end
 

@@ -14,6 +14,6 @@ class BenchError(RobinsError, RuntimeError):
 class LinkLost(BenchError):
     """A port whose far end is gone."""
 
-    def __init__(self, part: str, text: str):
-        super().__init__(text)
+    def __init__(self, part: str, why: OSError):
+        super().__init__(f"the port of '{part}' is gone: {why}")
         self.part = part

@@ -155,11 +155,10 @@ class Session:
         Raises:
             KeyboardInterrupt: after all processes have ended and the record is whole.
         """
-        setup, loop = self.flight.setup, self.flight.loop
+        setup = self.flight.setup
         if self._kit is None:
             self._tell(0.0, "preparing")
-            table = None if setup.table is None else setup.table.table()
-            self._kit = kit_for(loop, setup.filter, setup.seed, table=table)
+            self._kit = kit_of(self.flight)
         self.kit = self._kit
         self.telemetry = Telemetry(self.steps, self.kit.step_ns)
         failure, done, seconds = "", 0, 0.0
@@ -475,6 +474,13 @@ class Session:
         """
         for death in self.crew.deaths(part):
             raise _DiedAgainError(death)
+
+
+def kit_of(flight: Flight) -> Kit:
+    """What the parts of a run are made from."""
+    setup = flight.setup
+    table = None if setup.table is None else setup.table.table()
+    return kit_for(flight.loop, setup.filter, setup.seed, table=table)
 
 
 def wiring(kit: Kit) -> Wiring:

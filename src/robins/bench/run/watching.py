@@ -189,6 +189,7 @@ def state(session: Session, done: int) -> dict[str, Any]:
     recent = session.latencies.recent()
     late = recent["cycle"]["lateness_us"]
     flags = session.telemetry.flown.flags[:done]
+    now_ns, links, health = session.broker.time_ns, session.broker.links, _health(session)
     return {
         "state": "paused" if session.paused else "running",
         "clock": _clock(session),
@@ -199,23 +200,17 @@ def state(session: Session, done: int) -> dict[str, Any]:
             "histogram": session.latencies.summary()["histogram"],
         },
         "links": {
-            name: {
-                "frames": link.health.frames,
-                "wrong": link.health.wrong,
-                "lost": link.health.lost,
-                "late": link.health.late,
-                "silent_s": max(session.broker.time_ns - link.health.heard_ns, 0) * 1e-9,
-            }
-            for name, link in session.broker.links.items()
+            name: health[name] | {"silent_s": max(now_ns - link.health.heard_ns, 0) * 1e-9}
+            for name, link in links.items()
         },
-        "nodes": {name: session.state_of(name) for name in session.broker.links},
+        "nodes": {name: session.state_of(name) for name in links},
         "faults": [
             {"label": label, "until_s": fault.end} for label, fault in session.active_faults()
         ],
         "counts": {
             "refused_measurements": int(np.sum(flags >> FLAGS.index("star refused") & 1)),
-            "wrong_frames": sum(link.health.wrong for link in session.broker.links.values()),
-            "lost_frames": sum(link.health.lost for link in session.broker.links.values()),
+            "wrong_frames": sum(counted["wrong"] for counted in health.values()),
+            "lost_frames": sum(counted["lost"] for counted in health.values()),
             "processes_died": session.deaths,
         },
     }
@@ -260,14 +255,16 @@ def report(session: Session, done: int, url: str) -> dict[str, Any]:
             name: {
                 "process": session.crew.process(name),
                 "port": session.flight.setup.ports.get(name, ""),
-                "frames": link.health.frames,
-                "wrong": link.health.wrong,
-                "lost": link.health.lost,
-                "late": link.health.late,
+                **counted,
             }
-            for name, link in session.broker.links.items()
+            for name, counted in _health(session).items()
         },
     }
+
+
+def _health(session: Session) -> dict[str, dict[str, int]]:
+    names, links = ("frames", "wrong", "lost", "late"), session.broker.links.items()
+    return {link: {k: getattr(one.health, k) for k in names} for link, one in links}
 
 
 def page_for(session_name: str, run: int, wheels: int, host: str, port: int) -> Live:
