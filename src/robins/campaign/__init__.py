@@ -2,12 +2,7 @@
 
 from robins.campaign.monte_carlo import CHUNK, chunks, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
-from robins.campaign.statistics import (
-    Statistics,
-    collect,
-    mean_with_bounds,
-    rms_with_bounds,
-)
+from robins.campaign.statistics import Statistics, collect, mean_with_bounds, rms_with_bounds
 
 __all__ = [
     "CHUNK",

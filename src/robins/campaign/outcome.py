@@ -19,10 +19,7 @@ from robins.systems.tables import Seen, block_array, innovation_tables
 
 
 def simulate(
-    problem: Problem,
-    runs: int,
-    chunk: int = CHUNK,
-    progress: Progress = silent,
+    problem: Problem, runs: int, chunk: int = CHUNK, progress: Progress = silent
 ) -> Outcome:
     """Run every filter of a problem over the same runs and compare them.
 

@@ -57,11 +57,7 @@ class Delay(NamedTuple):
 
 
 def delayed(
-    filter_: Filter,
-    model: Model,
-    depth: int,
-    u: Any = None,
-    aux: Mapping[str, Any] | None = None,
+    filter_: Filter, model: Model, depth: int, u: Any = None, aux: Mapping[str, Any] | None = None
 ) -> Filter:
     """A filter that takes measurements up to ``depth`` steps late, in any order.
 

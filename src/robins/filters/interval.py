@@ -35,11 +35,7 @@ def _seen(belief: Belief, g: Function) -> Observation:
 
 
 def clip(
-    belief: Belief,
-    g: Function,
-    lower: Numbers,
-    upper: Numbers,
-    weight: Weight = "covariance",
+    belief: Belief, g: Function, lower: Numbers, upper: Numbers, weight: Weight = "covariance"
 ) -> Bounded:
     """Move the mean m to the nearest state within ``lower <= g(x) <= upper``; P is kept.
 

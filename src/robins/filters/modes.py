@@ -143,8 +143,7 @@ def _each(modes: tuple[Mode, ...]) -> Bank:
 
     audited = any(f.audit is not None for f in filters)
     return Bank(
-        *(len(modes), init, beliefs, restart, predict, update, reset),
-        audit if audited else None,
+        *(len(modes), init, beliefs, restart, predict, update, reset), audit if audited else None
     )
 
 

@@ -27,10 +27,7 @@ from robins.rotation import skew
 
 
 def error_dynamics(
-    state: Any,
-    f_b: Float[Array, "3"],
-    omega_ib_b: Float[Array, "3"],
-    noise: Any = None,
+    state: Any, f_b: Float[Array, "3"], omega_ib_b: Float[Array, "3"], noise: Any = None
 ) -> tuple[Float[Array, "n n"], Float[Array, "n m"]]:
     """F and G at a state.
 

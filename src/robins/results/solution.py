@@ -14,12 +14,7 @@ from robins.results import roles
 
 
 def variable(
-    dims: str | Sequence[str],
-    values: Any,
-    unit: str,
-    long_name: str,
-    frame: str = "",
-    **attrs: Any,
+    dims: str | Sequence[str], values: Any, unit: str, long_name: str, frame: str = "", **attrs: Any
 ) -> xr.Variable:
     """Numbers with what a reader must know about them: a coordinate, such as the time.
 

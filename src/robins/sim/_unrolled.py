@@ -60,11 +60,7 @@ def dot(a: Three, b: Three) -> Any:
 
 def cross(a: Three, b: Three) -> Three:
     """Vector product."""
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def apply(m: Matrix, v: Sequence[Any]) -> Three:

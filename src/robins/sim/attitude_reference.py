@@ -50,9 +50,7 @@ def _nadir(r, v) -> Reference:
     rate = -area / r_sq
     change = -2.0 * rate * jnp.sum(r * v, -1) / r_sq
     return Reference(
-        _without_jumps(q),
-        jnp.stack([none, rate, none], -1),
-        jnp.stack([none, change, none], -1),
+        _without_jumps(q), jnp.stack([none, rate, none], -1), jnp.stack([none, change, none], -1)
     )
 
 

@@ -38,13 +38,7 @@ class FreeBody(NamedTuple):
 
 
 def free_body(
-    key: Array,
-    body: FreeBody,
-    q0_nb: Any,
-    omega0_b: Any,
-    dt_s: Any,
-    steps: int,
-    torque_noise: Any,
+    key: Array, body: FreeBody, q0_nb: Any, omega0_b: Any, dt_s: Any, steps: int, torque_noise: Any
 ) -> tuple[Float[Array, "epochs 4"], Float[Array, "epochs 3"]]:
     """Attitude and rates at 0, dt, 2 dt ...; pure JAX, so it maps over keys.
 
@@ -101,10 +95,7 @@ def free_body(
         return (normalise(q), omega), (q, omega)
 
     _, (q, omega) = jax.lax.scan(step, (q0, omega0), normal)
-    return (
-        normalise(jnp.concatenate([q0[None], q])),
-        jnp.concatenate([omega0[None], omega]),
-    )
+    return (normalise(jnp.concatenate([q0[None], q])), jnp.concatenate([omega0[None], omega]))
 
 
 def coning_start(

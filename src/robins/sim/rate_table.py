@@ -45,9 +45,7 @@ class TableState(NamedTuple):
 
 
 def rate_table(
-    lag_s: Any = 0.02,
-    rate_limit_rad_s: Any = np.inf,
-    acceleration_limit_rad_s2: Any = np.inf,
+    lag_s: Any = 0.02, rate_limit_rad_s: Any = np.inf, acceleration_limit_rad_s2: Any = np.inf
 ) -> RateTable:
     """A rate table of checked numbers, one for all axes or one each; infinity is no limit.
 

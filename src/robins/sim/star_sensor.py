@@ -166,11 +166,7 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
 
 
 def photograph(
-    key: Array,
-    index: StarIndex,
-    q_ib: Float[Array, "4"],
-    camera: StarCamera,
-    turn_rad: Any = None,
+    key: Array, index: StarIndex, q_ib: Float[Array, "4"], camera: StarCamera, turn_rad: Any = None
 ) -> StarImage:
     """Stars as a camera sees them. Pure JAX: it maps over keys, attitudes and sizes of errors.
 

@@ -44,11 +44,7 @@ def publishing(
 
 
 def publish(
-    outcome: Outcome,
-    out: str | os.PathLike[str],
-    *,
-    command: str = "",
-    progress: Progress = silent,
+    outcome: Outcome, out: str | os.PathLike[str], *, command: str = "", progress: Progress = silent
 ) -> Result:
     """Write an outcome as a result folder with figures and a page; see `publishing`.
 

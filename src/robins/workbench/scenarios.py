@@ -92,7 +92,4 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
 def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:
     """Fields of an outcome: the scenario as it was run, and what ran it."""
     effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
-    return {
-        "parameters": effective if settings else text,
-        "device": jax.devices()[0].device_kind,
-    }
+    return {"parameters": effective if settings else text, "device": jax.devices()[0].device_kind}

@@ -12,13 +12,4 @@ from robins.bench.run.one_program import in_process
 from robins.bench.run.session import Ran, Session
 from robins.bench.run.setup import Flight, Setup
 
-__all__ = [
-    "Flight",
-    "Latencies",
-    "LockStep",
-    "Ran",
-    "RealTime",
-    "Session",
-    "Setup",
-    "in_process",
-]
+__all__ = ["Flight", "Latencies", "LockStep", "Ran", "RealTime", "Session", "Setup", "in_process"]

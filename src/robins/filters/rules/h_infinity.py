@@ -15,12 +15,7 @@ from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules import _inflation
-from robins.filters.rules._feasibility import (
-    HInfinityMemory,
-    Infeasible,
-    anew,
-    raise_infeasible,
-)
+from robins.filters.rules._feasibility import HInfinityMemory, Infeasible, anew, raise_infeasible
 
 __all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
 

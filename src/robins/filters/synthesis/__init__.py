@@ -7,25 +7,13 @@ norms.
 """
 
 from robins.filters.synthesis.closed_form import Isotropic, closed_form, isotropic
-from robins.filters.synthesis.design import (
-    Design,
-    NotCertified,
-    Unreachable,
-    certify,
-    certify_full,
-)
+from robins.filters.synthesis.design import Design, NotCertified, Unreachable, certify, certify_full
 from robins.filters.synthesis.every_step import EveryStep, FrozenTimeWarning
 from robins.filters.synthesis.full_order import full
 from robins.filters.synthesis.least import LeastGamma, least_gamma
 from robins.filters.synthesis.lmi import observer
 from robins.filters.synthesis.norms import h2_norm, hinf_norm, peak_gain, spectral_radius
-from robins.filters.synthesis.plant import (
-    ErrorSystem,
-    Plant,
-    current_form,
-    error_system,
-    plant,
-)
+from robins.filters.synthesis.plant import ErrorSystem, Plant, current_form, error_system, plant
 from robins.filters.synthesis.programs import MissingExtra
 from robins.filters.synthesis.riccati import (
     inflated_gain,

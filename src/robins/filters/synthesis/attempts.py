@@ -21,11 +21,7 @@ from robins.filters.synthesis.scaling import Scales, balanced
 
 
 def attempt(
-    plant: Plant,
-    form: Form,
-    aim: Aim,
-    gamma: Number,
-    certified: Callable[[Answer, Scales], Design],
+    plant: Plant, form: Form, aim: Aim, gamma: Number, certified: Callable[[Answer, Scales], Design]
 ) -> Design:
     """The first answer whose true norms are what was asked.
 

@@ -52,11 +52,7 @@ def h2_norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = 
 
 
 def hinf_norm(
-    A: np.ndarray,
-    B: np.ndarray,
-    C: np.ndarray,
-    D: np.ndarray | None = None,
-    rtol: Number = 1e-11,
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None, rtol: Number = 1e-11
 ) -> float:
     """Greatest singular value of C (zI - A)^-1 B + D on the unit circle, by level tests.
 
@@ -154,11 +150,7 @@ class Levels(NamedTuple):
 
 
 def peak_gain(
-    A: np.ndarray,
-    B: np.ndarray,
-    C: np.ndarray,
-    D: np.ndarray | None = None,
-    points: int = 200,
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None, points: int = 200
 ) -> float:
     """Greatest gain found by a sweep of the frequency: never more than the H-infinity norm.
 

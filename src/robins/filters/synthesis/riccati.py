@@ -128,11 +128,7 @@ def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
 
 
 def _bisect(
-    plant: Plant,
-    meets: Callable[[np.ndarray], bool],
-    below: float,
-    above: float,
-    K: np.ndarray,
+    plant: Plant, meets: Callable[[np.ndarray], bool], below: float, above: float, K: np.ndarray
 ) -> tuple[np.ndarray, float]:
     while above - below > _RTOL * above:
         middle = 0.5 * (below + above)
