@@ -73,15 +73,9 @@ def replay(
     dataset = logs.clean(dataset)
     with refusing(dataset.name):
         found = chosen_system.replay(dataset, parameters, chosen, part(progress, 0.1, 1.0))
-    return replace(
-        found,
-        scenario=f"{system}/{dataset.name}",
-        seed=seed,
-        last_lines=[
-            "Next:   robins allan STILL_LOG   finds the noise of your unit, if it is not set"
-        ],
-        **asked(text, settings),
-    )
+    then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
+    told = {"scenario": f"{system}/{dataset.name}", "seed": seed, "last_lines": [f"Next:   {then}"]}
+    return replace(found, **told, **asked(text, settings))
 
 
 def align(
@@ -135,15 +129,10 @@ def align(
     dataset = logs.clean(dataset)
     with refusing(dataset.name):
         found = alignment.align(dataset, parameters, chosen, part(progress, 0.1, 1.0))
-    return replace(
-        found,
-        scenario=f"{system.name}/{dataset.name}",
-        seed=seed,
-        last_lines=[
-            f"Next:   robins run COPY   simulates such a pair; COPY is {name} with your units"
-        ],
-        **asked(text, settings),
-    )
+    then = f"robins run COPY   simulates such a pair; COPY is {name} with your units"
+    label = f"{system.name}/{dataset.name}"
+    told = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
+    return replace(found, **told, **asked(text, settings))
 
 
 def _examine(dataset: Dataset, findings: Findings) -> None:

@@ -48,6 +48,10 @@ _TAKES: dict[str, tuple[str, ...]] = {
 _NEEDS = {"delay": "delay", "wheel": "wheel", "killed": "link"}
 
 
+_OfFrames = Literal["bit errors", "loss", "duplication", "reorder", "delay", "stuck"]
+_OfParts = Literal["turned", "lost", "sign", "wheel", "killed", "silent"]
+
+
 class LinkFault(Parameters):
     """Something goes wrong on a link from `begin` (included) to `end` (not; left out: for good).
 
@@ -70,20 +74,7 @@ class LinkFault(Parameters):
     the frames that are hit, at random.
     """
 
-    kind: Literal[
-        "bit errors",
-        "loss",
-        "duplication",
-        "reorder",
-        "delay",
-        "stuck",
-        "turned",
-        "lost",
-        "sign",
-        "wheel",
-        "killed",
-        "silent",
-    ]
+    kind: Literal[_OfFrames, _OfParts]
     begin: Annotated[float, Quantity("time", least="0 s")]
     end: Annotated[float, Quantity("time", above="0 s")] | None = None
     link: str | None = None
