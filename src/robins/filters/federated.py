@@ -181,7 +181,7 @@ def federated(
         beliefs = parted(common.belief, a)
         for f, member, belief in zip(filters, state.memory.members, beliefs, strict=True):
             code = int(Code.DONE)
-            if _is_plain(member):
+            if isinstance(member.memory, tuple) and not member.memory:  # no rules
                 member = f.reset(member, belief)
             else:
                 own = True
@@ -207,11 +207,6 @@ def federated(
 
     update = _channels.updating(channels, information_sum, "federated")
     return in_step(Filter(init, predict, update, reset, _channels.auditing(channels)))
-
-
-def _is_plain(member: FilterState) -> bool:
-    """Whether a filter has nothing to remember: no rules."""
-    return isinstance(member.memory, tuple) and not member.memory
 
 
 def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:

@@ -70,13 +70,10 @@ def innovation(z: Any, y: Any) -> tuple[Array, Array]:
     not finite is a fault of the model and stays visible. Missing numbers are replaced before any
     arithmetic, so that gradients stay finite.
     """
-    present = jnp.concatenate([_present(a, b) for a, b in _pairs(z, y)])
+    pairs = zip(manifold.leaves(z), manifold.leaves(y), strict=True)
+    present = jnp.concatenate([_present(a, b) for a, b in pairs])
     filled = jax.tree_util.tree_map(lambda a, b: jnp.where(jnp.isfinite(b), b, a), z, y)
     return jnp.where(present, manifold.local(z, filled), 0.0), present
-
-
-def _pairs(z, y):
-    return zip(manifold.leaves(z), manifold.leaves(y), strict=True)
 
 
 def _present(predicted, measured) -> Array:

@@ -20,15 +20,6 @@ _BEYOND = 4.0  # a stated sigma this many times any error does not set the scale
 _STEEP = 3.0  # a start this much higher than all that follows is cut off, and said so
 
 
-def _rows(count: int) -> float:
-    """Height in inches of a figure of so many stacked axes."""
-    return 0.9 + 1.35 * count
-
-
-def _label(axes: Axes, text: str, unit: str) -> None:
-    axes.set_ylabel(f"{text} [{unit}]" if unit else text)
-
-
 def _limit(axes: Axes, x: np.ndarray, lines: list[np.ndarray], centred: bool = True) -> bool:
     """Scale to the time after the start if the start is far higher; True if that cuts it off.
 
@@ -75,13 +66,13 @@ def _top(lines: list[np.ndarray]) -> float:
 
 
 def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, series.Clock]:
-    figure, grid = style.new(len(data.axes), 1, _rows(len(data.axes)), sharex=True)
+    figure, grid = style.new(len(data.axes), 1, 0.9 + 1.35 * len(data.axes), sharex=True)
     clock = series.clock(data.x)
     outage = series.outage(solution)
     for axes, label in zip(grid[:, 0], data.axes, strict=True):
         if outage is not None:
             style.shade(axes, outage[0] / clock.seconds, outage[1])
-        _label(axes, label, data.unit)
+        axes.set_ylabel(f"{label} [{data.unit}]" if data.unit else label)
         axes.margins(x=0.0)
     grid[-1, 0].set_xlabel(clock.label)
     figure.align_ylabels()

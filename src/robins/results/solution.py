@@ -85,7 +85,8 @@ def check(solution: xr.Dataset) -> None:
                     raise ValueError(f"{name}: the attribute {attr!r} is missing")
         elif array.dtype.kind not in "UO" or name not in solution.dims:
             raise ValueError(f"{name}: arrays of {array.dtype} are not stored")
-        if _has_axes(array.dims) and "frame" not in array.attrs and name not in solution.dims:
+        has_axes = any(str(dim) == "axis" or str(dim).startswith("axis_") for dim in array.dims)
+        if has_axes and "frame" not in array.attrs and name not in solution.dims:
             raise ValueError(f"{name}: has components along axes, but no attribute 'frame'")
         if "display_unit" in array.attrs:
             try:
@@ -99,10 +100,6 @@ def check(solution: xr.Dataset) -> None:
                 )
         if name in solution.data_vars and (wrong := roles.fault(str(name), array)):
             raise ValueError(f"{name}: {wrong}")
-
-
-def _has_axes(dims: Sequence[Any]) -> bool:
-    return any(str(dim) == "axis" or str(dim).startswith("axis_") for dim in dims)
 
 
 def pack(solution: xr.Dataset) -> bytes:

@@ -206,7 +206,8 @@ def sine_velocity(
     mean, amplitude, phase = (
         np.broadcast_to(np.asarray(a, float), 3) for a in (mean_mps, amplitude_mps, phase_rad)
     )
-    t = _knots(duration_s, period_s / 600.0)
+    steps = max(int(np.ceil(duration_s / (period_s / 600.0))), 8)
+    t = np.linspace(0.0, duration_s, steps + 1)
     v = mean + amplitude * np.sin(2.0 * np.pi * t[:, None] / period_s + phase)
     heading = np.arctan2(v[:, 1], v[:, 0])
     pitch = np.arctan2(-v[:, 2], np.hypot(v[:, 0], v[:, 1]))
@@ -231,10 +232,6 @@ def quaternion(roll_rad: np.ndarray, pitch_rad: np.ndarray, heading_rad: np.ndar
     """q_nb (N, 4) of angles (N,); as `robins.rotation.from_euler`, with nothing to compile."""
     angles = np.stack([heading_rad, pitch_rad, roll_rad], -1)
     return _Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
-
-
-def _knots(duration_s: float, spacing_s: float) -> np.ndarray:
-    return np.linspace(0.0, duration_s, max(int(np.ceil(duration_s / spacing_s)), 8) + 1)
 
 
 def _attitude(t: np.ndarray, q: np.ndarray, degree: int = _DEGREE) -> BSpline:

@@ -210,7 +210,7 @@ class Injector:
             self._said[where] = payload
         for fault in hits:
             if fault.kind == "sign" and (now_ns + 1) // _SECOND_NS % 2 == 1:
-                payload = _negative(payload)
+                payload = _star(payload, -decode("star", payload)["q_ib"])
             elif fault.kind == "wheel" and fault.wheel is not None:
                 payload = _without_wheel(payload, fault.wheel)
         return _blind(payload) if lost else payload
@@ -276,10 +276,6 @@ def _turned(payload: bytes, angle_rad: float) -> bytes:
     w, x, y, z = decode("star", payload)["q_ib"]
     c, s = math.cos(0.5 * angle_rad), math.sin(0.5 * angle_rad)
     return _star(payload, np.array([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]))
-
-
-def _negative(payload: bytes) -> bytes:
-    return _star(payload, -decode("star", payload)["q_ib"])
 
 
 def _blind(payload: bytes) -> bytes:

@@ -78,9 +78,6 @@ def table(ports: Sequence[PortInfo]) -> str:
     if usable:
         # a port that tells what it is has been plugged in; a built-in one may have no socket
         likely = next((p for p in usable if p.description), usable[0])
-        lines += ["", "To put a board in the place of a part:", f"  {_next(likely.path)}"]
+        given = f"robins bench up satellite/s1 --node {EXAMPLE}={likely.path},{BAUD}"
+        lines += ["", "To put a board in the place of a part:", f"  {given} --clock realtime"]
     return "\n".join(lines)
-
-
-def _next(path: str) -> str:
-    return f"robins bench up satellite/s1 --node {EXAMPLE}={path},{BAUD} --clock realtime"

@@ -63,7 +63,8 @@ def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
     """
     cp = packages()
     with _LOCK:
-        program = build(form, aim, *_shape(plant))
+        sizes = (*plant.Bw.shape, plant.Bn.shape[1], len(plant.C), len(plant.L))
+        program = build(form, aim, *sizes)
         for name, parameter in program.parameters.items():
             parameter.value = getattr(plant, name)
         try:
@@ -109,7 +110,3 @@ def packages() -> ModuleType:
             "Riccati designs (robins.filters.synthesis.riccati) do without"
         ) from error
     return cvxpy
-
-
-def _shape(plant: Plant) -> tuple[int, int, int, int, int]:
-    return (*plant.Bw.shape, plant.Bn.shape[1], len(plant.C), len(plant.L))
