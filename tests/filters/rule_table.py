@@ -12,7 +12,7 @@ import numpy as np
 from dense_kalman import System, simulate
 from jax.tree_util import Partial
 
-from robins.filters import Belief, Model, Motion, Sensor
+from robins.filters import Belief, Model, Motion, Observation, Sensor
 from robins.filters.rules import (
     adaptive_h_infinity,
     channel_inflation,
@@ -101,6 +101,23 @@ FACING = Belief(
     {"heading": Angle(SEAM + START.mean[0]), "rest": START.mean[1:]}, factor=START.factor
 )
 
+
+def seen(residual, accepted=(True, True), deficit=None) -> Observation:
+    """An observation of two components: H P H' + Omega has diagonal 5.25 and 2, R 4 and 2."""
+    return Observation(
+        sensor="y",
+        prior=START,
+        residual=jnp.array(residual),
+        present=jnp.array([True, True]),
+        accepted=jnp.array(accepted),
+        spread=jnp.array([[1.0, 0.0, 2.0, 0.0], [0.0, 1.0, 0.0, 0.0]]),
+        excess=jnp.array([[0.5], [1.0]]),
+        noise=jnp.array([[2.0, 0.0], [1.0, 1.0]]),
+        size=jnp.ones(2),
+        deficit=deficit,
+    )
+
+
 # ---------------------------------------------------------------------------------------- the rules
 
 SEEN = SYSTEM.H
@@ -185,11 +202,12 @@ QUIET_WHEN_OFF = QUIET | {"channel_inflation.lambda": 0.0, "h_infinity.gamma": m
 
 # Filters in which each rule acts on `Y`; no rule is left out.
 ACTING = {
-    "robust": [huber(), correntropy()],
-    "gated": [gate(0.999, 2, "reinitialise"), student_t(whose="both")],
+    "robust": [
+        *(fading_memory(1.05), innovation_fading(2, 50.0), consider([3])),
+        *(huber(), correntropy()),
+    ],
+    "gated": [gate(0.999, 2, "reinitialise"), student_t(whose="both"), strong_tracking(0.9)],
     "learning": [sage_husa(0.9, "QR", 0.01, 100.0), variational_bayes(0.9)],
-    "fading": [fading_memory(1.05), innovation_fading(2, 50.0), consider([3])],
-    "strong tracking": [strong_tracking(0.9)],
     "strong tracking, multiple": [
         strong_tracking(0.9, form="multiple", weights=[2.0, 1.0, 1.6, 0.5])
     ],
@@ -265,6 +283,22 @@ MISUSED = [
         {"memory_s": 1.0, "step_s": 0.0},
         "fading_memory step_s must be positive and finite",
     ),
+    (innovation_fading, {"reach": 0.5}, "innovation_fading reach must be at least 1, got"),
+    (innovation_fading, {"reach": NAN}, "innovation_fading reach must"),
+    (sage_husa, {"forgetting": 0.0}, r"sage_husa forgetting must lie in \(0, 1\], got 0.0"),
+    (sage_husa, {"forgetting": NAN}, "sage_husa forgetting must"),
+    (sage_husa, {"forgetting": 1.1}, "sage_husa forgetting must"),
+    (sage_husa, {"floor": 0.0}, r"sage_husa floor must lie in \(0, 1\], got 0.0"),
+    (sage_husa, {"floor": 1.5}, "sage_husa floor must"),
+    (sage_husa, {"ceiling": 0.9}, "sage_husa ceiling must be finite and not below 1"),
+    (sage_husa, {"ceiling": INF}, "sage_husa ceiling must"),
+    (sage_husa, {"adapt": "P"}, "sage_husa adapt must be 'R', 'Q' or 'QR', got 'P'"),
+    (variational_bayes, {"forgetting": 0.0}, "variational_bayes forgetting must"),
+    (variational_bayes, {"iterations": 0}, "variational_bayes iterations must be 1 or more"),
+    (variational_bayes, {"initial_dof": 0.0}, "variational_bayes initial_dof must be pos"),
+    (variational_bayes, {"initial_dof": INF}, "variational_bayes initial_dof must"),
+    (variational_bayes, {"floor": -1.0}, "variational_bayes floor must"),
+    (variational_bayes, {"ceiling": 0.5}, "variational_bayes ceiling must"),
     (strong_tracking, {"rho": 0.0}, "rho"),
     (strong_tracking, {"rho": 1.1}, "rho"),
     (strong_tracking, {"beta": 0.9}, "beta"),

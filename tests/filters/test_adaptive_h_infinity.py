@@ -1,13 +1,11 @@
 """The adaptive H-infinity rule against a dense recursion, its limit and its memory."""
 
-import jax.numpy as jnp
 import numpy as np
-import pytest
 from dense_h_infinity import compensated, greatest, h_infinity_filter
-from dense_kalman import random_system, simulate, times
-from jax.tree_util import Partial
+from dense_kalman import random_system, simulate
+from two_sensors import by_sensor, split
 
-from robins.filters import Model, Motion, Sensor, kalman, run
+from robins.filters import kalman, run
 from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
 
 T = 30
@@ -65,11 +63,10 @@ def agrees(solution, dense, chosen, last="y"):
     assert not np.any(solution.steps.prediction.code)
 
 
-@pytest.mark.parametrize("form", ["sqrt", "joseph"])
-def test_the_recursion_is_as_documented(form):
+def test_the_recursion_is_as_documented():
     rule = adaptive_h_infinity(L, zeta=0.3, window=4, floor=1.2, ceiling=50.0)
     chosen = Chosen(0.3, 4, 1.2, 50.0)
-    solution = run(kalman(rules=[rule], form=form), MODEL, START, Y)
+    solution = run(kalman(rules=[rule]), MODEL, START, Y)
     dense = h_infinity_filter(SYSTEM, Y, L, chosen)
     agrees(solution, dense, chosen)
     # the range of alpha is used, its ends included
@@ -89,13 +86,8 @@ def test_the_order_of_the_patent_compensates_first():
 
 
 def test_sensors_add_up_to_one_step():
-    F, G, H = (jnp.array(a) for a in SYSTEM[:3])
-    near = Sensor(Partial(times, H[:2]), jnp.array([0.5, 0.7]), 2, "near")
-    far = Sensor(Partial(times, H[2:]), jnp.array([2.0]), 1, "far")
-    model = Model(Motion(Partial(times, F), G), (near, far))
-    y = {"near": Y[:, :2], "far": Y[:, 2:]}
+    system = SYSTEM._replace(W=np.diag([0.5, 0.7, 2.0]))
     one = kalman(rules=[adaptive_h_infinity(L, window=4)])
-    solution = run(one, model, START, y)
+    solution = run(one, split(system), START, by_sensor(Y))
     chosen = Chosen(window=4)
-    dense = h_infinity_filter(SYSTEM._replace(W=np.diag([0.5, 0.7, 2.0])), Y, L, chosen)
-    agrees(solution, dense, chosen, "far")
+    agrees(solution, h_infinity_filter(system, Y, L, chosen), chosen, "b")

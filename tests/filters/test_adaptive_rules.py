@@ -1,22 +1,17 @@
 """Rules that learn the size of the noise, against the papers' recursions written with inverses."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense_kalman import random_system, simulate, times
-from jax.tree_util import Partial
+from dense_kalman import random_system, simulate
+from rule_table import START as PRIOR
+from rule_table import seen
+from two_sensors import ROWS, by_sensor, split
 
-from robins.filters import (
-    Code,
-    Model,
-    Motion,
-    Rule,
-    Sensor,
-    kalman,
-    run,
-)
-from robins.filters.observation import Observation
+from robins.filters import Code, Model, Rule, kalman, run
 from robins.filters.rules.gate import gate
 from robins.filters.rules.sage_husa import sage_husa
 from robins.filters.rules.variational_bayes import variational_bayes
@@ -25,7 +20,6 @@ T = 30
 SYSTEM = random_system(2)
 MODEL, START = SYSTEM.model(), SYSTEM.start()
 Y = simulate(SYSTEM, 2, T, 0.2)[1]
-SPLIT = {"near": slice(0, 2), "far": slice(2, 3)}
 # The nominal noise changes from step to step, and is not that of the data.
 SWELL = 0.6 + 0.5 * np.random.default_rng(0).random(T)
 
@@ -38,15 +32,12 @@ def scaled_cov(nominal, scale):
 # ------------------------------------------------------------------------------------- Sage-Husa
 
 
-def two_sensors() -> tuple:
+def swelling() -> tuple:
     """The system with its measurement split in two, with what each needs."""
-    F, G, H, W = (jnp.array(a) for a in SYSTEM[:4])
-    sensors = tuple(
-        Sensor(Partial(times, H[part]), lambda x, aux: aux, len(H[part]), name)
-        for name, part in SPLIT.items()
-    )
-    aux = {name: SWELL[:, None, None] * np.array(W[part]) for name, part in SPLIT.items()}
-    return Model(Motion(Partial(times, F), G), sensors), {k: Y[:, p] for k, p in SPLIT.items()}, aux
+    model = split(SYSTEM)
+    sensors = tuple(replace(s, noise=lambda x, aux: aux) for s in model.sensors)
+    aux = {name: SWELL[:, None, None] * SYSTEM.W[part] for name, part in ROWS.items()}
+    return Model(model.motion, sensors), by_sensor(Y), aux
 
 
 def dense_sage_husa(adapt, b, low, high):
@@ -61,7 +52,7 @@ def dense_sage_husa(adapt, b, low, high):
         m, moved = F @ m, F @ P @ F.T
         P, used = moved + scaled_cov(Q0, q), q.copy()
         correction = np.zeros(4)
-        for part in SPLIT.values():
+        for part in ROWS.values():
             here = np.flatnonzero(np.isfinite(Y[k, part])) + part.start
             if not len(here):
                 continue
@@ -86,59 +77,42 @@ def dense_sage_husa(adapt, b, low, high):
     return np.array(means), np.array(covariances), np.array(r_scales), np.array(q_scales)
 
 
-@pytest.mark.parametrize(("adapt", "form"), [("R", "sqrt"), ("Q", "joseph"), ("QR", "sqrt")])
+@pytest.mark.parametrize(("adapt", "form"), [("R", "joseph"), ("QR", "sqrt")])
 def test_sage_husa_is_its_recursion(adapt, form):
-    model, y, aux = two_sensors()
+    model, y, aux = swelling()
     rule = sage_husa(0.9, adapt, floor=0.3, ceiling=2.5)
     solution = run(kalman(rules=[rule], form=form), model, START, y, aux=aux)
     means, covariances, r, q = dense_sage_husa(adapt, 0.9, 0.3, 2.5)
     np.testing.assert_allclose(solution.mean, means, rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(solution.covariance, covariances, rtol=1e-9, atol=1e-10)
     notes = {name: info.notes for name, info in solution.steps.info.items()}
-    if "R" in adapt:
-        got = [notes["near"][f"sage_husa.r_scale.{i}"] for i in (0, 1)]
-        got = np.stack([*got, notes["far"]["sage_husa.r_scale.0"]], axis=1)
-        np.testing.assert_allclose(got, r, rtol=1e-9)
-        assert np.any((r > 0.3) & (r < 2.5) & (r != 1.0))
-        assert {0.3, 2.5} <= set(r.ravel())  # the guard was at work on both sides
+    got = [notes["a"][f"sage_husa.r_scale.{i}"] for i in (0, 1)]
+    got = np.stack([*got, notes["b"]["sage_husa.r_scale.0"]], axis=1)
+    np.testing.assert_allclose(got, r, rtol=1e-9)
+    assert np.any((r > 0.3) & (r < 2.5) & (r != 1.0))
+    assert {0.3, 2.5} <= set(r.ravel())  # the guard was at work on both sides
     if "Q" in adapt:
         for sensor in notes.values():
             got = np.stack([sensor[f"sage_husa.q_scale.{i}"] for i in range(4)], axis=1)
             np.testing.assert_allclose(got, q, rtol=1e-8)
         assert {0.3, 2.5} <= set(q.ravel())
-    assert len(notes["far"]) == ("R" in adapt) + 4 * ("Q" in adapt)
-
-
-def seen(residual, accepted=(True, True), deficit=None) -> Observation:
-    """An observation of two components, with all kinds of covariance in it."""
-    return Observation(
-        sensor="y",
-        prior=START,
-        residual=jnp.array(residual),
-        present=jnp.array([True, True]),
-        accepted=jnp.array(accepted),
-        spread=jnp.array([[1.0, 0.0, 2.0, 0.0], [0.0, 1.0, 0.0, 0.0]]),
-        excess=jnp.array([[0.5], [1.0]]),
-        noise=jnp.array([[2.0, 0.0], [1.0, 1.0]]),
-        size=jnp.ones(2),
-        deficit=deficit,
-    )
+    assert len(notes["b"]) == 1 + 4 * ("Q" in adapt)
 
 
 def test_sage_husa_takes_all_of_the_prediction_from_the_innovation():
     # 5.25 and 2 are H P- H' + Omega, 4 and 2 the nominal variances; a deficit takes 1 of 5.25.
     rule = sage_husa(1.0, floor=1e-3, ceiling=1e3)
-    memory = rule.init(START, {"y": 2})
-    memory, prior, o = rule.before(memory, START, seen([5.0, 3.0]))
-    assert prior is START
+    memory = rule.init(PRIOR, {"y": 2})
+    memory, prior, o = rule.before(memory, PRIOR, seen([5.0, 3.0]))
+    assert prior is PRIOR
     scale = np.array([0.5 + 0.5 * (25 - 5.25) / 4, 0.5 + 0.5 * (9 - 2) / 2])
     np.testing.assert_allclose(memory[0]["y"].ratio, scale, rtol=1e-14)
     np.testing.assert_allclose(o.noise, seen([0, 0]).noise * np.sqrt(scale)[:, None], rtol=1e-14)
-    less = rule.before(memory, START, seen([5.0, 3.0], deficit=jnp.array([1.0, 0.0])))[0]
+    less = rule.before(memory, PRIOR, seen([5.0, 3.0], deficit=jnp.array([1.0, 0.0])))[0]
     third = 2 / 3 * scale[0] + (25 - 4.25) / 4 / 3
     assert float(less[0]["y"].ratio[0]) == pytest.approx(third, rel=1e-14)
     # refused: nothing learnt, but the noise stays as known
-    kept, _, o = rule.before(memory, START, seen([99.0, 3.0], accepted=(False, True)))
+    kept, _, o = rule.before(memory, PRIOR, seen([99.0, 3.0], accepted=(False, True)))
     assert float(kept[0]["y"].ratio[0]) == scale[0]
     assert kept[0]["y"].samples.tolist() == [1, 2]
     assert float(o.noise[0, 0]) == pytest.approx(2.0 * np.sqrt(scale[0]))

@@ -68,9 +68,3 @@ def test_nothing_fades_before_the_window_is_full(free):
     # what filled it is counted: without the window the first innovation alone would have faded
     assert Y[0, 0] ** 2 - 1.0 > SIGMA[0] ** 2 + NOISE[0, 0] ** 2
     assert factor[WINDOW - 1] > 1.0
-
-
-@pytest.mark.parametrize("reach", [0.5, -1.0, np.nan])
-def test_a_reach_within_the_start_is_refused(reach):
-    with pytest.raises(ValueError, match="innovation_fading reach must be at least 1, got"):
-        innovation_fading(reach=reach)

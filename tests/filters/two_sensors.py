@@ -47,8 +47,13 @@ START = Belief(jnp.array(STACKED.m0), jnp.array([linalg.factor(s.P0) for s in SY
 
 
 def model_of(F, G, H, W) -> Model:
-    sensors = (Sensor(Partial(times, H[r]), W[r, r], r.stop - r.start, k) for k, r in ROWS.items())
+    sensors = (Sensor(Partial(times, H[r]), W[r], r.stop - r.start, k) for k, r in ROWS.items())
     return Model(Motion(Partial(times, F), G), tuple(sensors))
+
+
+def split(s: System) -> Model:
+    """The model of a system whose measurement is of two sensors."""
+    return model_of(*(jnp.array(part) for part in s[:4]))
 
 
 def by_sensor(y):
@@ -65,9 +70,8 @@ def answer(filter_, parts, start, y):
 def one_run(filter_, steps: int = 40, y=None):
     """Means and covariances of the first system."""
     s = SYSTEMS[0]
-    parts = [jnp.array(a) for a in (s.F, s.G, s.H, s.W)]
-    start = Belief(jnp.array(s.m0), linalg.factor(s.P0))
-    got = answer(filter_, parts, start, jnp.array(Y[0, :steps] if y is None else y))
+    parts = [jnp.array(part) for part in s[:4]]
+    got = answer(filter_, parts, s.start(), jnp.array(Y[0, :steps] if y is None else y))
     return got.mean, got.covariance
 
 
