@@ -69,16 +69,9 @@ def pendulum(dt: float):
 
 def coordinated_turn(dt: float):
     def step(x, u):
-        px, py, v, heading, rate = x
-        return jnp.stack(
-            [
-                px + v * jnp.cos(heading) * dt,
-                py + v * jnp.sin(heading) * dt,
-                v,
-                heading + rate * dt,
-                rate,
-            ]
-        )
+        _, _, v, heading, rate = x
+        still = jnp.zeros(())
+        return x + dt * jnp.stack([v * jnp.cos(heading), v * jnp.sin(heading), still, rate, still])
 
     def read(x, aux):
         return jnp.hypot(x[:1], x[1:2]), Angle(jnp.arctan2(x[1], x[0]))
@@ -102,24 +95,17 @@ def weights_of(case: dict) -> tuple:
 
 
 def filtered(solution):
-    return {
-        "m": solution.mean,
-        "P": solution.covariance,
-        "loglik": solution.log_likelihood,
-    }
+    return {"m": solution.mean, "P": solution.covariance, "loglik": solution.log_likelihood}
 
 
 def test_kf_filter(cases_dir):
     for case in cases(cases_dir, "kf_filter"):
-        model, start = linear(case)
-        solution = run(kalman(), model, start, given(case, "y")[0])
-        check(case, series=True, **filtered(solution))
+        check(case, series=True, **filtered(run(kalman(), *linear(case), given(case, "y")[0])))
 
 
 def test_rts_smoother(cases_dir):
     for case in cases(cases_dir, "rts_smoother"):
-        model, start = linear(case)
-        solution = run(kalman(), model, start, given(case, "y")[0])
+        solution = run(kalman(), *linear(case), given(case, "y")[0])
         smooth = rts_smoother(solution)
         check(case, series=True, m=smooth.mean, P=smooth.covariance, loglik=solution.log_likelihood)
 
@@ -127,17 +113,14 @@ def test_rts_smoother(cases_dir):
 @pytest.mark.parametrize("form", ["sqrt", "joseph"])
 def test_ekf_filter(cases_dir, form):
     for case in cases(cases_dir, "ekf_filter"):
-        model, start, y = nonlinear(case)
-        solution = run(kalman(taylor(), form=form), model, start, y)
-        check(case, series=True, **filtered(solution))
+        check(case, series=True, **filtered(run(kalman(form=form), *nonlinear(case))))
 
 
 @pytest.mark.parametrize("form", ["sqrt", "joseph"])
 def test_ukf_filter(cases_dir, form):
     for case in cases(cases_dir, "ukf_filter"):
-        model, start, y = nonlinear(case)
         ukf = kalman(unscented(*weights_of(case), redraw=case["given"]["redraw"]), form=form)
-        check(case, series=True, **filtered(run(ukf, model, start, y)))
+        check(case, series=True, **filtered(run(ukf, *nonlinear(case))))
 
 
 def test_sigma_points(cases_dir):

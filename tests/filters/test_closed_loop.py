@@ -97,12 +97,11 @@ def test_what_does_not_fit_is_named():
     with pytest.raises(ValueError, match="must have one length, got"):
         run_closed(kalman(), MODEL, START, loop()._replace(due={"seen": np.ones(3, bool)}))
 
+    def heard(x, belief, row):
+        return x, Reading(jnp.zeros(()), {"heard": x[:1]}, x)
+
     with pytest.raises(ValueError, match=r"no sensor \['heard'\]; this model has \['seen'\]"):
         run_closed(kalman(), MODEL, START, loop()._replace(react=heard))
-
-
-def heard(x, belief, row):
-    return x, Reading(jnp.zeros(()), {"heard": x[:1]}, x)
 
 
 def test_rules_report_as_in_a_run():
@@ -141,11 +140,10 @@ def test_a_constant_gain_states_its_own_covariance():
 
 
 def test_a_steady_kalman_gain_is_the_kalman_filter():
-    y = np.random.default_rng(2).normal(size=(500, 1))
-    best = run(kalman(), MODEL, START, y, np.zeros(500))
+    y, u = np.random.default_rng(2).normal(size=(500, 1)), np.zeros(500)
+    best = run(kalman(), MODEL, START, y, u)
     steady = np.asarray(best.steps.info["seen"].gain[-1])
-    begun = kalman(rules=[constant_gain({"seen": steady})])
-    same = run(begun, MODEL, START, y, np.zeros(500))
+    same = run(kalman(rules=[constant_gain({"seen": steady})]), MODEL, START, y, u)
     np.testing.assert_allclose(same.mean[-1], best.mean[-1], atol=1e-6)
     np.testing.assert_allclose(same.covariance[-1], best.covariance[-1], rtol=1e-6)
 
@@ -160,13 +158,11 @@ def test_a_gate_before_it_refuses():
 
 
 def test_gains_are_data():
-    y = np.ones((5, 1))
+    y, u = np.ones((5, 1)), np.zeros(5)
     rule = kalman(rules=[constant_gain({"seen": np.zeros((2, 1))})])
     begun = rule.init(START, MODEL.dims)
-    solve = jax.jit(
-        lambda K: run(rule, MODEL, with_gains(begun, {"seen": K}), y, np.zeros(5)).mean[-1]
-    )
-    direct = run(kalman(rules=[constant_gain({"seen": GAIN})]), MODEL, START, y, np.zeros(5))
+    solve = jax.jit(lambda K: run(rule, MODEL, with_gains(begun, {"seen": K}), y, u).mean[-1])
+    direct = run(kalman(rules=[constant_gain({"seen": GAIN})]), MODEL, START, y, u)
     np.testing.assert_allclose(solve(jnp.asarray(GAIN)), direct.mean[-1], atol=1e-14)
     assert np.max(np.abs(solve(jnp.zeros((2, 1))))) == 0.0
     with pytest.raises(ValueError, match="the filter was begun with"):

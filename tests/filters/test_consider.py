@@ -33,13 +33,8 @@ def gains_and_covariances(y):
         Hx, Hp = H[here][:, x], H[here][:, p]
         R = SYSTEM.R[np.ix_(here, here)]
         seen = P[x, x] @ Hx.T + P[x, p] @ Hp.T
-        W = (
-            Hx @ P[x, x] @ Hx.T
-            + Hx @ P[x, p] @ Hp.T
-            + Hp @ P[p, x] @ Hx.T
-            + Hp @ P[p, p] @ Hp.T
-            + R
-        )
+        W = Hx @ P[x, x] @ Hx.T + Hx @ P[x, p] @ Hp.T + R
+        W = W + Hp @ P[p, x] @ Hx.T + Hp @ P[p, p] @ Hp.T
         K = seen @ np.linalg.inv(W)
         P_new = P.copy()
         P_new[x, x] = P[x, x] - K @ seen.T
@@ -54,9 +49,7 @@ def gains_and_covariances(y):
     return np.array(means)[:, back], np.array(covariances)[:, back][:, :, back]
 
 
-@pytest.mark.parametrize(
-    ("way", "form"), [(taylor(), "sqrt"), (taylor(), "joseph"), (cubature(), "sqrt")]
-)
+@pytest.mark.parametrize(("way", "form"), [(taylor(), "sqrt"), (cubature(), "joseph")])
 def test_the_partitioned_equations(way, form):
     solution = run(kalman(way, [consider(HELD)], form), MODEL, START, Y)
     means, covariances = gains_and_covariances(Y)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from dense_kalman import times
 from jax.tree_util import Partial
 from scipy.optimize import minimize
 
@@ -249,12 +250,8 @@ def test_shares_by_observability():
     H = {"a": rng.normal(size=(2, n)) * [1.0, 0.2, 0.0], "b": np.array([[0.3, 0.0, 0.0]])}
     W = {"a": np.array([[0.2, 0.0], [0.1, 0.4]]), "b": np.array([[0.7]])}
     sigma = np.array([2.0, 0.3, 5.0])
-    model = Model(
-        Motion(Partial(lambda A, x, u: A @ x, jnp.array(F)), jnp.ones(n)),
-        tuple(
-            Sensor(Partial(lambda A, x, aux: A @ x, jnp.array(H[k])), W[k], len(H[k]), k) for k in H
-        ),
-    )
+    sensors = (Sensor(Partial(times, jnp.array(H[k])), W[k], len(H[k]), k) for k in H)
+    model = Model(Motion(Partial(times, jnp.array(F)), jnp.ones(n)), tuple(sensors))
     channels = [channel("a"), channel("b")]
     belief = Belief.of(jnp.zeros(n), np.diag(sigma**2))
     seen = []
@@ -319,20 +316,15 @@ def test_given_weights():
     a, b = random_belief(13), random_belief(14)
     got = covariance_intersection([a, b], [0.3, 0.7])
     P = np.linalg.inv(0.3 * information(a) + 0.7 * information(b))
-    mean = P @ (
-        0.3 * information(a) @ np.asarray(a.mean) + 0.7 * information(b) @ np.asarray(b.mean)
-    )
+    mean = P @ (0.3 * information(a) @ a.mean + 0.7 * information(b) @ b.mean)
     np.testing.assert_allclose(got.covariance, P, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(got.mean, mean, rtol=1e-9, atol=1e-11)
     alone = covariance_intersection([a, b], [1.0, 0.0])
     np.testing.assert_allclose(alone.covariance, a.covariance, rtol=1e-11, atol=1e-12)
-    for bad, why in (
-        ([0.5], "one for each of 2"),
-        ([0.5, 0.6], "sum to one"),
-        ([1.5, -0.5], "sum"),
-    ):
+    wrong = {(0.5,): "one for each of 2", (0.5, 0.6): "sum to one", (1.5, -0.5): "sum"}
+    for bad, why in wrong.items():
         with pytest.raises(ValueError, match=why):
-            covariance_intersection([a, b], bad)
+            covariance_intersection([a, b], list(bad))
     with pytest.raises(ValueError, match="'trace', 'det' or weights"):
         inspect.unwrap(covariance_intersection)([a, b], "volume")
 
