@@ -149,7 +149,8 @@ def test_sigma_points_in_josephs_form_on_a_circle_say_what_derivatives_on_a_line
 SMOOTH = pytest.mark.parametrize("name", [name for name in FILTERS if name not in NO_SLOPE])
 
 
-@SMOOTH
+# The gate of "given" is closed in the end; the slope of its whole run is always looked at.
+@pytest.mark.parametrize("name", [n for n in FILTERS if n not in NO_SLOPE | {"given"}])
 def test_slopes_of_a_step_are_right(name):
     one, learnt = kalman(rules=FILTERS[name]), ran(name).final
     row = jnp.asarray(Y[-1] + np.array([RAD, 1.0, 1.0]))  # too little for a gate to refuse
