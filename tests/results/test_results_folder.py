@@ -188,7 +188,8 @@ def test_a_failed_exchange_is_taken_back(earlier, monkeypatch, which, error):
     still_there(earlier)
 
 
-def test_an_interrupt_at_any_line_leaves_a_whole_result(earlier):
+@pytest.mark.parametrize("every", [1, 5])
+def test_an_interrupt_at_any_line_leaves_a_whole_result(earlier, every):
     """Ctrl-C can fall between any two lines of the code that moves folders about."""
     modules = (folder.__file__, results.writer.__file__)
 
@@ -208,7 +209,7 @@ def test_an_interrupt_at_any_line_leaves_a_whole_result(earlier):
 
     outer, seeds, lines = sys.gettrace(), [], 0
     while True:
-        lines += 1
+        lines += every
         sys.settrace(Countdown(lines))
         try:
             write(earlier, a_summary(seed=2))

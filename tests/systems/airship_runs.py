@@ -21,14 +21,8 @@ from robins.systems.system import Problem
 RUNS = 20
 UNWARNED = tuple(name for name in FILTERS if name != "distributed-full")
 TO_THE_END = ('imu.rate="10 Hz"', 'duration="800 s"')  # of what counts: 200 to 800 s
-QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, ten times as fast to run
-
-
-class Flights(NamedTuple):
-    """Runs of a scenario."""
-
-    problem: Problem
-    batch: World  # leading axis: runs
+QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, some times as fast to run
+OFTEN = ("ukf", "intersection")  # filters that run so often, or so slowly, that it is worth it
 
 
 class Found(NamedTuple):
@@ -61,6 +55,30 @@ class Found(NamedTuple):
     def horizontal_rms_m(self, epoch: int) -> float:
         """Over the runs, at the end of an epoch."""
         return float(np.sqrt(np.mean(np.sum(self.error[:, epoch, 6:8] ** 2, axis=1))))
+
+
+class Flights(NamedTuple):
+    """Runs of a scenario."""
+
+    problem: Problem
+    batch: World  # leading axis: runs
+
+    def found(self, name: str) -> Found:
+        """What a filter makes of them."""
+        program, *given = self._called(name)
+        error, square = program(*given)
+        counted = slice(self.problem.count_from, self.problem.count_to)
+        return Found(np.asarray(error), np.asarray(square), counted)
+
+    def traced(self, name: str) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
+        """Shapes of the error and of its square, without compiling."""
+        program, *given = self._called(name)
+        return program.eval_shape(*given)
+
+    def _called(self, name: str):
+        c = self.problem.contenders[name]
+        program = _program(c.filter, name in OFTEN)
+        return program, c.model, c.case, jnp.asarray(c.reported), self.batch
 
 
 def parsed(name: str, settings: tuple[str, ...] = TO_THE_END) -> Airship:
@@ -106,11 +124,7 @@ def _program(filter_: Any, quick: bool):
     return jax.jit(mapped, compiler_options=QUICK if quick else None)
 
 
-def found(flights: Flights, name: str, batch: World | None = None, quick: bool = False) -> Found:
-    """What a filter makes of flights, or of the same flights altered."""
-    p = flights.problem
-    c = p.contenders[name]
-    program = _program(c.filter, quick)
-    which = flights.batch if batch is None else batch
-    error, square = program(c.model, c.case, jnp.asarray(c.reported), which)
-    return Found(np.asarray(error), np.asarray(square), slice(p.count_from, p.count_to))
+@cache
+def found(name: str, filter_: str) -> Found:
+    """What a filter makes of a packaged scenario."""
+    return flights(name).found(filter_)

@@ -115,10 +115,12 @@ def _program(filter_: Any):
     return jax.jit(mapped, compiler_options=QUICK)
 
 
-def found(flown: Flights, name: str) -> Found:
-    """What a filter makes of flights."""
+@cache
+def found(name: str, filter_: str) -> Found:
+    """What a filter makes of flights of a scenario."""
+    flown = flights(name, SHORT if name.startswith("a") else ())
     p = flown.problem
-    c = p.contenders[name]
+    c = p.contenders[filter_]
     error, square = _program(c.filter)(c.model, c.case, flown.batch)
     every, length = flown.every_s, flown.length_s
     return Found(np.degrees(np.asarray(error)), np.asarray(square), p.epoch_s, every, length)

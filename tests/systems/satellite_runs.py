@@ -83,9 +83,19 @@ def _program(filter_: Any):
     return jax.jit(jax.vmap(one, (None, None, 0)), compiler_options=QUICK)
 
 
-def found(p: Problem, name: str, batch: Any) -> Found:
-    """What a filter makes of a batch of worlds."""
-    c = p.contenders[name]
+@cache
+def flights(name: str, runs: int, settings: tuple[str, ...]) -> Any:
+    """Worlds of a packaged scenario, changed; leading axis: runs."""
+    ((batch, _),) = worlds(problem(name, ("mekf",), settings), runs)
+    return batch
+
+
+@cache
+def flown(name: str, filter_: str, runs: int, settings: tuple[str, ...] = ()) -> Found:
+    """What a filter makes of runs of a packaged scenario, changed."""
+    p = problem(name, (filter_,), settings)
+    c = p.contenders[filter_]
+    batch = flights(name, runs, settings)
     error, nees, sigma, outputs, used = _program(c.filter)(c.model, c.case, batch)
     size = [np.asarray(x) / ARCSEC for x in (error, sigma, outputs["pointing"])]
     return Found(
@@ -98,12 +108,3 @@ def found(p: Problem, name: str, batch: Any) -> Found:
         p.epoch_s,
         slice(p.count_from, None),
     )
-
-
-def flown(
-    name: str, filters: tuple[str, ...], runs: int, settings: tuple[str, ...] = ()
-) -> dict[str, Found]:
-    """Runs of a packaged scenario, changed, with filters."""
-    p = problem(name, filters, settings)
-    ((batch, _),) = worlds(p, runs)
-    return {one: found(p, one, batch) for one in filters}

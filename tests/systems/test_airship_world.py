@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from airship_runs import flights, found, parsed
+from airship_runs import flights, parsed
 from scipy.linalg import expm
 
 from robins.earth import Geodetic
@@ -200,7 +200,7 @@ def test_heading_south_is_as_good_as_heading_east(windy):
     heading = np.asarray(south.batch.euler[..., 2])
     assert np.any(heading > 3.1)
     assert np.any(heading < -3.1)
-    ways = [found(of, "ekf") for of in (windy, south)]
+    ways = [of.found("ekf") for of in (windy, south)]
     for way in ways:
         assert np.all(np.isfinite(way.error))
     # the same errors turned: what was along the wind is again
@@ -223,7 +223,8 @@ def test_a_fix_that_is_no_number_is_left_out(windy):
         )
 
     missing, infinite, whole = (
-        found(windy, "ekf", b).error for b in (with_fix(jnp.nan), with_fix(jnp.inf), batch)
+        windy._replace(batch=b).found("ekf").error
+        for b in (with_fix(jnp.nan), with_fix(jnp.inf), batch)
     )
     assert np.all(np.isfinite(infinite))
     np.testing.assert_array_equal(infinite, missing)

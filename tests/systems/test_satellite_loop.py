@@ -19,7 +19,7 @@ SHORT = ('duration="120 s"', 'counted_from="60 s"')
 
 @pytest.fixture(scope="module")
 def mekf():
-    return flown("s1", ("mekf",), 4, SHORT)["mekf"]
+    return flown("s1", "mekf", 4, SHORT)
 
 
 def test_it_settles_and_points(mekf):
@@ -33,21 +33,28 @@ def test_it_settles_and_points(mekf):
 
 
 def test_the_additive_filter_is_the_multiplicative_one(mekf):
-    other = flown("s1", ("ekf-quaternion",), 4, SHORT)["ekf-quaternion"]
+    other = flown("s1", "ekf-quaternion", 4, SHORT)
     # to a few counts of the gyro, 0.05 arcsec, for in a loop a count may fall on either side
     np.testing.assert_allclose(other.error, mekf.error, atol=0.15)
     np.testing.assert_allclose(other.pointing, mekf.pointing, atol=0.15)
 
 
-def test_a_run_over_its_measurements_gives_the_same_estimates():
-    p = problem("s1", ("mekf",), SHORT)
+def closed_loop(p):
+    """One run of a problem in closed loop: contender, world, case, and what came of it."""
     ((batch, _),) = worlds(p, 1)
-    c = p.contenders["mekf"]
-    world = _first(batch)
+    c, world = p.contenders["mekf"], jax.tree.map(lambda x: x[0], batch)
     it = c.case(world)
-    closed = run_closed(c.filter, c.model, it.start, it.loop, lambda s: s.posterior.mean)
+    return c, world, it, run_closed(c.filter, c.model, it.start, it.loop, _mean)
+
+
+def _mean(step):
+    return step.posterior.mean
+
+
+def test_a_run_over_its_measurements_gives_the_same_estimates():
+    c, _, it, closed = closed_loop(problem("s1", ("mekf",), SHORT))
     again = run(c.filter, c.model, it.start, closed.readings.y, closed.readings.u)
-    for a, b in zip(_arrays(closed.steps), _arrays(again.mean), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (closed.steps, again.mean)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
@@ -57,26 +64,15 @@ def test_momentum_is_conserved_without_environment():
     far = given.orbit.model_copy(update={"altitude": 1e12})  # beyond what a scenario may say
     given = given.model_copy(update={"orbit": far})
     p = SYSTEM.studies["attitude-loop"].problem(given, ("mekf",), 0)
-    ((batch, _),) = worlds(p, 1)
-    c, world = p.contenders["mekf"], _first(batch)
-    it = c.case(world)
-    closed = run_closed(c.filter, c.model, it.start, it.loop, lambda s: ())
+    _, world, _, closed = closed_loop(p)
     moved = np.asarray(closed.world.craft.momentum_i - world.craft.momentum_i)
     assert np.max(np.abs(moved)) < 1e-15
     assert np.max(np.abs(closed.world.craft.wheel_h)) > 1e-3  # and yet it slews
 
 
-def _first(batch):
-    return jax.tree_util.tree_map(lambda x: x[0], batch)
-
-
-def _arrays(tree):
-    return [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
-
-
 def test_stars_are_tracked_and_say_how_sure_they_are():
     """A camera with false stars and missed ones; the covariance of each frame is the filter's R."""
-    stars = flown("stars", ("mekf",), 4, SHORT)["mekf"]
+    stars = flown("stars", "mekf", 4, SHORT)
     assert np.all(stars.used[:, 4::5])
     at = slice(700, None)
     assert abs(np.mean(stars.nees[:, at]) - 1.0) < 0.35
@@ -89,7 +85,7 @@ def test_stars_are_tracked_and_say_how_sure_they_are():
 
 
 def test_without_stars_it_goes_on_by_gyro(mekf):
-    lost = flown("s1", ("mekf",), 4, (*SHORT, 'star.lost=[{begin="60 s", end="110 s"}]'))["mekf"]
+    lost = flown("s1", "mekf", 4, (*SHORT, 'star.lost=[{begin="60 s", end="110 s"}]'))
     before, away = slice(0, 599), slice(600, 1099)
     np.testing.assert_allclose(lost.error[:, before], mekf.error[:, before], atol=1e-6)
     assert not np.any(lost.used[:, away])
@@ -99,11 +95,11 @@ def test_without_stars_it_goes_on_by_gyro(mekf):
 
 
 def test_a_lost_wheel(mekf):
-    known = flown("s1", ("mekf",), 4, (*SHORT, "wheels.lost=[0]"))["mekf"]
+    known = flown("s1", "mekf", 4, (*SHORT, "wheels.lost=[0]"))
     assert np.all(known.wheel_momentum[:, :, 0] == 0.0)
     assert known.points < 1.5 * mekf.points
     unknown = (*SHORT, "wheels.lost=[0]", "wheels.loss_known=false")
-    unknown = flown("s1", ("mekf",), 4, unknown)["mekf"]
+    unknown = flown("s1", "mekf", 4, unknown)
     assert np.all(unknown.wheel_momentum[:, :, 0] == 0.0)
     assert unknown.points > known.points  # a quarter of the torque about x is missing
 
@@ -148,10 +144,8 @@ def test_a_design_without_its_solver(monkeypatch):
         problem("s1", ("mixed-lmi",), SHORT)
 
 
-def test_the_covariance_bound_of_the_loop():
-    p = problem("s1", ("mekf",), SHORT)
-    found = bound(p, "mekf")
+def test_the_covariance_bound_of_the_loop(mekf):
+    found = bound(problem("s1", ("mekf",), SHORT), "mekf")
     sigma = np.asarray(found["bound_attitude"])[-5:] / ARCSEC
     # what a steady Kalman filter states at its frames and between them
-    mekf = flown("s1", ("mekf",), 1, SHORT)["mekf"].sigma[0, -5:]
-    np.testing.assert_allclose(sigma, mekf, rtol=1e-3)
+    np.testing.assert_allclose(sigma, mekf.sigma[0, -5:], rtol=1e-3)

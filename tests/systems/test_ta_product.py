@@ -1,5 +1,6 @@
 """The product model of transfer alignment: derivatives, readings, delays, consistency, refusals."""
 
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -174,12 +175,11 @@ def test_flexure_and_mounting_move_apart_from_the_slave(derived):
 
 
 def test_start_of_the_flexure_is_its_steady_state():
-    pair = parse(Product, S_TURN)
     believed = Believed.model_validate_json(
         '{"flexure": {"sigma": ["8 arcmin", "5 arcmin", "0 arcmin"], "time": "2 s",'
         ' "damping": 0.3}, "mounting": "0.2 deg"}'
     )
-    sigma = start_sigma(pair, believed, flexure_of("product", believed))
+    sigma = start_sigma(PAIR, believed, flexure_of("product", believed))
     np.testing.assert_allclose(sigma[15:18], np.deg2rad(0.2))
     np.testing.assert_allclose(sigma[18:21], np.array([8.0, 5.0, 0.0]) * MINUTE, rtol=1e-9)
     np.testing.assert_allclose(sigma[21:], sigma[18:21] * 2.146 / 2.0, rtol=1e-9)
@@ -241,57 +241,51 @@ def test_lag_collects_what_the_slave_felt():
 # ------------------------------------------------------------------------------- whole runs
 
 
-@pytest.fixture(scope="module")
-def s_turn():
-    pair = parse(Product, S_TURN)
-    return pair, lay_out(pair)
-
-
 def with_mounting(pair: Product, error) -> Product:
     """The scenario with a true mounting error that may be traced."""
     return pair.model_copy(update={"mounting": pair.mounting.model_copy(update={"error": error})})
 
 
 RUNS = 24
+PAIR = parse(Product, S_TURN)
+CONTENDER = product_contender(PAIR)
+course = cache(partial(lay_out, PAIR))
 
 
-@pytest.fixture(scope="module")
-def aligned(s_turn):
-    """Errors and sigmas of "product" with no mounting error and with 0.3 deg on each axis."""
-    pair, course = s_turn
-    contender = product_contender(pair)
-
-    @jax.jit
-    def batch(index, error):
-        world = simulate_pair(with_mounting(pair, error), course, 0, index)
-        case = contender.case(world)
-        y = {**case.y, p.VELOCITY: case.y[p.VELOCITY].at[HALF, 0].set(jnp.nan)}
-        keep = lambda s: (s.posterior, s.prediction.belief.sigma, s.info[p.VELOCITY].code)  # noqa: E731
-        found = run(kalman(form="joseph"), contender.model, case.start, y, case.u, case.aux, keep)
-        belief, before, code = found.steps
-        return jax.vmap(local)(belief.mean, case.truth), belief.sigma, before, code
-
-    index = jnp.tile(jnp.arange(RUNS), 2)
-    error = jnp.repeat(jnp.deg2rad(jnp.array([0.0, 0.3])), RUNS)[:, None] * jnp.ones((1, 3))
-    return [np.asarray(a) for a in jax.vmap(batch)(index, error)]
+@jax.jit
+@partial(jax.vmap, in_axes=(0, None))
+def runs(index, mounting_error):
+    """Errors, sigmas and sigmas before the velocity of "product", and what became of that."""
+    world = simulate_pair(with_mounting(PAIR, mounting_error), course(), 0, index)
+    case = CONTENDER.case(world)
+    y = {**case.y, p.VELOCITY: case.y[p.VELOCITY].at[HALF, 0].set(jnp.nan)}
+    keep = lambda s: (s.posterior, s.prediction.belief.sigma, s.info[p.VELOCITY].code)  # noqa: E731
+    found = run(kalman(form="joseph"), CONTENDER.model, case.start, y, case.u, case.aux, keep)
+    belief, before, code = found.steps
+    return jax.vmap(local)(belief.mean, case.truth), belief.sigma, before, code
 
 
-@pytest.fixture(scope="module")
-def settled(s_turn, aligned):
-    """Errors and sigmas, (2 worlds, runs, epochs from 30 s on, 18)."""
-    pair, course = s_turn
-    counts = course.epoch_s > pair.settle
-    return [a[:, counts].reshape(2, RUNS, -1, 18) for a in aligned[:2]]
+@cache
+def aligned(mounting_error_deg):
+    course()  # before it is traced
+    error = jnp.full(3, jnp.deg2rad(mounting_error_deg))
+    return [np.asarray(a) for a in runs(jnp.arange(RUNS), error)]
+
+
+def settled(mounting_error_deg):
+    """Errors and sigmas, (runs, epochs from 30 s on, 18)."""
+    counts = course().epoch_s > PAIR.settle
+    return [a[:, counts] for a in aligned(mounting_error_deg)[:2]]
 
 
 def pooled(x, block):
     return np.sqrt(np.mean(x[..., block] ** 2, axis=(-3, -2, -1)))
 
 
-@pytest.mark.parametrize("world", [0, 1], ids=["no mounting error", "0.3 deg mounting error"])
-def test_errors_are_as_large_as_the_filter_says(settled, world):
+@pytest.mark.parametrize("mounting_error_deg", [0.0, 0.3])
+def test_errors_are_as_large_as_the_filter_says(mounting_error_deg):
     """Scenarios A and E at full initial errors, from 30 s on."""
-    e, s = (a[world] for a in settled)
+    e, s = settled(mounting_error_deg)
     attitude = slice(0, 3)
     ratio = pooled(e, attitude) / pooled(s, attitude)
     assert 0.9 < ratio < 1.1
@@ -300,18 +294,17 @@ def test_errors_are_as_large_as_the_filter_says(settled, world):
         assert 0.85 < pooled(e, at) / pooled(s, at) < 1.15
 
 
-def test_mounting_is_found(settled):
-    e, s = settled
-    mounting = slice(15, 18)
-    assert pooled(e[1][:, -1:], mounting) < 0.2 * MINUTE
-    assert 0.8 < pooled(e[1][:, -1:], mounting) / pooled(s[1][:, -1:], mounting) < 1.2
+def test_mounting_is_found():
+    e, s = (pooled(a[:, -1:], slice(15, 18)) for a in settled(0.3))
+    assert e < 0.2 * MINUTE
+    assert 0.8 < e / s < 1.2
 
 
-def test_missing_records_are_passed_over(aligned):
-    _, sigma, before, code = aligned
+def test_missing_records_are_passed_over():
+    _, sigma, before, code = aligned(0.3)
     assert np.all(code[:, LOST] == Code.MISSING)
     assert np.all(code[:, HALF] == Code.PARTLY_MISSING)
-    assert np.sum(code != Code.DONE) == 2 * RUNS * 6
+    assert np.sum(code != Code.DONE) == RUNS * 6
     np.testing.assert_array_equal(sigma[:, LOST], before[:, LOST])
     assert np.all(sigma[:, HALF, 4] < before[:, HALF, 4])
 
