@@ -2,16 +2,20 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from robins import logs, scenario
 from robins.dataset import Dataset
-from robins.systems.ins_gnss import Drive, Replay, drive_dataset
+from robins.systems import ins_gnss
+from robins.systems.ins_gnss import Drive, Replay, drive_dataset, drive_problem
 from robins.systems.ins_gnss import replay as replay_log
 from robins.systems.ins_gnss.prepare import gained_in_window, on_one_clock, pieces
+from robins.workbench import replay as replay_files
 
 DRIVE = """
 system = "ins-gnss"
@@ -147,6 +151,10 @@ def test_every_fix_falls_on_an_epoch_of_its_own_time(log):
     assert np.all(np.diff(whole.gnss_s) == pytest.approx(FIX_RATE_S, abs=1e-9))
 
 
+def rows_of(imu, rows):
+    return replace(imu, **{f: getattr(imu, f)[rows] for f in ("time_ns", "gyro", "accel")})
+
+
 @pytest.mark.parametrize("where", [0.0, 0.31, 0.77, 1.0])
 @pytest.mark.parametrize(
     ("reason", "spoil"),
@@ -160,13 +168,7 @@ def test_a_bad_sample_is_as_if_it_were_absent(log, where, reason, spoil):
     k = round(where * (len(log.imu) - 1))
     imu = replace(log.imu, gyro=log.imu.gyro.copy(), accel=log.imu.accel.copy())
     spoil(imu, k)
-    keep = np.arange(len(imu)) != k
-    absent = replace(
-        log.imu,
-        time_ns=log.imu.time_ns[keep],
-        gyro=log.imu.gyro[keep],
-        accel=log.imu.accel[keep],
-    )
+    absent = rows_of(log.imu, np.arange(len(imu)) != k)
     cleaned = logs.clean(replace(log, imu=imu))
     assert cleaned.counts[reason] == 1
     for field in ("time_ns", "gyro", "accel"):
@@ -176,9 +178,7 @@ def test_a_bad_sample_is_as_if_it_were_absent(log, where, reason, spoil):
 def test_an_inserted_duplicate_and_a_step_back_change_nothing(log, clean_outcome):
     k = 700
     rows = np.insert(np.arange(len(log.imu)), k, [k - 1, k - 40])
-    time = log.imu.time_ns[rows]
-    imu = replace(log.imu, time_ns=time, gyro=log.imu.gyro[rows], accel=log.imu.accel[rows])
-    cleaned = logs.clean(replace(log, imu=imu))
+    cleaned = logs.clean(replace(log, imu=rows_of(log.imu, rows)))
     assert cleaned.counts["imu_duplicate"] == 1
     assert cleaned.counts["imu_backward"] == 1
     outcome = replay_log(cleaned, configuration(), ("ekf", "ekf+rts"))
@@ -214,14 +214,7 @@ def test_a_missing_component_leaves_the_others_in_use(log):
 
 def _without(log, begin_s, end_s):
     t = log.imu.time_ns * 1e-9
-    keep = (t < begin_s) | (t > end_s)
-    imu = replace(
-        log.imu,
-        time_ns=log.imu.time_ns[keep],
-        gyro=log.imu.gyro[keep],
-        accel=log.imu.accel[keep],
-    )
-    return logs.clean(replace(log, imu=imu))
+    return logs.clean(replace(log, imu=rows_of(log.imu, (t < begin_s) | (t > end_s))))
 
 
 def test_a_short_gap_is_bridged_with_more_noise_and_a_long_one_declared(log):
@@ -229,7 +222,7 @@ def test_a_short_gap_is_bridged_with_more_noise_and_a_long_one_declared(log):
     assert short.counts["imu_gaps_declared"] == 0
     assert short.counts["blocks_over_imu_gaps"] >= 1
     assert np.all(np.isfinite(short.solution["lat_rad"].values))
-    long = replay_log(_without(log, 20.0, 23.0), configuration(), ("ekf", "ekf+rts"))
+    long = replay_log(_without(log, 20.0, 23.0), configuration(), ("ekf",))
     assert long.counts["imu_gaps_declared"] == 1
     lat = long.solution["lat_rad"].values[0]
     assert np.sum(np.isnan(lat)) == 1, "one epoch of NaN breaks the curve at the gap"
@@ -254,8 +247,6 @@ def test_velocity_gained_in_a_window_is_that_of_a_plain_sum(log):
     gained, age = gained_in_window(increments, time, np.array([end]), window)
     assert age[0] == pytest.approx(window / 2, rel=1e-9)
     # the same by fine steps: mean over the window of the velocity gained until its end
-    from scipy.spatial.transform import Rotation
-
     # an increment is in the axes at its start; the force itself is in those of the moment
     at_once = increments.dv - 0.5 * np.cross(increments.theta, increments.dv)
     rate, force = increments.theta / increments.dt[:, None], at_once / increments.dt[:, None]
@@ -270,12 +261,7 @@ def test_velocity_gained_in_a_window_is_that_of_a_plain_sum(log):
 
 
 def test_the_walk_meets_its_figures(data_dir):
-    from pathlib import Path
-
-    import robins.systems.ins_gnss as here
-    from robins.workbench import replay as replay_files
-
-    walk = Path(here.__file__).parent / "scenarios" / "walk.toml"
+    walk = Path(ins_gnss.__file__).parent / "scenarios" / "walk.toml"
     files = [data_dir / "gnssimu_walk_imu.csv.xz", data_dir / "gnssimu_walk_gnss.pos.xz", walk]
     found = replay_files(files).metrics
     ekf, smoothed = found["ekf"], found["ekf+rts"]
@@ -286,8 +272,6 @@ def test_the_walk_meets_its_figures(data_dir):
 
 
 def test_a_run_as_a_log_has_the_noise_of_the_campaign(drive, log):
-    from robins.systems.ins_gnss import drive_problem
-
     problem = drive_problem(drive, ("ekf",), 3)
     case = jax.jit(problem.simulate)(0)
     here = np.isfinite(np.asarray(case.y["gnss_position"].lat))

@@ -76,7 +76,7 @@ longest_block = "0.2 s"
 """
 PAIR = scenario.parse(Replay, TEXT)
 PRODUCT = product_contender(PAIR, "product", PAIR.believed)
-RUNS = 8
+RUNS = 4
 
 
 def read_back(dataset, folder):
