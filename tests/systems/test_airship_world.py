@@ -30,7 +30,7 @@ from robins.systems.airship.model import (
     walk,
     wind_states,
 )
-from robins.systems.airship.world import lay_out
+from robins.systems.airship.world import lay_out, simulate
 from robins.workbench import InputError
 from robins.workbench import run as run_scenario
 
@@ -63,9 +63,25 @@ def windy():
 
 
 @pytest.fixture(scope="module")
-def perfect():
-    """Without errors of the inertial unit, hardly any of the stars; sensors are lost at times."""
-    return flights("s1", (*SHORT, *GUSTS, *NO_IMU_ERRORS, *LOST, 'star.attitude="0.001 arcsec"'), 2)
+def seen_or_not():
+    """Without errors of the inertial unit, sensors lost at times; the wind felt, and not felt."""
+    exact = (*NO_IMU_ERRORS, 'star.attitude="0.001 arcsec"')
+    given = parsed("s1", (*SHORT, *GUSTS, *exact, *LOST))
+    course = lay_out(given)
+
+    @jax.jit
+    @jax.vmap
+    def fly(unsensed, index):
+        imu = given.imu.model_copy(update={"unsensed": unsensed})
+        return simulate(given.model_copy(update={"imu": imu}), course, 0, index)
+
+    both = fly(jnp.array([0.0, 0.0, 1.0, 1.0]), jnp.array([0, 1, 0, 1]))
+    return [jax.tree.map(lambda x, at=at: x[at], both) for at in (slice(2), slice(2, 4))]
+
+
+@pytest.fixture(scope="module")
+def perfect(seen_or_not):
+    return seen_or_not[0]
 
 
 def as_ins(nav: Nav, gyro_bias, accel_bias) -> InsState:
@@ -80,7 +96,7 @@ def one(batch, run=0):
 
 
 def test_a_unit_without_errors_navigates_to_the_truth(perfect):
-    world = one(perfect.batch)
+    world = one(perfect)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), world.parts)
     pieces = flat.dt.shape[0] // EPOCHS
     assert pieces > 1
@@ -122,19 +138,19 @@ def specific_force(batch):
     return np.asarray(felt)[..., :2], np.diff(v, axis=1)[..., :2]
 
 
-def test_gusts_are_felt_unless_they_are_not_to_be(perfect):
-    felt, gained = specific_force(perfect.batch)
+def test_gusts_are_felt_unless_they_are_not_to_be(seen_or_not):
+    perfect, blind = seen_or_not
+    felt, gained = specific_force(perfect)
     assert np.max(np.abs(gained)) > 0.2
     # Coriolis of 20 m/s and the turn of the body within an epoch are what they differ by
     np.testing.assert_allclose(felt, gained, atol=0.02)
-    blind = flights("s1", (*SHORT, *GUSTS, *NO_IMU_ERRORS, "imu.unsensed=1.0"), 2)
-    felt, gained = specific_force(blind.batch)
+    felt, gained = specific_force(blind)
     assert np.max(np.abs(gained)) > 0.2
     np.testing.assert_allclose(felt, 0.0, atol=0.02)
 
 
 def test_gyros_carry_the_star_sights_of_an_epoch_to_its_end(perfect):
-    world = one(perfect.batch)
+    world = one(perfect)
     age = jnp.full((EPOCHS, 1), 0.5)
     zero = jnp.zeros((EPOCHS, 3))
     states = WindIns(as_ins(world.truth, zero, zero), world.wind_error)
@@ -170,7 +186,7 @@ def _pairs(batch, noise):
 
 
 def test_sensors_are_missing_where_they_are_lost_and_nowhere_else(perfect):
-    world, time = one(perfect.batch), np.arange(1, EPOCHS + 1)
+    world, time = one(perfect), np.arange(1, EPOCHS + 1)
     assert set(time[np.isnan(world.sar_heading)]) == {5, 6, 7, 8}
     assert set(time[np.isnan(world.sar_position.lat)]) == {5, 6, 7, 8}
     assert set(time[np.isnan(world.height)]) == {3, 20, 21, 22, 23}

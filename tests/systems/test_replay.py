@@ -136,7 +136,7 @@ def test_a_lever_arm_told_with_the_log_is_that_of_the_configuration(log, clean_o
 def test_a_replay_that_contradicts_its_sigmas_ends_with_the_likely_causes(log, clean_outcome):
     assert clean_outcome.warnings == []
     sure = replace(log, gnss=replace(log.gnss, sigma_m=0.05 * log.gnss.sigma_m))
-    outcome = replay_log(logs.clean(sure), configuration("update.gate=0.999"), ("ekf",))
+    outcome = replay_log(logs.clean(sure), configuration(), ("ekf",))
     refused = outcome.metrics["ekf"]["refused_gnss_position"]
     assert refused > len(log.gnss) / 3
     told = rf"ekf: {refused} of \d+ measurements of 'gnss_position' were refused"

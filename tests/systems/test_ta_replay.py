@@ -76,7 +76,7 @@ longest_block = "0.2 s"
 """
 PAIR = scenario.parse(Replay, TEXT)
 PRODUCT = product_contender(PAIR, "product", PAIR.believed)
-RUNS = 4
+RUNS = 2
 
 
 def read_back(dataset, folder):
