@@ -13,6 +13,7 @@ from robins.campaign.bound import bound_sigma
 from robins.systems.airship.problem import airship_problem
 
 FIRST_LOST, LAST_LOST = 399, 698  # numbers of the epochs that end at 400 s and 699 s
+ANY = (0.0, np.inf)
 CERTIFIED = (  # filters that `make certify` alone runs
     *("cukf-exact", "cukf-hard", "cukf-hard-gated", "cukf-wind-states", "cukf-printed"),
     *("federated", "intersection", "distributed-full", "ukf-printed-h"),
@@ -27,9 +28,6 @@ def test_a_filter_of_the_campaigns_can_be_traced(name):
     error, nees = flights("s1")._replace(problem=problem).traced(name)
     assert error.shape == (20, 800, 9)
     assert nees.shape == (20, 800)
-
-
-ANY = (0.0, np.inf)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,20 @@ SHORT = ('imu.rate="10 Hz"', 'duration="60 s"', 'counted={begin="10 s", end="60 
 STEEP = ('start.attitude=["2 deg", "3 deg", "20 deg"]',)  # no small angle
 
 
+@jax.jit
+@jax.vmap
+def compared(total, fed, truth):
+    """What the two estimates differ by, the error of the total state, and its sigma; (9,)."""
+
+    def away(a, b):
+        parts = (a.q_nb.local(b.q_nb), b.v_n - a.v_n, a.position.local(b.position))
+        return jax.numpy.concatenate(parts)
+
+    return away(total.mean, fed.mean.nav), away(total.mean, truth), total.sigma
+
+
 def solved(settings):
-    """What the two estimates differ by, the error of the total state, and its sigma; (60, 9)."""
+    """Estimates of both filters compared, (60, 9)."""
     text = SYSTEM.scenarios["s0"].read_text()
     given = scenario.parse(Airship, text, (*SHORT, *settings), source="s0")
     problem = airship_problem(given, ("centralised", "centralised-errors"), seed=3)
@@ -22,14 +34,7 @@ def solved(settings):
         case = contender.case(world)
         solution = run(contender.filter, contender.model, case.start, case.y, case.u, case.aux)
         beliefs.append(solution.steps.posterior)
-
-    def away(a, b):
-        parts = (a.q_nb.local(b.q_nb), b.v_n - a.v_n, a.position.local(b.position))
-        return jax.numpy.concatenate(parts)
-
-    total, errors = beliefs[0], jax.vmap(lambda fed: fed.nav)(beliefs[1].mean)
-    apart, off = (jax.vmap(away)(total.mean, other) for other in (errors, world.truth))
-    return tuple(np.asarray(x) for x in (apart, off, jax.vmap(lambda b: b.sigma)(total)))
+    return map(np.asarray, compared(*beliefs, world.truth))
 
 
 def test_errors_fed_back_are_the_total_state():
