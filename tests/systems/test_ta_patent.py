@@ -105,7 +105,8 @@ def flights(name):
 def reached(name, filter_):
     """RMS of attitude over all axes ['], and the codes that predictions gave."""
     given = parsed(name)
-    contender = patent.contender(given, filter_, lay_out(given).epoch_s, least())
+    gamma = least() if filter_ in patent.FIXED else math.nan
+    contender = patent.contender(given, filter_, lay_out(given).epoch_s, gamma)
     error, _, code = errors_of(contender, flights(name))
     rms = math.sqrt(np.mean(error[:, COUNT_FROM:, :3] ** 2)) / patent.ARCMIN
     return rms, np.unique(code).tolist()
