@@ -3,155 +3,99 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
-from robins.logs.findings import LogError
+from robins.logs.findings import LogError, refused
+from robins.logs.tables import Table
 from robins.logs.timebase import LIMIT_NS
 
-# Columns and the number of components of each; None: one number a row.
-_IMU: dict[str, int | None] = {"gyro": 3, "accel": 3}
-_GNSS: dict[str, int | None] = {
-    "lat_rad": None,
-    "lon_rad": None,
-    "alt_m": None,
-    "sigma_m": 3,
-    "v_n": 3,
-    "sigma_v": 3,
+AnyTable = TypeVar("AnyTable", bound=Table)
+
+# Columns of real numbers and how many components each has; 0: one number a row.
+_PLACE = {"lat_rad": 0, "lon_rad": 0, "alt_m": 0}
+_FLOATS: dict[type, dict[str, int]] = {
+    ImuTable: {"gyro": 3, "accel": 3},
+    GnssTable: _PLACE | {"sigma_m": 3, "v_n": 3, "sigma_v": 3},
+    Trajectory: _PLACE | {"v_n": 3, "q_nb": 4, "omega_ib_b": 3},
+    MagTable: {"field_t": 3},
+    AttitudeTable: {"q_nb": 4},
 }
-_TRUTH: dict[str, int | None] = {
-    "lat_rad": None,
-    "lon_rad": None,
-    "alt_m": None,
-    "v_n": 3,
-    "q_nb": 4,
-    "omega_ib_b": 3,
-}
-_OPTIONAL = {"v_n", "sigma_v", "quality", "rows", "omega_ib_b"}
+_OPTIONAL = {(GnssTable, "v_n"), (GnssTable, "sigma_v"), (Trajectory, "omega_ib_b")}
 
 
-def checked_imu(imu: ImuTable) -> ImuTable:
+def checked(table: AnyTable) -> AnyTable:
     """The same table with plain arrays.
 
     Integers, float32, big-endian and strided arrays become contiguous float64 of the same values.
 
     Raises:
-        LogError: an array is missing, not numeric, complex, or of another length; or a stamp is
-            not an integer.
+        LogError: an array is missing, not numeric, complex, or of another length; a stamp is not an
+            integer, ``moving`` not bool; or velocities come without their sigmas.
     """
-    if imu.kind not in ("rate", "increment"):
-        raise LogError(
-            _name(imu),
-            "is neither 'rate' nor 'increment'",
-            "say which of them the rows are",
-            field="kind",
-            value=imu.kind,
+    if isinstance(table, ImuTable) and table.kind not in ("rate", "increment"):
+        raise refused(_name(table), field="kind", value=table.kind)(
+            "is neither 'rate' nor 'increment'", "say which of them the rows are"
         )
-    return dataclasses.replace(imu, **_checked(imu, _IMU, integers=("rows",)))
-
-
-def checked_gnss(gnss: GnssTable) -> GnssTable:
-    """As `checked_imu`; velocities come with their sigmas or not at all."""
-    if (gnss.v_n is None) != (gnss.sigma_v is None):
-        lacking = "sigma_v" if gnss.sigma_v is None else "v_n"
-        raise LogError(
-            _name(gnss), "velocities and their sigmas belong together", f"give {lacking} as well"
-        )
-    return dataclasses.replace(gnss, **_checked(gnss, _GNSS, integers=("quality", "rows")))
-
-
-def checked_truth(truth: Trajectory) -> Trajectory:
-    """As `checked_imu`."""
-    return dataclasses.replace(truth, **_checked(truth, _TRUTH, integers=("rows",)))
-
-
-def checked_mag(mag: MagTable) -> MagTable:
-    """As `checked_imu`."""
-    return dataclasses.replace(mag, **_checked(mag, {"field_t": 3}, integers=("rows",)))
-
-
-def checked_attitude(attitude: AttitudeTable) -> AttitudeTable:
-    """As `checked_imu`; ``moving`` is of bool."""
-    arrays = _checked(attitude, {"q_nb": 4}, integers=("rows",))
-    if attitude.moving is not None:
-        moving = np.asarray(attitude.moving)
-        if moving.dtype.kind != "b":
-            raise LogError(
-                _name(attitude),
-                f"is {moving.dtype}, not bool",
-                "give True and False",
-                field="moving",
-            )
-        arrays["moving"] = _shaped(attitude, "moving", moving, (len(arrays["time_ns"]),))
-    return dataclasses.replace(attitude, **arrays)
-
-
-def _name(table: Any) -> str:
-    return table.source or type(table).__name__
-
-
-def _checked(
-    table: Any, floats: dict[str, int | None], integers: tuple[str, ...]
-) -> dict[str, np.ndarray]:
-    out = {"time_ns": _integers(table, "time_ns")}
+    if isinstance(table, GnssTable) and (table.v_n is None) != (table.sigma_v is None):
+        lacking = "sigma_v" if table.sigma_v is None else "v_n"
+        mend = f"give {lacking} as well"
+        raise LogError(_name(table), "velocities and their sigmas belong together", mend)
+    out = {"time_ns": _stamps(table)}
     n = len(out["time_ns"])
-    # not by np.abs, which leaves the least integer negative
-    if n and not -LIMIT_NS < out["time_ns"].min() <= out["time_ns"].max() < LIMIT_NS:
-        k = int(np.argmax((out["time_ns"] <= -LIMIT_NS) | (out["time_ns"] >= LIMIT_NS)))
-        raise LogError(
-            _name(table),
-            "is 146 years or more from zero",
-            "give int64 nanoseconds; repair or leave out this row",
-            where=f"row {k}" if table.rows is None else f"line {table.rows[k]}",
-            field="time_ns",
-            value=int(out["time_ns"][k]),
-        )
-    for field in integers:
-        if getattr(table, field) is not None:
-            out[field] = _integers(table, field)
-    for field, components in floats.items():
+    for field, components in _FLOATS[type(table)].items():
         value = getattr(table, field)
-        if value is None and field in _OPTIONAL:
+        if value is None and (type(table), field) in _OPTIONAL:
             continue
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
-            raise LogError(
-                _name(table),
+            raise refused(_name(table), field=field)(
                 f"holds {array.dtype}, not real numbers",
                 "give an array of floats, nan where a number is missing",
-                field=field,
             )
-        out[field] = _shaped(table, field, array, (n,) if components is None else (n, components))
-    for field in integers:
-        if field in out:
-            _shaped(table, field, out[field], (n,))
-    return {k: v if k in ("time_ns", *integers) else _plain(v) for k, v in out.items()}
+        shape = (n, components) if components else (n,)
+        out[field] = np.ascontiguousarray(_shaped(table, field, array, shape), np.float64)
+    for field in ("quality", "rows"):
+        if getattr(table, field, None) is not None:
+            out[field] = _shaped(table, field, _integers(table, field, "give integers"), (n,))
+    if isinstance(table, AttitudeTable) and table.moving is not None:
+        moving = np.asarray(table.moving)
+        if moving.dtype.kind != "b":
+            raise refused(_name(table), field="moving")(
+                f"is {moving.dtype}, not bool", "give True and False"
+            )
+        out["moving"] = _shaped(table, "moving", moving, (n,))
+    return dataclasses.replace(table, **out)
 
 
-def _plain(array: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(array, np.float64)
+def _name(table: Table) -> str:
+    return table.source or type(table).__name__
 
 
-def _integers(table: Any, field: str) -> np.ndarray:
+def _stamps(table: Table) -> np.ndarray:
+    time_ns = _integers(table, "time_ns", "give time as int64 nanoseconds")
+    beyond = (time_ns <= -LIMIT_NS) | (time_ns >= LIMIT_NS)
+    if beyond.any():
+        k = int(np.argmax(beyond))
+        where = f"row {k}" if table.rows is None else f"line {table.rows[k]}"
+        raise refused(_name(table), where, "time_ns", int(time_ns[k]))(
+            "is 146 years or more from zero", "give int64 nanoseconds; repair or leave out this row"
+        )
+    return time_ns
+
+
+def _integers(table: Table, field: str, mend: str) -> np.ndarray:
     array = np.asarray(getattr(table, field))
     if array.dtype.kind not in "iu" or array.ndim != 1:
-        raise LogError(
-            _name(table),
-            f"is {array.dtype} of shape {array.shape}, not a row of integers",
-            "give time as int64 nanoseconds" if field == "time_ns" else "give integers",
-            field=field,
-        )
+        cause = f"is {array.dtype} of shape {array.shape}, not a row of integers"
+        raise refused(_name(table), field=field)(cause, mend)
     return np.ascontiguousarray(array, np.int64)
 
 
-def _shaped(table: Any, field: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _shaped(table: Table, field: str, array: np.ndarray, shape: tuple[int, ...]) -> Any:
     if array.shape != shape:
-        raise LogError(
-            _name(table),
-            f"has shape {array.shape} where {shape} is needed",
-            "one row for each time stamp",
-            field=field,
-        )
+        cause = f"has shape {array.shape} where {shape} is needed"
+        raise refused(_name(table), field=field)(cause, "one row for each time stamp")
     return array

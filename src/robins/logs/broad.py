@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
-from robins.logs.findings import Finding, LogError
+from robins.logs.findings import Finding, LogError, refused
 from robins.logs.opening import whole
 from robins.logs.text import Head
 from robins.logs.unit_length import unit_quaternions
@@ -113,11 +113,9 @@ def _members(file: str) -> dict[str, np.ndarray]:
 def _array(file: str, archive: zipfile.ZipFile, name: str) -> np.ndarray:
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > _LARGEST:
-        raise LogError(
-            file,
+        raise refused(file, field=name)(
             f"would take {member.file_size >> 20} MiB, more than {_LARGEST >> 20} MiB",
             "cut the recording into parts",
-            field=name,
         )
     data = io.BytesIO(archive.read(member))
     try:
@@ -125,12 +123,12 @@ def _array(file: str, archive: zipfile.ZipFile, name: str) -> np.ndarray:
             warnings.simplefilter("error")  # NumPy warns of arrays that Python 2 wrote
             array: Any = np.lib.format.read_array(data, allow_pickle=False)
     except (ValueError, UserWarning) as error:
-        raise LogError(
-            file, f"is no plain array ({error})", "save it as numbers, without pickle", field=name
+        raise refused(file, field=name)(
+            f"is no plain array ({error})", "save it as numbers, without pickle"
         ) from error
     if data.read(1):
-        raise LogError(
-            file, "holds more than its header says", "save it again with numpy.savez", field=name
+        raise refused(file, field=name)(
+            "holds more than its header says", "save it again with numpy.savez"
         )
     return array
 
@@ -140,12 +138,9 @@ def _rate(file: str, value: np.ndarray) -> float:
         raise _misfit(file, "sampling_rate", value, "() of a real number")
     rate = float(value.reshape(()))
     if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
-        raise LogError(
-            file,
+        raise refused(file, field="sampling_rate", value=rate)(
             f"is not between {_RATES_HZ[0]:g} and {_RATES_HZ[1]:g} Hz, and time is made from it",
             "give samples a second",
-            field="sampling_rate",
-            value=rate,
         )
     return rate
 
@@ -154,15 +149,13 @@ def _rows_of(file: str, name: str, array: np.ndarray, width: int) -> np.ndarray:
     if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
         raise _misfit(file, name, array, f"(n, {width}) of real numbers")
     if not len(array):
-        raise LogError(file, "has no rows", "record it again", field=name)
+        raise refused(file, field=name)("has no rows", "record it again")
     with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
         return np.ascontiguousarray(array, np.float64)
 
 
 def _misfit(file: str, name: str, array: np.ndarray, wanted: str) -> LogError:
-    return LogError(
-        file,
+    return refused(file, field=name)(
         f"is {array.dtype} of shape {array.shape} where {wanted} is needed",
         "save the arrays as BROAD does",
-        field=name,
     )

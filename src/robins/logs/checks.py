@@ -10,22 +10,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from robins.logs import (
-    checks_attitude,
-    checks_columns,
-    checks_gnss,
-    checks_imu,
-    checks_limits,
-    checks_mag,
-    checks_mag_axes,
-    checks_master,
-    checks_motion,
-    checks_span,
-    checks_time,
-    checks_turning,
-    checks_velocity,
-)
+from robins.logs.checks_attitude import check_attitude
+from robins.logs.checks_gnss import check_gnss, check_velocity
+from robins.logs.checks_imu import check_columns, check_imu
+from robins.logs.checks_mag import check_mag, check_mag_axes
+from robins.logs.checks_master import check_master
+from robins.logs.checks_motion import check_motion, check_turning
+from robins.logs.checks_time import check_span, check_time
 from robins.logs.findings import Finding
+from robins.logs.limits import check_limits
 
 _NONE: frozenset[str] = frozenset()
 
@@ -94,7 +87,7 @@ _NO_PLACE = frozenset(("position_unit", "no_fix_as_zero"))
 ALONE = (
     Check(
         "In time",
-        checks_time.check_time,
+        check_time,
         "stamps unit_known",
         (
             Code("too_short", "error", "fewer than two samples; nothing can be run on that"),
@@ -112,13 +105,13 @@ ALONE = (
     ),
     Check(
         "In the numbers of any table",
-        checks_limits.check_limits,
+        check_limits,
         "table",
         (Code("absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"),),
     ),
     Check(
         "In the inertial samples",
-        checks_columns.check_columns,
+        check_columns,
         "imu",
         (
             Code("column_missing", "error", "a column without a number"),
@@ -131,7 +124,7 @@ ALONE = (
     ),
     Check(
         "In the inertial samples",
-        checks_imu.check_imu,
+        check_imu,
         "imu in_vehicle",
         (
             Code("no_samples", "error", "fewer than ten samples have all six numbers"),
@@ -150,7 +143,7 @@ ALONE = (
     ),
     Check(
         "In the GNSS fixes",
-        checks_gnss.check_gnss,
+        check_gnss,
         "gnss",
         (
             Code("gnss_missing", "error, warning or note", "components; the others are used"),
@@ -167,14 +160,14 @@ ALONE = (
     ),
     Check(
         "In the GNSS fixes",
-        checks_velocity.check_velocity,
+        check_velocity,
         "gnss",
         (*_OF_VELOCITY, Code("velocity_sign", "error", "a vertical velocity of the other sign")),
         silenced_by=_NO_PLACE,
     ),
     Check(
         "In the magnetic field",
-        checks_mag.check_mag,
+        check_mag,
         "mag",
         (
             Code("field_missing", "warning", "samples without a number"),
@@ -203,7 +196,7 @@ _GYROS_WRONG = {"gyro_unit", "gyro_axes", "gyro_reversed", "left_handed"}
 TOGETHER = (
     Check(
         "In time",
-        checks_span.check_span,
+        check_span,
         "imu others",
         (
             Code("no_overlap", "error", "the files share no time; names the offset that would fit"),
@@ -213,7 +206,7 @@ TOGETHER = (
     ),
     Check(
         "In a master and the IMU to be aligned to it",
-        checks_master.check_master,
+        check_master,
         "imu master delay_s",
         (
             Code("master_missing", "error or warning", "position, velocity or attitude"),
@@ -245,7 +238,7 @@ TOGETHER = (
     ),
     Check(
         "In IMU and GNSS together",
-        checks_motion.check_motion,
+        check_motion,
         "imu gnss",
         (
             Code("motion_not_checked", "note", "too little motion to compare them"),
@@ -266,7 +259,7 @@ TOGETHER = (
     ),
     Check(
         "In an IMU that was turned about",
-        checks_turning.check_turning,
+        check_turning,
         "imu",
         (
             Code("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit"),
@@ -280,7 +273,7 @@ TOGETHER = (
     ),
     Check(
         "In the magnetic field",
-        checks_mag_axes.check_mag_axes,
+        check_mag_axes,
         "imu mag",
         (Code("field_axes", "error", "it turns as the gyros say only with other columns"),),
         silenced_by=_SPOILT | _GYROS_WRONG | {"field_unit", "field_stuck"},
@@ -288,7 +281,7 @@ TOGETHER = (
     ),
     Check(
         "In the attitudes",
-        checks_attitude.check_attitude,
+        check_attitude,
         "imu attitude",
         (
             Code("attitude_missing", "warning", "there is none"),

@@ -34,11 +34,8 @@ def check_attitude(imu: ImuTable, attitude: AttitudeTable) -> Iterator[Finding]:
     """Findings about attitudes beside an IMU that is sound; see the module."""
     known = np.abs(np.linalg.norm(attitude.q_nb, axis=1) - 1.0) < TOLERANCE
     if not known.any():
-        yield warning(
-            attitude,
-            "attitude_missing",
-            len(attitude),
-            "there is not one attitude in it, so nothing can be compared.",
+        yield warning(attitude, "attitude_missing", len(attitude))(
+            "there is not one attitude in it, so nothing can be compared."
         )
         return
     signal = signal_of(imu)
@@ -66,11 +63,8 @@ def _turning(
     for words, (order, sign) in _ORDERS.items():
         other = q[:, order] * [1.0, sign, sign, sign]
         if (left := _left_over(steps, time_s, other)[0]) < good:
-            yield error(
-                attitude,
-                "attitude_order",
-                float(as_is),
-                f"{shown}, but they do ({left:.0%}) if the quaternions are {words}.",
+            yield error(attitude, "attitude_order", float(as_is))(
+                f"{shown}, but they do ({left:.0%}) if the quaternions are {words}."
             )
             return
     maps = signed_permutations()
@@ -78,20 +72,14 @@ def _turning(
     left = _left_over(steps, time_s, q, maps)
     k = int(np.argmin(left))
     if left[k] < good:
-        yield error(
-            attitude,
-            "attitude_axes",
-            float(as_is),
+        yield error(attitude, "attitude_axes", float(as_is))(
             f"{shown}, but they do ({left[k]:.0%}) with the gyros {words_of(maps[k], 'gyro')}. "
-            "They are those of a body with other axes than the sensor's; turn one into the other.",
+            "They are those of a body with other axes than the sensor's; turn one into the other."
         )
         return
-    yield warning(
-        attitude,
-        "attitude_disagrees",
-        float(as_is),
+    yield warning(attitude, "attitude_disagrees", float(as_is))(
         f"{shown}, whatever order, sense or axes are tried. They are of another body or another "
-        "time; what is compared with them will seem wrong.",
+        "time; what is compared with them will seem wrong."
     )
 
 
@@ -128,13 +116,10 @@ def _upright(
         if up < -_UPRIGHT
         else "The frame they refer to does not stand upright, or is of another body"
     )
-    yield error(
-        attitude,
-        "attitude_frame",
-        float(up),
+    yield error(attitude, "attitude_frame", float(up))(
         f"at rest the specific force points along ({x:+.2f}, {y:+.2f}, {z:+.2f}) by these "
         f"attitudes, where {attitude.nav} has up at (0, 0, {1 if other == 'NED' else -1}). "
-        f"{cause}.",
+        f"{cause}."
     )
 
 

@@ -1,4 +1,7 @@
-"""The doctor on GNSS fixes: place, height, sigmas, quality, decimals."""
+"""The doctor on GNSS fixes: place, height, sigmas, quality, decimals.
+
+And on their velocities, against differences of the positions: axes, unit, sign, delay.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,10 @@ import numpy as np
 
 from robins.dataset import GnssTable
 from robins.logs.findings import Finding
+from robins.logs.gnss_motion import Steps, Track, lateness, steps_of, track_of
 from robins.logs.limits import ALT_LIMIT_M, LAT_LIMIT, LON_LIMIT, SPEED_LIMIT
 from robins.logs.quiet import error, finding, median_of, note, warning
+from robins.logs.tables import place_of
 
 _AXES = {"NED": ("north", "east", "down"), "ENU": ("east", "north", "up")}
 
@@ -48,10 +53,11 @@ def _missing(gnss: GnssTable) -> Iterator[Finding]:
                 gnss,
                 "gnss_missing",
                 int(bad.sum()),
+                k,
+            )(
                 f"{name} is {column[k]:g} here, missing or impossible in {bad.sum()} of "
                 f"{len(gnss)} fixes. The receiver had none, or the columns are others; `clean` "
-                "leaves it out and keeps the other components of those fixes.",
-                k,
+                "leaves it out and keeps the other components of those fixes."
             )
 
 
@@ -70,35 +76,24 @@ def _place(gnss: GnssTable) -> Iterator[Finding]:
             cause = "They are degrees where radians are needed; convert them (numpy.deg2rad)"
         else:
             cause = "The columns are not latitude and longitude, or scaled (1e-7 deg?); check them"
-        yield error(
-            gnss,
-            "position_unit",
-            float(lat_deg),
+        yield error(gnss, "position_unit", float(lat_deg), k)(
             f"latitude {lat_deg:.6g} deg, longitude {lon_deg:.6g} deg is no place on Earth "
-            f"({beyond.sum()} of {len(gnss)} fixes). {cause}.",
-            k,
+            f"({beyond.sum()} of {len(gnss)} fixes). {cause}."
         )
         return
     zero = known & (lat == 0.0) & (lon == 0.0)
     if zero.any():
-        yield error(
-            gnss,
-            "no_fix_as_zero",
-            int(zero.sum()),
+        yield error(gnss, "no_fix_as_zero", int(zero.sum()), int(np.argmax(zero)))(
             f"latitude and longitude are both exactly 0 in {zero.sum()} of {len(gnss)} fixes. The "
-            "receiver had no fix and wrote zeros; delete those lines, or write nan.",
-            int(np.argmax(zero)),
+            "receiver had no fix and wrote zeros; delete those lines, or write nan."
         )
     elif np.all(np.abs(np.rad2deg(lat[known])) <= np.pi / 2) and np.all(
         np.abs(np.rad2deg(lon[known])) <= np.pi
     ):
-        yield warning(
-            gnss,
-            "position_in_radians",
-            float(np.rad2deg(lat[known][0])),
+        yield warning(gnss, "position_in_radians", float(np.rad2deg(lat[known][0])))(
             f"all places lie within latitude {np.rad2deg(lat[known][0]):.5f} deg, longitude "
             f"{np.rad2deg(lon[known][0]):.5f} deg or so, in the Gulf of Guinea. The file probably "
-            "holds radians where degrees are expected; convert them, unless you were there.",
+            "holds radians where degrees are expected; convert them, unless you were there."
         )
 
 
@@ -106,20 +101,14 @@ def _height(gnss: GnssTable) -> Iterator[Finding]:
     alt = median_of(gnss.alt_m)
     if alt < -500.0 or alt > 12_000.0:
         hidden = alt < -12_000.0 or alt > 2_000_000.0
-        yield finding(
-            "error" if hidden else "warning",
-            gnss,
-            "height",
-            alt,
+        yield finding("error" if hidden else "warning", gnss, "height", alt)(
             f"the median height is {alt:.6g} m, where nobody drives, sails or flies by air. The "
-            "column is in mm or feet, or is another one; if this is a rocket, all is well.",
+            "column is in mm or feet, or is another one; if this is a rocket, all is well."
         )
 
 
 def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
-    groups = [
-        ("position", "m", gnss.sigma_m, np.stack([gnss.lat_rad, gnss.lon_rad, gnss.alt_m], -1))
-    ]
+    groups = [("position", "m", gnss.sigma_m, place_of(gnss))]
     if gnss.sigma_v is not None and gnss.v_n is not None:
         groups.append(("velocity", "m/s", gnss.sigma_v, gnss.v_n))
     for what, unit, sigma, values in groups:
@@ -127,32 +116,22 @@ def _sigmas(gnss: GnssTable) -> Iterator[Finding]:
         if bad.any():
             k = int(np.argmax(bad))
             shown = ", ".join(f"{s:g}" for s in sigma[k])
-            yield error(
-                gnss,
-                "sigma_not_positive",
-                int(bad.sum()),
+            yield error(gnss, "sigma_not_positive", int(bad.sum()), k)(
                 f"the {what} sigmas are ({shown}) {unit} here, and not all positive in {bad.sum()} "
                 f"of {len(gnss)} fixes. Zero means unknown, but a filter takes it for exact and "
-                "ends in NaN; write real sigmas (RTK 0.02 m, code 2 m; velocity 0.05 m/s).",
-                k,
+                "ends in NaN; write real sigmas (RTK 0.02 m, code 2 m; velocity 0.05 m/s)."
             )
         if np.isfinite(values).any() and np.isnan(sigma).all():
-            yield error(
-                gnss,
-                "sigma_missing",
-                len(gnss),
+            yield error(gnss, "sigma_missing", len(gnss))(
                 f"the {what} has no sigma in any fix. A filter cannot weigh it; write real sigmas "
-                "(RTK 0.02 m, code 2 m; velocity 0.05 m/s).",
+                "(RTK 0.02 m, code 2 m; velocity 0.05 m/s)."
             )
         typical = median_of(sigma[sigma > 0.0])
         if typical < 1e-3 or typical > 1e3:
-            yield warning(
-                gnss,
-                "sigma_absurd",
-                typical,
+            yield warning(gnss, "sigma_absurd", typical)(
                 f"the {what} sigmas are {typical:.3g} {unit} (median), which no receiver has. "
                 f"They may be variances or in another unit; a filter would "
-                f"{'trust them blindly' if typical < 1 else 'ignore the fixes'}.",
+                f"{'trust them blindly' if typical < 1 else 'ignore the fixes'}."
             )
 
 
@@ -168,14 +147,10 @@ def _quality(gnss: GnssTable) -> Iterator[Finding]:
     if 0.0 < unsure < 1.5 * sure:
         ratio = unsure / sure
         share = "the sigma" if abs(ratio - 1.0) < 0.05 else f"{ratio:.2g} times the sigma"
-        yield warning(
-            gnss,
-            "float_sigma",
-            ratio,
+        yield warning(gnss, "float_sigma", ratio, k)(
             f"{other.sum()} of {len(gnss)} fixes are float or worse (Q > 1), the first of them "
             f"here, but state {share} of fixed ones ({unsure:.3g} m). The receiver is too sure of "
-            "them; scale their sigmas, by 2 for float and 5 for single.",
-            k,
+            "them; scale their sigmas, by 2 for float and 5 for single."
         )
 
 
@@ -187,11 +162,145 @@ def _resolution(gnss: GnssTable) -> Iterator[Finding]:
     step_m = float(np.min(np.diff(lat_deg))) * 111_000.0
     sigma = median_of(gnss.sigma_m[:, 0])
     if step_m > sigma > 0.0:
-        yield note(
-            gnss,
-            "position_resolution",
-            step_m,
+        yield note(gnss, "position_resolution", step_m)(
             f"latitude is written in steps of {step_m * 1e3:.1f} mm, its sigma is "
             f"{sigma * 1e3:.1f} mm. The file has too few decimals for such good fixes; that adds "
-            f"{step_m / np.sqrt(12.0) * 1e3:.1f} mm of noise. Write nine decimals.",
+            f"{step_m / np.sqrt(12.0) * 1e3:.1f} mm of noise. Write nine decimals."
         )
+
+
+_SCALES = {
+    3.6: ("km/h", "divide them by 3.6"),
+    1.0 / 0.514444: ("knots", "multiply them by 0.514444"),
+    1.0 / 0.3048: ("ft/s", "multiply them by 0.3048"),
+    100.0: ("cm/s", "divide them by 100"),
+    1000.0: ("mm/s", "divide them by 1000"),
+}
+_LATE_S = 0.03
+
+
+def check_velocity(gnss: GnssTable) -> Iterator[Finding]:
+    """Findings about velocities; none if there are none, or if the receiver hardly moves."""
+    track = track_of(gnss)
+    steps = steps_of(track) if track else None
+    if track is None or steps is None:
+        return
+    late = lateness(track)
+    if late is not None:
+        steps = steps_of(track, late) or steps
+    p, v = steps.of_position[:, :2], steps.of_velocity[:, :2]
+    change, scale = _horizontal(p, v)
+    if change is None:
+        left = float(np.sum((p - v) ** 2) / np.sum(p**2))
+        if left > 0.5:
+            yield _disagreement(gnss, left)
+        return
+    if change:
+        yield _wrong_axes(gnss, change)
+    elif abs(scale - 1.0) > 0.1:
+        yield _wrong_scale(gnss, 1.0 / scale)
+    # East, north, up for north, east, down reverses the third axis too; said once is enough.
+    if "exchanged" not in change and _vertical_reversed(steps, track):
+        names = ("down", "up") if gnss.nav == "NED" else ("up", "down")
+        yield error(gnss, "velocity_sign", "vertical")(
+            f"the height changes against the vertical velocity. The third component is probably "
+            f"{names[1]}, not {names[0]}; turn its sign."
+        )
+    if not change and late is not None and abs(late) > _LATE_S:
+        yield _late(gnss, track, late)
+
+
+def _disagreement(gnss: GnssTable, left: float) -> Finding:
+    return warning(gnss, "velocity_disagrees", left)(
+        "the velocities do not describe the motion of the positions, in whatever order, sign or "
+        "unit. One of them belongs to another sensor, time or axis; compare plots of both before "
+        "you trust either."
+    )
+
+
+def _wrong_axes(gnss: GnssTable, change: str) -> Finding:
+    exchanged = "exchanged" in change
+    if exchanged and _place_exchanged(gnss):
+        cause = "Latitude and longitude are exchanged; name the columns the other way round"
+    elif exchanged:
+        other = _AXES["ENU" if gnss.nav == "NED" else "NED"]
+        cause = (
+            f"The velocity columns are probably {', '.join(other)}, not "
+            f"{', '.join(_AXES[gnss.nav])}; say so or reorder them"
+        )
+    else:
+        cause = "A sign convention differs (south or west positive); turn that sign"
+    return error(gnss, "velocity_axes", change)(
+        f"the positions move as the velocities say only with {change}. {cause}."
+    )
+
+
+def _late(gnss: GnssTable, track: Track, late: float) -> Finding:
+    epoch = float(np.median(np.diff(track.time_s)))
+    half = abs(late - epoch / 2) < 0.2 * epoch
+    cause = (
+        " That is half an epoch: the receiver gives the mean velocity of the last epoch."
+        if half
+        else ""
+    )
+    return warning(gnss, "velocity_late", late)(
+        f"the velocities are {abs(late):.2f} s {'older' if late > 0 else 'younger'} than their "
+        f"stamps, judged by the positions.{cause} At 2 m/s^2 that is {2 * abs(late):.2f} m/s of "
+        "error: take them at their true time, or raise their sigmas."
+    )
+
+
+def _horizontal(p: np.ndarray, v: np.ndarray) -> tuple[str | None, float]:
+    """How v must be changed to fit p: words (empty: not at all; None: nothing fits) and scale."""
+    best = ("", 0.0, np.inf)
+    as_is = np.inf
+    for exchange in (False, True):
+        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            turned = (v[:, ::-1] if exchange else v) * signs
+            scale = max(float(np.sum(p * turned) / np.sum(v * v)), 0.0)
+            left = float(np.sum((p - scale * turned) ** 2) / np.sum(p * p))
+            words = "exchanged horizontal axes" if exchange else ""
+            minus = [name for name, s in zip(("north", "east"), signs, strict=True) if s < 0]
+            if minus:
+                words += f"{' and ' if words else ''}reversed {' and '.join(minus)}"
+            if words == "":
+                as_is = left
+            if scale > 0 and left < best[2]:
+                best = (words, scale, left)
+    if best[2] > 0.3:
+        return None, 0.0
+    # Along a straight road several changes fit alike; then nothing is wrong.
+    if best[0] != "" and as_is < 3.0 * best[2] + 0.02:
+        return "", float(np.sum(p * v) / np.sum(v * v))
+    return best[0], best[1]
+
+
+def _vertical_reversed(steps: Steps, track: Track) -> bool:
+    p, v = (x[:, 2] - x[:, 2].mean() for x in steps)
+    if np.std(p) < max(3.0 * track.sigma_m, 0.05) or np.std(v) == 0.0:
+        return False
+    return float(np.sum(p * v) / np.sqrt(np.sum(p * p) * np.sum(v * v))) < -0.5
+
+
+def _place_exchanged(gnss: GnssTable) -> bool:
+    """Whether exchanging latitude and longitude explains more than exchanging velocities."""
+    tracks = track_of(gnss, swap=True), track_of(gnss)
+    swapped, as_is = (steps_of(track) if track else None for track in tracks)
+    if swapped is None or as_is is None:
+        return False
+    by_place = np.sum((swapped.of_position - swapped.of_velocity)[:, :2] ** 2)
+    turned = as_is.of_velocity[:, [1, 0]]
+    return bool(by_place < np.sum((as_is.of_position[:, :2] - turned) ** 2))
+
+
+def _wrong_scale(gnss: GnssTable, ratio: float) -> Finding:
+    known = [words for value, words in _SCALES.items() if abs(ratio / value - 1.0) < 0.05]
+    if known:
+        cause = f"They are probably in {known[0][0]}: {known[0][1]}"
+    elif 10.0 < ratio < 60.0 and abs(median_of(gnss.lat_rad)) < np.deg2rad(np.pi / 2):
+        cause = "The positions are radians that were read as degrees: convert them"
+    else:
+        cause = "A unit or a column is wrong; compare with a known speed"
+    return error(gnss, "velocity_unit", ratio)(
+        f"velocities are {ratio:.3g} times what the positions say. {cause}."
+    )

@@ -2,6 +2,11 @@
 
 The Earth's field is 20 to 70 uT strong everywhere on the ground, so its size tells the unit, and a
 size that changes with the direction tells of iron or magnets that turn with the sensor.
+
+It stands still, so from one moment to the next it must turn in the sensor as the gyros say,
+m(t + dt) = C' m(t). Magnetometers are chips of their own, and often sit otherwise than the gyros
+beside them. Each way to exchange and reverse the columns is tried, with an offset (hard iron) of
+its own; a field and its opposite turn alike, so of each pair only the right-handed one is.
 """
 
 from __future__ import annotations
@@ -10,11 +15,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robins.dataset import MagTable
-from robins.logs.checks_columns import longest_run
+from robins.dataset import ImuTable, MagTable
+from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding, Severity
 from robins.logs.limits import FIELD_LIMIT_T, few_beyond
-from robins.logs.quiet import error, finding, note, usual_step_s, warning
+from robins.logs.motion import at, signed_permutations
+from robins.logs.ordering import increasing
+from robins.logs.quiet import error, finding, longest_run, note, signal_of, usual_step_s, warning
+from robins.logs.steps import steps_of
 
 EARTH_T = (20e-6, 70e-6)
 _FEW = 10  # samples below which nothing is judged
@@ -79,14 +87,10 @@ def _missing(mag: MagTable, good: np.ndarray) -> Finding:
     first, bad = int(np.argmin(good)), int(np.count_nonzero(~good))
     lacking = [a for a, c in zip("xyz", mag.field_t.T, strict=True) if not np.isfinite(c).any()]
     whole = f"; of {', '.join(f'field_{a}' for a in lacking)} there is nothing at all"
-    return warning(
-        mag,
-        "field_missing",
-        bad,
+    return warning(mag, "field_missing", bad, first)(
         f"{bad} of {len(mag)} samples ({bad / len(mag):.1%}) of the magnetic field are not numbers"
         f"{whole if lacking else ', this one first'}. What is missing is not used; heading is held "
-        "by the gyros meanwhile.",
-        first,
+        "by the gyros meanwhile."
     )
 
 
@@ -94,25 +98,19 @@ def _zero(mag: MagTable, zero: np.ndarray) -> Finding:
     count = int(np.count_nonzero(zero))
     everywhere = count == len(mag)
     return finding(
-        "error" if everywhere else "warning",
-        mag,
-        "field_zero",
-        count,
+        "error" if everywhere else "warning", mag, "field_zero", count, int(np.argmax(zero))
+    )(
         f"the magnetic field is exactly 0 0 0 in {count} of {len(mag)} samples"
         f"{'' if everywhere else ', this one first'}. The sensor was not connected or not yet "
-        "measuring; write nan there, for a field of zero has no direction.",
-        int(np.argmax(zero)),
+        "measuring; write nan there, for a field of zero has no direction."
     )
 
 
 def _dead(mag: MagTable, axes: list[str], field: np.ndarray) -> Finding:
     value = float(field["xyz".index(axes[0])])
-    return error(
-        mag,
-        "field_stuck",
-        value,
+    return error(mag, "field_stuck", value)(
         f"field_{', field_'.join(axes)} never changes ({value * 1e6:.4g} uT in every sample). A "
-        "real sensor always has noise: the axis is dead, or this is another column.",
+        "real sensor always has noise: the axis is dead, or this is another column."
     )
 
 
@@ -120,16 +118,13 @@ def _unit(mag: MagTable, size: float) -> Iterator[Finding]:
     shown = f"the magnetic field is {size * 1e6:.4g} uT strong where the Earth's is 20 to 70"
     for shift, (severity, cause, mend) in _SHIFTS.items():
         if EARTH_T[0] <= size / 10.0**shift <= EARTH_T[1]:
-            yield finding(severity, mag, "field_unit", size, f"{shown}. {cause}: {mend}.")
+            yield finding(severity, mag, "field_unit", size)(f"{shown}. {cause}: {mend}.")
             return
     # Iron in the casing of a cheap sensor is often stronger than the Earth's field.
     if not EARTH_T[0] / 2 <= size <= 10 * EARTH_T[1]:
-        yield error(
-            mag,
-            "field_unit",
-            size,
+        yield error(mag, "field_unit", size)(
             f"{shown}, and no usual unit makes it that. These are counts of a converter, or other "
-            "columns.",
+            "columns."
         )
 
 
@@ -137,14 +132,10 @@ def _stuck(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Findi
     start, length = longest_run(~fresh)
     step_s = usual_step_s(mag.time_ns)
     if length >= _STUCK_SAMPLES and length * step_s >= _STUCK_S:
-        yield warning(
-            mag,
-            "field_stuck_for_a_while",
-            length,
+        yield warning(mag, "field_stuck_for_a_while", length, int(rows[max(start - 1, 0)]))(
             f"the magnetic field does not change at all for {length + 1} samples "
             f"({length * step_s:.1f} s) from here. The sensor or its bus hung; a filter would take "
-            "this for a perfect measurement, so write nan there.",
-            int(rows[max(start - 1, 0)]),
+            "this for a perfect measurement, so write nan there."
         )
 
 
@@ -152,13 +143,10 @@ def _repeated(mag: MagTable, fresh: np.ndarray) -> Iterator[Finding]:
     share = 1.0 - float(fresh.mean())
     if share > _REPEATED and fresh.sum() > _FEW:
         rate = 1.0 / usual_step_s(mag.time_ns)
-        yield note(
-            mag,
-            "field_repeated",
-            share,
+        yield note(mag, "field_repeated", share)(
             f"{share:.0%} of the samples of the magnetic field repeat the one before: the sensor "
             f"measures about {rate * (1.0 - share):.3g} times a second, the log has {rate:.4g} "
-            "rows a second. The noise of one row is that of fewer measurements than it seems.",
+            "rows a second. The noise of one row is that of fewer measurements than it seems."
         )
 
 
@@ -172,14 +160,10 @@ def _stopped(mag: MagTable, rows: np.ndarray, fresh: np.ndarray) -> Iterator[Fin
             if abs(extreme) < _STOP_T or length < _STOPPED:
                 continue
             total = int(np.count_nonzero(column == extreme))
-            yield warning(
-                mag,
-                "field_saturated",
-                extreme,
+            yield warning(mag, "field_saturated", extreme, int(rows[readings[start]]))(
                 f"field_{axis} stops at {extreme * 1e6:.6g} uT in {total} readings, {length} in a "
                 "row here, while the others go on. The sensor is saturated by a magnet or iron; "
-                "what it shows there has neither size nor direction of the field.",
-                int(rows[readings[start]]),
+                "what it shows there has neither size nor direction of the field."
             )
 
 
@@ -197,34 +181,24 @@ def _iron(
         steadied = left.std() / left.mean() < 0.5 * size.std() / size.mean()
         if steadied and np.linalg.norm(centre) > 0.1:
             offset = ", ".join(f"{c:+.1f}" for c in centre * usual * 1e6)
-            yield warning(
-                mag,
-                "field_offset",
-                float(np.linalg.norm(centre)) * usual,
+            yield warning(mag, "field_offset", float(np.linalg.norm(centre)) * usual)(
                 f"the size of the magnetic field changes while the sensor turns, {shown}, and it "
                 f"hardly would without an offset of ({offset}) uT. That is hard iron: run "
                 "`robins calibrate` on a log in which the sensor is turned all about, or heading "
-                "errs by several degrees.",
+                "errs by several degrees."
             )
             return
     if (high - low) / usual > _SPREAD:
-        yield warning(
-            mag,
-            "field_varies",
-            float((high - low) / usual),
+        yield warning(mag, "field_varies", float((high - low) / usual))(
             f"the size of the magnetic field changes {shown}. That is hard or soft iron that turns "
             "with the sensor, for which run `robins calibrate`; or it was carried past steel and "
-            "magnets, against which only a filter helps that refuses such samples.",
+            "magnets, against which only a filter helps that refuses such samples."
         )
     elif off.any():
-        yield note(
-            mag,
-            "field_disturbed",
-            float(off.mean()),
+        yield note(mag, "field_disturbed", float(off.mean()), int(rows[np.argmax(off)]))(
             f"the magnetic field is {_FAR:.0%} weaker or stronger than usual in "
             f"{np.count_nonzero(off)} samples ({off.mean():.1%}), this one first. Steel or a "
-            "magnet was near; a filter should not take its heading from them.",
-            int(rows[np.argmax(off)]),
+            "magnet was near; a filter should not take its heading from them."
         )
 
 
@@ -236,3 +210,55 @@ def _centre(field: np.ndarray) -> np.ndarray | None:
     # |m - c|^2 = r^2 is linear in c and in r^2 - |c|^2.
     known = np.column_stack([2.0 * field, np.ones(len(field))])
     return np.linalg.lstsq(known, np.sum(field * field, axis=1), rcond=None)[0][:3]
+
+
+_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change left unexplained
+
+
+def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:
+    """Findings about a field that does not turn as the gyros say; none if they hardly turn."""
+    signal = signal_of(imu)
+    if signal is None or mag.body != imu.body:
+        return
+    time_s, field = _readings(mag, int(imu.time_ns[signal.rows[0]]))
+    steps = steps_of(signal, time_s)
+    if steps is None:
+        return
+    maps = signed_permutations()
+    maps = maps[np.linalg.det(maps) > 0.0]
+    before, after = (at(when, time_s, field) for when in (steps.begin_s, steps.end_s))
+    left = _left_over(before, after, np.swapaxes(steps.C, 1, 2), maps)
+    k = int(np.argmin(left))
+    if left[0] < _WRONG or left[k] > min(_RIGHT, _BETTER * left[0]):
+        return
+    yield error(mag, "field_axes", float(left[0]))(
+        f"the magnetic field does not turn as the gyros say ({left[0]:.0%} of its change is left "
+        f"over), but it does ({left[k]:.0%}) with the columns {words_of(maps[k], 'field')}, or all "
+        "three of these reversed. The magnetometer is mounted otherwise than the gyros: exchange "
+        "its columns so."
+    )
+
+
+def _readings(mag: MagTable, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and field of unit size, each reading once and in order."""
+    good = np.isfinite(mag.field_t).all(axis=1) & (np.linalg.norm(mag.field_t, axis=1) > 0.0)
+    good &= ~few_beyond(mag.field_t, FIELD_LIMIT_T)
+    rows = np.flatnonzero(good)
+    rows = rows[increasing(mag.time_ns[rows])]
+    field = mag.field_t[rows]
+    fresh = np.concatenate([[True], np.diff(field, axis=0).any(axis=1)])[: len(rows)]
+    field = field[fresh]
+    size = np.median(np.linalg.norm(field, axis=1)) if len(field) else 1.0
+    return (mag.time_ns[rows[fresh]] - start_ns) * 1e-9, field / size
+
+
+def _left_over(
+    before: np.ndarray, after: np.ndarray, turn: np.ndarray, maps: np.ndarray
+) -> np.ndarray:
+    """(h,) share of the change of the field that each map and its best offset leave over."""
+    rest = np.einsum("hij,nj->hni", maps, after)
+    rest = rest - np.einsum("nij,hjk,nk->hni", turn, maps, before, optimize=True)
+    by_offset = (np.eye(3) - turn).reshape(-1, 3)
+    flat = rest.reshape(len(maps), -1).T
+    offset = np.linalg.lstsq(by_offset, flat, rcond=1e-3)[0]
+    return np.sum((flat - by_offset @ offset) ** 2, axis=0) / np.sum((after - before) ** 2)

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import GnssTable, ImuTable, Trajectory
 from robins.ins.frames import to_ned_frd
+from robins.logs.checks_gnss import check_velocity
 from robins.logs.checks_imu import UNITS, G
 from robins.logs.checks_motion import SCALES, words_of
-from robins.logs.checks_velocity import check_velocity
 from robins.logs.findings import Finding
 from robins.logs.motion import signed_permutations
 from robins.logs.pair_motion import (
@@ -30,6 +30,7 @@ from robins.logs.pair_motion import (
     turned_by_gyros,
 )
 from robins.logs.quiet import error, finding, name_of, note, usual_step_s
+from robins.logs.tables import place_of
 
 _LEAST_RATE = np.deg2rad(0.5)  # rad/s RMS; below it noise of the attitudes is all there is
 _WELL, _BETTER = 0.3, 0.1  # shares of the turning left unexplained
@@ -93,9 +94,8 @@ def _as_fixes(master: Trajectory) -> GnssTable:
 
 
 def _missing(master: Trajectory) -> Iterator[Finding]:
-    position = np.stack([master.lat_rad, master.lon_rad, master.alt_m], -1)
     for name, values in (
-        ("position", position),
+        ("position", place_of(master)),
         ("velocity", master.v_n),
         ("attitude", master.q_nb),
     ):
@@ -103,13 +103,10 @@ def _missing(master: Trajectory) -> Iterator[Finding]:
         if bad.any():
             k = int(np.argmax(bad))
             yield finding(
-                "error" if bad.all() else "warning",
-                master,
-                "master_missing",
-                int(bad.sum()),
+                "error" if bad.all() else "warning", master, "master_missing", int(bad.sum()), k
+            )(
                 f"the {name} is not whole here, nor in {bad.sum()} of {len(master)} records. The "
-                "rest of those records is used.",
-                k,
+                "rest of those records is used."
             )
 
 
@@ -120,12 +117,9 @@ def _turning(
     of_master = of_master - of_master.mean(axis=0)
     length = 1.0 if shared is None else float(np.median(shared.length_s))
     if shared is None or np.sqrt(np.mean(np.sum(of_master**2, axis=1))) < _LEAST_RATE * length:
-        yield note(
-            imu,
-            "turning_not_checked",
-            0,
+        yield note(imu, "turning_not_checked", 0)(
             f"gyro unit, axes and time offset could not be checked against {name_of(master)}: the "
-            "vehicle hardly turns while both were recorded.",
+            "vehicle hardly turns while both were recorded."
         )
         return
     of_gyros = turned_by_gyros(shared)
@@ -141,12 +135,9 @@ def _turning(
     if found is not None:
         yield found
     elif as_is.share > _WELL:
-        yield error(
-            imu,
-            "turning_disagrees",
-            as_is.share,
+        yield error(imu, "turning_disagrees", as_is.share)(
             f"{shown}), whatever unit, axis or shift of a second is tried. The files are of "
-            "different recordings or clocks, or the nominal mounting is another.",
+            "different recordings or clocks, or the nominal mounting is another."
         )
     elif abs(as_is.late_s) > max(_LATE_S, _SIGMAS * as_is.sigma_s):
         yield _late(imu, master, as_is, delay_s)
@@ -177,13 +168,10 @@ def _other_attitudes(
     words = min(fits, key=lambda w: fits[w].share)
     if not fits[words].share < min(_BETTER, _HALVED * as_is.share):
         return None
-    return error(
-        master,
-        "attitude_sign",
-        fits[words].share,
+    return error(master, "attitude_sign", fits[words].share)(
         f"its attitudes turn as the gyros of {name_of(imu)} do only {words}: that leaves "
         f"{fits[words].share:.2%} of the turning over, as they stand {as_is.share:.2%}. "
-        f"{tried[words][1]}.",
+        f"{tried[words][1]}."
     )
 
 
@@ -204,7 +192,7 @@ def _other_gyros(imu: ImuTable, shared: Shared, as_is: Turning, shown: str) -> F
         scale = float(tried[k][0, 0])
         unit, mend = SCALES.get(scale, ("of the attitudes in another unit", "check both files"))
         cause = f"They are probably {unit}: {mend}"
-    return error(imu, code, float(left[k]), f"{shown}, with other gyros {left[k]:.0%}). {cause}.")
+    return error(imu, code, float(left[k]))(f"{shown}, with other gyros {left[k]:.0%}). {cause}.")
 
 
 def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Finding:
@@ -216,13 +204,11 @@ def _late(imu: ImuTable, master: Trajectory, fit: Turning, delay_s: float) -> Fi
         else f"Add {-total_s:.3f} s to their stamps, and state no delay"
     )
     return finding(
-        "error" if abs(fit.late_s) > _TOO_LATE_S else "warning",
-        master,
-        "master_late",
-        fit.late_s,
+        "error" if abs(fit.late_s) > _TOO_LATE_S else "warning", master, "master_late", fit.late_s
+    )(
         f"its attitudes are {1e3 * abs(fit.late_s):.0f} ms (one sigma {1e3 * fit.sigma_s:.1f} ms) "
         f"{'older' if fit.late_s > 0 else 'younger'} than {said}, judged by the gyros of "
-        f"{name_of(imu)}. {mend}.",
+        f"{name_of(imu)}. {mend}."
     )
 
 
@@ -234,13 +220,10 @@ def _velocity_sign(imu: ImuTable, master: Trajectory, shared: Shared) -> Iterato
     for k, (name, other) in enumerate((("north", "south"), ("east", "west"), ("down", "up"))):
         left = fit_velocity(shared.v_n * np.where(np.arange(3) == k, -1.0, 1.0), shared)
         if left is not None and left[k] < _THIRD * as_is[k]:
-            yield error(
-                master,
-                "velocity_sign",
-                name,
+            yield error(master, "velocity_sign", name)(
                 f"its velocity {name} changes against what the accelerometers of {name_of(imu)} "
                 f"feel; with its sign turned {left[k] / as_is[k]:.1%} of the squares are left. "
-                f"It is probably positive {other}: turn its sign.",
+                f"It is probably positive {other}: turn its sign."
             )
 
 
@@ -248,12 +231,9 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
     """Accelerometers against what the master's velocities and attitudes ask for."""
     forces = None if shared is None else forces_of(shared)
     if forces is None:
-        yield note(
-            imu,
-            "force_not_checked",
-            0,
+        yield note(imu, "force_not_checked", 0)(
             f"the accelerometers could not be checked against {name_of(master)}: too few seconds "
-            "of both.",
+            "of both."
         )
         return
     wanted, measured = forces
@@ -288,10 +268,7 @@ def _force(imu: ImuTable, master: Trajectory, shared: Shared | None) -> Iterator
         code = "accel_axes"
         fit = words_of(maps[k], "accel")
         cause = f"They fit as {fit}: correct the nominal mounting or the axes"
-    yield error(
-        imu,
-        code,
-        float(left[k]),
+    yield error(imu, code, float(left[k]))(
         f"the accelerometers do not feel what the velocities and attitudes of {name_of(master)} "
-        f"ask for ({as_is:.0%} of the specific force is left over). {cause}.",
+        f"ask for ({as_is:.0%} of the specific force is left over). {cause}."
     )

@@ -1,4 +1,9 @@
-"""The doctor on IMU and GNSS together: gyro unit, axes, handedness, forward, time offset."""
+"""The doctor on IMU and GNSS together: gyro unit, axes, handedness, forward, time offset.
+
+And on an IMU alone that was turned about, by gravity standing still. That is weaker, for the
+sensor's own acceleration disturbs it and a reflection of both triads looks like gyros of the
+opposite sense; used where GNSS cannot judge.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +18,29 @@ from robins.logs.motion import (
     GRAVITY,
     Fit,
     Pair,
+    at_the_spot,
     pair_of,
     signed_permutations,
     travel_in_body,
     unexplained,
     unexplained_but_for_biases,
 )
-from robins.logs.quiet import Signal, error, finding, name_of, note, signal_of, warning, windows_of
+from robins.logs.quiet import (
+    Signal,
+    error,
+    finding,
+    name_of,
+    note,
+    signal_of,
+    usual_force,
+    warning,
+    windows_of,
+)
 
 _WELL = 0.05  # share left unexplained by data about which there is no question
 _GOOD = 0.5  # most that data which fit may leave
 _BETTER = 0.4  # a hypothesis must leave this share of what the data as they are leave
+_TURNED_WRONG, _TURNED_RIGHT, _TURNED_BETTER = 0.1, 0.1, 0.2  # likewise of gravity alone
 _OFFSET_S = 0.05
 _SMALL_LAG_S = 5.0
 SCALES = {
@@ -40,13 +57,10 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         return
     pair = _pair(imu, gnss, signal, track)
     if pair is None:
-        yield note(
-            imu,
-            "motion_not_checked",
-            0,
+        yield note(imu, "motion_not_checked", 0)(
             "gyro unit, axes and time offset could not be checked against GNSS: there are no "
             "30 s of common data with enough acceleration for these fixes. Drive a figure of eight "
-            "to have them checked.",
+            "to have them checked."
         )
         return
     as_is = float(np.mean(unexplained(pair, np.eye(3)[None]).proper))
@@ -63,7 +77,7 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
 def _pair(imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track) -> Pair | None:
     """Both on one time, specific force scaled to gravity, velocities without their delay."""
     windows = windows_of(signal)
-    size = float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
+    size = usual_force(windows)
     if not size > 0.0:
         return None
     # Half a minute of a cheap gyro's bias tilts gravity by more than the vehicle accelerates.
@@ -88,14 +102,10 @@ def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Findin
         return
     lag = float(np.median(clear))
     if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())):
-        yield finding(
-            "error" if abs(lag) > 1.0 else "warning",
-            gnss,
-            "time_offset",
-            lag,
+        yield finding("error" if abs(lag) > 1.0 else "warning", gnss, "time_offset", lag)(
             f"the motion fits {name_of(imu)} best if {lag:+.2f} s is added to the stamps of this "
             f"file (from {len(clear)} stretches of 30 s). A buffer or a filter delays one of them; "
-            "give the run that time offset.",
+            "give the run that time offset."
         )
 
 
@@ -108,14 +118,11 @@ def _forward(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
     angle = float(np.rad2deg(np.angle(mean)))
     off = (angle - forward + 180.0) % 360.0 - 180.0
     if np.abs(mean) > 0.85 and abs(off) > 30.0:
-        yield warning(
-            imu,
-            "forward_axis",
-            off,
+        yield warning(imu, "forward_axis", off)(
             f"by the velocities of {name_of(gnss)} the vehicle travels {angle:+.0f} deg from x "
             f"towards y of the IMU, not along {'x' if imu.body == 'FRD' else 'y'}. The sensor is "
             f"turned in the vehicle: give its mounting, {abs(off):.0f} deg more about the "
-            "vertical, else a heading begun from the velocity is wrong by as much.",
+            "vertical, else a heading begun from the velocity is wrong by as much."
         )
 
 
@@ -137,14 +144,11 @@ def _diagnosis(
     if left[best] > min(_GOOD, _BETTER * as_is):
         if as_is < _GOOD:
             return None
-        return warning(
-            imu,
-            "motion_disagrees",
-            as_is,
+        return warning(imu, "motion_disagrees", as_is)(
             f"the IMU does not explain the velocities of {name_of(gnss)} ({_all(as_is)} of their "
             "change is left), and neither another gyro unit, exchanged or reversed axes, nor a "
             "shift of up to 30 s mends it. Are the files of one recording, and is the IMU fixed to "
-            "the vehicle?",
+            "the vehicle?"
         )
     share = (
         f"(then {left[best]:.0%} of the change of velocity is left unexplained, now {_all(as_is)})"
@@ -188,12 +192,9 @@ def _late(imu: ImuTable, gnss: GnssTable, lags: np.ndarray, fit: Fit, share: str
         if leap
         else "The clocks were never set together"
     )
-    return error(
-        gnss,
-        "leap_seconds" if leap else "time_offset",
-        lag,
+    return error(gnss, "leap_seconds" if leap else "time_offset", lag)(
         f"the motion fits {name_of(imu)} only if {lag:+.2f} s is added to the stamps of this file "
-        f"{share}. {cause}; shift one of the files.",
+        f"{share}. {cause}; shift one of the files."
     )
 
 
@@ -204,12 +205,9 @@ def _unit(imu: ImuTable, scale: float, step_s: float, share: str) -> Finding:
         unit, mend = "rates where increments are expected", f"multiply by {step_s:g} s"
     else:
         unit, mend = "increments where rates are expected", f"divide by {step_s:g} s"
-    return error(
-        imu,
-        "gyro_unit",
-        scale,
+    return error(imu, "gyro_unit", scale)(
         f"turns by the gyros fit those of the GNSS velocity only if the rates are multiplied by "
-        f"{scale:.4g} {share}. The gyro columns are probably {unit}: {mend}.",
+        f"{scale:.4g} {share}. The gyro columns are probably {unit}: {mend}."
     )
 
 
@@ -217,12 +215,9 @@ def _axes(imu: ImuTable, fit: Fit, share: str) -> Finding:
     left = _mean(fit)
     mirrored, k = np.unravel_index(int(np.nanargmin(left)), left.shape)
     code, cause = _meaning(signed_permutations()[k], bool(mirrored))
-    return error(
-        imu,
-        code,
-        _least(left),
+    return error(imu, code, _least(left))(
         "gyros and accelerometers together do not explain the GNSS velocities, with other axes "
-        f"they do {share}. {cause}.",
+        f"they do {share}. {cause}."
     )
 
 
@@ -264,3 +259,45 @@ def words_of(S: np.ndarray, sensor: str) -> str:
         j = int(np.argmax(np.abs(row)))
         parts.append(f"{'-' if row[j] < 0 else ''}{sensor}_{'xyz'[j]}")
     return f"({', '.join(parts)})"
+
+
+def check_turning(imu: ImuTable) -> Iterator[Finding]:
+    """Findings about gyros that do not turn gravity as the accelerometers see it turn."""
+    signal = signal_of(imu)
+    if signal is None:
+        return
+    size = usual_force(windows_of(signal))
+    if not size > 0.0:
+        return
+    pair = at_the_spot(signal._replace(accel=signal.accel * (GRAVITY / size)))
+    if pair is None:
+        return
+    as_is = float(np.mean(unexplained(pair, np.eye(3)[None]).proper))
+    if not as_is > _TURNED_WRONG:
+        return
+    scales = np.array([*SCALES, 0.0])  # the last: as if it had not turned at all
+    maps = np.concatenate([signed_permutations(), scales[:, None, None] * np.eye(3)])
+    left = np.mean(unexplained(pair, maps).proper, axis=0)
+    k = int(np.argmin(left))
+    # A vehicle that only accelerates needs no turns to be explained, and tells nothing about them.
+    if left[k] > min(_TURNED_RIGHT, _TURNED_BETTER * as_is, 0.5 * left[-1]):
+        return
+    if k >= 48:
+        unit, mend = SCALES[float(scales[k - 48])]
+        code, cause = "gyro_unit", f"The gyro columns are probably {unit}: {mend}"
+    elif np.array_equal(maps[k], -np.eye(3)):
+        code, cause = (
+            "left_handed",
+            "The gyros have the opposite sense of rotation, or both triads are left-handed: two "
+            "axes exchanged or one reversed, alike in both",
+        )
+    else:
+        code, cause = (
+            "gyro_axes",
+            f"The gyros fit as {words_of(maps[k], 'gyro')}; or the accelerometers' columns were "
+            "exchanged or reversed accordingly",
+        )
+    yield error(imu, code, float(left[k]))(
+        "turned about, the gyros do not turn gravity as the accelerometers see it turn "
+        f"({as_is:.0%} of it is left over, with other gyro columns {left[k]:.0%}). {cause}."
+    )

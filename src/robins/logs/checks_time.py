@@ -1,16 +1,20 @@
-"""The doctor on time stamps: unit, order, duplicates, jumps, gaps, jitter."""
+"""The doctor on time stamps: unit, order, duplicates, jumps, gaps, jitter.
+
+And on whether the files of one run overlap in time, and are on one time base.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs.findings import Finding
 from robins.logs.ordering import increasing
-from robins.logs.quiet import error, finding, place, usual_step_s, warning
+from robins.logs.quiet import error, finding, name_of, place, usual_step_s, warning
 from robins.logs.tables import Table
+from robins.logs.timebase import GPS_EPOCH_S, WEEK_S
 
 # Steps a clock makes, in seconds, and what makes them.
 _WRAPS = {
@@ -44,11 +48,11 @@ def check_time(table: Table, unit_known: bool = False) -> Iterator[Finding]:
         unit_known: the format says in which unit its stamps are, so slow ones are just that.
     """
     if len(table) < 2:
-        yield error(table, "too_short", len(table), _SHORT.format(n=len(table)))
+        yield error(table, "too_short", len(table))(_SHORT.format(n=len(table)))
         return
     usual = usual_step_s(table.time_ns)
     if not np.isfinite(usual):
-        yield error(table, "time_stands", 0.0, _STANDS)
+        yield error(table, "time_stands", 0.0)(_STANDS)
         return
     yield from _slow(table, usual) if unit_known else _unit(table, usual)
     keep = increasing(table.time_ns)
@@ -65,13 +69,10 @@ _STANDS = "time never goes forward. The time column is constant or another one; 
 def _slow(table: Table, usual: float) -> Iterator[Finding]:
     """Stamps whose unit is beyond doubt: inertial samples too far apart to navigate by."""
     if isinstance(table, ImuTable) and usual > _SLOWEST_IMU_S:
-        yield warning(
-            table,
-            "time_slow",
-            usual,
+        yield warning(table, "time_slow", usual)(
             f"inertial samples are {usual:.4g} s apart. The log was thinned out or its logger is "
             "slow; how the sensor moved between them is lost, so expect little of a run: log at "
-            "50 Hz or more.",
+            "50 Hz or more."
         )
 
 
@@ -87,21 +88,15 @@ def _unit(table: Table, usual: float) -> Iterator[Finding]:
     slowest, fastest = _limits_s(table)
     for factor, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if usual > slowest and fastest < usual * factor < slowest:
-            yield error(
-                table,
-                "time_unit",
-                usual,
+            yield error(table, "time_unit", usual)(
                 f"samples are {usual:g} s apart, one every {usual * factor:g} s if the time column "
-                f"is in {unit}. It probably is; convert it to seconds.",
+                f"is in {unit}. It probably is; convert it to seconds."
             )
             return
     if usual > slowest or usual < fastest:
-        yield error(
-            table,
-            "time_unit",
-            usual,
+        yield error(table, "time_unit", usual)(
             f"samples are {usual:g} s apart, which no such sensor does. The time column is in "
-            "another unit than seconds, or is another column; check it.",
+            "another unit than seconds, or is another column; check it."
         )
 
 
@@ -114,13 +109,9 @@ def _duplicates(table: Table) -> Iterator[Finding]:
             if share > 0.05
             else "A line was written twice, or time is rounded too coarsely"
         )
-        yield warning(
-            table,
-            "time_duplicate",
-            len(again),
+        yield warning(table, "time_duplicate", len(again), int(again[0]))(
             f"{len(again)} samples ({share:.1%}) repeat the time of the sample before, this one "
-            f"first. {cause}; `clean` refuses the second of each.",
-            int(again[0]),
+            f"first. {cause}; `clean` refuses the second of each."
         )
 
 
@@ -135,25 +126,17 @@ def _order(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
             continue
         size = float(-step[k]) + usual
         cause = _named(size, usual, _WRAPS | _STEPS) or "The clock was set, or the logger restarted"
-        yield error(
-            table,
-            "clock_set_back",
-            float(step[k]),
+        yield error(table, "clock_set_back", float(step[k]), int(k) + 1)(
             f"time goes back by {-step[k]:.6g} s and goes on from there. {cause}. `clean` refuses "
             f"{lost} samples so that time increases, and what follows them is joined wrongly: "
-            "split the file here, or add the step to all later stamps.",
-            int(k) + 1,
+            "split the file here, or add the step to all later stamps."
         )
     if slips:
         sizes = -step[slips]
-        yield warning(
-            table,
-            "time_backward",
-            len(slips),
+        yield warning(table, "time_backward", len(slips), slips[0] + 1)(
             f"time goes back by {sizes.max():.6g} s for a sample or so ({len(slips)} such places, "
             "this one first). Lines were swapped or a stamp is damaged; `clean` refuses those "
-            "samples and goes on.",
-            slips[0] + 1,
+            "samples and goes on."
         )
 
 
@@ -185,14 +168,9 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
     jumps = [k for k in long if _jump(step[k] - usual, usual)]
     for k in jumps:
         size = step[k] - usual
-        yield finding(
-            "error" if size > 1.5 else "warning",
-            table,
-            "time_jump",
-            size,
+        yield finding("error" if size > 1.5 else "warning", table, "time_jump", size, rows[k + 1])(
             f"time jumps ahead by {size:.6g} s. {_jump(size, usual)}, unless exactly that much was "
-            "lost. If the motion goes on without a break, take the step off all later stamps.",
-            rows[k + 1],
+            "lost. If the motion goes on without a break, take the step off all later stamps."
         )
     gaps = [k for k in long if k not in jumps]
     if not gaps:
@@ -210,10 +188,11 @@ def _gaps(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
         table,
         "gap_long" if step[worst] >= 1.0 else "gap_short",
         float(step[worst]),
+        rows[worst + 1],
+    )(
         f"no sample for {step[worst]:.6g} s before this one, where {usual:.6g} s is usual "
         f"({len(gaps)} gaps, {total:.6g} s in all, the first at {place(table, rows[gaps[0]])}). "
-        f"{cause}.",
-        rows[worst + 1],
+        f"{cause}."
     )
 
 
@@ -229,13 +208,89 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
     scatter = float(step.std()) / usual
     if scatter > 0.1:
         low, high = np.percentile(step, [0.5, 99.5])
-        yield finding(
-            "warning" if scatter > 0.5 else "note",
-            table,
-            "time_jitter",
-            scatter,
+        yield finding("warning" if scatter > 0.5 else "note", table, "time_jitter", scatter)(
             f"steps of time scatter from {low * 1e3:.3g} to {high * 1e3:.3g} ms (mean "
             f"{step.mean() * 1e3:.4g} ms, {1 / step.mean():.4g} Hz). The stamps were taken on "
             "arrival or rounded, not by the sensor's clock; harmless for slow motion, but use the "
-            "sensor's own counter if it was logged.",
+            "sensor's own counter if it was logged."
         )
+
+
+_LEAP = 18.0
+
+
+def check_span(imu: ImuTable, others: Sequence[Table]) -> Iterator[Finding]:
+    """Findings about how the times of other tables lie against the IMU's."""
+    for other in others:
+        yield from _span_of(imu, other)
+
+
+def _span_of(imu: ImuTable, other: Table) -> Iterator[Finding]:
+    if not len(imu) or not len(other):
+        return
+    (a, b), (c, d) = _span(imu), _span(other)
+    overlap = min(b, d) - max(a, c)
+    if overlap <= 0:
+        cause = _offset(a, b, c, d)
+        yield error(other, "no_overlap", c - a)(
+            f"covers {c:.3f} to {d:.3f} s, {name_of(imu)} covers {a:.3f} to {b:.3f} s: no common "
+            f"time. {cause}"
+        )
+        return
+    if abs(abs(c - a) - _LEAP) < 1.0 and abs(abs(d - b) - _LEAP) < 1.0 and (c - a) * (d - b) > 0:
+        yield warning(other, "leap_seconds", c - a)(
+            f"begins {c - a:+.3f} s and ends {d - b:+.3f} s against {name_of(imu)}. Both were "
+            "probably recorded together, one stamped in UTC (Unix time) and one in GPS time, which "
+            "is 18 s ahead since 2017; shift one of them."
+        )
+    if overlap < 0.5 * (d - c):
+        yield warning(other, "little_overlap", overlap)(
+            f"only {overlap:.1f} s of {d - c:.1f} s are covered by {name_of(imu)} "
+            f"({a:.3f} to {b:.3f} s). The rest is of no use; are the files of one recording?"
+        )
+
+
+def _span(table: Table) -> tuple[float, float]:
+    """Start and end [s], without the few stamps that a damaged clock put far away."""
+    ns = np.sort(table.time_ns)
+    trim = len(ns) // 100
+    return float(ns[trim]) * 1e-9, float(ns[len(ns) - 1 - trim]) * 1e-9
+
+
+def _offset(a: float, b: float, c: float, d: float) -> str:
+    """Which shift of the other table's time [c, d] would put it on the IMU's [a, b]."""
+
+    def fits(shift: float | int) -> bool:
+        return min(b, d + shift) - max(a, c + shift) > 0.5 * min(b - a, d - c)
+
+    weeks = round((a - GPS_EPOCH_S - c) / WEEK_S), round((c - GPS_EPOCH_S - a) / WEEK_S)
+    if fits(GPS_EPOCH_S + weeks[0] * WEEK_S) and weeks[0] > 0:
+        return (
+            f"Its times are seconds of the GPS week, the IMU's are absolute: they fit if GPS week "
+            f"{weeks[0]} ({GPS_EPOCH_S + weeks[0] * WEEK_S} s) is added."
+        )
+    if fits(-GPS_EPOCH_S - weeks[1] * WEEK_S) and weeks[1] > 0:
+        return (
+            f"Its times are absolute, the IMU's are seconds of the GPS week: they fit if GPS week "
+            f"{weeks[1]} ({GPS_EPOCH_S + weeks[1] * WEEK_S} s) is added to the IMU's."
+        )
+    for shift, cause in (
+        (float(GPS_EPOCH_S), "counted from 1980, the IMU's from 1970"),
+        (-float(GPS_EPOCH_S), "counted from 1970, the IMU's from 1980"),
+        (_LEAP, "in UTC, the IMU's in GPS time, 18 s ahead"),
+        (-_LEAP, "in GPS time, the IMU's in UTC, 18 s behind"),
+    ):
+        if fits(shift):
+            return f"Its times are probably {cause}: they fit if {shift:+.0f} s is added."
+    for scale, unit in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+        for low, high, whose in ((c, d, "its"), (a, b, "the IMU's")):
+            first, last = (a, b) if whose == "its" else (c, d)
+            if min(last, high * scale) - max(first, low * scale) > 0:
+                return f"They fit if {whose} times are {unit}: convert that column to seconds."
+    hours = round((a - c) / 3600.0)
+    if 0 < abs(hours) <= 14 and fits(hours * 3600.0):
+        return f"They fit if {hours:+d} h is added: one clock is in local time."
+    return (
+        "No usual offset explains it: one counts from power-up, or the files are of different "
+        "recordings. Give both one time base."
+    )

@@ -15,22 +15,24 @@ from typing import Any
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
-from robins.logs.arrays import checked_gnss, checked_imu, checked_truth
+from robins.logs.arrays import checked
 from robins.logs.clean_mag import clean_attitude, clean_mag
-from robins.logs.findings import LogError
+from robins.logs.findings import LogError, refused
 from robins.logs.limits import (
     ACCEL_LIMIT,
     ALT_LIMIT_M,
     GYRO_LIMIT,
     LAT_LIMIT,
     LON_LIMIT,
+    QUATERNION_LIMIT,
     SIGMA_LIMIT,
     SPEED_LIMIT,
 )
-from robins.logs.ordering import increasing, reasons, rows_where
+from robins.logs.ordering import refusals, rows_where
+from robins.logs.tables import place_of
 
 _PLACEHOLDER_SIGMA = 1.0
-_COMPONENTS = ("north", "east", "vertical")
+_PLACE_LIMIT = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M])
 
 
 def clean(dataset: Dataset) -> Dataset:
@@ -64,29 +66,27 @@ def clean(dataset: Dataset) -> Dataset:
 
 def clean_imu(imu: ImuTable) -> tuple[ImuTable, dict[str, int], list[tuple[int, int]]]:
     """Clean one IMU table: the table, counts by reason, gaps (start_ns, end_ns). See `clean`."""
-    imu = checked_imu(imu)
-    values = np.hstack([imu.gyro, imu.accel])
+    imu = checked(imu)
     limit = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
-    keep, counts = _whole_rows(imu.time_ns, values, limit)
+    have, bad = _whole_rows(np.hstack([imu.gyro, imu.accel]), limit)
+    keep, counts = refusals("imu", imu.time_ns, have, bad)
     if np.count_nonzero(keep) < 2:
-        refused = ", ".join(f"{n} {reason}" for reason, n in counts.items() if n) or "none"
+        told = ", ".join(f"{n} {k.removeprefix('imu_')}" for k, n in counts.items() if n) or "none"
         raise LogError(
             imu.source or "ImuTable",
-            f"fewer than two of {len(imu)} samples can be used (refused: {refused})",
+            f"fewer than two of {len(imu)} samples can be used (refused: {told})",
             "the doctor tells what is wrong with them",
         )
-    gaps = _gaps(imu, keep)
-    return rows_where(imu, keep), {f"imu_{k}": n for k, n in counts.items()}, gaps
+    return rows_where(imu, keep), counts, _gaps(imu, keep)
 
 
 def clean_truth(truth: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     """Clean a trajectory: whole rows only."""
-    truth = checked_truth(truth)
-    position = np.stack([truth.lat_rad, truth.lon_rad, truth.alt_m], -1)
-    values = np.hstack([position, truth.v_n, truth.q_nb])
-    limit = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M, *[SPEED_LIMIT] * 3, *[1.001] * 4])
-    keep, counts = _whole_rows(truth.time_ns, values, limit)
-    return rows_where(truth, keep), {f"truth_{k}": n for k, n in counts.items()}
+    truth = checked(truth)
+    values = np.hstack([place_of(truth), truth.v_n, truth.q_nb])
+    limit = np.array([*_PLACE_LIMIT, *[SPEED_LIMIT] * 3, *[QUATERNION_LIMIT] * 4])
+    keep, counts = refusals("truth", truth.time_ns, *_whole_rows(values, limit))
+    return rows_where(truth, keep), counts
 
 
 def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
@@ -94,113 +94,81 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
 
     An attitude is one thing, so it is missing whole.
     """
-    master = checked_truth(master)
-    parts = {
-        "position": (
-            np.stack([master.lat_rad, master.lon_rad, master.alt_m], -1),
-            np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M]),
-        ),
-        "v_n": (master.v_n, np.full(3, SPEED_LIMIT)),
-        "q_nb": (master.q_nb, np.full(4, 1.001)),
-    }
+    master = checked(master)
+    place, v_n, q_nb = place_of(master), master.v_n, master.q_nb
+    parts = {"place": (place, _PLACE_LIMIT), "v_n": (v_n, SPEED_LIMIT)}
+    parts["q_nb"] = (q_nb, QUATERNION_LIMIT)
     if master.omega_ib_b is not None:
-        parts["omega_ib_b"] = (master.omega_ib_b, np.full(3, GYRO_LIMIT))
+        parts["omega_ib_b"] = (master.omega_ib_b, GYRO_LIMIT)
     kept: dict[str, np.ndarray] = {}
-    refused = {reason: np.zeros(len(master), bool) for reason in ("nan", "inf", "absurd")}
+    bad = {reason: np.zeros(len(master), bool) for reason in ("nan", "inf", "absurd")}
     for name, (values, limit) in parts.items():
         nan, inf = np.isnan(values), np.isinf(values)
         with np.errstate(invalid="ignore"):
             absurd = (np.abs(values) > limit) & ~inf
         missing = nan | inf | absurd
         if name == "q_nb":
-            missing = np.broadcast_to(missing.any(axis=1)[:, None], missing.shape)
+            missing = missing.any(axis=1, keepdims=True)
         kept[name] = np.where(missing, np.nan, values)
-        for reason, mask in zip(refused, (nan, inf, absurd), strict=True):
-            refused[reason] |= mask.any(axis=1)
+        for reason, mask in zip(bad, (nan, inf, absurd), strict=True):
+            bad[reason] |= mask.any(axis=1)
     have = np.any([np.isfinite(values).any(axis=1) for values in kept.values()], axis=0)
-    in_order = np.zeros(len(master), bool)
-    in_order[have] = increasing(master.time_ns[have])
-    counts = {reason: int(rows.sum()) for reason, rows in refused.items()}
-    counts |= reasons(master.time_ns[have], in_order[have])
-    lat, lon, alt = kept.pop("position").T
+    keep, counts = refusals("master", master.time_ns, have, bad)
+    lat, lon, alt = kept.pop("place").T
     table = dataclasses.replace(master, lat_rad=lat, lon_rad=lon, alt_m=alt, **kept)
-    return rows_where(table, in_order), {f"master_{k}": n for k, n in counts.items()}
+    return rows_where(table, keep), counts
 
 
 def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
     """Clean one GNSS table: the table and counts by reason. See `clean`."""
-    gnss = checked_gnss(gnss)
-    position = np.stack([gnss.lat_rad, gnss.lon_rad, gnss.alt_m], -1)
-    limit = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M])
-    values, sigma, refused = _components(gnss, "position", position, gnss.sigma_m, limit)
-    v_n = sigma_v = None
+    gnss = checked(gnss)
+    place, sigma_m, bad = _components(gnss, "position", place_of(gnss), gnss.sigma_m, _PLACE_LIMIT)
+    have = np.isfinite(place).any(axis=1)
+    lat, lon, alt = place.T
+    kept = {"lat_rad": lat, "lon_rad": lon, "alt_m": alt, "sigma_m": sigma_m}
     if gnss.v_n is not None and gnss.sigma_v is not None:
         limit = np.full(3, SPEED_LIMIT)
         v_n, sigma_v, more = _components(gnss, "velocity", gnss.v_n, gnss.sigma_v, limit)
-        refused = {reason: refused[reason] | more[reason] for reason in refused}
-    have = np.isfinite(values).any(axis=1)
-    if v_n is not None:
+        bad = {reason: bad[reason] | more[reason] for reason in bad}
         have |= np.isfinite(v_n).any(axis=1)
-    in_order = np.zeros(len(gnss), bool)
-    in_order[have] = increasing(gnss.time_ns[have])
-    counts = {reason: int(rows.sum()) for reason, rows in refused.items()}
-    counts |= reasons(gnss.time_ns[have], in_order[have])
-    table = dataclasses.replace(
-        gnss,
-        lat_rad=values[:, 0],
-        lon_rad=values[:, 1],
-        alt_m=values[:, 2],
-        sigma_m=sigma,
-        v_n=v_n,
-        sigma_v=sigma_v,
-    )
-    return rows_where(table, in_order), {f"gnss_{k}": n for k, n in counts.items()}
+        kept |= {"v_n": v_n, "sigma_v": sigma_v}
+    keep, counts = refusals("gnss", gnss.time_ns, have, bad)
+    return rows_where(dataclasses.replace(gnss, **kept), keep), counts
 
 
-def _whole_rows(
-    time_ns: np.ndarray, values: np.ndarray, limit: np.ndarray
-) -> tuple[np.ndarray, dict[str, int]]:
-    """Rows to keep, and counts, where one bad number spoils its row."""
+def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Good rows, and bad ones by their first reason, where one bad number spoils its row."""
     nan = np.isnan(values).any(axis=1)
     inf = np.isinf(values).any(axis=1) & ~nan
     with np.errstate(invalid="ignore"):
         absurd = (np.abs(values) > limit).any(axis=1) & ~nan & ~inf
-    good = ~(nan | inf | absurd)
-    keep = np.zeros(len(time_ns), bool)
-    keep[good] = increasing(time_ns[good])
-    counts = {"nan": int(nan.sum()), "inf": int(inf.sum()), "absurd": int(absurd.sum())}
-    return keep, counts | reasons(time_ns[good], keep[good])
+    return ~(nan | inf | absurd), {"nan": nan, "inf": inf, "absurd": absurd}
 
 
 def _components(
     gnss: GnssTable, what: str, values: np.ndarray, sigma: np.ndarray, limit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Values with NaN where a component is missing, sigmas, rows touched by each reason."""
-    with np.errstate(invalid="ignore"):
-        absurd = (np.abs(values) > limit) | (sigma > SIGMA_LIMIT)
-        unsure = sigma <= 0.0
-    for k, name in enumerate(_COMPONENTS):
+    for k, name in enumerate(("north", "east", "vertical")):
         known = np.isfinite(values[:, k])
         if known.any() and not (sigma[known, k] > 0.0).any():
-            raise LogError(
-                gnss.source or "GnssTable",
+            at = gnss.source or "GnssTable", "", f"sigma of {name} {what}"
+            raise refused(*at, float(sigma[known, k][0]))(
                 f"the {name} {what} has {np.count_nonzero(known)} fixes and no positive sigma",
                 "zero means unknown, not exact: give real sigmas"
                 + (", or leave the velocities out" if what == "velocity" else ""),
-                field=f"sigma of {name} {what}",
-                value=float(sigma[known, k][0]),
             )
     nan = np.isnan(values) | np.isnan(sigma)
     inf = (np.isinf(values) | np.isinf(sigma)) & ~nan
-    absurd &= ~nan & ~inf
-    unsure &= ~nan & ~inf
-    refused = {"nan": nan, "inf": inf, "absurd": absurd, "sigma": unsure}
-    missing = nan | inf | absurd | unsure
+    with np.errstate(invalid="ignore"):
+        absurd = ((np.abs(values) > limit) | (sigma > SIGMA_LIMIT)) & ~nan & ~inf
+        unsure = (sigma <= 0.0) & ~nan & ~inf
     usable = (sigma > 0.0) & (sigma <= SIGMA_LIMIT)
+    bad = {"nan": nan, "inf": inf, "absurd": absurd, "sigma": unsure}
     return (
-        np.where(missing, np.nan, values),
+        np.where(nan | inf | absurd | unsure, np.nan, values),
         np.where(usable, sigma, _PLACEHOLDER_SIGMA),
-        {reason: np.asarray(mask.any(axis=1)) for reason, mask in refused.items()},
+        {reason: np.asarray(mask.any(axis=1)) for reason, mask in bad.items()},
     )
 
 

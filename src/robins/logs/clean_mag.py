@@ -12,9 +12,9 @@ import dataclasses
 import numpy as np
 
 from robins.dataset import AttitudeTable, MagTable
-from robins.logs.arrays import checked_attitude, checked_mag
+from robins.logs.arrays import checked
 from robins.logs.limits import FIELD_LIMIT_T
-from robins.logs.ordering import increasing, reasons, rows_where
+from robins.logs.ordering import refusals, rows_where
 from robins.logs.unit_length import TOLERANCE
 
 
@@ -29,16 +29,13 @@ def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
     Raises:
         LogError: arrays that are no table.
     """
-    mag = checked_mag(mag)
+    mag = checked(mag)
     nan, inf = np.isnan(mag.field_t), np.isinf(mag.field_t)
     absurd = (np.abs(mag.field_t) > FIELD_LIMIT_T) & ~inf
     field_t = np.where(inf | absurd, np.nan, mag.field_t)
-    keep = increasing(mag.time_ns)
-    counts = {"nan": nan, "inf": inf, "absurd": absurd}
-    told = {reason: int(rows.any(axis=1).sum()) for reason, rows in counts.items()}
-    told |= reasons(mag.time_ns, keep)
-    table = rows_where(dataclasses.replace(mag, field_t=field_t), keep)
-    return table, {f"mag_{reason}": n for reason, n in told.items()}
+    bad = {"nan": nan.any(axis=1), "inf": inf.any(axis=1), "absurd": absurd.any(axis=1)}
+    keep, counts = refusals("mag", mag.time_ns, np.ones(len(mag), bool), bad)
+    return rows_where(dataclasses.replace(mag, field_t=field_t), keep), counts
 
 
 def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, int]]:
@@ -49,14 +46,12 @@ def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, in
     Raises:
         LogError: arrays that are no table.
     """
-    attitude = checked_attitude(attitude)
+    attitude = checked(attitude)
     q_nb = attitude.q_nb
     nan, inf = np.isnan(q_nb).any(axis=1), np.isinf(q_nb).any(axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
         wrong = ~(np.abs(np.linalg.norm(q_nb, axis=1) - 1.0) < TOLERANCE) & ~nan & ~inf
-    bad = nan | inf | wrong
-    keep = increasing(attitude.time_ns)
-    told = {"nan": int((nan & ~inf).sum()), "inf": int(inf.sum()), "absurd": int(wrong.sum())}
-    told |= reasons(attitude.time_ns, keep)
-    blank = dataclasses.replace(attitude, q_nb=np.where(bad[:, None], np.nan, q_nb))
-    return rows_where(blank, keep), {f"attitude_{reason}": n for reason, n in told.items()}
+    q_nb = np.where((nan | inf | wrong)[:, None], np.nan, q_nb)
+    bad = {"nan": nan & ~inf, "inf": inf, "absurd": wrong}
+    keep, counts = refusals("attitude", attitude.time_ns, np.ones(len(attitude), bool), bad)
+    return rows_where(dataclasses.replace(attitude, q_nb=q_nb), keep), counts

@@ -19,30 +19,20 @@ import os
 import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from robins.logs.findings import LogError
+from robins.logs.findings import LogError, refused
 from robins.logs.quantities import QUANTITIES
 from robins.logs.text import Head, peek
-from robins.logs.text_format import Column, TextFormat, columns_of, header_of
+from robins.logs.text_format import Column, TextFormat, columns_of, header_of, one_of
 from robins.units import KINDS
 
 Paths = Iterable[str | os.PathLike[str]]
-_KEYS: dict[str, tuple[type, ...]] = {
-    "columns": (dict,),
-    "separator": (str,),
-    "skip": (int,),
-    "body": (str,),
-    "nav": (str,),
-}
-_COLUMN: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "place": (int,),
-    "unit": (str,),
-    "scale": (int, float),
-}
+Types = dict[str, tuple[type, ...]]
+_KEYS: Types = {"columns": (dict,), "separator": (str,), "skip": (int,)}
+_KEYS |= {"body": (str,), "nav": (str,)}
+_COLUMN: Types = {"name": (str,), "place": (int,), "unit": (str,), "scale": (int, float)}
 _WORDS = {dict: "a table", str: "text", int: "a whole number", float: "a number"}
 
 
@@ -65,12 +55,11 @@ def columns_from(path: str | os.PathLike[str]) -> TextFormat:
     _checked(file, "", content, _KEYS)
     if not content.get("columns"):
         mend = 'state them, such as time = { name = "t", unit = "ms" }'
-        raise LogError(file, "states no columns", mend, where="columns")
+        raise refused(file, "columns")("states no columns", mend)
     columns = tuple(_column(file, *item) for item in content.pop("columns").items())
     if content.get("skip", 0) < 0:
-        raise LogError(
-            file, "is less than 0", "count lines from 0", field="skip", value=content["skip"]
-        )
+        at = refused(file, field="skip", value=content["skip"])
+        raise at("is less than 0", "count lines from 0")
     name = Path(path).name.split(".")[0]
     row = TextFormat(name, f"declared in {file}", columns, others=True, source=file, **content)
     # a file of several sensors has gaps where one is slower
@@ -81,21 +70,18 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
     key = f"columns.{quantity}"
     if not isinstance(stated, dict):
         mend = 'write it like { name = "t", unit = "ms" }'
-        raise LogError(file, "is not a table of name and unit", mend, field=key, value=stated)
+        raise refused(file, field=key, value=stated)("is not a table of name and unit", mend)
     _checked(file, f"{key}.", stated, _COLUMN)
     if ("name" in stated) == ("place" in stated):
         mend = "state the name in the header, or the place from 1 where there is none"
         both = "both name and place" if "name" in stated else "neither name nor place"
-        raise LogError(file, f"has {both}", mend, where=key)
+        raise refused(file, key)(f"has {both}", mend)
     if stated.get("place", 1) < 1:
-        raise LogError(
-            file, "is less than 1", "count columns from 1", where=key, field="place",
-            value=stated["place"],
-        )  # fmt: skip
+        raise refused(file, key, "place", stated["place"])("is less than 1", "count from 1")
     kind = QUANTITIES.get(quantity, "ratio")
     if kind != "ratio" and "unit" not in stated:
         mend = f"state one of {', '.join(KINDS[kind])}"
-        raise LogError(file, "has no unit", mend, where=key)
+        raise refused(file, key)("has no unit", mend)
     return Column(
         quantity,
         stated.get("name", f"column {stated.get('place')}"),
@@ -105,19 +91,14 @@ def _column(file: str, quantity: str, stated: Any) -> Column:
     )
 
 
-def _checked(file: str, at: str, table: dict[str, Any], allowed: dict[str, tuple[type, ...]]):
+def _checked(file: str, at: str, table: dict[str, Any], allowed: Types):
     """Refuse keys and types that are not allowed."""
     for key, value in table.items():
         if key not in allowed:
-            near = get_close_matches(key, allowed, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            mend = f"choose of {', '.join(allowed)}"
-            raise LogError(file, f"is no key{hint}", mend, where=f"{at}{key}")
+            raise refused(file, f"{at}{key}")("is not a known key", one_of(key, allowed))
         if not isinstance(value, allowed[key]) or isinstance(value, bool):
             words = _WORDS[allowed[key][-1]]
-            raise LogError(
-                file, f"is not {words}", f"give {words}", field=f"{at}{key}", value=value
-            )
+            raise refused(file, field=f"{at}{key}", value=value)(f"is not {words}", f"give {words}")
 
 
 def formats_of(files: Paths, columns: Paths) -> dict[str, TextFormat]:
@@ -137,10 +118,8 @@ def formats_of(files: Paths, columns: Paths) -> dict[str, TextFormat]:
         fitting = [head for head in heads if row.recognise(head)]
         for head in fitting:
             if head.file in out:
-                mend = "give the columns of each file once"
-                raise LogError(
-                    head.file, f"fits both {out[head.file].source} and {row.source}", mend
-                )
+                both = f"fits both {out[head.file].source} and {row.source}"
+                raise LogError(head.file, both, "give the columns of each file once")
             out[head.file] = row
         if not fitting and heads:
             columns_of(row, heads[0].file, header_of(row, heads[0]))

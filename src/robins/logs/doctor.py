@@ -6,32 +6,18 @@ run would be wrong; a healthy log has none.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
-from robins.logs.arrays import (
-    checked_attitude,
-    checked_gnss,
-    checked_imu,
-    checked_mag,
-    checked_truth,
-)
+from robins.logs.arrays import checked
 from robins.logs.checks import ALONE, TOGETHER, Check
 from robins.logs.findings import Finding, by_severity
 from robins.logs.tables import Table, kind_of, tables_of
 
 Subject = Dataset | Table | Sequence[Table | Dataset]
-
-_CHECKED: dict[type, Callable[..., Table]] = {
-    ImuTable: checked_imu,
-    GnssTable: checked_gnss,
-    Trajectory: checked_truth,
-    MagTable: checked_mag,
-    AttitudeTable: checked_attitude,
-}
 
 
 def examine(subject: Subject) -> list[Finding]:
@@ -52,7 +38,7 @@ def examine(subject: Subject) -> list[Finding]:
     findings = [finding for dataset in datasets for finding in dataset.findings]
     unit_known = {file for dataset in datasets for file in dataset.time_unit_known}
     with np.errstate(all="ignore"):  # nonsense is looked at on purpose here
-        tables = [_CHECKED[type(table)](table) for part in parts for table in _tables(part)]
+        tables = [checked(table) for part in parts for table in _tables(part)]
         all_of_them: dict[str, Any] = {"others": [t for t in tables if not isinstance(t, ImuTable)]}
         for table in tables:
             things = {kind_of(table): table, "table": table, "in_vehicle": _in_vehicle(tables)}
@@ -61,7 +47,7 @@ def examine(subject: Subject) -> list[Finding]:
             findings += _asked(ALONE, things, [])
             all_of_them[kind_of(table)] = table
         if isinstance(subject, Dataset) and subject.master is not None:
-            master, delay_s = checked_truth(subject.master), subject.master_delay_s
+            master, delay_s = checked(subject.master), subject.master_delay_s
             all_of_them |= {"master": master, "delay_s": delay_s}
         return by_severity(_asked(TOGETHER, all_of_them, findings))
 

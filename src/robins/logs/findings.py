@@ -6,6 +6,8 @@ Both name the file, the line or time, the value, the likely cause and the mend, 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from pathlib import Path
 
 from robins.dataset import Finding as Finding  # where datasets hold them; read from here too
 from robins.dataset import Severity as Severity
@@ -38,8 +40,28 @@ class LogError(RobinsError, ValueError):
         self.file, self.field, self.value = file, field, value
 
 
+def refused(
+    file: str, where: str = "", field: str = "", value: object = ""
+) -> Callable[[str, str], LogError]:
+    """Makes a `LogError` about a place in a file of what is wrong and how to mend it."""
+    return lambda what, fix: LogError(file, what, fix, where=where, field=field, value=value)
+
+
 class LogWarning(UserWarning):
     """A finding of a reader that was given no list to put it in."""
+
+
+def told(
+    severity: Severity,
+    code: str,
+    file: str,
+    where: str = "",
+    value: float | int | str = "",
+    name: str = "",
+) -> Callable[[str], Finding]:
+    """Makes a finding of its sentence, put behind name (or file) and place."""
+    begin = f"{name or Path(file).name} {where}".rstrip()
+    return lambda sentence: Finding(severity, code, file, where, value, f"{begin}: {sentence}")
 
 
 def report(findings: list[Finding] | None, finding: Finding) -> None:

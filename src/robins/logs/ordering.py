@@ -69,6 +69,24 @@ def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
     }
 
 
+def refusals(
+    kind: str, time_ns: np.ndarray, have: np.ndarray, refused: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Which of the rows that have something are in order, and how many are not used, by reason.
+
+    Args:
+        kind: of the table, with which the reasons begin.
+        time_ns: (n,) stamps.
+        have: (n,) bool: rows to choose from.
+        refused: reason -> (n,) bool: rows in which something was refused before.
+    """
+    keep = np.zeros(len(time_ns), bool)
+    keep[have] = increasing(time_ns[have])
+    counts = {reason: int(np.count_nonzero(rows)) for reason, rows in refused.items()}
+    counts |= reasons(time_ns[have], keep[have])
+    return keep, {f"{kind}_{reason}": n for reason, n in counts.items()}
+
+
 def rows_where(table: Any, keep: np.ndarray) -> Any:
     """A table of `robins.dataset` with only some of its rows, (n,) bool."""
     n = len(table.time_ns)

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.logs.findings import Finding, LogError
+from robins.logs.findings import Finding, LogError, refused
 from robins.logs.text import Columns, Head, Layout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns
 from robins.units import to_si
@@ -64,20 +64,15 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
     file, head = str(path), peek(path)
     line, names = _header(head)
     if lacking := [name for name in _NEEDED if name not in names]:
-        raise LogError(
-            file,
-            f"the header lacks {', '.join(lacking)}",
-            "is it of another format?",
-            where=f"line {line}",
+        raise refused(file, f"line {line}")(
+            f"the header lacks {', '.join(lacking)}", "is it of another format?"
         )
     if twice := sorted({name for name in _NEEDED if names.count(name) > 1}):
-        raise LogError(
-            file, f"the header names {', '.join(twice)} twice", "keep one", where=f"line {line}"
+        raise refused(file, f"line {line}")(
+            f"the header names {', '.join(twice)} twice", "keep one"
         )
     if names[0] != "time":
-        raise LogError(
-            file, "the first column is not the time", "put it first", where=f"line {line}"
-        )
+        raise refused(file, f"line {line}")("the first column is not the time", "put it first")
     columns = read_columns(path, Layout(tuple(names), ",", skip=line, all_named=True), findings)
     place = {name: k - 1 for k, name in enumerate(names)}
 
@@ -156,13 +151,9 @@ def _stamps(file: str, columns: Columns) -> np.ndarray:
             year, month, day, clock, sign, hours, minutes = match.groups()
             utc_ns = calendar_to_ns(f"{year}/{month}/{day}", clock, utc=True)
         except ValueError as error:
-            raise LogError(
-                file,
+            raise refused(file, f"line {columns.rows[k]}", "time", text)(
                 f"is not a date and time with its offset from UTC ({error})",
                 "write it like 2025-06-11 20:34:27+00:00",
-                where=f"line {columns.rows[k]}",
-                field="time",
-                value=text,
             ) from error
         ahead_s = (3600 * int(hours) + 60 * int(minutes)) if sign else 0
         out[k] = utc_ns - (-ahead_s if sign == "-" else ahead_s) * 1_000_000_000

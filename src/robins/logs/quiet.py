@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.ins.intervals import own_intervals
-from robins.logs.findings import SEVERITIES, Finding, Severity
+from robins.logs.findings import SEVERITIES, Finding, Severity, told
 from robins.logs.ordering import increasing
 from robins.logs.tables import Table
 
@@ -41,17 +42,11 @@ def place(table: Table, row: int) -> str:
 
 
 def finding(
-    severity: Severity,
-    table: Table,
-    code: str,
-    value: float | int | str,
-    sentence: str,
-    row: int | None = None,
-) -> Finding:
-    """A finding about a table; the sentence is put behind the file's name and the place."""
+    severity: Severity, table: Table, code: str, value: float | int | str, row: int | None = None
+) -> Callable[[str], Finding]:
+    """As `told`, about a table or a row of it."""
     where = "" if row is None else place(table, row)
-    begin = f"{name_of(table)} {where}".rstrip()
-    return Finding(severity, code, table.source, where, value, f"{begin}: {sentence}")
+    return told(severity, code, table.source, where, value, name_of(table))
 
 
 error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
@@ -68,6 +63,16 @@ def median_of(values: np.ndarray) -> float:
     """Median of the finite numbers; NaN if there are none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else np.nan
+
+
+def longest_run(same: np.ndarray) -> tuple[int, int]:
+    """First index and length of the longest stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
+    starts, lengths = edges[::2], np.diff(edges)[::2]
+    if not len(starts):
+        return 0, 0
+    k = int(np.argmax(lengths))
+    return int(starts[k]), int(lengths[k])
 
 
 class Signal(NamedTuple):
@@ -106,6 +111,11 @@ class Windows(NamedTuple):
     restless: np.ndarray  # (w,) scatter of |gyro - mean|
     at_rest: np.ndarray  # (w,) bool: the specific force hardly changes; needs no unit
     calm: np.ndarray  # (w,) bool: those at rest; if there are none, the quietest tenth
+
+
+def usual_force(windows: Windows) -> float:
+    """Median size of the specific force when it is calm."""
+    return float(np.median(np.linalg.norm(windows.accel[windows.calm], axis=-1)))
 
 
 def windows_of(signal: Signal) -> Windows:

@@ -23,7 +23,7 @@ from robins.dataset import (
 )
 from robins.ins.frames import swap, swap_q
 from robins.logs.axes import Axes
-from robins.logs.findings import Finding, LogError, report
+from robins.logs.findings import Finding, LogError, refused, report, told
 from robins.logs.local import LocalPath, Origin, from_local
 from robins.logs.quantities import QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of
@@ -160,13 +160,9 @@ def _frames(format: TextFormat, head: Head) -> tuple[NavFrame, BodyFrame]:
         words = set(re.findall(r"[A-Z]{3}", said[1]))
         fitting = [pair for pair in PAIRS if words and words <= set(pair)]
         if len(fitting) != 1:
-            raise LogError(
-                head.file,
+            raise refused(head.file, f"line {number}", "frames", said[1].strip())(
                 "is neither NED FRD nor ENU RFU",
                 "convert the columns to one of the two and say which",
-                where=f"line {number}",
-                field="frames",
-                value=said[1].strip(),
             )
         return fitting[0]
     return nav, body
@@ -256,7 +252,14 @@ def _path(read: Read, origin: Origin | None) -> Trajectory:
     omega = read.stack("omega") if read.has("omega") else None
     if read.has("local"):
         if origin is None:
-            report(read.findings, _no_place(read.file))
+            report(
+                read.findings,
+                told("note", "no_place", read.file, value="0 0 0")(
+                    "positions are local metres; they are put at latitude 0, longitude 0, height "
+                    "0, x to the east. Gravity and Earth rate there are not those of the "
+                    "recording; give an origin if that matters."
+                ),
+            )
         local = LocalPath(read.time_ns, read.stack("local"), swap(v_n), q_nb)
         path = from_local(local, origin or NOWHERE, source=read.file)
         return Trajectory(
@@ -311,25 +314,16 @@ def _within_limits(read: Read, quantity: str) -> None:
     if 2 * beyond.sum() > np.isfinite(values).sum():
         radians = found.unit == "rad"
         other = "degrees under a name that says radians" if radians else "another unit"
-        raise LogError(
-            read.file,
+        raise refused(read.file, f"line {read.rows[k]}", found.name, shown)(
             f"beyond {allowed}, as in {count}: probably {other}, or another column",
             "name the column with the unit it is in",
-            where=f"line {read.rows[k]}",
-            field=found.name,
-            value=shown,
         )
     values[beyond] = np.nan
     report(
         read.findings,
-        Finding(
-            "warning",
-            "angle_range",
-            read.file,
-            f"line {read.rows[k]}",
-            shown,
-            f"{Path(read.file).name} line {read.rows[k]}: {found.name} is {shown:g}, beyond "
-            f"{allowed} ({count}). What cannot be is taken as missing.",
+        told("warning", "angle_range", read.file, f"line {read.rows[k]}", shown)(
+            f"{found.name} is {shown:g}, beyond {allowed} ({count}). What cannot be is taken as "
+            "missing."
         ),
     )
 
@@ -340,30 +334,12 @@ def _compare_dt(read: Read) -> None:
     off = np.flatnonzero(np.abs(dt[1:] - elapsed) > 0.01 * np.abs(dt[1:]))
     if len(off):
         first = int(off[0]) + 1
+        where, shown = f"line {read.rows[first]}", float(dt[first])
         report(
             read.findings,
-            Finding(
-                "warning",
-                "dt_disagrees",
-                read.file,
-                f"line {read.rows[first]}",
-                float(dt[first]),
-                f"{Path(read.file).name} line {read.rows[first]}: dt is {dt[first]:g} s but the "
-                f"time has grown by {elapsed[first - 1]:g} s ({len(off)} such rows). Increments "
-                "are taken over the time since the row before; rows are missing, or dt belongs to "
-                "the next row.",
+            told("warning", "dt_disagrees", read.file, where, shown)(
+                f"dt is {shown:g} s but the time has grown by {elapsed[first - 1]:g} s ({len(off)} "
+                "such rows). Increments are taken over the time since the row before; rows are "
+                "missing, or dt belongs to the next row."
             ),
         )
-
-
-def _no_place(file: str) -> Finding:
-    return Finding(
-        "note",
-        "no_place",
-        file,
-        "",
-        "0 0 0",
-        f"{Path(file).name}: positions are local metres; they are put at latitude 0, longitude 0, "
-        "height 0, x to the east. Gravity and Earth rate there are not those of the recording; "
-        "give an origin if that matters.",
-    )

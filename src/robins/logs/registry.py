@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from robins.dataset import Dataset
 from robins.logs import broad, phone, rtklib, ulog
-from robins.logs.findings import Finding, LogError
+from robins.logs.findings import Finding, LogError, refused
 from robins.logs.local import Origin
 from robins.logs.opening import beginning
 from robins.logs.quantities import words_of
@@ -110,11 +110,9 @@ def recognise(path: str | os.PathLike[str]) -> Format:
     candidates = found or FORMATS
     width = max(len(f.name) for f in candidates)
     listed = "".join(f"\n  {f.name:{width}}  {f.about}" for f in candidates)
-    raise LogError(
-        head.file,
+    raise refused(head.file, f"line {shown[0]}")(
         f"{'several formats fit' if found else 'no known format fits'} ({shown[1][:60]!r})",
         f"{mend}:{listed}",
-        where=f"line {shown[0]}",
     )
 
 

@@ -9,31 +9,19 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, LogError, report
+from robins.logs.findings import Finding, LogError, refused, report, told
 from robins.logs.text import Head, Layout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
 # What RTKLIB writes, with velocities or without; used where the header was stripped.
 _POSITION: list[str] = ["latitude", "longitude", "height", "Q", "ns"]
 _POSITION += ["sdn", "sde", "sdu", "sdne", "sdeu", "sdun", "age", "ratio"]
-_WITH_VELOCITY: list[str] = [
-    *_POSITION,
-    "vn",
-    "ve",
-    "vu",
-    "sdvn",
-    "sdve",
-    "sdvu",
-    "sdvne",
-    "sdveu",
-    "sdvun",
-]
 _VELOCITY = ("vn", "ve", "vu", "sdvn", "sdve", "sdvu")
+_WITH_VELOCITY = [*_POSITION, *_VELOCITY, "sdvne", "sdveu", "sdvun"]
 _NEEDED = ("latitude", "longitude", "height", "Q", "sdn", "sde", "sdu")
 _UNSUPPORTED = {
     "x-ecef": ("positions are Earth-fixed X, Y, Z", "out-solformat = llh"),
@@ -77,11 +65,9 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     layout = Layout((*time_names, *names), "," if comma else None, tuple(range(texts)))
     columns = read_columns(path, layout, findings)
     if missing := [n for n in _NEEDED if n not in names]:
-        raise LogError(
-            file,
+        raise refused(file, "header")(
             f"has no column {', '.join(missing)}",
             "write latitude, longitude, height, Q and the standard deviations",
-            where="header",
         )
 
     def column(name: str) -> np.ndarray:
@@ -95,9 +81,23 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
         v_n, sigma_v = vectors("vn", "ve", "vu", -1.0), vectors("sdvn", "sdve", "sdvu", 1.0)
         if not (v_n.any() or sigma_v.any()):
             v_n = sigma_v = None
-            report(findings, _no_velocity(file))
+            report(
+                findings,
+                told("note", "no_velocity", file, value=0.0)(
+                    "all velocities and their sigmas are zero, so RTKLIB did not solve for them; "
+                    "they are left out. Heading will be found from the positions alone; set "
+                    "out-outvel = on."
+                ),
+            )
     if any("/geodetic" in line for line in head.lines if line.startswith("%")):
-        report(findings, _above_geoid(file))
+        report(
+            findings,
+            told("warning", "height_above_geoid", file, "header", "geodetic")(
+                "heights are above the geoid, and robins takes them as above the WGS-84 "
+                "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
+                "metre. Set out-height = ellipsoidal in RTKLIB."
+            ),
+        )
     quality = column("Q")
     return GnssTable(
         time_ns=_times(file, columns.texts, columns.rows, calendar, utc),
@@ -120,11 +120,8 @@ def _header(head: Head) -> tuple[list[str], bool]:
             fields = line[1:].replace(",", " ").split()
             for mark, (what, mend) in _UNSUPPORTED.items():
                 if any(mark in field for field in fields) and "ns" in fields:
-                    raise LogError(
-                        head.file,
-                        what,
-                        f"set {mend} in RTKLIB and solve again",
-                        where=f"line {number}",
+                    raise refused(head.file, f"line {number}")(
+                        what, f"set {mend} in RTKLIB and solve again"
                     )
             if fields[:1] in (["GPST"], ["UTC"]):
                 names = [field.split("(")[0] for field in fields[1:]]
@@ -142,38 +139,8 @@ def _times(file: str, texts: np.ndarray, rows: np.ndarray, calendar: bool, utc: 
         try:
             out[i] = calendar_to_ns(*stamp.split(), utc=utc)
         except (ValueError, TypeError) as error:
-            raise LogError(
-                file,
+            raise refused(file, f"line {rows[i]}", "time", stamp)(
                 f"is not a time stamp year/month/day hour:minute:second ({error})",
                 "repair or delete the line",
-                where=f"line {rows[i]}",
-                field="time",
-                value=stamp,
             ) from error
     return out
-
-
-def _no_velocity(file: str) -> Finding:
-    return Finding(
-        "note",
-        "no_velocity",
-        file,
-        "",
-        0.0,
-        f"{Path(file).name}: all velocities and their sigmas are zero, so RTKLIB did not solve for "
-        "them; they are left out. Heading will be found from the positions alone; set "
-        "out-outvel = on.",
-    )
-
-
-def _above_geoid(file: str) -> Finding:
-    return Finding(
-        "warning",
-        "height_above_geoid",
-        file,
-        "header",
-        "geodetic",
-        f"{Path(file).name} header: heights are above the geoid, and robins takes them as above "
-        "the WGS-84 ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
-        "metre. Set out-height = ellipsoidal in RTKLIB.",
-    )

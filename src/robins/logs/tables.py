@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 
 Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable
@@ -14,6 +16,11 @@ KINDS: dict[type, str] = {
     AttitudeTable: "attitude",
 }
 """The field of a `Dataset` in which a table lies; a path that is no truth is its ``master``."""
+
+
+def place_of(table: GnssTable | Trajectory) -> np.ndarray:
+    """(n, 3) latitude, longitude, height."""
+    return np.stack([table.lat_rad, table.lon_rad, table.alt_m], axis=-1)
 
 
 def kind_of(table: Table) -> str:

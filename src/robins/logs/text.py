@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.logs.findings import Finding, LogError, report
+from robins.logs.findings import Finding, LogError, refused, report
 from robins.logs.opening import Source
 
 _PARSE_BYTES = 1 << 22
@@ -95,15 +95,15 @@ def peek(path: str | os.PathLike[str]) -> Head:
     _refuse_nul(file, start[:_LONGEST_LINE], 1)
     start = start[:_LONGEST_LINE].removeprefix(_BOM)
     if b"\r" in start and _LF not in start:
-        raise LogError(
-            file, "its lines end in CR alone", "save it with line ends LF or CR LF", where="line 1"
+        raise refused(file, "line 1")(
+            "its lines end in CR alone", "save it with line ends LF or CR LF"
         )
     try:
         text = start[: start.rfind(_LF) + 1 or None].decode("utf-8")
     except UnicodeDecodeError as error:
         line = start[: error.start].count(_LF) + 1
-        raise LogError(
-            file, "is not text in UTF-8", "is this the log itself?", where=f"line {line}"
+        raise refused(file, f"line {line}")(
+            "is not text in UTF-8", "is this the log itself?"
         ) from error
     return Head(file, [line.removesuffix("\r") for line in text.removesuffix("\n").split("\n")])
 
@@ -149,11 +149,9 @@ def _refuse_nul(file: str, data: bytes, line: int) -> None:
     """Raise if the bytes, whose first line has this number, cannot be text."""
     if b"\0" in data:
         utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
-        raise LogError(
-            file,
+        raise refused(file, f"line {line + data[: data.index(bytes(1))].count(_LF)}")(
             "is UTF-16 text" if utf16 else "holds NUL bytes: a binary file, or one with a hole",
             "save it as UTF-8" if utf16 else "copy it again, or cut it before this line",
-            where=f"line {line + data[: data.index(bytes(1))].count(_LF)}",
         )
 
 
@@ -169,11 +167,9 @@ def _blocks_of_lines(file: str, source: Source) -> Iterator[tuple[bytes, bool]]:
         lines, rest = _split(b"".join(pending), line)
         line += lines.count(_LF)
         if len(rest) > _LONGEST_LINE:
-            raise LogError(
-                file,
+            raise refused(file, f"line {line}")(
                 f"is longer than {_LONGEST_LINE} bytes",
                 "is this a text log with one sample a line?",
-                where=f"line {line}",
             )
         yield lines, True
         pending = [rest]
@@ -201,13 +197,11 @@ def _width(head: Head, layout: Layout) -> tuple[int, tuple[int, str] | None]:
     cut = len(widths) == 2 and widths[0] < widths[1]
     width = max(widths)
     if width < len(layout.names) or (layout.all_named and width > len(layout.names)):
-        raise LogError(
-            head.file,
+        raise refused(head.file, f"line {data[-1][0] if cut else data[0][0]}")(
             f"{width} fields where {len(layout.names)} are needed: {', '.join(layout.names)}",
             "is it of another format, or separated by other characters?"
             if width < len(layout.names)
             else "write numbers with a decimal point, not a comma; or name all columns",
-            where=f"line {data[-1][0] if cut else data[0][0]}",
         )
     return width, (data[0] if cut else None)
 
@@ -299,47 +293,34 @@ class _Reader:
 
     def _no_number(self, line: int, k: int, field: bytes, cause: str) -> LogError:
         names = self.layout.names
-        return LogError(
+        return refused(
             self.file,
-            cause,
-            "write numbers with a decimal point, nan where one is missing; or delete the line",
-            where=f"line {line}",
-            field=names[k] if k < len(names) else f"column {k + 1}",
-            value=field[:_TEXT_BYTES].decode("utf-8", "replace"),
-        )
+            f"line {line}",
+            names[k] if k < len(names) else f"column {k + 1}",
+            field[:_TEXT_BYTES].decode("utf-8", "replace"),
+        )(cause, "write numbers with a decimal point, nan where one is missing; or delete the line")
 
     def _wrong_width(self, line: int, fields: list[bytes]) -> LogError:
-        return LogError(
-            self.file,
+        return refused(self.file, f"line {line}")(
             f"{len(fields)} fields where the first lines have {self.width}",
             "bytes are missing, or numbers have decimal commas; delete or repair the line",
-            where=f"line {line}",
         )
 
 
 def _ends_early(file: str, line: int, rest: str, cut: bool) -> Finding:
-    where = f"line {line}"
     shown = rest.strip()[:60]
     what = "the compressed stream has no end mark" if cut else "the last line has no line end"
     lost = f"; line {line} ({shown!r}) may have lost digits and is left out" if rest else ""
-    return Finding(
-        "warning",
-        "ends_early",
-        file,
-        where,
-        shown,
+    sentence = (
         f"{Path(file).name} ends early at line {line}: {what}{lost}. The recording or the copy was "
-        "interrupted; all lines before it were read. Copy it again if the original is longer.",
+        "interrupted; all lines before it were read. Copy it again if the original is longer."
     )
+    return Finding("warning", "ends_early", file, f"line {line}", shown, sentence)
 
 
 def _begins_midway(file: str, line: int, text: str) -> Finding:
-    return Finding(
-        "warning",
-        "begins_midway",
-        file,
-        f"line {line}",
-        text[:60],
+    sentence = (
         f"{Path(file).name} line {line} ({text[:60]!r}) has fewer fields than the next: the "
-        "recording began in the middle of a line. It is left out; nothing else is affected.",
+        "recording began in the middle of a line. It is left out; nothing else is affected."
     )
+    return Finding("warning", "begins_midway", file, f"line {line}", text[:60], sentence)

@@ -9,15 +9,15 @@ has one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 from robins.dataset import BodyFrame, NavFrame
 from robins.logs.axes import Axes
-from robins.logs.findings import LogError
+from robins.logs.findings import refused
 from robins.logs.quantities import CLOCKS, QUANTITIES, TABLES, groups_of, parts, tables_of_groups
 from robins.logs.text import COMMENTS, Head
 from robins.units import KINDS, UnitError, unit
@@ -257,13 +257,11 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
     Raises:
         LogError: columns are missing, two hold the same, or a unit is none.
     """
-    where = f"line {header.line}"
+    at = partial(refused, file, f"line {header.line}")
     out: dict[str, Found] = {}
     for f in header.found:
         if (other := out.get(f.column.holds)) is not None:
-            raise LogError(
-                file, f"{other.name} and {f.name} are the same thing", "keep one", where=where
-            )
+            raise at()(f"{other.name} and {f.name} are the same thing", "keep one")
         out[f.column.holds] = f
     used, lacking = sort_out(format, set(out))
     clocks = {"time", "time_of_week"} & format.quantities
@@ -279,89 +277,86 @@ def columns_of(format: TextFormat, file: str, header: Header) -> dict[str, Found
             between = next((s for s in ";\t|," if s in header.names[0]), "")
             mend = f"state separator = {between!r}" if between else "state the names that it has"
             mend += f" in {format.source}"
-        raise LogError(
-            file, f"the header lacks {wanted}; it has {', '.join(header.names)}", mend, where=where
-        )
+        raise at()(f"the header lacks {wanted}; it has {', '.join(header.names)}", mend)
     out = {q: f for q, f in out.items() if q in used}
     for quantity, f in out.items():
         try:
             unit(f.unit, QUANTITIES[quantity])
         except UnitError as error:
-            raise LogError(file, str(error), "state the unit", where=where, field=f.name) from error
+            raise at(f.name)(str(error), "state the unit") from error
     return out
 
 
 def _check(format: TextFormat) -> None:
     """Raise if a row cannot be one."""
-
-    def refused(where: str, cause: str, mend: str, field: str = "", value: object = "") -> LogError:
-        file = format.source or f"format {format.name}"
-        return LogError(file, cause, mend, where=where, field=field, value=value)
-
+    at = partial(refused, format.source or f"format {format.name}")
     for column in format.columns:
         quantity, where = column.holds, f"columns.{column.holds}"
         clock = quantity in ("time", "time_of_week")
         if quantity not in QUANTITIES:
-            near = get_close_matches(quantity, QUANTITIES, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            allowed = f"choose of {', '.join(QUANTITIES)}"
-            raise refused(where, f"is no quantity that a column holds{hint}", allowed)
+            raise at(where)("is no quantity that a column can hold", one_of(quantity, QUANTITIES))
         for symbol in column.units:
             try:
                 plain = symbol if symbol == ANY else unit(symbol, QUANTITIES[quantity]).symbol
             except UnitError as error:
-                raise refused(where, str(error), "state one of these", "unit", symbol) from error
+                raise at(where, "unit", symbol)(str(error), "state one of these") from error
             if clock and plain not in CLOCKS:
                 mend = f"record it in one of {', '.join(CLOCKS)}"
-                raise refused(where, "is no unit of time stamps", mend, "unit", symbol)
+                raise at(where, "unit", symbol)("is no unit of time stamps", mend)
         if not (math.isfinite(column.scale) and column.scale):
             mend = "give a number other than 0, such as -1"
-            raise refused(where, "cannot scale anything", mend, "scale", column.scale)
+            raise at(where, "scale", column.scale)("cannot scale anything", mend)
         if column.scale != 1.0 and (clock or quantity == "week"):
-            raise refused(
-                where, "is not for time stamps", "state their unit", "scale", column.scale
-            )
+            raise at(where, "scale", column.scale)("is not for time stamps", "state their unit")
     held = [column.holds for column in format.columns]
     if twice := [q for q in held if held.count(q) > 1]:
-        raise refused(f"columns.{twice[0]}", "is held by two columns", "keep one")
+        raise at(f"columns.{twice[0]}")("is held by two columns", "keep one")
     if len({column.place > 0 for column in format.columns}) > 1:
-        raise refused("columns", "some have names and some have places", "give all the same way")
+        raise at("columns")("some have names and some have places", "give all the same way")
     if len({"time", "time_of_week"} & format.quantities) != 1:
-        raise refused("columns", "there is no time, or there are two", "state one column as time")
+        raise at("columns")("there is no time, or there are two", "state one column as time")
     if "week" in format.quantities and "time" in format.quantities:
-        raise refused("columns.week", "needs the second of that week", "state time_of_week")
+        raise at("columns.week")("needs the second of that week", "state time_of_week")
     kinds = format.kinds
     if not kinds or (len(kinds) > 1 and "imu" not in kinds):
         what = f"make {' and '.join(kinds)} alone" if kinds else "make no table"
-        mend = f"state whole sets of them: {'; '.join(map(_told, TABLES))}"
-        raise refused("columns", f"{what}, where several need an IMU" if kinds else what, mend)
+        mend = f"state all columns of a table: {'; '.join(map(_needs, TABLES))}"
+        raise at("columns")(f"{what}, where several need an IMU" if kinds else what, mend)
     used, lacking = whole_sets(kinds, set(QUANTITIES), format.quantities)
     if lacking:
         told = ", ".join(q for q in QUANTITIES if q in lacking)
-        mend = f"state them too; a table needs {'; '.join(map(_told, kinds))}"
-        raise refused("columns", f"{told} are not stated", mend)
+        mend = f"state the columns that hold them: {'; '.join(map(_needs, kinds))}"
+        raise at("columns")(f"without {told} a table is not whole", mend)
     if not format.choice and (idle := format.quantities - used):
         told = ", ".join(q for q in QUANTITIES if q in idle)
-        raise refused("columns", f"{told} have no use in {' and '.join(kinds)}", "leave them out")
+        raise at("columns")(f"{told} have no use in {' and '.join(kinds)}", "leave them out")
     if len(format.separator) != 1 or format.separator.isalnum() or format.separator in '+-."#%':
         mend = 'give one character, such as "," ";" "\\t" or " "'
-        raise refused("", "cannot separate numbers", mend, "separator", format.separator)
+        raise at("", "separator", format.separator)("cannot separate numbers", mend)
     try:
         Axes.of(format.body)
     except ValueError as error:
-        raise refused("", str(error), "name the ways of x, y, z", "body", format.body) from error
+        raise at("", "body", format.body)(str(error), "name the ways of x, y, z") from error
     if format.nav not in ("NED", "ENU"):
-        raise refused("", "is neither NED nor ENU", "choose one", "nav", format.nav)
+        raise at("", "nav", format.nav)("is neither NED nor ENU", "choose one")
     turned = groups_of(format.quantities) & {"euler", "quaternion"}
     if turned and not format.local and (format.nav, format.body) not in PAIRS:
         mend = "use NED with FRD or ENU with RFU where there are attitudes"
-        raise refused("", f"does not go with nav {format.nav}", mend, "body", format.body)
+        raise at("", "body", format.body)(f"does not go with nav {format.nav}", mend)
 
 
-def _told(kind: str) -> str:
+def one_of(name: str, allowed: Iterable[str]) -> str:
+    """How to mend a name that is not among those allowed."""
+    allowed = list(allowed)
+    near = get_close_matches(name, allowed, n=1)
+    choose = f"hoose one of {', '.join(allowed)}"
+    return f"did you mean {near[0]}? If not, c{choose}" if near else f"c{choose}"
+
+
+def _needs(kind: str) -> str:
     """What a table needs, in words."""
-    sets = (" ".join(parts(groups)) for groups in TABLES[kind].needs)
-    return f"{kind}: {', or '.join(sets)}"
+    sets = (", ".join(parts(groups)) for groups in TABLES[kind].needs)
+    return f"the {kind} table needs {', or '.join(sets)}"
 
 
 def decimals_of(found: Found) -> int:

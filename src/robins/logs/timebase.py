@@ -14,7 +14,7 @@ from decimal import Decimal
 
 import numpy as np
 
-from robins.logs.findings import LogError
+from robins.logs.findings import refused
 
 GPS_EPOCH_S = 315_964_800  # 1980-01-06 on a count from 1970-01-01 without leap seconds
 WEEK_S = 604_800
@@ -108,13 +108,9 @@ def stamps_to_ns(
         bad = int(np.argmin(good))
         shown = text[bad].decode("utf-8", "replace").strip()
         large = _exactly(text[bad], 0) is not None
-        raise LogError(
-            file,
+        raise refused(file, f"line {rows[bad]}", field, shown)(
             "does not fit: the time may be in ns, us or ms" if large else "is not a time stamp",
             "convert the time column to seconds" if large else "repair or delete the line",
-            where=f"line {rows[bad]}",
-            field=field,
-            value=shown,
         )
     return time_ns
 
@@ -166,13 +162,8 @@ def weeks_of(file: str, field: str, text: np.ndarray, rows: np.ndarray) -> np.nd
     weeks = stamps_to_ns(file, field, text, rows, exponent=0)
     bad = (weeks < 0) | (weeks > _LAST_WEEK)
     if bad.any():
-        raise LogError(
-            file,
-            "is no GPS week from which anyone has a log",
-            "repair or delete the line",
-            where=f"line {rows[np.argmax(bad)]}",
-            field=field,
-            value=int(weeks[np.argmax(bad)]),
+        raise refused(file, f"line {rows[np.argmax(bad)]}", field, int(weeks[np.argmax(bad)]))(
+            "is no GPS week from which anyone has a log", "repair or delete the line"
         )
     return weeks
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.logs.findings import Finding, LogError, report
+from robins.logs.findings import Finding, LogError, refused, report, told
 from robins.logs.opening import whole
 from robins.logs.text import Head
 from robins.logs.timebase import LIMIT_NS
@@ -39,6 +39,12 @@ _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
 _GNSS = ("vehicle_gps_position", "sensor_gps")
 _NO_FIX, _FLAT_FIX = 2, 3  # below these there is no fix, or none of the height
 _QUALITY = {6: 1, 5: 2, 4: 4, 3: 5, 2: 5}  # PX4's fix_type -> RTKLIB's Q
+
+
+_EARLY = (
+    "{name} breaks off at byte {sound} of {size}: what follows is half a message, or none. The "
+    "recording or the copy was interrupted, or a crash report is appended; all before it was read."
+)
 
 
 class Topic(NamedTuple):
@@ -66,10 +72,20 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     file = str(path)
     data, cut = whole(path, _LARGEST)
     if not data.startswith(MAGIC):
-        raise LogError(file, "is no ULog", "leave the format to be recognised", where="byte 0")
+        raise refused(file, "byte 0")("is no ULog", "leave the format to be recognised")
     sound = _sound(data)
     if sound < len(data) or cut:
-        report(findings, _ends_early(file, sound, len(data)))
+        report(
+            findings,
+            Finding(
+                "warning",
+                "ends_early",
+                file,
+                f"byte {sound}",
+                sound,
+                _EARLY.format(name=Path(file).name, sound=sound, size=len(data)),
+            ),
+        )
     log = _decode(file, data[:sound])
     imu = _first(file, log, _IMU, findings)
     if imu is None:
@@ -142,14 +158,9 @@ def _first(
         if len(found) > 1:
             report(
                 findings,
-                Finding(
-                    "note",
-                    "several_instances",
-                    file,
-                    "",
-                    len(found),
-                    f"{Path(file).name}: {name} was logged of {len(found)} sensors; the first, "
-                    f"number {found[0].multi_id}, is read and the others are left alone.",
+                told("note", "several_instances", file, value=len(found))(
+                    f"{name} was logged of {len(found)} sensors; the first, number "
+                    f"{found[0].multi_id}, is read and the others are left alone."
                 ),
             )
         if found:
@@ -161,11 +172,9 @@ def _column(file: str, topic: Topic, name: str) -> np.ndarray:
     if name in topic.fields:
         with np.errstate(invalid="ignore"):  # a NaN that signals stays a NaN
             return np.asarray(topic.fields[name], np.float64)
-    raise LogError(
-        file,
+    raise refused(file, field=topic.name)(
         f"has no field {name}; it has {', '.join(sorted(topic.fields))}",
         "this version of PX4 is not known; export the topic to CSV",
-        field=topic.name,
     )
 
 
@@ -178,11 +187,8 @@ def _stamps(file: str, topic: Topic) -> np.ndarray:
     sample = topic.fields.get("timestamp_sample")
     stamps = topic.fields.get("timestamp") if sample is None or not np.all(sample) else sample
     if stamps is None or stamps.dtype.kind != "u" or np.any(stamps >= LIMIT_NS // 1000):
-        raise LogError(
-            file,
-            "are no microseconds since power-up",
-            "fetch it again",
-            field=f"stamps of {topic.name}",
+        raise refused(file, field=f"stamps of {topic.name}")(
+            "are no microseconds since power-up", "fetch it again"
         )
     return stamps.astype(np.int64) * 1000
 
@@ -222,17 +228,4 @@ def _fixes(file: str, topic: Topic) -> GnssTable:
         sigma_v=np.repeat(speed[:, None], 3, axis=1),
         quality=np.array([_QUALITY.get(int(k), 0) for k in fix], np.int64),
         source=file,
-    )
-
-
-def _ends_early(file: str, sound: int, size: int) -> Finding:
-    return Finding(
-        "warning",
-        "ends_early",
-        file,
-        f"byte {sound}",
-        sound,
-        f"{Path(file).name} breaks off at byte {sound} of {size}: what follows is half a message, "
-        "or none. The recording or the copy was interrupted, or a crash report is appended; all "
-        "before it was read.",
     )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from robins.logs.findings import Finding, LogError, report
+from robins.logs.findings import Finding, refused, report, told
 
 TOLERANCE = 1e-3  # how far from one a length may be by its decimals
 
@@ -42,24 +40,14 @@ def unit_quaternions(
     where = f"row {k + 1}" if rows is None else f"line {rows[k]}"
     count = f"{wrong.sum()} of {known.sum()} rows"
     if 2 * wrong.sum() > known.sum():
-        raise LogError(
-            file,
-            f"is not of unit length, as in {count}",
-            "are the columns scalar first: w, x, y, z?",
-            where=where,
-            field=f"length of {name}",
-            value=float(length[k]),
+        raise refused(file, where, f"length of {name}", float(length[k]))(
+            f"is not of unit length, as in {count}", "are the columns scalar first: w, x, y, z?"
         )
     report(
         findings,
-        Finding(
-            "warning",
-            "quaternion_length",
-            file,
-            where,
-            float(length[k]),
-            f"{Path(file).name} {where}: the quaternion {name} has length {length[k]:g}, not 1 "
-            f"({count}). Such attitudes are taken as missing.",
+        told("warning", "quaternion_length", file, where, float(length[k]))(
+            f"the quaternion {name} has length {length[k]:g}, not 1 ({count}). Such attitudes are "
+            "taken as missing."
         ),
     )
     return out

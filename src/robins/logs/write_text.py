@@ -14,10 +14,10 @@ from robins import rotation
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.ins.frames import swap
 from robins.logs.axes import Axes
-from robins.logs.findings import LogError
+from robins.logs.findings import LogError, refused
 from robins.logs.local import Origin, to_local
 from robins.logs.quantities import CLOCKS, parts, words_of
-from robins.logs.tables import Table, kind_in_text, tables_of
+from robins.logs.tables import Table, kind_in_text, place_of, tables_of
 from robins.logs.text_format import ANY, PAIRS, Column, TextFormat
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS, ns_to_decimal
 from robins.logs.writing import write_lines
@@ -118,7 +118,7 @@ def _values(format: TextFormat, table: Any, origin: Origin | None) -> Values:
     elif isinstance(table, GnssTable):
         quality = None if table.quality is None else np.asarray(table.quality, float)[:, None]
         groups = {
-            "place": np.stack([table.lat_rad, table.lon_rad, table.alt_m], axis=-1),
+            "place": place_of(table),
             "sigma": table.sigma_m,
             "velocity": table.v_n,
             "sigma_v": table.sigma_v,
@@ -152,7 +152,7 @@ def _path(format: TextFormat, table: Trajectory, origin: Origin | None) -> dict[
         }
     v_n = np.asarray(table.v_n)
     return {
-        "place": np.stack([table.lat_rad, table.lon_rad, table.alt_m], axis=-1),
+        "place": place_of(table),
         "velocity": swap(v_n) if table.nav == "ENU" else v_n,
         "omega": table.omega_ib_b,
         **_turned(format, table.q_nb, table.nav),
@@ -213,11 +213,9 @@ def _refuse_missing(
     good = np.all([np.isfinite(v) for v in held], axis=0)
     if not good.all():
         at = ns_to_decimal(int(time_ns[np.argmin(good)]))
-        raise LogError(
-            str(path),
+        raise refused(str(path), f"time {at} s")(
             f"{format.name} cannot hold a missing component",
             "leave out the rows that are not complete",
-            where=f"time {at} s",
         )
 
 
