@@ -8,7 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_logs import rows_of, with_gnss, with_imu
 
-from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
+from robins.dataset import (
+    AttitudeTable,
+    Dataset,
+    GnssTable,
+    ImuTable,
+    MagTable,
+    Trajectory,
+)
 from robins.logs import LogError, Mounting, clean, load_dataset
 
 N = 200
@@ -33,7 +40,22 @@ GNSS = GnssTable(
     source="gnss.pos",
     rows=np.arange(1, M + 1),
 )
-DATA = Dataset("made", IMU, GNSS)
+Q = np.random.default_rng(6).normal(size=(M, 4))
+Q /= np.linalg.norm(Q, axis=1)[:, None]
+DATA = Dataset(
+    "made",
+    IMU,
+    GNSS,
+    Trajectory(GNSS.time_ns, GNSS.lat_rad, GNSS.lon_rad, GNSS.alt_m, GNSS.v_n, Q, source="t.csv"),
+    mag=MagTable(GNSS.time_ns, 1e-5 * GNSS.v_n, source="m.npz", rows=np.arange(2, M + 2)),
+    attitude=AttitudeTable(GNSS.time_ns, Q, "ENU", moving=np.arange(M) > 9, source="m.npz"),
+)
+DATA = dataclasses.replace(DATA, master=DATA.truth)
+TABLES = ["imu", "gnss", "truth", "master", "mag", "attitude"]
+
+
+def cleaned(**tables):
+    return clean(dataclasses.replace(DATA, **tables))
 
 
 def assert_same(one, two):
@@ -44,6 +66,19 @@ def assert_same(one, two):
         if isinstance(a, np.ndarray) and f.name != "rows":
             assert a.dtype == b.dtype
             assert a.tobytes() == b.tobytes(), f.name
+
+
+def assert_all_same(one, two):
+    for kind in TABLES:
+        if getattr(two, kind) is not None:
+            assert_same(getattr(one, kind), getattr(two, kind))
+
+
+def put(table, name, row, value):
+    """The table with one number changed."""
+    column = getattr(table, name).copy()
+    column[row] = value
+    return dataclasses.replace(table, **{name: column})
 
 
 def refused(counts):
@@ -82,45 +117,45 @@ KINDS = ["nan", "inf", "-inf", "1e308", "1e9", "duplicate", "backward"]
 BACK = ["sample", "second", "hour"]
 
 
-@given(st.sampled_from(KINDS), st.integers(1, N), st.integers(0, 5), st.sampled_from(BACK))
-def test_one_bad_imu_sample_anywhere(kind, at, axis, pick):
-    imu, reason = spoil(kind, IMU, at, axis, pick)
-    if pick == "sample" and kind == "backward" and at == 1:
-        reason = "backward"
-    got = clean(dataclasses.replace(DATA, imu=imu))
-    assert_same(got.imu, clean(DATA).imu)
+@pytest.fixture(scope="module", params=["made", "walk"])
+def data(request):
+    if request.param == "made":
+        return Dataset("made", IMU, GNSS)
+    files = request.getfixturevalue("walk_files")
+    return load_dataset(files, mounting=Mounting(180.0, 0.0, -90.0))
+
+
+@given(draw=st.data())
+def test_one_bad_imu_sample_anywhere(data, draw):
+    at = draw.draw(st.integers(1, len(data.imu)))
+    kind, pick = draw.draw(st.sampled_from(KINDS)), draw.draw(st.sampled_from(BACK))
+    imu, reason = spoil(kind, data.imu, at, draw.draw(st.integers(0, 5)), pick)
+    got = clean(dataclasses.replace(data, imu=imu))
+    assert_all_same(got, data)
     # A step back by one sample meets the stamp before the last: an earlier time all the same.
     assert refused(got.counts) == {f"imu_{reason}": 1}
-    assert got.imu_gaps == []
+    assert got.imu_gaps == clean(data).imu_gaps
 
 
-@pytest.fixture(scope="module")
-def walk(walk_files):
-    return load_dataset(walk_files, mounting=Mounting(180.0, 0.0, -90.0))
-
-
-@given(data=st.data())
-def test_one_bad_sample_anywhere_in_the_walk(walk, data):
-    at = data.draw(st.integers(1, len(walk.imu)))
-    kind, pick = data.draw(st.sampled_from(KINDS)), data.draw(st.sampled_from(BACK))
-    imu, reason = spoil(kind, walk.imu, at, data.draw(st.integers(0, 5)), pick)
-    got = clean(dataclasses.replace(walk, imu=imu))
-    assert_same(got.imu, walk.imu)
-    assert_same(got.gnss, walk.gnss)
-    assert refused(got.counts) == {f"imu_{reason}": 1}
+@given(
+    st.sampled_from(TABLES),
+    st.integers(1, M - 2),
+    st.sampled_from([(0, "duplicate"), (-(10**9) - 7, "backward"), (3600 * 10**9, "ahead")]),
+)
+def test_a_row_out_of_order_is_as_if_it_had_never_been(kind, at, step):
+    table = getattr(DATA, kind)
+    got = cleaned(**{kind: put_in(table, at, table.time_ns[at - 1] + step[0])})
+    assert_all_same(got, DATA)
+    assert refused(got.counts) == {f"{kind}_{step[1]}": 1}
 
 
 def test_a_clean_log_passes_bit_by_bit_and_all_reasons_are_listed():
     got = clean(DATA)
-    assert_same(got.imu, IMU)
-    assert_same(got.gnss, GNSS)
-    assert set(got.counts.values()) == {0}
-    assert sorted(got.counts) == [
-        *sorted(
-            f"gnss_{r}" for r in ("absurd", "ahead", "backward", "duplicate", "inf", "nan", "sigma")
-        ),
-        *sorted(f"imu_{r}" for r in ("absurd", "ahead", "backward", "duplicate", "inf", "nan")),
-    ]
+    assert_all_same(got, DATA)
+    reasons = ("absurd", "ahead", "backward", "duplicate", "inf", "nan")
+    listed = [f"{kind}_{reason}" for kind in TABLES for reason in reasons]
+    assert got.counts == dict.fromkeys([*listed, "gnss_sigma"], 0)
+    assert clean(Dataset("bare", IMU)).gnss is None
 
 
 def test_cleaning_twice_changes_nothing_and_keeps_the_counts():
@@ -273,18 +308,12 @@ def test_sigmas_that_are_never_positive_are_refused_in_a_sentence(change, messag
         clean(with_gnss(DATA, **change))
 
 
-@given(st.integers(1, M), st.sampled_from(["nan", "duplicate", "backward"]))
-def test_one_bad_fix_anywhere(at, kind):
-    before = int(GNSS.time_ns[at - 1])
-    if kind == "nan":
-        nan = np.nan
-        hole = {"lat_rad": nan, "lon_rad": nan, "alt_m": nan, "v_n": np.full(3, nan)}
-        table = put_in(GNSS, at, before + 1000, **hole)
-    else:
-        table = put_in(GNSS, at, before - (0 if kind == "duplicate" else 10**9 + 7))
-    got = clean(dataclasses.replace(DATA, gnss=table))
+def test_a_fix_without_any_component_is_refused_whole():
+    nan = np.nan
+    hole = {"lat_rad": nan, "lon_rad": nan, "alt_m": nan, "v_n": np.full(3, nan)}
+    got = cleaned(gnss=put_in(GNSS, 9, GNSS.time_ns[8] + 1000, **hole))
     assert_same(got.gnss, GNSS)
-    assert refused(got.counts) == {f"gnss_{kind}": 1}
+    assert refused(got.counts) == {"gnss_nan": 1}
 
 
 def test_positions_without_velocities():
@@ -293,15 +322,39 @@ def test_positions_without_velocities():
     np.testing.assert_array_equal(got.gnss.alt_m, GNSS.alt_m)
 
 
-def test_an_imu_alone_and_a_truth():
-    q = np.tile([1.0, 0, 0, 0], (M, 1))
-    truth = Trajectory(GNSS.time_ns, GNSS.lat_rad, GNSS.lon_rad, GNSS.alt_m, GNSS.v_n, q)
-    q = q.copy()
-    q[3, 0] = np.nan
-    got = clean(Dataset("x", IMU, truth=dataclasses.replace(truth, q_nb=q)))
-    assert_same(got.truth, rows_of(truth, np.arange(M) != 3))
+# ------------------------------------------------------------------- paths, field and attitude
+
+
+def test_a_row_of_a_path_is_refused_whole():
+    got = cleaned(truth=put(DATA.truth, "q_nb", (3, 0), np.nan))
+    assert_same(got.truth, rows_of(DATA.truth, np.arange(M) != 3))
     assert refused(got.counts) == {"truth_nan": 1}
-    assert got.gnss is None
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "inf"), (1e308, "absurd"), (-1.5, "absurd")],
+)
+@pytest.mark.parametrize(
+    ("kind", "column", "whole"), [("mag", "field_t", False), ("attitude", "q_nb", True)]
+)
+def test_what_is_bad_beside_the_samples_goes_missing_and_its_row_stays(
+    kind, column, whole, value, reason
+):
+    table = getattr(DATA, kind)
+    got = cleaned(**{kind: put(table, column, (7, 1), value)})
+    expected = getattr(table, column).copy()
+    expected[7, slice(None) if whole else 1] = np.nan
+    np.testing.assert_array_equal(getattr(getattr(got, kind), column), expected)
+    assert refused(got.counts) == {f"{kind}_{reason}": 1}
+
+
+def test_small_numbers_are_numbers_and_a_quaternion_of_zeros_is_none():
+    small = put(DATA.mag, "field_t", (7, 1), 5e-324)
+    assert_same(cleaned(mag=small).mag, small)
+    got = cleaned(attitude=put(DATA.attitude, "q_nb", 7, 0.0))
+    assert refused(got.counts) == {"attitude_absurd": 1}
+    assert np.isnan(got.attitude.q_nb[7]).all()
 
 
 # ------------------------------------------------------------------------------ arrays (F04)
@@ -340,14 +393,21 @@ def test_other_arrays_of_numbers_give_the_same(kind):
         ({"time_ns": IMU.time_ns * 1e-9}, r"time_ns: is float64 of .*; give time as int64 nano"),
         ({"rows": IMU.rows[:5]}, r"rows: has shape \(5,\)"),
         ({"kind": "rates"}, r"kind = 'rates': is neither 'rate' nor 'increment'"),
+        ({"field_t": DATA.mag.field_t[:-1]}, r"field_t: has shape \(29, 3\)"),
+        ({"field_t": DATA.mag.field_t * 1j}, "field_t: holds complex128"),
+        ({"q_nb": Q[:, :3], "moving": None}, r"q_nb: has shape \(30, 3\)"),
+        ({"moving": np.ones(M)}, "moving: is float64, not bool"),
+        ({"moving": DATA.attitude.moving[1:]}, r"moving: has shape \(29,\)"),
     ],
 )
 def test_arrays_that_are_no_table(change, message):
-    imu = object.__new__(ImuTable)  # as a user without checked annotations would have it
-    for f in dataclasses.fields(ImuTable):
-        object.__setattr__(imu, f.name, change.get(f.name, getattr(IMU, f.name)))
+    kind = next(k for k in ("imu", "mag", "attitude") if hasattr(getattr(DATA, k), [*change][-1]))
+    good = getattr(DATA, kind)
+    table = object.__new__(type(good))  # as a user without checked annotations would have it
+    for f in dataclasses.fields(good):
+        object.__setattr__(table, f.name, change.get(f.name, getattr(good, f.name)))
     with pytest.raises(LogError, match=message):
-        clean(dataclasses.replace(DATA, imu=imu))
+        cleaned(**{kind: table})
 
 
 def test_velocities_without_their_sigmas():

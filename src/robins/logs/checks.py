@@ -20,8 +20,6 @@ from robins.logs.checks_time import check_span, check_time
 from robins.logs.findings import Finding
 from robins.logs.limits import check_limits
 
-_NONE: frozenset[str] = frozenset()
-
 
 class Code(NamedTuple):
     """What one finding says."""
@@ -39,26 +37,27 @@ class Check:
     find: Callable[..., Iterable[Finding]]
     needs: str  # what it is given, in this order; where one of these is missing it is not asked
     codes: tuple[Code, ...]
-    silenced_by: frozenset[str] = _NONE  # codes; beside these it would blame the wrong thing
+    silenced_by: str = ""  # codes; beside these it would blame the wrong thing
     unless: str = ""  # it is not asked where one of these is there, for that tells more ...
     but_after: str = ""  # ... but where it could tell nothing, by this code
-    proves: frozenset[str] = _NONE  # codes that, if found here, replace those found before
-    overrules: frozenset[str] = _NONE  # codes found before that it judges better ...
+    proves: str = ""  # codes that, if found here, replace those found before
+    overrules: str = ""  # codes found before that it judges better ...
     undecided: str = ""  # ... unless by this code it could not
 
     def is_asked(self, things: Mapping[str, Any], found: set[str]) -> bool:
         """Whether it is, about these things and after these codes."""
         there = things.keys() >= set(self.needs.split())
         kept_out = set(self.unless.split()) & things.keys() and self.but_after not in found
-        return there and not kept_out and not self.silenced_by & found
+        return there and not kept_out and not set(self.silenced_by.split()) & found
 
     def ask(self, things: Mapping[str, Any]) -> list[Finding]:
         """What it finds."""
         return list(self.find(*(things[need] for need in self.needs.split())))
 
-    def outdated(self, found: set[str]) -> frozenset[str]:
+    def outdated(self, found: set[str]) -> set[str]:
         """Codes of earlier findings that need not be told beside what this check found."""
-        return (self.proves & found) | (_NONE if self.undecided in found else self.overrules)
+        judged = "" if self.undecided in found else self.overrules
+        return set(self.proves.split()) & found | set(judged.split())
 
 
 # What readers leave out or doubt while they read.
@@ -81,7 +80,7 @@ _OF_VELOCITY = (
     Code("velocity_late", "warning", "velocities that fit only with a delay"),
 )
 
-_NO_PLACE = frozenset(("position_unit", "no_fix_as_zero"))
+_NO_PLACE = "position_unit no_fix_as_zero"
 
 # Asked about each table by itself; only findings on that table silence.
 ALONE = (
@@ -185,12 +184,12 @@ ALONE = (
 )
 
 # Beside these, sensors seem to show two motions.
-_SPOILT = _NO_PLACE | {
-    *("no_overlap", "rates_as_increments", "increments_as_rates", "time_unit", "time_slow"),
-    *("velocity_axes", "velocity_unit", "velocity_sign"),
-}
+_SPOILT = (
+    f"{_NO_PLACE} no_overlap rates_as_increments increments_as_rates time_unit time_slow "
+    "velocity_axes velocity_unit velocity_sign"
+)
 # With these, what is compared with the gyros would be blamed for them.
-_GYROS_WRONG = {"gyro_unit", "gyro_axes", "gyro_reversed", "left_handed"}
+_GYROS_WRONG = "gyro_unit gyro_axes gyro_reversed left_handed"
 
 # Asked about all tables of a log together.
 TOGETHER = (
@@ -227,13 +226,8 @@ TOGETHER = (
             Code("force_disagrees", "error", "they feel something else than the velocities ask"),
         ),
         # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
-        overrules=frozenset(
-            (
-                *("gravity_unit", "gravity_unknown", "gravity_bias", "gravity_not_seen"),
-                *("gravity_missing", "z_axis_reversed", "not_level"),
-                *("rates_as_increments", "increments_as_rates"),
-            )
-        ),
+        overrules="gravity_unit gravity_unknown gravity_bias gravity_not_seen gravity_missing "
+        "z_axis_reversed not_level rates_as_increments increments_as_rates",
         undecided="force_not_checked",
     ),
     Check(
@@ -255,7 +249,7 @@ TOGETHER = (
         ),
         silenced_by=_SPOILT,
         unless="master",
-        proves=frozenset(("gyro_unit",)),
+        proves="gyro_unit",
     ),
     Check(
         "In an IMU that was turned about",
@@ -269,14 +263,14 @@ TOGETHER = (
         silenced_by=_SPOILT,
         unless="master gnss",
         but_after="motion_not_checked",
-        proves=frozenset(("gyro_unit",)),
+        proves="gyro_unit",
     ),
     Check(
         "In the magnetic field",
         check_mag_axes,
         "imu mag",
         (Code("field_axes", "error", "it turns as the gyros say only with other columns"),),
-        silenced_by=_SPOILT | _GYROS_WRONG | {"field_unit", "field_stuck"},
+        silenced_by=f"{_SPOILT} {_GYROS_WRONG} field_unit field_stuck",
         unless="master",
     ),
     Check(
@@ -290,7 +284,7 @@ TOGETHER = (
             Code("attitude_disagrees", "warning", "they are of another body or another time"),
             Code("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
         ),
-        silenced_by=_SPOILT | _GYROS_WRONG,
+        silenced_by=f"{_SPOILT} {_GYROS_WRONG}",
         unless="master",
     ),
 )

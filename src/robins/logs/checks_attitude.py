@@ -13,10 +13,9 @@ import numpy as np
 from robins.dataset import AttitudeTable, ImuTable
 from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding
-from robins.logs.motion import signed_permutations
+from robins.logs.motion import Steps, signed_permutations, steps_of
 from robins.logs.ordering import increasing
 from robins.logs.quiet import Signal, error, signal_of, warning, windows_of
-from robins.logs.steps import Steps, steps_of
 from robins.logs.unit_length import TOLERANCE
 
 _WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the turning left unexplained

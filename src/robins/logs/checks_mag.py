@@ -19,10 +19,9 @@ from robins.dataset import ImuTable, MagTable
 from robins.logs.checks_motion import words_of
 from robins.logs.findings import Finding, Severity
 from robins.logs.limits import FIELD_LIMIT_T, few_beyond
-from robins.logs.motion import at, signed_permutations
+from robins.logs.motion import at, signed_permutations, steps_of
 from robins.logs.ordering import increasing
 from robins.logs.quiet import error, finding, longest_run, note, signal_of, usual_step_s, warning
-from robins.logs.steps import steps_of
 
 EARTH_T = (20e-6, 70e-6)
 _FEW = 10  # samples below which nothing is judged

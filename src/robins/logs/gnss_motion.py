@@ -9,6 +9,7 @@ import numpy as np
 from robins.dataset import GnssTable
 from robins.earth import curvature_radii
 from robins.logs.limits import ALT_LIMIT_M, SPEED_LIMIT
+from robins.logs.motion import at, integral
 from robins.logs.ordering import increasing
 
 _BASE_S = 1.0
@@ -69,12 +70,8 @@ def velocity_of(track: Track) -> tuple[np.ndarray, float]:
     """
     if track.v_n is not None:
         return track.v_n, float(np.sqrt(6.0)) * track.sigma_v
-    time_s = track.time_s
-
-    def at(when: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(when, time_s, c) for c in track.r_n.T], axis=-1)
-
-    v_n = (at(time_s + 0.5 * _BASE_S) - at(time_s - 0.5 * _BASE_S)) / _BASE_S
+    ahead, behind = (at(track.time_s + k * _BASE_S, track.time_s, track.r_n) for k in (0.5, -0.5))
+    v_n = (ahead - behind) / _BASE_S
     return v_n, float(np.sqrt(12.0)) * track.sigma_m / _BASE_S
 
 
@@ -100,18 +97,10 @@ def steps_of(track: Track, late_s: float = 0.0) -> Steps | None:
     last = first + stride
     near = time_s[last] - time_s[first] < 1.5 * np.median(time_s[last] - time_s[first])
     first, last = first[near], last[near]
-    path = np.concatenate(
-        [
-            np.zeros((1, 3)),
-            np.cumsum(0.5 * (track.v_n[1:] + track.v_n[:-1]) * np.diff(time_s)[:, None], axis=0),
-        ]
-    )
-
-    def at(when: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(when, time_s, c) for c in path.T], axis=-1)
-
+    path = integral(time_s, track.v_n)
     by_position = track.r_n[last] - track.r_n[first]
-    by_velocity = at(time_s[last] + late_s) - at(time_s[first] + late_s)
+    ends = (at(time_s[rows] + late_s, time_s, path) for rows in (last, first))
+    by_velocity = np.subtract(*ends)
     duration = time_s[last] - time_s[first]
     # By either view, so that positions in a wrong unit do not pass for rest.
     by_both = np.maximum(*(np.linalg.norm(x[:, :2], axis=-1) for x in (by_position, by_velocity)))

@@ -41,9 +41,8 @@ def load_dataset(
     """
     paths = [os.fspath(p) for p in paths]
     if unknown := set(formats or {}) - set(paths):
-        raise LogError(
-            ", ".join(sorted(unknown)), "a format is given, but not the file", "check its path"
-        )
+        given = ", ".join(sorted(unknown))
+        raise LogError(given, "a format is given, but not the file", "check its path")
     findings: list[Finding] = []
     held: dict[str, Any] = {}
     known: list[str] = []
@@ -54,16 +53,12 @@ def load_dataset(
         for table in tables_of(opened):
             kind = kind_of(table)
             if kind in held:
-                raise LogError(
-                    path,
-                    f"is a second file of the kind of {held[kind].source} ({kind})",
-                    "give one of the two",
-                )
+                cause = f"is a second file of the kind of {held[kind].source} ({kind})"
+                raise LogError(path, cause, "give one of the two")
             held[kind] = table
     if "imu" not in held:
-        raise LogError(
-            ", ".join(paths) or "(no file)", "no IMU log among the files", "give one IMU log"
-        )
+        given = ", ".join(paths) or "(no file)"
+        raise LogError(given, "no IMU log among the files", "give one IMU log")
     dataset = Dataset(
         name=name or Path(held["imu"].source).name.split(".")[0],
         **held,
@@ -128,8 +123,5 @@ def _open_as(
 
 
 def _exchanged(path: str | os.PathLike[str], what: str, option: str) -> LogError:
-    return LogError(
-        os.fspath(path),
-        f"holds {what}",
-        f"give {option} the right file; were master and slave exchanged?",
-    )
+    mend = f"give {option} the right file; were master and slave exchanged?"
+    return LogError(os.fspath(path), f"holds {what}", mend)

@@ -94,11 +94,9 @@ def _lever_arm(dataset: Dataset, mounting: Mounting) -> tuple[float, float, floa
     if arm is None:
         return dataset.lever_arm_b_m
     if dataset.gnss is None:
-        raise LogError(
-            dataset.name,
-            "has no GNSS fixes, but is given a lever arm to their antenna",
-            "give the log of the receiver too, or omit the lever arm",
-        )
+        cause = "has no GNSS fixes, but is given a lever arm to their antenna"
+        mend = "give the log of the receiver too, or omit the lever arm"
+        raise LogError(dataset.name, cause, mend)
     if not np.all(np.isfinite(arm)):
         raise LogError(dataset.name, f"is given a lever arm of {arm} m", "give finite numbers")
     return arm

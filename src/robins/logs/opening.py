@@ -139,9 +139,6 @@ def whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
         parts.append(block)
         size += len(block)
         if size > limit:
-            raise LogError(
-                str(path),
-                f"holds more than {limit >> 20} MiB",
-                "cut the recording into parts",
-            )
+            held = f"holds more than {limit >> 20} MiB"
+            raise LogError(str(path), held, "cut the recording into parts")
     return b"".join(parts), source.cut

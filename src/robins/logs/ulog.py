@@ -142,11 +142,8 @@ def _decode(file: str, data: bytes) -> Any:
 
 
 def _damaged(file: str, why: str) -> LogError:
-    return LogError(
-        file,
-        f"is damaged ({why})",
-        "fetch it again; nothing of it was used, for no number in it can be trusted",
-    )
+    mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
+    return LogError(file, f"is damaged ({why})", mend)
 
 
 def _first(

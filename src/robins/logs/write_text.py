@@ -68,21 +68,17 @@ def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> No
         cause = f"{format.name} holds {held}, not {words_of(kind)}"
         raise LogError(str(path), cause, "choose another format")
     if isinstance(table, ImuTable):
-        wanted = {"rate": "gyro_x", "increment": "dtheta_x"}[table.kind]
+        wanted, other, mend = {
+            "rate": ("gyro_x", "increment", "integrate them first"),
+            "increment": ("dtheta_x", "rate", "divide them by their dt first"),
+        }[table.kind]
         if wanted not in format.quantities:
-            wants, are, mend = (
-                ("rates", "increments", "divide them by their dt first")
-                if table.kind == "increment"
-                else ("increments", "rates", "integrate them first")
-            )
-            raise LogError(str(path), f"{format.name} wants {wants}, these are {are}", mend)
+            cause = f"{format.name} wants {other}s, these are {table.kind}s"
+            raise LogError(str(path), cause, mend)
     if format.says_frames:
         if isinstance(table, Trajectory) and (table.nav, table.body) not in PAIRS:
-            raise LogError(
-                str(path),
-                f"frames {table.nav} and {table.body} do not belong together",
-                "convert the table first",
-            )
+            cause = f"frames {table.nav} and {table.body} do not belong together"
+            raise LogError(str(path), cause, "convert the table first")
         return
     body = "RFU" if format.body == "RFU" else "FRD"
     nav = format.nav if isinstance(table, Trajectory | AttitudeTable | GnssTable) else None
@@ -91,11 +87,8 @@ def _check(format: TextFormat, path: str | os.PathLike[str], table: Table) -> No
         ("nav", getattr(table, "nav", nav), "NED" if isinstance(table, GnssTable) else nav),
     ):
         if has != wants and not (format.local and what == "nav"):
-            raise LogError(
-                str(path),
-                f"{format.name} wants {what} frame {wants}, this table is in {has}",
-                "convert the table first",
-            )
+            cause = f"{format.name} wants {what} frame {wants}, this table is in {has}"
+            raise LogError(str(path), cause, "convert the table first")
 
 
 def _values(format: TextFormat, table: Any, origin: Origin | None) -> Values:
@@ -181,11 +174,8 @@ def _together(
     if all(np.array_equal(t, times[0]) for t in times):
         return times[0], {q: v for _, values in parts_ for q, v in values.items()}
     if not format.sparse:
-        raise LogError(
-            str(path),
-            f"{format.name} has one time for all, these tables have different times",
-            "write them to files of their own",
-        )
+        cause = f"{format.name} has one time for all, these tables have different times"
+        raise LogError(str(path), cause, "write them to files of their own")
     stamps = np.concatenate(times)
     order = np.argsort(stamps, kind="stable")
     ends = np.cumsum([0, *map(len, times)])

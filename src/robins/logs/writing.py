@@ -6,16 +6,12 @@ import gzip
 import lzma
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from robins.logs.findings import LogError
-from robins.logs.timebase import ns_to_decimal
 
-_ROWS = 50_000
 _OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 
 
@@ -62,17 +58,3 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
-
-
-def rows_of_numbers(
-    time_ns: np.ndarray, values: np.ndarray, separator: str, *, seconds: bool = True
-) -> Iterator[str]:
-    """Lines "time, numbers": each the shortest decimal that reads back to the same number."""
-    stamp = ns_to_decimal if seconds else str
-    for start in range(0, len(time_ns), _ROWS):
-        times = time_ns[start : start + _ROWS].tolist()
-        numbers = values[start : start + _ROWS].tolist()
-        yield "".join(
-            f"{stamp(t)}{separator}{separator.join(map(repr, row))}\n"
-            for t, row in zip(times, numbers, strict=True)
-        )
