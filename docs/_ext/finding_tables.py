@@ -1,14 +1,8 @@
 """Tables of the doctor's findings and of what `clean` refuses, out of `robins.logs.checks`."""
 
-from pathlib import Path
+from generated import setup_of, table
 
 from robins.logs.checks import ALONE, OF_READERS, REFUSALS, TOGETHER
-
-
-def table(head: tuple[str, ...], rows) -> str:
-    """A table in Markdown; the first column is code."""
-    lines = [head, ("---",) * len(head), *((f"`{first}`", *rest) for first, *rest in rows)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def findings() -> str:
@@ -25,17 +19,4 @@ def refusals() -> str:
     return table(("reason", "what"), REFUSALS.items())
 
 
-def write(app) -> None:
-    """Write what `logs.md` includes; a table that has not changed is left untouched."""
-    folder = Path(app.srcdir) / "_generated"
-    folder.mkdir(exist_ok=True)
-    for name, text in {"findings.txt": findings(), "refusals.txt": refusals()}.items():
-        path = folder / name
-        if not path.exists() or path.read_text("utf-8") != text:
-            path.write_text(text, "utf-8")
-
-
-def setup(app) -> dict:
-    """Write the tables before Sphinx looks for sources."""
-    app.connect("builder-inited", write)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
+setup = setup_of(findings=findings, refusals=refusals)

@@ -1,17 +1,11 @@
 """The tables of log formats and of what columns hold, as `robins.logs` has them."""
 
-from pathlib import Path
+from generated import setup_of, table
 
 from robins.logs.quantities import GROUPS, TABLES
 from robins.logs.registry import FORMATS
 from robins.logs.text_format import ANY
 from robins.logs.text_formats import TEXT_FORMATS
-
-
-def table(head: tuple[str, ...], rows) -> str:
-    """A table in Markdown; the first column is code."""
-    lines = [head, ("---",) * len(head), *((f"`{first}`", *rest) for first, *rest in rows)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def formats() -> str:
@@ -42,17 +36,4 @@ def quantities() -> str:
     return table(("quantities", "kind of unit", "meaning"), rows)
 
 
-def write(app) -> None:
-    """Write what `logs.md` includes; a table that has not changed is left untouched."""
-    folder = Path(app.srcdir) / "_generated"
-    folder.mkdir(exist_ok=True)
-    for make in (formats, columns, quantities):
-        path, text = folder / f"{make.__name__}.txt", make()
-        if not path.exists() or path.read_text("utf-8") != text:
-            path.write_text(text, "utf-8")
-
-
-def setup(app) -> dict:
-    """Write the tables before Sphinx looks for sources."""
-    app.connect("builder-inited", write)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
+setup = setup_of(formats=formats, columns=columns, quantities=quantities)

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
+
+from generated import setup_of
 
 from robins.report import FIGURES
 from robins.results import ROLES
@@ -37,14 +38,4 @@ def rows() -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
 
 
-def write(app) -> None:
-    """Write what the contract includes, beside the pages of the reference."""
-    folder = Path(app.srcdir) / "_generated"
-    folder.mkdir(exist_ok=True)
-    (folder / "arrays.txt").write_text("\n".join([*rows(), ""]), "utf-8")
-
-
-def setup(app) -> dict:
-    """Write the table before Sphinx looks for sources."""
-    app.connect("builder-inited", write)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
+setup = setup_of(arrays=lambda: "\n".join([*rows(), ""]))

@@ -6,14 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_WAYS = {
-    "F": (0, 1.0),
-    "B": (0, -1.0),
-    "R": (1, 1.0),
-    "L": (1, -1.0),
-    "D": (2, 1.0),
-    "U": (2, -1.0),
-}
+_WAYS = {way: (k // 2, -1.0 if k % 2 else 1.0) for k, way in enumerate("FBRLDU")}
 
 
 class Axes(NamedTuple):

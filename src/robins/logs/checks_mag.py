@@ -44,11 +44,7 @@ _SHIFTS: dict[int, tuple[Severity, str, str]] = {
     1: ("warning", "They may be in mG where uT is said, or a magnet is near", "divide by 10"),
     -1: ("warning", "They may be in uT where mG is said, or it is shielded", "multiply by 10"),
     -2: ("error", "They are probably in gauss where uT is said", "multiply by 100"),
-    -3: (
-        "error",
-        "They are probably in uT where nT is said, or mT where uT",
-        "multiply by 1000",
-    ),
+    -3: ("error", "They are probably in uT where nT is said, or mT where uT", "multiply by 1000"),
 }
 
 

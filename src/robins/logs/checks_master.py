@@ -80,17 +80,9 @@ def _as_fixes(master: Trajectory) -> GnssTable:
     bends = bends[np.isfinite(bends).all(axis=1)]
     scatter = np.median(bends, axis=0) / 0.6745 / np.sqrt(6.0) if len(bends) else np.ones(3)
     sigma_m = np.tile(np.maximum(_CLEAR * scatter, 1.0), (len(master), 1))
-    return GnssTable(
-        time_ns=master.time_ns,
-        lat_rad=master.lat_rad,
-        lon_rad=master.lon_rad,
-        alt_m=master.alt_m,
-        sigma_m=sigma_m,
-        v_n=master.v_n,
-        sigma_v=np.ones((len(master), 3)),
-        source=master.source,
-        rows=master.rows,
-    )
+    sigma_v = np.ones((len(master), 3))
+    fixes = GnssTable(master.time_ns, *place_of(master).T, sigma_m, master.v_n, sigma_v)
+    return replace(fixes, source=master.source, rows=master.rows)
 
 
 def _missing(master: Trajectory) -> Iterator[Finding]:

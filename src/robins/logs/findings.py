@@ -13,6 +13,7 @@ from robins.dataset import Finding as Finding  # where datasets hold them; read 
 from robins.dataset import Severity as Severity
 from robins.errors import RobinsError
 
+Value = float | int | str
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
@@ -52,12 +53,7 @@ class LogWarning(UserWarning):
 
 
 def told(
-    severity: Severity,
-    code: str,
-    file: str,
-    where: str = "",
-    value: float | int | str = "",
-    name: str = "",
+    severity: Severity, code: str, file: str, where: str = "", value: Value = "", name: str = ""
 ) -> Callable[[str], Finding]:
     """Makes a finding of its sentence, put behind name (or file) and place."""
     begin = f"{name or Path(file).name} {where}".rstrip()

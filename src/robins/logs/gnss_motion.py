@@ -50,11 +50,7 @@ def track_of(gnss: GnssTable, *, swap: bool = False) -> Track | None:
     meridian, transverse = (np.asarray(r) for r in curvature_radii(lat))
     east = np.unwrap(lon) - lon[0]
     r_n = np.stack(
-        [
-            (lat - lat[0]) * (meridian + alt),
-            east * (transverse + alt) * np.cos(lat),
-            alt[0] - alt,
-        ],
+        [(lat - lat[0]) * (meridian + alt), east * (transverse + alt) * np.cos(lat), alt[0] - alt],
         axis=-1,
     )
     sigma_v = np.inf if gnss.sigma_v is None else float(np.median(gnss.sigma_v[rows]))

@@ -88,28 +88,14 @@ def read_phone(path: str | os.PathLike[str], findings: list[Finding] | None = No
     for what, lines in have.items():
         if not lines.any():
             raise LogError(file, f"no line has {what}", "record that sensor as well")
-    imu, mag, gnss = have.values()
+    (imu, mag, gnss), rows = have.values(), columns.rows
     return Dataset(
         name=Path(file).name.split(".")[0],
         imu=ImuTable(
-            time_ns[imu],
-            stack(*_GYRO)[imu],
-            stack(*_ACCEL)[imu],
-            "rate",
-            body="RFU",
-            source=file,
-            rows=columns.rows[imu],
+            time_ns[imu], stack(*_GYRO)[imu], stack(*_ACCEL)[imu], "rate", "RFU", file, rows[imu]
         ),
-        mag=MagTable(
-            time_ns[mag],
-            to_si(stack(*_MAG)[mag], "uT"),
-            body="RFU",
-            source=file,
-            rows=columns.rows[mag],
-        ),
-        gnss=_fixes(
-            file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], columns.rows[gnss]
-        ),
+        mag=MagTable(time_ns[mag], to_si(stack(*_MAG)[mag], "uT"), "RFU", file, rows[mag]),
+        gnss=_fixes(file, time_ns[gnss], stack(*_PLACE)[gnss], stack(*_VELOCITY)[gnss], rows[gnss]),
         time_unit_known=(file,),
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
 from robins.ins.intervals import own_intervals
-from robins.logs.findings import SEVERITIES, Finding, Severity, told
+from robins.logs.findings import SEVERITIES, Finding, Severity, Value, told
 from robins.logs.ordering import increasing
 from robins.logs.tables import Table
 
@@ -42,7 +42,7 @@ def place(table: Table, row: int) -> str:
 
 
 def finding(
-    severity: Severity, table: Table, code: str, value: float | int | str, row: int | None = None
+    severity: Severity, table: Table, code: str, value: Value, row: int | None = None
 ) -> Callable[[str], Finding]:
     """As `told`, about a table or a row of it."""
     where = "" if row is None else place(table, row)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -61,6 +62,11 @@ class Read(NamedTuple):
         """Its columns side by side; NaN if there are none."""
         missing = np.full(len(self.rows), np.nan)
         return np.stack([self.values.get(q, missing) for q in parts(group)], axis=-1)
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """Where its numbers come from, for a table."""
+        return {"source": self.file, "rows": self.rows}
 
     def of(self, rows: np.ndarray) -> Read:
         """Some of the rows."""
@@ -205,20 +211,17 @@ def _imu(read: Read) -> ImuTable:
     if read.has("dt"):
         _compare_dt(read)
     rate = read.has("gyro")
-    gyro, accel = ("gyro", "accel") if rate else ("dtheta", "dv")
     return ImuTable(
-        time_ns=read.time_ns,
-        gyro=read.stack(gyro),
-        accel=read.stack(accel),
+        read.time_ns,
+        *map(read.stack, ("gyro", "accel") if rate else ("dtheta", "dv")),
         kind="rate" if rate else "increment",
         body=read.body,
-        source=read.file,
-        rows=read.rows,
+        **read.origin,
     )
 
 
 def _mag(read: Read) -> MagTable:
-    return MagTable(read.time_ns, read.stack("mag"), read.body, read.file, read.rows)
+    return MagTable(read.time_ns, read.stack("mag"), read.body, **read.origin)
 
 
 def _gnss(read: Read) -> GnssTable:
@@ -227,22 +230,19 @@ def _gnss(read: Read) -> GnssTable:
         quality = np.where(np.abs(quality) < 100.0, quality, 0.0).astype(np.int64)
     moves = read.has("velocity")
     return GnssTable(
-        time_ns=read.time_ns,
-        lat_rad=read.values["lat"],
-        lon_rad=read.values["lon"],
-        alt_m=read.values["height"],
+        read.time_ns,
+        *(read.values[q] for q in parts("place")),
         sigma_m=read.stack("sigma"),
         v_n=read.stack("velocity") if moves else None,
         sigma_v=read.stack("sigma_v") if moves else None,
         quality=quality,
-        source=read.file,
-        rows=read.rows,
+        **read.origin,
     )
 
 
 def _attitude(read: Read) -> AttitudeTable:
     q_nb = _quaternions(read)
-    return AttitudeTable(read.time_ns, q_nb, read.nav, read.body, source=read.file, rows=read.rows)
+    return AttitudeTable(read.time_ns, q_nb, read.nav, read.body, **read.origin)
 
 
 def _path(read: Read, origin: Origin | None) -> Trajectory:
@@ -262,21 +262,16 @@ def _path(read: Read, origin: Origin | None) -> Trajectory:
             )
         local = LocalPath(read.time_ns, read.stack("local"), swap(v_n), q_nb)
         path = from_local(local, origin or NOWHERE, source=read.file)
-        return Trajectory(
-            **{**vars(path), "body": read.body, "omega_ib_b": omega, "rows": read.rows}
-        )
+        return replace(path, body=read.body, omega_ib_b=omega, rows=read.rows)
     return Trajectory(
-        time_ns=read.time_ns,
-        lat_rad=read.values["lat"],
-        lon_rad=read.values["lon"],
-        alt_m=read.values["height"],
+        read.time_ns,
+        *(read.values[q] for q in parts("place")),
         v_n=swap(v_n) if read.nav == "ENU" else v_n,
         q_nb=q_nb,
         nav=read.nav,
         body=read.body,
-        source=read.file,
         omega_ib_b=omega,
-        rows=read.rows,
+        **read.origin,
     )
 
 

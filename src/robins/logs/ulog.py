@@ -75,24 +75,14 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
         raise refused(file, "byte 0")("is no ULog", "leave the format to be recognised")
     sound = _sound(data)
     if sound < len(data) or cut:
-        report(
-            findings,
-            Finding(
-                "warning",
-                "ends_early",
-                file,
-                f"byte {sound}",
-                sound,
-                _EARLY.format(name=Path(file).name, sound=sound, size=len(data)),
-            ),
-        )
+        sentence = _EARLY.format(name=Path(file).name, sound=sound, size=len(data))
+        report(findings, Finding("warning", "ends_early", file, f"byte {sound}", sound, sentence))
     log = _decode(file, data[:sound])
     imu = _first(file, log, _IMU, findings)
     if imu is None:
         held = ", ".join(sorted({item.name for item in log.data_list})) or "nothing"
-        raise LogError(
-            file, f"has no samples of {_IMU[0]}; it holds {held}", "log that topic and fly again"
-        )
+        cause = f"has no samples of {_IMU[0]}; it holds {held}"
+        raise LogError(file, cause, "log that topic and fly again")
     time_ns = _stamps(file, imu)
     mag, gnss = (_first(file, log, topics, findings) for topics in (_MAG, _GNSS))
     return Dataset(

@@ -10,11 +10,7 @@ TOLERANCE = 1e-3  # how far from one a length may be by its decimals
 
 
 def unit_quaternions(
-    file: str,
-    name: str,
-    q: np.ndarray,
-    rows: np.ndarray | None,
-    findings: list[Finding] | None,
+    file: str, name: str, q: np.ndarray, rows: np.ndarray | None, findings: list[Finding] | None
 ) -> np.ndarray:
     """Unit quaternions; a row that is not one is taken as missing, whole, and reported.
 
