@@ -170,7 +170,7 @@ def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("separator", "seperator"), r"own.toml seperator: is not a .* key; did you mean separator\?"),
+        (("separator", "seperator"), r"own.toml seperator: is not a .*; did you mean separator\?"),
         (('";"', "1"), "own.toml: separator = 1: is not text; give text"),
         (('";"', '"ab"'), "own.toml: separator = 'ab': cannot separate numbers; give one char"),
         (('"FLU"', '"FLD"'), "own.toml: body = 'FLD': is left-handed; give a right-handed"),
@@ -199,7 +199,7 @@ def test_columns_decide_which_table_it_is(tmp_path, columns, kind):
         (("[columns]", "[cols]"), "own.toml cols: is not a known key; did you mean columns"),
         ((TOML, ""), "own.toml columns: states no columns; state them, such"),
         ((TOML[TOML.index("gyro_x") :], FIXES + MAG), "make mag and gnss alone, where"),
-        ((TOML[TOML.index("gyro_x") :], ""), "make no table; state all columns of a table: the imu"),
+        ((TOML[TOML.index("gyro_x") :], ""), "make no table; state all columns of a table: the"),
         ((TOML[TOML.index("gyro_x") :], MAG + 'quality = { name = "q" }'), "quality have no use"),
         ((TOML[TOML.index("gyro_x") :], "".join(f'{q} = {{ name = "{q}", unit = "deg" }}\n'
           for q in ("roll", "pitch", "heading"))), "body = 'FLU': does not go with nav NED"),

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_nine_axis import tumble_dataset
 from test_findings import ROWS
 
 from robins.logs import Mounting, examine, load_dataset
@@ -13,12 +12,10 @@ from robins.logs.mounting import turned
 TRIALS = ("broad_15_undisturbed_fast_translation_A", "broad_24_disturbed_tapping_A")
 
 
-@pytest.fixture(scope="module", params=["made", *TRIALS])
-def data(request):
-    """One that is made, and two as they were recorded."""
-    if request.param == "made":
-        return tumble_dataset()
-    return load_dataset([request.getfixturevalue("data_dir") / f"{request.param}.npz"])
+@pytest.fixture(scope="module", params=TRIALS)
+def data(request, data_dir):
+    """Two as they were recorded; one that is made is in `test_findings`."""
+    return load_dataset([data_dir / f"{request.param}.npz"])
 
 
 def about_attitude(data, **columns):

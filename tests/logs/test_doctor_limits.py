@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from log_samples import PHONE, RTKLIB
 from made_nine_axis import tumble_dataset
+from made_spoilt import a_path, put
 
-from robins.dataset import Trajectory
 from robins.logs import LogError, clean, examine, open_log
 
 
 def spoilt(data, table, column, row, value):
     old = getattr(data, table)
-    new = np.array(getattr(old, column))
-    new[row] = value
-    return dataclasses.replace(data, **{table: dataclasses.replace(old, **{column: new})})
+    new = dataclasses.replace(old, **{column: put(row, value)(getattr(old, column))})
+    return dataclasses.replace(data, **{table: new})
 
 
 PLACES = [
@@ -27,8 +26,7 @@ PLACES = [
 
 @pytest.mark.parametrize("value", [1e308, -1e308])
 def test_absurd_numbers_are_found_and_refused_in_every_table(drive, value):
-    g, q_nb = drive.gnss, np.tile([1.0, 0.0, 0.0, 0.0], (len(drive.gnss), 1))
-    path = Trajectory(g.time_ns, g.lat_rad, g.lon_rad, g.alt_m, g.v_n, q_nb, source="path.csv")
+    path = a_path()
     data = dataclasses.replace(drive, truth=path)
     assert examine(data) == []
     places = [place for place in PLACES if value > 0.0 or "sigma" not in place[1]]
@@ -70,10 +68,9 @@ def test_sigmas_without_measure_are_not_squared(drive):
     assert not np.isfinite(clean(dataclasses.replace(drive, gnss=gnss)).gnss.v_n).any()
 
 
-def test_an_infinite_place_in_a_path_is_found(drive):
-    g, q_nb = drive.gnss, np.tile([1.0, 0.0, 0.0, 0.0], (len(drive.gnss), 1))
-    lat = np.where(np.arange(len(g)) == 7, np.inf, g.lat_rad)
-    told = examine(Trajectory(g.time_ns, lat, g.lon_rad, g.alt_m, g.v_n, q_nb))
+def test_an_infinite_place_in_a_path_is_found():
+    path = a_path()
+    told = examine(dataclasses.replace(path, lat_rad=put(7, np.inf)(path.lat_rad)))
     assert [(f.code, f.value) for f in told] == [("absurd", 1)]
 
 

@@ -1,12 +1,14 @@
-"""The doctor on IMU and GNSS together, and its manners."""
+"""The doctor on sensors that share a motion, and its manners."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 from made_logs import found, rows_of, with_gnss, with_imu
+from made_pair import make_pair
+from made_spoilt import late
 
-from robins.dataset import Dataset
+from robins.dataset import Dataset, ImuTable
 from robins.logs import Finding, LogError, Mounting, examine, load_dataset
 
 
@@ -46,6 +48,48 @@ def test_large_biases_are_no_wrong_axes(drive):
         accel=imu.accel + np.array([0.2, 0.1, 0]),
     )
     assert set(found(Dataset("moving", biased, gnss))) <= {"gravity_bias"}
+
+
+# ------------------------------------------------------------- a master and its slave
+
+
+def errors(data):
+    return [f for f in examine(data) if f.severity != "note"]
+
+
+@pytest.mark.parametrize("kind", ["rate", "increment"])
+def test_a_healthy_pair_is_silent(kind):
+    for seed in range(3):
+        pair = make_pair(seed, kind)
+        assert errors(pair) == []
+        assert errors(late(0.1, 0.1)(pair)) == []
+
+
+@pytest.mark.parametrize("delay_s", [0.03, 0.08, 0.2, -0.05])
+@pytest.mark.parametrize("stated_s", [0.0, 0.04])
+def test_a_delay_is_measured_by_the_gyros(delay_s, stated_s):
+    (told,) = errors(late(delay_s + stated_s, stated_s)())
+    assert (told.severity, told.code, told.file) == ("error", "master_late", "master.csv")
+    assert told.value == pytest.approx(delay_s, abs=0.004)
+    total = told.value + stated_s
+    mend = f'master.delay = "{total:.3f} s"' if total >= 0.0 else f"Add {-total:.3f} s to their"
+    assert mend in told.sentence
+
+
+# ------------------------------------------------------- an IMU that was turned about by hand
+
+
+@pytest.mark.parametrize("trial", [1, 7, 15, 24, 28])
+def test_real_recordings_by_hand(data_dir, trial):
+    """BROAD, with its z up turned down: no error as it is, the fault found where one is put in."""
+    (path,) = data_dir.glob(f"broad_{trial:02d}_*.npz")
+    with np.load(path) as file:
+        rate_hz = float(file["sampling_rate"])
+        gyro, accel = (file[k].astype(float) * [1, -1, -1] for k in ("imu_gyr", "imu_acc"))
+    time_ns = (np.arange(len(gyro)) * 1e9 / rate_hz).astype(np.int64)
+    imu = ImuTable(time_ns, gyro, accel, "rate", source="drive_imu.csv")
+    assert found(imu, "error") == []
+    assert found(dataclasses.replace(imu, gyro=-gyro), "error") == ["left_handed"]
 
 
 # ---------------------------------------------------------------------------------- manners

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from finding_tables import findings as documented
+from log_samples import EUROC_TRUTH, KFGINS_IMU, RTKLIB
 from made_spoilt import tumble
 from made_ulog import flight
 from spoilt import HEALTHY, SPOILT
@@ -43,32 +44,28 @@ ROWS = [
     for row in rows
 ]
 PARTS = ("", " (magnetic field)", " (attitude)")
-FIX = "2025/08/28 17:30:39.749 40.5 -105.25 1601 1 25 0.01 0.02 0.03 0 0 0 0 9"
-POS = "% GPST latitude(deg) longitude(deg) height(m) Q ns sdn sde sdu sdne sdeu sdun age ratio"
+HEADER, FIX, *_ = RTKLIB.split("\n")
 PATH = "time_s,lat_deg,lon_deg,height_m,v_north_m_s,v_east_m_s,v_down_m_s,"
-SAMPLES = "".join(f"456300.{k:03d} 1e-5 2e-5 -3e-5 1e-3 2e-3 -4.9e-2\n" for k in range(0, 100, 5))
 STEPS = "time,dt,theta_x,theta_y,theta_z,dv_x,dv_y,dv_z\n"
 
 # What readers tell: code, what is found, the file.
 FILES = (
-    ("ends_early", "warning line 20: the last line has no line end", SAMPLES[:-5]),
-    ("begins_midway", "warning line 1: has fewer fields than the next", SAMPLES[15:]),
+    ("ends_early", "warning line 20: the last line has no line end", KFGINS_IMU[:-5]),
+    ("begins_midway", "warning line 1: has fewer fields than the next", KFGINS_IMU[15:]),
     (
         "no_place",
         "note: positions are local metres",
-        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
-        "q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]"
-        "\n1403636580838555648,4.6,-1.7,0.7,1,0,0,0,0,0,0,0\n",
+        EUROC_TRUTH,
     ),
     (
         "no_velocity",
         "note: RTKLIB did not solve for them; they are left out",
-        f"{POS} vn ve vu sdvn sdve sdvu sdvne sdveu sdvun\n{FIX}{' 0' * 9}\n",
+        f"{HEADER} vn ve vu sdvn sdve sdvu sdvne sdveu sdvun\n{FIX}{' 0' * 9}\n",
     ),
     (
         "height_above_geoid",
         "warning header: heights are above the geoid",
-        f"% (lat/lon/height=WGS84/geodetic,Q=1:fix,2:float,ns=# of satellites)\n{POS}\n{FIX}\n",
+        f"% (lat/lon/height=WGS84/geodetic,Q=1:fix,2:float,ns=# of satellites)\n{HEADER}\n{FIX}\n",
     ),
     (
         "dt_disagrees",

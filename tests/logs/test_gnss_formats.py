@@ -37,18 +37,16 @@ def test_rtklib_in_north_east_down(pos):
     assert (gnss.quality.tolist(), gnss.nav, gnss.rows.tolist()) == ([1], "NED", [3])
 
 
-def test_rtklib_without_velocities(pos):
-    gnss = read_rtklib(pos(HEADER, FIX.format(q=5)))
-    assert gnss.v_n is None
-    assert gnss.sigma_v is None
-    assert gnss.quality.tolist() == [5]
-
-
-def test_rtklib_with_velocities_that_were_not_solved(pos):
+@pytest.mark.parametrize(
+    ("header", "line", "codes"),
+    [(HEADER, "", []), (HEADER + VELOCITY, " 0 0 0 0 0 0 0 0 0", ["no_velocity"])],
+)
+def test_rtklib_without_velocities_or_with_none_that_were_solved(pos, header, line, codes):
     findings = []
-    line = FIX.format(q=5) + " 0 0 0 0 0 0 0 0 0"
-    assert read_rtklib(pos(HEADER + VELOCITY, line), findings).v_n is None
-    assert [(f.severity, f.code) for f in findings] == [("note", "no_velocity")]
+    gnss = read_rtklib(pos(header, FIX.format(q=5) + line), findings)
+    assert (gnss.v_n, gnss.sigma_v, gnss.quality.tolist()) == (None, None, [5])
+    assert [f.code for f in findings] == codes
+    assert read_rtklib(pos(HEADER, FIX.format(q="nan"))).quality.tolist() == [0]  # unknown
 
 
 @pytest.mark.parametrize(
@@ -108,7 +106,3 @@ def test_columns_are_found_by_name(pos):
 def test_rtklib_files_that_are_refused(pos, lines, message):
     with pytest.raises(LogError, match=message):
         read_rtklib(pos(*(line.format(q=1) if "Q" not in line else line for line in lines)), [])
-
-
-def test_a_quality_that_is_no_number_is_unknown(pos):
-    assert read_rtklib(pos(HEADER, FIX.format(q="nan"))).quality.tolist() == [0]

@@ -10,7 +10,7 @@ import pytest
 from pyins import transform
 
 from robins.dataset import ImuTable, Trajectory
-from robins.logs import LogError, Mounting, Origin, open_log, write_log
+from robins.logs import LogError, Origin, open_log, write_log
 
 RNG = np.random.default_rng(5)
 TIME_NS = 1_700_000_000_123_456_789 + np.arange(40) * 5_000_001
@@ -62,37 +62,6 @@ def test_gnss_imu_in_si(tmp_path):
     assert imu.accel[0].tolist() == [9.80665, 0.0, -4.903325]
     assert imu.gyro[0].tolist() == [0.1, 0.2, 0.3]
     assert (imu.kind, imu.source, imu.rows.tolist()) == ("rate", str(path), [1, 2])
-
-
-# ---------------------------------------------------------------------------------- mounting
-
-
-def test_the_mounting_of_the_walk_only_exchanges_axes():
-    C = Mounting(180.0, 0.0, -90.0).dcm_bs()
-    assert C.tolist() == [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-
-
-def test_the_mounting_is_the_attitude_of_the_body_seen_from_the_sensor():
-    mounting = Mounting(10.0, -20.0, 130.0)
-    C_sb = transform.mat_from_rph([10.0, -20.0, 130.0])
-    np.testing.assert_allclose(mounting.dcm_bs(), C_sb.T, atol=1e-15)
-    turned = mounting.turn(RATES)
-    np.testing.assert_allclose(turned.gyro, RATES.gyro @ C_sb, atol=1e-14)
-    np.testing.assert_allclose(turned.accel, RATES.accel @ C_sb, atol=1e-14)
-
-
-def test_turning_by_right_angles_keeps_every_bit_and_every_nan_on_its_axis():
-    gyro = RATES.gyro.copy()
-    gyro[3, 2] = np.nan
-    turned = Mounting(180.0, 0.0, -90.0).turn(dataclasses.replace(RATES, gyro=gyro))
-    np.testing.assert_array_equal(turned.gyro[:, 0], -gyro[:, 1])
-    np.testing.assert_array_equal(turned.gyro[:, 2], -gyro[:, 2])
-    assert np.isfinite(turned.gyro[3]).tolist() == [True, True, False]
-
-
-def test_a_mounting_that_is_no_angle():
-    with pytest.raises(ValueError, match="must be finite"):
-        Mounting(np.nan).dcm_bs()
 
 
 # ---------------------------------------------------------------------------------- KF-GINS

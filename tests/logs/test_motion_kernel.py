@@ -1,8 +1,10 @@
 """The arithmetic behind the doctor's judgement of motion, each against another computation."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-from made_logs import velocity_ned
+from made_logs import rows_of, velocity_ned
 from pyins import transform
 from scipy.spatial.transform import Rotation
 
@@ -113,3 +115,12 @@ def test_windows_find_the_rest_of_the_drive(drive):
     assert np.count_nonzero(windows.at_rest) < 16
     k = int(windows.first[3])
     np.testing.assert_allclose(windows.accel[3], drive.imu.accel[k : k + 100].mean(axis=0))
+
+
+def test_an_increment_after_lost_ones_is_the_rate_of_its_own_interval(drive):
+    imu = drive.imu
+    sums = dataclasses.replace(imu, gyro=imu.gyro * 0.01, accel=imu.accel * 0.01, kind="increment")
+    keep = np.delete(np.arange(len(imu)), [500, 900, 901, 902])
+    signal = signal_of(rows_of(sums, keep))
+    np.testing.assert_allclose(signal.accel, imu.accel[keep], atol=1e-9)
+    np.testing.assert_allclose(signal.gyro, imu.gyro[keep], atol=1e-9)

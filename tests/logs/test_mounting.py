@@ -53,6 +53,18 @@ def test_what_is_seen_from_the_ground_does_not_depend_on_the_mounting(data):
     assert out.attitude.nav == "ENU"
 
 
+def test_turning_by_right_angles_keeps_every_bit_and_every_nan_on_its_axis(data):
+    """That of the walk only exchanges axes."""
+    mounting = Mounting(180.0, 0.0, -90.0)
+    assert mounting.dcm_bs().tolist() == [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+    gyro = data.imu.gyro.copy()
+    gyro[3, 2] = np.nan
+    out = mounting.turn(dataclasses.replace(data.imu, gyro=gyro))
+    np.testing.assert_array_equal(out.gyro, -gyro[:, [1, 0, 2]])
+    with pytest.raises(ValueError, match="must be finite"):
+        Mounting(np.nan).dcm_bs()
+
+
 def test_missing_attitudes_stay_missing(data):
     out = turned(data.attitude, Mounting(*ANGLES))
     np.testing.assert_array_equal(np.isnan(out.q_nb), np.isnan(data.attitude.q_nb))

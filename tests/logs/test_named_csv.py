@@ -92,7 +92,9 @@ def test_angles_in_another_unit(tmp_path, column, value, words, cause):
     header = HEADER.replace(column.replace("rad", "deg"), column)
     row = ROW.format(t="{t}", heading=30).strip().split(",")
     row[header.split(",").index(column)] = str(value)
-    told = refusal(tmp_path, "\n".join([header, *(",".join(row).format(t=t) for t in range(5)), ""]))
+    told = refusal(
+        tmp_path, "\n".join([header, *(",".join(row).format(t=t) for t in range(5)), ""])
+    )
     assert f"line 2: {column} = {value}: {words}" in told
     assert cause in told
 

@@ -204,18 +204,6 @@ def test_another_archive_is_told_from_a_trial(tmp_path):
     assert "has no array imu_gyr, " in refusal(tmp_path, archive({"x": np.zeros(3)}))
 
 
-def test_two_trials_make_no_dataset(tmp_path):
-    paths = [tmp_path / "a.npz", tmp_path / "b.npz"]
-    for path in paths:
-        path.write_bytes(broad_bytes(1.0))
-    with pytest.raises(LogError, match=r"b.npz: is a second file of the kind of .*a.npz \(imu\)"):
-        load_dataset(paths)
-    data = load_dataset(paths[:1])
-    assert {data.imu.source, data.mag.source, data.attitude.source} == {str(paths[0])}
-    assert data.gnss is None
-    assert data.truth is None
-
-
 def test_of_a_trial_only_the_samples_are_those_of_a_slave(tmp_path):
     master, slave = tmp_path / "master.csv", tmp_path / "slave.npz"
     master.write_text(
@@ -304,14 +292,6 @@ def test_decimal_commas_are_refused_however_they_look(tmp_path):
     assert "with a decimal point, not a comma" in refusal(
         tmp_path, xio(XIO.replace(",", ";"), split)
     )
-
-
-def test_files_without_samples_are_refused(tmp_path):
-    assert "header only" in refusal(tmp_path, XIO + "\n")
-    assert "header only" in refusal(tmp_path, PHONE + "\n")
-    assert "is empty (0 bytes)" in refusal(tmp_path, b"")
-    hole = xio().encode()[:300] + bytes(64) + xio().encode()[364:]
-    assert "NUL" in refusal(tmp_path, hole)
 
 
 def test_a_cut_drive_gives_the_exact_prefix(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_ulog import GPS, IMU, NEW_GPS, RAW_MAG, flight, ulog
 
-from robins.logs import LogError, LogWarning, load_dataset, open_log
+from robins.logs import LogError, load_dataset, open_log
 
 pytest.importorskip("pyulog", reason="the extra `logs` is not installed")
 LOG, WRITTEN = flight()
@@ -146,13 +146,6 @@ def test_damaged_definitions_are_refused(tmp_path):
     no_magic = b"ULof" + LOG[4:]
     assert "holds NUL bytes: a binary file" in refusal(tmp_path, no_magic)
     assert "Header too short" in refusal(tmp_path, LOG[:8])
-
-
-def test_readers_warn_where_nobody_listens(tmp_path):
-    path = tmp_path / "flight.ulg"
-    path.write_bytes(ulog([("sensor_combined", 0, IMU)], [(0, (1, *range(6)))] * 2)[:-3])
-    with pytest.warns(LogWarning, match="breaks off at byte"):
-        open_log(path)
 
 
 def test_the_sample_of_pyulog(data_dir):
