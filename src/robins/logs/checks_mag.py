@@ -32,6 +32,7 @@ _REPEATED = 0.2  # share of rows that repeat the one before
 _SPREAD = 0.25  # of the size, between its 5th and 95th percentile
 _FAR = 0.3  # of the usual size: how far off a disturbed sample is
 _TURNED = 0.02  # smallest spread of directions by which a centre is found
+_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change the gyros leave unexplained
 
 # By what power of ten the numbers are too large, and what makes them so.
 _SHIFTS: dict[int, tuple[Severity, str, str]] = {
@@ -205,9 +206,6 @@ def _centre(field: np.ndarray) -> np.ndarray | None:
     # |m - c|^2 = r^2 is linear in c and in r^2 - |c|^2.
     known = np.column_stack([2.0 * field, np.ones(len(field))])
     return np.linalg.lstsq(known, np.sum(field * field, axis=1), rcond=None)[0][:3]
-
-
-_WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the change left unexplained
 
 
 def check_mag_axes(imu: ImuTable, mag: MagTable) -> Iterator[Finding]:

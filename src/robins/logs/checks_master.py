@@ -81,7 +81,8 @@ def _as_fixes(master: Trajectory) -> GnssTable:
     scatter = np.median(bends, axis=0) / 0.6745 / np.sqrt(6.0) if len(bends) else np.ones(3)
     sigma_m = np.tile(np.maximum(_CLEAR * scatter, 1.0), (len(master), 1))
     sigma_v = np.ones((len(master), 3))
-    fixes = GnssTable(master.time_ns, *place_of(master).T, sigma_m, master.v_n, sigma_v)
+    place = (master.lat_rad, master.lon_rad, master.alt_m)
+    fixes = GnssTable(master.time_ns, *place, sigma_m, master.v_n, sigma_v)
     return replace(fixes, source=master.source, rows=master.rows)
 
 

@@ -37,6 +37,7 @@ _WHY_GAPS = {
     MagTable: "The logger lost data; heading is held by the gyros meanwhile",
     AttitudeTable: "Nothing is compared there",
 }
+_LEAP = 18.0  # s between UTC and GPS time since 2017
 _BLIP = 3  # refused samples that count as a slip, not as a clock set anew
 
 
@@ -214,9 +215,6 @@ def _jitter(table: Table, keep: np.ndarray, usual: float) -> Iterator[Finding]:
             "arrival or rounded, not by the sensor's clock; harmless for slow motion, but use the "
             "sensor's own counter if it was logged."
         )
-
-
-_LEAP = 18.0
 
 
 def check_span(imu: ImuTable, others: Sequence[Table]) -> Iterator[Finding]:

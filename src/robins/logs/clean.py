@@ -28,7 +28,7 @@ from robins.logs.limits import (
     SIGMA_LIMIT,
     SPEED_LIMIT,
 )
-from robins.logs.ordering import refusals, rows_where
+from robins.logs.ordering import Rows, refusals, rows_where
 from robins.logs.tables import place_of
 
 _PLACEHOLDER_SIGMA = 1.0
@@ -95,9 +95,11 @@ def clean_master(master: Trajectory) -> tuple[Trajectory, dict[str, int]]:
     An attitude is one thing, so it is missing whole.
     """
     master = checked(master)
-    place, v_n, q_nb = place_of(master), master.v_n, master.q_nb
-    parts = {"place": (place, _PLACE_LIMIT), "v_n": (v_n, SPEED_LIMIT)}
-    parts["q_nb"] = (q_nb, QUATERNION_LIMIT)
+    parts: dict[str, tuple[np.ndarray, np.ndarray | float]] = {
+        "place": (place_of(master), _PLACE_LIMIT),
+        "v_n": (master.v_n, SPEED_LIMIT),
+        "q_nb": (master.q_nb, QUATERNION_LIMIT),
+    }
     if master.omega_ib_b is not None:
         parts["omega_ib_b"] = (master.omega_ib_b, GYRO_LIMIT)
     kept: dict[str, np.ndarray] = {}
@@ -136,7 +138,7 @@ def clean_gnss(gnss: GnssTable) -> tuple[GnssTable, dict[str, int]]:
     return rows_where(dataclasses.replace(gnss, **kept), keep), counts
 
 
-def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _whole_rows(values: np.ndarray, limit: np.ndarray) -> tuple[Rows, dict[str, Rows]]:
     """Good rows, and bad ones by their first reason, where one bad number spoils its row."""
     nan = np.isnan(values).any(axis=1)
     inf = np.isinf(values).any(axis=1) & ~nan

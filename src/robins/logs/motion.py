@@ -29,6 +29,12 @@ _NO_LAG = np.zeros(1)
 _BIAS_STEP = 1e-4  # rad/s, m/s^2
 _BIAS_SIGMA = np.repeat([0.01, 0.1], 3)  # what the unknowns are measured in
 
+# Of steps by which something else that turned is compared with the gyros.
+_FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine ones, and compared over 0.2 s
+_MOST = 1500  # steps, of those that turn most
+_LEAST = 50  # below which nothing is judged
+_TURNED = 0.1  # rad, of a step that tells something
+
 
 def signed_permutations() -> np.ndarray:
     """(48, 3, 3): all ways to exchange and reverse three axes, the identity first."""
@@ -274,12 +280,6 @@ def _kabsch(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
     R = np.einsum("hji,hj,hkj->hik", Vt, corrected, U)
     both = s[:, 0] + s[:, 1]
     return R, total - 2.0 * (both + sign * s[:, 2]), total - 2.0 * (both - sign * s[:, 2])
-
-
-_FINE_S, _PER_STEP = 0.01, 20  # rotations are composed of fine ones, and compared over 0.2 s
-_MOST = 1500  # steps, of those that turn most
-_LEAST = 50  # below which nothing is judged
-_TURNED = 0.1  # rad, of a step that tells something
 
 
 class Steps(NamedTuple):

@@ -10,9 +10,13 @@ from __future__ import annotations
 
 import dataclasses
 from bisect import bisect_left
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+Rows = np.ndarray | np.bool
+"""(n,) bool; NumPy's types allow a single one where rows are reduced."""
 
 
 def increasing(time_ns: np.ndarray) -> np.ndarray:
@@ -70,7 +74,7 @@ def reasons(time_ns: np.ndarray, keep: np.ndarray) -> dict[str, int]:
 
 
 def refusals(
-    kind: str, time_ns: np.ndarray, have: np.ndarray, refused: dict[str, np.ndarray]
+    kind: str, time_ns: np.ndarray, have: Rows, refused: Mapping[str, Rows]
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Which of the rows that have something are in order, and how many are not used, by reason.
 
