@@ -10,7 +10,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import click
 import pytest
 
 from robins import cli, results
@@ -230,24 +229,6 @@ def test_help_is_given(robins, command):
     assert answer.status == 0
     assert answer.out.startswith("Usage: robins")
     assert robins(*command, "-h").out == answer.out
-
-
-def examples():
-    """Every command line in the help of any command."""
-    texts = [cli.app.epilog, *(command.epilog or "" for command in cli.app.commands.values())]
-    lines = [line.split("   ")[0].strip() for text in texts for line in text.splitlines()]
-    return [line for line in lines if line.startswith("robins ")]
-
-
-def test_there_are_examples():
-    assert len(examples()) > 10
-
-
-@pytest.mark.parametrize("line", examples())
-def test_examples_in_the_help_are_commands(line):
-    words = shlex.split(line)
-    context = click.Context(cli.app, obj=[])
-    cli.app.commands[words[1]].make_context(words[1], words[2:], parent=context)
 
 
 def test_help_teaches_the_contract(robins):
