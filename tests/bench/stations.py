@@ -1,15 +1,21 @@
-"""The seven parts in one process, joined by bytes: the loop of the bench without ports."""
+"""The seven parts in one process: joined by bytes, or on threads in the place of processes."""
 
-from collections.abc import Callable
+import os
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from robins.bench.parts.satellite import BUILD, Kit
 from robins.bench.parts.satellite.preparing import kit_for
-from robins.bench.parts.station import Station, ready
+from robins.bench.parts.station import Part, Station, ready, serve
+from robins.bench.ports.port import address, open_port
+from robins.bench.run.one_program import in_process
 from robins.bench.run.setup import read
+from robins.bench.run.telemetry import Flown
 from robins.bench.wire import Frame, Header, Receiver, decode, encode, encode_frame, message
 
 RUN = 7
@@ -17,10 +23,74 @@ ORDER = ("acm", "actuators", "plant", "table", "gyro", "star", "adm")
 Meddle = Callable[[int, str, str, bytes], list[tuple[int, bytes]]]
 
 
+def alive(pid: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 @cache
 def kit(name: str = "satellite/s1", filter_: str = "mekf", *settings: str) -> Kit:
     flight = read(name, settings)
     return kit_for(flight.loop, filter_, seed=0)
+
+
+@cache
+def one_program(name: str, filter_: str, *settings: str) -> Flown:
+    """The run of a kit without any wire."""
+    return in_process(read(name, settings), kit(name, filter_, *settings))
+
+
+_READY: dict[int, tuple[Kit, dict[str, Part]]] = {}
+
+
+def parts(of: Kit) -> dict[str, Part]:
+    """The parts of a kit, compiled once; what they remember is with their stations."""
+    if id(of) not in _READY:  # the kit is kept, so that no other has its identity
+        _READY[id(of)] = of, {name: ready(build(of), of.frames) for name, build in BUILD.items()}
+    return _READY[id(of)][1]
+
+
+class Threads:
+    """In the place of `Crew`: parts on threads, over pseudo-terminals; starts no process."""
+
+    stations: ClassVar[Mapping[str, Callable[[Part], Station]]] = {}  # of parts that are odd
+
+    def __init__(self, kit: Kit, realtime: bool = False, restarts: bool = False):
+        self.parts, self.threads = parts(kit), list[threading.Thread]()
+
+    def __enter__(self) -> "Threads":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for thread in self.threads:
+            thread.join(5.0)
+
+    def start(self, name: str, port: str, since: int = -1) -> None:
+        def be():
+            with suppress(OSError), open_port(address(port), timeout_s=None) as line:
+                serve(line, self.stations.get(name, Station)(self.parts[name]))
+
+        self.threads.append(threading.Thread(target=be, daemon=True))
+        self.threads[-1].start()
+
+    def process(self, name: str) -> None:
+        return None
+
+    def deaths(self, among: str | None = None) -> list[Any]:
+        return []
+
+    def remembers(self, name: str, step: int) -> bool:
+        return False
+
+
+def on_threads(monkeypatch: Any, crew: type[Threads] = Threads, **stations: Any) -> None:
+    """Let sessions start threads, some of them with other stations."""
+    monkeypatch.setattr(crew, "stations", stations)
+    monkeypatch.setattr("robins.bench.run.session.Crew", crew)
 
 
 class Loop:
@@ -31,9 +101,7 @@ class Loop:
 
     def __init__(self, of: Kit, meddle: Meddle | None = None):
         self.kit, self.meddle = of, meddle
-        self.stations = {
-            name: Station(ready(build(of), of.frames)) for name, build in BUILD.items()
-        }
+        self.stations = {name: Station(part) for name, part in parts(of).items()}
         self.sent = dict.fromkeys(BUILD, 0)
         self.receivers = {name: Receiver() for name in BUILD}
         self.heard: dict[str, list[dict[str, Any]]] = {}

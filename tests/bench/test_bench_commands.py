@@ -7,48 +7,39 @@ import subprocess
 import sys
 import time
 
+from stations import alive
+
 from robins.bench.recording import read_record
+from robins.cli import main
 
 ROBINS = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
 
 
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path, monkeypatch, capsys):
+    def status(*options):
+        assert main(["bench", "status", *options]) == 0
+        return capsys.readouterr().out
 
-
-def told(environment, *arguments):
-    command = [*ROBINS, "bench", *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    return done.stdout
-
-
-def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path):
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     out = tmp_path / "out"
     command = [*ROBINS, "bench", "up", "satellite/s1", "--baud", "9600", "--out", str(out)]
-    bench = subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    bench = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until, found = time.monotonic() + 120.0, []
     states = []
     while states[-1:] != ["running"] and time.monotonic() < until:
         time.sleep(0.2)
-        found = json.loads(told(environment, "status", "--json"))["benches"]
+        found = json.loads(status("--json"))["benches"]
         states += [one["state"] for one in found]
         if states == ["starting"]:  # it is there before its parts are
             assert found[0]["parts"] == {}
-            assert ": starting, 0.0 s" in told(environment, "status")
+            assert ": starting, 0.0 s" in status()
     assert states[0] == "starting"
     (one,) = found
     assert (one["name"], one["filter"], one["state"]) == ("satellite/s1", "mekf", "running")
     pids = [part["process"] for part in one["parts"].values()]
     assert len(pids) == 7
     assert all(alive(pid) for pid in pids)
-    assert "satellite/s1 (mekf, lockstep), process" in told(environment, "status")
+    assert "satellite/s1 (mekf, lockstep), process" in status()
     os.killpg(bench.pid, signal.SIGINT)  # as the terminal does it
     _, said = bench.communicate(timeout=30.0)
     assert bench.returncode == 3, said
@@ -59,4 +50,4 @@ def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path):
     record = read_record(f"{out}.record.mcap")  # what was flown is not lost
     assert record.whole
     assert len(record.entries) > 10
-    assert told(environment, "status").startswith("No bench runs.")
+    assert status().startswith("No bench runs.")

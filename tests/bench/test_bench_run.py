@@ -1,4 +1,8 @@
-"""Runs on the bench with real processes: bits, faults, deaths, clocks, boards."""
+"""Runs on the bench: bits, faults, deaths, clocks, boards.
+
+Bits and deaths are those of real processes; where they would make no difference, the parts are on
+threads.
+"""
 
 import os
 import resource
@@ -8,21 +12,19 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from stations import Station, alive, kit, on_threads, one_program
 
 from robins.bench.broker import BenchError, LinkFault
-from robins.bench.parts.satellite import Kit
-from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.ports.cable import cable
 from robins.bench.recording import read_record
 from robins.bench.run import Flight, Setup
 from robins.bench.run.one_program import in_process
 from robins.bench.run.session import Ran, Session
-from robins.bench.run.setup import changed, read
+from robins.bench.run.setup import built_in, changed, read
 from robins.bench.run.telemetry import difference, flag
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.receiver import Receiver
@@ -59,19 +61,6 @@ class Watch:
         return []
 
 
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-@cache
-def kit(filter_: str = "mekf") -> Kit:
-    return kit_for(read("satellite/s1", LOOP).loop, filter_, 0)
-
-
 class Done(NamedTuple):
     ran: Ran
     off: float  # from the same inside one program
@@ -79,15 +68,20 @@ class Done(NamedTuple):
 
 
 def run(of: Flight, at: dict[int, Any] | None = None, record: Any = None) -> Done:
-    watch = Watch(at)
-    ran = Session(of, record, watch, kit=kit(of.setup.filter)).run()
+    watch, what = Watch(at), ("satellite/s1", of.setup.filter, *LOOP)
+    ran = Session(of, record, watch, kit=kit(*what)).run()
     assert not any(alive(pid) for pid in watch.pids.values()), "a process was left over"
-    return Done(ran, difference(ran.flown, in_process(of, ran.kit)), watch)
+    return Done(ran, difference(ran.flown, one_program(*what)), watch)
+
+
+@pytest.fixture
+def threads(monkeypatch):
+    on_threads(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    """A run in lock-step, in which a part was stopped for two seconds."""
+    """A run in lock-step: one part is stopped for two seconds, two are killed and started anew."""
 
     def stop(session):
         pid = session.crew.process("adm")
@@ -96,18 +90,27 @@ def plain(tmp_path_factory):
 
     record = tmp_path_factory.mktemp("bench") / "plain.mcap"
     began = time.monotonic()
-    done = run(flight(), {50: stop}, record)
+    # the star sensor after it has put its memory aside
+    at = {20: kill("gyro"), 50: stop, 265: kill("star")}
+    done = run(flight(on_death="restart", seconds=28.0), at, record)
     assert time.monotonic() - began > 2.0
     return done, record
+
+
+def kill(part):
+    return lambda session: os.kill(session.crew.process(part), signal.SIGKILL)
 
 
 def test_lock_step_has_the_bits_of_one_program_even_if_a_part_is_stopped(plain):
     done, _ = plain
     assert done.ran.failure == ""
-    assert done.ran.steps == 200
+    assert done.ran.steps == 280
     assert done.off == 0.0
     assert max(h.wrong + h.lost + h.late + h.strange for h in done.ran.health.values()) == 0
-    assert done.ran.star_frames == 40
+    assert done.ran.star_frames == 56
+    assert done.ran.deaths == 2
+    told = [e.text.split(" told ")[1] for e in done.ran.events if e.kind == "restarted"]
+    assert told == ["all again", "all since step 255 again"]
 
 
 def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
@@ -118,18 +121,19 @@ def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
     problem = attitude_problem(flight().loop, ("mekf",), 0)
     ((world, count),) = worlds(problem, 1)
     found = record(problem, "mekf", world, count)
-    np.testing.assert_array_equal(done.ran.flown.q_est_ib, found["mean"].attitude.wxyz[0, :200])
-    np.testing.assert_array_equal(done.ran.flown.bias, found["mean"].gyro_bias[0, :200])
-    np.testing.assert_array_equal(
-        done.ran.flown.wheel_h, found["outputs"]["wheel_momentum"][0, :200]
-    )
+    for flown, wanted in (
+        (done.ran.flown.q_est_ib, found["mean"].attitude.wxyz),
+        (done.ran.flown.bias, found["mean"].gyro_bias),
+        (done.ran.flown.wheel_h, found["outputs"]["wheel_momentum"]),
+    ):
+        np.testing.assert_array_equal(flown, wanted[0, :280])
 
 
 def test_the_record_holds_all_that_went_over_the_links(plain):
     done, path = plain
     record = read_record(path)
     assert record.whole
-    assert record.header["steps"] == 200
+    assert record.header["steps"] == 280
     said: dict[tuple[str, str], list[Frame]] = {}
     for entry in record.entries:
         said.setdefault((entry.link, entry.direction), []).extend(Receiver().feed(entry.data))
@@ -144,7 +148,7 @@ def test_the_record_holds_all_that_went_over_the_links(plain):
     np.testing.assert_array_equal(q, done.ran.flown.q_est_ib)
     ticks = [f for f in said["adm", "to"] if f.header.type == message("tick").number]
     # the one that was not answered for two seconds was sent again
-    assert 200 < len(ticks) <= 203
+    assert 280 < len(ticks) <= 283
     assert [f.header.sequence for f in said["adm", "to"]] == list(range(len(said["adm", "to"])))
 
 
@@ -154,15 +158,15 @@ def test_the_record_holds_all_that_went_over_the_links(plain):
 def test_each_part_is_killed_in_turn_and_started_anew_to_the_last_bit(tmp_path):
     killed_at = {}
 
-    def kill(part):
+    def note(part):
         def now(session):
             killed_at[part] = session._wall_ns()
-            os.kill(session.crew.process(part), signal.SIGKILL)
+            kill(part)(session)
 
         return now
 
     # four of them after they have put their memory aside
-    at = {10 * (k + 1) + 250 * (k > 2): kill(part) for k, part in enumerate(PARTS)}
+    at = {10 * (k + 1) + 250 * (k > 2): note(part) for k, part in enumerate(PARTS)}
     done = run(flight(on_death="restart", seconds=33.0), at, tmp_path / "r.mcap")
     assert done.ran.failure == ""
     assert done.ran.deaths == 7
@@ -178,20 +182,44 @@ def test_each_part_is_killed_in_turn_and_started_anew_to_the_last_bit(tmp_path):
     assert told == ["all again"] * 3 + ["all since step 255 again"] * 4
 
 
-def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(tmp_path):
-    def kill(session):
-        os.kill(session.crew.process("plant"), signal.SIGKILL)
+@pytest.fixture(scope="module")
+def failed(tmp_path_factory):
+    """A run in which a part dies, with the best scheduler there is; schedulers by who has them."""
+    schedulers = {}
 
+    def look(session):
+        numbers = {part: session.crew.process(part) for part in PARTS} | {"bench": 0}
+        if hasattr(os, "SCHED_FIFO"):
+            schedulers.update({who: os.sched_getscheduler(n) for who, n in numbers.items()})
+
+    record = tmp_path_factory.mktemp("bench") / "failed.mcap"
     began = time.monotonic()
-    done = run(flight(), {30: kill}, tmp_path / "f.mcap")
+    done = run(flight(fifo=True), {20: look, 30: kill("plant")}, record)
+    assert time.monotonic() - began < 60.0
+    return done, record, schedulers
+
+
+def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(failed):
+    done, path, _ = failed
     assert "'plant' was killed by SIGKILL, at 3." in done.ran.failure
     assert done.ran.steps == 31
     assert done.off == 0.0  # as far as it went
     assert done.watch.events[-1][0] == "failed"
-    record = read_record(tmp_path / "f.mcap")
+    record = read_record(path)
     assert record.whole
     assert record.events[-1].kind == "failed"
-    assert time.monotonic() - began < 60.0
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="this system has no SCHED_FIFO")
+def test_a_better_scheduler_is_had_or_its_refusal_told(failed):
+    done, _, schedulers = failed
+    refused = [event.text for event in done.ran.events if event.kind == "scheduler"]
+    if refused:
+        assert refused[0].startswith("no real-time scheduler: ")
+        assert set(schedulers.values()) == {os.SCHED_OTHER}
+    else:
+        assert set(schedulers.values()) == {os.SCHED_FIFO}
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER  # only while it runs
 
 
 def test_parts_end_when_the_bench_is_killed(tmp_path):
@@ -226,7 +254,7 @@ def test_parts_end_when_the_bench_is_killed(tmp_path):
     assert len(record.entries) > 100
 
 
-def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path):
+def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path, threads):
     path = tmp_path / "full.mcap"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
@@ -235,7 +263,7 @@ def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path)
 
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
-        ran = Session(flight(), path, Watch({100: fill}), kit=kit()).run()
+        ran = run(flight(), {100: fill}, path).ran
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)
@@ -250,9 +278,8 @@ def test_a_disk_that_fills_up_fails_the_run_and_keeps_what_was_written(tmp_path)
 # --------------------------------------------------------------------------------------- clocks
 
 
-def test_real_time_keeps_its_deadlines_and_counts_those_it_misses():
-    of = flight(clock="realtime", rate=25.0, seconds=6.0)
-    ran = Session(of, kit=kit()).run()
+def test_real_time_keeps_its_deadlines_and_counts_those_it_misses(threads):
+    ran = run(flight(clock="realtime", rate=25.0, seconds=6.0)).ran
     assert ran.steps == 60
     assert ran.failure == ""
     # never sleep(1/f): 60 steps take 60 periods, however late each was
@@ -264,39 +291,18 @@ def test_real_time_keeps_its_deadlines_and_counts_those_it_misses():
     assert told["missed"] == sum(e.kind == "missed" for e in ran.events)
 
 
-@pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="this system has no SCHED_FIFO")
-def test_a_better_scheduler_is_had_or_its_refusal_told():
-    seen = {}
+def test_a_part_that_is_stopped_in_real_time_is_not_waited_for(monkeypatch):
+    goes = threading.Event()
+    goes.set()
 
-    def look(session):
-        numbers = {part: session.crew.process(part) for part in PARTS}
-        seen.update({part: os.sched_getscheduler(n) for part, n in numbers.items()})
-        seen["bench"] = os.sched_getscheduler(0)
+    class Stopped(Station):
+        def feed(self, data):
+            goes.wait(30.0)
+            return super().feed(data)
 
-    before = os.sched_getscheduler(0)
-    done = run(flight(clock="realtime", rate=25.0, seconds=3.0, fifo=True), {20: look})
-    refused = [event.text for event in done.ran.events if event.kind == "scheduler"]
-    if refused:
-        assert refused[0].startswith("no real-time scheduler: ")
-        assert set(seen.values()) == {os.SCHED_OTHER}
-    else:
-        assert set(seen.values()) == {os.SCHED_FIFO}
-    assert os.sched_getscheduler(0) == before  # only while it runs
-    assert done.ran.steps == 30
-
-
-def test_a_part_that_is_stopped_in_real_time_is_not_waited_for():
-    stopped = {}
-
-    def stop(session):
-        stopped["pid"] = session.crew.process("star")
-        os.kill(stopped["pid"], signal.SIGSTOP)
-
-    def go_on(session):
-        os.kill(stopped["pid"], signal.SIGCONT)
-
+    on_threads(monkeypatch, star=Stopped)
     of = flight(clock="realtime", rate=25.0, seconds=10.0, patience=0.5, filter="mekf-gate")
-    done = run(of, {20: stop, 60: go_on})
+    done = run(of, {20: lambda _: goes.clear(), 60: lambda _: goes.set()})
     assert done.ran.steps == 100
     assert done.ran.silent["star"] >= 30
     assert np.any(flag(done.ran.flown, "star silent"))
@@ -304,12 +310,12 @@ def test_a_part_that_is_stopped_in_real_time_is_not_waited_for():
     assert done.ran.health["star"].late + done.ran.health["star"].frames > 0
 
 
-def test_overrun_may_abort_the_run():
+def test_overrun_may_abort_the_run(threads):
     def slow(session):
         time.sleep(0.3)
 
     of = flight(clock="realtime", rate=25.0, overrun="abort", seconds=10.0)
-    ran = Session(of, None, Watch(dict.fromkeys(range(20, 25), slow)), kit=kit()).run()
+    ran = run(of, dict.fromkeys(range(20, 25), slow)).ran
     assert 'overrun = "abort"' in ran.failure
     assert ran.steps < 40
 
@@ -317,7 +323,15 @@ def test_overrun_may_abort_the_run():
 # --------------------------------------------------------------------------------------- faults
 
 
-def test_faults_are_the_same_however_fast_it_goes():
+@pytest.mark.parametrize("name", built_in())
+def test_every_scenario_of_the_bench_flies(threads, name):
+    of = changed(read(name), {"seconds": 2.0})
+    ran = Session(of).run()
+    assert (ran.failure, ran.steps) == ("", round(2.0 / of.loop.step))
+    assert np.isfinite(ran.flown.q_ib).all()
+
+
+def test_faults_are_the_same_however_fast_it_goes(threads):
     faults = (
         LinkFault(kind="bit errors", begin=2.0, share=0.05),
         LinkFault(kind="loss", begin=4.0, end=8.0, share=0.05, direction="to"),
@@ -359,7 +373,7 @@ def board(part: str, path: str):
         process.communicate()
 
 
-def test_a_part_may_be_a_board_on_a_real_port():
+def test_a_part_may_be_a_board_on_a_real_port(threads):
     """Here the board is a process started by hand, at the other end of a cable."""
     whole = changed(read("satellite/s1"), {"seconds": 5.0})
     with cable() as ends, board("gyro", ends.board) as process:
@@ -386,11 +400,11 @@ def test_what_does_not_fit_is_refused_before_anything_starts():
         flight(filter="mekff")
 
 
-def test_a_board_that_says_nothing_is_named(monkeypatch):
+def test_a_board_that_says_nothing_is_named(monkeypatch, threads):
     monkeypatch.setattr("robins.bench.run.session.HELLO_S", 0.2)
     with cable() as ends:
         of = flight(ports={"gyro": ends.bench})
-        ran = Session(of, kit=kit()).run()
+        ran = Session(of, kit=kit("satellite/s1", "mekf", *LOOP)).run()
     assert "no hello from" in ran.failure
     assert "gyro" in ran.failure
     assert ran.steps == 0

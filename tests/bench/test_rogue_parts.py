@@ -1,39 +1,24 @@
 """Parts that say what they must not, among honest ones: all on threads, over pseudo-terminals."""
 
-import threading
-from contextlib import suppress
-from functools import cache
+from functools import partial
 
 import numpy as np
 import pytest
+from stations import Threads, kit, on_threads
 
 from robins.bench import wire
 from robins.bench.parts.satellite import BUILD
-from robins.bench.parts.satellite.preparing import kit_for
-from robins.bench.parts.station import Part, Station, ready, serve
-from robins.bench.ports.port import address, open_port
+from robins.bench.parts.station import Part, Station
 from robins.bench.recording import Event
 from robins.bench.run import outcome
 from robins.bench.run.crew import Death
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 
-FLIGHT = changed(
-    read("satellite/s1", ("duration=60 s", "counted_from=10 s")),
-    {"seconds": 4.0, "filter": "mekf-gate"},
-)
+SHORT = "duration=60 s", "counted_from=10 s"
+FLIGHT = changed(read("satellite/s1", SHORT), {"seconds": 4.0, "filter": "mekf-gate"})
 WRONG = 24  # the first step in which the rogue goes wrong; it ends with a star frame
 AGAIN = 5  # steps between two star frames
-
-
-@cache
-def kit():
-    return kit_for(FLIGHT.loop, "mekf-gate", 0)
-
-
-@cache
-def part(name: str) -> Part:
-    return ready(BUILD[name](kit()), kit().frames)
 
 
 class Rogue(Station):
@@ -59,48 +44,17 @@ class Rogue(Station):
         return more + super()._frame(name, payload, time_ns)
 
 
-class Threads:
-    """In the place of `Crew`: starts no process."""
-
-    rogue: tuple[str, tuple[str, ...]] = ("", ())
-
-    def __init__(self, kit, realtime=False, restarts=False):
-        self.threads: list[threading.Thread] = []
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        for thread in self.threads:
-            thread.join(5.0)
-
-    def start(self, name, port, since=-1):
-        def be():
-            with suppress(OSError), open_port(address(port), timeout_s=None) as line:
-                rogue = name == self.rogue[0]
-                serve(line, Rogue(part(name), self.rogue[1]) if rogue else Station(part(name)))
-
-        self.threads.append(threading.Thread(target=be, daemon=True))
-        self.threads[-1].start()
-
-    def process(self, name):
-        return 1
-
-    def deaths(self, among=None):
-        return []
-
-    def remembers(self, name, step):
-        return False
-
-
 @pytest.fixture
 def fly(monkeypatch):
     def now(name: str = "", *modes: str):
-        monkeypatch.setattr(Threads, "rogue", (name, modes))
-        monkeypatch.setattr("robins.bench.run.session.Crew", Threads)
-        return Session(FLIGHT, kit=kit()).run()
+        on_threads(monkeypatch, **{name: partial(Rogue, modes=modes)})
+        return session(FLIGHT).run()
 
     return now
+
+
+def session(of):
+    return Session(of, kit=kit("satellite/s1", "mekf-gate", *SHORT))
 
 
 ALL = ("long", "1e308", "inf", "nan")
@@ -160,11 +114,10 @@ def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch):
             if len(self.threads) < len(BUILD):  # nobody comes in the place of the dead
                 super().start(name, port, since)
 
-    monkeypatch.setattr("robins.bench.run.session.Crew", Mortal)
-    of = changed(FLIGHT, {"on_death": "restart", "restarts": 3})
-    session = Session(of, kit=kit())
-    monkeypatch.setattr(session, "_glance", lambda: session.done > 2 and session._bury())
-    ran = session.run()
+    on_threads(monkeypatch, Mortal)
+    mortal = session(changed(FLIGHT, {"on_death": "restart", "restarts": 3}))
+    monkeypatch.setattr(mortal, "_glance", lambda: mortal.done > 2 and mortal._bury())
+    ran = mortal.run()
     assert ran.failure.startswith("'adm' was killed by SIGKILL, at 0.4 s of the run; that is one")
     assert ran.failure.endswith("one more than restarts = 3")
     assert ran.deaths == 4

@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 import pytest
-from stations import Loop, kit
+import stations
+from stations import Loop, kit, one_program
 
 from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station
-from robins.bench.run.one_program import in_process
 from robins.bench.run.setup import read
 from robins.bench.run.telemetry import turn
 from robins.bench.wire import Header, decode, encode, encode_frame, message
@@ -17,12 +17,18 @@ ARCSEC = np.pi / 648000.0
 SHORT = "duration=60 s", "counted_from=10 s"
 
 
+@pytest.fixture
+def of():
+    """The numbers of a short run; its parts are compiled once."""
+    return kit("satellite/s1", "mekf", *SHORT)
+
+
 def bit(flags, text):
     return flags >> FLAGS.index(text) & 1 == 1
 
 
-def reference(of, steps):
-    loop = in_process(read("satellite/s1", SHORT), of)
+def reference(name, steps):
+    loop = one_program("satellite/s1", name, *SHORT)
     return {name: getattr(loop, name)[:steps] for name in ("q_ib", "q_est_ib", "bias", "wheel_h")}
 
 
@@ -30,7 +36,7 @@ def reference(of, steps):
 def test_over_bytes_the_loop_has_the_bits_of_one_program(name):
     of = kit("satellite/s1", name, *SHORT)
     loop = Loop(of).run(300)
-    wanted = reference(of, 300)
+    wanted = reference(name, 300)
     np.testing.assert_array_equal(loop.all("motion", "q_ib"), wanted["q_ib"])
     np.testing.assert_array_equal(loop.all("estimate", "q_ib"), wanted["q_est_ib"])
     np.testing.assert_array_equal(loop.all("estimate", "gyro_bias"), wanted["bias"])
@@ -43,7 +49,7 @@ def test_over_bytes_the_loop_has_the_bits_of_one_program(name):
 def test_the_additive_filter_is_the_same_to_rounding():
     # XLA multiplies its matrices in another order where it is not in a scan.
     of = kit("satellite/s1", "ekf-quaternion", *SHORT)
-    loop, wanted = Loop(of).run(100), reference(of, 100)
+    loop, wanted = Loop(of).run(100), reference("ekf-quaternion", 100)
     np.testing.assert_allclose(loop.all("estimate", "q_ib"), wanted["q_est_ib"], atol=1e-13)
     np.testing.assert_allclose(loop.all("estimate", "gyro_bias"), wanted["bias"], atol=1e-15)
 
@@ -52,7 +58,7 @@ def test_a_camera_is_told_where_to_look():
     settings = "duration=30 s", "counted_from=10 s", "star.camera.magnitude=5.0"
     of = kit("satellite/stars", "mekf", *settings)
     loop = Loop(of).run(100)
-    inside = in_process(read("satellite/stars", settings), of)
+    inside = one_program("satellite/stars", "mekf", *settings)
     np.testing.assert_array_equal(loop.all("estimate", "q_ib"), inside.q_est_ib[:100])
     factor, stars = loop.all("star", "factor"), loop.all("star", "stars")
     assert np.all(np.any(factor != 0.0, axis=1))
@@ -63,8 +69,7 @@ def test_a_camera_is_told_where_to_look():
     assert loop.stations["star"].part.takes == {"motion": 0, "gyro": 0, "estimate": 1}
 
 
-def test_messages_are_of_the_schema_and_of_the_end_of_their_step():
-    of = kit("satellite/s1", "mekf", *SHORT)
+def test_messages_are_of_the_schema_and_of_the_end_of_their_step(of):
     loop = Loop(of).run(20)
     for part, frame in loop.said:
         name = message(frame.header.type).name
@@ -98,8 +103,7 @@ def without(name, taker, steps):
     return meddle
 
 
-def test_without_star_frames_the_gyro_carries_on():
-    of = kit("satellite/s1", "mekf", *SHORT)
+def test_without_star_frames_the_gyro_carries_on(of):
     loop = Loop(of, without("star", "adm", range(100, 400))).run(300)
     error = np.linalg.norm(turn(loop.all("estimate", "q_ib"), loop.all("motion", "q_ib")), axis=1)
     assert np.all(bit(loop.flags()[125:], "star silent"))
@@ -109,8 +113,7 @@ def test_without_star_frames_the_gyro_carries_on():
     assert error[-1] < 5.0 * sigma[-1]
 
 
-def test_a_gyro_sample_that_is_missing_is_held_for_one_step():
-    of = kit("satellite/s1", "mekf", *SHORT)
+def test_a_gyro_sample_that_is_missing_is_held_for_one_step(of):
     loop = Loop(of, without("gyro", "adm", {50})).run(100)
     flags = loop.flags()
     assert list(np.flatnonzero(bit(flags, "gyro held"))) == [50]
@@ -119,9 +122,7 @@ def test_a_gyro_sample_that_is_missing_is_held_for_one_step():
     assert np.all(np.any(torque[1:] != 0.0, axis=1))
 
 
-def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back():
-    of = kit("satellite/s1", "mekf", *SHORT)
-
+def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back(of):
     def meddle(step, message, to, payload):
         gone = message == "gyro" and step in range(50, 60)
         return [] if gone else [((step + 1) * of.step_ns, payload)]
@@ -155,6 +156,7 @@ def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
             compiled.append(told["fun_name"])
 
     jax.clear_caches()
+    stations._READY.clear()
     loop = Loop(of, meddle)
     jax.monitoring.register_event_duration_secs_listener(hear)
     try:
@@ -167,9 +169,7 @@ def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
     assert np.any(bit(loop.flags(), FLAGS[3]))
 
 
-def test_no_sample_of_an_axis_is_no_sample():
-    of = kit("satellite/s1", "mekf", *SHORT)
-
+def test_no_sample_of_an_axis_is_no_sample(of):
     def meddle(step, message, to, payload):
         if message == "gyro" and to == "adm" and step == 40:
             payload = encode("gyro", {"theta_b": [0.0, np.nan, 0.0]})
@@ -184,9 +184,7 @@ def test_no_sample_of_an_axis_is_no_sample():
     ("change", "text"),
     [(lambda q: 0.99 * q, FLAGS[5]), (lambda q: np.full(4, np.nan), None), (lambda q: -q, "same")],
 )
-def test_quaternions_that_are_none_are_refused_and_either_sign_is_the_same(change, text):
-    of = kit("satellite/s1", "mekf", *SHORT)
-
+def test_quaternions_that_are_none_are_refused_and_either_sign_is_the_same(of, change, text):
     def meddle(step, message, to, payload):
         if message == "star" and step >= 50:
             said = decode("star", payload)
@@ -204,9 +202,7 @@ def test_quaternions_that_are_none_are_refused_and_either_sign_is_the_same(chang
     assert np.all(bit(loop.flags()[due], FLAGS[5]) == (text is not None))
 
 
-def test_late_frames_are_not_fused_at_the_wrong_time():
-    of = kit("satellite/s1", "mekf", *SHORT)
-
+def test_late_frames_are_not_fused_at_the_wrong_time(of):
     def late(step, message, to, payload):
         behind = of.step_ns * (3 if message == "star" else 0)
         return [((step + 1) * of.step_ns - behind, payload)]
@@ -216,8 +212,7 @@ def test_late_frames_are_not_fused_at_the_wrong_time():
     assert loop.stations["adm"].counts["late"] == int(np.sum(of.due[:60]))
 
 
-def test_a_lost_command_stands_for_a_step_then_wheels_rest():
-    of = kit("satellite/s1", "mekf", *SHORT)
+def test_a_lost_command_stands_for_a_step_then_wheels_rest(of):
     loop = Loop(of, without("command", "actuators", {30, 31, 32})).run(40)
     given, asked = loop.all("actuation", "wheel_torque"), loop.all("command", "wheel_torque")
     np.testing.assert_array_equal(given[30], given[29])
@@ -225,8 +220,7 @@ def test_a_lost_command_stands_for_a_step_then_wheels_rest():
     np.testing.assert_array_equal(given[33], asked[33])
 
 
-def test_a_gyro_reports_what_it_missed_with_its_next_sample():
-    of = kit("satellite/s1", "mekf", *SHORT)
+def test_a_gyro_reports_what_it_missed_with_its_next_sample(of):
     plain = Loop(of).run(40)
     loop = Loop(of, without("mounted", "gyro", {20})).run(40)
     assert len(loop.heard["gyro"]) == 39
@@ -259,8 +253,7 @@ def test_more_wheels_than_the_wire_has_are_refused():
         kit_for(flight.loop, "mekf", 0)
 
 
-def test_a_part_of_another_run_hears_nothing():
-    of = kit("satellite/s1", "mekf", *SHORT)
+def test_a_part_of_another_run_hears_nothing(of):
     station = Station(BUILD["adm"](of))
     begin = encode("begin", {"step": of.step_ns})
     station.feed(encode_frame(Header(message("begin").number, 5, 0, 0), begin))
