@@ -314,8 +314,8 @@ def as_short_as_can_be(words):
             return [*words, "--runs", "1"]
         case ["design", *_] if "--methods" not in words:
             return [*words, "--methods", "riccati"]
-        case ["replay", *_] if "--system" not in words:
-            return [*words, "--filters", "ekf"]
+        case ["replay", *_]:
+            return [*words, "--filters", "marg" if "--system" in words else "ekf"]
         case ["bench", "up", *_]:
             return [*words, "--seconds", "2"]  # the last of an option counts
     return words
