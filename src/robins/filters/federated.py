@@ -30,11 +30,11 @@ from jaxtyping import Array, ArrayLike
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters import channels as _channels
-from robins.filters.belief import Belief, Code
+from robins.filters.belief import Belief, Code, Number
 from robins.filters.channels import Channel, Joined, Moved, with_noise
 from robins.filters.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.kalman import Filter, FilterState, in_step, kalman
-from robins.filters.linearise import Linearisation, Number
+from robins.filters.linearise import Linearisation
 from robins.filters.model import Motion, as_noise
 from robins.filters.shares import diagonal_shares, equal_shares, floored, trace_shares
 
