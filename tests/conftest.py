@@ -22,7 +22,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # figures never need a screen. Most of a test run is compiling what runs for a moment: code is
 # generated without LLVM's optimisation, by the older of XLA's emitters of loops, in one piece. That
 # takes less than half of the time (XLA_FLAGS= tests what users run). What was compiled once serves
-# every worker and the next run; where it is kept is not a cost.
+# every worker and the next run; where it is kept is not a cost. Nobody asks of compiled code which
+# line of a test it is from, and to write that into it takes a tenth of the time.
 SETTINGS = {
     "JAX_PLATFORMS": "cpu",
     "MPLBACKEND": "Agg",
@@ -30,15 +31,13 @@ SETTINGS = {
     "--xla_cpu_parallel_codegen_split_count=1",
     "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax"),
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
+    "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
 }
 os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
-# JAX was imported above, by then it has read what is there.
-jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
-jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-jax.config.update(
-    "jax_persistent_cache_min_compile_time_secs",
-    float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"]),
-)
+# JAX was imported above: it has read its own already.
+for name in (name for name in SETTINGS if name.startswith("JAX_")):
+    kind = type(getattr(jax.config, name.lower()) or "")
+    jax.config.update(name.lower(), kind(os.environ[name]))
 # A shell starts what runs in the background deaf to interrupts, `nohup` to the end of a terminal;
 # processes that tests start and interrupt would inherit that.
 for number, handler in (
