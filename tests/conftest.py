@@ -36,8 +36,8 @@ SETTINGS = {
 os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
 # JAX was imported above: it has read its own already.
 for name in (name for name in SETTINGS if name.startswith("JAX_")):
-    kind = type(getattr(jax.config, name.lower()) or "")
-    jax.config.update(name.lower(), kind(os.environ[name]))
+    was = getattr(jax.config, name.lower())
+    jax.config.update(name.lower(), (str if was is None else type(was))(os.environ[name]))
 # A shell starts what runs in the background deaf to interrupts, `nohup` to the end of a terminal;
 # processes that tests start and interrupt would inherit that.
 for number, handler in (

@@ -336,7 +336,7 @@ BEGINS = {
     ("run", "--master"): "robins.workbench.recorded.part",
     ("replay", "--system"): "robins.workbench.recorded.part",
     ("bench", "up"): "robins.bench.run.session.Session.run",
-    ("bench", "replay"): "robins.workbench.benches._kit",
+    ("bench", "replay"): "robins.workbench.benches.kit_of",
 }
 
 

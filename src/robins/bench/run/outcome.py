@@ -18,13 +18,6 @@ from robins.results.summary import dumps, plain
 
 RECORD, ACCOUNT = "record.mcap", "bench.json"
 
-_WRONG = ("wrong", "lost", "repeated", "late", "refused")
-_FLAGGED = {
-    "refused_measurements": "star refused",
-    "quaternions_of_wrong_length": "star of a length other than one",
-    "steps_without_gyro": "gyro held",
-    "steps_in_safe_mode": "safe: do not steer by this",
-}
 _EVENTS = 200  # told; all are in the record
 _AXES = ("x", "y", "z (boresight)")
 
@@ -64,8 +57,17 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
         "missed": summary["missed"],
         "counts": {
             "frames": sum(h.frames for h in health),
-            **{f"{how}_frames": sum(getattr(h, how) for h in health) for how in _WRONG},
-            **{name: int(np.sum(flag(flown, what))) for name, what in _FLAGGED.items()},
+            "wrong_frames": sum(h.wrong for h in health),
+            "lost_frames": sum(h.lost for h in health),
+            "repeated_frames": sum(h.repeated for h in health),
+            "late_frames": sum(h.late for h in health),
+            "refused_frames": sum(h.refused for h in health),
+            "refused_measurements": int(np.sum(flag(flown, "star refused"))),
+            "quaternions_of_wrong_length": int(
+                np.sum(flag(flown, "star of a length other than one"))
+            ),
+            "steps_without_gyro": int(np.sum(flag(flown, "gyro held"))),
+            "steps_in_safe_mode": int(np.sum(flag(flown, "safe: do not steer by this"))),
             "silent_parts": sum(ran.silent.values()),
             "processes_died": ran.deaths,
         },
