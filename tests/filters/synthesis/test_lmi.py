@@ -293,16 +293,18 @@ def true(answer):
 
 
 def test_an_inaccurate_answer_is_taken_if_its_true_norms_are_right(monkeypatch):
+    want = on_two_states(1.0)
     answers(monkeypatch, doubtful)
     found = observer(two_states(), 1.0)
     assert found.status == "optimal_inaccurate"
-    assert found.gain == pytest.approx(on_two_states(1.0).gain)
+    assert found.gain == pytest.approx(want.gain)
 
 
 @pytest.mark.parametrize("first", [wrong, boastful, silent])
 def test_an_answer_that_fails_is_sought_again_in_other_units(monkeypatch, first):
+    want = on_two_states(1.0)
     answers(monkeypatch, first, true)
-    assert observer(two_states(), 1.0).h2 == pytest.approx(on_two_states(1.0).h2, rel=1e-4)
+    assert observer(two_states(), 1.0).h2 == pytest.approx(want.h2, rel=1e-4)
 
 
 def test_no_good_answer_is_an_error_that_tells_status_and_test(monkeypatch):
@@ -323,13 +325,14 @@ def test_a_filter_that_r_spoils_is_taken_in_the_limit(monkeypatch):
     def spoilt(answer):
         return answer._replace(unknowns=answer.unknowns | {"S": 3.0 * answer.unknowns["S"]})
 
+    want = on_two_states(1.0)
     answers(monkeypatch, spoilt)
     found = full(two_states(), 1.0)
     assert found.filter is not None
     Ah, Bh, Gh = found.filter
     np.testing.assert_allclose(Ah, two_states().A - Bh @ two_states().C, rtol=0, atol=1e-14)
     np.testing.assert_allclose(Gh, np.eye(2), rtol=0, atol=1e-14)
-    assert found.h2 == pytest.approx(on_two_states(1.0).h2, rel=1e-3)
+    assert found.h2 == pytest.approx(want.h2, rel=1e-3)
 
 
 @pytest.mark.parametrize("design", [observer, full])
