@@ -14,17 +14,13 @@ XV = ("x", "v")
 
 
 def contender(dim=1, sensor="y"):
-    model = Model(
-        Motion(lambda x, u: x, jnp.ones(2)),
-        (Sensor(lambda x, a: x[:dim], jnp.ones(dim), dim, sensor),),
-    )
-    return Contender(kalman(), model)
+    sensors = (Sensor(lambda x, a: x[:dim], jnp.ones(dim), dim, sensor),)
+    return Contender(kalman(), Model(Motion(lambda x, u: x, jnp.ones(2)), sensors))
 
 
 def a_problem(**changes):
-    case = Case(
-        Belief(jnp.zeros(2), jnp.eye(2)), None, {"y": jnp.ones((4, 1))}, {}, jnp.zeros((4, 2))
-    )
+    start = Belief(jnp.zeros(2), jnp.eye(2))
+    case = Case(start, None, {"y": jnp.ones((4, 1))}, {}, jnp.zeros((4, 2)))
     given = {
         "simulate": lambda index: case._replace(y={"y": jnp.ones((4, 1)) * index.astype(float)}),
         "contenders": {"kf": contender()},
@@ -43,10 +39,7 @@ def a_problem(**changes):
     [
         ({"sensors": {"line": SensorAxes("m", "E", ("x",))}}, "line: names a sensor and a block"),
         ({"outputs": (Output("line", "m", "m", "E", XV, ""),)}, "line: names a output and a block"),
-        (
-            {"context": xr.Dataset(coords={"axis_y": ["x"]})},
-            "y: names a context and a sensor",
-        ),
+        ({"context": xr.Dataset(coords={"axis_y": ["x"]})}, "y: names a context and a sensor"),
         ({"limits": (Limit("1_m", "lines", 1.0),)}, "limit 1_m: there is no block 'lines'"),
         (
             {"contenders": {"kf": contender(sensor="z")}},
@@ -74,11 +67,10 @@ def test_statistics_that_nothing_can_be_made_of_are_kept(tmp_path):
     (kept,) = tmp_path.iterdir()
     assert str(kept / "arrays.npz") in str(error.value)
     assert "a metric that a study forgot" in str(error.value)
-    found = np.load(kept / "arrays.npz")
+    with np.load(kept / "arrays.npz") as found:
+        rms = np.sqrt(found["kf._square"] / found["kf.runs"])
     whole = simulate(a_problem(), 3).solution
-    np.testing.assert_array_equal(
-        np.sqrt(found["kf._square"] / found["kf.runs"]), whole["rms_line"][0]
-    )
+    np.testing.assert_array_equal(rms, whole["rms_line"][0])
 
 
 def test_a_disk_that_takes_nothing_is_told_as_it_is(tmp_path, monkeypatch):
