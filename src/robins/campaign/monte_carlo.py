@@ -23,6 +23,7 @@ from robins.filters.consistency import nees, normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
 from robins.systems.system import Case, Contender, Problem
+from robins.systems.tables import updates
 
 CHUNK = 64  # runs; large enough to fill a core's vectors, small enough for the cache
 
@@ -31,10 +32,7 @@ _Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the report
 
 def _kept(step: Step) -> Any:
     """What a campaign keeps of a step: enough for errors, bounds and innovations."""
-    info = {
-        name: (i.innovation, i.sigma, i.nis, i.dof, i.code, i.notes)
-        for name, i in step.info.items()
-    }
+    info = {name: u._replace(notes=step.info[name].notes) for name, u in updates(step).items()}
     return step.posterior, info, step.prediction.code == int(Code.DONE)
 
 
@@ -86,12 +84,7 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
         "dim": jnp.asarray(posterior.factor.shape[-1]),
         "block_nees": {k: jax.vmap(normalised_sq)(error[at], factor[at]) for k, at in of.items()},
         "mean": posterior.mean,
-        "innovation": {k: v[0] for k, v in info.items()},
-        "innovation_sigma": {k: v[1] for k, v in info.items()},
-        "nis": {k: v[2] for k, v in info.items()},
-        "dof": {k: v[3] for k, v in info.items()},
-        "code": {k: v[4] for k, v in info.items()},
-        "notes": {k: v[5] for k, v in info.items()},
+        "updates": info,
         "outputs": dict(case.outputs),
         "tally": tally,
     }
@@ -155,8 +148,7 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     Returns:
         NumPy records with a leading axis of ``count`` runs. Of the reported components error and
         sigma (E, r) and block_nees by block; of the state mean, nees (E,) and dim (); by sensor
-        innovation, innovation_sigma, nis, dof, code and the notes of rules; by name the outputs;
-        the tally of its steps.
+        updates, each an `Update`; by name the outputs; the tally of its steps.
 
     Raises:
         ValueError: there is no such contender.

@@ -15,7 +15,7 @@ from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
 from robins.results import Outcome, Progress, array, keeping, silent, variable
 from robins.systems.system import Problem
-from robins.systems.tables import Seen, block_array, innovation_tables
+from robins.systems.tables import block_array, innovation_tables
 
 
 def simulate(
@@ -160,7 +160,8 @@ def campaign_solution(
             data |= block_array("rms", o, rms, f"RMS {words}", comment=o.text, runs=runs)
     data |= _notes(found)
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
-    return xr.Dataset(data | innovation_tables(_seen(found), problem.sensors, problem.epoch_s))
+    seen = [s.first_run["updates"] for s in found.values()]
+    return xr.Dataset(data | innovation_tables(seen, problem.sensors, problem.epoch_s))
 
 
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
@@ -170,8 +171,8 @@ def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
     """
     of: dict[str, dict[str, np.ndarray]] = {}
     for name, s in found.items():
-        for notes in s.first_run["notes"].values():
-            for note, value in notes.items():
+        for update in s.first_run["updates"].values():
+            for note, value in update.notes.items():
                 if np.ndim(value) == 1:
                     of.setdefault(note, {})[name] = np.asarray(value, dtype=float)
     epochs = next(iter(found.values())).rms.shape[0]
@@ -182,24 +183,3 @@ def _notes(found: dict[str, Statistics]) -> dict[str, Any]:
         values = np.stack([by.get(name, none) for name in found])
         data |= array("note", values, note.replace(".", "_"), long_name=text)
     return data
-
-
-def _seen(found: dict[str, Statistics]) -> dict[str, Seen]:
-    """Innovations of the first run, by sensor; NaN for filters that use no such sensor."""
-    shapes = {k: v.shape for s in found.values() for k, v in s.first_run["innovation"].items()}
-
-    def of(kind: str, sensor: str) -> np.ndarray:
-        shape = shapes[sensor] if kind.startswith("innovation") else shapes[sensor][:1]
-        rows = [s.first_run[kind].get(sensor) for s in found.values()]
-        return np.stack([np.full(shape, np.nan) if r is None else r.astype(float) for r in rows])
-
-    return {
-        k: Seen(
-            of("innovation", k),
-            of("innovation_sigma", k),
-            of("nis", k),
-            of("dof", k),
-            of("code", k) == int(Code.REFUSED),
-        )
-        for k in shapes
-    }

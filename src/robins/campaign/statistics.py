@@ -73,9 +73,9 @@ class Statistics:
         for name, value in record["block_nees"].items():
             total = np.sum(np.where(bad[:, None], np.inf, value), axis=0)
             self._block_nees[name] = self._block_nees.get(name, 0.0) + total
-        for name, value in record["nis"].items():
-            self._nis[name] = self._nis.get(name, 0.0) + np.sum(value, axis=0)
-            self._dof[name] = self._dof.get(name, 0) + np.sum(record["dof"][name], axis=0)
+        for name, update in record["updates"].items():
+            self._nis[name] = self._nis.get(name, 0.0) + np.sum(update.nis, axis=0)
+            self._dof[name] = self._dof.get(name, 0) + np.sum(update.dof, axis=0)
         self._tallies.append(record.get("tally", Tally.blank(())))
         for name, value in record.get("outputs", {}).items():
             value = np.where(bad[:, None, None], np.inf, value)

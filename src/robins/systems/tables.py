@@ -8,23 +8,32 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from robins.filters import StepWarning, Tally, doubts
+from robins.filters import Code, StepWarning, Tally, doubts
+from robins.filters.consistency import grand_mean_nis
+from robins.filters.run import Step
 from robins.results import array, variable
 from robins.systems.system import Output, SensorAxes, StateBlock
 
 EULER = StateBlock("euler", slice(0, 3), "rad", "deg", "FRD to NED", ("roll", "pitch", "heading"))
 
 
-class Seen(NamedTuple):
-    """What the filters saw of one sensor; leading axes are filter and epoch, NaN where nothing."""
+class Update(NamedTuple):
+    """What is kept of the updates of one sensor, of a `StepInfo`; leading axis E epochs."""
 
-    innovation: np.ndarray  # (F, E, m)
-    sigma: np.ndarray  # (F, E, m)
-    nis: np.ndarray  # (F, E)
-    dof: np.ndarray  # (F, E)
-    refused: np.ndarray  # (F, E)
+    innovation: Any  # (E, m)
+    sigma: Any  # (E, m)
+    nis: Any  # (E,)
+    dof: Any  # (E,)
+    code: Any  # (E,)
+    notes: Mapping[str, Any] = {}
+
+
+def updates(step: Step) -> dict[str, Update]:
+    """What is kept of a step, by sensor, without what its rules noted."""
+    return {k: Update(i.innovation, i.sigma, i.nis, i.dof, i.code) for k, i in step.info.items()}
 
 
 def block_array(
@@ -52,18 +61,21 @@ def place_arrays(
 
 
 def innovation_tables(
-    seen: Mapping[str, Seen], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
+    seen: Sequence[Mapping[str, Any]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
 ) -> dict[str, Any]:
     """Arrays and coordinates of a solution, at the epochs where each sensor spoke.
 
     Args:
-        seen: by sensor.
+        seen: by filter and sensor, an `Update`. A filter that has no such sensor, as a smoother has
+            none, has NaN there, and refuses nothing.
         axes: by sensor, units and names of the innovation's components.
         epoch_s: (E,) time of each epoch.
     """
     data: dict[str, Any] = {}
-    for sensor, s in seen.items():
-        spoke = np.any(np.isfinite(s.innovation), axis=(0, 2))
+    for sensor in dict.fromkeys(sensor for of in seen for sensor in of):
+        kept = Update._fields[:5]
+        innovation, spread, nis, dof, code = (_every(seen, sensor, what) for what in kept)
+        spoke = np.any(np.isfinite(innovation), axis=(0, 2))
         if not np.any(spoke):
             continue
         time, (units, frame, labels, shown) = f"{sensor}_time", axes[sensor]
@@ -71,12 +83,19 @@ def innovation_tables(
         about |= {"display_unit": shown} if shown else {}
         words = sensor.replace("_", " ")
         data[time] = variable(time, epoch_s[spoke], "s", f"time of {words}")
-        data |= array("innovation", s.innovation[:, spoke], sensor, **about)
-        data |= array("innovation_sigma", s.sigma[:, spoke], sensor, **about)
-        data |= array("nis", s.nis[:, spoke], sensor)
-        data |= array("nis_dof", s.dof[:, spoke], sensor)
-        data |= array("refused", s.refused[:, spoke], sensor)
+        data |= array("innovation", innovation[:, spoke], sensor, **about)
+        data |= array("innovation_sigma", spread[:, spoke], sensor, **about)
+        data |= array("nis", nis[:, spoke], sensor)
+        data |= array("nis_dof", dof[:, spoke], sensor)
+        data |= array("refused", code[:, spoke] == Code.REFUSED, sensor)
     return data
+
+
+def _every(seen: Sequence[Mapping[str, Any]], sensor: str, what: str) -> np.ndarray:
+    """What is kept of a sensor by every filter, leading axis; NaN for one without the sensor."""
+    rows = [getattr(of[sensor], what) if sensor in of else None for of in seen]
+    blank = np.full(np.shape(next(row for row in rows if row is not None)), np.nan)
+    return np.stack([blank if row is None else np.asarray(row, dtype=float) for row in rows])
 
 
 @contextmanager
@@ -85,6 +104,37 @@ def doubts_told_at_the_end() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StepWarning)
         yield
+
+
+def update_metrics(seen: Mapping[str, Any], bounds: bool = False) -> dict[str, Any]:
+    """Grand mean NIS with its band, and how many were refused, of each sensor that spoke.
+
+    Args:
+        seen: by sensor, an `Update`.
+        bounds: the filter states bounds: what it expects is no covariance, so there is no NIS.
+    """
+    out: dict[str, Any] = {}
+    for sensor, update in seen.items():
+        refused = np.asarray(update.code) == Code.REFUSED
+        used = np.asarray(update.dof) * ~refused
+        if np.any(used) and not bounds:
+            verdict = grand_mean_nis(np.asarray(update.nis), used)
+            out[f"nis_{sensor}"] = verdict.value
+            out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+        if np.any(used) or np.any(refused):
+            out[f"refused_{sensor}"] = int(np.sum(refused))
+    return out
+
+
+def end_to_end(trees: Sequence[Any]) -> Any:
+    """Pieces of a log, a row of NaN between two of them so that no curve crosses a gap."""
+
+    def join(*leaves: Any) -> jax.Array:
+        rows = [np.asarray(leaf) for leaf in leaves]
+        blank = np.full_like(rows[0][:1], np.nan if rows[0].dtype.kind == "f" else 0)
+        return jnp.asarray(np.concatenate([rows[0], *(a for r in rows[1:] for a in (blank, r))]))
+
+    return jax.tree_util.tree_map(join, *trees)
 
 
 def together(tallies: Sequence[Tally | None]) -> Tally | None:

@@ -10,13 +10,18 @@ import numpy as np
 import xarray as xr
 
 from robins.earth import Geodetic
-from robins.filters import Belief, Code, StepInfo, Tally
-from robins.filters.consistency import grand_mean_nis
+from robins.filters import Belief, StepInfo, Tally
 from robins.results import array, variable
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log
 from robins.systems.ins_gnss.setup import SENSORS, state_blocks
-from robins.systems.tables import EULER, Seen, block_array, innovation_tables, place_arrays
+from robins.systems.tables import (
+    EULER,
+    block_array,
+    innovation_tables,
+    place_arrays,
+    update_metrics,
+)
 
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
@@ -74,14 +79,7 @@ def replay_metrics(flight: Flight, answer: Answer) -> dict[str, Any]:
             "outage_vertical_rms_m": _rms(error[withheld, 2]),
             "outage_fixes": int(np.sum(withheld)),
         }
-    for sensor, info in answer.info.items():
-        used = np.asarray(info.dof) * (np.asarray(info.code) != int(Code.REFUSED))
-        if np.sum(used) == 0:
-            continue
-        verdict = grand_mean_nis(np.asarray(info.nis), used)
-        out[f"nis_{sensor}"] = verdict.value
-        out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
-        out[f"refused_{sensor}"] = int(np.sum(np.asarray(info.code) == int(Code.REFUSED)))
+    out |= update_metrics(answer.info)
     if answer.info:
         out["log_likelihood"] = answer.log_likelihood
     return out
@@ -110,7 +108,8 @@ def replay_solution(flight: Flight, answers: dict[str, Answer], parameters: Repl
     euler = _stack(answers, lambda a: np.stack(a.belief.mean.q_nb.as_euler(), -1))
     data |= block_array("estimate", EULER, euler, "estimated roll, pitch, heading")
     data |= _fixes(flight.log)
-    return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, flight.epoch_s))
+    seen = [answer.info for answer in answers.values()]
+    return xr.Dataset(data | innovation_tables(seen, SENSORS, flight.epoch_s))
 
 
 def _estimate(answer: Answer, block: str) -> np.ndarray:
@@ -133,26 +132,3 @@ def _fixes(log: Log) -> dict[str, Any]:
             flag_meanings=" ".join(RTK_QUALITY[q] for q in known),
         )
     return out
-
-
-def _seen(answers: dict[str, Answer]) -> dict[str, Seen]:
-    """Innovations by sensor; a smoother has none, so its rows are NaN."""
-    causal = [name for name, answer in answers.items() if answer.info]
-    if not causal:
-        return {}
-
-    def of(pick: Any, sensor: str) -> np.ndarray:
-        rows = {name: np.asarray(pick(answers[name].info[sensor]), dtype=float) for name in causal}
-        blank = np.full_like(rows[causal[0]], np.nan)
-        return np.stack([rows.get(name, blank) for name in answers])
-
-    return {
-        k: Seen(
-            of(lambda i: i.innovation, k),
-            of(lambda i: i.sigma, k),
-            of(lambda i: i.nis, k),
-            of(lambda i: i.dof, k),
-            of(lambda i: i.code == int(Code.REFUSED), k),
-        )
-        for k in answers[causal[0]].info
-    }

@@ -20,7 +20,7 @@ from robins.systems.ins_gnss.model import ROAD, STANDSTILL, STILL_RATE, Mount, r
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log, Prepared, on_one_clock, pieces, prepare
 from robins.systems.ins_gnss.setup import SMOOTHED, make_filter, model_of, mount_of
-from robins.systems.tables import doubts_told_at_the_end, replay_warnings, together
+from robins.systems.tables import doubts_told_at_the_end, end_to_end, replay_warnings, together
 
 CAUSES = (
     "Likely causes: the lever arm or the latency of the GNSS, the mounting of the unit, sigmas "
@@ -64,27 +64,16 @@ def navigate(prepared: Prepared, parameters: Replay, wanted: tuple[str, ...]) ->
 
 
 def _joined(answers: list[Answer]) -> Answer:
-    """Pieces one after the other, an epoch of NaN between two so that no curve crosses a gap."""
+    """The answers of all pieces, laid out as `end_to_end` does."""
     if len(answers) == 1:
         return answers[0]
-
-    def blank(x):
-        row = np.asarray(x)[:1]
-        return np.full_like(row, np.nan) if row.dtype.kind == "f" else np.zeros_like(row)
-
-    def join(*leaves):
-        rows = [a for leaf in leaves for a in (blank(leaf), np.asarray(leaf))]
-        return jnp.asarray(np.concatenate(rows[1:]))
-
-    belief, place, info = jax.tree_util.tree_map(
-        join, *((a.belief, a.antenna, a.info) for a in answers)
-    )
+    belief, place, info = end_to_end([(a.belief, a.antenna, a.info) for a in answers])
     likelihood = sum(a.log_likelihood for a in answers)
     return Answer(belief, place, info, likelihood, together([a.tally for a in answers]))
 
 
 def _flight(log: Log, parts: list[Prepared]) -> Flight:
-    """The epochs and fixes of all pieces together, laid out as `_joined` does."""
+    """The epochs and fixes of all pieces together, laid out as `end_to_end` does."""
     epoch, withheld = [], []
     fix_epoch = np.full(len(log.gnss), -1)
     for part in parts:

@@ -10,7 +10,6 @@ import xarray as xr
 
 from robins.dataset import Dataset
 from robins.filters import Code, Tally
-from robins.filters.consistency import grand_mean_nis
 from robins.results import array, variable
 from robins.rotation import to_euler
 from robins.systems.marg.accuracy import orientation_errors, rms_deg, truth_at
@@ -18,17 +17,7 @@ from robins.systems.marg.model import MAGNETOMETER, MargState
 from robins.systems.marg.prepare import Prepared
 from robins.systems.marg.setup import BLOCKS, SENSORS
 from robins.systems.system import StateBlock
-from robins.systems.tables import EULER, Seen, block_array, innovation_tables
-
-
-class Update(NamedTuple):
-    """What a run keeps of the updates of one sensor; leading axis B blocks."""
-
-    innovation: Any  # (B, m)
-    sigma: Any  # (B, m)
-    nis: Any  # (B,)
-    dof: Any  # (B,)
-    code: Any  # (B,)
+from robins.systems.tables import EULER, Update, block_array, innovation_tables, update_metrics
 
 
 class Answer(NamedTuple):
@@ -60,15 +49,7 @@ def metrics(dataset: Dataset, log: Prepared, answer: Answer) -> dict[str, Any]:
         # one where the stated spread of the heading is right
         out["heading_nees"] = float(np.mean(ratio**2)) if ratio.size else float("nan")
     out["rest_share"] = float(np.mean(log.still))
-    for sensor, update in answer.updates.items():
-        used = update.dof * (update.code != int(Code.REFUSED))
-        refused = int(np.sum(update.code == int(Code.REFUSED)))
-        out[f"refused_{sensor}"] = refused
-        if np.sum(used) == 0:
-            continue
-        verdict = grand_mean_nis(update.nis, used)
-        out[f"nis_{sensor}"] = verdict.value
-        out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+    out |= update_metrics(answer.updates)
     if answer.updates:
         out["log_likelihood"] = answer.log_likelihood
     return out
@@ -136,7 +117,8 @@ def solution(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> xr.
         long_name="magnetometer refused",
         dims="filter time",
     )
-    return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, log.epoch_s))
+    seen = [answer.updates for answer in answers.values()]
+    return xr.Dataset(data | innovation_tables(seen, SENSORS, log.epoch_s))
 
 
 def _error_tables(dataset: Dataset, log: Prepared, answers: dict[str, Answer]) -> dict[str, Any]:
@@ -163,33 +145,6 @@ def _disturbed(answer: Answer, blocks: int) -> np.ndarray:
     if MAGNETOMETER not in answer.updates:
         return np.zeros(blocks, dtype=np.int8)
     return (answer.updates[MAGNETOMETER].code == int(Code.REFUSED)).astype(np.int8)
-
-
-def _seen(answers: dict[str, Answer]) -> dict[str, Seen]:
-    """Innovations by sensor; a smoother has none, so its rows are NaN."""
-    causal = [a.updates for a in answers.values() if a.updates]
-    if not causal:
-        return {}
-
-    def of(sensor: str, pick) -> np.ndarray:
-        shape = np.shape(pick(causal[0][sensor]))
-        blank = np.full(shape, np.nan)
-        rows = [
-            np.asarray(pick(a.updates[sensor]), dtype=float) if a.updates else blank
-            for a in answers.values()
-        ]
-        return np.stack(rows)
-
-    return {
-        name: Seen(
-            of(name, lambda u: u.innovation),
-            of(name, lambda u: u.sigma),
-            of(name, lambda u: u.nis),
-            of(name, lambda u: u.dof),
-            of(name, lambda u: u.code == int(Code.REFUSED)),
-        )
-        for name in causal[0]
-    }
 
 
 def sentences(log: Prepared, answers: dict[str, Answer]) -> list[str]:

@@ -8,16 +8,16 @@ import jax
 import numpy as np
 
 from robins.dataset import Dataset
-from robins.filters import Belief, Code, Filter, Model, StepInfo, rts_smoother, run
+from robins.filters import Belief, Code, Filter, Model, rts_smoother, run
 from robins.filters.run import Step
 from robins.results import Outcome, Progress, silent
-from robins.systems.marg.answer import Answer, Update, metrics, sentences, solution
+from robins.systems.marg.answer import Answer, metrics, sentences, solution
 from robins.systems.marg.blocks import causal_attitudes, smoothed_attitudes
 from robins.systems.marg.model import REST_RATE, TRAVEL
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.prepare import Prepared, prepare
 from robins.systems.marg.setup import CAUSAL, SMOOTHED, filter_of, model_of
-from robins.systems.tables import doubts_told_at_the_end, replay_warnings
+from robins.systems.tables import doubts_told_at_the_end, replay_warnings, updates
 
 CAUSES = (
     "Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, axes "
@@ -34,16 +34,12 @@ class Light(NamedTuple):
     failed: Any  # () the prediction was not taken
 
 
-def _update(info: StepInfo) -> Update:
-    return Update(info.innovation, info.sigma, info.nis, info.dof, info.code)
-
-
 def light(step: Step) -> Light:
     """Keep the posterior's mean and standard deviations and how the updates went."""
     return Light(
         step.posterior.mean,
         step.posterior.sigma,
-        {name: _update(info) for name, info in step.info.items()},
+        updates(step),
         step.prediction.code != int(Code.DONE),
     )
 

@@ -10,11 +10,16 @@ import xarray as xr
 
 from robins import units
 from robins.dataset import Trajectory
-from robins.filters import Belief, Code, StepInfo, Tally
-from robins.filters.consistency import grand_mean_nis
+from robins.filters import Belief, StepInfo, Tally
 from robins.results import array, variable
 from robins.systems.system import SensorAxes, StateBlock
-from robins.systems.tables import EULER, Seen, block_array, innovation_tables, place_arrays
+from robins.systems.tables import (
+    EULER,
+    block_array,
+    innovation_tables,
+    place_arrays,
+    update_metrics,
+)
 from robins.systems.transfer_alignment.product import ATTITUDE, POSITION, VELOCITY
 
 _NED, _FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -88,17 +93,8 @@ def metrics_of(answer: Answer) -> dict[str, Any]:
         if value is not None:
             out[f"{block.name}_{ending}"] = units.convert(value[-1], *convert).tolist()
         out[f"{block.name}_sigma_{ending}"] = units.convert(spread[-1], *convert).tolist()
-    for sensor, info in answer.info.items():
-        code = np.asarray(info.code)
-        used = np.asarray(info.dof) * (code != int(Code.REFUSED))
-        out[f"refused_{sensor}"] = int(np.sum(code == int(Code.REFUSED)))
-        # what an H-infinity filter expects is no covariance, so chi-square says nothing of it
-        if np.sum(used) and not answer.bounds:
-            verdict = grand_mean_nis(np.asarray(info.nis), used)
-            out[f"nis_{sensor}"] = verdict.value
-            out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
-    out["log_likelihood"] = answer.log_likelihood
-    return out
+    out |= update_metrics(answer.info, answer.bounds)
+    return out | {"log_likelihood": answer.log_likelihood}
 
 
 def remarks(name: str, answer: Answer) -> list[str]:
@@ -155,33 +151,9 @@ def solution_of(recorded: Recorded, answers: Mapping[str, Answer]) -> xr.Dataset
     data |= array("bounds", np.array([a.bounds for a in answers.values()], dtype=np.int8))
     path = (master.lat_rad, master.lon_rad, master.alt_m)
     data |= place_arrays("reference", path, "{} of the master", dims=mt)
-    return xr.Dataset(data | innovation_tables(_seen(answers), SENSORS, recorded.epoch_s))
+    seen = [answer.info for answer in answers.values()]
+    return xr.Dataset(data | innovation_tables(seen, SENSORS, recorded.epoch_s))
 
 
 def _place(position: Any) -> tuple[Any, Any, Any]:
     return position.lat, position.lon, position.alt
-
-
-def _seen(answers: Mapping[str, Answer]) -> dict[str, Seen]:
-    """Innovations by sensor; NaN for a filter that does not use it."""
-    sensors = dict.fromkeys(sensor for answer in answers.values() for sensor in answer.info)
-
-    def of(pick: Any, sensor: str) -> np.ndarray:
-        rows = {
-            name: np.asarray(pick(a.info[sensor]), dtype=float)
-            for name, a in answers.items()
-            if sensor in a.info
-        }
-        blank = np.full_like(next(iter(rows.values())), np.nan)
-        return np.stack([rows.get(name, blank) for name in answers])
-
-    return {
-        k: Seen(
-            of(lambda i: i.innovation, k),
-            of(lambda i: i.sigma, k),
-            of(lambda i: i.nis, k),
-            of(lambda i: i.dof, k),
-            of(lambda i: i.code == int(Code.REFUSED), k),
-        )
-        for k in sensors
-    }

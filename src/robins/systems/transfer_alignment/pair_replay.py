@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pydantic
@@ -25,7 +24,7 @@ from robins.results import Outcome, Progress, silent
 from robins.rotation import Rotation
 from robins.systems.limits import Names
 from robins.systems.system import Alignment, Contender
-from robins.systems.tables import doubts_told_at_the_end, replay_warnings, together
+from robins.systems.tables import doubts_told_at_the_end, end_to_end, replay_warnings, together
 from robins.systems.transfer_alignment.pair_answer import (
     Answer,
     Recorded,
@@ -127,19 +126,10 @@ def aligned(piece: Piece, contender: Contender, parameters: PairParameters) -> A
 
 
 def _joined(answers: list[Answer]) -> Answer:
-    """Pieces one after the other, a row of NaN between two so that no curve crosses a gap."""
+    """The answers of all pieces, laid out as `end_to_end` does."""
     if len(answers) == 1:
         return answers[0]
-
-    def blank(x):
-        row = np.asarray(x)[:1]
-        return np.full_like(row, np.nan) if row.dtype.kind == "f" else np.zeros_like(row)
-
-    def join(*leaves):
-        rows = [a for leaf in leaves for a in (blank(leaf), np.asarray(leaf))]
-        return jnp.asarray(np.concatenate(rows[1:]))
-
-    belief, info = jax.tree_util.tree_map(join, *((a.belief, dict(a.info)) for a in answers))
+    belief, info = end_to_end([(a.belief, dict(a.info)) for a in answers])
     return answers[-1]._replace(
         belief=belief,
         info=info,
@@ -227,7 +217,7 @@ ALIGNMENT = Alignment("product", Replay, FILTERS, replay)
 
 
 def _epochs(pieces: list[Piece]) -> np.ndarray:
-    """(E,) of all pieces, laid out as `_joined` does."""
+    """(E,) of all pieces, laid out as `end_to_end` does."""
     rows = [a for p in pieces for a in (np.array([p.start_s]), p.epoch_s)]
     return np.concatenate(rows[1:])
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robins import units
+from robins.systems.claims import consistency, grand_means, proven
 
 FIVE_ARCMIN = "5_arcmin"
 JUDGED = "product"  # the filter whose consistency is claimed
@@ -74,16 +75,7 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
             out["mounting_last_sigma_arcmin"] = (last[here] / one).tolist()
     settled = statistics.settled(FIVE_ARCMIN)
     out["share_below_5_arcmin"] = float(np.mean(settled <= start))
-    out["error_over_sigma"] = statistics.overall_ratio().tolist()
-    out["error_over_sigma_bounds"] = statistics.ratio_bounds().tolist()
-    out["anees_share_inside"] = statistics.anees_share_inside()
-    out["anees_mean"] = float(np.mean(statistics.anees()[start:]))
-    for sensor in statistics.sensors:
-        verdict = statistics.nis(sensor, 0.999)
-        out[f"nis_{sensor}"] = verdict.value
-        out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
-    out["diverged_runs"] = statistics.diverged
-    return out
+    return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
 def product_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
@@ -91,14 +83,7 @@ def product_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]
     if JUDGED not in metrics:
         return []
     m = metrics[JUDGED]
-    bounds = np.asarray(m["error_over_sigma_bounds"])
-    off = max(float(np.max(bounds[:, 0] - 1.0)), float(np.max(1.0 - bounds[:, 1])), 0.0)
-    farthest, inside = 1.0, True
-    for name, band in m.items():
-        if name.startswith("nis_") and name.endswith("_band"):
-            value = m[name.removesuffix("_band")]
-            inside &= band[0] <= value <= band[1]
-            farthest = max(farthest, value, key=lambda v: abs(v - 1.0))
+    off, (farthest, inside) = proven(m), grand_means(m)
     share, ratio = m["anees_share_inside"], m["attitude_over_sigma"]
     verdicts = (
         (off, [0.0, 0.05], off <= 0.05),
