@@ -1,6 +1,6 @@
 """Do two versions of robins give the same results? All scenarios, and the real logs.
 
-    python benchmarks/unchanged.py record OLDER/src older     # some minutes a dozen scenarios
+    python benchmarks/unchanged.py record OLDER/src older     # an hour and a half on one core
     python benchmarks/unchanged.py record src newer
     python benchmarks/unchanged.py compare older newer
 
@@ -41,18 +41,20 @@ def commands(python: list[str], source: Path) -> dict[str, list[str]]:
 
 
 def record(source: Path, into: Path) -> int:
-    """The results of all commands of a version, each in a folder of its name."""
+    """The results of all commands of a version, each in a folder of its name; 1 if one failed."""
     into.mkdir(parents=True, exist_ok=True)
     os.environ |= {"PYTHONPATH": str(source.resolve()), "XLA_FLAGS": ALIKE}
     python = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
+    failed = 0
     for name, words in commands(python, source).items():
         out = into / name
         if not (out / "summary.json").exists():
             shutil.rmtree(out, ignore_errors=True)
             log = (into / f"{name}.log").open("w")
             done = subprocess.run([*python, *words, "--out", out], stdout=log, stderr=log)
+            failed += done.returncode != 0
             print(f"{name}: status {done.returncode}", flush=True)
-    return 0
+    return int(failed > 0)
 
 
 def difference(old: np.ndarray, new: np.ndarray) -> float:
@@ -73,7 +75,6 @@ def numbers(result: results.Result) -> dict[str, np.ndarray]:
         f"{name} {key}": np.array(value)
         for name, found in result.summary["filters"].items()
         for key, value in found.items()
-        if isinstance(value, int | float)
     }
     return {str(name): array.values for name, array in data.items()} | metrics
 
