@@ -115,6 +115,17 @@ def tried(mutant: dict, root: Path, stamp: int, limit_s: float, most: int) -> di
     return {"status": status, "seconds": seconds, "caught_by": caught, "why": why}
 
 
+def listed(due: list[dict], before: dict, done: dict) -> str:
+    """A table of the faults, and of the first test that caught each in two commits."""
+    lines = ["| fault | before | now |", "|---|---|---|"]
+    for mutant in due:
+        runs = (run.get(mutant["id"], {}) for run in (before, done))
+        tests = ((run.get("caught_by") or [run.get("status", "not run")])[0] for run in runs)
+        short = (f"`{test.removeprefix('tests/').partition('[')[0]}`" for test in tests)
+        lines.append(f"| {mutant['what']} | {' | '.join(short)} |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> int:
     """Plant, run, write down."""
     asked = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -126,6 +137,7 @@ def main() -> int:
     asked.add_argument("--out", type=Path, default=ROOT / ".pytest_cache" / "mutants.json")
     asked.add_argument("--resume", action="store_true", help="leave out what --out holds already")
     asked.add_argument("--before", type=Path, help="outcome of an earlier commit to compare with")
+    asked.add_argument("--page", type=Path, help="where to list the tests that caught each")
     given = asked.parse_args()
     done = json.loads(given.out.read_text("utf-8")) if given.resume and given.out.exists() else {}
     before = json.loads(given.before.read_text("utf-8")) if given.before else {}
@@ -154,6 +166,8 @@ def main() -> int:
                     flush=True,
                 )
     left = [m["id"] for m in due if done[m["id"]]["status"] != "caught"]
+    if given.page:
+        given.page.write_text(listed(due, before, done), "utf-8")
     print(f"{len(due) - len(left)} of {len(due)} caught")
     for name in left:
         was = " ".join(before.get(name, {}).get("caught_by", []))

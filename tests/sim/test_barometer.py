@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.linalg import toeplitz
 
 from robins.sim.barometer import observe_height
 from robins.sim.random import Component, stream
@@ -28,8 +29,7 @@ def errors(*arguments, **named):
         ({"bias_sigma_m": 30.0}, 400.0 * np.eye(COUNT) + 900.0),
         (
             {"bias_sigma_m": 30.0, "bias_tau_s": 8.0, "step_s": 2.0},
-            400.0 * np.eye(COUNT)
-            + 900.0 * np.exp(-0.25 * np.abs(np.subtract.outer(range(COUNT), range(COUNT)))),
+            400.0 * np.eye(COUNT) + 900.0 * toeplitz(np.exp(-0.25 * np.arange(COUNT))),
         ),
     ],
 )
@@ -58,10 +58,7 @@ def test_the_bias_leaves_the_white_noise_alone():
     ("make", "message"),
     [
         (lambda: observe_height(KEY, HEIGHT, -1.0, PRESENT), "sigma_m must be"),
-        (
-            lambda: observe_height(KEY, HEIGHT[:4], 1.0, PRESENT),
-            "height_m must have shape",
-        ),
+        (lambda: observe_height(KEY, HEIGHT[:4], 1.0, PRESENT), "height_m must have shape"),
         (lambda: observe_height(KEY, HEIGHT, 1.0, PRESENT, -2.0), "bias_sigma_m must be"),
         (lambda: observe_height(KEY, HEIGHT, 1.0, PRESENT, 2.0, 0.0), "bias_tau_s must be"),
         (lambda: observe_height(KEY, HEIGHT, 1.0, PRESENT, 2.0, 60.0), "wants step_s"),

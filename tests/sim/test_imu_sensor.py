@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn import assert_variance
 from scipy.linalg import expm
-from scipy.stats import chi2
 
 from robins.dataset import ImuTable
 from robins.ins.allan import deviation
@@ -40,10 +40,6 @@ def bits(x):
 
 def gyro(**errors):
     return ImuErrorModel(gyro=TriadErrors(**errors))
-
-
-def accel(**errors):
-    return ImuErrorModel(accel=TriadErrors(**errors))
 
 
 def test_a_unit_without_errors_reports_the_truth_bit_for_bit():
@@ -204,15 +200,6 @@ def batch():
         return corrupt(dt, zero, zero, ALL, stream(3, run, Component.IMU))
 
     return dt, jax.jit(jax.vmap(one))(jnp.arange(RUNS))
-
-
-def assert_variance(x, wanted, draws=None):
-    """Mean square of independent draws of mean zero, within 1e-4 of each side of chi-square."""
-    x = np.asarray(x)
-    draws = len(x) if draws is None else draws
-    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], draws) / draws
-    ratio = np.mean(np.square(x), axis=0) / wanted
-    assert np.all((ratio > low) & (ratio < high)), (ratio, low, high)
 
 
 def test_what_is_drawn_once_has_its_sigma(batch):

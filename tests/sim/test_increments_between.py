@@ -25,20 +25,13 @@ def swaying(size: float) -> Trajectory:
     return Trajectory((t * 1e9).round().astype(np.int64), lat, lon, 2e4 + 2.0 * t, v, q)
 
 
-@pytest.fixture(scope="module")
-def between():
-    return jax.jit(increments_between)
-
-
-@pytest.fixture(scope="module")
-def leads():
-    return jax.jit(jax.vmap(step))
+between, leads = jax.jit(increments_between), jax.jit(jax.vmap(step))
 
 
 @pytest.mark.parametrize(
     ("size", "turn_rad", "push_m_s"), [(0.1, 1e-13, 1e-12), (1.0, 2e-11, 2e-11)]
 )
-def test_each_step_leads_to_the_next_state(between, leads, size, turn_rad, push_m_s):
+def test_each_step_leads_to_the_next_state(size, turn_rad, push_m_s):
     path = swaying(size)
     before, after = (nav_at(path, rows) for rows in (slice(-1), slice(1, None)))
     found = between(before, after, jnp.full(STEPS, DT_S))
@@ -50,7 +43,7 @@ def test_each_step_leads_to_the_next_state(between, leads, size, turn_rad, push_
     np.testing.assert_allclose(reached.v_n, after.v_n, atol=push_m_s)
 
 
-def test_they_are_those_of_the_table(between):
+def test_they_are_those_of_the_table():
     """`ideal_increments` makes samples of which `from_imu` makes increments, coning and all."""
     path = swaying(0.1)
     before, after = (nav_at(path, rows) for rows in (slice(-1), slice(1, None)))
@@ -63,19 +56,11 @@ def test_they_are_those_of_the_table(between):
     np.testing.assert_allclose(found.dv, table.dv, atol=1e-8)
 
 
-def test_a_body_at_rest_feels_gravity_and_the_turning_earth(between):
+def test_a_body_at_rest_feels_gravity_and_the_turning_earth():
     lat, alt = 0.6, 0.0
-    start = nav_at(
-        Trajectory(
-            np.array([0, 10**8]),
-            np.full(2, lat),
-            np.full(2, 1.0),
-            np.full(2, alt),
-            np.zeros((2, 3)),
-            np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
-        ),
-        slice(0, 1),
-    )
+    place, q_nb = (np.full(2, x) for x in (lat, 1.0, alt)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
+    still = Trajectory(np.array([0, 10**8]), *place, np.zeros((2, 3)), q_nb)
+    start = nav_at(still, slice(0, 1))
     rest = between(start, start, jnp.array([0.1]))
     earth = 7.292115e-5 * np.array([np.cos(lat), 0.0, -np.sin(lat)])
     np.testing.assert_allclose(rest.theta[0] / 0.1, earth, atol=1e-15)

@@ -14,12 +14,7 @@ DEG = np.pi / 180.0
 START = Geodetic(32.0 * DEG, 118.0 * DEG, 3000.0)
 G = float(np.asarray(gravity(START.lat, START.alt)))
 SPEED, PITCH, ROLL_S = 100.0, 2.0 * DEG, 2.0
-S_TURN = [
-    Bank(0.0, 10.0),
-    Bank(30.0 * DEG, 31.0),
-    Bank(-30.0 * DEG, 30.0),
-    Bank(0.0, 49.0),
-]
+S_TURN = [Bank(0.0, 10.0), Bank(30.0 * DEG, 31.0), Bank(-30.0 * DEG, 30.0), Bank(0.0, 49.0)]
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +95,8 @@ def test_bank_in_the_turn_is_that_of_the_closed_form(s_turn):
     # the Earth pushes a northern aircraft to the right, so its wings push to the left
     to_right = G * np.tan(commanded) - about_down * SPEED
     g = np.asarray(gravity(k.lat, k.alt))
-    np.testing.assert_allclose(
-        np.tan(roll), to_right / ((g - lift) * np.cos(PITCH)), rtol=0, atol=2e-5
-    )
+    expected = to_right / ((g - lift) * np.cos(PITCH))
+    np.testing.assert_allclose(np.tan(roll), expected, rtol=0, atol=2e-5)
 
 
 def test_heading_turns_by_the_integral_of_the_turn_rate(s_turn, hard_turn):
@@ -123,12 +117,10 @@ def test_heading_turns_by_the_integral_of_the_turn_rate(s_turn, hard_turn):
         return total
 
     def change(motion):
-        k = motion.at(np.array([0.0, motion.duration_s]))
-        return np.diff(euler(k)[2])[0]
+        return np.diff(euler(motion.at(np.array([0.0, motion.duration_s])))[2])[0]
 
     hard = [(0.0, np.arctan(3.0)), (12.0, 0.0)]
-    expected = turned(hard, 0.0, 20.0, 1.0, 240.0)
-    assert change(hard_turn) == pytest.approx(expected, abs=1e-7)
+    assert change(hard_turn) == pytest.approx(turned(hard, 0.0, 20.0, 1.0, 240.0), abs=1e-7)
     steady = np.diff(np.unwrap(euler(hard_turn.at(np.array([1.0, 12.0])))[2]))[0]
     assert steady == pytest.approx(11.0 * 3.0 * G / 240.0, abs=1e-7)
 
@@ -148,8 +140,8 @@ def test_a_ship_sways_as_told(ship):
     np.testing.assert_allclose(pitch, wave(MODERATE_SEA.pitch), rtol=0, atol=1e-7)
     np.testing.assert_allclose(heading, 2.0 + wave(MODERATE_SEA.yaw), rtol=0, atol=1e-7)
     np.testing.assert_allclose(k.alt, START.alt + wave(MODERATE_SEA.heave), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(k.v_n[:, 0], 6.0 * np.cos(2.0), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(k.v_n[:, 1], 6.0 * np.sin(2.0), rtol=0, atol=1e-6)
+    course = np.tile([6.0 * np.cos(2.0), 6.0 * np.sin(2.0)], (len(t), 1))
+    np.testing.assert_allclose(k.v_n[:, :2], course, rtol=0, atol=1e-6)
 
 
 def test_amplitudes_of_a_single_swell():
@@ -175,9 +167,8 @@ def test_a_rough_road_shakes_the_body_and_leaves_the_path(road, rough):
     roll, pitch, heading = euler(shaken)
     x = 2.0 * np.pi * t
     np.testing.assert_allclose(roll, 0.5 * DEG * np.sin(x / 1.3 + 0.4), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(
-        pitch, 0.3 * DEG * np.sin(x / 0.9) + 0.1 * DEG * np.sin(x / 2.1), rtol=0, atol=1e-6
-    )
+    waves = 0.3 * DEG * np.sin(x / 0.9) + 0.1 * DEG * np.sin(x / 2.1)
+    np.testing.assert_allclose(pitch, waves, rtol=0, atol=1e-6)
     np.testing.assert_allclose(heading, 0.7, rtol=0, atol=1e-6)
 
 

@@ -70,9 +70,7 @@ def test_the_dipole_is_minus_the_gradient_of_its_potential():
 
 def test_the_dipole_turns_with_the_earth():
     r, angle = spread(5), 0.9
-    turn = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
+    turn = Rotation.from_euler("z", angle).as_matrix()
     turned = dipole_field_i(jnp.asarray(r @ turn.T), angle)
     still = np.asarray(dipole_field_i(jnp.asarray(r), 0.0))
     np.testing.assert_allclose(turned, still @ turn.T, rtol=0.0, atol=1e-19)
@@ -99,10 +97,8 @@ def full_field(orbit):
     Geodetic coordinates by pyproj.
     """
     angle = EARTH_ANGLE + OMEGA_E * TIME[SOME]
-    turned = Rotation.from_rotvec(-angle[:, None] * [0.0, 0.0, 1.0]).apply(
-        np.array(orbit.r_i_m[SOME])
-    )
-    r_e = np.concatenate([spread(4000), turned])
+    turn = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0])
+    r_e = np.concatenate([spread(4000), turn.inv().apply(np.array(orbit.r_i_m[SOME]))])
     lat, lon, alt = Transformer.from_crs(4978, 4979).transform(*r_e.T)
     lat, lon = lat * DEG, lon * DEG
     b_n = np.asarray(field_n(wmm(2025), lat, lon, alt, YEAR))
@@ -143,9 +139,8 @@ def test_derivatives_are_finite():
         orbit = circular_orbit(alt, 0.5, 0.1, 0.2, np.array([0.0, 100.0]))
         return jnp.sum(field_along_orbit(orbit)[1] ** 2)
 
-    slope = jax.grad(size)(ALT)
-    step = 100.0
-    np.testing.assert_allclose(slope, (size(ALT + step) - size(ALT - step)) / 200.0, rtol=1e-6)
+    slope = (size(ALT + 100.0) - size(ALT - 100.0)) / 200.0
+    np.testing.assert_allclose(jax.grad(size)(ALT), slope, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -173,6 +168,5 @@ def test_another_model_and_another_date_are_refused(orbit):
         field_along_orbit(orbit, "igrf")
     with pytest.raises(MagneticModelError, match="2031"):
         field_along_orbit(orbit, "wmm", decimal_year=2031.0)
-    high = circular_orbit(900e3, INCL, RAAN, ARG, TIME)
     with pytest.raises(MagneticModelError, match="alt_m"):
-        field_along_orbit(high, "wmm")
+        field_along_orbit(circular_orbit(900e3, INCL, RAAN, ARG, TIME), "wmm")

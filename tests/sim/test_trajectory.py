@@ -137,9 +137,8 @@ def test_an_aircraft_banks_into_its_turns_and_a_car_does_not(drive):
 def test_waypoints_are_met_across_the_date_line(waypoints):
     t = np.arange(12) * 10.0
     table = waypoints.trajectory(np.round(t * 1e9).astype(np.int64))
-    np.testing.assert_allclose(
-        table.lat_rad, np.deg2rad(-17.0) + 1e-4 * np.sin(0.05 * t), rtol=1e-12
-    )
+    lat = np.deg2rad(-17.0) + 1e-4 * np.sin(0.05 * t)
+    np.testing.assert_allclose(table.lat_rad, lat, rtol=1e-12)
     moved = (table.lon_rad - np.deg2rad(-179.99) + 5e-6 * t + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(moved, 0.0, atol=1e-12)
     assert table.lon_rad.max() > 3.0
@@ -154,12 +153,10 @@ def test_waypoints_are_met_across_the_date_line(waypoints):
 
 def test_attitude_at_waypoints_may_be_given():
     t = np.arange(20.0)
-    q = SciRotation.from_euler("ZYX", np.stack([0.3 * t, 0.1 * t, 0.2 * t], -1)).as_quat(
-        scalar_first=True
-    )
-    motion = from_waypoints(t, 0.9 + 1e-6 * t, 0.5 + 0.0 * t, 0.0 * t, q_nb=-q)
+    given = SciRotation.from_euler("ZYX", np.stack([0.3 * t, 0.1 * t, 0.2 * t], -1))
+    q = -given.as_quat(scalar_first=True)
+    motion = from_waypoints(t, 0.9 + 1e-6 * t, 0.5 + 0.0 * t, 0.0 * t, q_nb=q)
     turned = SciRotation.from_quat(motion.at(t).q_nb, scalar_first=True)
-    given = SciRotation.from_quat(q, scalar_first=True)
     assert (turned.inv() * given).magnitude().max() < 1e-12
 
 
@@ -186,17 +183,12 @@ def test_sampling_times():
     times = motion.times_ns(3.0)
     assert times.dtype == np.int64
     assert len(times) == 91
-    np.testing.assert_array_equal(
-        times[[0, 1, 2, 3, -1]], [0, 333333333, 666666667, 10**9, 30 * 10**9]
-    )
+    some = [0, 333333333, 666666667, 10**9, 30 * 10**9]
+    np.testing.assert_array_equal(times[[0, 1, 2, 3, -1]], some)
 
 
-GOOD = {
-    "time_s": np.arange(8.0),
-    "lat_rad": np.full(8, 0.9) + 1e-6 * np.arange(8),
-    "lon_rad": np.full(8, 0.5),
-    "alt_m": np.zeros(8),
-}
+GOOD = {"time_s": np.arange(8.0), "lat_rad": 0.9 + 1e-6 * np.arange(8)}
+GOOD |= {"lon_rad": np.full(8, 0.5), "alt_m": np.zeros(8)}
 BAD_WAYPOINTS = {
     "time_s: 8 waypoints, at least 4 at increasing": {"time_s": np.arange(8.0)[::-1]},
     r"lat_rad: 8 finite numbers.*\(7,\)": {"lat_rad": np.full(7, 0.9)},

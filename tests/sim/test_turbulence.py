@@ -44,11 +44,8 @@ def published(form, across, wave):
 @cache
 def correlation(form, across, distance):
     """Transform of the spectrum at a distance in lengths."""
-    if distance == 0.0:
-        return quad(lambda w: published(form, across, w), 0.0, np.inf, limit=400)[0]
-    return quad(
-        lambda w: published(form, across, w), 0.0, np.inf, weight="cos", wvar=distance, limlst=400
-    )[0]
+    waves = {"weight": "cos", "wvar": distance, "limlst": 400} if distance else {"limit": 400}
+    return quad(lambda w: published(form, across, w), 0.0, np.inf, **waves)[0]
 
 
 @partial(jax.jit, static_argnums=1)
@@ -126,9 +123,8 @@ def test_the_correlation_of_von_karman_is_the_transform_of_his_spectrum(across):
     for distance in (0.0, 0.01, 0.3, 1.0, 4.0):
         got = turbulence._correlation(np.array([distance / turbulence._A]), across)
         # The constant in print, 1.339, is rounded in the fifth place.
-        np.testing.assert_allclose(
-            got, correlation("von_karman", across, distance), rtol=0.0, atol=3e-5
-        )
+        wanted = correlation("von_karman", across, distance)
+        np.testing.assert_allclose(got, wanted, rtol=0.0, atol=3e-5)
 
 
 def test_a_circle_twice_as_long_as_the_record_is_enough():

@@ -120,9 +120,8 @@ def test_where_two_winds_meet_the_later_one_counts():
     wind = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]])
     # 0.3 / 0.1 is 2.9999999999999996
     np.testing.assert_array_equal(wind_at(wind, 0.1, 0.3), [4.0, 0.0])
-    np.testing.assert_array_equal(
-        wind_at(wind, 0.1, np.array([[0.0, 0.05], [0.1, 9.0]]))[..., 0], [[1, 1], [2, 4]]
-    )
+    several = wind_at(wind, 0.1, np.array([[0.0, 0.05], [0.1, 9.0]]))
+    np.testing.assert_array_equal(several[..., 0], [[1, 1], [2, 4]])
     calm = carry(wind, 0.1, np.zeros(2), TAU, wind[3])
     at = carried_at(calm, 0.3)
     np.testing.assert_allclose(at[2], (wind[3] - at[0]) / TAU)
@@ -134,12 +133,11 @@ def test_beyond_the_last_step_its_wind_is_held():
     end = M * STEP
     velocity, displacement, _ = carried_at(MOTION, end + 3.0)
     longer = carry(np.concatenate([WIND, WIND[-1:]]), STEP, COMMANDED, TAU, START)
-    np.testing.assert_allclose(
-        carried_at(MOTION, end + 0.5)[1], carried_at(longer, end + 0.5)[1], rtol=1e-13
-    )
+    soon, same = (carried_at(motion, end + 0.5)[1] for motion in (MOTION, longer))
+    np.testing.assert_allclose(soon, same, rtol=1e-13)
     target = WIND[-1] + COMMANDED
-    faded = np.exp(-3.0 / TAU)
-    np.testing.assert_allclose(velocity, target + (MOTION.velocity[-1] - target) * faded)
+    wanted = target + (MOTION.velocity[-1] - target) * np.exp(-3.0 / TAU)
+    np.testing.assert_allclose(velocity, wanted)
     assert np.all(np.isfinite(displacement))
 
 
