@@ -18,21 +18,21 @@ import tiers
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Processes started by tests inherit these; a run on an accelerator is asked for by JAX_PLATFORMS;
-# figures never need a screen. Most of a test run is compiling what runs for a moment: code is
-# generated without LLVM's optimisation, by the older of XLA's emitters of loops, in one piece. That
-# takes less than half of the time (XLA_FLAGS= tests what users run). What was compiled once serves
-# every worker and the next run; where it is kept is not a cost. Nobody asks of compiled code which
-# line of a test it is from, and to write that into it takes a tenth of the time.
+# Processes started by tests inherit these; a run on an accelerator is asked for by JAX_PLATFORMS.
+# Most of a test run is compiling what runs for a moment: code is generated without LLVM's
+# optimisation, by the older of XLA's emitters of loops, in one piece. That takes less than half of
+# the time (XLA_FLAGS= tests what users run). What was compiled once serves every worker and the
+# next run; where it is kept is not a cost. Nobody asks of compiled code which line of a test it is
+# from, and to write that into it takes a tenth of the time.
 SETTINGS = {
     "JAX_PLATFORMS": "cpu",
-    "MPLBACKEND": "Agg",
     "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_cpu_parallel_codegen_split_count=1",
     "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax"),
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
     "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
 }
+os.environ["MPLBACKEND"] = "Agg"  # figures never need a screen
 os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
 # JAX was imported above: it has read its own already.
 for name in (name for name in SETTINGS if name.startswith("JAX_")):
@@ -104,15 +104,20 @@ def pytest_configure(config):
         config.pluginmanager.register(tiers.Certificate(page))
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     tiers.mark(items)
-    items[:] = tiers.arrange(items, os.environ.get("PART", "1/1"))
+    items[:], others = tiers.arrange(items, os.environ.get("PART", "1/1"))
+    config.hook.pytest_deselected(items=others)
 
 
 def pytest_collection_finish():
-    """What was imported stays: the collector of garbage need not look through it again."""
+    """What was imported stays: the collector of garbage need not look through it again.
+
+    Tracing makes many objects that live on, so it is not to look after every 700 either.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def outside(variable: str, folder: str) -> Path:

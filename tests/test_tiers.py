@@ -70,7 +70,9 @@ def by_file(items):
 def test_parts_hold_every_test_once_in_whole_files_and_cost_alike():
     items = [Item(f"tests/{node}") for node in tiers.costs()]
     random.Random(1).shuffle(items)
-    parts = [tiers.arrange(items, f"{k}/3") for k in (1, 2, 3)]
+    split = [tiers.arrange(items, f"{k}/3") for k in (1, 2, 3)]
+    assert all(sorted(part + others) == sorted(items) for part, others in split)
+    parts = [part for part, _ in split]
     assert sorted(item for part in parts for item in part) == sorted(items)
     files = [by_file(part) for part in parts]
     assert sum(map(len, files)) == len({name for names in files for name in names})

@@ -61,10 +61,13 @@ def mark(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.fast)
 
 
-def arrange(items: list[pytest.Item], part: str = "1/1") -> list[pytest.Item]:
-    """The costly files first, so that workers end together; of "2/4" the second of four parts.
+def arrange(
+    items: list[pytest.Item], part: str = "1/1"
+) -> tuple[list[pytest.Item], list[pytest.Item]]:
+    """The items of a part, of "2/4" the second of four, and those of the other parts.
 
-    A file stays whole. Each goes to the part that has least to do.
+    Costly files come first, so that workers end together. A file stays whole; each goes to the part
+    that has least to do.
     """
     costly, spent = costs(), dict[str, float]()
     for node in dict.fromkeys(plain(item.nodeid.removeprefix("tests/")) for item in items):
@@ -76,11 +79,10 @@ def arrange(items: list[pytest.Item], part: str = "1/1") -> list[pytest.Item]:
         least = load.index(min(load))
         load[least] += spent[file]
         place[file] = least, rank
-    by_item = [
-        (place[item.nodeid.removeprefix("tests/").partition("::")[0]], item) for item in items
-    ]
-    kept = [(rank, item) for (where, rank), item in by_item if where == mine - 1]
-    return [item for _, item in sorted(kept, key=lambda pair: pair[0])]
+    at = {item: place[item.nodeid.removeprefix("tests/").partition("::")[0]] for item in items}
+    ordered = sorted(items, key=lambda item: at[item][1])
+    kept = [item for item in ordered if at[item][0] == mine - 1]
+    return kept, [item for item in ordered if at[item][0] != mine - 1]
 
 
 class Meter:
