@@ -116,9 +116,8 @@ def test_no_example_escapes_by_its_spelling():
 
 def test_the_documented_summary_is_one():
     contract = ROOT / "docs" / "contract.md"
-    (shown,) = (
-        json.loads(code) for _, language, code in blocks(contract.read_text()) if language == "json"
-    )
+    (code,) = (code for _, language, code in blocks(contract.read_text()) if language == "json")
+    shown = json.loads(code)
     made = checked({key: value for key, value in shown.items() if key != "files"})
     assert list(made) == list(shown)
     assert made | {"files": shown["files"]} == shown
@@ -154,12 +153,8 @@ def test_the_contract_names_every_command_option_and_status():
 
 
 def test_the_configurations_shown_can_be_read(tmp_path):
-    shown = [
-        code
-        for page in pages()
-        for _, language, code in blocks(page.read_text("utf-8"))
-        if language == "toml"
-    ]
+    every = [block for page in pages() for block in blocks(page.read_text("utf-8"))]
+    shown = [code for _, language, code in every if language == "toml"]
     assert any("[columns]" in code for code in shown)
     assert any("bench" in scenario.mapping_of(code) for code in shown)
     for code in shown:
@@ -172,9 +167,7 @@ def test_the_configurations_shown_can_be_read(tmp_path):
             scenario.validate(Setup, mapping)
             continue
         system = SYSTEMS[mapping["system"]]
-        aligned = system.alignment and system.alignment.parameters
-        parameters = system.replay_parameters or aligned
-        assert parameters
+        parameters = system.replay_parameters or system.alignment.parameters
         scenario.validate(parameters, mapping)
 
 
@@ -192,13 +185,9 @@ def test_a_failing_example_is_found_at_its_line(tmp_path):
 
 
 def test_links_between_pages_lead_somewhere():
-    broken = [
-        f"{page.relative_to(ROOT)}: {target}"
-        for page in pages()
-        for target in re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
-        if not (page.parent / target).exists()
-    ]
-    assert not broken
+    for page in pages():
+        targets = re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
+        assert [t for t in targets if not (page.parent / t).exists()] == [], page
 
 
 @pytest.mark.parametrize(

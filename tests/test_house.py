@@ -196,12 +196,9 @@ def foreign_linalg(code: str) -> list[str]:
 
 
 def test_filters_do_linear_algebra_only_through_robins():
-    found = {
-        str(path.relative_to(SOURCE)): uses
-        for path in (SOURCE / "filters").rglob("*.py")
-        if (uses := foreign_linalg(path.read_text("utf-8")))
-    }
-    assert not found
+    modules = (SOURCE / "filters").rglob("*.py")
+    found = {str(path): foreign_linalg(path.read_text("utf-8")) for path in modules}
+    assert not {path: uses for path, uses in found.items() if uses}
 
 
 @pytest.mark.parametrize(
@@ -228,14 +225,9 @@ def own_files() -> list[Path]:
     """Text of the project, whether or not it lies in a git clone."""
     folders = ("src", "tests", "docs", "benchmarks", "changelog.d", ".ci", ".github")
     built = {"__pycache__", "_build", "_generated"}
-    files = [p for p in ROOT.iterdir() if p.is_file()]
-    for folder in folders:
-        files += [
-            p
-            for p in (ROOT / folder).rglob("*")
-            if p.is_file() and not built & set(p.relative_to(ROOT).parts)
-        ]
-    return sorted(files)
+    inside = [p for folder in folders for p in (ROOT / folder).rglob("*")]
+    files = [p for p in inside if not built & set(p.relative_to(ROOT).parts)]
+    return sorted(p for p in [*ROOT.iterdir(), *files] if p.is_file())
 
 
 def text_of(path: Path) -> str:
@@ -269,21 +261,13 @@ def test_planted_machine_paths_are_found():
 
 
 def test_no_module_grows_beyond_one_idea():
-    lengths = {
-        str(p.relative_to(ROOT)): len(text_of(p).splitlines())
-        for p in own_files()
-        if p.suffix == ".py"
-    }
-    assert not {path: n for path, n in lengths.items() if n > LONGEST}
+    modules = [p for p in own_files() if p.suffix == ".py"]
+    assert [str(p) for p in modules if len(text_of(p).splitlines()) > LONGEST] == []
 
 
 def test_every_module_says_what_it_is():
-    bare = [
-        str(path.relative_to(SOURCE))
-        for path in sorted(SOURCE.rglob("*.py"))
-        if not ast.get_docstring(ast.parse(path.read_text("utf-8")))
-    ]
-    assert not bare
+    said = {p: ast.get_docstring(ast.parse(p.read_text("utf-8"))) for p in SOURCE.rglob("*.py")}
+    assert [str(path) for path, text in said.items() if not text] == []
 
 
 def test_no_two_files_of_tests_share_a_name():
@@ -342,13 +326,8 @@ def test_one_version_everywhere():
 
 def test_a_source_that_was_never_installed_has_a_version():
     code = f"import sys; sys.path.insert(0, {str(SOURCE.parent)!r}); import robins"
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", f"{code}; print(robins.__version__)"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "0+unknown\n"
+    done = python(f"{code}; print(robins.__version__)", "-I", "-S")
+    assert (done.returncode, done.stdout) == (0, "0+unknown\n"), done.stderr
 
 
 def test_every_make_command_that_is_named_exists():
@@ -370,16 +349,11 @@ def test_types_are_shipped():
 # ----------------------------------------------------------------------------------- float width
 
 
-def python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a fresh interpreter."""
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def python(code: str, *options: str, **variables: str | None) -> subprocess.CompletedProcess[str]:
+    """Run code in a fresh interpreter, without the variables that are None."""
+    kept = {k: v for k, v in {**os.environ, **variables}.items() if v is not None}
+    told = [sys.executable, *options, "-c", code]
+    return subprocess.run(told, env=kept, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_importing_a_numeric_room_turns_64_bit_on():
@@ -410,13 +384,4 @@ def test_one_worker_thread_unless_the_user_asks_for_more(given, workers):
         "names = [t.read_text() for t in pathlib.Path('/proc/self/task').glob('*/comm')];"
         "print(sum(name.startswith('tf_XLAEigen') for name in names))"
     )
-    kept = {k: v for k, v in os.environ.items() if k != "PJRT_NPROC"}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=kept | ({"PJRT_NPROC": given} if given else {}),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    assert int(done.stdout) == workers
+    assert int(python(code, PJRT_NPROC=given).stdout) == workers

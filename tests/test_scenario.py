@@ -167,10 +167,7 @@ def test_a_bound_of_another_kind_is_a_fault_of_the_program(bound):
             "filters.0.alpha: unknown key (allowed: kind, iterations)",
         ),
         ("[imu]", "imu.rate: required, but not given"),
-        (
-            GOOD + 'gyro_bias = ["1 deg/h", "1 deg/h"]',
-            "imu.gyro_bias.2: required, but not given",
-        ),
+        (GOOD + 'gyro_bias = ["1 deg/h", "1 deg/h"]', "imu.gyro_bias.2: required, but not given"),
         # missing unit, wrong dimension
         (
             "[imu]\nrate = 100",
@@ -228,10 +225,7 @@ def test_a_bound_of_another_kind_is_a_fault_of_the_program(bound):
             'heights.0 = "500 km": must be below 500 km and at least -500 m',
         ),
         # beyond the range of the kind, where a side has no bound of its own
-        (
-            GOOD + 'markov = "1e6 d"',
-            'imu.markov = "1e6 d": must be at most 3650 d and above 0 s',
-        ),
+        (GOOD + 'markov = "1e6 d"', 'imu.markov = "1e6 d": must be at most 3650 d and above 0 s'),
         (
             GOOD + 'gyro_bias = "-1e9 deg/h"',
             'imu.gyro_bias = "-1e9 deg/h": must be at least -100000 deg/s and at most 100000 deg/s',
@@ -360,11 +354,7 @@ def test_settings_leave_the_mapping_they_are_given():
     before = tomllib.loads(text_of(mapping))
     changed = override(mapping, ["imu.rate=1 Hz", "filters.0.kind=ukf", "new.key=1"])
     assert mapping == before
-    assert changed == {
-        "imu": {"rate": "1 Hz"},
-        "filters": [{"kind": "ukf"}],
-        "new": {"key": 1},
-    }
+    assert changed == {"imu": {"rate": "1 Hz"}, "filters": [{"kind": "ukf"}], "new": {"key": 1}}
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """What is said of the flags of estimates: when a thing begins and when it ends, and no more."""
 
+import pytest
+
 from robins.bench.run.alarms import Alarms
 from robins.bench.wire.schema import FLAGS
 
@@ -13,45 +15,40 @@ def heard(*flags: int) -> list[tuple[int, str, str]]:
     return [(k, *said) for k, one in enumerate(flags) for said in alarms.hear(one)]
 
 
-def test_nothing_is_said_of_a_sound_run():
-    assert heard(USED, *BETWEEN, USED, *BETWEEN, USED) == []
+RUNS = {
+    "nothing is said of a sound run": ([USED, *BETWEEN, USED, *BETWEEN, USED], []),
+    "frames refused in a row are one alarm and are counted": (
+        [USED, *BETWEEN, REFUSED, *BETWEEN, REFUSED, *BETWEEN, REFUSED, *BETWEEN, USED],
+        [(5, "alarm", "star refused"), (20, "info", "star used again, 3 frames were refused")],
+    ),
+    "each row is counted from its beginning": (
+        [REFUSED, 0, USED, 0, REFUSED, 0, USED],
+        [
+            (0, "alarm", "star refused"),
+            (2, "info", "star used again, one frame was refused"),
+            (4, "alarm", "star refused"),
+            (6, "info", "star used again, one frame was refused"),
+        ],
+    ),
+    "a frame that is no attitude is said until one is": (
+        [SHORT, 0, SHORT, 0, USED, SHORT],
+        [(k, "warning", "star of a length other than one") for k in (0, 5)],
+    ),
+    "a gyro that falls silent ends in safe and comes back": (
+        [0, HELD, HELD | SAFE, HELD | SAFE, SAFE, USED],
+        [
+            (1, "warning", "gyro held"),
+            (2, "alarm", "safe: do not steer by this"),
+            (5, "info", "the estimate can be steered by again"),
+        ],
+    ),
+    "a silence of the star sensor is said once": (
+        [0, SILENT, SILENT, SILENT | HELD, USED, SILENT],
+        [(1, "warning", "star silent"), (3, "warning", "gyro held"), (5, "warning", "star silent")],
+    ),
+}
 
 
-def test_frames_refused_in_a_row_are_one_alarm_and_are_counted():
-    run = [USED, *BETWEEN, REFUSED, *BETWEEN, REFUSED, *BETWEEN, REFUSED, *BETWEEN, USED]
-    assert heard(*run) == [
-        (5, "alarm", "star refused"),
-        (20, "info", "star used again, 3 frames were refused"),
-    ]
-
-
-def test_each_row_is_counted_from_its_beginning():
-    assert heard(REFUSED, 0, USED, 0, REFUSED, 0, USED) == [
-        (0, "alarm", "star refused"),
-        (2, "info", "star used again, one frame was refused"),
-        (4, "alarm", "star refused"),
-        (6, "info", "star used again, one frame was refused"),
-    ]
-
-
-def test_a_frame_that_is_no_attitude_is_said_until_one_is():
-    assert heard(SHORT, 0, SHORT, 0, USED, SHORT) == [
-        (0, "warning", "star of a length other than one"),
-        (5, "warning", "star of a length other than one"),
-    ]
-
-
-def test_a_gyro_that_falls_silent_ends_in_safe_and_comes_back():
-    assert heard(0, HELD, HELD | SAFE, HELD | SAFE, SAFE, USED) == [
-        (1, "warning", "gyro held"),
-        (2, "alarm", "safe: do not steer by this"),
-        (5, "info", "the estimate can be steered by again"),
-    ]
-
-
-def test_a_silence_of_the_star_sensor_is_said_once():
-    assert heard(0, SILENT, SILENT, SILENT | HELD, USED, SILENT) == [
-        (1, "warning", "star silent"),
-        (3, "warning", "gyro held"),
-        (5, "warning", "star silent"),
-    ]
+@pytest.mark.parametrize(("flags", "said"), RUNS.values(), ids=RUNS)
+def test_what_is_said(flags, said):
+    assert heard(*flags) == said

@@ -147,8 +147,7 @@ class Story:
     def answer(self, step: int, took: int = 5) -> None:
         told = estimate(self.total, step)
         self.back(encoded("estimate", self.from_count, time_ns(step), **told))
-        done = encoded("done", self.from_count + 1, time_ns(step), step=step, compute=took)
-        self.back(done)
+        self.back(encoded("done", self.from_count + 1, time_ns(step), step=step, compute=took))
         self.from_count += 2
 
     def step(self, k: int) -> None:
@@ -158,8 +157,8 @@ class Story:
         self.total = self.total + self.theta[k]
         self.answer(k)
 
-    def record(self, whole: bool = True) -> Record:
-        return Record({}, self.entries, [], whole, "" if whole else "cut")
+    def record(self) -> Record:
+        return Record({}, self.entries, [], True, "")
 
 
 def plain_story() -> Story:
@@ -214,8 +213,7 @@ def test_the_same_part_says_the_same(story, tmp_path):
         for entry in story().entries:
             recorder.write(entry)
         recorder.event(Event(0, "note", "nothing", {}))
-    told = []
-    parts = []
+    told, parts = [], []
 
     @contextlib.contextmanager
     def start(path):
@@ -244,10 +242,9 @@ def test_a_part_that_has_changed_is_found_out():
 
     found = replay(plain_story().record(), "adm", starting(change=change), 5.0)
     assert not found.same
-    then = wire.decode("estimate", found.recorded[23].payload)["gyro_bias"][1]
-    now = float(np.nextafter(then, 9.0))
-    expected = f"step 23 (2.4 s): estimate.gyro_bias[1] was {float(then)!r}, is {now!r}"
-    assert found.first_difference == expected
+    then = float(wire.decode("estimate", found.recorded[23].payload)["gyro_bias"][1])
+    words = f"was {then!r}, is {float(np.nextafter(then, 9.0))!r}"
+    assert found.first_difference == f"step 23 (2.4 s): estimate.gyro_bias[1] {words}"
     (d,) = differences(found.recorded, found.frames, found.step_ns)
     assert (d.field, d.component, d.first_step, d.count) == ("gyro_bias", 1, 23, STEPS - 23)
 
@@ -260,10 +257,8 @@ def test_a_nan_of_other_bits_is_not_byte_for_byte():
 
     found = replay(plain_story().record(), "adm", starting(change=change), 5.0)
     assert not found.same
-    assert (
-        "step 7 (0.8 s): 'estimate' of 0.8 s, number 14, has the same numbers in other bytes"
-        in (found.first_difference or "")
-    )
+    words = "step 7 (0.8 s): 'estimate' of 0.8 s, number 14, has the same numbers in other bytes"
+    assert words in found.first_difference
 
 
 def test_frames_too_many_and_too_few_are_told():
@@ -272,11 +267,10 @@ def test_frames_too_many_and_too_few_are_told():
     found = replay(Record({}, lacking, [], True, ""), "adm", starting(), 5.0)
     words = "step 8 (0.9 s): 'estimate' of 0.9 s, number 16, is said now and was not recorded"
     assert found.first_difference == words
-    story.back(
-        encoded("innovation", 2 * STEPS, time_ns(60), innovation=[0] * 3, sigma=[0] * 3, ratio=0)
-    )
+    more = {"innovation": [0] * 3, "sigma": [0] * 3, "ratio": 0}
+    story.back(encoded("innovation", 2 * STEPS, time_ns(60), **more))
     found = replay(story.record(), "adm", starting(), 5.0)
-    assert "number 120, was recorded and is not said now" in (found.first_difference or "")
+    assert "number 120, was recorded and is not said now" in found.first_difference
 
 
 def test_a_frame_that_the_bench_heard_twice_counts_once():
@@ -288,8 +282,7 @@ def test_a_frame_that_the_bench_heard_twice_counts_once():
 @pytest.mark.parametrize("lost", [1, 2, 3, 4, 5, 6])
 def test_a_record_that_was_cut_is_replayed_so_far(lost):
     """Wherever an answer was cut, what is there is the same."""
-    story = plain_story()
-    cut = Record({}, story.entries[:-lost], [], False, "cut")
+    cut = Record({}, plain_story().entries[:-lost], [], False, "cut")
     found = replay(cut, "adm", starting(), 5.0)
     assert found.same
     assert found.steps == STEPS - (lost >= 4)
@@ -353,17 +346,11 @@ def test_a_record_without_the_part_lists_those_it_has():
         replay(Record({}, [], [], True, ""), "star", starting())
 
 
-PROCESS = """
-import os, sys, time
-time.sleep(0.2)
-sys.exit(3)
-"""
-
-
 def test_a_process_that_dies_is_told_by_its_code():
     @contextlib.contextmanager
     def start(path):
-        process = subprocess.Popen([sys.executable, "-c", PROCESS])
+        code = "import sys, time; time.sleep(0.2); sys.exit(3)"
+        process = subprocess.Popen([sys.executable, "-c", code])
         yield process
         process.wait()
 

@@ -81,8 +81,6 @@ def test_as_a_program():
     command = [sys.executable, "-m", "robins.bench.ports.cable"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         paths = [process.stdout.readline().split() for _ in range(2)]
         assert [name for name, _ in paths] == ["bench:", "board:"]
         with open_port(address(paths[0][1])) as one, open_port(address(paths[1][1]), 5.0) as other:

@@ -1,4 +1,4 @@
-"""Twenty thousand damaged frames among as many sound ones, and every error of one or two bits."""
+"""Damaged frames of each kind among as many sound ones, and every error of one or two bits."""
 
 from itertools import combinations
 
@@ -11,7 +11,7 @@ from robins.bench.wire import Frame, Header, Receiver, Sequence, receiver
 from robins.bench.wire.receiver import LONGEST
 
 EACH = 4000
-KINDS = ("one bit", "two bits", "burst", "truncated", "noise")
+KINDS = ("one bit", "two bits", "burst", "truncated", "dropped byte", "noise")
 DATA = [m for m in wire.MESSAGES if m.number >= 16]
 Pieces = list[tuple[bytes, Frame, bool]]  # on the line, what it was, whether damaged
 
@@ -33,6 +33,8 @@ def damaged(kind: str, made: bytes, rng: np.random.Generator) -> bytes:
         data[at : at + size] = rng.bytes(len(data[at : at + size]))
     elif kind == "truncated":
         del data[int(rng.integers(0, len(data))) :]
+    elif kind == "dropped byte":
+        del data[int(rng.integers(0, len(data)))]
     else:  # between frames; in every other one there are zeros
         noise = rng.integers(int(rng.integers(2)), 256, int(rng.integers(1, 200)), dtype="u1")
         data = noise.tobytes() + data

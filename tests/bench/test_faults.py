@@ -52,7 +52,6 @@ def put(injector: Injector, link: str, direction: str, one: Frame, now_ns: int) 
 def said(pieces: list[Piece]) -> dict:
     (piece,) = pieces
     assert piece.raw is None
-    assert piece.frame is not None
     return wire.decode(wire.message(piece.frame.header.type).name, piece.frame.payload)
 
 
@@ -133,7 +132,6 @@ def test_bit_errors_spoil_a_frame_by_as_many_bits():
         raw = wire.encode_frame(*one)
         (piece,) = injector.pass_on("gyro", "from", one, raw, 0)
         assert piece.frame is None
-        assert piece.raw is not None
         bits = np.unpackbits(np.frombuffer(piece.raw, "u1") ^ np.frombuffer(raw, "u1"))
         assert bits.sum() == 3
         seen.update(np.flatnonzero(bits))
@@ -402,7 +400,6 @@ def test_a_lie_on_a_noisy_line():
     )
     one = star(WORKING)
     (piece,) = put(injector, "star", "from", one, 0)
-    assert piece.raw is not None
     lie = said(put(Injector(faults('kind = "lost"; begin = "0 s"')), "star", "from", one, 0))
     raw = wire.encode_frame(one.header, wire.encode("star", lie))
     flipped = np.frombuffer(piece.raw, "u1") ^ np.frombuffer(raw, "u1")

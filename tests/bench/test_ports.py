@@ -30,10 +30,7 @@ def test_ports_of_this_machine():
 
 
 def test_what_the_system_says_and_what_it_does_not(monkeypatch, pair):
-    there = [
-        known(pair.path, "FT232R USB UART", "FTDI", "A50285BI"),
-        known("/dev/ttyX0"),
-    ]
+    there = [known(pair.path, "FT232R USB UART", "FTDI", "A50285BI"), known("/dev/ttyX0")]
     monkeypatch.setattr(listing.system, "comports", lambda: there)
     assert list_ports()[0] == PortInfo(pair.path, "FT232R USB UART", "FTDI", "A50285BI", True, "")
     gone = list_ports()[1]
@@ -54,13 +51,8 @@ def test_a_port_that_we_may_not_open_says_what_to_do(monkeypatch, pair):
 def test_ports_are_in_the_order_of_their_numbers(monkeypatch):
     names = ["/dev/ttyUSB10", "/dev/ttyS0", "/dev/ttyUSB9", "/dev/ttyACM0", "/dev/cu.debug"]
     monkeypatch.setattr(listing.system, "comports", lambda: [known(n) for n in names])
-    assert [p.path for p in list_ports()] == [
-        "/dev/cu.debug",
-        "/dev/ttyACM0",
-        "/dev/ttyS0",
-        "/dev/ttyUSB9",
-        "/dev/ttyUSB10",
-    ]
+    in_order = ["/dev/cu.debug", "/dev/ttyACM0", "/dev/ttyS0", "/dev/ttyUSB9", "/dev/ttyUSB10"]
+    assert [p.path for p in list_ports()] == in_order
 
 
 def test_the_table_ends_with_what_to_type(pair):

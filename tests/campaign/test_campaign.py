@@ -93,25 +93,17 @@ def test_statistics_are_those_of_a_plain_loop(problem):
     s = collect(records, problem.blocks)
     error = np.concatenate([r["error"] for r in records])
     np.testing.assert_allclose(s.rms, np.sqrt(np.mean(error**2, axis=0)), rtol=1e-13)
-    P = [run_covariance(problem, i) for i in range(10)]
-    nees = np.mean(
-        [
-            [e @ np.linalg.solve(p, e) for e, p in zip(err, cov, strict=True)]
-            for err, cov in zip(error, P, strict=True)
-        ],
-        axis=0,
-    )
+    c = problem.contenders["right"]
+    nees = np.zeros(STEPS)
+    for i in range(10):
+        case = _simulate(jnp.asarray(i))
+        P = np.asarray(run(c.filter, c.model, case.start, case.y).covariance)
+        nees += [e @ np.linalg.solve(p, e) / 10 for e, p in zip(error[i], P, strict=True)]
     np.testing.assert_allclose(s.anees() * 2, nees, rtol=1e-9)
     np.testing.assert_allclose(s.block_anees()["line"], s.anees(), rtol=1e-9)
     assert s.runs == 10
     assert s.run_rms.shape == (10, 2)
     assert s.sensors == ["y"]
-
-
-def run_covariance(problem, i):
-    c = problem.contenders["right"]
-    case = _simulate(jnp.asarray(i))
-    return np.asarray(run(c.filter, c.model, case.start, case.y).covariance)
 
 
 def test_a_matched_filter_is_consistent_and_wrong_ones_are_caught(problem, right):
@@ -137,10 +129,8 @@ def test_a_diverged_run_is_counted_not_dropped(problem):
 
 def test_a_filter_that_cannot_predict_has_no_error_to_show(problem):
     """An H-infinity filter that does not exist must not look like a result."""
-    rule = h_infinity(0.5, jnp.eye(2))
-    none = replace(
-        problem, contenders={"hinf": Contender(kalman(taylor(), [rule]), _model(0.4), bounds=True)}
-    )
+    strict = kalman(taylor(), [h_infinity(0.5, jnp.eye(2))])
+    none = replace(problem, contenders={"hinf": Contender(strict, _model(0.4), bounds=True)})
     record = next(chunks(none, "hinf", 3, chunk=4))
     first = np.argmax(np.isnan(record["error"]).any(axis=2), axis=1)
     assert np.all(first > 0)
@@ -180,8 +170,7 @@ def test_filters_may_have_states_of_their_own(problem):
         return case._replace(start=start, truth=truth)
 
     def scaled(case):
-        start = Belief(jnp.zeros(2), 100.0 * jnp.eye(2))
-        y = {"y": 100.0 * case.y["y"]}
+        start, y = Belief(jnp.zeros(2), 100.0 * jnp.eye(2)), {"y": 100.0 * case.y["y"]}
         return case._replace(start=start, y=y, truth=100.0 * case.truth)
 
     right = problem.contenders["right"].filter
@@ -207,14 +196,14 @@ def test_filters_may_have_states_of_their_own(problem):
     np.testing.assert_allclose([share for _, share in told], shares)
     ds = outcome.solution
     for name in ("rms_line", "mean_sigma_line", "error_line"):
-        np.testing.assert_allclose(ds[name][1], ds[name][0], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(ds[name][2], ds[name][0], rtol=1e-9, atol=1e-12)
+        for other in (1, 2):
+            np.testing.assert_allclose(ds[name][other], ds[name][0], rtol=1e-9, atol=1e-12)
     assert outcome.metrics["wide"]["states"] == 3
     np.testing.assert_array_equal(ds["bounds"], [0, 0, 1])
     np.testing.assert_array_equal(ds["anees_dof"][:2, 0], [2, 3])
     assert np.all(np.isnan(ds["anees"][2]))
-    records = [np.concatenate([r["error"] for r in chunks(problem, "right", 6, chunk=4)])]
-    inside = np.mean(np.max(np.abs(records[0]), axis=2) <= 1.0, axis=0)
+    error = np.concatenate([r["error"] for r in chunks(problem, "right", 6, chunk=4)])
+    inside = np.mean(np.max(np.abs(error), axis=2) <= 1.0, axis=0)
     np.testing.assert_allclose(ds["within_1_m"][0], inside)
 
 
@@ -240,9 +229,7 @@ def test_filters_that_differ_in_numbers_share_what_was_compiled(problem):
 
 
 def test_a_filter_that_is_far_too_sure_is_doubted(problem):
-    far = replace(
-        problem, contenders={"far": Contender(problem.contenders["right"].filter, _model(0.1))}
-    )
+    far = replace(problem, contenders={"far": Contender(kalman(taylor()), _model(0.1))})
     (said,) = simulate(far, 4, chunk=4).warnings
     assert said.startswith("far: the innovations of 'y' are larger than the filter expects")
 

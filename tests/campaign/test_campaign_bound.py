@@ -63,12 +63,9 @@ def found(problem):
     return bound(problem, "kf")
 
 
-def kalman_sigma(y):
-    return np.asarray(run(kalman(), MODEL, START, y, aux=None, u=np.zeros(STEPS)).sigma)
-
-
 def test_what_stands_still_is_bounded_by_the_kalman_filter(found):
-    sigma = kalman_sigma({"fix": np.zeros((STEPS, 1))})
+    y = {"fix": np.zeros((STEPS, 1))}
+    sigma = run(kalman(), MODEL, START, y, aux=None, u=np.zeros(STEPS)).sigma
     np.testing.assert_allclose(found.bound_speed[:, 0], sigma[:, 1], rtol=1e-12)
     np.testing.assert_allclose(found.bound_place[:, 0], sigma[:, 0], rtol=1e-12)
     assert found.bound_prior_speed.item() == 1.0
@@ -89,11 +86,8 @@ def test_a_sensor_that_is_left_out_tells_nothing(found):
 
 
 def test_variances_are_averaged_over_the_runs(problem, found):
-    both, moving = (
-        bound(problem, "kf", runs=2),
-        replace(problem, simulate=lambda i: simulate(i + 1)),
-    )
-    other = bound(moving, "kf")
+    both = bound(problem, "kf", runs=2)
+    other = bound(replace(problem, simulate=lambda i: simulate(i + 1)), "kf")
     assert other.bound_speed[-1, 0] < 0.9 * found.bound_speed[-1, 0]
     mean = np.sqrt((found.bound_speed**2 + other.bound_speed**2) / 2.0)
     np.testing.assert_allclose(both.bound_speed, mean, rtol=1e-12)
@@ -125,7 +119,8 @@ def test_states_that_nothing_reports_are_named_by_their_fields(problem):
     start = Belief(state, jnp.eye(6))
     still = Motion(lambda x, u: x, jnp.zeros(6))
     course = Sensor(lambda x, a: x.wind_error[:1] - x.rest["drift"].local(Angle(0.0)), [1.0], 1)
-    case = Case(start, None, {"y": jnp.zeros((STEPS, 1))}, {}, along(state))
+    truth = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (STEPS, *x.shape)), state)
+    case = Case(start, None, {"y": jnp.zeros((STEPS, 1))}, {}, truth)
     turned = np.eye(6)[:2]
     ship = replace(
         problem,
@@ -139,11 +134,6 @@ def test_states_that_nothing_reports_are_named_by_their_fields(problem):
     assert int(found.gramian_rank) == 1
     assert "50 % wind error 1 against 50 % drift" in [d[3:] for d in found.direction.values]
     assert found.bound_left_speed.item() == pytest.approx(1.0, abs=1e-13)  # nothing tells of it
-
-
-def along(state):
-    """The same state all the time."""
-    return jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (STEPS, *x.shape)), state)
 
 
 def test_the_dataset_can_be_stored(found):
@@ -161,8 +151,7 @@ def test_bad_input_is_named(problem):
 
 
 def test_a_model_that_does_not_hold_along_the_truth_is_named(problem):
-    broken = replace(
-        problem, simulate=lambda i: simulate(i)._replace(truth=jnp.full((30, 3), jnp.nan))
-    )
+    nowhere = jnp.full((STEPS, 3), jnp.nan)
+    broken = replace(problem, simulate=lambda i: simulate(i)._replace(truth=nowhere))
     with pytest.raises(ValueError, match="cannot be linearised along the true states"):
         bound(broken, "kf")

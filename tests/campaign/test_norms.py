@@ -15,17 +15,14 @@ BAD = 4  # a run that is not finite from the middle on
 
 def a_record(error):
     """What a campaign yields of runs without a sensor."""
-    count = len(error)
     square = np.sum(error**2, axis=2)
     return {
         "error": error,
         "sigma": np.ones_like(error),
         "nees": square,
-        "dim": np.full(count, 4),
+        "dim": np.full(len(error), 4),
         "block_nees": {"all": square},
-        "nis": {},
-        "dof": {},
-        "code": {},
+        "updates": {},
     }
 
 
@@ -45,9 +42,8 @@ def statistics():
 def plain(components, last: int | None = LAST):
     rows = []
     for run in range(RUNS):
-        lengths = []
-        for epoch in range(FIRST, EPOCHS if last is None else last):
-            lengths.append(sum(ERROR[run, epoch, i] ** 2 for i in components) ** 0.5)
+        epochs = range(FIRST, EPOCHS if last is None else last)
+        lengths = [sum(ERROR[run, k, i] ** 2 for i in components) ** 0.5 for k in epochs]
         mean = sum(lengths) / len(lengths)
         rows.append([mean, (sum((x - mean) ** 2 for x in lengths) / len(lengths)) ** 0.5])
     return np.array(rows)

@@ -41,19 +41,14 @@ def write(path, euler_rad, disturbed=slice(0, 0)):
     return path
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("logs")
-
-
 def tumbling():
     time = np.arange(COUNT) / RATE_HZ
     return np.column_stack([1.3 * time, 1.5 * np.sin(0.6 * time), 0.9 * time])
 
 
 @pytest.fixture(scope="module")
-def log(folder):
-    return write(folder / "tumbling.npz", tumbling())
+def log(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("logs") / "tumbling.npz", tumbling())
 
 
 @pytest.fixture
@@ -117,15 +112,16 @@ def test_the_mounting_turns_what_is_found(robins, log, tmp_path):
     np.testing.assert_allclose(turned, np.array(offset) * [1.0, -1.0, -1.0], rtol=1e-5)
 
 
-def test_a_part_of_the_log_can_be_left_out(robins, folder, tmp_path):
+def test_a_part_of_the_log_can_be_left_out(robins, tmp_path):
     """Something magnetic is near from 10 to 14 s."""
-    log = write(folder / "disturbed.npz", tumbling(), slice(500, 700))
+    log = write(tmp_path / "disturbed.npz", tumbling(), slice(500, 700))
     whole = robins("calibrate", log, "--out", tmp_path / "a")
     assert "something magnetic was near" in whole.out
-    late = robins("calibrate", log, "--begin", "14.01 s", "--end", "40 s", "--out", tmp_path / "b")
+    late = robins("calibrate", log, "--begin", "14.01 s", "--end", "38 s", "--out", tmp_path / "b")
     assert "something magnetic" not in late.out
-    solution = results.read(tmp_path / "b").solution
-    assert 14.0 < float(solution["time"][0]) < 14.1
+    time_s = results.read(tmp_path / "b").solution["time"].values
+    assert 14.0 < time_s[0] < 14.1
+    assert 37.9 < time_s[-1] < 38.1
 
 
 def test_gaps_and_needless_calibrations_are_told():
@@ -144,8 +140,8 @@ def test_gaps_and_needless_calibrations_are_told():
     assert "the matrix is the identity" in command.advice(calibrate(4e-5 * cap + HARD + far))[0]
 
 
-def test_what_cannot_be_calibrated_is_told_in_a_line(robins, folder, log, tmp_path):
-    flat = write(folder / "flat.npz", tumbling() * [1.0, 0.0, 0.0])
+def test_what_cannot_be_calibrated_is_told_in_a_line(robins, log, tmp_path):
+    flat = write(tmp_path / "flat.npz", tumbling() * [1.0, 0.0, 0.0])
     imu = tmp_path / "imu.csv"
     logs.write_log(imu, logs.open_log(log).imu, "euroc-imu")
     for arguments, says in (

@@ -103,7 +103,7 @@ def test_a_log_is_one_run(robins, workbench):
     assert robins("replay", "imu.csv", "--runs", 1).status == 0
     answer = robins("replay", "imu.csv", "--runs", 5)
     assert answer.status == Status.BAD_INPUT
-    assert answer.err == ("robins: --runs 5: a recorded log is one run; omit the option.\n")
+    assert answer.err == "robins: --runs 5: a recorded log is one run; omit the option.\n"
 
 
 @pytest.mark.parametrize(
@@ -128,12 +128,8 @@ def test_the_demonstration_ends_with_its_verdict(robins, workbench, verdict, sta
 # ----------------------------------------------------------------------------------------- errors
 
 
-def refused_result():
-    return results.ResultError("out", "is a file, not a folder", "choose a new folder")
-
-
-def full_disk():
-    return cannot("out", "write", OSError(28, "No space left on device"))
+REFUSED = results.ResultError("out", "is a file, not a folder", "choose a new folder")
+FULL_DISK = cannot("out", "write", OSError(28, "No space left on device"))
 
 
 @pytest.mark.parametrize(
@@ -143,8 +139,8 @@ def full_disk():
         (ScenarioError(["x: one", "y: two"]), 2, ["x: one", "y: two"]),
         (UnitError("deg is an angle"), 2, ["deg is an angle"]),
         (LogError("imu.csv", "is empty", "give another"), 2, ["imu.csv: is empty; give another"]),
-        (refused_result(), 2, ["out: is a file, not a folder; choose a new folder"]),
-        (full_disk(), 1, ["out: cannot write: No space left on device; free some space"]),
+        (REFUSED, 2, ["out: is a file, not a folder; choose a new folder"]),
+        (FULL_DISK, 1, ["out: cannot write: No space left on device; free some space"]),
         (MemoryError(), 1, ["out of memory; ask for fewer runs or filters at a time."]),
         (OSError(13, "Permission denied", "x"), 1, ["failed: PermissionError: [Errno 13] "]),
         (ValueError("shapes\nand more"), 1, ["failed: ValueError: shapes", "this may be a fault"]),
@@ -250,33 +246,21 @@ def test_the_version_is_told(robins):
 def test_the_list_names_everything(robins, systems):
     answer = robins("list", "--json")
     assert answer.status == 0
+    scenarios, filters = ["car/town", "car/road"], ["ekf", "ukf"]
+    claim = {"id": "C1", "text": "it holds"}
+    car = {"name": "car", "summary": "a car", "scenarios": scenarios, "filters": filters}
+    car |= {"claims": [claim], "replays": True}
+    kite = {"name": "kite", "summary": "a kite", "scenarios": [], "filters": ["ekf"]}
+    kite |= {"claims": [], "replays": False}
     assert json.loads(answer.out) == {
-        "scenarios": ["car/town", "car/road"],
-        "systems": [
-            {
-                "name": "car",
-                "summary": "a car",
-                "scenarios": ["car/town", "car/road"],
-                "filters": ["ekf", "ukf"],
-                "claims": [{"id": "C1", "text": "it holds"}],
-                "replays": True,
-            },
-            {
-                "name": "kite",
-                "summary": "a kite",
-                "scenarios": [],
-                "filters": ["ekf"],
-                "claims": [],
-                "replays": False,
-            },
-        ],
-        "filters": ["ekf", "ukf"],
-        "claims": [{"id": "C1", "text": "it holds", "system": "car"}],
+        "scenarios": scenarios,
+        "systems": [car, kite],
+        "filters": filters,
+        "claims": [claim | {"system": "car"}],
         "bench": sorted(p.stem for p in PACKAGE.glob("bench/run/scenarios/*.toml")),
         "designs": sorted(p.stem for p in PACKAGE.glob("workbench/problems/*.toml")),
     }
-    of_the_car = json.loads(answer.out)["systems"][0]
-    assert json.loads(robins("list", "car", "--json").out) == of_the_car
+    assert json.loads(robins("list", "car", "--json").out) == car
 
 
 def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, systems):
@@ -370,12 +354,8 @@ def test_the_cache_keeps_out_of_the_way(monkeypatch, tmp_path, why):
 
 
 def test_statuses_are_those_of_the_contract():
-    assert {s.name: int(s) for s in Status} == {
-        "DONE": 0,
-        "FAILED": 1,
-        "BAD_INPUT": 2,
-        "INTERRUPTED": 3,
-    }
+    told = {s.name: int(s) for s in Status}
+    assert told == {"DONE": 0, "FAILED": 1, "BAD_INPUT": 2, "INTERRUPTED": 3}
     assert running.main is cli.main
 
 

@@ -28,6 +28,9 @@ BENCH = app.commands["bench"]
 assert isinstance(BENCH, click.Group)
 COMMANDS = BENCH.commands
 SATELLITE = "satellite/s1"
+PARTS = ", ".join(NODES)
+OF_A_FILTER = ("--node", "adm", "--filter", "mekf")
+RECORD = ROOT / "tests" / "bench" / "records" / "adm.mcap"
 
 
 @pytest.fixture(autouse=True)
@@ -98,12 +101,7 @@ def keys(tree: ast.AST, name: str | None = None) -> list[str]:
     (returned,) = (n.value for n in ast.walk(function) if isinstance(n, ast.Return))
     assert isinstance(returned, ast.Dict)
     for key, value in zip(returned.keys, returned.values, strict=True):
-        if (
-            name is not None
-            and isinstance(value, ast.Dict)
-            and key
-            and ast.literal_eval(key) == name
-        ):
+        if name and key and ast.literal_eval(key) == name:
             returned = value
     return [ast.literal_eval(key) for key in returned.keys if key is not None]
 
@@ -126,9 +124,7 @@ def test_the_page_names_every_kind_of_fault_with_its_fields():
         with pytest.raises(pydantic.ValidationError) as refused:
             LinkFault(kind=kind, begin=0.0, **every)
         (takes,) = re.findall(r"it takes ([\w, ]+\w)", str(refused.value))
-        assert told[kind] == [
-            field for field in takes.split(", ") if field not in ("kind", "begin", "end")
-        ]
+        assert told[kind] == [f for f in takes.split(", ") if f not in ("kind", "begin", "end")]
 
 
 # ------------------------------------------------------------------------------------ small ones
@@ -200,50 +196,34 @@ def test_a_second_bench_with_the_same_folder_is_refused(robins, tmp_path):
     first.discard()
 
 
-def test_a_part_to_be_by_hand_must_be_one(robins):
-    answer = robins("bench", "node", "gyros", "/dev/null", SATELLITE)
-    assert answer.status == 2
-    assert answer.err.strip() == f"robins: no part 'gyros', only {', '.join(NODES)}"
-
-
-@pytest.fixture
-def foreign(tmp_path):
-    """An MCAP file that the bench did not write."""
-    path = tmp_path / "foreign.mcap"
-    with path.open("wb") as file:
-        writer = mcap.writer.Writer(file)
-        writer.start()
-        writer.finish()
-    return path
-
-
-@pytest.fixture
-def text(tmp_path):
-    path = tmp_path / "text.mcap"
+@pytest.mark.parametrize("foreign", [False, True], ids=["text", "foreign"])
+def test_what_is_no_record_is_refused(robins, tmp_path, foreign):
+    """Text, and an MCAP file that the bench did not write."""
+    path = tmp_path / "x.mcap"
     path.write_text("no record")
-    return path
-
-
-@pytest.mark.parametrize("which", ["text", "foreign"])
-def test_what_is_no_record_is_refused(robins, request, which):
-    path = request.getfixturevalue(which)
+    if foreign:
+        with path.open("wb") as file:
+            writer = mcap.writer.Writer(file)
+            writer.start()
+            writer.finish()
     answer = robins("bench", "replay", path, "--node", "adm")
     assert answer.status == 2
     assert str(path) in answer.err
     assert re.search("a record that the bench wrote|not one that the bench wrote", answer.err)
 
 
-def test_a_part_to_be_replayed_must_be_one(robins):
-    record = ROOT / "tests" / "bench" / "records" / "adm.mcap"
-    answer = robins("bench", "replay", record, "--node", "amd")
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (("node", "gyros", "/dev/null", SATELLITE), f"no part 'gyros', only {PARTS}"),
+        (("replay", RECORD, "--node", "amd"), f"--node: there is no part 'amd', only {PARTS}"),
+        (
+            ("replay", RECORD, *OF_A_FILTER, "--diff", RECORD),
+            "--filter and --diff: the one runs a filter, the other compares records",
+        ),
+    ],
+)
+def test_parts_that_are_none_and_options_that_exclude_each_other(robins, given, told):
+    answer = robins("bench", *given)
     assert answer.status == 2
-    assert f"--node: there is no part 'amd', only {', '.join(NODES)}" in answer.err
-
-
-def test_a_filter_and_a_second_record_exclude_each_other(robins):
-    record = ROOT / "tests" / "bench" / "records" / "adm.mcap"
-    answer = robins(
-        "bench", "replay", record, "--node", "adm", "--filter", "mekf", "--diff", record
-    )
-    assert answer.status == 2
-    assert "--filter and --diff" in answer.err
+    assert answer.err == f"robins: {told}\n"

@@ -33,18 +33,19 @@ def a_still_imu(seconds=60.0, gravity=-9.81, kind="rate"):
     return ImuTable(time_ns, gyro, accel, kind)
 
 
+def written(path, table):
+    logs.write_log(path, table, "euroc-imu")
+    return path
+
+
 @pytest.fixture(scope="module")
 def still_log(tmp_path_factory):
-    path = tmp_path_factory.mktemp("logs") / "still.csv"
-    logs.write_log(path, a_still_imu(), "euroc-imu")
-    return path
+    return written(tmp_path_factory.mktemp("logs") / "still.csv", a_still_imu())
 
 
 @pytest.fixture(scope="module")
 def upside_down(tmp_path_factory):
-    path = tmp_path_factory.mktemp("logs") / "upside down.csv"
-    logs.write_log(path, a_still_imu(gravity=9.81), "euroc-imu")
-    return path
+    return written(tmp_path_factory.mktemp("logs") / "upside down.csv", a_still_imu(gravity=9.81))
 
 
 # ------------------------------------------------------------------------------------ bad TOML
@@ -131,9 +132,8 @@ def test_the_mounting_of_a_configuration_is_heeded(robins, upside_down, monkeypa
 def test_a_configuration_alone_is_no_log(robins, command):
     answer = robins(command, "unit.toml")
     assert answer.status == 2
-    assert answer.err == (
-        "robins: unit.toml: is a configuration; give the files of the log beside it.\n"
-    )
+    said = "robins: unit.toml: is a configuration; give the files of the log beside it.\n"
+    assert answer.err == said
     assert not list(Path().iterdir())
 
 
@@ -160,12 +160,8 @@ def test_what_a_log_holds_is_shown_before_it_is_judged(robins, still_log, nine_a
     assert answer.out.startswith("inertial samples 6000 rows at 100 Hz, 60.0 s  (still.csv)\n")
     answer = robins("doctor", nine_axis)
     assert answer.status == 0
-    kinds = [line.split("  ")[0] for line in answer.out.splitlines()[:3]]
-    assert [k.split(" 2000")[0].strip() for k in kinds] == [
-        "inertial samples",
-        "magnetic field",
-        "true attitude",
-    ]
+    kinds = [line.split("  ")[0].split(" 2000")[0] for line in answer.out.splitlines()[:3]]
+    assert [k.strip() for k in kinds] == ["inertial samples", "magnetic field", "true attitude"]
     # There are no fixes to find a place with, but a field to find north with.
     assert answer.out.endswith("robins replay trial.npz --system marg\n")
     told = json.loads(robins("doctor", nine_axis, "--json").out)
@@ -254,14 +250,12 @@ def test_the_longest_stretch_without_a_gap_is_used_and_it_is_said(tmp_path):
     keep = np.ones(len(table), bool)
     keep[1000:1050] = False
     gapped = ImuTable(table.time_ns[keep], table.gyro[keep], table.accel[keep], "rate")
-    logs.write_log(tmp_path / "gapped.csv", gapped, "euroc-imu")
-    found = still.still(tmp_path / "gapped.csv")
+    found = still.still(written(tmp_path / "gapped.csv", gapped))
     assert len(found.time_ns) == 1950
     np.testing.assert_allclose(found.rates["gyro"], table.gyro[1050:], atol=1e-9)
     (note,) = found.notes
-    assert note.startswith(
-        "The log has gaps: only its longest stretch without one is used, 19.49 s"
-    )
+    said = "The log has gaps: only its longest stretch without one is used, 19.49 s"
+    assert note.startswith(said)
 
 
 @pytest.mark.parametrize(
@@ -282,18 +276,16 @@ def test_a_moving_sensor_is_noticed(tmp_path):
     table = a_still_imu(10.0)
     turning = table.gyro.copy()
     turning[400:600, 2] += 0.2
-    logs.write_log(
-        tmp_path / "a.csv", ImuTable(table.time_ns, turning, table.accel, "rate"), "euroc-imu"
-    )
-    logs.write_log(tmp_path / "b.csv", table, "euroc-imu")
-    assert any("turned" in note for note in still.still(tmp_path / "a.csv").notes)
-    assert not any("turned" in note for note in still.still(tmp_path / "b.csv").notes)
+    for gyro, turned in ((turning, True), (table.gyro, False)):
+        imu = ImuTable(table.time_ns, gyro, table.accel, "rate")
+        notes = still.still(written(tmp_path / "log.csv", imu)).notes
+        assert any("turned" in note for note in notes) == turned
 
 
 def test_a_stuck_sensor_is_refused(robins, tmp_path):
     table = a_still_imu(10.0)
     stuck = ImuTable(table.time_ns, np.zeros_like(table.gyro), table.accel, "rate")
-    logs.write_log(tmp_path / "stuck.csv", stuck, "euroc-imu")
+    written(tmp_path / "stuck.csv", stuck)
     answer = robins("allan", "stuck.csv")
     assert answer.status == 2
     assert answer.err.startswith("robins: stuck.csv: gyro: axis 0 is constant")
@@ -301,11 +293,8 @@ def test_a_stuck_sensor_is_refused(robins, tmp_path):
 
 
 def test_a_short_log_gives_its_curve_and_the_reason_why_no_parameters(tmp_path):
-    logs.write_log(tmp_path / "short.csv", a_still_imu(2.0), "euroc-imu")
-    heard = []
-    found = find_noise(
-        tmp_path / "short.csv", terms="QNBKR", progress=lambda share, what: heard.append(share)
-    )
+    log, heard = written(tmp_path / "short.csv", a_still_imu(2.0)), []
+    found = find_noise(log, terms="QNBKR", progress=lambda share, what: heard.append(share))
     assert [note[:53] for note in found.notes] == [
         "No parameters of the gyro: too short for the 5 terms ",
         "No parameters of the accel: too short for the 5 terms",

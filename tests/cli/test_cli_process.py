@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 
 import pytest
@@ -17,10 +18,11 @@ from robins.cli import Status, interrupts
 
 
 def start(code, *arguments, **settings):
-    """Start a process that runs `main` after some code of the test's."""
+    """Start a process that runs `main` after some code of the test's; its output is piped."""
     prologue = "import sys\nfrom robins.cli import main\n"
     script = f"{prologue}{textwrap.dedent(code)}\nsys.exit(main(sys.argv[1:]))"
-    return subprocess.Popen([sys.executable, "-c", script, *arguments], text=True, **settings)
+    settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | settings
+    return subprocess.Popen([sys.executable, "-c", script, *arguments], **settings)
 
 
 @pytest.mark.parametrize("argument", ["--help", "list", "nonsense"])
@@ -33,7 +35,7 @@ def test_what_computes_nothing_is_there_in_a_blink(argument):
         print(used.ru_utime + used.ru_stime, sorted(heavy & set(sys.modules)), file=sys.stderr)
     atexit.register(told)
     """
-    process = start(code, argument, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = start(code, argument)
     _, err = process.communicate(timeout=60)
     assert process.returncode == (Status.BAD_INPUT if argument == "nonsense" else Status.DONE)
     seconds, loaded = err.splitlines()[-1].split(maxsplit=1)
@@ -42,6 +44,7 @@ def test_what_computes_nothing_is_there_in_a_blink(argument):
 
 
 SLOW = """
+import threading
 import time
 from robins import workbench
 def run(name, **asked):
@@ -49,18 +52,13 @@ def run(name, **asked):
     time.sleep(60)
 workbench.run = run
 """
+RUN = ("run", "car/town", "--out", "out")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workbench, number):
-    robins("run", "car/town", "--out", "out", "--seed", 1)
-    process = start(
-        SLOW,
-        *("run", "car/town", "--out", "out"),
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    robins(*RUN, "--seed", 1)
+    process = start(SLOW, *RUN, cwd=tmp_path)
     assert process.stdout.readline() == "computing\n"
     assert len(list(tmp_path.iterdir())) == 3  # the result, the next one, and its lock
     process.send_signal(number)
@@ -74,16 +72,13 @@ def test_a_signal_leaves_the_earlier_result_and_status_3(tmp_path, robins, workb
 def test_a_terminal_that_is_closed_is_an_interrupt(tmp_path):
     """What is then written to it fails, also what click writes before it passes Ctrl-C on."""
     screen, keyboard = os.openpty()
-    process = start(
-        SLOW,
-        *("run", "car/town", "--out", "out"),
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=keyboard,
-    )
+    process = start(SLOW, *RUN, cwd=tmp_path, stderr=keyboard)
     os.close(keyboard)
     assert process.stdout.readline() == "computing\n"
-    os.close(screen)
+    # To close it may wait for who writes to it: some kernels then wait for ever.
+    closing = threading.Thread(target=os.close, args=(screen,), daemon=True)
+    closing.start()
+    closing.join(timeout=5)
     process.send_signal(signal.SIGHUP)
     process.communicate(timeout=30)
     assert process.returncode == 3
@@ -131,9 +126,7 @@ workbench.run = run
 
 @pytest.mark.parametrize("code", [DEAF, SWALLOWED], ids=["in a callback", "swallowed"])
 def test_an_interrupt_is_not_lost(tmp_path, code):
-    process = start(
-        code, "run", "car/town", cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    process = start(code, "run", "car/town", cwd=tmp_path)
     _, err = process.communicate(timeout=15)
     assert process.returncode == 3
     assert err.strip().startswith("robins: interrupted.")
@@ -147,13 +140,7 @@ atexit.register(os.abort)
 main_of_the_process = main
 main = lambda arguments: main_of_the_process()
 """
-    process = start(
-        code,
-        *("run", "car/town", "--out", "out"),
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    process = start(code, *RUN, cwd=tmp_path)
     assert process.stdout.readline() == "computing\n"
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
@@ -165,14 +152,14 @@ main = lambda arguments: main_of_the_process()
 @pytest.mark.parametrize("command", [("list",), ("bench", "status", "--json"), ("--help",)])
 def test_a_full_standard_output_is_a_failure(command):
     with open("/dev/full", "w") as full:
-        process = start("", *command, stdout=full, stderr=subprocess.PIPE)
+        process = start("", *command, stdout=full)
         _, err = process.communicate(timeout=60)
     assert process.returncode == 1
     assert err == "robins: cannot write to standard output: No space left on device\n"
 
 
 def test_a_reader_that_goes_away_is_no_reason_to_complain():
-    process = start("", "list", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = start("", "list")
     process.stdout.close()
     process.wait(timeout=60)
     assert process.stderr.read() == ""
@@ -181,12 +168,9 @@ def test_a_reader_that_goes_away_is_no_reason_to_complain():
 
 
 def test_a_closed_standard_output_is_told():
-    code = shlex.join(
-        [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
-    )
-    closed = subprocess.run(
-        f"{code} --help >&-", shell=True, stderr=subprocess.PIPE, text=True, timeout=30
-    )
+    code = "from robins.cli import main; raise SystemExit(main())"
+    shell = f"{shlex.join([sys.executable, '-c', code])} --help >&-"
+    closed = subprocess.run(shell, shell=True, stderr=subprocess.PIPE, text=True, timeout=30)
     assert closed.returncode == 1
     assert closed.stderr == "robins: cannot write to standard output: it is closed\n"
 
@@ -225,10 +209,6 @@ def test_a_command_in_any_bytes_can_be_kept(robins, workbench):
 
 
 def test_the_entry_point_is_installed():
-    done = subprocess.run(
-        [Path(sys.executable).with_name("robins"), "--version"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.startswith("robins, version ")
+    installed = Path(sys.executable).with_name("robins")
+    told = subprocess.check_output([installed, "--version"], text=True)
+    assert told.startswith("robins, version ")

@@ -14,11 +14,8 @@ GRAIN_M = 4e-9  # one unit in the last place of a longitude near pi is 2.8e-9 m
 @pytest.fixture(scope="module")
 def places():
     rng = np.random.default_rng(0)
-    return Geodetic(
-        jnp.asarray(rng.uniform(-1.5, 1.5, 500)),
-        jnp.asarray(rng.uniform(-np.pi, np.pi, 500)),
-        jnp.asarray(rng.uniform(-500, 5e5, 500)),
-    )
+    ranges = ((-1.5, 1.5), (-np.pi, np.pi), (-500, 5e5))
+    return Geodetic(*(jnp.asarray(rng.uniform(*ends, 500)) for ends in ranges))
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3, 1.0, 1e3, 1e5])

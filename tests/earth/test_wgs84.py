@@ -35,11 +35,8 @@ def places():
     )
     rng = np.random.default_rng(0)
     n = 20_000
-    random = (
-        np.arcsin(rng.uniform(-1, 1, n)),
-        rng.uniform(-np.pi, np.pi, n),
-        rng.uniform(-500, 5e5, n),
-    )
+    lat, lon = np.arcsin(rng.uniform(-1, 1, n)), rng.uniform(-np.pi, np.pi, n)
+    random = (lat, lon, rng.uniform(-500, 5e5, n))
     return [np.concatenate([g.ravel(), r]) for g, r in zip(grid, random, strict=True)]
 
 
@@ -57,19 +54,19 @@ def exact_ecef(lat, lon, alt):
     return np.stack([across * np.cos(lon), across * np.sin(lon), up], -1)
 
 
-def rms(error):
-    return np.sqrt(np.mean(np.square(error)))
+def assert_at(r, lat, lon, alt):
+    """Earth-fixed coordinates are those of PROJ and of extended precision."""
+    for name, expected in (
+        ("proj", np.stack(proj.transform(lon, lat, alt, radians=True), -1)),
+        ("exact", exact_ecef(lat, lon, alt)),
+    ):
+        error = np.abs(r - expected).astype(float)
+        assert np.sqrt(np.mean(np.square(error))) < RMS_M, name
+        assert error.max() <= ORACLES[name], name
 
 
 def test_ecef_is_that_of_proj_and_of_extended_precision():
-    got = np.asarray(to_ecef(LAT, LON, ALT))
-    for name, expected in (
-        ("proj", np.stack(proj.transform(LON, LAT, ALT, radians=True), -1)),
-        ("exact", exact_ecef(LAT, LON, ALT)),
-    ):
-        error = np.abs(got - expected).astype(float)
-        assert rms(error) < RMS_M, name
-        assert error.max() <= ORACLES[name], name
+    assert_at(np.asarray(to_ecef(LAT, LON, ALT)), LAT, LON, ALT)
 
 
 def test_geodetic_coordinates_lead_back_to_the_place():
@@ -77,13 +74,7 @@ def test_geodetic_coordinates_lead_back_to_the_place():
     # step of Bowring, 3 mm off at 500 km, so it is no measure here.
     r = np.asarray(to_ecef(LAT, LON, ALT))
     lat, lon, alt = (np.asarray(a) for a in to_geodetic(r))
-    for name, back in (
-        ("proj", np.stack(proj.transform(lon, lat, alt, radians=True), -1)),
-        ("exact", exact_ecef(lat, lon, alt)),
-    ):
-        error = np.abs(back - r).astype(float)
-        assert rms(error) < RMS_M, name
-        assert error.max() <= ORACLES[name], name
+    assert_at(r, lat, lon, alt)
     np.testing.assert_allclose(alt, ALT, atol=WORST_M, rtol=0)
     # Latitude is known to the rounding of r and of itself, which is coarser above 1 rad.
     np.testing.assert_allclose(lat, LAT, atol=WORST_M / wgs84.A_M, rtol=0)
@@ -123,11 +114,8 @@ def test_directions_of_the_local_frame_are_those_of_growing_coordinates():
     slope = np.asarray(jax.jit(point)(np.stack([lat, lon, alt], -1)))
     C_en = np.asarray(wgs84.dcm_en(lat, lon))
     meridian, transverse = wgs84.curvature_radii(lat)
-    np.testing.assert_allclose(
-        slope[..., 0], C_en[..., 0] * (np.asarray(meridian) + 100.0)[:, None], atol=1e-8
-    )
-    radius = (np.asarray(transverse) + 100.0) * np.cos(lat)
-    np.testing.assert_allclose(slope[..., 1], C_en[..., 1] * radius[:, None], atol=1e-8)
+    radii = np.stack([meridian + 100.0, (transverse + 100.0) * np.cos(lat)], -1)
+    np.testing.assert_allclose(slope[..., :2], C_en[..., :2] * radii[:, None], atol=1e-8)
     np.testing.assert_allclose(slope[..., 2], -C_en[..., 2], atol=1e-15)
 
 
@@ -167,18 +155,12 @@ def test_gravity_is_the_slope_of_the_normal_potential(alt):
     tiny = 1e-20  # no difference is taken, so no digits are lost
     outward = potential(p + 1j * tiny, z).imag / tiny
     northward = potential(p, z + 1j * tiny).imag / tiny
-    expected = np.stack(
-        [
-            northward * np.cos(lat) - outward * np.sin(lat),
-            np.zeros(73),
-            -northward * np.sin(lat) - outward * np.cos(lat),
-        ],
-        -1,
-    )
+    north = northward * np.cos(lat) - outward * np.sin(lat)
+    down = -northward * np.sin(lat) - outward * np.cos(lat)
+    expected = np.stack([north, np.zeros(73), down], -1)
     np.testing.assert_allclose(gravity_n(lat, np.full(73, alt)), expected, atol=1e-11, rtol=0)
-    np.testing.assert_allclose(
-        wgs84.gravity(lat, alt), np.linalg.norm(expected, axis=-1), atol=1e-11, rtol=0
-    )
+    size = np.linalg.norm(expected, axis=-1)
+    np.testing.assert_allclose(wgs84.gravity(lat, alt), size, atol=1e-11, rtol=0)
 
 
 def test_gravity_on_the_ellipsoid_is_the_formula_of_somigliana():
@@ -213,9 +195,8 @@ def test_field_of_gravity_has_no_curl_and_the_divergence_of_the_rotation():
     slope = np.asarray(jax.jit(jax.vmap(jax.jacfwd(field)))(r))
     np.testing.assert_allclose(slope, np.swapaxes(slope, -1, -2), atol=1e-20)
     # Outside the masses only the centrifugal part has a divergence.
-    np.testing.assert_allclose(
-        np.trace(slope, axis1=-2, axis2=-1), 2 * wgs84.OMEGA_E**2, rtol=1e-10
-    )
+    divergence = np.trace(slope, axis1=-2, axis2=-1)
+    np.testing.assert_allclose(divergence, 2 * wgs84.OMEGA_E**2, rtol=1e-10)
 
 
 def test_plumb_line_is_curved_northward_by_the_known_rate():

@@ -139,7 +139,7 @@ RULES = {
     "strong_tracking multiple": strong_tracking(form="multiple"),
     "strong_tracking projected": strong_tracking(form="projected"),
     "discriminator": discriminator(),
-    "h_infinity": h_infinity(10.0, jnp.eye(N)),
+    "h_infinity": h_infinity(20.0, jnp.eye(N)),  # which what strong tracking inflates allows too
     "adaptive_h_infinity": adaptive_h_infinity(jnp.eye(N)[:2]),
     "equality": equality(jnp.array([[1.0, 0.0, 1.0, 0.0]]), jnp.array([0.5])),
     "inequality": inequality(jnp.array([[1.0, 0.0, 0.0, 0.0]]), [-10.0], [10.0]),

@@ -26,14 +26,7 @@ from two_sensors import (
 )
 
 from robins import linalg
-from robins.filters import (
-    Belief,
-    Model,
-    Motion,
-    Sensor,
-    kalman,
-    run,
-)
+from robins.filters import Belief, Model, Motion, Sensor, kalman, run
 from robins.filters.channels import channel
 from robins.filters.federated import federated
 

@@ -16,13 +16,7 @@ from dense_h_infinity import (
 )
 from dense_kalman import SPLIT_W, kalman_filter, random_system, simulate, split
 
-from robins.filters import (
-    Belief,
-    Code,
-    OnlineFilter,
-    kalman,
-    run,
-)
+from robins.filters import Belief, Code, OnlineFilter, kalman, run
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
 from robins.manifold import Angle
 

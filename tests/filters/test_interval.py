@@ -162,8 +162,7 @@ D = np.array([[1.0, 0.0, 0.5, 0.0]])
 
 
 @pytest.mark.parametrize(
-    ("method", "way", "form"),
-    [("active-set", unscented(), "joseph"), ("truncation", None, "sqrt")],
+    ("method", "way", "form"), [("active-set", unscented(), "joseph"), ("truncation", None, "sqrt")]
 )
 def test_a_rule_keeps_its_bounds(method, way, form):
     rule = inequality(D, [0.2], [0.6], method)

@@ -10,14 +10,7 @@ from dense_kalman import random_system, simulate
 from scipy import optimize
 
 from robins import manifold
-from robins.filters import (
-    Belief,
-    Sensor,
-    cubature,
-    kalman,
-    run,
-    unscented,
-)
+from robins.filters import Belief, Sensor, cubature, kalman, run, unscented
 from robins.filters.iterated import iterated
 from robins.filters.rules import gate
 from robins.manifold import Angle

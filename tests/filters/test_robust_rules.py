@@ -10,20 +10,13 @@ import pytest
 from dense_kalman import random_system, simulate
 from scipy import optimize, stats
 
-from robins.filters import (
-    Belief,
-    Code,
-    Model,
-    Motion,
-    Sensor,
-    kalman,
-    run,
-)
+from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run
 from robins.filters.rules.correntropy import correntropy
 from robins.filters.rules.gate import gate
 from robins.filters.rules.huber import huber
 from robins.filters.rules.igg3 import igg3
 from robins.filters.rules.student_t import student_t
+from robins.rotation import Rotation
 
 T = 60
 SYSTEM = random_system(2)
@@ -147,10 +140,7 @@ PAIRS = {
     "igg3": (igg3(floor=0.01, patience=4), book_igg3),
     "igg3 that refuses": (igg3(floor=0.0, patience=4), lambda *a: book_igg3(*a, floor=0.0)),
     "student_t": (student_t(4.0), book_student_t),
-    "student_t of both": (
-        student_t(4.0, whose="both"),
-        lambda *a: book_student_t(*a, both=True),
-    ),
+    "student_t of both": (student_t(4.0, whose="both"), lambda *a: book_student_t(*a, both=True)),
     "correntropy": (correntropy(2.5, 4), book_correntropy),
 }
 
@@ -250,3 +240,38 @@ def test_the_kalman_filter_fails_on_outliers(plain):
 def test_outliers_cost_a_robust_filter_little(rule, bounds, plain):
     got = rmse(rule) / plain[0]
     assert np.all(got < bounds), got
+
+
+# ---------------------------------------------------------------------------------------- manifold
+
+STAR = Sensor(lambda x, aux: x["attitude"], jnp.full(3, 1e-4), 3)
+TUMBLING = Model(
+    Motion(
+        lambda x, u: {
+            **x,
+            "attitude": x["attitude"].retract(0.1 * (jnp.array([0.3, 2.0, -1.0]) - x["bias"])),
+        },
+        jnp.concatenate([jnp.full(3, 1e-5), jnp.full(3, 1e-7)]),
+    ),
+    (STAR,),
+)
+
+
+def test_star_frames_wrong_by_ten_degrees_do_not_turn_an_attitude():
+    rng = np.random.default_rng(3)
+    rate, bias, steps = np.array([0.3, 2.0, -1.0]), np.array([1e-4, -1e-4, 0.0]), 40
+    turned = 0.1 * np.arange(1.0, steps + 1.0)[:, None] * (rate - bias)
+    fault = 1e-4 * rng.normal(size=(steps, 3)) + 0.17 * (np.arange(steps) == 25)[:, None]
+    truth = jax.vmap(Rotation.identity().retract)(jnp.asarray(turned))
+    frames = jax.vmap(lambda x, d: x.retract(d))(truth, jnp.asarray(fault))
+    start = {"attitude": Rotation.identity(), "bias": jnp.zeros(3)}
+    belief = Belief.of(start, np.diag([1e-4] * 3 + [1e-8] * 3))
+    rules = (huber(), igg3(), student_t(), correntropy())
+    robust, plain = (run(kalman(rules=r), TUMBLING, belief, frames) for r in (rules, ()))
+    worst = [
+        float(np.max(np.linalg.norm(s.mean["attitude"].local(truth), axis=1)[5:]))
+        for s in (robust, plain)
+    ]
+    assert worst[0] < 3e-4
+    assert worst[1] > 0.03  # contrast
+    assert np.all(np.abs(robust.mean["bias"][-1] - bias) < 5 * robust.sigma[-1, 3:])

@@ -8,17 +8,7 @@ import pytest
 from dense_kalman import SPLIT_W, kalman_filter, random_system, simulate, split, times
 from jax.tree_util import Partial
 
-from robins.filters import (
-    Belief,
-    Code,
-    Model,
-    Motion,
-    OnlineFilter,
-    Sensor,
-    kalman,
-    run,
-    unscented,
-)
+from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, run, unscented
 
 T = 20
 EKF, UKF = kalman(), kalman(unscented())

@@ -43,10 +43,7 @@ MADE = {
         lambda stay, p: imm([kalman(), kalman(rules=[huber(p)])], [[stay, 1 - stay], [0.5, 0.5]]),
         [(0.9, 0.9), (0.8, 0.9), (0.9, 0.8)],
     ),
-    "guarded": (
-        lambda p: guarded(kalman(rules=[gate(p)]), kalman(), "y", "z"),
-        [(0.9,), (0.8,)],
-    ),
+    "guarded": (lambda p: guarded(kalman(rules=[gate(p)]), kalman(), "y", "z"), [(0.9,), (0.8,)]),
     "particle": (lambda n, k: particle(n, jax.random.key(k)), [(10, 0), (20, 0), (10, 1)]),
 }
 

@@ -8,14 +8,7 @@ import pytest
 from dense_kalman import System, kalman_filter, random_system, simulate
 from test_cases import cases, check, given, linear
 
-from robins.filters import (
-    Model,
-    Rule,
-    Sensor,
-    kalman,
-    run,
-    taylor,
-)
+from robins.filters import Model, Rule, Sensor, kalman, run, taylor
 from robins.filters.kalman import Form
 from robins.filters.rules.strong_tracking import strong_tracking
 
@@ -110,11 +103,7 @@ CASES: dict[str, tuple[Rule, Form, Fading]] = {
         "joseph",
         Fading("outside", KEEP, GAIN, beta=2.0, limit=3.0),
     ),
-    "projected": (
-        strong_tracking(0.9, form="projected"),
-        "sqrt",
-        Fading("projected", KEEP, GAIN),
-    ),
+    "projected": (strong_tracking(0.9, form="projected"), "sqrt", Fading("projected", KEEP, GAIN)),
     "multiple": (
         strong_tracking(0.9, form="multiple", weights=WEIGHTS),
         "sqrt",

@@ -42,9 +42,8 @@ def at_rest(C_nb, lat=LAT):
 
 def phi(C_true, q_nb):
     """Error in C_true = exp(phi x) C_estimate, by another library."""
-    return Reference.from_matrix(
-        C_true @ np.swapaxes(np.asarray(q_nb.as_dcm()), -1, -2)
-    ).as_rotvec()
+    C_bn = np.swapaxes(np.asarray(q_nb.as_dcm()), -1, -2)
+    return Reference.from_matrix(C_true @ C_bn).as_rotvec()
 
 
 def assert_covariance(errors, covariances):
@@ -78,9 +77,8 @@ def test_levelling_perfect_sensors_gives_roll_and_pitch():
     np.testing.assert_allclose(got.q_nb.as_dcm(), C_nb, atol=2e-13)
     one = level(at_rest(C_nb[7])[1], 0.01)
     np.testing.assert_allclose(np.stack(one.q_nb.as_euler()), [*euler[7, :2], 0.0], atol=1e-12)
-    np.testing.assert_allclose(
-        one.covariance[2, 2], UNKNOWN_HEADING_RAD**2 + (0.01 / G * np.tan(euler[7, 1])) ** 2
-    )
+    unknown = UNKNOWN_HEADING_RAD**2 + (0.01 / G * np.tan(euler[7, 1])) ** 2
+    np.testing.assert_allclose(one.covariance[2, 2], unknown)
 
 
 SIGMA_OMEGA = DEG_H * np.array([0.05, 0.1, 0.2])
@@ -98,17 +96,15 @@ def test_the_covariance_of_gyrocompassing_is_that_of_its_errors():
 
 def test_the_covariance_of_levelling_is_that_of_its_errors():
     C_nb, euler = attitudes(4000, RNG, largest_pitch=1.2)
-    sigma_heading = 0.02
     f = at_rest(C_nb)[1] + SIGMA_F * RNG.normal(size=(4000, 3))
-    heading = euler[:, 2] + sigma_heading * RNG.normal(size=4000)
-    got = level(f, SIGMA_F, heading, sigma_heading)
+    heading = euler[:, 2] + 0.02 * RNG.normal(size=4000)
+    got = level(f, SIGMA_F, heading, 0.02)
     assert_covariance(phi(C_nb, got.q_nb), got.covariance)
 
 
 @pytest.mark.parametrize("lat", [0.0, 0.7, -1.2])
 def test_error_formulas_of_the_books(lat):
-    C_nb, _ = attitudes(1, RNG)
-    C_nb = C_nb[0]
+    C_nb = attitudes(1, RNG)[0][0]
     omega, f = at_rest(C_nb, lat)
     g, level_rate = float(gravity(lat, 0.0)), OMEGA_E * np.cos(lat)
 
@@ -121,13 +117,11 @@ def test_error_formulas_of_the_books(lat):
     # Titterton & Weston: tilt = accelerometer bias over g, heading = east gyro bias over the
     # horizontal Earth rate, and the tilt about north times tan L.
     np.testing.assert_allclose(error(d_f_n=north), [0.0, -1e-6 / g, 0.0], atol=1e-12)
-    np.testing.assert_allclose(
-        error(d_f_n=east), [1e-6 / g, 0.0, -1e-6 / g * np.tan(lat)], atol=1e-12
-    )
+    tilt = 1e-6 / g
+    np.testing.assert_allclose(error(d_f_n=east), [tilt, 0.0, -tilt * np.tan(lat)], atol=1e-12)
     np.testing.assert_allclose(error(d_f_n=down), np.zeros(3), atol=1e-12)
-    np.testing.assert_allclose(
-        error(d_omega_n=east * OMEGA_E), [0.0, 0.0, 1e-6 * OMEGA_E / level_rate], atol=1e-11
-    )
+    turned = [0.0, 0.0, 1e-6 * OMEGA_E / level_rate]
+    np.testing.assert_allclose(error(d_omega_n=east * OMEGA_E), turned, atol=1e-11)
     for harmless in (north, down):
         np.testing.assert_allclose(error(d_omega_n=harmless * OMEGA_E), np.zeros(3), atol=1e-11)
 
@@ -135,9 +129,8 @@ def test_error_formulas_of_the_books(lat):
 def test_heading_sigma_of_a_good_gyro():
     omega, f = at_rest(np.eye(3))
     got = gyrocompass(omega, f, LAT, 0.01 * DEG_H, 0.0)
-    np.testing.assert_allclose(
-        np.sqrt(got.covariance[2, 2]), 0.01 * DEG_H / (OMEGA_E * np.cos(LAT)), rtol=1e-12
-    )
+    expected = 0.01 * DEG_H / (OMEGA_E * np.cos(LAT))
+    np.testing.assert_allclose(np.sqrt(got.covariance[2, 2]), expected, rtol=1e-12)
     np.testing.assert_allclose(got.covariance[:2, :2], 0.0, atol=1e-30)
     # The figure in the head of the module.
     at_45 = gyrocompass(*at_rest(np.eye(3), np.pi / 4), np.pi / 4, 0.01 * DEG_H, 0.0)

@@ -20,9 +20,8 @@ def test_every_increment_is_used_once_in_its_block(stream):
     increments, time = stream
     epochs = time[[49, 99, 250, 399]]
     blocks = cut(increments, time, 0.0, epochs)
-    np.testing.assert_array_equal(
-        blocks.parent[blocks.parent >= 0], np.arange(400), "increments out of order"
-    )
+    in_order = blocks.parent[blocks.parent >= 0]
+    np.testing.assert_array_equal(in_order, np.arange(400), "increments out of order")
     assert np.sum(blocks.increments.dt) == pytest.approx(time[-1], abs=1e-12)
     np.testing.assert_array_equal(blocks.increments.theta[0, :50], increments.theta[:50])
     np.testing.assert_array_equal(blocks.increments.dv[2, :151], increments.dv[100:251])

@@ -17,6 +17,8 @@ rng = np.random.default_rng(1)
 Q = rng.normal(size=(200, 4))
 Q /= np.linalg.norm(Q, axis=1, keepdims=True)
 V = rng.normal(size=(200, 3)) * 10.0 ** rng.uniform(-300, 300, (200, 3))
+TIME, AT_ZERO = np.arange(200, dtype=np.int64), np.zeros((3, 200))  # latitude, longitude, height
+MIXED = pytest.mark.parametrize(("nav", "body"), [("ENU", "FRD"), ("NED", "RFU")])
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -47,27 +49,16 @@ def test_swapped_quaternion_is_the_matrix_between_swapped_axes():
 
 
 def trajectory() -> Trajectory:
-    n = len(Q)
-    return Trajectory(
-        time_ns=np.arange(n, dtype=np.int64),
-        lat_rad=np.zeros(n),
-        lon_rad=np.zeros(n),
-        alt_m=np.zeros(n),
-        v_n=V,
-        q_nb=Q,
-    )
+    return Trajectory(TIME, *AT_ZERO, v_n=V, q_nb=Q)
 
 
 def tables():
-    n = len(Q)
-    time = np.arange(n, dtype=np.int64)
-    zero = np.zeros(n)
-    yield ImuTable(time, V, V[::-1], "rate")
-    yield GnssTable(time, zero, zero, zero, np.abs(V), V, np.abs(V[::-1]))
-    yield GnssTable(time, zero, zero, zero, np.abs(V))
+    yield ImuTable(TIME, V, V[::-1], "rate")
+    yield GnssTable(TIME, *AT_ZERO, np.abs(V), V, np.abs(V[::-1]))
+    yield GnssTable(TIME, *AT_ZERO, np.abs(V))
     yield trajectory()
-    yield MagTable(time, V)
-    yield AttitudeTable(time, Q, moving=V[:, 0] > 0.0)
+    yield MagTable(TIME, V)
+    yield AttitudeTable(TIME, Q, moving=V[:, 0] > 0.0)
 
 
 @pytest.mark.parametrize("table", list(tables()), ids=lambda t: type(t).__name__)
@@ -94,7 +85,7 @@ def test_a_field_is_relabelled_with_its_axes():
     np.testing.assert_array_equal(there.field_t, V[:, [1, 0, 2]] * [1, 1, -1])
 
 
-@pytest.mark.parametrize(("nav", "body"), [("ENU", "FRD"), ("NED", "RFU")])
+@MIXED
 def test_mixed_attitudes_are_those_of_a_trajectory(nav, body):
     mixed = replace(trajectory(), nav=nav, body=body)
     bare = AttitudeTable(mixed.time_ns, mixed.q_nb, nav=nav, body=body)
@@ -102,16 +93,15 @@ def test_mixed_attitudes_are_those_of_a_trajectory(nav, body):
         np.testing.assert_array_equal(turn(bare).q_nb, turn(mixed).q_nb)
 
 
-@pytest.mark.parametrize(("nav", "body"), [("ENU", "FRD"), ("NED", "RFU")])
+@MIXED
 def test_mixed_trajectory_against_matrices(nav, body):
     mixed = replace(trajectory(), nav=nav, body=body)
     C = np.asarray(rotation.to_dcm(jnp.asarray(Q)))
     expected = C @ T.T if body == "RFU" else T @ C  # what NED/FRD would read
-    got = np.asarray(rotation.to_dcm(jnp.asarray(frames.to_ned_frd(mixed).q_nb)))
-    np.testing.assert_allclose(got, expected, rtol=0, atol=4e-15)
-    np.testing.assert_array_equal(
-        frames.to_ned_frd(mixed).v_n, V if nav == "NED" else frames.swap(V)
-    )
+    got = frames.to_ned_frd(mixed)
+    C_ned_frd = rotation.to_dcm(jnp.asarray(got.q_nb))
+    np.testing.assert_allclose(C_ned_frd, expected, rtol=0, atol=4e-15)
+    np.testing.assert_array_equal(got.v_n, V if nav == "NED" else frames.swap(V))
 
 
 def test_angles_of_an_enu_attitude_from_its_axes():
@@ -128,8 +118,5 @@ def test_yaw_turns_against_heading():
     heading = np.deg2rad([0.0, 10.0, 90.0, 179.0, 181.0, 350.0])
     yaw = np.rad2deg(np.asarray(frames.yaw_from_heading(heading)))
     np.testing.assert_allclose(yaw, [0.0, -10.0, -90.0, -179.0, 179.0, 10.0], atol=1e-13)
-    np.testing.assert_allclose(
-        np.asarray(frames.yaw_from_heading(frames.yaw_from_heading(heading))),
-        np.asarray(frames.wrap(heading)),
-        atol=1e-15,
-    )
+    again = frames.yaw_from_heading(frames.yaw_from_heading(heading))
+    np.testing.assert_allclose(again, frames.wrap(heading), atol=1e-15)

@@ -73,9 +73,8 @@ def test_a_data_sheet_becomes_si():
 
 def test_names_of_the_white_noise():
     a = ImuErrorModel.from_datasheet({"arw": "0.6 deg/sqrt(h)"}, {"vrw": "0.06 m/s/sqrt(h)"})
-    b = ImuErrorModel.from_datasheet(
-        {"noise": "0.01 deg/s/sqrt(Hz)"}, {"noise": "0.001 m/s^2/sqrt(Hz)"}
-    )
+    given = {"noise": "0.01 deg/s/sqrt(Hz)"}, {"noise": "0.001 m/s^2/sqrt(Hz)"}
+    b = ImuErrorModel.from_datasheet(*given)
     np.testing.assert_allclose(a.gyro.white, b.gyro.white, rtol=1e-14)
     np.testing.assert_allclose(a.accel.white, b.accel.white, rtol=1e-14)
 
@@ -196,9 +195,8 @@ def test_allan_curves_of_the_other_terms_and_their_sum():
         second_difference / (2.0 * tau**2),
     )
     # Neighbouring means of a ramp differ by slope * tau.
-    np.testing.assert_allclose(
-        allan_deviation(TriadErrors(ramp=-0.2), tau)[:, 2], 0.2 * tau / np.sqrt(2.0)
-    )
+    of_ramp = allan_deviation(TriadErrors(ramp=-0.2), tau)[:, 2]
+    np.testing.assert_allclose(of_ramp, 0.2 * tau / np.sqrt(2.0))
     parts = [
         {"white": [1.0, 2.0, 3.0]},
         {"walk": 0.2},
@@ -216,11 +214,9 @@ def test_the_markov_curve_at_short_times_is_that_of_the_random_walk():
     errors = TriadErrors(markov_sigma=2.0, markov_tau_s=1e5)
     walk = TriadErrors(walk=2.0 * np.sqrt(2.0 / 1e5))
     tau = np.array([0.01, 1.0, 9.9, 10.1, 100.0])
-    np.testing.assert_allclose(
-        allan_deviation(errors, tau) / allan_deviation(walk, tau),
-        np.sqrt(1.0 - 0.75e-5 * tau[:, None] + 0.35e-10 * tau[:, None] ** 2) * np.ones(3),
-        rtol=1e-7,
-    )
+    ratio = allan_deviation(errors, tau) / allan_deviation(walk, tau)
+    series = np.sqrt(1.0 - 0.75e-5 * tau + 0.35e-10 * tau**2)
+    np.testing.assert_allclose(ratio, np.tile(series[:, None], 3), rtol=1e-7)
 
 
 def test_mean_sigma_from_autocovariances():
@@ -231,18 +227,15 @@ def test_mean_sigma_from_autocovariances():
         return np.sqrt(2.0 * area) / duration
 
     markov = TriadErrors(markov_sigma=3.0, markov_tau_s=5.0)
-    np.testing.assert_allclose(
-        mean_sigma(markov, duration), mean_of(lambda s, t: 9.0 * np.exp(-(t - s) / 5.0)), rtol=1e-8
-    )
+    fading = mean_of(lambda s, t: 9.0 * np.exp(-(t - s) / 5.0))
+    np.testing.assert_allclose(mean_sigma(markov, duration), fading, rtol=1e-8)
     walk = TriadErrors(walk=2.0)
     np.testing.assert_allclose(mean_sigma(walk, duration), mean_of(lambda s, t: 4.0 * s), rtol=1e-8)
-    sum_of = TriadErrors(
-        markov_sigma=3.0, markov_tau_s=5.0, walk=2.0, bias_sigma=[1.0, 0.0, 2.0], bias=9.0
-    )
-    np.testing.assert_allclose(
-        mean_sigma(sum_of, duration) ** 2,
-        mean_sigma(markov, duration) ** 2 + mean_sigma(walk, duration) ** 2 + [1.0, 0.0, 4.0],
-    )
+    more = {"walk": 2.0, "bias_sigma": [1.0, 0.0, 2.0], "bias": 9.0}
+    sum_of = TriadErrors(markov_sigma=3.0, markov_tau_s=5.0, **more)
+    squares = mean_sigma(markov, duration) ** 2 + mean_sigma(walk, duration) ** 2
+    wanted = squares + np.array([1.0, 0.0, 4.0])
+    np.testing.assert_allclose(mean_sigma(sum_of, duration) ** 2, wanted)
     np.testing.assert_allclose(mean_sigma(TriadErrors(white=2.0), 16.0), 0.5)
     np.testing.assert_allclose(mean_sigma(TriadErrors(quantum=6.0), 2.0), np.sqrt(6.0) / 2.0)
     with pytest.raises(ValueError, match="duration_s must be a positive number"):

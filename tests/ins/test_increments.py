@@ -25,9 +25,8 @@ class Coning:
 
     def attitude(self, t):
         phase = self.w * t
-        return Rotation.from_rotvec(
-            self.a * np.stack([np.cos(phase), np.sin(phase), 0.0 * phase], -1)
-        )
+        axis = np.stack([np.cos(phase), np.sin(phase), 0.0 * phase], -1)
+        return Rotation.from_rotvec(self.a * axis)
 
     def rate(self, t):
         phase, s, c = self.w * t, np.sin(self.a), np.cos(self.a)
@@ -44,11 +43,8 @@ class Coning:
             return ImuTable(time_ns, self.rate(t), self.force(t), "rate")
         dt = np.append(np.diff(t)[:1], np.diff(t))
         at = (t - 0.5 * dt)[:, None] + 0.5 * dt[:, None] * NODES
-        gyro, accel = (
-            0.5 * dt[:, None] * np.einsum("nkj,k->nj", f(at), WEIGHTS)
-            for f in (self.rate, self.force)
-        )
-        return ImuTable(time_ns, gyro, accel, "increment")
+        means = (0.5 * np.einsum("nkj,k->nj", f(at), WEIGHTS) for f in (self.rate, self.force))
+        return ImuTable(time_ns, *(dt[:, None] * mean for mean in means), "increment")
 
     def motion(self, t0, t1):
         """Rotation, velocity and displacement from t0 to t1 in the axes at t0, by quadrature."""
@@ -58,11 +54,8 @@ class Coning:
         start = self.attitude(np.array(t0)).inv()
         force = (start * self.attitude(at.ravel())).apply(self.force(at.ravel()))
         weights = half * np.tile(WEIGHTS, len(at))
-        return (
-            (start * self.attitude(np.array(t1))).as_rotvec(),
-            weights @ force,
-            (weights * (t1 - at.ravel())) @ force,
-        )
+        turned = (start * self.attitude(np.array(t1))).as_rotvec()
+        return turned, weights @ force, (weights * (t1 - at.ravel())) @ force
 
 
 def joined_error(body, t, kind):
@@ -102,11 +95,8 @@ def test_constant_rate_and_force_in_closed_form():
     K = np.cross(np.eye(3), omega) / w  # cross product with the axis
     x = w * h
     dv = h * (np.eye(3) + (1 - np.cos(x)) / x * K + (1 - np.sin(x) / x) * K @ K) @ f
-    dr = (
-        h**2
-        * (0.5 * np.eye(3) + (x - np.sin(x)) / x**2 * K + (0.5 - (1 - np.cos(x)) / x**2) * K @ K)
-        @ f
-    )
+    once, twice = (x - np.sin(x)) / x**2, 0.5 - (1 - np.cos(x)) / x**2
+    dr = h**2 * (0.5 * np.eye(3) + once * K + twice * K @ K) @ f
     for imu in (
         ImuTable(time_ns, np.tile(omega, (n, 1)), np.tile(f, (n, 1)), "rate"),
         ImuTable(time_ns, np.tile(omega * h, (n, 1)), np.tile(f * h, (n, 1)), "increment"),
@@ -158,27 +148,21 @@ def test_coning_drift_stays_at_its_bound(hz, samples):
 
 def test_a_gap_in_rates_is_bridged_by_a_straight_line():
     t = np.concatenate([np.arange(10), np.arange(300, 310)]) * 0.01
-    imu = ImuTable(
-        (t * 1e9).astype(np.int64),
-        np.sin(50 * t)[:, None] * [1, 0, 0],
-        0 * t[:, None] + [0, 0, 1.0],
-        "rate",
-    )
+    gyro, accel = np.sin(50 * t)[:, None] * [1, 0, 0], np.tile([0, 0, 1.0], (20, 1))
+    imu = ImuTable((t * 1e9).astype(np.int64), gyro, accel, "rate")
     inc, _ = from_imu(imu)
     mean = 0.5 * (imu.gyro[9] + imu.gyro[10])
     np.testing.assert_allclose(inc.theta[9], mean * (t[10] - t[9]), atol=1e-12)
 
 
 def test_rfu_tables_give_the_same_increments():
-    body = Coning(0.1, 3.0)
-    imu = body.imu(np.arange(50) / 50.0, "increment")
+    imu = Coning(0.1, 3.0).imu(np.arange(50) / 50.0, "increment")
     for ours, theirs in zip(from_imu(imu)[0], from_imu(to_enu_rfu(imu))[0], strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
 def test_thinned_increments_are_compositions():
-    body = Coning(0.2, 4.0)
-    inc, end_ns = from_imu(body.imu(np.arange(24) / 50.0, "increment"))
+    inc, end_ns = from_imu(Coning(0.2, 4.0).imu(np.arange(24) / 50.0, "increment"))
     joined, joined_ns = thin(inc, end_ns, 5)
     np.testing.assert_array_equal(joined_ns, end_ns[[4, 9, 14, 19, 22]])
     np.testing.assert_allclose(joined.dt, [0.1] * 4 + [0.06], atol=1e-15)
@@ -198,13 +182,12 @@ def at_row(k, value):
     return lambda a: np.where(np.arange(len(a))[:, None] == k, value, a)
 
 
+NAMES = ("time_ns", "gyro", "accel")
 BAD = {
     "time stands still or runs backwards at line 13": {"time_ns": lambda t: t - 50 * (t > 2)},
     "gyro in line 14 is .*nan": {"gyro": at_row(4, np.nan)},
     "accel in line 11 is .*inf": {"accel": at_row(1, np.inf)},
-    r"1 sample\(s\); an interval needs two": dict.fromkeys(
-        ("time_ns", "gyro", "accel"), lambda a: a[:1]
-    ),
+    r"1 sample\(s\); an interval needs two": dict.fromkeys(NAMES, lambda a: a[:1]),
     r"gyro has shape \(5, 3\), not \(6, 3\)": {"gyro": lambda g: g[:5]},
 }
 
@@ -222,8 +205,7 @@ def test_bad_tables_are_refused_by_name_and_line(message):
 
 def without(imu, lost):
     keep = ~np.isin(np.arange(len(imu)), lost)
-    names = ("time_ns", "gyro", "accel")
-    return replace(imu, **{name: getattr(imu, name)[keep] for name in names})
+    return replace(imu, **{name: getattr(imu, name)[keep] for name in NAMES})
 
 
 @pytest.mark.parametrize(

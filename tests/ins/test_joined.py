@@ -1,7 +1,5 @@
 """Increments joined inside compiled code, against NumPy and against navigating sample by sample."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,24 +32,21 @@ SAMPLES = sampled()
 ONE_S = Increments(*(a[:RATE_HZ] for a in SAMPLES))
 
 
-@pytest.fixture(scope="module")
-def join():
-    return jax.jit(joined)
+join = jax.jit(joined)
 
 
 @pytest.mark.parametrize("shifts", [True, False], ids=["with dr", "without dr"])
-def test_joined_is_what_numpy_composes(join, shifts):
+def test_joined_is_what_numpy_composes(shifts):
     given = ONE_S if shifts else ONE_S._replace(dr=None)
     want, _ = thin(given, np.arange(RATE_HZ), RATE_HZ)
     got = join(given)
     assert float(got.dt) == pytest.approx(float(want.dt[0]), rel=1e-14)
     for name in ("theta", "dv", "dr"):
-        np.testing.assert_allclose(
-            getattr(got, name), getattr(want, name)[0], rtol=1e-12, atol=1e-14, err_msg=name
-        )
+        mine, theirs = getattr(got, name), getattr(want, name)[0]
+        np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-14, err_msg=name)
 
 
-def test_many_intervals_are_mapped(join):
+def test_many_intervals_are_mapped():
     blocks = Increments(*(a.reshape(SPANS, RATE_HZ, *a.shape[1:]) for a in SAMPLES))
     got = jax.vmap(join)(blocks)
     want, _ = thin(SAMPLES, np.arange(len(SAMPLES.dt)), RATE_HZ)
@@ -63,7 +58,7 @@ def test_many_intervals_are_mapped(join):
         np.testing.assert_allclose(a, b[0], rtol=1e-12, atol=1e-13)
 
 
-def test_one_step_over_a_second_leads_where_its_samples_lead(join):
+def test_one_step_over_a_second_leads_where_its_samples_lead():
     start = Nav(
         Rotation(from_euler(*jnp.asarray([0.1, -0.2, 2.0]))),
         jnp.array([30.0, -20.0, 1.0]),
@@ -88,7 +83,7 @@ def test_one_step_over_a_second_leads_where_its_samples_lead(join):
     assert np.linalg.norm(off) > 100 * np.linalg.norm(shift)
 
 
-def test_gradients_are_finite_where_nothing_turns(join):
+def test_gradients_are_finite_where_nothing_turns():
     def moved(theta):
         still = Increments(jnp.full(5, 0.1), theta, jnp.ones((5, 3)))
         return jnp.sum(join(still).dr) + jnp.sum(join(still).theta)
@@ -96,5 +91,5 @@ def test_gradients_are_finite_where_nothing_turns(join):
     slope = jax.jit(jax.grad(moved))(jnp.zeros((5, 3)))
     assert np.all(np.isfinite(slope))
     # a small turn of the k-th sample turns the sum by as much
-    difference = partial(moved)(1e-6 * jnp.eye(3)[:1].repeat(5, 0)) - moved(jnp.zeros((5, 3)))
+    difference = moved(1e-6 * jnp.eye(3)[:1].repeat(5, 0)) - moved(jnp.zeros((5, 3)))
     assert float(difference) == pytest.approx(1e-6 * float(jnp.sum(slope[:, 0])), rel=1e-4)

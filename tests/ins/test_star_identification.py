@@ -139,10 +139,8 @@ def test_the_table_of_pairs_holds_each_pair_in_the_field_and_finds_every_range()
     few = synthetic(4.0)
     index = index_pairs(few, FIELD)
     i, j = np.triu_indices(len(few.unit_i), 1)
-    angle = np.arctan2(
-        np.linalg.norm(np.cross(few.unit_i[i], few.unit_i[j]), axis=1),
-        np.sum(few.unit_i[i] * few.unit_i[j], 1),
-    )
+    a, b = few.unit_i[i], few.unit_i[j]
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, 1))
     within = angle < FIELD
     every = sorted(zip(i[within], j[within], strict=True))
     assert sorted(zip(index.first, index.second, strict=True)) == every

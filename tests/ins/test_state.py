@@ -24,9 +24,8 @@ def test_states_without_scales_are_a_part_of_those_with():
     _, Phi_small, L_small = linear(small, block(violent), noise, 4)
     np.testing.assert_allclose(Phi_small, Phi[:15, :15], rtol=1e-12, atol=1e-18)
     weight = np.outer(SIZE[:15], SIZE[:15])
-    np.testing.assert_allclose(
-        L_small @ L_small.T / weight, (L @ L.T)[:15, :15] / weight, rtol=1e-9, atol=1e-18
-    )
+    Q_small, Q = L_small @ L_small.T / weight, (L @ L.T)[:15, :15] / weight
+    np.testing.assert_allclose(Q_small, Q, rtol=1e-9, atol=1e-18)
 
 
 @jax.jit
@@ -129,11 +128,8 @@ def test_blocks_steps_and_zeros_agree():
         y = one(y, jax.tree.map(lambda a, k=k: a[k], increments), NOISE)
     for a, b in zip(jax.tree.leaves(y), jax.tree.leaves(end), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
-    for a, b in zip(
-        jax.tree.leaves(linear(x, padded(increments), NOISE, 4)[0]),
-        jax.tree.leaves(moved(x, increments, NOISE)),
-        strict=True,
-    ):
+    ends = linear(x, padded(increments), NOISE, 4)[0], moved(x, increments, NOISE)
+    for a, b in zip(*map(jax.tree.leaves, ends), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 

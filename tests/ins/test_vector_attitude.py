@@ -119,13 +119,11 @@ def test_the_covariance_is_that_of_many_draws():
         # Whitened by what each run says of itself, all is of variance one and unrelated.
         roots = np.linalg.cholesky(np.linalg.inv(found[name].covariance))
         white = np.einsum("kji,kj->ki", roots, error)
-        np.testing.assert_allclose(
-            white.T @ white / runs, np.eye(3), atol=5.0 * (2.0 / runs) ** 0.5
-        )
+        near = 5.0 * (2.0 / runs) ** 0.5
+        np.testing.assert_allclose(white.T @ white / runs, np.eye(3), atol=near)
     # TRIAD took stars 2 and, farthest from it, 3: better told than with the worst two.
-    assert np.all(
-        np.linalg.eigvalsh(found["triad"].covariance - found["quest"].covariance) > -1e-16
-    )
+    more = found["triad"].covariance - found["quest"].covariance
+    assert np.all(np.linalg.eigvalsh(more) > -1e-16)
 
 
 @pytest.mark.parametrize("noise", [0.0, SIGMA])

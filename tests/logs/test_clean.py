@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_logs import rows_of, with_gnss, with_imu
 
-from robins.dataset import (
-    AttitudeTable,
-    Dataset,
-    GnssTable,
-    ImuTable,
-    MagTable,
-    Trajectory,
-)
+from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs import LogError, Mounting, clean, load_dataset
 
 N = 200
@@ -159,9 +152,7 @@ def test_a_clean_log_passes_bit_by_bit_and_all_reasons_are_listed():
 
 
 def test_cleaning_twice_changes_nothing_and_keeps_the_counts():
-    gyro = IMU.gyro.copy()
-    gyro[7, 1] = np.nan
-    once = clean(dataclasses.replace(with_imu(DATA, gyro=gyro), counts={"imu_nan": 2, "late": 5}))
+    once = cleaned(imu=put(IMU, "gyro", (7, 1), np.nan), counts={"imu_nan": 2, "late": 5})
     twice = clean(once)
     assert refused(once.counts) == {"imu_nan": 3, "late": 5}
     assert twice.counts == once.counts
@@ -191,30 +182,24 @@ def test_denormals_and_large_but_possible_numbers_pass():
     assert_same(got.imu, dataclasses.replace(IMU, gyro=gyro, accel=accel))
 
 
-def test_a_clock_set_back_is_refused_until_time_passes_and_declared_as_a_gap():
+@pytest.mark.parametrize(
+    ("rows", "step_ns", "lost", "counts", "gaps"),
+    [
+        (slice(120, N), -100_000_000, slice(120, 140), {"duplicate": 1, "backward": 19}, [119]),
+        (slice(60, N), -(10**17), slice(60), {"ahead": 60}, []),
+        (slice(50, 51), 3600 * 10**9, slice(50, 51), {"ahead": 1}, []),
+    ],
+    ids=["set back", "a restart", "a lone stamp in the future"],
+)
+def test_a_clock_that_steps_costs_the_shorter_part(rows, step_ns, lost, counts, gaps):
+    """Where it is set back, time is refused until it passes, and declared as a gap."""
     time_ns = IMU.time_ns.copy()
-    time_ns[120:] -= 20 * 5_000_000
+    time_ns[rows] += step_ns
     got = clean(with_imu(DATA, time_ns=time_ns))
-    keep = np.r_[0:120, 140:N]
+    keep = np.delete(np.arange(N), lost)
     assert_same(got.imu, rows_of(dataclasses.replace(IMU, time_ns=time_ns), keep))
-    assert refused(got.counts) == {"imu_duplicate": 1, "imu_backward": 19}
-    assert got.imu_gaps == [(time_ns[119], time_ns[140])]
-
-
-def test_a_restart_costs_the_shorter_part_never_everything_after_it():
-    time_ns = IMU.time_ns.copy()
-    time_ns[60:] -= 10**17
-    got = clean(with_imu(DATA, time_ns=time_ns))
-    assert_same(got.imu, rows_of(dataclasses.replace(IMU, time_ns=time_ns), slice(60, None)))
-    assert refused(got.counts) == {"imu_ahead": 60}
-
-
-def test_a_lone_stamp_in_the_future_costs_itself():
-    time_ns = IMU.time_ns.copy()
-    time_ns[50] += 3600 * 10**9
-    got = clean(with_imu(DATA, time_ns=time_ns))
-    assert_same(got.imu, rows_of(IMU, np.arange(N) != 50))
-    assert refused(got.counts) == {"imu_ahead": 1}
+    assert refused(got.counts) == {f"imu_{reason}": n for reason, n in counts.items()}
+    assert got.imu_gaps == [(time_ns[before], time_ns[lost.stop]) for before in gaps]
 
 
 @pytest.mark.parametrize(
@@ -230,17 +215,14 @@ def test_gaps_are_declared(kind, lost, declared):
 
 
 def test_ten_nan_in_a_row_are_one_gap():
-    gyro = IMU.gyro.copy()
-    gyro[40:50] = np.nan
-    got = clean(with_imu(DATA, gyro=gyro))
+    got = cleaned(imu=put(IMU, "gyro", slice(40, 50), np.nan))
     assert refused(got.counts) == {"imu_nan": 10}
     assert got.imu_gaps == [(IMU.time_ns[39], IMU.time_ns[50])]
 
 
 def test_nan_for_ever_is_refused_with_the_reason():
-    with pytest.raises(
-        LogError, match=r"imu.csv: fewer than two of 200 .*\(refused: 200 nan\); the"
-    ):
+    message = r"imu.csv: fewer than two of 200 .*\(refused: 200 nan\); the"
+    with pytest.raises(LogError, match=message):
         clean(with_imu(DATA, gyro=np.full((N, 3), np.nan)))
 
 
@@ -249,34 +231,21 @@ def test_nan_for_ever_is_refused_with_the_reason():
 
 @given(st.integers(0, M - 1), st.integers(0, 5), st.sampled_from([np.nan, np.inf, -np.inf, 1e300]))
 def test_one_bad_gnss_component_leaves_the_others(at, axis, bad):
-    names = ["lat_rad", "lon_rad", "alt_m"]
-    if axis < 3:
-        column = getattr(GNSS, names[axis]).copy()
-        column[at] = bad
-        got = clean(with_gnss(DATA, **{names[axis]: column}))
-        expected = column.copy()
-        expected[at] = np.nan
-        np.testing.assert_array_equal(getattr(got.gnss, names[axis]), expected)
-    else:
-        v_n = GNSS.v_n.copy()
-        v_n[at, axis - 3] = bad
-        got = clean(with_gnss(DATA, v_n=v_n))
-        v_n[at, axis - 3] = np.nan
-        np.testing.assert_array_equal(got.gnss.v_n, v_n)
+    name = ("lat_rad", "lon_rad", "alt_m", "v_n", "v_n", "v_n")[axis]
+    place = at if axis < 3 else (at, axis - 3)
+    got = cleaned(gnss=put(GNSS, name, place, bad))
     reason = "nan" if np.isnan(bad) else "inf" if np.isinf(bad) else "absurd"
     assert refused(got.counts) == {f"gnss_{reason}": 1}
-    for name in (*names, "sigma_m", "sigma_v"):
-        if axis >= 3 or name != names[axis]:
-            np.testing.assert_array_equal(getattr(got.gnss, name), getattr(GNSS, name))
+    expected = put(GNSS, name, place, np.nan)
+    for name in ("lat_rad", "lon_rad", "alt_m", "v_n", "sigma_m", "sigma_v"):
+        np.testing.assert_array_equal(getattr(got.gnss, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize(
     ("bad", "reason"), [(0.0, "sigma"), (-1.0, "sigma"), (np.nan, "nan"), (np.inf, "inf")]
 )
 def test_a_component_without_a_usable_sigma_is_missing(bad, reason):
-    sigma = GNSS.sigma_m.copy()
-    sigma[4, 2] = bad
-    got = clean(with_gnss(DATA, sigma_m=sigma))
+    got = cleaned(gnss=put(GNSS, "sigma_m", (4, 2), bad))
     assert np.flatnonzero(np.isnan(got.gnss.alt_m)).tolist() == [4]
     assert np.all(got.gnss.sigma_m > 0)
     assert refused(got.counts) == {f"gnss_{reason}": 1}
@@ -293,10 +262,7 @@ def test_a_component_without_a_usable_sigma_is_missing(bad, reason):
             {"sigma_v": -GNSS.sigma_v},
             r"sigma of north velocity = -0.05: .*real sigmas, or leave the velocities out",
         ),
-        (
-            {"sigma_v": GNSS.sigma_v * np.nan},
-            r"sigma of north velocity = nan: .* no positive sigma",
-        ),
+        ({"sigma_v": GNSS.sigma_v * np.nan}, "sigma of north velocity = nan: .* no positive sigma"),
         (
             {"sigma_m": GNSS.sigma_m * [1, 1, 0]},
             r"sigma of vertical position = 0.0: .*; zero means unknown, not exact: give real",
@@ -379,16 +345,10 @@ def test_other_arrays_of_numbers_give_the_same(kind):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"gyro": np.full((N, 3), None)},
-            r"imu.csv: gyro: holds object, not real numbers; give",
-        ),
+        ({"gyro": np.full((N, 3), None)}, r"imu.csv: gyro: holds object, not real numbers; give"),
         ({"gyro": IMU.gyro.astype(str)}, r"gyro: holds <U32, not real numbers"),
         ({"accel": IMU.accel.astype(complex)}, r"accel: holds complex128, not real"),
-        (
-            {"accel": IMU.accel[:-1]},
-            r"accel: has shape \(199, 3\) where \(200, 3\) is needed; one",
-        ),
+        ({"accel": IMU.accel[:-1]}, r"accel: has shape \(199, 3\) where \(200, 3\) is needed; one"),
         ({"accel": IMU.accel[:, :2]}, r"shape \(200, 2\)"),
         ({"time_ns": IMU.time_ns * 1e-9}, r"time_ns: is float64 of .*; give time as int64 nano"),
         ({"rows": IMU.rows[:5]}, r"rows: has shape \(5,\)"),

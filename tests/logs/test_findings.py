@@ -52,11 +52,7 @@ STEPS = "time,dt,theta_x,theta_y,theta_z,dv_x,dv_y,dv_z\n"
 FILES = (
     ("ends_early", "warning line 20: the last line has no line end", KFGINS_IMU[:-5]),
     ("begins_midway", "warning line 1: has fewer fields than the next", KFGINS_IMU[15:]),
-    (
-        "no_place",
-        "note: positions are local metres",
-        EUROC_TRUTH,
-    ),
+    ("no_place", "note: positions are local metres", EUROC_TRUTH),
     (
         "no_velocity",
         "note: RTKLIB did not solve for them; they are left out",

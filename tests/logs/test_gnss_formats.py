@@ -10,8 +10,11 @@ HEADER = (
 )
 VELOCITY = " vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun"
 FIX = "2025/08/28 17:30:39.749 40.5 -105.25 1601.435 {q} 25 0.01 0.02 0.03 0 0 0 0 9.9"
+PLACES = "% GPST latitude(deg) longitude(deg) height(m) Q ns"
 SPEED = " 1.5 -2.5 0.25 0.04 0.05 0.06 0 0 0"
-GPST_NS = 1756402239749000000
+CLOCK, GPST_NS = "17:30:39.749", 1756402239749000000
+FLOAT = FIX.format(q=2)
+IN_WEEKS = FLOAT.replace(f"2025/08/28 {CLOCK}", "2381 408639.749")
 
 
 @pytest.fixture
@@ -25,9 +28,8 @@ def pos(tmp_path):
 
 
 def test_rtklib_in_north_east_down(pos):
-    gnss = open_log(
-        pos("% program : RTKLIB", HEADER + VELOCITY, FIX.format(q=1) + SPEED), findings=[]
-    )
+    path = pos("% program : RTKLIB", HEADER + VELOCITY, FIX.format(q=1) + SPEED)
+    gnss = open_log(path, findings=[])
     assert gnss.time_ns.tolist() == [GPST_NS]
     assert np.rad2deg([gnss.lat_rad[0], gnss.lon_rad[0]]) == pytest.approx([40.5, -105.25], 1e-15)
     assert gnss.alt_m.tolist() == [1601.435]
@@ -52,17 +54,12 @@ def test_rtklib_without_velocities_or_with_none_that_were_solved(pos, header, li
 @pytest.mark.parametrize(
     ("header", "line"),
     [
-        (HEADER, FIX.format(q=2).replace(" ", ",", 20).replace("28,17", "28 17")),
-        (HEADER, FIX.format(q=2).replace("2025/08/28 17:30:39.749", "2381 408639.749")),
-        (
-            HEADER,
-            FIX.format(q=2)
-            .replace("2025/08/28 17:30:39.749 ", "2381,408639.749,")
-            .replace(" ", ","),
-        ),
-        (HEADER.replace("GPST", "UTC"), FIX.format(q=2).replace("17:30:39.749", "17:30:21.749")),
-        ("% no names of columns", FIX.format(q=2)),
-        ("% no names of columns", FIX.format(q=2) + SPEED),
+        (HEADER, FLOAT.replace(" ", ",", 20).replace("28,17", "28 17")),
+        (HEADER, IN_WEEKS),
+        (HEADER, IN_WEEKS.replace(" ", ",")),
+        (HEADER.replace("GPST", "UTC"), FLOAT.replace(CLOCK, "17:30:21.749")),
+        ("% no names of columns", FLOAT),
+        ("% no names of columns", FLOAT + SPEED),
     ],
     ids=["commas", "week", "week with commas", "utc", "nameless", "nameless with velocity"],
 )
@@ -86,20 +83,11 @@ def test_columns_are_found_by_name(pos):
     [
         (["% GPST x-ecef(m) y-ecef(m) z-ecef(m) Q ns", "2381 1 1 2 3 1 25"], r"line 1: .* X, Y, Z"),
         (["% GPST e-baseline(m) n-baseline(m) u-baseline(m) Q ns", "2381 1 1 2"], r"baselines"),
-        (
-            ["% GPST latitude(d'\") longitude(d'\") height(m) Q ns", "2381 1 40 30 0"],
-            "degrees, min",
-        ),
-        (["% JST latitude(deg) longitude(deg) height(m) Q ns", "2381 1 40 30 0"], "Japan standard"),
+        ([PLACES.replace("deg", "d'\""), "2381 1 40 30 0"], "degrees, min"),
+        ([PLACES.replace("GPST", "JST"), "2381 1 40 30 0"], "Japan standard"),
         ([HEADER], r"holds no solution: header only; was any epoch solved"),
-        (
-            ["% GPST latitude(deg) longitude(deg) height(m) Q ns", "2381 1 40 30 0 1 5"],
-            "no column sdn",
-        ),
-        (
-            [HEADER, FIX.replace("17:30:39.749", "25:30:39")],
-            r"line 2: time = '2025/08/28 25:30:39': is",
-        ),
+        ([PLACES, "2381 1 40 30 0 1 5"], "no column sdn"),
+        ([HEADER, FIX.replace(CLOCK, "25:30:39")], r"line 2: time = '2025/08/28 25:30:39': is"),
         ([HEADER, FIX.replace("-105.25", "W105")], r"line 2: longitude = 'W105': is not a number"),
     ],
 )

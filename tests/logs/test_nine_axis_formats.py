@@ -186,10 +186,7 @@ def test_damage_is_refused_or_touches_no_number(tmp_path):
 def test_more_numbers_than_the_header_says_are_refused(tmp_path):
     """Nothing is read past what an array says of itself, and nothing is left over."""
     file = io.BytesIO()
-    with (
-        zipfile.ZipFile(io.BytesIO(archive(ARRAYS))) as old,
-        zipfile.ZipFile(file, "w") as new,
-    ):
+    with zipfile.ZipFile(io.BytesIO(archive(ARRAYS))) as old, zipfile.ZipFile(file, "w") as new:
         for name in old.namelist():
             more = b"\0" * 24 if name == "imu_mag.npy" else b""
             new.writestr(name, old.read(name) + more)

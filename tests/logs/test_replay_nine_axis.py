@@ -61,10 +61,7 @@ def test_field_and_attitude_arrive_clean_and_turned(tmp_path, seen):
     field_enu = mean + 2.0 * np.cross(v, np.cross(v, mean) + w * mean)
     np.testing.assert_allclose(field_enu * 1e6, FIELD_ENU_UT, atol=0.1)
     assert {f.severity for f in told} <= {"warning", "note"}
-    assert (found.scenario, found.metrics) == (
-        "compass/trial",
-        {"plain": {"total_rmse_deg": 1.0}},
-    )
+    assert (found.scenario, found.metrics) == ("compass/trial", {"plain": {"total_rmse_deg": 1.0}})
 
 
 def test_what_the_doctor_calls_an_error_is_not_run(tmp_path, seen):

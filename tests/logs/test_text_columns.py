@@ -35,18 +35,15 @@ def assert_is(columns, text):
     np.testing.assert_array_equal(columns.values, np.array(values).reshape(-1, 2))
 
 
-@pytest.fixture(params=["", ".gz", ".xz"])
+@pytest.fixture(params=[bytes, gzip.compress, lzma.compress], ids=["", ".gz", ".xz"])
 def write(request, tmp_path):
     """Write bytes, plain or compressed; the name never tells which."""
 
     def write(data):
         path = tmp_path / "log.csv"
-        path.write_bytes(
-            {"": bytes, ".gz": gzip.compress, ".xz": lzma.compress}[request.param](data)
-        )
+        path.write_bytes(request.param(data))
         return path
 
-    write.kind = request.param
     return write
 
 
@@ -86,9 +83,8 @@ def test_bom_crlf_comments_blank_lines_and_blanks(write):
 
 def test_empty_fields_nan_and_inf_are_kept_for_cleaning(write):
     columns = read_columns(write(b"1,,-Inf\n2,NaN,infinity\n3,1e-310,1e400\n"), LAYOUT, [])
-    np.testing.assert_array_equal(
-        columns.values, [[np.nan, -np.inf], [np.nan, np.inf], [1e-310, np.inf]]
-    )
+    expected = [[np.nan, -np.inf], [np.nan, np.inf], [1e-310, np.inf]]
+    np.testing.assert_array_equal(columns.values, expected)
 
 
 def test_extra_columns_are_read_too(write):
@@ -144,9 +140,8 @@ def test_other_kinds_of_file_are_named(tmp_path, data, message):
 def test_decimal_commas_between_blanks_are_named(tmp_path):
     path = tmp_path / "log.txt"
     path.write_text("1,5 2,25 3\n")
-    with pytest.raises(
-        LogError, match=r"line 1: x = '2,25': is not a number \(a decimal comma\?\)"
-    ):
+    message = r"line 1: x = '2,25': is not a number \(a decimal comma\?\)"
+    with pytest.raises(LogError, match=message):
         read_columns(path, LAYOUT._replace(delimiter=None), [])
 
 
@@ -257,25 +252,26 @@ def test_nothing_is_left_out_silently(tmp_path):
         read_columns(path, LAYOUT)
 
 
+def assert_refused_in_bounded_memory(path, message):
+    tracemalloc.start()
+    with pytest.raises(LogError, match=message):
+        read_columns(path, LAYOUT, [])
+    assert tracemalloc.get_traced_memory()[1] < 50e6
+    tracemalloc.stop()
+
+
 def test_a_sparse_file_of_ten_gigabytes_is_refused_at_once(tmp_path):
     path = tmp_path / "sparse.csv"
     path.write_text("".join(lines(10)))
     os.truncate(path, 10 << 30)
-    tracemalloc.start()
-    with pytest.raises(LogError, match=r"line 11: holds NUL bytes"):
-        read_columns(path, LAYOUT, [])
-    assert tracemalloc.get_traced_memory()[1] < 50e6
-    tracemalloc.stop()
+    assert_refused_in_bounded_memory(path, "line 11: holds NUL bytes")
 
 
 def test_a_bomb_of_one_line_is_refused_in_bounded_memory(tmp_path):
     path = tmp_path / "bomb.xz"
     path.write_bytes(lzma.compress(b"1,2,3\n" + b"7" * 100_000_000, preset=0))
-    tracemalloc.start()
-    with pytest.raises(LogError, match=r"line 2: is longer than 65536 bytes; is this a text log"):
-        read_columns(path, LAYOUT, [])
-    assert tracemalloc.get_traced_memory()[1] < 50e6
-    tracemalloc.stop()
+    message = "line 2: is longer than 65536 bytes; is this a text log"
+    assert_refused_in_bounded_memory(path, message)
 
 
 def test_memory_is_bounded_by_the_numbers_not_by_the_text(tmp_path):

@@ -41,16 +41,12 @@ def a_drive(filters=2, runs=0, seconds=600.0, lat0=0.85, lon0=0.19):
     sigma_g = worse * (2e-5 * (0.1 + start)) * np.ones(3)
     error_p = about(1.0, sigma_p)
     arrays = {}
+    angles = {"unit": "rad", "frame": "NED", "axes": RPH, "display_unit": "deg"}
     bias = {"unit": "rad/s", "frame": "FRD", "axes": XYZ, "display_unit": "deg/h"}
     for block, shown, sigma, error in (
         ("position", {"unit": "m", "frame": "NED", "axes": NED}, sigma_p, error_p),
         ("velocity", {"unit": "m/s", "frame": "NED", "axes": NED}, sigma_v, about(1.0, sigma_v)),
-        (
-            "attitude",
-            {"unit": "rad", "frame": "NED", "axes": RPH, "display_unit": "deg"},
-            sigma_a,
-            about(1.0, sigma_a),
-        ),
+        ("attitude", angles, sigma_a, about(1.0, sigma_a)),
         ("gyro_bias", bias, sigma_g, about(1.0, sigma_g)),
     ):
         if not runs:
@@ -126,13 +122,8 @@ def updates(rng, filters, count, missing):
 def an_allan_curve():
     tau = np.geomspace(0.01, 2000.0, 45)
     n, b, k = 3e-5 * np.array([1, 1.3, 0.8]), 4e-7, 3e-8 * np.array([1, 1, 3])
-    parts = np.stack(
-        [
-            n / np.sqrt(tau)[:, None],
-            0.664 * b * np.ones((len(tau), 3)),
-            k * np.sqrt(tau / 3.0)[:, None],
-        ]
-    )
+    bias = 0.664 * b * np.ones((len(tau), 3))
+    parts = np.stack([n / np.sqrt(tau)[:, None], bias, k * np.sqrt(tau / 3.0)[:, None]])
     model = np.sqrt((parts**2).sum(axis=0))
     few = np.sqrt(tau / 2000.0)[:, None]
     rng = np.random.default_rng(5)

@@ -12,11 +12,6 @@ def test_every_step_is_in_a_bar_with_the_edge_that_it_is_above():
     picture = lateness(xr.Dataset(array("lateness_steps", counts) | array("lateness_edge", edges)))
     axes = picture.figure.axes[0]
     assert [bar.get_height() for bar in axes.patches] == [0, 3, 0, 40, 2]
-    assert [t.get_text() for t in axes.get_xticklabels()] == [
-        "< 1 µs",
-        "1 µs",
-        "20 µs",
-        "500 µs",
-        "2 ms",
-    ]
+    labels = [t.get_text() for t in axes.get_xticklabels()]
+    assert labels == ["< 1 µs", "1 µs", "20 µs", "500 µs", "2 ms"]
     assert picture.caption.startswith("45 steps")

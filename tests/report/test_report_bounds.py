@@ -59,9 +59,7 @@ def test_the_figure_shows_the_bound_and_what_each_sensor_buys(told):
 
 def test_what_runs_away_does_not_set_the_scale(told):
     away = told.copy(deep=True)
-    away["bound_unaided_position"] = told["bound_unaided_position"].copy(
-        data=told["bound_unaided_position"].values * np.exp(TIME)[:, None]
-    )
+    away["bound_unaided_position"].values *= np.exp(TIME)[:, None]
     (north, _) = bounds.sigmas(away, "position").figure.axes
     low, high = north.get_ylim()
     assert low < 8e-3 / np.sqrt(101.0)

@@ -60,9 +60,8 @@ def test_biases_are_drawn_within_three_sigma(drive):
 
 def test_an_angle_that_wraps_is_not_drawn_across_the_figure(drive):
     heading = np.deg2rad(np.linspace(0.0, 700.0, drive.sizes["time"]))
-    wrapped = np.mod(heading + np.pi, 2.0 * np.pi) - np.pi
     values = np.zeros((2, len(heading), 3))
-    values[..., 2] = wrapped
+    values[..., 2] = np.mod(heading + np.pi, 2.0 * np.pi) - np.pi
     turning = drive.drop_vars("error_attitude").assign(
         array("estimate", values, "attitude", unit="rad", frame="NED")
     )
@@ -83,29 +82,24 @@ def test_bands_are_those_of_the_field(drive):
     """N = 50 runs, n = 15 states: the published band of ANEES is 13.5201 to 16.5557."""
     fifty = a_drive(2, runs=50, seconds=60.0)
     band = bands.band(fifty["anees"])
-    assert band is not None
     assert band.low[0, 0] == pytest.approx(13.5201, abs=5e-5)
     assert band.high[0, 0] == pytest.approx(16.5557, abs=5e-5)
     assert band.expected == 15.0
     fifty["anees"].attrs["normalised"] = 1
     normalised = bands.band(fifty["anees"])
-    assert normalised is not None
     np.testing.assert_allclose(normalised.low, band.low / 15.0)
     np.testing.assert_allclose(normalised.high, band.high / 15.0)
     assert normalised.expected == 1.0
     single = bands.band(drive["nis_gnss_position"])
-    assert single is not None
     assert single.low[0, 0] == pytest.approx(chi2.ppf(0.025, 3))
     dof = drive["nis_gnss_position"] * 0.0 + 2.0
     dof[:, 0] = 0.0
     varying = bands.band(drive["nis_gnss_position"], dof)
-    assert varying is not None
     assert varying.high[0, 1] == pytest.approx(chi2.ppf(0.975, 2))
     assert np.isnan(varying.high[0, 0])
     nees = drive["nees"].copy()
     nees.attrs |= {"band_low": 3.0, "band_high": 4.0, "probability": 0.9}
     given = bands.band(nees)
-    assert given is not None
     assert (given.low[0, 0], given.high[0, 0], given.probability) == (3.0, 4.0, 0.9)
     nees.attrs = {}
     assert bands.band(nees) is None
@@ -131,8 +125,7 @@ def test_innovations_are_drawn_between_three_sigma_and_refusals_are_marked(drive
     assert (low.min(), high.max()) == pytest.approx((-2.7, 2.7))
     crosses = [line for line in axes.lines if line.get_marker() == "x"]
     np.testing.assert_array_equal(crosses[0].get_xdata(), drive["gnss_time"].values[[40]])
-    labels = [text.get_text() for text in figure.legends[0].texts]
-    assert "refused" in labels
+    assert "refused" in [text.get_text() for text in figure.legends[0].texts]
 
 
 def test_a_filter_without_updates_is_not_in_the_legend(drive):
@@ -197,7 +190,6 @@ def test_the_height_profile_shows_all_there_is(drive):
 
 def test_bars_are_as_long_as_their_numbers(town):
     picture = bars.comparison(town)
-    assert picture is not None
     shown = {axes.get_title(loc="left"): axes for axes in picture.figure.axes if axes.get_visible()}
     assert "Velocity RMS [m/s]" not in shown  # a list is not one number
     assert "Worst step [µs]" not in shown  # nobody has it
@@ -214,7 +206,6 @@ def test_one_filter_is_compared_with_nothing():
 def test_a_missing_metric_has_no_bar():
     filters = {"a": {"x_m": 1.0}, "b": {"x_m": None}, "c": {"x_m": -2.0}}
     picture = bars.comparison(a_summary() | {"filters": filters})
-    assert picture is not None
     axes = picture.figure.axes[0]
     assert [bar.get_width() for bar in axes.patches] == [1.0, 0.0, -2.0]
     assert [text.get_text() for text in axes.texts] == ["1", "–", "-2"]

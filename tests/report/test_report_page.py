@@ -112,38 +112,30 @@ def test_the_page_is_small(text):
 def test_hostile_names_are_printed_and_not_obeyed(town):
     hostile = "<script>alert(1)</script>\"'&<!--"
     claim = {"id": hostile, "text": hostile, "verdict": "not", "value": hostile, "band": None}
-    page = report.page(
-        town
-        | {
-            "scenario": hostile,
-            "filters": {hostile: {f"{hostile}_m": 1.0}},
-            "claims": [claim],
-            "counts": {hostile: 3},
-            "warnings": [hostile],
-        },
-        [],
-        report.Origin(
-            hostile, f"</pre>{hostile}", hostile, {hostile: hostile}, hostile, (hostile,)
-        ),
-    )
-    reader = Reader(page)
+    summary = town | {
+        "scenario": hostile,
+        "filters": {hostile: {f"{hostile}_m": 1.0}},
+        "claims": [claim],
+        "counts": {hostile: 3},
+        "warnings": [hostile],
+    }
+    said = hostile, f"</pre>{hostile}", hostile, {hostile: hostile}, hostile, (hostile,)
+    reader = Reader(report.page(summary, [], report.Origin(*said)))
     assert "script" not in reader.tags
     assert reader.words.count("alert(1)") >= 11
     assert hostile in reader.text
 
 
 def test_nothing_to_show_is_said(town):
-    words = Reader(
-        report.page(town | {"claims": [], "counts": {}, "filters": {}}, [], ORIGIN)
-    ).words
+    nothing = town | {"claims": [], "counts": {}, "filters": {}}
+    words = Reader(report.page(nothing, [], ORIGIN)).words
     assert "No claims are attached to this scenario." in words
     assert "Every sample was used." in words
     assert "Figures" not in words
 
 
 def test_a_long_scenario_is_cut_and_it_is_said(town):
-    long = ORIGIN._replace(scenario_text="x = 1\n" * 20_000)
-    page = report.page(town, [], long)
+    page = report.page(town, [], ORIGIN._replace(scenario_text="x = 1\n" * 20_000))
     assert len(page) < 60_000
     assert "the rest is in manifest.json" in page
 
@@ -184,8 +176,7 @@ def test_a_simple_figure_is_embedded_as_lines_and_a_crowded_one_as_dots(shots):
     drawing, dots = embed.embed([simple, crowded], 10**6)
     tree = decoded(drawing.source)
     assert tree.tag.endswith("}svg")
-    words = " ".join(tree.itertext())
-    assert "averaging time [s] & \"'<>#%" in words
+    assert "averaging time [s] & \"'<>#%" in " ".join(tree.itertext())
     assert "script" not in {e.tag.split("}")[1] for e in tree.iter()}
     assert decoded(dots.source).size == crowded.dots.size
 
@@ -222,9 +213,8 @@ def test_a_picture_of_one_colour_can_be_packed():
 
 @pytest.fixture
 def walk(tmp_path, town):
-    solution = a_drive(1, seconds=40.0)
-    names = ("lat_rad", "lon_rad", "outage", "error_velocity", "sigma_velocity")
-    few = solution[[*names]]
+    names = ["lat_rad", "lon_rad", "outage", "error_velocity", "sigma_velocity"]
+    few = a_drive(1, seconds=40.0)[names]
     results.write(tmp_path / "walk", a_summary(1), few, scenario_text="x = 1")
     return tmp_path / "walk"
 
@@ -245,20 +235,21 @@ def test_a_result_gets_its_figures_and_page(walk):
     assert share[-1] == 1.0
 
 
+def attached(walk):
+    """The figures that a result gets, byte for byte."""
+    return {n: p.read_bytes() for n, p in results.read(report.attach(walk)).figures.items()}
+
+
 def test_the_same_result_gets_the_same_figures(walk):
-    first = {n: p.read_bytes() for n, p in results.read(report.attach(walk)).figures.items()}
-    second = {n: p.read_bytes() for n, p in results.read(report.attach(walk)).figures.items()}
-    assert first == second
+    assert attached(walk) == attached(walk)
 
 
 def test_the_settings_of_a_user_do_not_change_the_figures(walk):
     import matplotlib
 
-    plain = {n: p.read_bytes() for n, p in results.read(report.attach(walk)).figures.items()}
+    plain = attached(walk)
     with matplotlib.rc_context({"font.size": 20, "axes.grid": False, "axes.facecolor": "pink"}):
-        report.attach(walk)
-    again = {n: p.read_bytes() for n, p in results.read(walk).figures.items()}
-    assert plain == again
+        assert attached(walk) == plain
 
 
 def test_an_interrupted_report_leaves_the_result_as_it_was(walk):

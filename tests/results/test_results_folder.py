@@ -138,13 +138,18 @@ def test_parents_made_for_a_failed_result_go_with_it(tmp_path):
     assert names(tmp_path) == []
 
 
-def full_disk(*_args, **_kwargs):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+def failing(code):
+    """A call of the system that fails with this error."""
+
+    def fail(*_args, **_kwargs):
+        raise OSError(code, os.strerror(code))
+
+    return fail
 
 
 @pytest.mark.parametrize("what", ["solution", "figure", "summary.json", "manifest.json", "sync"])
 def test_a_full_disk_leaves_the_earlier_result(earlier, monkeypatch, what):
-    real = Path.write_bytes
+    real, full_disk = Path.write_bytes, failing(errno.ENOSPC)
     named = {"solution": "solution.nc", "figure": "x.png"}.get(what, what)
     monkeypatch.setattr(
         Path, "write_bytes", lambda p, b: full_disk() if p.name == named else real(p, b)
@@ -160,10 +165,7 @@ def test_a_full_disk_leaves_the_earlier_result(earlier, monkeypatch, what):
 @pytest.mark.parametrize("code", [errno.EACCES, errno.EROFS, errno.EPERM, errno.EDQUOT])
 def test_a_folder_without_permission_is_refused_before_the_work(earlier, monkeypatch, code):
     # Tests may run as root, whom no permission stops, so the refusal is played.
-    def refuse(*_args, **_kwargs):
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(os, "mkdir", refuse)
+    monkeypatch.setattr(os, "mkdir", failing(code))
     with pytest.raises(ResultError, match=f"cannot make the result folder: {os.strerror(code)}"):
         ResultWriter(earlier)
     monkeypatch.undo()
@@ -363,22 +365,20 @@ def test_another_process_holds_a_folder_until_it_is_killed(earlier):
 
 def unlocked(monkeypatch):
     """A file system that knows no locks."""
-
-    def unsupported(*_args):
-        raise OSError(errno.ENOLCK, "no locks")
-
-    monkeypatch.setattr(folder.fcntl, "flock", unsupported)
+    monkeypatch.setattr(folder.fcntl, "flock", failing(errno.ENOLCK))
 
 
 def test_without_locks_the_last_of_two_writers_stands(earlier, monkeypatch):
     unlocked(monkeypatch)
+    unknown = folder._hidden(earlier, "new")
+    unknown.mkdir()
     first = ResultWriter(earlier)
     first.save_summary(a_summary(seed=2))
-    write(earlier, a_summary(seed=3))  # must not take the first for dead
+    write(earlier, a_summary(seed=3))  # must not take the first for dead, nor the unknown
     assert read(earlier).summary["seed"] == 3
     first.commit()
     assert read(earlier).summary["seed"] == 2
-    assert names(earlier.parent) == ["out"]
+    assert names(earlier.parent) == sorted([unknown.name, "out"])
 
 
 def test_a_writer_that_is_overtaken_in_the_exchange_tries_again(earlier, monkeypatch):
@@ -411,19 +411,10 @@ def test_what_a_dead_writer_set_aside_is_read_and_brought_back(earlier):
 def test_hidden_folders_of_others_are_not_touched(earlier):
     other = folder._hidden(earlier.with_name("other"), "new")
     looks_alike = earlier.parent / f"{folder._hidden(earlier, 'new').name}.backup"
-    for path in (other, looks_alike):
-        path.mkdir()
+    other.mkdir()
+    looks_alike.mkdir()
     write(earlier, a_summary())
     assert names(earlier.parent) == sorted([other.name, looks_alike.name, "out"])
-
-
-def test_without_locks_nothing_is_taken_for_dead(earlier, monkeypatch):
-    unlocked(monkeypatch)
-    unknown = folder._hidden(earlier, "new")
-    unknown.mkdir()
-    write(earlier, a_summary(seed=2))
-    assert read(earlier).summary["seed"] == 2
-    assert names(earlier.parent) == sorted([unknown.name, "out"])
 
 
 # -------------------------------------------------------------------------------------- extension
@@ -449,10 +440,7 @@ def test_a_failed_extension_changes_nothing(earlier):
 
 
 def test_an_extension_works_where_files_cannot_be_linked(earlier, monkeypatch):
-    def unsupported(*_args):
-        raise OSError(errno.EPERM, "no links")
-
-    monkeypatch.setattr(os, "link", unsupported)
+    monkeypatch.setattr(os, "link", failing(errno.EPERM))
     with results.extend(read(earlier)) as writer:
         writer.save_report("<p>")
     assert read(earlier).solution.identical(a_solution())

@@ -25,15 +25,11 @@ def examples():
             yield role, "gyro_bias" if of and "|" not in role.variable else of
 
 
-def an_array(role, of):
-    values = np.ones([2] * len(roles.dims(role, of)))
-    needed = dict.fromkeys(role.attrs, 1)
-    return array(role.name, values, of, unit="m", frame="NED", **needed)
-
-
 @pytest.mark.parametrize(("role", "of"), list(examples()), ids=lambda x: getattr(x, "variable", x))
 def test_an_array_is_found_by_its_role_and_an_old_one_by_its_name(role, of):
-    made = an_array(role, of)
+    values = np.ones([2] * len(roles.dims(role, of)))
+    needed = dict.fromkeys(role.attrs, 1)
+    made = array(role.name, values, of, unit="m", frame="NED", **needed)
     (name,) = made
     assert name == re.sub(r"\{.*\}", of, role.variable)
     assert roles.fault(name, made[name]) == ""

@@ -1,7 +1,7 @@
 """The airship's filters against the reference figures: wind, gusts, outliers, a lost radar.
 
 Figures are means over 200 to 800 s of 20 runs, bands those of the specification. `make test` runs
-the filter of the reference, the robust one and the product; `make certify` the others.
+the filter of the reference and the product; `make certify` the others.
 """
 
 import jax
@@ -15,7 +15,7 @@ from robins.systems.airship.problem import airship_problem
 FIRST_LOST, LAST_LOST = 399, 698  # numbers of the epochs that end at 400 s and 699 s
 ANY = (0.0, np.inf)
 CERTIFIED = (  # filters that `make certify` alone runs
-    *("cukf-exact", "cukf-hard", "cukf-hard-gated", "cukf-wind-states", "cukf-printed"),
+    *("raukf", "cukf-exact", "cukf-hard", "cukf-hard-gated", "cukf-wind-states", "cukf-printed"),
     *("federated", "intersection", "distributed-full", "ukf-printed-h"),
 )
 KNOWN = pytest.mark.filterwarnings("ignore:feedback='full' gives every local filter")

@@ -5,15 +5,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from robins import logs, scenario
 from robins.dataset import Dataset
+from robins.earth import Geodetic, earth_rate_n
+from robins.ins.state import InsState
+from robins.rotation import Rotation as Attitude
 from robins.systems import ins_gnss
 from robins.systems.ins_gnss import Drive, Replay, drive_dataset, drive_problem
 from robins.systems.ins_gnss import replay as replay_log
+from robins.systems.ins_gnss.model import Mount, read_position
 from robins.systems.ins_gnss.prepare import gained_in_window, on_one_clock, pieces
 from robins.workbench import replay as replay_files
 
@@ -279,3 +284,13 @@ def test_a_run_as_a_log_has_the_noise_of_the_campaign(drive, log):
         np.asarray(case.y["gnss_position"].lat)[here], log.gnss.lat_rad, rtol=0, atol=1e-15
     )
     assert isinstance(log, Dataset)
+
+
+def test_a_late_fix_is_of_where_the_antenna_was():
+    """Northwards at 10 m/s, not turning, the antenna a metre above the unit."""
+    here = Geodetic(jnp.array(0.8), jnp.array(0.2), jnp.array(100.0))
+    still, rate = jnp.zeros(3), earth_rate_n(here.lat)
+    x = InsState(Attitude.identity(), jnp.array([10.0, 0.0, 0.0]), here, still, still)
+    mount = Mount(jnp.array([0.0, 0.0, -1.0]), jnp.array(0.5), still)
+    moved = here.local(read_position(mount, x, rate))  # north, east, down
+    np.testing.assert_allclose(moved, [-5.0, 0.0, -1.0], atol=1e-5)

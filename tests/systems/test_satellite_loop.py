@@ -58,6 +58,15 @@ def test_a_run_over_its_measurements_gives_the_same_estimates():
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+def test_a_star_sensor_that_is_stuck_reports_one_attitude_again_and_again():
+    stuck = 'star.faults=[{kind="stuck", begin="20.2 s", end="39.8 s"}]'
+    *_, closed = closed_loop(problem("s1", ("mekf",), (*SHORT, stuck)))
+    (frames,) = jax.tree.leaves(closed.readings.y["star"])
+    heard = frames[4::5]  # every half second
+    again = np.all(heard[1:] == heard[:-1], axis=1)
+    np.testing.assert_array_equal(0.5 * (np.flatnonzero(again) + 2), np.arange(20.5, 39.6, 0.5))
+
+
 def test_momentum_is_conserved_without_environment():
     # no field, so no torque of the magnetorquers; no gravity: the orbit is far away
     given = parsed("s2", (*SHORT, 'craft.disturbance="0 N m"'))

@@ -8,12 +8,7 @@ from robins.filters.linearise import Transition
 from robins.ins.state import InsState
 from robins.rotation import Rotation
 from robins.systems.transfer_alignment.product import ProductState
-from robins.systems.transfer_alignment.product_adaptive import (
-    QUIET,
-    Hypothesis,
-    changes,
-    supposing,
-)
+from robins.systems.transfer_alignment.product_adaptive import QUIET, Hypothesis, changes, supposing
 
 INS = InsState(
     Rotation.from_euler(0.1, -0.2, 1.5),

@@ -89,13 +89,10 @@ def test_what_is_read_back_is_what_was_simulated(run, log):
     assert piece.start_s == pytest.approx(0.1)
     assert piece.first == 0
     np.testing.assert_array_equal(piece.record, np.arange(1, 150))
-    for got, wanted, tolerance in (
-        (piece.run.increments.theta, run.increments.theta, 1e-12),
-        (piece.run.increments.dv, run.increments.dv, 1e-12),
-        (piece.run.increments.dt, run.increments.dt, 1e-12),
-    ):
+    for name in ("theta", "dv", "dt"):
+        got, wanted = getattr(piece.run.increments, name), getattr(run.increments, name)
         width = wanted.shape[1]
-        np.testing.assert_allclose(got[:, :width], np.asarray(wanted)[1:], rtol=0, atol=tolerance)
+        np.testing.assert_allclose(got[:, :width], np.asarray(wanted)[1:], rtol=0, atol=1e-12)
         assert not np.any(got[:, width:])
     np.testing.assert_array_equal(piece.run.master_v_n, np.asarray(run.master_v_n)[1:])
     np.testing.assert_array_equal(piece.run.master_omega_b, np.asarray(run.master_omega_b)[1:])
@@ -174,13 +171,8 @@ def without_samples(dataset, begin_s, end_s):
     t = dataset.imu.time_ns * 1e-9
     keep = (t <= begin_s) | (t >= end_s)
     imu = dataset.imu
-    return replace(
-        dataset,
-        imu=replace(
-            imu,
-            **{f: getattr(imu, f)[keep] for f in ("time_ns", "gyro", "accel", "rows")},
-        ),
-    )
+    kept = {f: getattr(imu, f)[keep] for f in ("time_ns", "gyro", "accel", "rows")}
+    return replace(dataset, imu=replace(imu, **kept))
 
 
 def test_a_short_gap_is_bridged_with_noise_and_a_long_one_divides_the_log(log):

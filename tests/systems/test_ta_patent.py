@@ -17,6 +17,7 @@ from numpy.testing import assert_allclose
 from robins import scenario
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, run
+from robins.systems.tables import Update
 from robins.systems.transfer_alignment import patent
 from robins.systems.transfer_alignment import velocity_attitude as va
 from robins.systems.transfer_alignment.pair_course import lay_out
@@ -160,16 +161,15 @@ def test_the_kalman_filter_is_consistent_where_errors_are_small():
     assert np.all((ratio[3:] >= 0.7) & (ratio[3:] <= 1.3)), ratio
 
     statistics = Statistics(problem.blocks, problem.count_from, problem.limits)
-    blank = {"velocity_matching": np.zeros((RUNS, 1)), "attitude_matching": np.zeros((RUNS, 1))}
+    none = np.zeros((RUNS, 1))
+    blank = Update(none, none, none, none.astype(int), none.astype(int))
     statistics.add(
         {
             "error": error,
             "sigma": sigma,
             "nees": np.zeros(error.shape[:2]),
             "block_nees": {},
-            "nis": blank,
-            "dof": {k: np.zeros((RUNS, 1), int) for k in blank},
-            "code": {k: np.zeros((RUNS, 1), int) for k in blank},
+            "updates": {"velocity_matching": blank, "attitude_matching": blank},
             "dim": np.full(RUNS, 12),
         }
     )

@@ -20,14 +20,11 @@ from robins.rotation import Rotation
 from robins.scenario import ScenarioError, load, parse
 from robins.sim.flexure import Flexure
 from robins.systems import transfer_alignment
+from robins.systems.tables import Update
 from robins.systems.transfer_alignment import product as p
 from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.product_claims import (
-    CLAIMS,
-    product_claims,
-    product_metrics,
-)
+from robins.systems.transfer_alignment.product_claims import CLAIMS, product_claims, product_metrics
 from robins.systems.transfer_alignment.product_filters import (
     FILTERS,
     Believed,
@@ -414,10 +411,15 @@ def statistics(scale, runs=60, epochs=40, seed=0):
         "dim": np.full(runs, 18),
         "block_nees": {},
         "mean": {},
-        "nis": {p.VELOCITY: nis},
-        "dof": {p.VELOCITY: np.full((runs, epochs), 3)},
-        "code": {p.VELOCITY: np.zeros((runs, epochs), int)},
-        "notes": {},
+        "updates": {
+            p.VELOCITY: Update(
+                np.zeros((runs, epochs, 3)),
+                np.ones((runs, epochs, 3)),
+                nis,
+                np.full((runs, epochs), 3),
+                np.zeros((runs, epochs), int),
+            )
+        },
     }
     problem = product_problem(load(Product, *SHIP), (), 0)
     return collect([record], problem.blocks, 0, problem.limits)

@@ -76,7 +76,7 @@ longest_block = "0.2 s"
 """
 PAIR = scenario.parse(Replay, TEXT)
 PRODUCT = product_contender(PAIR, "product", PAIR.believed)
-RUNS = 2
+SEVERAL = 8
 
 
 def read_back(dataset, folder):
@@ -85,18 +85,25 @@ def read_back(dataset, folder):
     return logs.load_pair(folder / "master.csv", folder / "slave.csv")
 
 
+def simulated(count):
+    course = lay_out(PAIR)
+    several = jax.jit(jax.vmap(lambda k: simulate_pair(PAIR, course, 3, k)))(jnp.arange(count))
+    return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), several) for k in range(count)]
+
+
+def written(runs, folder):
+    """Each run as it is read from its two files, and cleaned."""
+    return [logs.clean(read_back(recorded(run, "made"), folder)) for run in runs]
+
+
 @pytest.fixture(scope="module")
 def runs():
-    course = lay_out(PAIR)
-    several = jax.jit(jax.vmap(lambda k: simulate_pair(PAIR, course, 3, k)))(jnp.arange(RUNS))
-    return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), several) for k in range(RUNS)]
+    return simulated(1)
 
 
 @pytest.fixture(scope="module")
 def pairs(runs, tmp_path_factory):
-    """Each run as it is read from its two files, and cleaned."""
-    folder = tmp_path_factory.mktemp("pairs")
-    return [logs.clean(read_back(recorded(run, "made"), folder)) for run in runs]
+    return written(runs, tmp_path_factory.mktemp("pairs"))
 
 
 @pytest.fixture(scope="module")
@@ -128,8 +135,10 @@ def at(tree, epoch):
 # ------------------------------------------------------------------------- right within its sigmas
 
 
-def test_errors_are_as_large_as_stated_over_several_pairs(runs, answers):
+def test_errors_are_as_large_as_stated_over_several_pairs(tmp_path):
     """NEES by a dense solve, of the whole state, over all pairs, early and late."""
+    runs = simulated(SEVERAL)
+    answers = [aligned(only_piece(pair), PRODUCT, PAIR) for pair in written(runs, tmp_path)]
     for epoch in (1, 60, len(answers[0].belief.factor) - 1):
         total, n = 0.0, 24
         for run, answer in zip(runs, answers, strict=True):
@@ -137,7 +146,7 @@ def test_errors_are_as_large_as_stated_over_several_pairs(runs, answers):
             e = np.asarray(local(belief.mean, true_state(run, epoch)))
             S = np.asarray(belief.factor)
             total += e @ np.linalg.solve(S @ S.T, e)
-        low, high = stats.chi2.ppf([0.0005, 0.9995], n * RUNS)
+        low, high = stats.chi2.ppf([0.0005, 0.9995], n * SEVERAL)
         assert low < total < high, epoch
 
 
@@ -217,20 +226,12 @@ def changed(dataset, rows=None, **arrays):
 
 def spoil(dataset, kind, k=90):
     m = dataset.master
-    if kind == "nan":
-        v_n = m.v_n.copy()
-        v_n[k] = np.nan
-        q_nb = m.q_nb.copy()
-        q_nb[k] = np.nan
-        return changed(dataset, v_n=v_n, q_nb=q_nb)
-    if kind == "inf":
-        v_n = m.v_n.copy()
-        v_n[k] = np.inf
-        q_nb = m.q_nb.copy()
-        q_nb[k, 0] = np.inf
-        return changed(dataset, v_n=v_n, q_nb=q_nb)
-    rows = np.insert(np.arange(len(m)), k, [k - 1, k - 20])  # a duplicate and a step back
-    return changed(dataset, rows=rows)
+    if kind == "order":  # a duplicate and a step back
+        return changed(dataset, rows=np.insert(np.arange(len(m)), k, [k - 1, k - 20]))
+    v_n, q_nb = m.v_n.copy(), m.q_nb.copy()
+    v_n[k] = float(kind)
+    q_nb[k, : 1 if kind == "inf" else 4] = float(kind)
+    return changed(dataset, v_n=v_n, q_nb=q_nb)
 
 
 @pytest.mark.parametrize("kind", ["nan", "inf"])
@@ -368,23 +369,17 @@ def test_a_filter_that_is_not_there_is_named(pairs):
 def files(runs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     dataset = recorded(runs[0], "made")
-    logs.write_log(folder / "master.csv", dataset.master)
-    logs.write_log(folder / "slave.csv", dataset.imu)
-    imu = dataset.imu
-    logs.write_log(folder / "late.csv", replace(imu, time_ns=imu.time_ns + 10**13))
+    read_back(dataset, folder)
+    late = replace(dataset.imu, time_ns=dataset.imu.time_ns + 10**13)
+    logs.write_log(folder / "late.csv", late)
     (folder / "mine.toml").write_text('system = "transfer-alignment"\nstudy = "product"\n' + TEXT)
     return folder
 
 
 def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
-    heard = []
-    outcome = align_pair(
-        str(files / "mine.toml"),
-        files / "master.csv",
-        files / "slave.csv",
-        settings=('title="Mine"',),
-        findings=heard.extend,
-    )
+    heard, pair = [], (files / "master.csv", files / "slave.csv")
+    mine, settings = str(files / "mine.toml"), ('title="Mine"',)
+    outcome = align_pair(mine, *pair, settings=settings, findings=heard.extend)
     result = publish(outcome, files / "result")
     assert result.summary["scenario"] == "transfer-alignment/slave"
     found, want = result.summary["filters"]["product"], clean.metrics["product"]
@@ -399,13 +394,9 @@ def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
 
 
 def refused(files, name=None, master="master.csv", slave="slave.csv", settings=()):
+    named = str(name or files / "mine.toml")
     with pytest.raises((InputError, logs.LogError)) as caught:
-        align_pair(
-            str(name or files / "mine.toml"),
-            files / master,
-            files / slave,
-            settings=settings,
-        )
+        align_pair(named, files / master, files / slave, settings=settings)
     return str(caught.value)
 
 
