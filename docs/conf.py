@@ -25,7 +25,7 @@ extensions = [
     "plain_docstrings",
     "role_table",
 ]
-exclude_patterns = ["_build", "certified.md"]
+exclude_patterns = ["_build", "certified.md", "mutants.md"]
 default_role = "py:obj"  # `name` in a docstring links to the name where there is one
 highlight_language = "text"
 myst_enable_extensions = ["deflist"]
