@@ -22,14 +22,15 @@ ROOT = Path(__file__).resolve().parents[1]
 # Most of a test run is compiling what runs for a moment: code is generated without LLVM's
 # optimisation, by the older of XLA's emitters of loops, in one piece. That takes less than half of
 # the time (XLA_FLAGS= tests what users run). What was compiled once serves every worker and the
-# next run; where it is kept is not a cost. Nobody asks of compiled code which line of a test it is
-# from, and to write that into it takes a tenth of the time.
+# next run, however small: most programs are one operation on one shape. Where they are kept is not
+# a cost. Nobody asks of compiled code which line of a test it is from, and to write that into it
+# takes a tenth of the time.
 SETTINGS = {
     "JAX_PLATFORMS": "cpu",
     "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
     "--xla_cpu_parallel_codegen_split_count=1",
     "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax"),
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
 }
 os.environ["MPLBACKEND"] = "Agg"  # figures never need a screen
