@@ -78,22 +78,20 @@ hypothesis.settings.load_profile("repeatable")
 
 # Linux gives a process 65530 memory maps, and a compiled run of a filter takes 400 of them: a
 # worker that keeps every program it compiled crashes in the compiler, and two workers with all
-# their programs leave no room for the processes of the bench. The tests of a file share programs,
-# those of two files hardly any: between files they are forgotten early, within one late.
+# their programs leave no room for the processes of the bench.
 MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
-MANY_BYTES = 1.75 * 2**30, 2.5 * 2**30  # between files, within one
+MANY_BYTES = 2 * 2**30
 LOOK_EVERY = 10  # tests, at the maps: to write them out takes the system milliseconds
 FINISHED = pytest.StashKey[int]()
 
 
-def pytest_runtest_teardown(item, nextitem):
+def pytest_runtest_teardown(item):
     """Forget compiled programs when there are many; the cache gives back those needed again."""
     if not MAPS.exists():
         return
     count = item.config.stash[FINISHED] = item.config.stash.get(FINISHED, 0) + 1
-    within = nextitem is not None and nextitem.path == item.path
-    large = int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MANY_BYTES[within]
+    large = int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MANY_BYTES
     if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
         jax.clear_caches()
         gc.collect()
