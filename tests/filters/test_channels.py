@@ -174,22 +174,6 @@ def test_going_on_from_another_belief_shares_it_out_and_keeps_what_was_learnt():
         assert int(again.memory.members[0].memory[0]) == 7
 
 
-def test_audits_of_local_filters_are_made():
-    made = []
-
-    def audit(start, final, again, time):
-        made.append((int(start), int(final), None if again is None else int(again(100)), time))
-
-    one = federated([channel("a"), channel("b", kalman(rules=[COUNTED._replace(audit=audit)]))])
-    start = one.init(START, MODEL.dims)
-    assert one.audit is not None
-    # the rule's run from another memory is a run of the whole from a state with that memory
-    again = lambda first: having_learnt(first, 1, int(first.memory.members[1].memory[0]) + 5)  # noqa: E731
-    one.audit(start, having_learnt(start, 1, 5), again, "time")
-    one.audit(start, start, None, None)
-    assert made == [(0, 5, 105, "time"), (0, 0, None, None)]
-
-
 @pytest.mark.parametrize("sharing", ["scalar", "root"])
 def test_a_step_that_one_local_cannot_take_is_taken_by_none(sharing):
     def settle(memory, belief):

@@ -351,22 +351,3 @@ def test_bad_arguments_are_named():
     more = Model(LINEAR.motion, (*LINEAR.sensors, extra))
     with pytest.raises(ValueError, match="sensor 'c' is new"):
         run(BACK, more, BEGIN, {"c": Y["a"]})
-
-
-def test_what_a_rule_has_to_report_is_reported():
-    heard = []
-
-    def audit(start, final, again, time):
-        heard.append(
-            (int(start[0]), int(final[0]), int(again((jnp.array(100), start[1]))[0]), time)
-        )
-
-    one = delayed(kalman(rules=[learning()._replace(audit=audit)]), LINEAR, 2)
-    start = one.init(BEGIN, LINEAR.dims)
-
-    def again(first):
-        return one.predict(one.predict(first, LINEAR.motion)[0], LINEAR.motion)[0]
-
-    one.audit(start, again(start), again, 3.0)
-    assert heard == [(0, 2, 102, 3.0)]
-    assert BACK.audit is None

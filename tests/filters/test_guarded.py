@@ -298,7 +298,7 @@ def test_angles_differ_the_short_way_and_a_run_is_differentiable():
     assert float(slope[0]) == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-4)
 
 
-def test_reset_audit_and_notes_reach_both():
+def test_reset_and_notes_reach_both():
     one = guarded(kalman(rules=[igg3()]), kalman(rules=[gate()]), **GUARD)
     state, info = one.update(
         one.init(START, model(0.05).dims), model(0.05).sensors[0], SAR[0, 0], None
@@ -308,22 +308,6 @@ def test_reset_audit_and_notes_reach_both():
     for side in ("filter", "reference"):
         np.testing.assert_array_equal(getattr(after.memory, side).belief.factor, START.factor)
     np.testing.assert_array_equal(after.belief.mean, START.mean)
-
-    heard = []
-
-    def audit(start, final, again, time):
-        heard.append((start, final, time, None if again is None else again(start)))
-
-    told = gate()._replace(audit=audit)
-    two = guarded(kalman(rules=[told]), kalman(rules=[told]), **GUARD)
-    state = two.init(START, model(0.05).dims)
-    assert two.audit is not None
-    two.audit(state, state, lambda first: first, 5.0)
-    assert [time for _, _, time, _ in heard] == [5.0, 5.0]
-    assert set(heard[0][0]) == {"sar", "wind"}
-    assert set(heard[1][0]) == {"sar"}
-    assert heard[0][0] is heard[0][3]
-    assert one.audit is None
 
 
 REFUSED = {

@@ -319,28 +319,6 @@ def test_a_reset_moves_all_modes_and_keeps_probabilities(solution):
     np.testing.assert_array_equal(after.memory.log_probability, final.memory.log_probability)
 
 
-def test_what_rules_of_a_mode_have_to_report_is_reported():
-    heard = []
-
-    def doubled(memory):
-        return {"y": memory["y"]._replace(ratio=jnp.asarray(4.0))}
-
-    def audit(start, final, again, time):
-        heard.append((float(final["y"][1]), float(again(doubled(start))["y"][1]), time))
-
-    reporting = kalman(rules=[gate()._replace(audit=audit)])
-    for modes, count in (
-        ([kalman(), reporting], 1),
-        (Family(lambda row: reporting, np.ones(2)), 2),
-    ):
-        two = imm(modes, np.eye(2))
-        start = two.init(START, MODEL.dims)
-        two.audit(start, start, lambda first: first, 5.0)
-        assert heard == [(0.0, 4.0, 5.0)] * count
-        heard.clear()
-    assert IMM.audit is None
-
-
 @pytest.mark.parametrize(
     ("transition", "start", "message"),
     [

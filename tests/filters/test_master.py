@@ -125,22 +125,6 @@ def test_a_guard_takes_over_below_the_master():
         np.testing.assert_allclose(a.belief.factor, b.belief.factor, rtol=1e-12)
 
 
-def test_audits_of_both_are_heard():
-    heard = []
-
-    def audit(start, final, again, time):
-        heard.append((start, None if again is None else again(start)))
-
-    told = kalman(rules=[gate()._replace(audit=audit)])
-    one = at_master(distributed([c._replace(filter=told) for c in CHANNELS]), "held", told)
-    state = one.init(START, model().dims)
-    assert one.audit is not None
-    one.audit(state, state, lambda first: first, None)
-    one.audit(state, state, None, None)
-    assert [sorted(start) for start, _ in heard] == [["a"], ["b"], ["held"]] * 2
-    assert all(start is again for start, again in heard[:3])
-
-
 def test_bad_input():
     with pytest.raises(ValueError, match="name at least one"):
         at_master(JOINED, ())

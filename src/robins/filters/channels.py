@@ -7,17 +7,18 @@ on its way to its local filter, the belief fused again after it, and steps that 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import register_static
 from jaxtyping import Array
 
 from robins.errors import require
+from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.fusion import is_singular
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, kalman, not_taken
+from robins.filters.kalman import Filter, FilterState, Prediction, kalman, not_taken
 from robins.filters.linearise import Transition
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.trees import equal, finite, select
@@ -35,6 +36,11 @@ class Channel(NamedTuple):
         return "+".join(self.sensors)
 
 
+@register_static
+class Names(tuple[str, ...]):
+    """Of the channels, in a state: no number, so no leaf."""
+
+
 class Joined(NamedTuple):
     """What a filter of channels carries besides the fused belief."""
 
@@ -42,6 +48,20 @@ class Joined(NamedTuple):
     shares: Array  # (members, 1 or n) of the information
     silent: Array  # (channels,) steps since a measurement was used
     singular: Array  # (members,) steps not taken because information was infinite
+    names: Names
+
+    def audit(self, start: Joined, again: Again | None, time: Any) -> None:
+        """Ask the members, then tell of steps that could not be taken (`robins.filters.audit`)."""
+        rerun = None if again is None else lambda m: again(start._replace(members=m)).members
+        audit(start.members, self.members, rerun, time)
+        for i, count in enumerate(np.asarray(self.singular).tolist()):
+            name = f"channel '{self.names[i]}'" if i < len(self.names) else "the master"
+            require(
+                count == 0,
+                f"the covariance of {name} was singular in {count} steps, which were not taken: "
+                "infinite information cannot be fused. Give a constraint, a measurement or a state "
+                "without noise some noise, or constrain what is fused",
+            )
 
 
 Fuse = Callable[[Sequence[Belief]], Belief]
@@ -167,42 +187,18 @@ def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction
     return new, Prediction(moved.transition, new.belief, code)
 
 
-def auditing(channels: Sequence[Channel]):
-    """The `audit` of a joined filter: that of each local filter, then its own."""
-
-    def rerun(start: FilterState, i: int, again: Again, first: FilterState) -> FilterState:
-        members = (*start.memory.members[:i], first, *start.memory.members[i + 1 :])
-        begun = start._replace(memory=start.memory._replace(members=members))
-        return again(begun).memory.members[i]
-
-    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        for i, one in enumerate(channels):
-            if one.filter.audit is not None:
-                once_more = None if again is None else partial(rerun, start, i, again)
-                one.filter.audit(start.memory.members[i], final.memory.members[i], once_more, time)
-        for i, count in enumerate(np.asarray(final.memory.singular).tolist()):
-            if count > 0:
-                name = f"channel '{channels[i].name}'" if i < len(channels) else "the master"
-                raise ValueError(
-                    f"the covariance of {name} was singular in {count} steps, which were not "
-                    "taken: infinite information cannot be fused. Give a constraint, a "
-                    "measurement or a state without noise some noise, or constrain what is fused"
-                )
-
-    return audit
-
-
 def _refused(state: FilterState, singular: Array) -> FilterState:
     joined: Joined = state.memory
     return state._replace(memory=joined._replace(singular=joined.singular + singular.astype(int)))
 
 
 def starting(
-    states: Sequence[FilterState], belief: Belief, shares: Array, count: int
+    states: Sequence[FilterState], belief: Belief, shares: Array, channels: Sequence[Channel]
 ) -> FilterState:
-    """The state of a joined filter of ``count`` channels at its start."""
-    zero = partial(jnp.zeros, dtype=int)
-    return FilterState(belief, Joined(tuple(states), shares, zero(count), zero(len(states))))
+    """The state of a joined filter at its start."""
+    silent, singular = (jnp.zeros(len(x), int) for x in (channels, states))
+    names = Names(c.name for c in channels)
+    return FilterState(belief, Joined(tuple(states), shares, silent, singular, names))
 
 
 def with_noise(motion: Motion, scale: Callable[[Array], Array]) -> Motion:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
+from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Model, Sensor
@@ -155,12 +156,12 @@ def run_closed(
     loop = Loop(same(_as_partial(loop.react)), world, rows, due)
     filter_, model = same(filter_), same_model(model)
     closed = Closed(*_scan(filter_, model, state, loop, keep))
-    if filter_.audit is not None and not is_traced(closed.final):
+    if not is_traced(closed.final):
 
         def again(first: FilterState) -> FilterState:
             return _scan(filter_, model, first, loop, nothing)[2]
 
-        filter_.audit(state, closed.final, again, time_s)
+        audit(state, closed.final, again, time_s)
     if not is_traced(closed.tally):
         warn_not_taken(closed.tally)
     return closed

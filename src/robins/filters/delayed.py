@@ -18,8 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Again, Filter, FilterState, compiled
+from robins.filters.kalman import Filter, FilterState, compiled
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.trees import select
 
@@ -54,6 +55,17 @@ class Delay(NamedTuple):
     now: Array  # number of the present step
     reach: Array  # how many steps back there are to go
     model: Model  # its numbers, as last seen
+
+    def audit(self, start: Delay, again: Again | None, time: Any) -> None:
+        """Ask the filter that is delayed, not its past (`robins.filters.audit`)."""
+
+        def rerun(inner: Any) -> Any:
+            assert again is not None
+            before = start.past.before._replace(memory=_rows(inner, len(start.past.moved)))
+            past = start.past._replace(before=before)
+            return again(start._replace(inner=inner, past=past)).inner
+
+        audit(start.inner, self.inner, None if again is None else rerun, time)
 
 
 def delayed(
@@ -224,18 +236,7 @@ def delayed(
         # What was measured before the new belief is part of it, or meant to be forgotten.
         return begin(filter_.reset(_inner(state), belief), state.memory.model)
 
-    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        def once_more(first: FilterState) -> FilterState:
-            assert again is not None
-            return _inner(again(begin(first, start.memory.model)))
-
-        assert filter_.audit is not None
-        rerun = None if again is None else once_more
-        filter_.audit(_inner(start), _inner(final), rerun, time)
-
-    return compiled(
-        Filter(init, predict, update, reset, audit if filter_.audit is not None else None)
-    )
+    return compiled(Filter(init, predict, update, reset))
 
 
 def _inner(state: FilterState) -> FilterState:

@@ -35,7 +35,6 @@ from robins.filters.channels import (
     Fuse,
     Joined,
     Moved,
-    auditing,
     concluded,
     local_dims,
     owners,
@@ -142,7 +141,7 @@ def _side_by_side(
                 f"{belief.factor.shape[0]}"
             )
         states = [c.filter.init(belief, d) for c, d in zip(channels, each, strict=True)]
-        return starting(states, belief, jnp.ones((count, 1)), count)
+        return starting(states, belief, jnp.ones((count, 1)), channels)
 
     def fed_back(state: FilterState) -> list[FilterState]:
         joined: Joined = state.memory
@@ -169,4 +168,4 @@ def _side_by_side(
         members = tuple(c.filter.reset(m, belief) for c, m in pairs)
         return FilterState(belief, joined._replace(members=members))
 
-    return in_step(Filter(init, predict, updating(channels, fuse, name), reset, auditing(channels)))
+    return in_step(Filter(init, predict, updating(channels, fuse, name), reset))

@@ -126,7 +126,7 @@ def federated(
         a = initial_shares(belief)
         parts = parted(belief, a)
         states = [f.init(p, d) for f, p, d in zip(filters, parts, given, strict=True)]
-        return _channels.starting(states, belief, a, count)
+        return _channels.starting(states, belief, a, channels)
 
     def initial_shares(belief: Belief) -> Array:
         n = belief.factor.shape[0]
@@ -206,7 +206,7 @@ def federated(
         return FilterState(belief, joined._replace(members=tuple(members)))
 
     update = _channels.updating(channels, information_sum, "federated")
-    return in_step(Filter(init, predict, update, reset, _channels.auditing(channels)))
+    return in_step(Filter(init, predict, update, reset))
 
 
 def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:

@@ -37,7 +37,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.channels import Joined
-from robins.filters.kalman import Filter, FilterState, Prediction, auditing, in_step
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step
 from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
@@ -205,9 +205,7 @@ def guarded(
             )
         )
 
-    return in_step(
-        Filter(init, predict, update, reset, auditing(filter=filter, reference=reference))
-    )
+    return in_step(Filter(init, predict, update, reset))
 
 
 def _names(given: str | Sequence[str]) -> tuple[str, ...]:

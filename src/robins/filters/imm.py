@@ -23,8 +23,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
+from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.kalman import Again, Filter, FilterState, Prediction, in_step
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step
 from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
 from robins.filters.modes import Family, Mode, bank
@@ -40,6 +41,26 @@ class Interaction(NamedTuple):
 
     states: Any  # of the modes: a tuple, or those of a family with a leading axis
     log_probability: Array  # (modes,)
+
+    def audit(self, start: Interaction, again: Again | None, time: Any) -> None:
+        """Ask the memories of each mode; of a family each has a row (`robins.filters.audit`)."""
+        if not isinstance(self.states, FilterState):
+            every = None if again is None else lambda s: again(start._replace(states=s)).states
+            audit(start.states, self.states, every, time)
+            return
+        for i in range(len(self.log_probability)):
+
+            def row(states: Any, i: int = i) -> Any:
+                return jax.tree_util.tree_map(lambda x: x[i], states)
+
+            def one(first: Any, i: int = i, row: Any = row) -> Any:
+                put = jax.tree_util.tree_map(
+                    lambda x, new: jnp.asarray(x).at[i].set(new), start.states, first
+                )
+                assert again is not None
+                return row(again(start._replace(states=put)).states)
+
+            audit(row(start.states), row(self.states), None if again is None else one, time)
 
 
 def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor] = ()) -> Mode:
@@ -137,16 +158,7 @@ def imm(
         states = all_.reset(state.memory.states, belief)
         return FilterState(belief, state.memory._replace(states=states))
 
-    def audit(begin: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        def rerun(states: Any) -> Any:
-            assert again is not None
-            return again(begin._replace(memory=begin.memory._replace(states=states))).memory.states
-
-        assert all_.audit is not None
-        once_more: Any = None if again is None else rerun
-        all_.audit(begin.memory.states, final.memory.states, once_more, time)
-
-    return in_step(Filter(init, predict, update, reset, all_.audit and audit))
+    return in_step(Filter(init, predict, update, reset))
 
 
 def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:

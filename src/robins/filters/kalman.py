@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.observation import Observation, contradicted, left_out, whiten
-from robins.filters.rule import Memory, Rule, keep_belief
+from robins.filters.rule import Rule, keep_belief
 from robins.filters.trees import finite, select
 
 Form = Literal["sqrt", "joseph"]
@@ -47,11 +46,8 @@ class Prediction(NamedTuple):
     origin: Belief | None = None  # where it began, if a rule has settled another belief
 
 
-Again = Callable[[FilterState], FilterState]  # a run once more, from another first state
-
-
 class Filter(NamedTuple):
-    """Functions, pure but for `audit`; a run, a campaign, a bench or a loop of yours calls them.
+    """Pure functions; a run, a campaign, a bench or a loop of yours calls them.
 
     Attributes:
         init: ``(belief, dims) -> state``; dims maps sensor names to dimensions (`Model.dims`).
@@ -59,33 +55,12 @@ class Filter(NamedTuple):
         update: ``(state, sensor, y, aux) -> (state, info)``.
         reset: ``(state, belief) -> state``: go on from another belief, keeping what was learned of
             the noise; a filter inside a federated filter or a mixture is told so.
-        audit: ``(start, final, again, time)``, outside compiled code: raises what a rule has to
-            report of a run; None where no rule has anything to say.
     """
 
     init: Callable[[Belief, Mapping[str, int]], FilterState]
     predict: Callable[[FilterState, Motion, Any], tuple[FilterState, Prediction]]
     update: Callable[[FilterState, Sensor, Any, Any], tuple[FilterState, StepInfo]]
     reset: Callable[[FilterState, Belief], FilterState]
-    audit: Callable[[FilterState, FilterState, Again | None, Any], None] | None = None
-
-
-def auditing(**sides: Filter):
-    """The `audit` of a filter whose memory holds the states of others, by their names there."""
-
-    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        for side, one in sides.items():
-            if one.audit is not None:
-
-                def rerun(first: FilterState, side: str = side) -> FilterState:
-                    assert again is not None
-                    begun = start._replace(memory=start.memory._replace(**{side: first}))
-                    return getattr(again(begun).memory, side)
-
-                once_more = None if again is None else rerun
-                one.audit(getattr(start.memory, side), getattr(final.memory, side), once_more, time)
-
-    return audit if any(one.audit is not None for one in sides.values()) else None
 
 
 def compiled(filter_: Filter) -> Filter:
@@ -305,15 +280,4 @@ def kalman(
     def reset(state: FilterState, belief: Belief) -> FilterState:
         return FilterState(belief, state.memory, drawn(belief))
 
-    def audit(start: FilterState, final: FilterState, again: Again | None, time: Any) -> None:
-        def rerun(i: int, again: Again, first: Memory) -> Memory:
-            memory = (*start.memory[:i], first, *start.memory[i + 1 :])
-            return again(start._replace(memory=memory)).memory[i]
-
-        for i, rule in enumerate(rules):
-            if rule.audit is not None:
-                once_more = None if again is None else partial(rerun, i, again)
-                rule.audit(start.memory[i], final.memory[i], once_more, time)
-
-    audited = any(rule.audit is not None for rule in rules)
-    return in_step(Filter(init, predict, update, reset, audit if audited else None))
+    return in_step(Filter(init, predict, update, reset))

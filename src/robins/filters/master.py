@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.channels import Joined
-from robins.filters.kalman import Filter, FilterState, Prediction, auditing, in_step, kalman
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman
 from robins.filters.model import Motion, Sensor
 
 
@@ -90,4 +90,4 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
         joined = filter.reset(mastered.joined, belief)
         return FilterState(joined.belief, Mastered(joined, centre.reset(mastered.master, belief)))
 
-    return in_step(Filter(init, predict, update, reset, auditing(joined=filter, master=centre)))
+    return in_step(Filter(init, predict, update, reset))

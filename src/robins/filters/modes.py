@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.kalman import Again, Filter, FilterState
+from robins.filters.kalman import Filter, FilterState
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
 
@@ -68,7 +68,6 @@ class Bank(NamedTuple):
         predict: ``(states, motion, u) -> (states, codes)``.
         update: ``(states, sensor, y, aux) -> (states, StepInfo, notes)``; notes by mode and name.
         reset: ``(states, belief) -> states``, all to one belief.
-        audit: as of `Filter`, of the states; None where no mode has anything to report.
     """
 
     size: int
@@ -78,7 +77,6 @@ class Bank(NamedTuple):
     predict: Callable[[Any, Motion, Any], tuple[Any, Array]]
     update: Callable[[Any, Sensor, Any, Any], tuple[Any, StepInfo, dict[str, Array]]]
     reset: Callable[[Any, Belief], Any]
-    audit: Callable[[Any, Any, Again | None, Any], None] | None
 
 
 def bank(modes: Sequence[Filter | Mode] | Family) -> Bank:
@@ -127,24 +125,10 @@ def _each(modes: tuple[Mode, ...]) -> Bank:
     def reset(states, belief):
         return tuple(f.reset(s, belief) for f, s in zip(filters, states, strict=True))
 
-    def audit(begin, final, again, time):
-        for i, f in enumerate(filters):
-            if f.audit is None:
-                continue
-
-            def rerun(inner: FilterState, i: int = i) -> FilterState:
-                assert again is not None
-                return again((*begin[:i], inner, *begin[i + 1 :]))[i]
-
-            f.audit(begin[i], final[i], None if again is None else rerun, time)
-
     def beliefs(states):
         return _stack([s.belief for s in states])
 
-    audited = any(f.audit is not None for f in filters)
-    return Bank(
-        *(len(modes), init, beliefs, restart, predict, update, reset), audit if audited else None
-    )
+    return Bank(len(modes), init, beliefs, restart, predict, update, reset)
 
 
 def _batched(family: Family) -> Bank:
@@ -188,28 +172,7 @@ def _batched(family: Family) -> Bank:
     def reset(states, belief):
         return rows(lambda mode, state: mode.filter_.reset(state, belief))(states)
 
-    each = [family.of(jax.tree_util.tree_map(lambda x, i=i: x[i], numbers)) for i in range(count)]
-
-    def audit(begin, final, again, time):
-        for i, mode in enumerate(each):
-
-            def one(states: Any, i: int = i) -> Any:
-                return jax.tree_util.tree_map(lambda x: x[i], states)
-
-            def rerun(inner: FilterState, i: int = i, one: Callable = one) -> FilterState:
-                assert again is not None
-                put = jax.tree_util.tree_map(
-                    lambda x, new: jnp.asarray(x).at[i].set(new), begin, inner
-                )
-                return one(again(put))
-
-            assert mode.filter_.audit is not None
-            mode.filter_.audit(one(begin), one(final), None if again is None else rerun, time)
-
-    return Bank(
-        *(count, init, lambda s: s.belief, restart, predict, update, reset),
-        audit if each[0].filter_.audit is not None else None,
-    )
+    return Bank(count, init, lambda s: s.belief, restart, predict, update, reset)
 
 
 def _stack(trees: Sequence[Any]) -> Any:

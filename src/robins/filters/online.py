@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
@@ -67,7 +68,7 @@ class OnlineFilter:
         code = Code(int(prediction.code))
         if code is not Code.DONE:
             self.counts[code.name] += 1
-        self._audit()
+        audit(self.state, self.state, None, None)
         return prediction
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
@@ -92,9 +93,5 @@ class OnlineFilter:
         numbers = as_measurement(sensor, y)
         self.state, info = _update(self._filter, chosen, self.state, numbers, aux)
         self.counts[Code(int(info.code)).name] += 1
-        self._audit()
+        audit(self.state, self.state, None, None)
         return info
-
-    def _audit(self) -> None:
-        if self._filter.audit is not None:
-            self._filter.audit(self.state, self.state, None, None)

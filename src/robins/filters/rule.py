@@ -61,10 +61,8 @@ class Rule(NamedTuple):
             measurements are in and the state is about to be predicted: inflate what the whole step
             left. A code other than ``DONE`` says that the step cannot be taken: the belief then
             stays, the memory of this hook is kept.
-        audit: ``(start, final, again, time)``, outside compiled code: raises what the memory a run
-            ended with has to report. ``again`` runs once more from another first memory and
-            returns the last one (None where samples came one by one); ``time`` holds the seconds of
-            the steps, or None.
+
+    A memory that has something to report of a run has a method `audit`: see `robins.filters.audit`.
     """
 
     init: Callable[[Belief, Mapping[str, int]], Memory] = _no_memory
@@ -77,4 +75,3 @@ class Rule(NamedTuple):
     )
     name: str = "rule"
     settle: Callable[[Memory, Belief], tuple[Memory, Belief, Any]] = keep_belief
-    audit: Callable[[Memory, Memory, Callable[[Memory], Memory] | None, Any], None] | None = None

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
@@ -159,7 +160,7 @@ def run(
         time_s: (T,) time of each step [s], which errors then name.
 
     Raises:
-        Exception: what a rule has to report, where it is its policy to raise (`Rule.audit`). In
+        Exception: what a memory has to report of the run (`robins.filters.audit`). In
             transformed or compiled code nothing can be raised: the codes of the steps say it.
         TypeError: a measurement is not a real number.
         ValueError: lengths differ, a measurement names no sensor of the model or is not of the
@@ -178,12 +179,12 @@ def run(
     state, u, extra = as_arrays(state), as_arrays(u), as_arrays(extra)
     filter_, model = same(filter_), same_model(model)
     solution = _scan(filter_, model, state, u, measurements, extra, keep)
-    if filter_.audit is not None and not is_traced(solution.final):
+    if not is_traced(solution.final):
 
         def again(first: FilterState) -> FilterState:
             return _scan(filter_, model, first, u, measurements, extra, nothing).final
 
-        filter_.audit(state, solution.final, again, time_s)
+        audit(state, solution.final, again, time_s)
     if not is_traced(solution.tally):
         warn_not_taken(solution.tally)
     return solution

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import RobinsError
+from robins.filters.audit import Again
 from robins.filters.rules._inflation import inflated, local_bound
 
 
@@ -82,32 +83,33 @@ def anew(memory: HInfinityMemory, gamma: Any) -> HInfinityMemory:
     return memory._replace(inverse=inverse, events=jnp.zeros((), int), first=jnp.array(-1))
 
 
-def raise_infeasible(
-    start: HInfinityMemory, final: HInfinityMemory, again: Callable | None, time: Any
-) -> None:
-    """Audit of policy "raise" (`Rule.audit`).
+class Demanding(HInfinityMemory):
+    """The same under policy "raise"."""
 
-    One sample at a time, a step is judged when the next prediction closes it: until then more
-    sensors may come.
+    def audit(self, start: HInfinityMemory, again: Again | None, time: Any) -> None:
+        """What it has to report (`robins.filters.audit`).
 
-    Raises:
-        Infeasible: the filter did not exist at some step.
-    """
-    broken = first_infeasible(final, whole=again is not None)
-    if broken is None:
-        return
-    step, weighted = broken
-    gamma, least = 1.0 / float(final.inverse), None
-    if again is not None:
-        step -= int(start.steps)
+        One sample at a time, a step is judged when the next prediction closes it: until then more
+        sensors may come.
 
-        def exists(one: float) -> bool:
-            return first_infeasible(again(anew(start, one))) is None
+        Raises:
+            Infeasible: the filter did not exist at some step.
+        """
+        broken = first_infeasible(self, whole=again is not None)
+        if broken is None:
+            return
+        step, weighted = broken
+        gamma, least = 1.0 / float(self.inverse), None
+        if again is not None:
+            step -= int(start.steps)
 
-        least = least_gamma(exists, gamma)
-    times = () if time is None else np.asarray(time)
-    time_s = float(times[step]) if 0 <= step < len(times) else None
-    raise Infeasible(step, time_s, gamma, float(local_bound(weighted)), least)
+            def exists(one: float) -> bool:
+                return first_infeasible(again(anew(start, one))) is None
+
+            least = least_gamma(exists, gamma)
+        times = () if time is None else np.asarray(time)
+        time_s = float(times[step]) if 0 <= step < len(times) else None
+        raise Infeasible(step, time_s, gamma, float(local_bound(weighted)), least)
 
 
 def least_gamma(exists: Callable[[float], bool], lower: float, rtol: float = 1e-4) -> float:

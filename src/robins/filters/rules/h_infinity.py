@@ -15,7 +15,7 @@ from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules import _inflation
-from robins.filters.rules._feasibility import HInfinityMemory, Infeasible, anew, raise_infeasible
+from robins.filters.rules._feasibility import Demanding, HInfinityMemory, Infeasible, anew
 
 __all__ = ["HInfinityMemory", "Infeasible", "h_infinity", "with_gamma"]
 
@@ -103,7 +103,7 @@ def h_infinity(
 
     def init(belief: Belief, dims):
         weighted = _inflation.weighted_factor(rows, belief, NAME)
-        return HInfinityMemory(
+        return (Demanding if policy == "raise" else HInfinityMemory)(
             inverse=jnp.asarray(1.0 / asked),
             steps=jnp.zeros((), int),
             fresh=jnp.array(True),
@@ -178,8 +178,7 @@ def h_infinity(
         )
         return memory, new, jnp.where(missed, int(Code.INFEASIBLE), int(Code.DONE))
 
-    audit = raise_infeasible if policy == "raise" else None
-    return Rule(init, process, before, after, name=NAME, settle=settle, audit=audit)
+    return Rule(init, process, before, after, name=NAME, settle=settle)
 
 
 def _as_gamma(gamma: Any) -> float:

@@ -13,8 +13,8 @@ def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
     """A rule that acts on measurements of the named sensors, and of others knows nothing.
 
     Its `before` and `after` are called for these alone, and it begins with their dimensions alone.
-    What it does once a step (`process`, `settle`) or after a run (`audit`) it does as ever. Other
-    sensors carry no notes of it.
+    What it does once a step (`process`, `settle`) it does as ever. Other sensors carry no notes of
+    it.
 
     Args:
         sensors: a name, or several; those that a filter does not have are left out, so that one

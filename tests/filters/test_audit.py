@@ -1,0 +1,103 @@
+"""Whatever filter a rule is in, its memory is asked after a run what it has to report."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+from two_sensors import SYSTEMS, N, Y, by_sensor, model_of
+
+from robins import linalg
+from robins.filters import (
+    Belief,
+    Family,
+    Model,
+    OnlineFilter,
+    Rule,
+    Sensor,
+    at_master,
+    channel,
+    delayed,
+    distributed,
+    federated,
+    guarded,
+    imm,
+    kalman,
+    run,
+)
+from robins.filters.rules import gate, only
+
+STEPS = 6
+S = SYSTEMS[0]
+MODEL = model_of(*(jnp.array(part) for part in (S.F, S.G, S.H, S.W)))
+HELD = Sensor(Partial(lambda row, x, aux: row @ x, jnp.ones((1, N))), jnp.ones(1), 1, "held")
+WITH_HELD = Model(MODEL.motion, (*MODEL.sensors, HELD))
+START = Belief(jnp.array(S.m0), linalg.factor(S.P0))
+DATA = by_sensor(np.nan_to_num(Y[0, :STEPS]))
+HEARD: list[tuple] = []
+
+
+class Asked(NamedTuple):
+    """Counts predictions, and keeps for whom."""
+
+    who: Any
+    count: Any
+
+    def audit(self, start, again, time):
+        """What it was asked with; run once more from 100."""
+        more = None if again is None else int(again(start._replace(count=start.count + 100)).count)
+        HEARD.append((int(self.who), int(start.count), int(self.count), more, time))
+
+
+def asked(who, rule=None):
+    """A filter with a rule whose memory is asked."""
+
+    def process(memory, transition):
+        return memory._replace(count=memory.count + 1), transition
+
+    counting = Rule(
+        lambda *_: Asked(jnp.asarray(who), jnp.zeros((), int)), process, name=f"counting {who}"
+    )
+    return kalman(rules=[gate(), counting if rule is None else rule(counting)])
+
+
+LOCALS = (channel("a", asked(0)), channel("b", asked(1)))
+EVEN = np.full((2, 2), 0.5)
+# The filter, who in it is asked, in order, and how many predictions it makes of those of the run.
+FILTERS = {
+    "kalman": (asked(0), [(0, 1)]),
+    "only": (asked(0, partial(only, "a")), [(0, 1)]),
+    "modes": (imm([kalman(), asked(1), asked(2)], np.eye(3)), [(1, 1), (2, 1)]),
+    "family": (imm(Family(asked, jnp.arange(2)), EVEN), [(0, 1), (1, 1)]),
+    "federated": (federated(LOCALS), [(0, 1), (1, 1)]),
+    "distributed": (distributed(LOCALS), [(0, 1), (1, 1)]),
+    "master": (at_master(distributed(LOCALS), "held", asked(2)), [(0, 1), (1, 1), (2, 0)]),
+    "guarded": (guarded(asked(0), asked(1), "a", ["b"], [(0, 1)]), [(0, 1), (1, 1)]),
+    "delayed": (delayed(asked(0), MODEL, 2), [(0, 1)]),
+    "deep": (
+        imm([kalman(), federated([channel("a", imm([asked(0)], [[1.0]])), LOCALS[1]])], EVEN),
+        [(0, 1), (1, 1)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_memory_is_asked_with_a_run_of_its_own(name):
+    filter_, expected = FILTERS[name]
+    model = WITH_HELD if name == "master" else MODEL
+    data = DATA | {"held": np.zeros((STEPS, 1))} if name == "master" else DATA
+    HEARD.clear()
+    run(filter_, model, START, data, time_s=np.arange(STEPS))
+    steps = [(who, STEPS * predicts) for who, predicts in expected]
+    assert [h[:4] for h in HEARD] == [(who, 0, n, 100 + n) for who, n in steps]
+    assert all(len(h[4]) == STEPS for h in HEARD)
+
+
+def test_one_by_one_there_is_no_other_run():
+    online = OnlineFilter(asked(3), MODEL, START)
+    HEARD.clear()
+    online.predict()
+    online.update(DATA["a"][0], "a")
+    assert HEARD == [(3, 1, 1, None, None)] * 2
