@@ -193,6 +193,35 @@ def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
     )
 
 
+def _named(given: Any) -> str:
+    """A wrong argument in an error: a function by its name."""
+    return getattr(given, "__name__", None) or repr(given)
+
+
+def _as_way(given: Any) -> Linearisation:
+    if given is None:
+        return taylor()
+    if not isinstance(given, Linearisation):
+        raise TypeError(
+            f"linearise must be made by taylor(), unscented() or cubature(), got {_named(given)}"
+            + (f": call it, {_named(given)}()" if callable(given) else "")
+        )
+    return given
+
+
+def _as_rules(given: Any) -> tuple[Rule, ...]:
+    if isinstance(given, Rule) or not isinstance(given, Sequence):
+        told = f"the rule {given.name}" if isinstance(given, Rule) else _named(given)
+        raise TypeError(f"rules must be a sequence of rules, as in rules=[gate()], got {told}")
+    for i, one in enumerate(given):
+        if not isinstance(one, Rule):
+            raise TypeError(
+                f"rules[{i}] must be a rule, as gate() makes one, got {_named(one)}"
+                + (f": call it, {_named(one)}()" if callable(one) else "")
+            )
+    return tuple(given)
+
+
 def kalman(
     linearise: Linearisation | None = None, rules: Sequence[Rule] = (), form: Form = "sqrt"
 ) -> Filter:
@@ -208,12 +237,12 @@ def kalman(
         form: "sqrt" (default, keeps full accuracy) or "joseph" (about 2.5 times faster at n = 15).
 
     Raises:
+        TypeError: linearise is not what `taylor` and its kin return, or rules are none.
         ValueError: the form is neither.
     """
     if form not in ("sqrt", "joseph"):
         raise ValueError(f"form must be 'sqrt' or 'joseph', got {form!r}")
-    way = taylor() if linearise is None else linearise
-    rules = tuple(rules)
+    way, rules = _as_way(linearise), _as_rules(rules)
 
     settling = any(rule.settle is not keep_belief for rule in rules)
 

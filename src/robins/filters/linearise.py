@@ -71,12 +71,10 @@ class Linearisation(NamedTuple):
     reuse: Reuse | None = None
 
 
-def _is_none(leaf):
-    return leaf is None
-
-
-def _shape(leaf):
-    return None if leaf is None else jnp.shape(leaf)
+def _form(x: Any) -> tuple[Any, tuple]:
+    """Structure and shapes, which compare without asking an element for its `__eq__`."""
+    leaves, tree = jax.tree_util.tree_flatten(x, is_leaf=lambda leaf: leaf is None)
+    return tree, tuple(None if leaf is None else jnp.shape(leaf) for leaf in leaves)
 
 
 def _magnitude(x: State) -> Array:
@@ -102,8 +100,8 @@ def _observe(
         ValueError: the sensor reads another number of components than it says, or its measurement
             is of another form than its reading.
     """
-    reads, given = (jax.tree_util.tree_map(_shape, x, is_leaf=_is_none) for x in (z, y))
-    if reads != given:
+    if (reads := _form(z)) != (given := _form(y)):
+        reads, given = (tree.unflatten(shapes) for tree, shapes in (reads, given))
         raise ValueError(
             f"sensor '{sensor.name}' reads shape {reads}, but was given {given} to compare"
         )
@@ -146,7 +144,7 @@ def taylor() -> Linearisation:
             mean, F, given = motion.linear(belief.mean, u)
             noise = as_noise(given, F.shape[0], "the motion")
         else:
-            mean, F = _jacobian(lambda x: motion.step(x, u), belief.mean)
+            mean, F = _jacobian(lambda x: motion.moved(x, u), belief.mean)
             noise = motion.noise_factor(belief.mean, u)
         return Transition(mean, F @ belief.factor, linalg.zeros(F.shape[0], 0), noise)
 
@@ -154,7 +152,7 @@ def taylor() -> Linearisation:
         if sensor.linear is not None:
             z, H = sensor.linear(prior.mean, aux)
         else:
-            z, H = _jacobian(lambda x: sensor.read(x, aux), prior.mean)
+            z, H = _jacobian(lambda x: sensor.reading(x, aux), prior.mean)
         size = jnp.abs(H) @ (prior.sigma + _magnitude(prior.mean))
         nothing = linalg.zeros(sensor.dim, 0)
         return _observe(sensor, prior, z, y, aux, H @ prior.factor, nothing, size)
@@ -263,7 +261,7 @@ def unscented(
     def transition(belief: Belief, motion: Motion, u) -> Transition:
         n = belief.factor.shape[0]
         points = sigma_points(belief, sigma_weights(n, alpha, beta, kappa).reach)
-        values = jax.vmap(lambda x: motion.step(x, u))(points)
+        values = jax.vmap(lambda x: motion.moved(x, u))(points)
         mean, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
         noise = motion.noise_factor(belief.mean, u)
         moved = None if redraw else Points(values, _square(noise))
@@ -272,7 +270,7 @@ def unscented(
     def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
         weights = sigma_weights(n, alpha, beta, kappa)
-        values = jax.vmap(lambda x: sensor.read(x, aux))(sigma_points(prior, weights.reach))
+        values = jax.vmap(lambda x: sensor.reading(x, aux))(sigma_points(prior, weights.reach))
         z, spread, excess, deficit = _regress(values, n, alpha, beta, kappa)
         size = jnp.max(jax.vmap(_magnitude)(values), axis=0) / weights.reach
         return _observe(sensor, prior, z, y, aux, spread, excess, size, deficit)
@@ -287,7 +285,7 @@ def unscented(
 
     def observe_again(points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
-        values = jax.vmap(lambda x: sensor.read(x, aux))(points.states)
+        values = jax.vmap(lambda x: sensor.reading(x, aux))(points.states)
         _, *state, lack = _regress(points.states, n, alpha, beta, kappa)
         z, *reading, deficit = _regress(values, n, alpha, beta, kappa)
         if lack is not None or deficit is not None:

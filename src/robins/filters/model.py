@@ -8,7 +8,7 @@ factors, parameters bound with ``jax.tree_util.Partial``) is data: it may change
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import InitVar, dataclass, fields
 from typing import Any
 
 import jax
@@ -32,6 +32,32 @@ def as_noise(value: Any, n: int, whose: str) -> Array:
             "factor L of the covariance L L' are wanted"
         )
     return linalg.as_factor(noise)
+
+
+def _settle_noise(own: Any, covariance: Any, whose: str) -> None:
+    if (own.noise is None) == (covariance is None):
+        raise TypeError(
+            f"{whose} needs noise=, standard deviations or a factor L of the covariance L L', or "
+            "noise_covariance= in its place"
+        )
+    if covariance is not None:
+        object.__setattr__(own, "noise", linalg.factor(covariance, f"noise covariance of {whose}"))
+
+
+def _told(tree: Any) -> Any:
+    """Kind and shape of each number of a pytree, for messages."""
+    return jax.tree_util.tree_map(lambda a: f"{jnp.result_type(a)}{jnp.shape(a)}", tree)
+
+
+def _check_width(whose: str, found: Any) -> None:
+    """Refuse what a user's function returns in another width than all of robins computes in."""
+    for leaf in jax.tree_util.tree_leaves(found):
+        kind = str(jnp.result_type(leaf))
+        if kind != "float64":
+            raise TypeError(
+                f"{whose} returns {kind}, and filters compute in float64: name no other dtype in "
+                "it, or end it with .astype(float)"
+            )
 
 
 def _is_static(value: Any) -> bool:
@@ -72,11 +98,34 @@ class Motion:
             deviations, (n, k) factor with Q = L L', or ``(x, u) -> `` one of these.
         linear: optional ``(x, u) -> (new x, F, noise)`` where an analytic transition exists;
             `taylor` then uses it in place of automatic differentiation.
+        noise_covariance: (n, n) Q, in the place of `noise` (looked at, so not inside `jit`).
+
+    Raises:
+        TypeError: both of noise and its covariance are given, or neither.
+        ValueError: the covariance is none.
     """
 
     step: Callable[[Any, Any], Any]
-    noise: Any
+    noise: Any = None
     linear: Callable[[Any, Any], Any] | None = None
+    noise_covariance: InitVar[Any] = None
+
+    def __post_init__(self, noise_covariance: Any) -> None:
+        """Take the noise as it was given."""
+        _settle_noise(self, noise_covariance, "the motion")
+
+    def moved(self, x, u):
+        """The state after a step.
+
+        Raises:
+            TypeError: `step` computes in another width than 64 bits.
+            ValueError: it returns something of another form than a state.
+        """
+        new = self.step(x, u)
+        _check_width("step of the motion", new)
+        if (found := str(_told(new))) != (wanted := str(_told(x))):
+            raise ValueError(f"step of the motion returns {found} of a state {wanted}")
+        return new
 
     def noise_factor(self, x, u):
         """Process noise factor at x."""
@@ -94,16 +143,40 @@ class Sensor:
             what the reading needs besides the state (star direction, antenna rate, ...), or None.
         noise: (m,) standard deviations, (m, k) factor with R = L L', or
             ``(x, aux) -> `` one of these.
-        dim: tangent dimension m of the measurement.
+        dim: tangent dimension m of the measurement; may be left out where the noise tells it.
         name: key of its measurements in a run.
         linear: optional ``(x, aux) -> (z, H)`` with an analytic Jacobian.
+        noise_covariance: (m, m) R, in the place of `noise` (looked at, so not inside `jit`).
+
+    Raises:
+        TypeError: both of noise and its covariance are given, or neither; nothing tells dim.
+        ValueError: the covariance is none.
     """
 
     read: Callable[[Any, Any], Any]
-    noise: Any
-    dim: int
+    noise: Any = None
+    dim: int = -1
     name: str = "y"
     linear: Callable[[Any, Any], Any] | None = None
+    noise_covariance: InitVar[Any] = None
+
+    def __post_init__(self, noise_covariance: Any) -> None:
+        """Take the noise as it was given."""
+        _settle_noise(self, noise_covariance, f"sensor '{self.name}'")
+        if self.dim < 0:
+            if callable(self.noise):
+                raise TypeError(f"sensor '{self.name}' needs dim=, how many numbers it reads")
+            object.__setattr__(self, "dim", len(self.noise))
+
+    def reading(self, x, aux):
+        """What it would read at x.
+
+        Raises:
+            TypeError: `read` computes in another width than 64 bits.
+        """
+        z = self.read(x, aux)
+        _check_width(f"read of sensor '{self.name}'", z)
+        return z
 
     def noise_factor(self, x, aux):
         """Measurement noise factor at x."""
