@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class RobinsError(Exception):
     """The base of all errors of robins: one sentence, ``where: what; fix``.
@@ -37,3 +40,22 @@ def require(holds: object, sentence: str, got: object = _NOTHING) -> None:
     """
     if not holds:
         raise ValueError(sentence if got is _NOTHING else f"{sentence}, got {got}")
+
+
+def hint(word: str, among: Iterable[str]) -> str:
+    """The end of a sentence about a word that is not known."""
+    near = difflib.get_close_matches(word, list(among), 1)
+    return f"; did you mean '{near[0]}'?" if near else "."
+
+
+def require_known(kind: str, name: str, among: Iterable[str], where: str = "this study") -> None:
+    """Refuse a name that is not among those there are.
+
+    Raises:
+        ValueError: it is not; the message names the nearest, and all.
+    """
+    known = list(among)
+    require(
+        name in known,
+        f"no {kind} '{name}' in {where}{hint(name, known)} It has {', '.join(known)}",
+    )

@@ -8,7 +8,8 @@ from robins import scenario
 from robins.campaign import chunks, collect
 from robins.systems.ins_gnss import Drive, drive_problem
 from robins.systems.ins_gnss.drive import lay_out
-from robins.systems.ins_gnss.drive_claims import drive_claims
+from robins.systems.ins_gnss.drive_claims import CLAIMS
+from robins.systems.judgement import judging
 
 RUNS = 100
 
@@ -23,7 +24,7 @@ def campaign(*settings):
     problem = drive_problem(parsed(*small, *settings), ("ekf",), 1)
     statistics = collect(chunks(problem, "ekf", RUNS, chunk=RUNS), problem.blocks)
     metrics = problem.metrics(statistics)
-    return metrics, {c["id"]: c["verdict"] for c in drive_claims({"ekf": metrics})}
+    return metrics, {c["id"]: c["verdict"] for c in judging(CLAIMS)({"ekf": metrics})}
 
 
 @pytest.fixture(scope="module")

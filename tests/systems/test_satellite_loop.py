@@ -142,7 +142,9 @@ def test_craft_that_cannot_be(settings, words):
 
 
 def test_unknown_filter():
-    with pytest.raises(ValueError, match="no filter 'ekf' in this study; it has raw, mekf,"):
+    with pytest.raises(
+        ValueError, match=r"no filter 'ekf' in this study; did you mean 'mekf'\? It has raw, mekf,"
+    ):
         problem("s1", ("ekf",))
 
 

@@ -19,6 +19,7 @@ from robins import rotation, scenario
 from robins.filters import run
 from robins.results import summary
 from robins.scenario import ScenarioError
+from robins.systems.judgement import judging
 from robins.systems.transfer_alignment.attitude_matching import ATTITUDE
 from robins.systems.transfer_alignment.matching import (
     lay_out,
@@ -30,7 +31,6 @@ from robins.systems.transfer_alignment.matching import (
 from robins.systems.transfer_alignment.matching_claims import (
     CLAIMS,
     NO_RESULT,
-    matching_claims,
     matching_metrics,
 )
 from robins.systems.transfer_alignment.matching_parameters import FILTERS, Matching
@@ -344,7 +344,7 @@ VERDICTS = {  # five-arcmin, gamma-50, units, beats-kf, saves-the-model
 @pytest.mark.parametrize("name", VERDICTS)
 def test_published_claims_are_judged(name):
     judged = told(name)
-    assert [c["id"] for c in CLAIMS] == list(judged)
+    assert list(CLAIMS) == list(judged)
     assert tuple(c["verdict"] for c in judged.values()) == VERDICTS[name]
     assert judged["units"]["value"] == 2
     assert judged["gamma-50"]["value"] < 0.2
@@ -392,13 +392,13 @@ GOOD = {
     ],
 )
 def test_a_claim_can_come_out_otherwise(claim, changed, verdict):
-    (judged,) = matching_claims([claim], GOOD | changed)
+    (judged,) = judging(CLAIMS, [claim])(GOOD | changed)
     assert judged["verdict"] == verdict
 
 
 def test_what_was_not_run_is_not_judged():
-    assert matching_claims([c["id"] for c in CLAIMS], {"kf": GOOD["kf"]}) == []
-    assert matching_claims([], GOOD) == []
+    assert judging(CLAIMS)({"kf": GOOD["kf"]}) == []
+    assert judging(CLAIMS, [])(GOOD) == []
 
 
 # -------------------------------------------------------------------------------------- bad input
@@ -441,7 +441,7 @@ def test_times_that_do_not_fit_are_refused():
 
 def test_an_unknown_filter_is_refused_with_those_there_are():
     with pytest.raises(
-        ValueError, match=r"no filter 'hinf' in this study; it has kf, .*hinf-weighted"
+        ValueError, match=r"no filter 'hinf' .*did you mean 'hinf-.*'\? It has kf, .*hinf-weighted"
     ):
         matching_problem(given(), ("kf", "hinf"), 0)
     assert tuple(given().filters) == FILTERS

@@ -17,11 +17,12 @@ from numpy.testing import assert_allclose
 from robins import scenario
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, run
+from robins.systems.judgement import judging
 from robins.systems.tables import Update
 from robins.systems.transfer_alignment import patent
 from robins.systems.transfer_alignment import velocity_attitude as va
 from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.patent_claims import patent_claims, patent_metrics
+from robins.systems.transfer_alignment.patent_claims import CLAIMS, patent_metrics
 
 FOLDER = Path(patent.__file__).parent / "scenarios"
 RUNS = 100
@@ -250,7 +251,9 @@ def test_scenarios_that_cannot_be(settings, message):
 
 
 def test_a_filter_nobody_knows_is_refused():
-    with pytest.raises(ValueError, match="no filter 'kalmann' in this study; it has kf, kf-told-r"):
+    with pytest.raises(
+        ValueError, match=r"no filter 'kalmann' in this study\. It has kf, kf-told-r"
+    ):
         patent.patent_problem(parsed("a"), ("kalmann",), 0)
 
 
@@ -273,11 +276,11 @@ def test_claims_are_judged_by_ratios_of_the_same_runs():
     }
     metrics = {name: {"attitude_rms_all_arcmin": value} for name, value in rms.items()}
     ids = ("beats-kf", "kf-suffers", "beats-fixed", "compensation")
-    found = {c["id"]: (c["verdict"], c["value"]) for c in patent_claims(ids, metrics)}
+    found = {c["id"]: (c["verdict"], c["value"]) for c in judging(CLAIMS, ids)(metrics)}
     assert found["beats-kf"] == ("partly", pytest.approx(0.97))
     assert found["kf-suffers"] == ("reproduced", pytest.approx(2.0))
     assert found["beats-fixed"] == ("not", pytest.approx(9.7 / 9.75))
     assert found["compensation"] == ("reproduced", pytest.approx(0.5))
     del metrics["kf"]
-    assert [c["id"] for c in patent_claims(ids, metrics)] == ["beats-fixed", "compensation"]
-    assert patent_claims((), metrics) == []
+    assert [c["id"] for c in judging(CLAIMS, ids)(metrics)] == ["beats-fixed", "compensation"]
+    assert judging(CLAIMS, ())(metrics) == []

@@ -20,11 +20,12 @@ from robins.rotation import Rotation
 from robins.scenario import ScenarioError, load, parse
 from robins.sim.flexure import Flexure
 from robins.systems import transfer_alignment
+from robins.systems.judgement import judging
 from robins.systems.tables import Update
 from robins.systems.transfer_alignment import product as p
 from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.product_claims import CLAIMS, product_claims, product_metrics
+from robins.systems.transfer_alignment.product_claims import CLAIMS, product_metrics
 from robins.systems.transfer_alignment.product_filters import (
     FILTERS,
     Believed,
@@ -441,7 +442,7 @@ def test_metrics_are_in_their_units_and_order():
     ("scale", "held"), [(1.0, {"sigma", "anees", "nis", "aligned"}), (1.3, {"nis"})]
 )
 def test_claims_hold_for_a_right_filter_only(scale, held):
-    claims = product_claims({"product": product_metrics(statistics(scale, epochs=200))})
-    assert [c["id"] for c in claims] == [c["id"] for c in CLAIMS]
+    claims = judging(CLAIMS)({"product": product_metrics(statistics(scale, epochs=200))})
+    assert [c["id"] for c in claims] == list(CLAIMS)
     assert {c["id"] for c in claims if c["verdict"] == "reproduced"} == held
-    assert product_claims({"kf": {}}) == []
+    assert judging(CLAIMS)({"kf": {}}) == []

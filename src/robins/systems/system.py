@@ -20,6 +20,7 @@ from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
 from robins.systems.catalogue import listed
+from robins.systems.judgement import Claim
 from robins.systems.limits import Names, Runs
 
 
@@ -184,7 +185,7 @@ class Study(NamedTuple):
     parameters: type[Scenario]
     problem: Callable[..., Problem]  # (parameters, filters, seed) -> problem
     filters: tuple[str, ...]
-    claims: tuple[Mapping[str, str], ...] = ()  # {"id", "text"} of what its scenarios check
+    claims: Mapping[str, Claim] = {}  # by id, what its scenarios check
 
 
 class Alignment(NamedTuple):
@@ -222,6 +223,7 @@ class System(NamedTuple):
 
     @property
     def claims(self) -> tuple[Mapping[str, str], ...]:
-        """What scenarios check, each once: studies may share claims."""
-        every = [claim for study in self.studies.values() for claim in study.claims]
-        return tuple(claim for i, claim in enumerate(every) if claim not in every[:i])
+        """Ids and texts of what scenarios check, each once: studies may share claims."""
+        every = (item for study in self.studies.values() for item in study.claims.items())
+        told = dict.fromkeys((key, claim.text) for key, claim in every)
+        return tuple({"id": key, "text": text} for key, text in told)

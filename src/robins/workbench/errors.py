@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from robins.errors import RobinsError
 
@@ -24,9 +23,3 @@ def refusing(what: object) -> Iterator[None]:
         yield
     except ValueError as error:
         raise InputError(str(error), what) from error
-
-
-def hint(word: str, among: Iterable[str]) -> str:
-    """The end of a sentence about a word that is not known."""
-    near = difflib.get_close_matches(word, list(among), 1)
-    return f"; did you mean '{near[0]}'?" if near else "."

@@ -9,9 +9,10 @@ from typing import Any
 import jax
 
 from robins import scenario, systems
+from robins.errors import hint, require_known
 from robins.systems import Study, System
 from robins.systems.catalogue import configurations, listed
-from robins.workbench.errors import InputError, hint
+from robins.workbench.errors import InputError, refusing
 
 
 def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
@@ -81,11 +82,9 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
     Raises:
         InputError: one of them is not among the known.
     """
-    for name in wanted:
-        if name not in known:
-            raise InputError(
-                f"no filter '{name}' in {where}{hint(name, known)} It has {', '.join(known)}"
-            )
+    with refusing(""):
+        for name in wanted:
+            require_known("filter", name, known, where)
     return tuple(dict.fromkeys(wanted))
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from robins.systems.claims import Claim, listed, ratio, verdicts
+from robins.systems.judgement import Claim, ratio
 
 AEKF, UKF, RAUKF, CUKF = "aekf", "ukf", "raukf", "cukf-wind-states"
 
@@ -67,7 +66,7 @@ def _worst_ratio(ours: str, others: Sequence[str]) -> Callable[..., float]:
     return value
 
 
-_CLAIMS: dict[str, Claim] = {
+CLAIMS: dict[str, Claim] = {
     "aekf-worse": Claim(
         "The robust adaptive UKF is more accurate than the adaptive EKF; value: ratio of the mean "
         "horizontal errors, RAUKF to AEKF",
@@ -127,9 +126,4 @@ _CLAIMS: dict[str, Claim] = {
         (0.0, 0.7),
     ),
 }
-
-CLAIMS = listed(_CLAIMS)
-"""Every claim a scenario of the study may state."""
-
-airship_claims = partial(verdicts, _CLAIMS)
-"""Verdicts of the claims that a scenario states: ``(ids, metrics by filter)``."""
+"""Every claim that a scenario may state."""

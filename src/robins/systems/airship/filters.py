@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from robins.errors import require_known
 from robins.filters import (
     Filter,
     Rule,
@@ -46,7 +47,6 @@ from robins.systems.airship.model import (
     WIND,
     WIND_OF_STAR,
 )
-from robins.systems.airship.parameters import FILTERS
 
 States = Literal["nine", "errors", "wind", "product"]
 Given = Literal["measured", "exact", "constant", "sideslip"]  # of air data and wind
@@ -189,6 +189,5 @@ def make_filter(name: str) -> Filter:
     Raises:
         ValueError: there is no filter of this name.
     """
-    if name not in KINDS:
-        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(FILTERS)}")
+    require_known("filter", name, KINDS)
     return KINDS[name].make()

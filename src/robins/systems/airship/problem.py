@@ -7,11 +7,12 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from robins.systems.airship.claims import airship_claims, airship_metrics, published
+from robins.systems.airship.claims import CLAIMS, airship_metrics, published
 from robins.systems.airship.contender import contender
 from robins.systems.airship.model import SAR, STAR, STAR_EARLY, WIND, WIND_OF_STAR
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import lay_out, simulate
+from robins.systems.judgement import judging
 from robins.systems.system import Norm, Problem, SensorAxes, StateBlock
 
 ENU = ("east", "north", "up")
@@ -59,7 +60,7 @@ def airship_problem(given: Airship, filters: tuple[str, ...], seed: int) -> Prob
         sensors=SENSORS,
         context=xr.Dataset(),
         metrics=partial(airship_metrics, course.epoch_s, at_s),
-        claims=partial(airship_claims, given.claims),
+        claims=judging(CLAIMS, given.claims),
         count_from=first,
         count_to=last,
         norms=NORMS,

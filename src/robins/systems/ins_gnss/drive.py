@@ -34,7 +34,7 @@ from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion
 from robins.systems.ins_gnss import model as names
-from robins.systems.ins_gnss.drive_claims import drive_claims, drive_metrics
+from robins.systems.ins_gnss.drive_claims import CLAIMS, drive_metrics
 from robins.systems.ins_gnss.legs import motion_of
 from robins.systems.ins_gnss.model import Block, Fix, Velocity
 from robins.systems.ins_gnss.outages import outage_mask
@@ -47,6 +47,7 @@ from robins.systems.ins_gnss.setup import (
     sigma_of,
     state_blocks,
 )
+from robins.systems.judgement import judging
 from robins.systems.limits import refuse_unsettled
 from robins.systems.system import Case, Contender, Problem
 from robins.systems.tables import place_arrays
@@ -277,7 +278,7 @@ def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:
         sensors=SENSORS,
         context=_context(course),
         metrics=partial(drive_metrics, course.outage, blocks),
-        claims=drive_claims,
+        claims=judging(CLAIMS),
         shown=_tracks,
         count_from=count_from,
     )

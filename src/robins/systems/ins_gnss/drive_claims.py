@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from robins import units
-from robins.systems.claims import consistency, grand_means, proven
+from robins.systems.judgement import consistency, consistency_claims
 from robins.systems.system import StateBlock
 
-CLAIMS = (
+CLAIMS = consistency_claims(
     {
-        "id": "sigma",
-        "text": "On no state the RMS error is proven, at 99 % confidence, to differ from the "
+        "sigma": "On no state the RMS error is proven, at 99 % confidence, to differ from the "
         "filter's sigma by more than 5 %; value: the largest difference proven",
-    },
-    {"id": "anees", "text": "ANEES is inside its 95 % band at 90 % of the epochs or more"},
-    {"id": "nis", "text": "The grand mean NIS of every sensor is inside its 99.9 % band"},
+        "anees": "ANEES is inside its 95 % band at 90 % of the epochs or more",
+        "nis": "The grand mean NIS of every sensor is inside its 99.9 % band",
+    }
 )
+"""With several filters, of the worst of them."""
 
 
 def drive_metrics(
@@ -53,20 +53,3 @@ def drive_metrics(
         worst = np.sum(rms[start:][~aided][:, horizontal] ** 2, axis=1)
         out["outage_horizontal_worst_rms_m"] = float(np.sqrt(np.max(worst)))
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
-
-
-def drive_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Verdict per claim; with several filters, of the worst of them."""
-    off = max(proven(m) for m in metrics.values())
-    share = min(m["anees_share_inside"] for m in metrics.values())
-    means, within = zip(*(grand_means(m) for m in metrics.values()), strict=True)
-    farthest, inside = max(means, key=lambda value: abs(value - 1.0)), all(within)
-    verdicts = (
-        (off, [0.0, 0.05], "reproduced" if off <= 0.05 else "not"),
-        (share, [0.9, 1.0], "reproduced" if share >= 0.9 else "not"),
-        (farthest, None, "reproduced" if inside else "not"),
-    )
-    return [
-        {**claim, "verdict": verdict, "value": value, "band": band}
-        for claim, (value, band, verdict) in zip(CLAIMS, verdicts, strict=True)
-    ]

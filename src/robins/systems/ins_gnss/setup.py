@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.earth import Geodetic
+from robins.errors import require_known
 from robins.filters import Belief, Filter, Model, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
 from robins.ins.state import InsNoise, InsState
@@ -44,10 +45,7 @@ def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
         ValueError: there is no filter of this name.
     """
     base = name.removesuffix(SMOOTHED)
-    if base not in FILTERS:
-        raise ValueError(
-            f"no filter '{name}'; there are {', '.join(FILTERS)}, each also with {SMOOTHED}"
-        )
+    require_known("filter", base, FILTERS, f"this system, where each may end in {SMOOTHED}")
     return FILTERS[base]((gate(gate_probability),) if gate_probability > 0.0 else ())
 
 

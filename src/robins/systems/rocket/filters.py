@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from robins.errors import require_known
 from robins.filters import Filter, Rule, channel, federated, kalman, taylor, unscented
 from robins.filters.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
@@ -168,8 +169,7 @@ def make_filter(name: str, sight: Sight) -> Filter:
     Raises:
         ValueError: there is no filter of this name.
     """
-    if name not in KINDS:
-        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(KINDS)}")
+    require_known("filter", name, KINDS)
     return KINDS[name].make(sight)
 
 
@@ -180,6 +180,5 @@ def make_field_filter(name: str) -> Filter:
     Raises:
         ValueError: there is no filter of this name.
     """
-    if name not in FIELD_KINDS:
-        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(FIELD_KINDS)}")
+    require_known("filter", name, FIELD_KINDS)
     return FIELD_KINDS[name].make()

@@ -9,9 +9,10 @@ import numpy as np
 import xarray as xr
 
 from robins.results import array
+from robins.systems.judgement import judging
 from robins.systems.rocket.angle_contender import angle_contender, sight_of
 from robins.systems.rocket.angles import GYRO, MAGNETIC
-from robins.systems.rocket.claims import rocket_claims
+from robins.systems.rocket.claims import CLAIMS
 from robins.systems.rocket.field import FIELD, SNAPSHOT
 from robins.systems.rocket.field_contender import field_contender
 from robins.systems.rocket.metrics import angle_metrics, field_metrics
@@ -87,7 +88,7 @@ def _problem(given: Flight, course: Course, seed: int, **own: Any) -> Problem:
         simulate=partial(simulate, given, course, seed),
         epoch_s=course.time_s,
         context=_context(course),
-        claims=partial(rocket_claims, given.claims),
+        claims=judging(CLAIMS, given.claims),
         count_from=int(np.searchsorted(course.time_s, given.counted_from + 1e-9)),
         windows=course.bursts,
         notes=notes,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-from robins.systems.claims import Claim, listed, ratio, verdicts
+from robins.systems.judgement import Claim, ratio
 
 RMS, POINTING, SPREAD = "attitude_rms_arcsec", "pointing_rms_arcsec", "attitude_rms_spread_arcsec"
 BETTER, PARTLY = (0.0, 0.9), (0.0, 1.0)
@@ -21,7 +19,7 @@ def _against(other: str, words: str) -> Claim:
     )
 
 
-_CLAIMS: dict[str, Claim] = {
+CLAIMS: dict[str, Claim] = {
     "improves-on-star": _against("raw", "the star sensor alone"),
     "improves-on-mekf": _against("mekf", "a Kalman filter that believes the nominal noise"),
     "improves-on-tuned": _against("mekf-tuned", "a Kalman filter with more noise on the bias"),
@@ -43,9 +41,4 @@ _CLAIMS: dict[str, Claim] = {
         PARTLY,
     ),
 }
-
-CLAIMS = listed(_CLAIMS)
 """Every claim that a scenario may state."""
-
-satellite_claims = partial(verdicts, _CLAIMS)
-"""Verdicts of the claims that a scenario states: ``(ids, metrics by filter)``."""

@@ -11,6 +11,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
+from robins.errors import require_known
 from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
@@ -91,8 +92,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
         ValueError: there is no filter of this name, or its design needs a package that is not
             there.
     """
-    if name not in KINDS:
-        raise ValueError(f"no filter '{name}' in this study; it has {', '.join(KINDS)}")
+    require_known("filter", name, KINDS)
     kind = KINDS[name]
     walk = believed_walk(given, kind)
     noise = model.noise_of(given.gyro.random_walk, walk, given.step)

@@ -8,7 +8,8 @@ import numpy as np
 import xarray as xr
 
 from robins.results import array
-from robins.systems.satellite.claims import satellite_claims
+from robins.systems.judgement import judging
+from robins.systems.satellite.claims import CLAIMS
 from robins.systems.satellite.contender import contender
 from robins.systems.satellite.course import Course, lay_out
 from robins.systems.satellite.metrics import attitude_metrics
@@ -42,7 +43,7 @@ def attitude_problem(given: AttitudeLoop, filters: tuple[str, ...], seed: int) -
         sensors={STAR: SensorAxes("rad", "body", AXES, "arcsec")},
         context=_context(course),
         metrics=attitude_metrics,
-        claims=partial(satellite_claims, given.claims),
+        claims=judging(CLAIMS, given.claims),
         count_from=counted,
         outputs=_outputs(given),
         norms=(Norm("attitude", (0, 1, 2)),),

@@ -25,6 +25,7 @@ from robins import rotation, units
 from robins.results import array
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.random import Component, stream, unit
+from robins.systems.judgement import judging
 from robins.systems.system import Limit, Problem, SensorAxes, StateBlock
 from robins.systems.transfer_alignment.attitude_matching import ATTITUDE
 from robins.systems.transfer_alignment.bank_turn import (
@@ -34,7 +35,7 @@ from robins.systems.transfer_alignment.bank_turn import (
     rate_in_enu,
     roll_rad,
 )
-from robins.systems.transfer_alignment.matching_claims import matching_claims, matching_metrics
+from robins.systems.transfer_alignment.matching_claims import CLAIMS, matching_metrics
 from robins.systems.transfer_alignment.matching_filters import World, contenders
 from robins.systems.transfer_alignment.matching_parameters import Manoeuvre, Matching
 
@@ -250,7 +251,7 @@ def matching_problem(given: Matching, filters: tuple[str, ...], seed: int) -> Pr
             | array("outage", (~course.heard).astype(np.int8), long_name="no attitude")
         ),
         metrics=matching_metrics,
-        claims=partial(matching_claims, given.claims),
+        claims=judging(CLAIMS, given.claims),
         count_from=count_from,
         limits=LIMITS,
     )

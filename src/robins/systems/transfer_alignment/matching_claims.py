@@ -2,49 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from robins import units
+from robins.systems.judgement import Claim, Metrics, graded, ratio
 
 FIVE_ARCMIN = "5_arcmin"
 
-CLAIMS = (
-    {
-        "id": "five-arcmin",
-        "text": "From 15 s on the H-infinity filter with gamma = 50 is within 5' on every axis, "
-        "the Kalman filter at tens of arcminutes (Gu & Qin 2005); RMS over the runs, in the unit "
-        "of angle that suits it best; value: its worst axis [arcmin]",
-    },
-    {
-        "id": "gamma-50",
-        "text": "gamma = 50 makes it robust (Gu & Qin 2005): in degrees it is at least 10 % more "
-        "accurate than the same filter with gamma = inf, a Kalman filter with R = (1 deg)^2; "
-        "value: the largest difference of their RMS on an axis [arcmin]",
-    },
-    {
-        "id": "units",
-        "text": "With R = I, L = I and gamma = 50 the filter exists over the whole run in any unit "
-        "of angle; value: in how many of radians, degrees and arcminutes it does",
-    },
-    {
-        "id": "beats-kf",
-        "text": "Told nothing of the flexure, the H-infinity filter in degrees is more accurate "
-        "than the Kalman filter with R = (1')^2 (Gu & Qin 2005) on every axis; value: the largest "
-        "ratio of their RMS on an axis",
-    },
-    {
-        "id": "saves-the-model",
-        "text": "It saves modelling the flexure (Gu & Qin 2005): in degrees its RMS over all axes "
-        "is at most 1.1 times that of a Kalman filter with flexure states; value: that ratio",
-    },
-)
-"""Every claim a scenario of the study may state."""
-
 UNITS = ("hinf-rad", "hinf-deg", "hinf-arcmin")
 PUBLISHED = ("hinf-rad", "hinf-rad-identity", "hinf-deg", "hinf-arcmin")
+ALL = "attitude_rms_all_arcmin"
 
 NO_RESULT: dict[str, Any] = {
     "attitude_rms_arcmin": [np.nan] * 3,
@@ -73,89 +43,81 @@ def matching_metrics(statistics: Any) -> dict[str, Any]:
     }
 
 
-def matching_claims(
-    stated: Sequence[str], metrics: Mapping[str, dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Verdicts of the claims that a scenario states, where their filters were run.
-
-    Args:
-        stated: ids of claims.
-        metrics: by filter.
-    """
-    judges = {
-        "five-arcmin": _five_arcmin,
-        "gamma-50": _gamma,
-        "units": _units,
-        "beats-kf": _beats,
-        "saves-the-model": _saves,
-    }
-    out = []
-    for claim in CLAIMS:
-        judged = judges[claim["id"]](metrics) if claim["id"] in stated else None
-        if judged is not None:
-            verdict, value, band = judged
-            out.append({**claim, "verdict": verdict, "value": value, "band": band})
-    return out
-
-
-def _existing(metrics: Mapping[str, dict[str, Any]], *names: str) -> list[dict[str, Any]] | None:
-    """Metrics of these filters; None where one was not run or does not exist."""
-    if any(name not in metrics or not metrics[name].get("feasible", True) for name in names):
-        return None
-    return [metrics[name] for name in names]
-
-
 def _axes(metrics: Mapping[str, Any]) -> np.ndarray:
     return np.asarray(metrics["attitude_rms_arcmin"])
 
 
-def _five_arcmin(metrics):
-    ran = [name for name in PUBLISHED if name in metrics]
-    kf = _existing(metrics, "kf")
-    if not ran or kf is None:
-        return None
-    worst = [np.max(_axes(m)) for name in ran for m in _existing(metrics, name) or ()]
-    best = float(min(worst, default=np.nan))
-    within, lost = best < 5.0, bool(np.all(_axes(kf[0]) >= 10.0))
-    verdict = "not" if not within else "reproduced" if lost else "partly"
-    return verdict, best, [0.0, 5.0]
+def _best(metrics: Metrics) -> float | None:
+    """The worst axis of the best of the published filters that exist."""
+    ran = [metrics[name] for name in PUBLISHED if name in metrics]
+    worst = [float(np.max(_axes(m))) for m in ran if m.get("feasible", True)]
+    return min(worst, default=float("nan")) if ran else None
 
 
-def _gamma(metrics):
-    found = _existing(metrics, "hinf-deg", "hinf-deg-inf")
-    if found is None:
-        return None
-    bounded, free = found
-    difference = float(np.max(np.abs(_axes(bounded) - _axes(free))))
-    gained = 1.0 - bounded["attitude_rms_all_arcmin"] / free["attitude_rms_all_arcmin"]
-    return (
-        ("reproduced" if gained >= 0.1 else "partly" if gained >= 0.02 else "not"),
-        difference,
-        None,
-    )
+def _kf_lost(metrics: Metrics) -> str:
+    best = _best(metrics)
+    within = best is not None and best < 5.0
+    return graded(within and np.all(_axes(metrics["kf"]) >= 10.0), within)
 
 
-def _units(metrics):
+def _gained(metrics: Metrics) -> str:
+    gained = 1.0 - metrics["hinf-deg"][ALL] / metrics["hinf-deg-inf"][ALL]
+    return graded(gained >= 0.1, gained >= 0.02)
+
+
+def _existing(metrics: Metrics) -> int | None:
     if any(name not in metrics for name in UNITS):
         return None
-    exists = sum(bool(metrics[name]["feasible"]) for name in UNITS)
-    return ("not", "partly", "partly", "reproduced")[exists], exists, [3, 3]
+    return sum(bool(metrics[name]["feasible"]) for name in UNITS)
 
 
-def _beats(metrics):
-    found = _existing(metrics, "hinf-deg", "kf")
-    if found is None:
-        return None
-    ratio = _axes(found[0]) / _axes(found[1])
-    better = int(np.sum(ratio < 1.0))
-    verdict = ("not", "partly", "partly", "reproduced")[better]
-    return verdict, float(np.max(ratio)), [0.0, 1.0]
+def _by_axis(metrics: Metrics) -> np.ndarray:
+    return _axes(metrics["hinf-deg"]) / _axes(metrics["kf"])
 
 
-def _saves(metrics):
-    found = _existing(metrics, "hinf-deg", "kf-flexure")
-    if found is None:
-        return None
-    ratio = found[0]["attitude_rms_all_arcmin"] / found[1]["attitude_rms_all_arcmin"]
-    verdict = "reproduced" if ratio <= 1.1 else "partly" if ratio <= 1.5 else "not"
-    return verdict, ratio, [0.0, 1.1]
+CLAIMS: dict[str, Claim] = {
+    "five-arcmin": Claim(
+        "From 15 s on the H-infinity filter with gamma = 50 is within 5' on every axis, the "
+        "Kalman filter at tens of arcminutes (Gu & Qin 2005); RMS over the runs, in the unit of "
+        "angle that suits it best; value: its worst axis [arcmin]",
+        ("kf",),
+        _best,
+        (0.0, 5.0),
+        verdict=_kf_lost,
+    ),
+    "gamma-50": Claim(
+        "gamma = 50 makes it robust (Gu & Qin 2005): in degrees it is at least 10 % more accurate"
+        " than the same filter with gamma = inf, a Kalman filter with R = (1 deg)^2; value: the "
+        "largest difference of their RMS on an axis [arcmin]",
+        ("hinf-deg", "hinf-deg-inf"),
+        lambda m: float(np.max(np.abs(_axes(m["hinf-deg"]) - _axes(m["hinf-deg-inf"])))),
+        None,
+        verdict=_gained,
+    ),
+    "units": Claim(
+        "With R = I, L = I and gamma = 50 the filter exists over the whole run in any unit of "
+        "angle; value: in how many of radians, degrees and arcminutes it does",
+        (),
+        _existing,
+        (3, 3),
+        (1, 3),
+    ),
+    "beats-kf": Claim(
+        "Told nothing of the flexure, the H-infinity filter in degrees is more accurate than the "
+        "Kalman filter with R = (1')^2 (Gu & Qin 2005) on every axis; value: the largest ratio of"
+        " their RMS on an axis",
+        ("hinf-deg", "kf"),
+        lambda metrics: float(np.max(_by_axis(metrics))),
+        (0.0, 1.0),
+        verdict=lambda m: graded(np.all(_by_axis(m) < 1.0), np.any(_by_axis(m) < 1.0)),
+    ),
+    "saves-the-model": Claim(
+        "It saves modelling the flexure (Gu & Qin 2005): in degrees its RMS over all axes is at "
+        "most 1.1 times that of a Kalman filter with flexure states; value: that ratio",
+        ("hinf-deg", "kf-flexure"),
+        ratio("hinf-deg", "kf-flexure", ALL),
+        (0.0, 1.1),
+        (0.0, 1.5),
+    ),
+}
+"""Every claim a scenario of the study may state."""

@@ -16,6 +16,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from robins import units
+from robins.errors import require_known
 from robins.filters import Filter, Step, kalman, run
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
 from robins.rotation import Rotation
@@ -193,8 +194,8 @@ def contenders(
     Raises:
         ValueError: there is no filter of a name.
     """
-    if unknown := [name for name in filters if name not in FILTERS]:
-        raise ValueError(f"no filter '{unknown[0]}' in this study; it has {', '.join(FILTERS)}")
+    for name in filters:
+        require_known("filter", name, FILTERS)
     b = given.believed
     spread = Spread(b.attitude, b.gyro_bias, b.mounting, given.slave.gyro_noise)
     nominal = np.asarray(Rotation.from_rotvec(given.mounting.nominal).as_dcm())

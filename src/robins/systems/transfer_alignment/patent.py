@@ -30,6 +30,7 @@ from jaxtyping import Array
 
 from robins import units
 from robins.earth import curvature_radii
+from robins.errors import require_known
 from robins.filters import Belief, Filter, gamma_min, kalman
 from robins.filters.rules import adaptive_h_infinity, h_infinity
 from robins.ins.frames import swap, swap_q
@@ -38,6 +39,7 @@ from robins.ins.mechanise import Nav
 from robins.results import array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
+from robins.systems.judgement import judging
 from robins.systems.limits import Names, Runs
 from robins.systems.system import Case, Contender, Limit, Problem, Scenario, SensorAxes, StateBlock
 from robins.systems.transfer_alignment import velocity_attitude as va
@@ -51,7 +53,7 @@ from robins.systems.transfer_alignment.pair import PairRun, simulate_pair
 from robins.systems.transfer_alignment.pair_answer import SENSORS as PRODUCT_SENSORS
 from robins.systems.transfer_alignment.pair_course import Course, lay_out
 from robins.systems.transfer_alignment.pair_parameters import Disturbance, PairParameters, Structure
-from robins.systems.transfer_alignment.patent_claims import patent_claims, patent_metrics
+from robins.systems.transfer_alignment.patent_claims import CLAIMS, patent_metrics
 from robins.systems.transfer_alignment.product_filters import product_contender
 
 ENU = ("east", "north", "up")
@@ -233,13 +235,12 @@ def make_filter(name: str, gamma: float = math.inf) -> Filter:
     Raises:
         ValueError: there is no filter of this name.
     """
+    require_known("filter", name, FILTERS)
     if name in TOLD:
         return kalman() if name == "kf" else make_filter("kf")
     if name in FIXED:
         return kalman(rules=[h_infinity(gamma, ATTITUDE_ROWS)])
-    if name in ADAPTIVE:
-        return kalman(rules=[adaptive_h_infinity(**ADAPTIVE[name])])
-    raise ValueError(f"no filter '{name}' in this study; it has {', '.join(FILTERS)}")
+    return kalman(rules=[adaptive_h_infinity(**ADAPTIVE[name])])
 
 
 def least_gamma(given: Patent, course: Course) -> float:
@@ -352,7 +353,7 @@ def patent_problem(given: Patent, filters: tuple[str, ...], seed: int) -> Proble
         sensors=SENSORS | PRODUCT_SENSORS,
         context=_context(course),
         metrics=partial(patent_metrics, epoch_s),
-        claims=partial(patent_claims, given.claims),
+        claims=judging(CLAIMS, given.claims),
         count_from=count_from,
         limits=LIMITS,
     )

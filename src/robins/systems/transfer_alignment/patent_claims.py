@@ -2,48 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from robins import units
+from robins.systems.judgement import Claim, ratio
 
 ADAPTIVE, FIXED, KALMAN = "adaptive-hinf", "hinf-fixed", "kf"
 COMPENSATED, INFORMED = "adaptive-hinf-compensated", "kf-told-both"
 
-CLAIMS = (
-    {
-        "id": "beats-kf",
-        "text": "Under noise that is unknown and not Gaussian the adaptive H-infinity filter "
-        "aligns more accurately than a Kalman filter that is told of the stated noise alone (the "
-        "patent); value: ratio of their attitude RMS over all axes",
-    },
-    {
-        "id": "kf-suffers",
-        "text": "Not told of the noise that is there, a Kalman filter loses accuracy (the patent); "
-        "value: its attitude RMS over that of one told of it",
-    },
-    {
-        "id": "beats-fixed",
-        "text": "A bound that adapts to the environment serves better than a fixed one (the "
-        "patent), here 1.05 times the least there is; value: ratio of attitude RMS",
-    },
-    {
-        "id": "compensation",
-        "text": "Compensating P where the bound does not hold raises the accuracy (the patent); "
-        "value: attitude RMS with compensation over that without",
-    },
-)
-"""Every claim a scenario of the study may state."""
-
+RMS = "attitude_rms_all_arcmin"
 _BETTER = 0.95  # ratio up to which one filter is better than the other
 _FAIRLY = 0.98  # and up to which it is so in part; beyond, the two are as good
-_COMPARED = {
-    "beats-kf": (ADAPTIVE, KALMAN),
-    "beats-fixed": (ADAPTIVE, FIXED),
-    "compensation": (COMPENSATED, ADAPTIVE),
+
+
+def _better(text: str, ours: str, theirs: str) -> Claim:
+    value = ratio(ours, theirs, RMS)
+    return Claim(text, (ours, theirs), value, (0.0, _BETTER), (0.0, _FAIRLY))
+
+
+CLAIMS: dict[str, Claim] = {
+    "beats-kf": _better(
+        "Under noise that is unknown and not Gaussian the adaptive H-infinity filter aligns more "
+        "accurately than a Kalman filter that is told of the stated noise alone (the patent); "
+        "value: ratio of their attitude RMS over all axes",
+        ADAPTIVE,
+        KALMAN,
+    ),
+    "kf-suffers": Claim(
+        "Not told of the noise that is there, a Kalman filter loses accuracy (the patent); value: "
+        "its attitude RMS over that of one told of it",
+        (KALMAN, INFORMED),
+        ratio(KALMAN, INFORMED, RMS),
+        (1.0 / _BETTER, None),
+        (1.0 / _FAIRLY, None),
+    ),
+    "beats-fixed": _better(
+        "A bound that adapts to the environment serves better than a fixed one (the patent), here "
+        "1.05 times the least there is; value: ratio of attitude RMS",
+        ADAPTIVE,
+        FIXED,
+    ),
+    "compensation": _better(
+        "Compensating P where the bound does not hold raises the accuracy (the patent); value: "
+        "attitude RMS with compensation over that without",
+        COMPENSATED,
+        ADAPTIVE,
+    ),
 }
+"""Every claim a scenario of the study may state."""
 
 
 def patent_metrics(epoch_s: np.ndarray, statistics: Any) -> dict[str, Any]:
@@ -78,38 +86,3 @@ def patent_metrics(epoch_s: np.ndarray, statistics: Any) -> dict[str, Any]:
         out[f"nis_{sensor}"] = statistics.nis(sensor).value
     out["diverged_runs"] = statistics.diverged
     return out
-
-
-def patent_claims(
-    stated: Sequence[str], metrics: Mapping[str, dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Verdicts of the claims that a scenario states, where their filters were run.
-
-    Args:
-        stated: ids of claims.
-        metrics: by filter.
-    """
-    out = []
-    for claim in CLAIMS:
-        judged = _judged(claim["id"], metrics) if claim["id"] in stated else None
-        if judged is not None:
-            verdict, value, band = judged
-            out.append({**claim, "verdict": verdict, "value": value, "band": band})
-    return out
-
-
-def _judged(claim: str, metrics: Mapping[str, dict[str, Any]]) -> tuple[str, float, Any] | None:
-    """Verdict, value and band of a claim; None where a filter it compares was not run."""
-    suffers = claim == "kf-suffers"
-    ours, theirs = (KALMAN, INFORMED) if suffers else _COMPARED[claim]
-    if ours not in metrics or theirs not in metrics:
-        return None
-    rms = [metrics[name]["attitude_rms_all_arcmin"] for name in (ours, theirs)]
-    ratio = rms[0] / rms[1]
-    if suffers:
-        band = [1.0 / _BETTER, None]
-        good, fair = ratio >= 1.0 / _BETTER, ratio >= 1.0 / _FAIRLY
-    else:
-        band = [0.0, _BETTER]
-        good, fair = ratio <= _BETTER, ratio <= _FAIRLY
-    return "reproduced" if good else "partly" if fair else "not", ratio, band

@@ -2,39 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from robins import units
-from robins.systems.claims import consistency, grand_means, proven
+from robins.systems.judgement import Claim, consistency, consistency_claims
 
 FIVE_ARCMIN = "5_arcmin"
 JUDGED = "product"  # the filter whose consistency is claimed
 
-CLAIMS = (
+CLAIMS = consistency_claims(
     {
-        "id": "sigma",
-        "text": "On no state the RMS error of the filter 'product' is proven, at 99 % confidence, "
+        "sigma": "On no state the RMS error of the filter 'product' is proven, at 99 % confidence, "
         "to differ from its sigma by more than 5 %; value: the largest difference proven",
-    },
-    {
-        "id": "anees",
-        "text": "ANEES of the filter 'product' is inside its 95 % band at 90 % of the epochs or "
+        "anees": "ANEES of the filter 'product' is inside its 95 % band at 90 % of the epochs or "
         "more; value: the share",
-    },
-    {
-        "id": "nis",
-        "text": "The grand mean NIS of every sensor is inside its 99.9 % band for the filter "
+        "nis": "The grand mean NIS of every sensor is inside its 99.9 % band for the filter "
         "'product'; value: the one farthest from 1",
     },
-    {
-        "id": "aligned",
-        "text": "Once it counts, the attitude RMS of the filter 'product' is at most 1.15 times "
-        "what its covariance allows, pooled over the axes; value: the ratio",
-    },
-)
+    JUDGED,
+) | {
+    "aligned": Claim(
+        "Once it counts, the attitude RMS of the filter 'product' is at most 1.15 times what its "
+        "covariance allows, pooled over the axes; value: the ratio",
+        (JUDGED,),
+        lambda metrics: metrics[JUDGED]["attitude_over_sigma"],
+        (0.0, 1.15),
+    )
+}
 
 _FIGURES = {  # block -> metric, unit
     "velocity": ("velocity_rms_mps", "m/s"),
@@ -76,22 +72,3 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
     settled = statistics.settled(FIVE_ARCMIN)
     out["share_below_5_arcmin"] = float(np.mean(settled <= start))
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
-
-
-def product_claims(metrics: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Verdict per claim; none where the filter they are about was not run."""
-    if JUDGED not in metrics:
-        return []
-    m = metrics[JUDGED]
-    off, (farthest, inside) = proven(m), grand_means(m)
-    share, ratio = m["anees_share_inside"], m["attitude_over_sigma"]
-    verdicts = (
-        (off, [0.0, 0.05], off <= 0.05),
-        (share, [0.9, 1.0], share >= 0.9),
-        (farthest, None, inside),
-        (ratio, [0.0, 1.15], ratio <= 1.15),
-    )
-    return [
-        {**claim, "verdict": "reproduced" if holds else "not", "value": value, "band": band}
-        for claim, (value, band, holds) in zip(CLAIMS, verdicts, strict=True)
-    ]

@@ -12,6 +12,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
+from robins.errors import require_known
 from robins.filters import Belief, Filter, Model, kalman, taylor, unscented
 from robins.filters.rules import huber
 from robins.ins.frames import swap
@@ -90,8 +91,7 @@ def make_filter(name: str) -> Filter:
 
 
 def _kind(name: str) -> _Kind:
-    if name not in _KINDS:
-        raise ValueError(f"no filter '{name}'; there are {', '.join(FILTERS)}")
+    require_known("filter", name, _KINDS)
     return _KINDS[name]
 
 

@@ -16,6 +16,7 @@ import xarray as xr
 
 from robins import units
 from robins.scenario import Quantity, default
+from robins.systems.judgement import judging
 from robins.systems.limits import Names
 from robins.systems.system import Limit, Problem, Scenario
 from robins.systems.tables import place_arrays
@@ -25,8 +26,8 @@ from robins.systems.transfer_alignment.pair_course import Course, lay_out
 from robins.systems.transfer_alignment.pair_parameters import PairParameters
 from robins.systems.transfer_alignment.product import ATTITUDE, POSITION, VELOCITY, ProductState
 from robins.systems.transfer_alignment.product_claims import (
+    CLAIMS,
     FIVE_ARCMIN,
-    product_claims,
     product_metrics,
 )
 from robins.systems.transfer_alignment.product_filters import (
@@ -75,7 +76,7 @@ def product_problem(given: Product, filters: tuple[str, ...], seed: int) -> Prob
         sensors={name: SENSORS[name] for name in used},
         context=_context(course),
         metrics=product_metrics,
-        claims=product_claims,
+        claims=judging(CLAIMS),
         shown=_tracks,
         count_from=count_from,
         limits=(Limit(FIVE_ARCMIN, "attitude", units.parse("5 arcmin", "angle")),),
