@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief
@@ -30,6 +28,7 @@ from robins.systems.airship.model import (
 )
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, start_sigma
+from robins.systems.recipes import recipe
 from robins.systems.system import Case, Contender
 
 
@@ -135,19 +134,9 @@ def contender(given: Airship, course: Course, name: str) -> Contender:
     return Contender(
         filter=filter_,
         model=believed_model(given, course, kind),
-        case=Partial(_case(kind.states, kind.given, kind.sensors, printed), numbers),
+        case=recipe(as_case, kind.states, kind.given, kind.sensors, printed, numbers=numbers),
         reported=reported(len(numbers.sigma)) if rows is None else rows,
     )
-
-
-@cache
-def _case(states: States, given: Given, sensors_: tuple[str, ...], printed: bool):
-    """The same function for the same choice, so that what was compiled serves again."""
-
-    def case(numbers: Numbers, world: World) -> Case:
-        return as_case(states, given, sensors_, printed, numbers, world)
-
-    return case
 
 
 def reported(n: int) -> np.ndarray:

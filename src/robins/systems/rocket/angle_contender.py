@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Model, channel, kalman, observability_shares
 from robins.manifold import Angle
 from robins.sim.free_body import coning_start
+from robins.systems.recipes import recipe
 from robins.systems.rocket.angles import (
     GYRO,
     MAGNETIC,
@@ -108,16 +107,6 @@ def _as_angles(rows: Array) -> tuple[Angle, Angle, Angle]:
     return roll, pitch, yaw
 
 
-@cache
-def _case(reads: str, reckoned: bool, sensors: tuple[str, ...]):
-    """The same function for the same choice, so that what was compiled serves again."""
-
-    def case(numbers: Numbers, world: World) -> Case:
-        return as_case(reads, reckoned, sensors, numbers, world)
-
-    return case
-
-
 def angle_contender(given: MagneticAttitude, name: str, sight: Sight) -> Contender:
     """A filter with its model and its data.
 
@@ -128,8 +117,11 @@ def angle_contender(given: MagneticAttitude, name: str, sight: Sight) -> Contend
     return Contender(
         filter=filter_,
         model=believed_model(given, kind),
-        case=Partial(
-            _case(given.gyro_reads, kind.motion == "reckoned", kind.sensors),
-            Numbers(initial_sigma(given)),
+        case=recipe(
+            as_case,
+            given.gyro_reads,
+            kind.motion == "reckoned",
+            kind.sensors,
+            numbers=Numbers(initial_sigma(given)),
         ),
     )

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Model
 from robins.rotation import Rotation, to_dcm
+from robins.systems.recipes import recipe
 from robins.systems.rocket.field import (
     SNAPSHOT,
     FieldState,
@@ -102,16 +101,6 @@ def as_case(scaled: bool, sees: str, scale_t: float | None, n: Numbers, world: W
     )
 
 
-@cache
-def _case(scaled: bool, sees: str, full_scale_t: float | None):
-    """The same function for the same choice, so that what was compiled serves again."""
-
-    def case(numbers: Numbers, world: World) -> Case:
-        return as_case(scaled, sees, full_scale_t, numbers, world)
-
-    return case
-
-
 def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     """A filter with its model and its data.
 
@@ -123,5 +112,7 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     return Contender(
         filter=filter_,
         model=believed_model(given, kind),
-        case=Partial(_case(kind.scaled, kind.sees, given.magnetometer.full_scale), numbers),
+        case=recipe(
+            as_case, kind.scaled, kind.sees, given.magnetometer.full_scale, numbers=numbers
+        ),
     )

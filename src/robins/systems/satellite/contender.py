@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,10 +15,11 @@ from robins.errors import require_known
 from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
+from robins.systems.recipes import recipe
 from robins.systems.satellite import design, model
 from robins.systems.satellite.course import Course
 from robins.systems.satellite.driven import Lens
-from robins.systems.satellite.filters import KINDS, Kind, make_filter
+from robins.systems.satellite.filters import KINDS, Build, Kind, make_filter
 from robins.systems.satellite.nodes import STAR, Given, Row, Vehicle, begin, react
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import World
@@ -69,20 +70,15 @@ def believed_walk(given: AttitudeLoop, kind: Kind) -> float:
     return math.sqrt(kind.drift) * believed
 
 
-@cache
-def _case(additive: bool, build: str):
-    """The same function for the same choice, so that what was compiled serves again."""
+def as_case(additive: bool, build: Build, n: Numbers, world: World) -> Case:
+    """What a filter takes of a run; pure."""
     reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
-
-    def case(n: Numbers, world: World) -> Case:
-        given, rows, vehicle = surroundings(n, world)
-        start: Any = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
-        if build.startswith("fixed"):
-            start = with_gains(make_filter(build).init(start, _DIMS), {STAR: n.gain})
-        loop = Loop(Partial(reacts, given), vehicle, rows, {STAR: n.due})
-        return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
-
-    return case
+    given, rows, vehicle = surroundings(n, world)
+    start: Any = model.start(world.start_q_ib, n.attitude_rad, n.bias_rad_s, additive)
+    if build.startswith("fixed"):
+        start = with_gains(make_filter(build).init(start, _DIMS), {STAR: n.gain})
+    loop = Loop(Partial(reacts, given), vehicle, rows, {STAR: n.due})
+    return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
 
 
 def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
@@ -127,6 +123,6 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     return Contender(
         filter=make_filter(kind.build),
         model=model.model(noise, given.star.noise, additive, given.star.camera is not None),
-        case=Partial(_case(additive, kind.build), numbers),
+        case=recipe(as_case, additive, kind.build, numbers=numbers),
         facts=facts,
     )
