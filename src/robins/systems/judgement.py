@@ -11,7 +11,7 @@ import numpy as np
 from robins.errors import require_known
 
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
-Band = tuple[float | None, float | None]
+Band = Sequence[float | None]  # from, to
 
 
 class Claim(NamedTuple):
@@ -151,7 +151,7 @@ def _nis_inside(metrics: Mapping[str, Any]) -> bool:
     return all(_inside(metrics[k], metrics[f"{k}_band"]) for k in _grand_means(metrics))
 
 
-def _inside(value: float, band: Band | None) -> bool:
+def _inside(value: Any, band: Band | None) -> bool:
     if band is None:
         return False
     low, high = band
