@@ -379,7 +379,7 @@ def test_reported_rows_in_the_other_frame():
 @pytest.mark.parametrize(
     ("settings", "filters", "words"),
     [
-        ((), ("product", "best"), "no filter 'best'; there are kf, product"),
+        ((), ("product", "best"), "no filter 'best' in this study. It has kf, product"),
         (('settle="21 s"',), ("kf",), "settle = 21 s leaves nothing to count of a run of 20 s"),
         (
             ('master.velocity_noise=["0.1 m/s", "0 m/s", "0.1 m/s"]',),
