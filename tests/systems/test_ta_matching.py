@@ -418,7 +418,6 @@ def test_what_was_not_run_is_not_judged():
         ("flexure.damping=0", "greater than 0"),
         ('slave.attitude_error="40 deg"', "at most 30 deg"),
         ('signs="mixed"', "fixed"),
-        ('claims=["five-arcmins"]', "five-arcmin"),
         ('manoeuvre.latitude="90 deg"', "at most 85 deg"),
     ],
 )

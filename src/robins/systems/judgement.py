@@ -11,7 +11,7 @@ import numpy as np
 from robins.errors import require_known
 
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
-Band = Sequence[float | None]  # from, to
+Band = Sequence[float | int | None]  # from, to
 
 
 class Claim(NamedTuple):
