@@ -57,6 +57,10 @@ MISTAKES = {
         lambda: Sensor(lambda x, aux: x, lambda x, aux: jnp.ones(1), name="gnss"),
         "sensor 'gnss' needs dim=, how many numbers it reads",
     ),
+    "noise without an axis": (
+        lambda: Sensor(lambda x, aux: x, 0.1, name="gnss"),
+        "sensor 'gnss' needs dim=, how many numbers it reads, or noise with an axis",
+    ),
     "step of a wrong shape": (
         runs(step=lambda x, u: F[:1] @ x),
         "step of the motion returns float64(1,) of a state float64(2,)",

@@ -164,9 +164,13 @@ class Sensor:
         """Take the noise as it was given."""
         _settle_noise(self, noise_covariance, f"sensor '{self.name}'")
         if self.dim < 0:
-            if callable(self.noise):
-                raise TypeError(f"sensor '{self.name}' needs dim=, how many numbers it reads")
-            object.__setattr__(self, "dim", len(self.noise))
+            shape = () if callable(self.noise) else jnp.shape(self.noise)
+            if not shape:
+                raise TypeError(
+                    f"sensor '{self.name}' needs dim=, how many numbers it reads, or noise with an "
+                    "axis of that length"
+                )
+            object.__setattr__(self, "dim", shape[0])
 
     def reading(self, x, aux):
         """What it would read at x.
