@@ -1,4 +1,4 @@
-"""Do two versions of robins give the same results? All scenarios, and the real logs.
+"""Do two versions of robins give the same results? All scenarios, all filters, and the real logs.
 
     python benchmarks/unchanged.py record OLDER/src older     # an hour and a half on one core
     python benchmarks/unchanged.py record src newer
@@ -24,6 +24,14 @@ TOLERANCE = 1e-9
 ALIKE = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 LISTED = re.compile(r"^  ((?:ins-gnss|transfer-alignment|airship|rocket|satellite)/\S+)", re.M)
+EVERY = """
+from robins.systems import SYSTEMS
+from robins.systems.catalogue import listed
+for name, system in SYSTEMS.items():
+    for key, study in system.studies.items():
+        first = [s for s, found in listed(name).items() if found.study in ("", key)][:1]
+        print(*(f"{name}/{s} {','.join(study.filters)}" for s in first))
+"""
 
 
 def commands(python: list[str], source: Path) -> dict[str, list[str]]:
@@ -32,6 +40,11 @@ def commands(python: list[str], source: Path) -> dict[str, list[str]]:
     found = {
         name.replace("/", "-"): ["run", name, "--runs", "2"] for name in LISTED.findall(listed)
     }
+    every = subprocess.run([python[0], "-c", EVERY], capture_output=True, text=True, check=True)
+    for line in filter(None, every.stdout.splitlines()):
+        name, filters = line.split()
+        words = ["run", name, "--runs", "2", "--filters", filters]
+        found[f"every-{name.replace('/', '-')}"] = words
     walk = next(source.glob("robins/systems/ins_gnss/**/walk.toml"))
     logs = [DATA / f"gnssimu_walk_{kind}.xz" for kind in ("imu.csv", "gnss.pos")]
     found["walk"] = ["replay", *map(str, logs), str(walk)]
