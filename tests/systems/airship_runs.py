@@ -16,7 +16,7 @@ from robins.systems.airship import SYSTEM
 from robins.systems.airship.parameters import FILTERS, Airship
 from robins.systems.airship.problem import airship_problem
 from robins.systems.airship.world import World
-from robins.systems.system import Problem
+from robins.systems.study import Problem
 
 RUNS = 20
 UNWARNED = tuple(name for name in FILTERS if name != "distributed-full")

@@ -15,7 +15,7 @@ from scipy import stats
 
 from robins.filters import Tally
 from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
-from robins.systems.system import Limit, Norm, StateBlock
+from robins.systems.study import Limit, Norm, StateBlock
 
 
 @dataclass

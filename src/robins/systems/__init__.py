@@ -14,29 +14,39 @@ from typing import TYPE_CHECKING, Any
 from robins.systems.catalogue import SUMMARIES
 
 if TYPE_CHECKING:
-    from robins.systems.system import (
+    from robins.systems.study import (
         Case,
         Contender,
+        Instrument,
         Limit,
         Output,
         Problem,
+        Scenario,
         SensorAxes,
         StateBlock,
         Study,
-        System,
+        View,
     )
+    from robins.systems.system import System
 
+_OF_STUDY = {
+    *("Case", "Contender", "Instrument", "Limit", "Output", "Problem", "Scenario"),
+    *("SensorAxes", "StateBlock", "Study", "View"),
+}
 __all__ = [
     "SYSTEMS",
     "Case",
     "Contender",
+    "Instrument",
     "Limit",
     "Output",
     "Problem",
+    "Scenario",
     "SensorAxes",
     "StateBlock",
     "Study",
     "System",
+    "View",
 ]
 
 
@@ -64,6 +74,7 @@ SYSTEMS: Mapping[str, System] = _Registry()
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(importlib.import_module(f"{__name__}.system"), name)
+    module = "study" if name in _OF_STUDY else "system"
+    found = getattr(importlib.import_module(f"{__name__}.{module}"), name)
     globals()[name] = found
     return found

@@ -15,7 +15,7 @@ from robins.filters import Code, StepWarning, Tally, doubts
 from robins.filters.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.results import array, variable
-from robins.systems.system import Output, SensorAxes, StateBlock
+from robins.systems.study import Output, SensorAxes, StateBlock
 
 EULER = StateBlock("euler", slice(0, 3), "rad", "deg", "FRD to NED", ("roll", "pitch", "heading"))
 

@@ -7,7 +7,8 @@ a product model with states for the biases and for the error of the wind.
 from robins.systems.airship.claims import CLAIMS
 from robins.systems.airship.parameters import FILTERS, Airship
 from robins.systems.airship.problem import airship_problem
-from robins.systems.system import Study, System
+from robins.systems.study import Study
+from robins.systems.system import System
 
 SYSTEM = System(
     name="airship",

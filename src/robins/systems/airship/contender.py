@@ -29,7 +29,7 @@ from robins.systems.airship.model import (
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, start_sigma
 from robins.systems.recipes import recipe
-from robins.systems.system import Case, Contender
+from robins.systems.study import Case, Contender
 
 
 class Numbers(NamedTuple):

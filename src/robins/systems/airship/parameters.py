@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Share, Span, default
-from robins.systems.limits import Names, Runs, refuse_too_long
-from robins.systems.system import Scenario
+from robins.systems.parts import Names, Runs, refuse_too_long
+from robins.systems.study import Scenario
 
 Three = tuple[float, float, float]
 Draw = Literal["plus-sigma", "random-sign", "normal"]

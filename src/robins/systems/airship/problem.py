@@ -13,7 +13,7 @@ from robins.systems.airship.model import SAR, STAR, STAR_EARLY, WIND, WIND_OF_ST
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import lay_out, simulate
 from robins.systems.judgement import judging
-from robins.systems.system import Norm, Problem, SensorAxes, StateBlock
+from robins.systems.study import Norm, Problem, SensorAxes, StateBlock
 
 ENU = ("east", "north", "up")
 BLOCKS = (

@@ -8,7 +8,8 @@ from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
 from robins.systems.ins_gnss.replay import replay
 from robins.systems.ins_gnss.setup import FILTERS, SMOOTHED
-from robins.systems.system import Study, System
+from robins.systems.study import Study
+from robins.systems.system import System
 
 _HERE = Path(__file__).parent / "scenarios"
 _FILTERS = (*FILTERS, *(name + SMOOTHED for name in FILTERS))

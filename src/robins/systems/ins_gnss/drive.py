@@ -48,8 +48,8 @@ from robins.systems.ins_gnss.setup import (
     state_blocks,
 )
 from robins.systems.judgement import judging
-from robins.systems.limits import refuse_unsettled
-from robins.systems.system import Case, Contender, Problem
+from robins.systems.parts import refuse_unsettled
+from robins.systems.study import Case, Contender, Problem
 from robins.systems.tables import place_arrays
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from robins import units
 from robins.systems.judgement import consistency, consistency_claims
-from robins.systems.system import StateBlock
+from robins.systems.study import StateBlock
 
 CLAIMS = consistency_claims(
     {

@@ -24,7 +24,7 @@ from robins.systems.ins_gnss.model import (
     ins_gnss_model,
 )
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
-from robins.systems.system import SensorAxes, StateBlock
+from robins.systems.study import SensorAxes, StateBlock
 
 FILTERS = {
     "ekf": lambda rules: kalman(taylor(), rules),

@@ -16,7 +16,7 @@ from robins.systems.marg.accuracy import orientation_errors, rms_deg, truth_at
 from robins.systems.marg.model import MAGNETOMETER, MargState
 from robins.systems.marg.prepare import Prepared
 from robins.systems.marg.setup import BLOCKS, SENSORS
-from robins.systems.system import StateBlock
+from robins.systems.study import StateBlock
 from robins.systems.tables import EULER, Update, block_array, innovation_tables, update_metrics
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Entry, Parameters, Quantity, default
-from robins.systems.limits import Names
+from robins.systems.parts import Names
 
 Three = tuple[float, float, float]
 Row = tuple[Entry, Entry, Entry]

@@ -15,7 +15,7 @@ from robins.systems.marg.model import (
 )
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.rules import marg_filter
-from robins.systems.system import SensorAxes, StateBlock
+from robins.systems.study import SensorAxes, StateBlock
 
 CAUSAL, SMOOTHED = "marg", "marg-smoothed"
 FILTERS = (CAUSAL, SMOOTHED)

@@ -23,7 +23,7 @@ from robins.systems.satellite.filters import KINDS, Build, Kind, make_filter
 from robins.systems.satellite.nodes import STAR, Given, Row, Vehicle, begin, react
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import World
-from robins.systems.system import Case, Contender
+from robins.systems.study import Case, Contender
 
 _DIMS = {STAR: 3}
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Entry, Parameters, Positive, Quantity, Span, default
-from robins.systems.limits import refuse_too_long, refuse_unsettled
-from robins.systems.system import Scenario
+from robins.systems.parts import refuse_too_long, refuse_unsettled
+from robins.systems.study import Scenario
 
 Three = tuple[float, float, float]
 _TILTED = (3.0**-0.5, 3.0**-0.5, 3.0**-0.5)

@@ -16,7 +16,7 @@ from robins.systems.satellite.metrics import attitude_metrics
 from robins.systems.satellite.nodes import STAR
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import simulate
-from robins.systems.system import Norm, Output, Problem, SensorAxes, StateBlock
+from robins.systems.study import Norm, Output, Problem, SensorAxes, StateBlock
 
 AXES = ("x", "y", "z (boresight)")
 BLOCKS = (

@@ -6,7 +6,8 @@ from robins.systems.satellite.claims import CLAIMS
 from robins.systems.satellite.filters import FILTERS
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.problem import attitude_problem
-from robins.systems.system import Study, System
+from robins.systems.study import Study
+from robins.systems.system import System
 
 SYSTEM = System(
     name="satellite",

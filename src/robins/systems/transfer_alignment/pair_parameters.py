@@ -12,7 +12,7 @@ import pydantic
 
 from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
 from robins.systems.ins_gnss.parameters import Leg, Place
-from robins.systems.limits import refuse_too_long, refuse_unsettled
+from robins.systems.parts import refuse_too_long, refuse_unsettled
 
 Three = tuple[float, float, float]
 

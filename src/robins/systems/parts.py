@@ -1,10 +1,16 @@
-"""What a scenario may ask for at most and must leave, refused before anything is simulated."""
+"""Parameters that systems share, and what a scenario may ask for at most."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
 import pydantic
+
+from robins.scenario import Parameters, Quantity
+
+NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
+ENU, RFU = ("east", "north", "up"), ("right", "forward", "up")
+Three = tuple[float, float, float]
 
 MOST_RUNS = 1_000_000
 MOST_SAMPLES = 10_000_000  # of one run: a day at 100 Hz; six axes of them are half a gigabyte
@@ -14,6 +20,13 @@ Runs = Annotated[int, pydantic.Field(ge=1, le=MOST_RUNS)]
 
 Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
 """Filters by name, one at least."""
+
+
+class Place(Parameters):
+    """Where a vehicle begins; a study adds its height."""
+
+    latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
+    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
 
 
 def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
