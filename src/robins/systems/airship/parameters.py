@@ -11,18 +11,15 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Share, Span, default
-from robins.systems.parts import Names, Runs, refuse_too_long
+from robins.systems.parts import Names, Place, Runs, Three, refuse_too_long
 from robins.systems.study import Scenario
 
-Three = tuple[float, float, float]
 Draw = Literal["plus-sigma", "random-sign", "normal"]
 
 
-class Place(Parameters):
+class Position(Place):
     """Where the flight begins."""
 
-    latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
-    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
     height: Annotated[float, Quantity("length", least="0 m", most="100 km")]
 
 
@@ -96,43 +93,43 @@ class Imu(Parameters):
     unsensed: Share = 0.0
 
 
-class Sar(Parameters):
-    """Horizontal position and heading from a radar image matched with a map."""
+class Readings(Parameters):
+    """What every instrument but the inertial unit has: how often it reads, when it is lost."""
 
     rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
+    lost: tuple[Span, ...] = ()
+
+
+class Sar(Readings):
+    """Horizontal position and heading from a radar image matched with a map."""
+
     position: Annotated[float, Quantity("length", above="0 m")] = default("25 m")  # each axis
     heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
     outlier_share: Share = 0.0
     outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 5.0
-    lost: tuple[Span, ...] = ()
 
 
-class Barometer(Parameters):
+class Barometer(Readings):
     """Height from static pressure."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
     height: Annotated[float, Quantity("length", above="0 m")] = default("20 m")
-    lost: tuple[Span, ...] = ()
 
 
-class Star(Parameters):
+class Star(Readings):
     """Pitch, roll and heading from stars, once an epoch or several times."""
 
     rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("2 Hz")
     attitude: Annotated[float, Quantity("angle", above="0 arcsec", most="180 deg")] = default(
         "20 arcsec"
     )
-    lost: tuple[Span, ...] = ()
 
 
-class AirData(Parameters):
+class AirData(Readings):
     """Velocity through the air, and what is thought to be the wind: both err."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
     noise: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")  # each axis
     wind_error: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")
     wind_time: Annotated[float, Quantity("time", above="0 s")] = default("50 s")
-    lost: tuple[Span, ...] = ()
 
 
 class Start(Parameters):
@@ -144,8 +141,8 @@ class Start(Parameters):
     draw: Draw = "plus-sigma"
 
 
-class Believed(Parameters):
-    """Noise that the filters of nine states believe in, for want of states for the biases.
+class BelievedNoise(Parameters):
+    """Noise of the inertial unit that filters of nine states believe, for want of bias states.
 
     The product believes the noise of the inertial unit, times `accel_noise_factor` where the hull
     bends or the unit sits off the centre.
@@ -160,34 +157,22 @@ class Believed(Parameters):
     accel_noise_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 1.0
 
 
-FILTERS = (
-    *("ekf", "aekf", "ukf", "raukf"),
-    *("cukf-hard", "cukf-soft", "cukf-wind-states", "cukf-exact", "cukf-printed", "cukf-robust"),
-    *("cukf-master", "cukf-identity", "cukf-unprojected", "cukf-wind-known", "cukf-sideslip"),
-    *("cukf-hard-gated", "cukf-soft-gated", "cukf-wind-known-gated", "cukf-sideslip-gated"),
-    "ukf-printed-h",
-    *("centralised", "centralised-errors", "federated", "intersection"),
-    *("distributed-mean", "distributed-full"),
-    "product",
-)
-"""Every filter of the study."""
-
 COMPARED = ("ekf", "aekf", "ukf", "raukf", "cukf-wind-states", "cukf-robust", "product")
 """Those that a scenario compares unless it says otherwise."""
 
 
-class Airship(Scenario, Parameters):
+class Airship(Scenario):
     """An airship in the wind, navigated by SINS, stars, radar, barometer and air data."""
 
     system: Literal["airship"] = "airship"
     title: str = "Airship in the wind"
     runs: Runs = 20
     filters: Names = COMPARED
-    claims: tuple[str, ...] = ()  # ids of those the scenario checks
+    claims: tuple[str, ...] | None = ()  # ids of those the scenario checks
     duration: Annotated[float, Quantity("time", above="0 s")] = default("1000 s")
     epoch: Annotated[float, Quantity("time", above="0 s")] = default("1 s")  # step of the filters
     counted: Span = Span(begin=200.0, end=800.0)  # figures pooled over time are of this span
-    place: Place
+    place: Position
     hull: Hull = pydantic.Field(default_factory=Hull)
     wind: Wind = pydantic.Field(default_factory=Wind)
     imu: Imu = pydantic.Field(default_factory=Imu)
@@ -196,7 +181,7 @@ class Airship(Scenario, Parameters):
     star: Star = pydantic.Field(default_factory=Star)
     air_data: AirData = pydantic.Field(default_factory=AirData)
     start: Start
-    believed: Believed = pydantic.Field(default_factory=Believed)
+    believed: BelievedNoise = pydantic.Field(default_factory=BelievedNoise)
 
     @pydantic.model_validator(mode="after")
     def _rates_fit(self) -> Airship:
@@ -209,7 +194,8 @@ class Airship(Scenario, Parameters):
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
                 of = "star.rate" if name == "imu" else "that of the epochs"
                 raise ValueError(f"{name}.rate must be a multiple of {of}, {among:g} Hz")
-        for name in ("sar", "barometer", "air_data"):
+        others = (name for name, of in self if isinstance(of, Readings) and name != "star")
+        for name in others:  # read at the end of an epoch
             ratio = 1.0 / (self.epoch * getattr(self, name).rate)
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
                 raise ValueError(
