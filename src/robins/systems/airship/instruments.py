@@ -34,6 +34,7 @@ from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, earth_rate_n, transport_rate_n
 from robins.filters import Sensor
 from robins.ins.frames import swap
+from robins.ins.mechanise import Nav
 from robins.manifold import Angle, wrap
 from robins.rotation import Rotation, to_euler
 from robins.sim.air_data import observe_air
@@ -64,7 +65,7 @@ _EULER = SensorAxes("rad", "Euler", ("pitch", "roll", "heading"))
 def level(datum: Datum, p: Geodetic) -> Array:
     """(..., 2) m north east from the datum."""
     away = jnp.stack([p.lat - datum.lat, wrap(p.lon - datum.lon)], -1)
-    return away * datum.metres
+    return away * jnp.broadcast_to(datum.metres, away.shape)
 
 
 def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
@@ -282,47 +283,44 @@ def printed_attitude_rows(
 
 
 def printed_constraint(
-    heading_rad: ArrayLike, air_speed_error: ArrayLike, wind_error_en: ArrayLike
+    heading_rad: ArrayLike, air_speed_error: ArrayLike
 ) -> tuple[Float[Array, "2 9"], Float[Array, "2"]]:
-    """D and d of (49) and (50) to the letter; D loses a row wherever the heading is cardinal.
+    """D and d of (49), (50) to the letter, but for the error of the wind in d, which nobody knows.
 
     dv_E and dv_N are components already, and yet are multiplied by sine and cosine of the heading;
-    d has these two the other way round.
+    d has these two the other way round. D loses a row wherever the heading is cardinal.
 
     Args:
         heading_rad: SINS's.
         air_speed_error: () m/s, the dv_a of (50), see `printed_wind`.
-        wind_error_en: (2,) m/s, east and north. In words (50) has the wind itself here.
     """
     s, c = _sin_cos(heading_rad)
     D = jnp.zeros((2, 9)).at[0, 3].set(s).at[1, 4].set(c)
-    along = jnp.asarray(air_speed_error, float) * jnp.stack([c, s])
-    return D, jnp.asarray(wind_error_en, float) + along
-
-
-def printed_attitude_rows_ned(q_nb: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Change of pitch, roll, heading by e, q_true = exp(e x) q_nb, NED, as (44) has it."""
-    return -swap(printed_attitude_rows(*to_euler(q_nb)))
+    return D, jnp.asarray(air_speed_error, float) * jnp.stack([c, s])
 
 
 def _printed_sar(datum: Datum, x: Any, aux: Any):
     """(45): the heading's row as printed."""
-    heading = printed_attitude_rows_ned(x.q_nb.wxyz)[2]
+    heading = _turned(x)[2]
     H = jnp.zeros((4, 9)).at[[0, 1, 3], [6, 7, 8]].set(jnp.array([1.0, 1.0, -1.0]))
     return read_sar(datum, x, aux), H.at[2, :3].set(heading)
 
 
 def _printed_euler(x: Any, aux: Any):
     """(48)."""
-    rows = printed_attitude_rows_ned(x.q_nb.wxyz)
-    return read_euler(x, aux), jnp.concatenate([rows, jnp.zeros((3, 6))], 1)
+    return read_euler(x, aux), jnp.concatenate([_turned(x), jnp.zeros((3, 6))], 1)
+
+
+def _turned(x: Nav) -> Array:
+    """(3, 3) change of pitch, roll, heading by phi, true minus estimated, NED, as (44) has it."""
+    return -swap(printed_attitude_rows(*to_euler(x.q_nb.wxyz)))
 
 
 def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
     """(49), (50): D x = d with x computed minus true; what d leaves over should be zero.
 
-    Read with d's wind error as zero, and its air speed error dv_a as it can be had: |v - wind| of
-    the SINS less the measured air speed.
+    The air speed error dv_a is taken as it can be had: |v - wind| of the SINS less the measured air
+    speed.
 
     Args:
         x: a `Nav`.
@@ -331,7 +329,7 @@ def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
     speed = jnp.linalg.norm(jnp.asarray(air[0]))
     wind = jnp.concatenate([jnp.asarray(air[1])[::-1], jnp.zeros(1)])  # east north up
     excess = jnp.linalg.norm(swap(x.v_n) - wind) - speed
-    D, d = printed_constraint(x.q_nb.as_euler()[2], excess, jnp.zeros(2))
+    D, d = printed_constraint(x.q_nb.as_euler()[2], excess)
     return -d, D @ error_from_tangent(x.position.lat, x.position.alt)
 
 

@@ -82,7 +82,7 @@ def nine_states(noise: InsNoise) -> Motion:
     Args:
         noise: of gyros and accelerometers as believed, one number for the three axes of each.
     """
-    return Motion(_step, Partial(_noise, noise), Partial(_linear, noise))
+    return Motion(step, Partial(_noise, noise), Partial(_linear, noise))
 
 
 def walk(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
@@ -96,10 +96,6 @@ def walk(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
     phi, v = (root * jnp.asarray(s) * eye for s in (noise.gyro_arw, noise.accel_vrw))
     shift, own = 0.5 * dt * v, dt / jnp.sqrt(12.0) * v
     return jnp.block([[phi, zero, zero], [zero, v, zero], [zero, shift, own]])
-
-
-def _step(x: Nav, block: Increments) -> Nav:
-    return step(x, block)
 
 
 def _noise(noise: InsNoise, x: Nav, block: Increments) -> Array:
@@ -119,12 +115,8 @@ def _linear(noise: InsNoise, x: Nav, block: Increments):
 def with_biases(noise: InsNoise) -> Motion:
     """Motion of an `InsState`; input of a step: K increments."""
     return Motion(
-        Partial(_step_ins, noise), Partial(_noise_ins, noise), Partial(_linear_ins, noise)
+        Partial(propagate, noise=noise), Partial(_noise_ins, noise), Partial(_linear_ins, noise)
     )
-
-
-def _step_ins(noise: InsNoise, x: InsState, block: Increments) -> InsState:
-    return propagate(x, block, noise)
 
 
 def _linear_ins(noise: InsNoise, x: InsState, block: Increments):

@@ -41,13 +41,13 @@ COMMON = 9  # states that all local filters have
 BOTH = (WIND, WIND_OF_STAR)
 
 
+POINTS = filters.unscented(alpha=1.0, beta=2.0, kappa=0.0)
+"""The paper's sigma points, with a spread that rounding does not swamp (its alpha is 1e-4)."""
+
+
 def ukf(*of: Rule) -> Filter:
-    """The paper's sigma points, with a spread that rounding does not swamp (its alpha is 1e-4)."""
-    return kalman(_points(), of)
-
-
-def _points() -> filters.Points:
-    return filters.unscented(alpha=1.0, beta=2.0, kappa=0.0)
+    """By sigma points."""
+    return kalman(POINTS, of)
 
 
 def ekf(*of: Rule) -> Filter:
@@ -67,11 +67,9 @@ def robust() -> Filter:
 
 
 def _locals(local: Callable[[], Filter], wind: Sequence[str] = ()) -> list[filters.Channel]:
-    """Two of one kind, and which of them take the constraint."""
-    return [
-        filters.channel((SAR, *(n for n in wind if n == WIND)), local()),
-        filters.channel((STAR, *(n for n in wind if n == WIND_OF_STAR)), local()),
-    ]
+    """Two of one kind, for radar and stars; the first, or both, take the constraint."""
+    channels = (SAR, *wind[:1]), (STAR, *wind[1:])
+    return [filters.channel(sensors, local()) for sensors in channels]
 
 
 def _two(local: Callable[[], Filter], wind: Sequence[str] = (), **how: Any) -> Filter:
@@ -139,7 +137,7 @@ CANDIDATES: dict[str, Candidate] = {
     "ukf-printed-h": Candidate(lambda: _two(ekf), (on.PRINTED_RADAR, on.PRINTED_STARS)),
     "centralised": Candidate(ukf, PLAIN),
     "centralised-errors": Candidate(lambda: ukf(feedback()), PLAIN, ERRORS),
-    "federated": Candidate(lambda: filters.federated(_locals(ukf), linearise=_points()), PLAIN),
+    "federated": Candidate(lambda: filters.federated(_locals(ukf), linearise=POINTS), PLAIN),
     "intersection": Candidate(lambda: filters.intersecting(_locals(ukf), "det"), PLAIN),
     "distributed-mean": Candidate(lambda: _two(ukf, feedback="mean"), PLAIN),
     "distributed-full": Candidate(lambda: _two(ukf, feedback="full"), PLAIN),
@@ -176,13 +174,12 @@ def contender(given: Airship, course: Course, name: str) -> Contender:
     aboard = [(i, s) for i in instruments if (s := i.believed(given, course)) is not None]
     sigma = jnp.concatenate([jnp.asarray(s) for s in states.sigma(given, course)])
     taken = tuple((i.name, i.taken) for i, _ in aboard)
-    windy = given.wind.gusts is not None or given.wind.turbulence is not None
     return Contender(
         filter=make(),
         model=Model(states.motion(given, course), tuple(s for _, s in aboard)),
         case=recipe(as_case, states, taken, numbers=sigma),
         reported=np.pad(states.reported(course), ((0, 0), (0, len(sigma) - COMMON))),
-        facts=published(name, windy),
+        facts=published(name, given.wind.gusty),
     )
 
 

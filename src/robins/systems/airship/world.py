@@ -142,13 +142,12 @@ def present(time_s: np.ndarray, instrument: Readings) -> np.ndarray:
 def _attitude(given: Airship, time_s: Any):
     """Roll, pitch, heading [rad] at times, NumPy or JAX: sines that grow in gusts."""
     hull, wind = given.hull, given.wind
-    gusty = wind.gusts is not None or wind.turbulence is not None
     xp = np if isinstance(time_s, np.ndarray) else jnp
 
     def rise(at: float):
         return 0.5 * (1.0 + xp.tanh((time_s - at) / (0.5 * _BLEND_S)))
 
-    share = rise(wind.span.begin) - rise(wind.span.end) if gusty else 0.0 * time_s
+    share = rise(wind.span.begin) - rise(wind.span.end) if wind.gusty else 0.0 * time_s
     out = []
     for i, mean in enumerate((0.0, 0.0, hull.course)):
         size = hull.sway_calm[i] + share * (hull.sway_gust[i] - hull.sway_calm[i])
@@ -159,39 +158,28 @@ def _attitude(given: Airship, time_s: Any):
 
 def blow(given: Airship, key: Array) -> tuple[Array, float]:
     """Wind held over steps: (M, 2) m/s north east, and the length of a step [s]."""
-    wind = given.wind
-    step = given.duration
-    if wind.gusts is not None:
-        step = wind.gusts.every
-    if wind.turbulence is not None:
-        step = wind.turbulence.step
-    count = math.ceil(given.duration / step - 1e-9)
-    total = jnp.broadcast_to(jnp.asarray(wind.constant * _towards(wind.towards)), (count, 2))
-    begin, end = wind.span.begin, wind.span.end
-    if wind.gusts is not None:
-        g = wind.gusts
-        coarse = math.ceil(given.duration / g.every - 1e-9)
-        drawn = gusts(
-            jax.random.fold_in(key, _GUSTS),
-            coarse,
-            begin,
-            end,
-            g.every,
-            g.speed,
-            (wind.towards, g.spread),
-        )
+    wind, g, t = given.wind, given.wind.gusts, given.wind.turbulence
+    step = t.step if t is not None else g.every if g is not None else given.duration
+    count, begin, end = _steps(given, step), wind.span.begin, wind.span.end
+    towards = _towards(wind.towards)
+    total = jnp.broadcast_to(jnp.asarray(wind.constant * towards), (count, 2))
+    if g is not None:
+        own, to = jax.random.fold_in(key, _GUSTS), (wind.towards, g.spread)
+        drawn = gusts(own, _steps(given, g.every), begin, end, g.every, g.speed, to)
         total = total + jnp.repeat(drawn, round(g.every / step), axis=0)[:count]
-    if wind.turbulence is not None:
-        t = wind.turbulence
+    if t is not None:
         shape = dryden if t.spectrum == "dryden" else von_karman
         own = jax.random.fold_in(key, _TURBULENCE)
         along_across = shape(own, count, step, given.hull.air_speed, t.sigma, t.length)
-        towards = _towards(wind.towards)
         turn = jnp.asarray(np.stack([towards, [-towards[1], towards[0]]]))
         time = step * jnp.arange(count, dtype=float)
         inside = (time >= begin) & (time < end)
         total = total + jnp.where(inside[:, None], along_across @ turn, 0.0)
     return total, step
+
+
+def _steps(given: Airship, step_s: float) -> int:
+    return math.ceil(given.duration / step_s - 1e-9)
 
 
 def signed(key: Array, size: Any, draw: Draw) -> Array:
@@ -208,13 +196,11 @@ def _desired(given: Airship, course: Course, carried: Carried, time_s: Float[Arr
     velocity, moved, _ = carried_at(carried, time_s)
     zero = jnp.zeros_like(time_s)
     start = course.start.position
-    lat, lon = (
-        at + moved[:, i] / course.datum.metres[i] for i, at in enumerate((start.lat, start.lon))
-    )
+    north, east = (moved[:, i] / course.datum.metres[i] for i in range(2))
     return Nav(
         Rotation(from_euler(*_attitude(given, time_s))),
         jnp.stack([velocity[:, 0], velocity[:, 1], zero], 1),
-        Geodetic(lat, lon, zero + start.alt),
+        Geodetic(start.lat + north, start.lon + east, zero + start.alt),
     )
 
 
@@ -290,10 +276,8 @@ def simulate(
 def _turned_since(single: Increments) -> Array:
     """Turn from each early sight of an epoch to its end, (E, S - 1, 3), from (E, S) increments."""
     sights = single.dt.shape[1]
-    rest = [
-        jax.vmap(joined)(jax.tree.map(lambda x, j=j: x[:, j:], single)).theta
-        for j in range(1, sights)
-    ]
+    late = (jax.tree.map(lambda x, j=j: x[:, j:], single) for j in range(1, sights))
+    rest = [jax.vmap(joined)(block).theta for block in late]
     return jnp.stack(rest, 1) if rest else jnp.zeros((single.dt.shape[0], 0, 3))
 
 
