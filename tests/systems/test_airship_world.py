@@ -126,7 +126,7 @@ def test_wind_changes_nothing_of_what_the_sensors_get_wrong(windy):
     datum = lay_out(parsed("s0", SHORT)).datum
     for noise, rounding in (
         ([w.readings[SAR][2][..., 0] - w.truth.position.alt for w in pair], 1e-10),
-        ([w.readings[SAR][0] - level(datum, w.truth.position) for w in pair], 1e-7),
+        ([(w.readings[SAR][0] - level(datum, w.truth.position))[..., 0] for w in pair], 1e-7),
         ([w.readings[WIND] - w.air_b for w in pair], 1e-12),
     ):
         np.testing.assert_allclose(noise[0], noise[1], atol=rounding)

@@ -234,14 +234,9 @@ class Fed:
         return corrected(self.sins, self.x)
 
 
-def error_states(noise: InsNoise, metres_per_radian: ArrayLike) -> Motion:
-    """Motion of a `Fed`; input of a step: one increment. Wants the rule `feedback`.
-
-    Args:
-        noise: of gyros and accelerometers as believed, one number for the three axes of each.
-        metres_per_radian: (2,) of latitude, longitude.
-    """
-    return Motion(_step, Partial(_noise, noise, jnp.asarray(metres_per_radian)))
+def _motion(given: Airship, course: Course) -> Motion:
+    """Motion of a `Fed`; input of a step: one increment. Wants the rule `feedback`."""
+    return Motion(_step, Partial(_noise, believed_noise(given), course.datum.metres))
 
 
 def _step(fed: Fed, block: Increments) -> Fed:
@@ -287,7 +282,7 @@ def _reported(course: Course) -> np.ndarray:
 
 
 ERRORS = States(
-    lambda given, course: error_states(believed_noise(given), course.datum.metres),
+    _motion,
     lambda nav, gyro, accel, wind: Fed(nav, jnp.zeros((*wind.shape[:-1], 9))),
     _start_sigma,
     _reported,

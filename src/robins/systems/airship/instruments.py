@@ -333,25 +333,22 @@ def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
     return -d, D @ error_from_tangent(x.position.lat, x.position.alt)
 
 
-def _printed_zero(x: Any, air: tuple[ArrayLike, Array]) -> Array:
-    return printed_wind(x, air)[0]
-
-
 def _taken_printed(world: World):
     wind, air_b = as_measured(world)
     return 0.0 * wind, (air_b, jnp.nan_to_num(wind))
 
 
-def _printed_radar(given: Airship, course: Course) -> Sensor:
-    sensor = _believed_sar(given, course)
-    return replace(sensor, linear=Partial(_printed_sar, course.datum))
-
-
-PRINTED_RADAR = RADAR._replace(believed=_printed_radar)
+PRINTED_RADAR = RADAR._replace(
+    believed=lambda given, course: replace(
+        _believed_sar(given, course), linear=Partial(_printed_sar, course.datum)
+    )
+)
 PRINTED_STARS = STARS._replace(
     believed=lambda given, course: replace(_believed_star(given, course), linear=_printed_euler)
 )
-PRINTED_WIND = hard(taken=_taken_printed, read=_printed_zero, linear=printed_wind)
+PRINTED_WIND = hard(
+    taken=_taken_printed, read=lambda x, air: printed_wind(x, air)[0], linear=printed_wind
+)
 
 
 def _sin_cos(angle: ArrayLike) -> tuple[Array, Array]:

@@ -114,9 +114,8 @@ def _linear(noise: InsNoise, x: Nav, block: Increments):
 
 def with_biases(noise: InsNoise) -> Motion:
     """Motion of an `InsState`; input of a step: K increments."""
-    return Motion(
-        Partial(propagate, noise=noise), Partial(_noise_ins, noise), Partial(_linear_ins, noise)
-    )
+    moved = Partial(propagate, noise=noise)
+    return Motion(moved, Partial(_noise_ins, noise), Partial(_linear_ins, noise))
 
 
 def _linear_ins(noise: InsNoise, x: InsState, block: Increments):
@@ -200,10 +199,6 @@ def _wind(given: Airship) -> WindNoise:
     return WindNoise(jnp.asarray(given.air_data.wind_error), jnp.asarray(given.air_data.wind_time))
 
 
-def _wind_sigma(given: Airship) -> np.ndarray:
-    return np.full(2, given.air_data.wind_error)
-
-
 def _product_motion(given: Airship, course: Course) -> Motion:
     imu, factor = given.imu, given.believed.accel_noise_factor
     noise = InsNoise(jnp.asarray(imu.gyro_noise), factor * jnp.asarray(imu.accel_noise))
@@ -218,14 +213,14 @@ NINE = States(
 WIND_STATES = States(
     lambda given, course: with_wind(nine_states(believed_noise(given)), _wind(given)),
     lambda nav, gyro, accel, wind: WithWind(nav, wind),
-    lambda given, course: [start_sigma(given), _wind_sigma(given)],
+    lambda given, course: [start_sigma(given), np.full(2, given.air_data.wind_error)],
 )
 PRODUCT = States(
     _product_motion,
     lambda nav, gyro, accel, wind: WithWind(InsState(*nav, gyro, accel), wind),
     lambda given, course: [
         *(start_sigma(given), given.imu.gyro_bias, given.imu.accel_bias),
-        _wind_sigma(given),
+        np.full(2, given.air_data.wind_error),
     ],
     in_parts=True,
 )
