@@ -30,9 +30,9 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import GM
+from robins.linalg import scalars as u
 from robins.rotation import conjugate, normalise, rotate
 from robins.sim import _given
-from robins.sim import _unrolled as u
 
 
 class Spacecraft(NamedTuple):
