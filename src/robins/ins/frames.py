@@ -29,7 +29,6 @@ from robins.dataset import (
     NavFrame,
     Trajectory,
 )
-from robins.manifold import wrap
 from robins.rotation import multiply, to_euler
 
 Table = TypeVar("Table", ImuTable, GnssTable, Trajectory, MagTable, AttitudeTable)
@@ -109,8 +108,3 @@ def euler_enu_rfu(q_nb) -> tuple[Array, Array, Array]:
     the same vehicle in NED/FRD.
     """
     return to_euler(swap_q(jnp.asarray(q_nb)))
-
-
-def yaw_from_heading(heading_rad) -> Array:
-    """Yaw [rad] counter-clockwise from north in [-pi, pi), as in PSINS; and back again."""
-    return wrap(-jnp.asarray(heading_rad))

@@ -8,8 +8,9 @@ inside an interval. One rule for each kind of sensor fills that in:
 *increment*: both ran linearly, with the slope that the previous sample shows. For equal intervals
 the coning term is then a 12th of (previous x this), that of Ignagni (1996) and Savage (1998, part
 1), and sculling goes likewise (part 2). Causal. The error of a path is of third order in the
-interval; after coning it is `coning_drift`. After lost samples the same line runs from the middle
-of the previous sample's own interval to that of this one's (`robins.ins.intervals`).
+interval; a cone of half angle a at rate W, sampled every T, leaves a drift of a^2 x^5 / (60 T),
+x = W T (Ignagni 1996). After lost samples the same line runs from the middle of the previous
+sample's own interval to that of this one's (`robins.ins.intervals`).
 
 *rate*: both ran along the cubic through the four nearest samples. Fourth order; needs one sample
 ahead. Where there are fewer than four, or their intervals differ by more than a factor of two, both
@@ -208,16 +209,3 @@ def displacement(increments: Increments) -> Any:
     """``dr`` [m], or what it is for a specific force constant in the turning body."""
     dt, theta, dv, dr = increments
     return dt[..., None] * (dv / 2.0 - _cross(theta, dv) / 12.0) if dr is None else dr
-
-
-def coning_drift(half_angle_rad: float, rate_rad_s: float, dt_s: float) -> float:
-    """Drift [rad/s] left by the two-sample rule about the axis of a coning motion.
-
-    The body axis runs around a cone of small half angle a at rate W, sampled every T. Truth and
-    rule differ by ``a^2 |(x - sin x)/2 - sin^2(x/2) sin(x)/3| / T`` with x = W T, which is
-    a^2 x^5 / (60 T) for small x (as Ignagni 1996, without the small-x limit). Terms in a^4 are left
-    out.
-    """
-    x = rate_rad_s * dt_s
-    left = 0.5 * (x - np.sin(x)) - np.sin(0.5 * x) ** 2 * np.sin(x) / 3.0
-    return float(half_angle_rad**2 * abs(left) / dt_s)

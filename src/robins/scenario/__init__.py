@@ -23,7 +23,7 @@ from robins.scenario.parameters import Parameters, Quantity, default
 from robins.scenario.ranges import Dof, Entry, Positive, Share
 from robins.scenario.reading import load, parse, validate
 from robins.scenario.span import Span
-from robins.scenario.text import hash_of, mapping_of, override, read_text, text_of
+from robins.scenario.text import mapping_of, override, read_text, text_of
 
 __all__ = [
     "Dof",
@@ -35,7 +35,6 @@ __all__ = [
     "Share",
     "Span",
     "default",
-    "hash_of",
     "load",
     "mapping_of",
     "override",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 import json
 import re
 import tomllib
@@ -85,11 +84,6 @@ def override(mapping: Mapping[str, Any], settings: Iterable[str]) -> dict[str, A
 def text_of(mapping: Mapping[str, Any]) -> str:
     """TOML text of the tables, so that a changed scenario can be kept and run again."""
     return "\n".join(_toml_lines(mapping, ())) + "\n"
-
-
-def hash_of(text: str) -> str:
-    """SHA-256 of a scenario text, hexadecimal."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _copy(value: Any) -> Any:

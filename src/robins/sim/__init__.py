@@ -23,7 +23,7 @@
 from robins.sim.commands import from_commands
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
-from robins.sim.ideal_imu import ideal_increments, ideal_rates, true_increments
+from robins.sim.ideal_imu import ideal_increments, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
 from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import fly, roughen, sail
@@ -48,7 +48,6 @@ __all__ = [
     "from_waypoints",
     "generator",
     "ideal_increments",
-    "ideal_rates",
     "observe",
     "roughen",
     "sail",

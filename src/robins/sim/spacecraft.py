@@ -150,16 +150,12 @@ def rate_b(craft: Spacecraft, state: CraftState) -> Float[Array, "3"]:
     return jnp.stack(u.apply(u.symmetric_inverse(u.matrix(craft.inertia_b)), left))
 
 
-def gravity_gradient(inertia_b: Float[Array, "3 3"], r_b_m: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Torque [N m] of gravity on a body at r_b from the Earth's centre, 3 mu/r^5 (r_b x J r_b).
+def gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
+    """Torque [N m] of gravity on a body of inertia J at r from the Earth's centre, body axes.
 
-    Far from the Earth and for a body small beside its distance (Wertz 1978, eq. 17-31). None at
-    r_b = 0, which stands for no Earth.
+    3 mu/r^5 (r x J r), far from the Earth and for a body small beside its distance (Wertz 1978, eq.
+    17-31). None at r = 0, which stands for no Earth.
     """
-    return jnp.stack(_gravity_gradient(u.matrix(inertia_b), u.scalars(r_b_m)))
-
-
-def _gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
     sq = u.dot(r, r)
     none = sq == 0.0
     safe = jnp.where(none, 1.0, sq)
@@ -217,7 +213,7 @@ def advance(
             *(_turned(g, v, -1.0) for v in (u.plus(total, added), place, field))
         )
         wheels = u.plus(held, u.times(share, gained))
-        torque = u.plus(_gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
+        torque = u.plus(gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
         omega, torque = u.settled(u.apply(J_inv, u.minus(momentum, wheels)), torque)
         along = u.plus(omega, u.cross(g, omega), u.times(u.dot(g, omega), g))
         (rate,) = u.settled((*u.times(0.5, along), *_turned(g, torque, 1.0)))
