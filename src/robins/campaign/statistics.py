@@ -59,7 +59,7 @@ class Statistics:
     _run_output_worst: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
-        """Take in a chunk as `robins.campaign.chunks` yields it."""
+        """Take in a chunk as `robins.campaign.record` gives it."""
         error, sigma = record["error"], record["sigma"]
         if self.example is None:
             self.example = jax.tree_util.tree_map(lambda x: x[0], record)

@@ -9,7 +9,7 @@
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
 - `wind`, `turbulence`: gusts and what they carry; Dryden and von Karman spectra.
-- `air_data`, `barometer`, `sar`, `star_tracker`: sensors of an airship.
+- `air_data`, `barometer`, `sar`: sensors of an airship.
 - `ballistic`, `free_body`: a rocket after burnout, the way it flies and the way it turns.
 - `mems_gyro`, `magnetometer`: its sensors.
 - `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and what is about it.
@@ -27,7 +27,7 @@ from robins.sim.ideal_imu import ideal_increments, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
 from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import fly, roughen, sail
-from robins.sim.random import Component, generator, stream
+from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion, from_velocity, from_waypoints, sine_velocity
 
 __all__ = [
@@ -46,7 +46,6 @@ __all__ = [
     "from_commands",
     "from_velocity",
     "from_waypoints",
-    "generator",
     "ideal_increments",
     "observe",
     "roughen",

@@ -17,7 +17,6 @@ from enum import IntEnum
 from typing import Any, SupportsIndex
 
 import jax
-import numpy as np
 from jaxtyping import Array
 
 from robins import _float64  # noqa: F401
@@ -72,22 +71,6 @@ def stream(seed: SupportsIndex, run: Any, component: SupportsIndex) -> Array:
     if not isinstance(run, jax.Array):
         run = _bounded("run", run, 2**32)
     return jax.random.fold_in(jax.random.fold_in(key, run), _bounded("component", component, 2**32))
-
-
-def generator(
-    seed: SupportsIndex, run: SupportsIndex, component: SupportsIndex
-) -> np.random.Generator:
-    """NumPy generator of one component in one run, for work outside compiled code.
-
-    It has the independence of `stream`, not its numbers: the two use different generators. NumPy
-    keeps Philox's bits across versions but not the way normals are made from them.
-
-    Raises:
-        ValueError: as in `stream`.
-    """
-    name = (_bounded("run", run, 2**32), _bounded("component", component, 2**32))
-    seeds = np.random.SeedSequence(_bounded("seed", seed, 2**63), spawn_key=name)
-    return np.random.Generator(np.random.Philox(seeds))
 
 
 def _bounded(name: str, value: Any, limit: int) -> int:
