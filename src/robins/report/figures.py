@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from robins.report import allan_curve, bars, bounds, curves, iron, limits, maps, updates
+from robins.report import allan_curve, bars, bounds, curves, iron, maps, updates
 from robins.report.lateness import lateness
 from robins.report.style import Picture
 from robins.report.trade_off import trade_off
@@ -49,8 +49,8 @@ FIGURES = (
     Figure(bounds.information, "information gramian_rank"),
     Figure(curves.errors, "error sigma bound bounds", EACH),
     Figure(curves.campaign, "rms mean_sigma bound bounds", EACH, _scatters),
-    Figure(limits.within, "within", EACH),
-    Figure(limits.worst_case, "note"),
+    Figure(curves.within, "within", EACH),
+    Figure(curves.worst_case, "note"),
     Figure(curves.estimates, "estimate sigma", EACH, _tells_more),
     Figure(curves.values, "value sigma", EACH),
     Figure(curves.height, "track reference gnss"),
