@@ -296,3 +296,15 @@ def test_body_rotation_errs_on_the_right():
     # seen in the frame that is mapped to, the same error is C delta
     left = Rotation(q.wxyz).local(Rotation(moved.wxyz))
     np.testing.assert_allclose(left, C.apply(delta), atol=1e-15)
+
+
+def test_numpy_is_answered_by_numpy_with_the_same_numbers():
+    rng = np.random.default_rng(11)
+    p, q = (rot.normalise(jnp.asarray(rng.normal(size=(40, 4)))) for _ in range(2))
+    v = rng.normal(size=(40, 3))
+    q = q.at[:3].set(jnp.array([[1.0, 0.0, 0.0, 0.0], [1.0, 1e-9, 0.0, 0.0], [-1.0, 0.0, 0.1, 0]]))
+    calls = [(rot.multiply, p, q), (rot.conjugate, q), (rot.to_rotvec, q), (rot.to_dcm, q)]
+    for f, *arguments in [*calls, (rot.skew, jnp.asarray(v))]:
+        got = f(*map(np.asarray, arguments))
+        assert type(got) is np.ndarray
+        np.testing.assert_allclose(got, f(*arguments), rtol=0.0, atol=4 * EPS)

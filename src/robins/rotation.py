@@ -3,7 +3,8 @@
 Quaternions are scalar first (w, x, y, z), Hamilton product; ``q_nb`` maps body coordinates to
 navigation coordinates, ``v_n = rotate(q_nb, v_b)``. All functions work on one or many alike: the
 last axis holds the components, leading axes broadcast. Euler angles are roll, pitch, heading of
-the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame.
+the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame. What `Real`
+takes is computed by NumPy where NumPy is given, with nothing to compile, else by JAX.
 
 Small-angle series live here; they are exact to rounding on both sides of their switch and have
 finite derivatives at zero. The exponential map to first order is ``I + skew(phi)``, its Jacobians
@@ -23,6 +24,8 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.linalg import scalars
 
+Real = Array | np.ndarray
+
 _SMALL = 1e-3  # rad^2; below it the series, of which no dropped term exceeds 1e-18
 _SMALL_TURN = 1e-2  # rad^2; below it those of `turn_coefficients`: 1e-16 of the first term
 
@@ -33,6 +36,10 @@ def _same_rank(*arrays):
     """Leading axes of length one where an array has fewer, for then the rest broadcasts itself."""
     most = max(a.ndim for a in arrays)
     return [a.reshape((1,) * (most - a.ndim) + a.shape) for a in arrays]
+
+
+def _library(*arrays):
+    return np if all(isinstance(a, np.ndarray) for a in arrays) else jnp
 
 
 def _components(q):
@@ -53,26 +60,24 @@ def _sinc_cos(angle_sq):
     return sinc, jnp.where(small, cos_series, jnp.cos(angle))
 
 
-def skew(
-    v: Float[Array, "*b 3"] | Float[np.ndarray, "*b 3"],
-) -> Float[Array, "*b 3 3"] | Float[np.ndarray, "*b 3 3"]:
-    """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; NumPy of NumPy, else JAX."""
-    xp = np if isinstance(v, np.ndarray) else jnp
+def skew(v: Float[Real, "*b 3"]) -> Float[Real, "*b 3 3"]:
+    """Cross-product matrix: ``skew(a) @ b == cross(a, b)``."""
+    xp = _library(v)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     o = xp.zeros_like(x)
     rows = [xp.stack(r, -1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))]
     return xp.stack(rows, -2)
 
 
-def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
+def multiply(p: Float[Real, "*#b 4"], q: Float[Real, "*#b 4"]) -> Float[Real, "*b 4"]:
     """Hamilton product p q: rotate by q first, then by p."""
-    p, q = (_components(a) for a in _same_rank(p, q))
-    return jnp.stack(scalars.product(p, q), -1)
+    factors = (_components(a) for a in _same_rank(p, q))
+    return _library(p, q).stack(scalars.product(*factors), -1)
 
 
-def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+def conjugate(q: Float[Real, "*b 4"]) -> Float[Real, "*b 4"]:
     """Inverse of a unit quaternion."""
-    return jnp.concatenate([q[..., :1], -q[..., 1:]], -1)
+    return _library(q).concatenate([q[..., :1], -q[..., 1:]], -1)
 
 
 def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -94,19 +99,20 @@ def from_rotvec(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     return jnp.concatenate([cos, 0.5 * sinc * phi], -1)
 
 
-def to_rotvec(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+def to_rotvec(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3"]:
     """Rotation vector [rad] of length at most pi; q and -q give the same."""
-    q = jnp.where(q[..., :1] < 0.0, -q, q)
+    xp = _library(q)
+    q = xp.where(q[..., :1] < 0.0, -q, q)
     w, u = q[..., :1], q[..., 1:]
-    s_sq = jnp.sum(u * u, -1, keepdims=True)
+    s_sq = xp.sum(u * u, -1, keepdims=True)
     small = s_sq < _SMALL
-    safe = jnp.where(small, 1.0, s_sq)
-    s = jnp.sqrt(safe)
-    x = jnp.where(small, s_sq / jnp.where(small, w * w, 1.0), 0.0)
+    safe = xp.where(small, 1.0, s_sq)
+    s = xp.sqrt(safe)
+    x = xp.where(small, s_sq / xp.where(small, w * w, 1.0), 0.0)
     # 2 atan2(s, w)/s; the series is that of 2 atan(t)/t with t = s/w, over w
     series = 2.0 * (1.0 - x * (1 / 3 - x * (1 / 5 - x * (1 / 7 - x * (1 / 9 - x / 11)))))
-    series = series / jnp.where(small, w, 1.0)
-    return jnp.where(small, series, 2.0 * jnp.arctan2(s, jnp.where(small, 1.0, w)) / s) * u
+    series = series / xp.where(small, w, 1.0)
+    return xp.where(small, series, 2.0 * xp.arctan2(s, xp.where(small, 1.0, w)) / s) * u
 
 
 def turn_coefficients(phi: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
@@ -139,9 +145,10 @@ def left_jacobian(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     return jnp.eye(3) + once * turn + twice * turn @ turn
 
 
-def to_dcm(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
+def to_dcm(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3 3"]:
     """Direction cosine matrix: ``v_n = C_nb @ v_b``."""
-    return jnp.stack([jnp.stack(row, -1) for row in scalars.dcm(_components(q))], -2)
+    xp = _library(q)
+    return xp.stack([xp.stack(row, -1) for row in scalars.dcm(_components(q))], -2)
 
 
 def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:

@@ -95,9 +95,9 @@ def _turned(q, turn_nav: bool, turn_body: bool):
     if turn_nav and turn_body:
         return swap_q(q)
     if turn_nav:
-        return np.asarray(multiply(jnp.asarray(_HALF_TURN), jnp.asarray(q)))
+        return multiply(_HALF_TURN, q)
     if turn_body:
-        return np.asarray(multiply(jnp.asarray(q), jnp.asarray(-_HALF_TURN)))
+        return multiply(q, -_HALF_TURN)
     return q
 
 
