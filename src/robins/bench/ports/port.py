@@ -28,12 +28,6 @@ class PortError(RobinsError, ValueError):
     """A port that cannot be had; says which, why, and what to do."""
 
 
-class PortLostError(RobinsError, ConnectionError):
-    """The far end of an open port is gone: pulled out, switched off, or its program ended."""
-
-    bad_input = False
-
-
 class Address(NamedTuple):
     """Where a port is and how fast it is."""
 
@@ -113,30 +107,6 @@ def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
     with contextlib.suppress(AttributeError, OSError, ValueError):
         port.set_low_latency_mode(True)
     return port
-
-
-def receive(port: serial.Serial) -> bytes:
-    """All that has come in; waits for a first byte as long as the port's timeout says.
-
-    Raises:
-        PortLostError: the far end is gone.
-    """
-    try:
-        return port.read(max(1, port.in_waiting))
-    except (OSError, termios.error) as error:
-        raise PortLostError(f"the far end is gone ({error})", f"port '{port.port}'") from None
-
-
-def send(port: serial.Serial, data: bytes) -> None:
-    """Write all of it.
-
-    Raises:
-        PortLostError: the far end is gone.
-    """
-    try:
-        port.write(data)
-    except (OSError, termios.error) as error:
-        raise PortLostError(f"the far end is gone ({error})", f"port '{port.port}'") from None
 
 
 @dataclass
