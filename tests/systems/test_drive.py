@@ -5,7 +5,7 @@ import pytest
 from test_replay import DRIVE
 
 from robins import scenario
-from robins.campaign import chunks, collect
+from robins.campaign import collect, record, worlds
 from robins.systems.ins_gnss import Drive, drive_problem
 from robins.systems.ins_gnss.drive import lay_out
 from robins.systems.ins_gnss.drive_claims import CLAIMS
@@ -22,7 +22,8 @@ def campaign(*settings):
     # an EKF is right only about small errors, and a gate cuts the tails of a right one
     small = ("start.tilt=0.5 deg", "start.heading=2 deg", "update.gate=0")
     problem = drive_problem(parsed(*small, *settings), ("ekf",), 1)
-    statistics = collect(chunks(problem, "ekf", RUNS, chunk=RUNS), problem.blocks)
+    (runs,) = worlds(problem, RUNS, RUNS)
+    statistics = collect([record(problem, "ekf", *runs)], problem.blocks)
     metrics = problem.metrics(statistics)
     return metrics, {c["id"]: c["verdict"] for c in judging(CLAIMS)({"ekf": metrics})}
 

@@ -23,15 +23,21 @@ from robins.dataset import (
     Trajectory,
 )
 from robins.ins.frames import swap, swap_q
-from robins.logs.axes import Axes
 from robins.logs.findings import Finding, LogError, refused, report, told
 from robins.logs.local import LocalPath, Origin, from_local
 from robins.logs.quantities import QUANTITIES, TABLES, parts, words_of
-from robins.logs.tables import Table, kind_of
+from robins.logs.tables import Table, kind_of, unit_quaternions
 from robins.logs.text import COMMENTS, Head, Layout, peek, read_columns
-from robins.logs.text_format import PAIRS, Found, TextFormat, columns_of, decimals_of, header_of
+from robins.logs.text_format import (
+    PAIRS,
+    Axes,
+    Found,
+    TextFormat,
+    columns_of,
+    decimals_of,
+    header_of,
+)
 from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, weeks_of
-from robins.logs.unit_length import unit_quaternions
 from robins.units import from_si, to_si, unit
 
 NOWHERE = Origin(0.0, 0.0, 0.0)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.rotation import conjugate, from_rotvec, multiply, normalise, to_rotvec
 from robins.sim import _given
-from robins.sim.gauss_markov import gauss_markov
+from robins.sim.random import gauss_markov
 
 # Streams folded into the key of the gyro; part of the file format, as `Component` is.
 _SIGN, _MARKOV, _WHITE = 0, 1, 2

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from robins import _float64  # noqa: F401
 from robins.earth.star_catalogue import Stars
 from robins.earth.star_index import StarIndex, index_stars, near
-from robins.ins.star_tracking import track_stars
+from robins.ins.star_identification import track_stars
 from robins.ins.vector_attitude import quest
 from robins.manifold import wrap
 from robins.rotation import conjugate, from_rotvec, multiply, normalise, rotate, to_euler
@@ -244,7 +244,7 @@ def measure_attitude(
         camera: the camera.
         turn_rad: an error that all stars share, see `photograph`.
         q_ib_prior: (4,) attitude as far as known; the stars are then those that
-            `robins.ins.star_tracking.track_stars` matches with it. None: each star is known.
+            `robins.ins.star_identification.track_stars` matches with it. None: each star is known.
         tolerance_rad: of the match [rad]; None: six sigmas of the faintest star that is reported.
 
     Returns:

@@ -30,7 +30,7 @@ from scipy.special import gamma, kv
 
 from robins import _float64, linalg  # noqa: F401
 from robins.sim import _given
-from robins.sim.gauss_markov import gauss_markov
+from robins.sim.random import gauss_markov
 
 # Streams folded into the key; part of the file format, as `robins.sim.random.Component` is. Zero is
 # that of `robins.sim.wind.gusts`.

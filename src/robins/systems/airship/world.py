@@ -24,12 +24,10 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
-from robins.ins.increments import Increments
-from robins.ins.joined import joined
+from robins.ins.increments import Increments, joined
 from robins.ins.mechanise import Nav, mechanise
 from robins.rotation import Rotation, conjugate, from_euler, rotate, to_euler
-from robins.sim.air_data import observe_air, wind_estimate_error
-from robins.sim.barometer import observe_height
+from robins.sim.air_data import observe_air, observe_height, wind_estimate_error
 from robins.sim.ideal_imu import increments_between
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream

@@ -14,8 +14,7 @@ from robins.earth import Geodetic
 from robins.filters import Belief
 from robins.ins.blocks import Blocks, cut, epochs_between
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
-from robins.ins.intervals import after_gap
+from robins.ins.increments import Increments, after_gap, from_imu
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import model as names
 from robins.systems.ins_gnss.model import Block, Fix, Velocity

@@ -11,8 +11,7 @@ import numpy as np
 from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import Belief
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import from_imu
-from robins.ins.intervals import after_gap, usual_interval
+from robins.ins.increments import after_gap, from_imu, usual_interval
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.marg.align import FirstLook, first_look
