@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import GM
 from robins.linalg import scalars as u
-from robins.rotation import conjugate, normalise, rotate
+from robins.rotation import conjugate, rotate
 from robins.sim import _given
 
 
@@ -129,11 +129,9 @@ def craft_state(craft: Spacecraft, q_ib: Any, omega_b: Any, wheel_h: Any = 0.0) 
     Raises:
         ValueError: shapes that do not fit, or a quaternion that is not of unit length.
     """
-    q, omega = _given.rows("q_ib", q_ib, 4), _given.rows("omega_b", omega_b, 3)
-    _given.number("q_ib must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
+    q, omega = _given.unit_quaternion("q_ib", q_ib), _given.rows("omega_b", omega_b, 3)
     _given.number("omega_b", omega)
     h = _given.vector("wheel_h", wheel_h, craft.wheel_axes_b.shape[1])
-    q = normalise(q)
     total = _times(craft.inertia_b, omega) + wheel_momentum_b(craft, h)
     return CraftState(q, rotate(q, total), h)
 
