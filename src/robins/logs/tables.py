@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
-from robins.logs.findings import Finding, LogError, refused, report, told
+from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.timebase import LIMIT_NS
 
 Table = ImuTable | GnssTable | Trajectory | MagTable | AttitudeTable
@@ -173,11 +173,8 @@ def unit_quaternions(
         raise refused(file, where, f"length of {name}", float(length[k]))(
             f"is not of unit length, as in {count}", "are the columns scalar first: w, x, y, z?"
         )
-    report(
-        findings,
-        told("warning", "quaternion_length", file, where, float(length[k]))(
-            f"the quaternion {name} has length {length[k]:g}, not 1 ({count}). Such attitudes are "
-            "taken as missing."
-        ),
+    telling(findings, "warning", "quaternion_length", file, where, float(length[k]))(
+        f"the quaternion {name} has length {length[k]:g}, not 1 ({count}). Such attitudes are "
+        "taken as missing."
     )
     return out
