@@ -50,10 +50,6 @@ def _alternating(x, coefficients):
 
 
 _Q0 = _q(_EP2)
-_M = OMEGA_E**2 * A_M**2 * B_M / GM
-_EP_QP_OVER_Q = 3.0 * _q_prime(_EP2) / _Q0  # e' q0'/q0, dimensionless
-GAMMA_E = GM / (A_M * B_M) * (1.0 - _M - _M * _EP_QP_OVER_Q / 6.0)  # m/s^2, at the equator
-GAMMA_P = GM / A_M**2 * (1.0 + _M * _EP_QP_OVER_Q / 3.0)  # m/s^2, at the poles
 
 
 def _floats(*values: ArrayLike) -> list[Array]:
