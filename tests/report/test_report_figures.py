@@ -7,7 +7,7 @@ from figure_reading import collisions, lines_of
 from scipy.stats import chi2
 
 from robins import report
-from robins.report import allan_curve, bars, curves, series, style, updates
+from robins.report import comparing, curves, instruments, series, style, updates
 from robins.results import array
 
 
@@ -189,7 +189,7 @@ def test_the_height_profile_shows_all_there_is(drive):
 
 
 def test_bars_are_as_long_as_their_numbers(town):
-    picture = bars.comparison(town)
+    picture = comparing.comparison(town)
     shown = {axes.get_title(loc="left"): axes for axes in picture.figure.axes if axes.get_visible()}
     assert "Velocity RMS [m/s]" not in shown  # a list is not one number
     assert "Worst step [µs]" not in shown  # nobody has it
@@ -200,12 +200,12 @@ def test_bars_are_as_long_as_their_numbers(town):
 
 
 def test_one_filter_is_compared_with_nothing():
-    assert bars.comparison(a_summary(1)) is None
+    assert comparing.comparison(a_summary(1)) is None
 
 
 def test_a_missing_metric_has_no_bar():
     filters = {"a": {"x_m": 1.0}, "b": {"x_m": None}, "c": {"x_m": -2.0}}
-    picture = bars.comparison(a_summary() | {"filters": filters})
+    picture = comparing.comparison(a_summary() | {"filters": filters})
     axes = picture.figure.axes[0]
     assert [bar.get_width() for bar in axes.patches] == [1.0, 0.0, -2.0]
     assert [text.get_text() for text in axes.texts] == ["1", "–", "-2"]
@@ -214,7 +214,7 @@ def test_a_missing_metric_has_no_bar():
 
 def test_the_allan_curve_is_drawn_in_field_units_with_its_fit():
     solution = an_allan_curve()
-    figure = allan_curve.allan(solution, "gyro").figure
+    figure = instruments.allan(solution, "gyro").figure
     unit = 3600.0 * 180.0 / np.pi
     for k, axes in enumerate(figure.axes):
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")

@@ -24,10 +24,10 @@ where you have them.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,33 @@ from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
 from robins.errors import require, require_known
-from robins.ins.records import checked_pytree
 from robins.units import UnitError, parse
+
+T = TypeVar("T", bound=type)
+
+
+def checked_pytree(cls: T) -> T:
+    """Register a frozen dataclass as a pytree whose rebuilding skips its ``__post_init__``.
+
+    JAX rebuilds a record with tracers, batches, axis numbers and stand-ins for leaves. Checks and
+    conversions are meant for what a person writes, so they run in the constructor and in
+    ``dataclasses.replace`` alone. A field that is None is structure, not a leaf.
+    """
+    names = tuple(f.name for f in dataclasses.fields(cls))
+
+    def flatten(record: Any) -> tuple[tuple[Any, ...], None]:
+        keys = (jax.tree_util.GetAttrKey(name) for name in names)
+        return tuple((key, getattr(record, key.name)) for key in keys), None
+
+    def unflatten(_: None, values: Iterable[Any]) -> Any:
+        record = object.__new__(cls)
+        for name, value in zip(names, values, strict=True):
+            object.__setattr__(record, name, value)
+        return record
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+    return cls
+
 
 MARKOV_PEAK = 0.6173642831
 """Largest Allan deviation of a Gauss-Markov process over its sigma, at 1.893 correlation times."""

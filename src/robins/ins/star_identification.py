@@ -35,8 +35,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from robins import _float64  # noqa: F401
-from robins.earth.star_catalogue import Stars
-from robins.earth.star_index import StarIndex, near
+from robins.earth.stars import StarIndex, Stars, near
 from robins.errors import require
 from robins.rotation import rotate
 
@@ -82,7 +81,7 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
     """Make the table of pairs; once for a catalogue, a fraction of a second for 4559 stars.
 
     Args:
-        stars: those that a camera can see, from `robins.earth.star_catalogue`. Many more, or less,
+        stars: those that a camera can see, from `robins.earth.stars`. Many more, or less,
             than it sees make identification slower or impossible.
         field_rad: largest angle between two stars in its field of view [rad].
 

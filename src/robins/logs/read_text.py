@@ -24,7 +24,7 @@ from robins.dataset import (
 )
 from robins.ins.frames import swap, swap_q
 from robins.logs.findings import Finding, LogError, refused, telling
-from robins.logs.local import LocalPath, Origin, from_local
+from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import QUANTITIES, TABLES, parts, words_of
 from robins.logs.tables import Table, kind_of, unit_quaternions
 from robins.logs.text import COMMENTS, Head, Layout, peek, read_columns

@@ -14,7 +14,7 @@ from robins import rotation
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.ins.frames import swap
 from robins.logs.findings import LogError, refused
-from robins.logs.local import Origin, to_local
+from robins.logs.mounting import Origin, to_local
 from robins.logs.opening import write_lines
 from robins.logs.quantities import CLOCKS, parts, words_of
 from robins.logs.tables import Table, kind_in_text, place_of, tables_of

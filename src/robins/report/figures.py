@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from robins.report import allan_curve, bars, bounds, curves, iron, maps, updates
+from robins.report import bounds, comparing, curves, instruments, maps, updates
 from robins.report.lateness import lateness
 from robins.report.style import Picture
-from robins.report.trade_off import trade_off
 from robins.results import find
 
 
@@ -56,11 +55,11 @@ FIGURES = (
     Figure(curves.height, "track reference gnss"),
     Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused", EACH),
     Figure(updates.consistency, "consistency consistency_dof", EACH),
-    Figure(allan_curve.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
-    Figure(trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
+    Figure(instruments.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
+    Figure(comparing.trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
     Figure(lateness, "lateness_steps lateness_edge"),
-    Figure(iron.planes, "field_calibrated field_measured"),
-    Figure(iron.size, "field_calibrated field_measured"),
+    Figure(instruments.planes, "field_calibrated field_measured"),
+    Figure(instruments.size, "field_calibrated field_measured"),
 )
 
 
@@ -73,5 +72,5 @@ def drawings(
         found += [partial(f.draw, solution, *of) for f in FIGURES for of in f.of(solution)]
     # Columns of a summary without filters are something else, such as the axes of a sensor.
     if solution is None or "filter" in solution.sizes:
-        found.append(partial(bars.comparison, summary))
+        found.append(partial(comparing.comparison, summary))
     return found

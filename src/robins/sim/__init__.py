@@ -7,14 +7,14 @@
 - `disturbance`: heavy tails, outliers, steps of noise and drift (import it by its name).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
-- `wind`, `turbulence`: gusts and what they carry; Dryden and von Karman spectra.
+- `wind`: gusts and what they carry; Dryden and von Karman spectra.
 - `air_data`, `sar`: sensors of an airship.
 - `ballistic`, `free_body`: a rocket after burnout, the way it flies and the way it turns.
-- `mems_gyro`, `magnetometer`: its sensors.
+- `gyro`, `magnetometer`: its sensors.
 - `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and what is about it.
 - `attitude_reference`, `attitude_control`: where it is to point, and the law that turns it there.
 - `rate_table`: what turns a gyro on the ground.
-- `gyro`, `star_sensor`: sensors of a spacecraft that turns as it is told to.
+- `star_sensor`, also `gyro`: sensors of a spacecraft that turns as it is told to.
 - `random`: streams of random numbers by seed, run and component; Gauss-Markov processes.
 """
 

@@ -25,7 +25,7 @@ from robins import _float64  # noqa: F401
 from robins.dataset import GnssTable
 from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.errors import require
-from robins.ins.records import checked_pytree
+from robins.ins.imu_errors import checked_pytree
 from robins.rotation import rotate
 from robins.sim import _given
 

@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from robins import _float64  # noqa: F401
-from robins.earth.star_catalogue import Stars
-from robins.earth.star_index import StarIndex, index_stars, near
+from robins.earth.stars import StarIndex, Stars, index_stars, near
 from robins.ins.star_identification import track_stars
 from robins.ins.vector_attitude import quest
 from robins.manifold import wrap
@@ -138,7 +137,7 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
 
     Args:
         camera: which is checked here.
-        stars: the catalogue, from `robins.earth.star_catalogue`.
+        stars: the catalogue, from `robins.earth.stars`.
         margin_rad: by which a list reaches beyond the field, for attitudes not exactly known [rad].
 
     Raises:

@@ -15,10 +15,9 @@ import numpy as np
 
 from robins import __version__
 from robins.bench.broker.broker import Broker, Wiring
-from robins.bench.broker.errors import BenchError
 from robins.bench.broker.faults import ROUTES, LinkFault
 from robins.bench.broker.injector import Injector
-from robins.bench.broker.link import Direction, Health, Link
+from robins.bench.broker.link import BenchError, Direction, Health, Link
 from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
 from robins.bench.parts.satellite import BUILD, Kit

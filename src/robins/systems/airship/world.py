@@ -33,8 +33,7 @@ from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.sar import SarErrorModel, observe_sar
 from robins.sim.star_sensor import observe_euler
-from robins.sim.turbulence import dryden, von_karman
-from robins.sim.wind import Carried, carried_at, carry, gusts, wind_at
+from robins.sim.wind import Carried, carried_at, carry, dryden, gusts, von_karman, wind_at
 from robins.systems.airship.parameters import AirData, Airship, Barometer, Draw, Sar, Star
 
 PARTS = 2  # increments between two star sights that a filter with states for biases takes

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from robins.earth.star_catalogue import hipparcos, synthetic
+from robins.earth.stars import hipparcos, synthetic
 from robins.sim.attitude_control import Controller, allocation_matrix, controller
 from robins.sim.attitude_reference import Reference, inertial, nadir, slews
 from robins.sim.orbit import circular_orbit, field_along_orbit

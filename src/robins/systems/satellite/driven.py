@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array
 
-from robins.earth.star_index import StarIndex
+from robins.earth.stars import StarIndex
 from robins.sim.star_sensor import StarCamera
 
 
