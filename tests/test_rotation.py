@@ -308,3 +308,17 @@ def test_numpy_is_answered_by_numpy_with_the_same_numbers():
         got = f(*map(np.asarray, arguments))
         assert type(got) is np.ndarray
         np.testing.assert_allclose(got, f(*arguments), rtol=0.0, atol=4 * EPS)
+
+
+def test_the_jacobians_of_the_exponential_map():
+    phi = jnp.asarray(np.random.default_rng(12).normal(size=(5, 3)))
+    J = rot.left_jacobian(phi)
+    # the integral of exp(s phi x) over s from 0 to 1
+    share = (np.arange(400) + 0.5) / 400
+    mean = sum(np.asarray(rot.to_dcm(rot.from_rotvec(s * phi))) for s in share) / 400
+    np.testing.assert_allclose(J, mean, atol=1e-5)
+    right = rot.left_jacobian(-phi)
+    np.testing.assert_allclose(rot.to_dcm(rot.from_rotvec(phi)) @ right, J, atol=1e-14)
+    small = 1e-4 * phi
+    first = rot.left_jacobian(small, first_order=True)
+    np.testing.assert_allclose(first, rot.left_jacobian(small), atol=1e-7)

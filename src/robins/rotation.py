@@ -3,8 +3,8 @@
 Quaternions are scalar first (w, x, y, z), Hamilton product; ``q_nb`` maps body coordinates to
 navigation coordinates, ``v_n = rotate(q_nb, v_b)``. All functions work on one or many alike: the
 last axis holds the components, leading axes broadcast. Euler angles are roll, pitch, heading of
-the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame. What `Real`
-takes is computed by NumPy where NumPy is given, with nothing to compile, else by JAX.
+the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame. Functions
+that take `Real` compute by NumPy where NumPy is given, with nothing to compile, else by JAX.
 
 Small-angle series live here; they are exact to rounding on both sides of their switch and have
 finite derivatives at zero. The exponential map to first order is ``I + skew(phi)``, its Jacobians
@@ -134,12 +134,16 @@ def turn_coefficients(phi: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
     )
 
 
-def left_jacobian(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+def left_jacobian(
+    phi: Float[Array, "*b 3"], *, first_order: bool = False
+) -> Float[Array, "*b 3 3"]:
     """J(phi): exp((phi + d) x) = exp((J d) x) exp(phi x) to first order in d (Sola 2017, eq. 145).
 
     The right Jacobian, exp((phi + d) x) = exp(phi x) exp((J_r d) x), is J(-phi). To first order in
-    phi, J = I + skew(phi) / 2.
+    phi too, J = I + skew(phi) / 2.
     """
+    if first_order:
+        return jnp.eye(3) + 0.5 * skew(phi)
     once, twice, _ = (c[..., None, None] for c in turn_coefficients(phi))
     turn = skew(phi)
     return jnp.eye(3) + once * turn + twice * turn @ turn

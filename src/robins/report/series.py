@@ -118,9 +118,9 @@ def alone(
 def stacked(
     solution: xr.Dataset, x: np.ndarray, axes: list[str], unit: str, more: int = 0
 ) -> tuple[Figure, np.ndarray, Clock]:
-    """A figure of one pair of axes over time for each component, outages shaded, and some more.
+    """A figure of one pair of axes over time for each component, outages shaded.
 
-    Components of several units say their own.
+    So many more pairs stand below. Components of several units state their own.
     """
     rows = len(axes) + more
     figure, grid = style.new(rows, 1, 0.9 + 1.35 * rows, sharex=True)

@@ -5,7 +5,7 @@ it, or JSON. Back: JSON, one object a line.
 
     sample: run u32 | sequence u32 | time_s f64 | values f64 ...
 
-What the page draws are signals, gathered in plots.
+The page draws signals, gathered in plots.
 """
 
 from __future__ import annotations
