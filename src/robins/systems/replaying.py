@@ -22,7 +22,7 @@ import xarray as xr
 from robins.filters import Belief, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.run import Step
 from robins.ins.blocks import Blocks
-from robins.ins.intervals import after_gap
+from robins.ins.increments import after_gap
 from robins.results import Outcome, Progress, silent, variable
 from robins.systems.study import Contender, SensorAxes, StateBlock
 from robins.systems.tables import (

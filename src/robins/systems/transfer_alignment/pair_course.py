@@ -20,7 +20,6 @@ from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.sim.commands import from_commands
 from robins.sim.ideal_imu import ideal_increments
-from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.trajectory import Motion
 from robins.systems.transfer_alignment.pair_parameters import (
