@@ -193,8 +193,9 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
         else:
             found = run(*arguments, keep=kept, time_s=piece.epoch_s)
             of_steps = found.steps
-    likelihood = float(found.log_likelihood)
-    answer = Answer("", *of_steps, case.start, likelihood, found.tally, contender.bounds)
+    mean, sigma, seen = of_steps
+    likelihood, bounds = float(found.log_likelihood), contender.bounds
+    answer = Answer("", mean, sigma, seen, case.start, likelihood, found.tally, bounds)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)
