@@ -81,6 +81,11 @@ def pooled_rms(statistics: Any, block: Any) -> float:
     return float(units.convert(size, block.units, block.display_unit))
 
 
+def rms_by_component(statistics: Any) -> np.ndarray:
+    """(r,) RMS error of each component that is reported [SI], over runs and epochs that count."""
+    return np.sqrt(np.mean(statistics.rms[statistics.counted] ** 2, axis=0))
+
+
 def standard_metrics(statistics: Any) -> dict[str, Any]:
     """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
     errors = {
