@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.filters.belief import SENTENCES, Code, StepInfo
-from robins.filters.consistency import chi2_band
+from robins.filters.chi_square import chi2_band
 
 # A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
 # share takes the model for right and the sensor for wrong.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.filters import Code, StepWarning, Tally, doubts
-from robins.filters.consistency import grand_mean_nis
+from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.results import array, variable
 from robins.systems.system import Output, SensorAxes, StateBlock

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
-from robins.filters.chi_square import limits
+from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
@@ -118,7 +118,7 @@ def discriminator(
     def before(memory: _Memory, prior: Belief, o: Observation):
         seen = normalised(o)
         # quantile by number of components used; none used is never too much
-        quantile = jnp.asarray(limits(probability, len(o.residual)))[seen.dof]
+        quantile = jnp.asarray(quantiles(probability, len(o.residual)))[seen.dof]
         count, power = memory.counter[o.sensor], memory.power[o.sensor]
         longer = jnp.where(seen.nis > quantile, count + 1, 0)
         count = jnp.where(seen.dof == 0, count, longer)

@@ -11,8 +11,8 @@ import numpy as np
 from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, Number, StepInfo
-from robins.filters.chi_square import limits
-from robins.filters.constrain import (
+from robins.filters.chi_square import quantiles
+from robins.filters.limits.constrain import (
     ITERATIONS,
     Function,
     Numbers,
@@ -90,7 +90,7 @@ def equality(
         held = constrain(posterior, g, d, weight, noise, hard, iterations)
         refused = jnp.zeros((), bool)
         if gate is not None:
-            refused = held.nis > jnp.asarray(limits(gate, len(held.residual)))[held.dof]
+            refused = held.nis > jnp.asarray(quantiles(gate, len(held.residual)))[held.dof]
         skip = refused | used
         belief = trees.select(skip, posterior, held.belief)
         worst = jnp.max(jnp.abs(held.residual))

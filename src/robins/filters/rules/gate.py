@@ -12,7 +12,7 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.chi_square import limits
+from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._reopen import reopened
@@ -136,10 +136,10 @@ def _judge(o: Observation, probability: float, joint: bool):
     """Limit, ratio to it, whether there is something to judge, and the components used."""
     seen = normalised(o)
     if joint:
-        table = jnp.asarray(limits(probability, len(o.residual)))
+        table = jnp.asarray(quantiles(probability, len(o.residual)))
         q = table[seen.dof]
         return q, seen.nis / q, seen.dof > 0, seen.used
-    q = limits(probability, 1)[1]
+    q = quantiles(probability, 1)[1]
     variance = jnp.sum(seen.factor**2, axis=1)
     square = jnp.where(seen.used, o.residual, 0.0) ** 2
     return q, square / variance / q, seen.used, seen.used
@@ -162,12 +162,12 @@ def _agree_as_one(probability: float, residual: Array, known: Array, noise: Arra
     # A component without noise agrees only if it repeats: the least pivot makes all else huge.
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) == 0.0, jnp.finfo(float).tiny, 0.0))
     white = linalg.solve_lower(L, _scatter(residual, known).T)
-    table = limits(probability, len(shared), len(residual) - 1)
+    table = quantiles(probability, len(shared), len(residual) - 1)
     count = jnp.sum(shared)
     return (count > 0) & (jnp.sum(white**2) <= jnp.asarray(table)[count])
 
 
 def _agree_each(probability: float, residual: Array, known: Array, noise: Array) -> Array:
-    limit = limits(probability, 1, len(residual) - 1)[1]
+    limit = quantiles(probability, 1, len(residual) - 1)[1]
     scatter = jnp.sum(_scatter(residual, known) ** 2, axis=0)
     return jnp.all(known, axis=0) & (scatter <= limit * jnp.sum(noise**2, axis=1))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
-from robins.filters.chi_square import limits
+from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._quantile import scale_to_quantile
@@ -43,7 +43,7 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
     def before(memory, prior: Belief, o: Observation):
         seen = normalised(o)
         if threshold is None:
-            limit = jnp.asarray(limits(probability, len(o.residual)))[seen.dof]
+            limit = jnp.asarray(quantiles(probability, len(o.residual)))[seen.dof]
         else:
             limit = float(threshold) ** 2
         s = scale_to_quantile(o, limit, seen)

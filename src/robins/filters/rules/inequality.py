@@ -9,8 +9,8 @@ import numpy as np
 
 from robins.filters import trees
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.constrain import Function, Numbers, as_sensor
-from robins.filters.interval import clip, truncate
+from robins.filters.limits.constrain import Function, Numbers, as_sensor
+from robins.filters.limits.interval import clip, truncate
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.constrain import Weight, check_weight, metric_of, nearest
+from robins.filters.limits.constrain import Weight, check_weight, metric_of, nearest
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 

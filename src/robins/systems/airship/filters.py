@@ -29,7 +29,7 @@ from robins.filters import (
     taylor,
     unscented,
 )
-from robins.filters.distributed import Feedback
+from robins.filters.composite.distributed import Feedback
 from robins.filters.rules import (
     gate,
     huber,

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth import curvature_radii
-from robins.filters.constrain import check_rows
+from robins.filters.limits.constrain import check_rows
 from robins.rotation import skew, to_euler
 from robins.systems.airship.error_model import ALT, LAT, LON, PHI, STATES, VELOCITY
 

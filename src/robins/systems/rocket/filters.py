@@ -18,7 +18,7 @@ import numpy as np
 
 from robins.errors import require_known
 from robins.filters import Filter, Rule, channel, federated, kalman, taylor, unscented
-from robins.filters.fusion import Sharing
+from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.systems.rocket.angles import GYRO, MAGNETIC
 from robins.systems.rocket.field import FIELD, SNAPSHOT

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.channels import Joined
+from robins.filters.composite.channels import Joined
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman
 from robins.filters.model import Motion, Sensor
 

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.fusion import is_singular
+from robins.filters.composite.fusion import is_singular
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman, not_taken
 from robins.filters.linearise import Transition
 from robins.filters.model import Motion, Sensor, as_noise

@@ -29,14 +29,14 @@ from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.errors import require
-from robins.filters import channels as _channels
 from robins.filters.belief import Belief, Code, Number
-from robins.filters.channels import Channel, Joined, Moved, with_noise
-from robins.filters.fusion import Sharing, check_sharing, information_sum, part
+from robins.filters.composite import channels as _channels
+from robins.filters.composite.channels import Channel, Joined, Moved, with_noise
+from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
+from robins.filters.composite.shares import diagonal_shares, equal_shares, floored, trace_shares
 from robins.filters.kalman import Filter, FilterState, in_step, kalman
 from robins.filters.linearise import Linearisation
 from robins.filters.model import Motion, as_noise
-from robins.filters.shares import diagonal_shares, equal_shares, floored, trace_shares
 
 Mode = Literal["fusion-reset", "no-reset", "zero-reset", "rescale"]
 
@@ -78,7 +78,7 @@ def federated(
         mode: "fusion-reset", "no-reset", "zero-reset" or "rescale" (module docstring).
             Zero-reset leaves a local filter nothing to judge measurements by, and sigma points of
             an unknown state reach beyond any model: give it Taylor and no robust rules.
-        sharing: "root", "scalar" or "half"; how, see `robins.filters.fusion`.
+        sharing: "root", "scalar" or "half"; how, see `robins.filters.composite.fusion`.
         shares: "equal"; "trace" or "diagonal", from the local covariances at every step; or (N,) or
             (N, n) numbers that sum to one with the master's, such as `observability_shares`.
             Shares below 0.05 are raised to it.

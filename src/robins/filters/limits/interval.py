@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
+from robins.filters.limits.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
 from robins.filters.observation import Observation
 

@@ -25,10 +25,10 @@ from jaxtyping import Array, ArrayLike
 from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.composite.mixture import innovation, log_normalised, matched
+from robins.filters.composite.modes import Family, Mode, bank
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step
-from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
-from robins.filters.modes import Family, Mode, bank
 from robins.filters.trees import equal, select
 
 Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them

@@ -12,7 +12,7 @@ the three readings are ``feedback``:
     full   each takes the fused mean and covariance: all information counted again at every step
 
 Locals with the same prior and process noise are not independent, so even the first is somewhat
-overconfident. The federated filter (`robins.filters.federated`) shares both out and is not;
+overconfident. The federated filter (`federated`) shares both out and is not;
 covariance intersection is safe whatever the correlation.
 
 States that only one local has (the errors of a wind that only its sensors see) cannot be fused:
@@ -30,7 +30,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from robins.filters.belief import Belief
-from robins.filters.channels import (
+from robins.filters.composite.channels import (
     Channel,
     Fuse,
     Joined,
@@ -41,7 +41,7 @@ from robins.filters.channels import (
     starting,
     updating,
 )
-from robins.filters.fusion import (
+from robins.filters.composite.fusion import (
     Criterion,
     check_criterion,
     common_information_sum,

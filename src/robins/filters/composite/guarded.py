@@ -36,9 +36,9 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
-from robins.filters.channels import Joined
+from robins.filters.composite.channels import Joined
+from robins.filters.composite.master import Mastered
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step
-from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
 

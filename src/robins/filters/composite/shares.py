@@ -31,7 +31,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.channels import Channel
+from robins.filters.composite.channels import Channel
 from robins.filters.linearise import taylor
 from robins.filters.model import Model
 

@@ -31,8 +31,8 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
+from robins.filters.analysis.bound import Linearised, linearised
 from robins.filters.belief import Belief
-from robins.filters.bound import Linearised, linearised
 from robins.filters.model import Model
 from robins.filters.observation import left_out
 from robins.manifold import State
@@ -56,7 +56,7 @@ def observability(
     Args:
         model: the motion and the sensors.
         start: belief before the first step; its standard deviations are the units.
-        truth: as `robins.filters.bound.linearised` takes it, and so y, u and aux.
+        truth: as `robins.filters.analysis.bound.linearised` takes it, and so y, u and aux.
         y: by sensor name.
         u: inputs of the motion.
         aux: what sensors need besides the state.
@@ -79,7 +79,7 @@ def observability_along(
     """The same of a model that has been linearised; one scan.
 
     Args:
-        line: from `robins.filters.bound.linearised`.
+        line: from `robins.filters.analysis.bound.linearised`.
         sigma: (n,) units of the states, their prior standard deviations.
         use: (S,) bool, which sensors of the model to use, in its order; all by default.
         window: number of steps after which to begin anew, each window with the same units. By
