@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -107,6 +108,11 @@ SENTENCES: dict[Code, str] = {
 }
 
 
+def with_notes(known: Mapping[str, Any], rule: str, notes: dict[str, Any]) -> dict[str, Any]:
+    """Notes with those of a rule, each as ``rule.name``; a ``_`` at the end of a name is cut."""
+    return {**known} | {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
+
+
 class StepInfo(NamedTuple):
     """What an update saw, and what it made of it. m is the measurement's tangent dimension."""
 
@@ -122,9 +128,8 @@ class StepInfo(NamedTuple):
     notes: dict[str, Any]  # what the rules add, by their names
 
     def noted(self, rule: str, **notes: Any) -> StepInfo:
-        """With what a rule notes, each as ``rule.name``; a ``_`` at the end of a name is cut."""
-        own = {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
-        return self._replace(notes={**self.notes, **own})
+        """With notes of a rule (`with_notes`)."""
+        return self._replace(notes=with_notes(self.notes, rule, notes))
 
     @property
     def sigma(self) -> Array:

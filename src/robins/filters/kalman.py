@@ -171,7 +171,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         dof=seen.dof,
         log_likelihood=jnp.where(wrong, -jnp.inf, likely - linalg.log_diagonal(S_y, used)),
         code=_outcome(o, wrong),
-        notes={},
+        notes=dict(o.notes),
     )
     return posterior, info
 
@@ -294,7 +294,7 @@ def kalman(
             if faded is not prior:  # the rule built another prior; seen while tracing
                 prior = faded
                 again = way.observation(prior, sensor, y, aux)
-                seen = again._replace(noise=seen.noise, accepted=seen.accepted)
+                seen = again._replace(noise=seen.noise, accepted=seen.accepted, notes=seen.notes)
         seen = seen._replace(accepted=seen.accepted & seen.present)
         posterior, info = updated(prior, seen, form)
         for i, rule in enumerate(rules):

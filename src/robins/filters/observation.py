@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief
+from robins.filters.belief import Belief, with_notes
 
 # What is known exactly carries rounding, of many steps: a share of what it was summed from that is
 # far above that, and far below any sensor.
@@ -30,6 +31,11 @@ class Observation(NamedTuple):
     noise: Array  # (m, q) measurement noise factor
     size: Array  # (m,) of what the spread was summed from: 1e-14 of it is rounding
     deficit: Array | None = None  # (m,) vector to take away again, for indefinite weights
+    notes: Mapping[str, Any] = {}  # what rules say of it before the update, by their names
+
+    def noted(self, rule: str, **notes: Any) -> Observation:
+        """With notes of a rule, which the update hands on to its `StepInfo` (`with_notes`)."""
+        return self._replace(notes=with_notes(self.notes, rule, notes))
 
 
 class Normalised(NamedTuple):

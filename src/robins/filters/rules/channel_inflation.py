@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -56,11 +56,10 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
         noise = jnp.concatenate([transition.noise, channel], axis=1)
         return memory, transition._replace(noise=noise)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        said = jnp.asarray(float(lambda_))
-        return memory, posterior, info.noted("channel_inflation", lambda_=said)
+    def before(memory, prior: Belief, o: Observation):
+        return memory, prior, o.noted("channel_inflation", lambda_=jnp.asarray(float(lambda_)))
 
-    return Rule(init=init, process=process, after=after, name="channel_inflation")
+    return Rule(init=init, process=process, before=before, name="channel_inflation")
 
 
 def _matrix(B: Any) -> Array:

@@ -20,7 +20,6 @@ class Fixed(NamedTuple):
     """Memory of the rule. Gains are data: exchange them in a state, and nothing compiles anew."""
 
     gains: dict[str, Array]  # (n, m) by sensor
-    prior: Belief  # of the last update
 
 
 def constant_gain(gains: Mapping[str, Any]) -> Rule:
@@ -60,10 +59,7 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
                     f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "
                     f"({n}, {dims[name]})"
                 )
-        return Fixed(given, belief)
-
-    def before(memory: Fixed, prior: Belief, o: Observation):
-        return memory._replace(prior=prior), prior, o
+        return Fixed(given)
 
     def after(memory: Fixed, posterior: Belief, info: StepInfo, o: Observation):
         if o.sensor not in memory.gains:
@@ -71,17 +67,17 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
         spread, excess, noise, deficit, used = left_out(o)
         used = used & info.used
         K = jnp.where(used[None, :], memory.gains[o.sensor], 0.0)
-        S = memory.prior.factor
+        S = o.prior.factor
         moved = K @ jnp.where(used, o.residual, 0.0)
         factor = linalg.tria(S - K @ spread, K @ excess, K @ noise)
         if deficit is not None:
             factor = linalg.downdate(factor, K @ deficit)
-        belief = Belief(manifold.retract(memory.prior.mean, moved), factor)
+        belief = Belief(manifold.retract(o.prior.mean, moved), factor)
         belief = select(jnp.any(used), belief, posterior)
         info = info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
         return memory, belief, info
 
-    return Rule(init=init, before=before, after=after, name="constant_gain")
+    return Rule(init=init, after=after, name="constant_gain")
 
 
 def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
@@ -29,22 +29,9 @@ class Verdict(IntEnum):
     MODEL = 2
 
 
-class _Said(NamedTuple):
-    """Of the update under way; between updates as if there was nothing to say."""
-
-    weight: Array  # of the measurement's covariance R: 1 / s, 0 where refused
-    factor: Array  # lambda
-    state: Array  # a `Verdict`
-
-
 class _Memory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     counter: dict[str, Array]  # () measurements in a row that were too large to be chance
-    said: _Said
-
-
-def _nothing() -> _Said:
-    return _Said(jnp.ones(()), jnp.ones(()), jnp.asarray(int(Verdict.CLEAN)))
 
 
 def discriminator(
@@ -113,7 +100,7 @@ def discriminator(
     def init(belief: Belief, dims):
         _fading.check_size("discriminator", shares, belief.factor.shape[0])
         power = {name: jnp.ones(m) for name, m in dims.items()}
-        return _Memory(power, {name: jnp.zeros((), int) for name in dims}, _nothing())
+        return _Memory(power, {name: jnp.zeros((), int) for name in dims})
 
     def before(memory: _Memory, prior: Belief, o: Observation):
         seen = normalised(o)
@@ -142,14 +129,8 @@ def discriminator(
         memory = _Memory(
             {**memory.power, o.sensor: power},
             {**memory.counter, o.sensor: count},
-            _Said(weight, factor, state),
         )
+        o = o.noted("discriminator", weight=weight, lambda_=factor, counter=count, state=state)
         return memory, Belief(prior.mean, S), o
 
-    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        said, count = memory.said, memory.counter[o.sensor]
-        notes = {"weight": said.weight, "lambda": said.factor, "counter": count}
-        info = info.noted("discriminator", **notes, state=said.state)
-        return memory._replace(said=_nothing()), posterior, info
-
-    return Rule(init=init, before=before, after=after, name="discriminator")
+    return Rule(init=init, before=before, name="discriminator")

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.belief import Belief, StepInfo
+from robins.filters.belief import Belief
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
@@ -29,7 +29,6 @@ class _Channel(NamedTuple):
 
     refused: Array  # (g) refusals in a row
     ratio: Array  # () greatest test ratio of the last measurement
-    recovered: Array  # () bool, it was used although it was too large
     residual: Array  # (k, m) the last innovations that were too large, newest last
     known: Array  # (k, m) bool, components they had
 
@@ -85,9 +84,8 @@ def gate(
     def init(belief, dims):
         def channel(m):
             shape = () if joint else (m,)
-            no = jnp.zeros((), bool)
             residual = jnp.zeros((kept, m))
-            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), no, residual, residual > 0.0)
+            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
 
         return {name: channel(m) for name, m in dims.items()}
 
@@ -109,7 +107,7 @@ def gate(
         refused = jnp.where(judged, jnp.where(passed, 0, was.refused + 1), was.refused)
         worst = jnp.max(jnp.where(over, 1.0, ratio), initial=0.0)
         worst = jnp.where(jnp.any(judged), worst, was.ratio)
-        now = _Channel(refused, worst, jnp.any(due), residual, known)
+        now = _Channel(refused, worst, residual, known)
 
         if recovery != "accept":
             doubted = due & used
@@ -121,15 +119,11 @@ def gate(
             if agreeing:
                 root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
             prior = reopened(jnp.any(due), prior, o, doubted, root)
+        most = jnp.max(refused, initial=0)
+        o = o.noted("gate", ratio=worst, refused=most, recovered=jnp.any(due))
         return {**memory, o.sensor: now}, prior, o._replace(accepted=o.accepted & passed)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        channel: _Channel = memory[o.sensor]
-        most = jnp.max(channel.refused, initial=0)
-        notes = {"ratio": channel.ratio, "refused": most, "recovered": channel.recovered}
-        return memory, posterior, info.noted("gate", **notes)
-
-    return Rule(init=init, before=before, after=after, name="gate")
+    return Rule(init=init, before=before, name="gate")
 
 
 def _judge(o: Observation, probability: float, joint: bool):

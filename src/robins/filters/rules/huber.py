@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
@@ -37,9 +37,6 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
     require(0.0 < probability <= 1.0, "huber probability must lie in (0, 1]", probability)
     require(threshold is None or threshold > 0.0, "huber threshold must be positive", threshold)
 
-    def init(belief, dims):
-        return jnp.ones(())  # of the update under way
-
     def before(memory, prior: Belief, o: Observation):
         seen = normalised(o)
         if threshold is None:
@@ -47,9 +44,7 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
         else:
             limit = float(threshold) ** 2
         s = scale_to_quantile(o, limit, seen)
-        return 1.0 / s, prior, o._replace(noise=jnp.sqrt(s) * o.noise)
+        o = o._replace(noise=jnp.sqrt(s) * o.noise)
+        return memory, prior, o.noted("huber", weight=1.0 / s)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        return jnp.ones(()), posterior, info.noted("huber", weight=memory)
-
-    return Rule(init=init, before=before, after=after, name="huber")
+    return Rule(before=before, name="huber")

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules._reopen import reopened
-
-
-class _Memory(NamedTuple):
-    doubted: dict[str, Array]  # () measurements of each sensor in a row with no weight left
-    weight: Array  # () least weight of the update under way
-    recovered: Array  # () bool, in the update under way
 
 
 def igg3(
@@ -56,10 +48,9 @@ def igg3(
     require(patience is None or patience >= 0, "igg3 patience must not be negative", patience)
 
     def init(belief, dims):
-        doubted = {name: jnp.zeros((), int) for name in dims}
-        return _Memory(doubted, jnp.ones(()), jnp.zeros((), bool))
+        return {name: jnp.zeros((), int) for name in dims}  # in a row with no weight left
 
-    def before(memory: _Memory, prior: Belief, o: Observation):
+    def before(memory, prior: Belief, o: Observation):
         seen = normalised(o)
         deviation = jnp.sqrt(jnp.sum(seen.factor**2, axis=1))
         t = jnp.abs(jnp.where(seen.used, o.residual, 0.0)) / deviation
@@ -70,24 +61,20 @@ def igg3(
 
         measured = jnp.any(seen.used)
         hopeless = measured & jnp.all(~seen.used | (weight <= floor))
-        before_ = memory.doubted[o.sensor]
+        earlier = memory[o.sensor]
         if patience is None:
             recovered = jnp.zeros((), bool)
         else:
-            recovered = hopeless & (before_ >= patience)
+            recovered = hopeless & (earlier >= patience)
             a = jnp.max(jnp.where(far, 1.0 / k0**2 - 1.0 / beyond**2, 0.0))
             root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
             prior = reopened(recovered, prior, o, seen.used, root)
         weight = jnp.where(recovered, 1.0, weight)
-        count = jnp.where(hopeless & ~recovered, before_ + 1, 0)
-        count = jnp.where(measured, count, before_)
-        now = _Memory({**memory.doubted, o.sensor: count}, jnp.min(weight), recovered)
+        count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
+        count = jnp.where(measured, count, earlier)
         heavier = o.noise / jnp.sqrt(jnp.where(weight > 0.0, weight, 1.0))[:, None]
-        return now, prior, o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
+        o = o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
+        o = o.noted("igg3", weight=jnp.min(weight), recovered=recovered)
+        return {**memory, o.sensor: count}, prior, o
 
-    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        info = info.noted("igg3", weight=memory.weight, recovered=memory.recovered)
-        quiet = memory._replace(weight=jnp.ones(()), recovered=jnp.zeros((), bool))
-        return quiet, posterior, info
-
-    return Rule(init=init, before=before, after=after, name="igg3")
+    return Rule(init=init, before=before, name="igg3")

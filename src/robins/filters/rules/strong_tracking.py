@@ -27,7 +27,6 @@ class _Memory(NamedTuple):
     moved: Array  # (n, 2n + 1) F S and what its linearisation left over
     noise: Array  # (n, n) factor of Q
     fresh: Array  # () bool: nothing has been used since the prediction
-    factor: Array  # () lambda of the update under way, 1 between updates
 
 
 def strong_tracking(
@@ -108,7 +107,6 @@ def strong_tracking(
             moved=linalg.zeros(n, 2 * n + 1),
             noise=linalg.zeros(n, n),
             fresh=jnp.array(False),
-            factor=jnp.ones(()),
         )
 
     def process(memory: _Memory, t: Transition):
@@ -133,14 +131,11 @@ def strong_tracking(
         memory = memory._replace(
             power={**memory.power, o.sensor: V},
             begun={**memory.begun, o.sensor: begun | white.counts},
-            factor=factor,
         )
-        return memory, Belief(prior.mean, S), o
+        return memory, Belief(prior.mean, S), o.noted("strong_tracking", lambda_=factor)
 
     def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        fresh = memory.fresh & ~jnp.any(info.used)
-        info = info.noted("strong_tracking", lambda_=memory.factor)
-        return memory._replace(fresh=fresh, factor=jnp.ones(())), posterior, info
+        return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
 
     return Rule(init=init, process=process, before=before, after=after, name="strong_tracking")
 

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules._quantile import MOST
@@ -76,18 +76,11 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
 
         return jax.lax.fori_loop(0, iterations, better, (jnp.ones(()), jnp.ones(())))
 
-    def init(belief, dims):
-        return jnp.ones(()), jnp.ones(())  # of the update under way
-
     def before(memory, prior: Belief, o: Observation):
         b, c = scales(o, prior.factor.shape[0])
         if whose == "both":
             prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
-        return (1.0 / c, 1.0 / b), prior, o._replace(noise=jnp.sqrt(c) * o.noise)
+        o = o._replace(noise=jnp.sqrt(c) * o.noise)
+        return memory, prior, o.noted("student_t", weight=1.0 / c, prior=1.0 / b)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        weight, other = memory
-        info = info.noted("student_t", weight=weight, prior=other)
-        return (jnp.ones(()), jnp.ones(())), posterior, info
-
-    return Rule(init=init, before=before, after=after, name="student_t")
+    return Rule(before=before, name="student_t")
