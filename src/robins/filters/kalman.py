@@ -46,6 +46,14 @@ class Prediction(NamedTuple):
     origin: Belief | None = None  # where it began, if a rule has settled another belief
 
 
+Follow = Callable[[Sequence[Belief], Belief], FilterState]
+
+
+def no_members(state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
+    """The default of `Filter.members`."""
+    return (), lambda beliefs, belief: state
+
+
 class Filter(NamedTuple):
     """Pure functions; a run, a campaign, a bench or a loop of yours calls them.
 
@@ -55,12 +63,17 @@ class Filter(NamedTuple):
         update: ``(state, sensor, y, aux) -> (state, info)``.
         reset: ``(state, belief) -> state``: go on from another belief, keeping what was learned of
             the noise; a filter inside a federated filter or a mixture is told so.
+        members: ``state -> (beliefs, follow)``: what the local filters of a joined filter believe,
+            and ``follow(beliefs, belief) -> state``, the state in which they go on from others and
+            the whole from their fusion. The only question that a filter asks of the parts of
+            another one; by default there are none.
     """
 
     init: Callable[[Belief, Mapping[str, int]], FilterState]
     predict: Callable[[FilterState, Motion, Any], tuple[FilterState, Prediction]]
     update: Callable[[FilterState, Sensor, Any, Any], tuple[FilterState, StepInfo]]
     reset: Callable[[FilterState, Belief], FilterState]
+    members: Callable[[FilterState], tuple[tuple[Belief, ...], Follow]] = no_members
 
 
 def compiled(filter_: Filter) -> Filter:

@@ -121,6 +121,22 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
     return [{k: v for k, v in dims.items() if owner[k] == i} for i in range(len(channels))]
 
 
+def members_of(filters: Sequence[Filter]):
+    """The `members` of a joined filter: each goes on by its own `reset`."""
+
+    def members(state: FilterState):
+        joined: Joined = state.memory
+
+        def follow(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            each = zip(filters, joined.members, beliefs, strict=True)
+            states = tuple(f.reset(member, own) for f, member, own in each)
+            return FilterState(belief, joined._replace(members=states))
+
+        return tuple(member.belief for member in joined.members), follow
+
+    return members
+
+
 # ----------------------------------------------------------------------------- steps of the whole
 
 

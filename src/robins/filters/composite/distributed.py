@@ -37,6 +37,7 @@ from robins.filters.composite.channels import (
     Moved,
     concluded,
     local_dims,
+    members_of,
     owners,
     starting,
     updating,
@@ -163,9 +164,7 @@ def _side_by_side(
         return concluded(state, Moved(tuple(members), tuple(codes), fused, state.memory.shares))
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
-        joined: Joined = state.memory
-        pairs = zip(channels, joined.members, strict=True)
-        members = tuple(c.filter.reset(m, belief) for c, m in pairs)
-        return FilterState(belief, joined._replace(members=members))
+        return members(state)[1]([belief] * count, belief)
 
-    return in_step(Filter(init, predict, updating(channels, fuse, name), reset))
+    members = members_of([c.filter for c in channels])
+    return in_step(Filter(init, predict, updating(channels, fuse, name), reset, members))

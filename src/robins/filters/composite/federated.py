@@ -31,7 +31,7 @@ from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number
 from robins.filters.composite import channels as _channels
-from robins.filters.composite.channels import Channel, Joined, Moved, with_noise
+from robins.filters.composite.channels import Channel, Moved, with_noise
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.composite.shares import diagonal_shares, equal_shares, floored, trace_shares
 from robins.filters.kalman import Filter, FilterState, in_step, kalman
@@ -181,7 +181,7 @@ def federated(
         beliefs = parted(common.belief, a)
         for f, member, belief in zip(filters, state.memory.members, beliefs, strict=True):
             code = int(Code.DONE)
-            if isinstance(member.memory, tuple) and not member.memory:  # no rules
+            if member.memory == ():  # a Kalman filter without rules
                 member = f.reset(member, belief)
             else:
                 own = True
@@ -200,13 +200,11 @@ def federated(
         return _channels.concluded(state, moved)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
-        joined: Joined = state.memory
-        beliefs = parted(belief, joined.shares)
-        members = [f.reset(m, b) for f, m, b in zip(filters, joined.members, beliefs, strict=True)]
-        return FilterState(belief, joined._replace(members=tuple(members)))
+        return members(state)[1](parted(belief, state.memory.shares), belief)
 
     update = _channels.updating(channels, information_sum, "federated")
-    return in_step(Filter(init, predict, update, reset))
+    members = _channels.members_of(filters)
+    return in_step(Filter(init, predict, update, reset, members))
 
 
 def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:

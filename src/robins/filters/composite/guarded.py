@@ -36,8 +36,6 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
-from robins.filters.composite.channels import Joined
-from robins.filters.composite.master import Mastered
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
@@ -136,6 +134,18 @@ def guarded(
         )
         return _given_out(watch)
 
+    def taken_over(watch: Watch) -> FilterState:
+        """The filter gone on from what the reference believes.
+
+        Where both are filters of as many locals, local by local: a joined filter that is reset to
+        one belief would have it in every local, and so count it more than once.
+        """
+        mine, follow = filter.members(watch.filter)
+        others, _ = reference.members(watch.reference)
+        if mine and len(mine) == len(others):
+            return follow(others, watch.reference.belief)
+        return filter.reset(watch.filter, watch.reference.belief)
+
     def judged(watch: Watch, failed: Array, renewed: Array | float) -> Watch:
         """The verdict after a step: evidence taken, trust lost or given."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
@@ -154,7 +164,7 @@ def guarded(
         most = jnp.max(looks)
         earned = (most >= wait) & jnp.all((looks >= wait) | (looks < _JUDGED * most))
         return Watch(
-            select(wrong, _taken_over(filter, watch.filter, watch.reference), watch.filter),
+            select(wrong, taken_over(watch), watch.filter),
             watch.reference,
             (watch.trusted & ~wrong) | earned,
             jnp.where(wrong, 0.0, evidence),
@@ -266,34 +276,6 @@ def _not_believed(info: StepInfo) -> StepInfo:
         code=jnp.where(missing, info.code, int(Code.REFUSED)),
         notes={},
     )
-
-
-def _taken_over(filter: Filter, mine: FilterState, other: FilterState) -> FilterState:
-    """The filter gone on from what the reference believes.
-
-    Where both are filters of as many locals, local by local: a joined filter that is reset to one
-    belief would have it in every local, and so count it more than once.
-    """
-    state = filter.reset(mine, other.belief)
-    followed = _local_by_local(mine, other)
-    return state if followed is None else followed
-
-
-def _local_by_local(mine: FilterState, other: FilterState) -> FilterState | None:
-    """A joined filter, each local at the belief of the other's; None where that cannot be."""
-    a, b = mine.memory, other.memory
-    if isinstance(a, Mastered):
-        joined = _local_by_local(a.joined, b.joined if isinstance(b, Mastered) else other)
-        if joined is None:
-            return None
-        return FilterState(joined.belief, a._replace(joined=joined))
-    if not (isinstance(a, Joined) and isinstance(b, Joined)) or len(a.members) != len(b.members):
-        return None
-    pairs = list(zip(a.members, b.members, strict=True))
-    if any(m.points != () or m.belief.factor.shape != o.belief.factor.shape for m, o in pairs):
-        return None
-    members = tuple(m._replace(belief=o.belief, current=o.current) for m, o in pairs)
-    return FilterState(other.belief, a._replace(members=members))
 
 
 def _check(

@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.composite.channels import Joined
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman
 from robins.filters.model import Motion, Sensor
 
@@ -60,10 +60,10 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
                 "last in the model"
             )
         joined = filter.init(belief, {k: m for k, m in dims.items() if k not in names})
-        if not isinstance(joined.memory, Joined):
-            raise ValueError(
-                "at_master wants a filter of channels: one without locals uses the sensor itself"
-            )
+        require(
+            filter.members(joined)[0],
+            "at_master wants a filter of channels: one without locals uses the sensor itself",
+        )
         own = centre.init(belief, {k: m for k, m in dims.items() if k in names})
         return FilterState(joined.belief, Mastered(joined, own))
 
@@ -90,4 +90,13 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
         joined = filter.reset(mastered.joined, belief)
         return FilterState(joined.belief, Mastered(joined, centre.reset(mastered.master, belief)))
 
-    return in_step(Filter(init, predict, update, reset))
+    def members(state: FilterState):
+        mastered: Mastered = state.memory
+        beliefs, follow = filter.members(mastered.joined)
+
+        def followed(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            return FilterState(belief, mastered._replace(joined=follow(beliefs, belief)))
+
+        return beliefs, followed
+
+    return in_step(Filter(init, predict, update, reset, members))
