@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
+from robins.filters.checks import finite_numbers
 from robins.manifold import State
 
 Number = float | int  # where types are checked an int is no float
@@ -35,7 +35,9 @@ class Belief(NamedTuple):
             ValueError: the mean is not finite, the covariance is not one, or its size is not the
                 state's.
         """
-        mean = jax.tree_util.tree_map(_as_state, mean)
+        mean = jax.tree_util.tree_map(
+            lambda leaf: jnp.asarray(finite_numbers("initial mean", leaf)), mean
+        )
         factor = linalg.factor(covariance, "initial covariance")
         n = manifold.dim(mean)
         if factor.shape != (n, n):
@@ -51,15 +53,6 @@ class Belief(NamedTuple):
     def sigma(self) -> Array:
         """(..., n) standard deviation of each tangent component."""
         return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))
-
-
-def _as_state(leaf):
-    array = np.asarray(leaf)
-    if array.dtype.kind not in "iuf":
-        raise TypeError(f"initial mean holds {array.dtype}: real numbers are wanted")
-    if not np.all(np.isfinite(array)):
-        raise ValueError("initial mean has entries that are not finite numbers")
-    return jnp.asarray(array.astype(float))
 
 
 class Code(IntEnum):

@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.observation import Observation, contradicted, left_out, whiten
@@ -253,8 +254,7 @@ def kalman(
         TypeError: linearise is not what `taylor` and its kin return, or rules are none.
         ValueError: the form is neither.
     """
-    if form not in ("sqrt", "joseph"):
-        raise ValueError(f"form must be 'sqrt' or 'joseph', got {form!r}")
+    one_of("form", form, Form)
     way, rules = _as_way(linearise), _as_rules(rules)
 
     settling = any(rule.settle is not keep_belief for rule in rules)

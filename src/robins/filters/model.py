@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
+from robins.errors import require
 
 
 def as_noise(value: Any, n: int, whose: str) -> Array:
@@ -202,8 +203,7 @@ class Model:
 
     def __post_init__(self):
         names = [s.name for s in self.sensors]
-        if len(set(names)) < len(names):
-            raise ValueError(f"sensors must have names of their own, got {names}")
+        require(len(set(names)) >= len(names), "sensors must have names of their own", names)
 
     @property
     def dims(self) -> dict[str, int]:

@@ -31,6 +31,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.analysis.bound import Linearised, linearised
 from robins.filters.belief import Belief
 from robins.filters.model import Model
@@ -89,8 +90,7 @@ def observability_along(
     Raises:
         ValueError: a window is shorter than a step.
     """
-    if window is not None and window < 1:
-        raise ValueError(f"a window of {window} steps: at least one is wanted")
+    require(window is None or window >= 1, f"a window of {window} steps: at least one is wanted")
     unit, D = linalg.identity(sigma.shape[0]), jnp.diag(sigma)
     use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
 

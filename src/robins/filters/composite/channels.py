@@ -17,6 +17,7 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.checks import sensor_names
 from robins.filters.composite.fusion import is_singular
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman, not_taken
 from robins.filters.linearise import Transition
@@ -77,9 +78,8 @@ def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Chann
     Raises:
         ValueError: no sensor is named, or one twice.
     """
-    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"a channel needs sensors, each named once, got {list(names)}")
+    names = sensor_names("channel", sensors)
+    require(len(set(names)) == len(names), "a channel names each sensor once", list(names))
     return Channel(names, kalman() if filter is None else filter)
 
 

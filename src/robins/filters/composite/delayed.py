@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, compiled
@@ -102,8 +103,7 @@ def delayed(
             of other shapes than were given here.
     """
     depth = operator.index(depth)
-    if depth < 0:
-        raise ValueError(f"depth of a delayed filter must not be negative, got {depth}")
+    require(depth >= 0, "depth of a delayed filter must not be negative", depth)
     names = tuple(model.dims)
     given = dict(aux or {})
     if unknown := set(given) - set(names):

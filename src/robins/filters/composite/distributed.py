@@ -29,7 +29,9 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
+from robins.errors import require
 from robins.filters.belief import Belief
+from robins.filters.checks import one_of
 from robins.filters.composite.channels import (
     Channel,
     Fuse,
@@ -86,14 +88,12 @@ def distributed(
         ValueError: a sensor in two channels, an unknown feedback, no common component; at `init`, a
             sensor without a channel, or a state with fewer components than are common.
     """
-    if feedback not in ("own", "mean", "full"):
-        raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
+    one_of("feedback", feedback, Feedback)
     if feedback == "full":
         warnings.warn(FULL, UserWarning, stacklevel=2)
     if common is None:
         return _side_by_side(channels, information_sum, feedback, "distributed")
-    if common < 1:
-        raise ValueError(f"distributed: at least one component must be common, got {common}")
+    require(common >= 1, "distributed: at least one component must be common", common)
     summed = partial(common_information_sum, common=common)
     return _side_by_side(channels, summed, feedback, "distributed", common)
 
@@ -117,8 +117,7 @@ def intersecting(
     Raises:
         ValueError: as `distributed`, or the criterion is none of these.
     """
-    if feedback not in ("own", "mean", "full"):
-        raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
+    one_of("feedback", feedback, Feedback)
     check_criterion(criterion, len(channels))
 
     def intersect(beliefs: Sequence[Belief]) -> Belief:

@@ -30,6 +30,7 @@ from jaxtyping import Array, ArrayLike
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number
+from robins.filters.checks import one_of
 from robins.filters.composite import channels as _channels
 from robins.filters.composite.channels import Channel, Moved, with_noise
 from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
@@ -97,10 +98,7 @@ def federated(
     """
     channels = tuple(channels)
     _channels.owners(channels)
-    if mode not in ("fusion-reset", "no-reset", "zero-reset", "rescale"):
-        raise ValueError(
-            "mode must be 'fusion-reset', 'no-reset', 'zero-reset' or 'rescale', got " + repr(mode)
-        )
+    one_of("mode", mode, Mode)
     check_sharing(sharing)
     _check_master(mode, shares, master, keep)
     fixed = _fixed_shares(shares, len(channels), master)

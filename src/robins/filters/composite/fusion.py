@@ -36,7 +36,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
+from robins.filters.checks import one_of
 from robins.filters.run import is_traced
 
 Sharing = Literal["scalar", "root", "half"]
@@ -69,8 +71,7 @@ def fuse(beliefs: Sequence[Belief]) -> Belief:
 
 def _looked_at(beliefs: Sequence[Belief], doing: str) -> list[Belief]:
     beliefs = list(beliefs)
-    if not beliefs:
-        raise ValueError(f"nothing to {doing}: at least one belief is wanted")
+    require(beliefs, f"nothing to {doing}: at least one belief is wanted")
     if not is_traced(beliefs):
         for i, belief in enumerate(beliefs):
             if bool(is_singular(belief)):
@@ -182,10 +183,8 @@ def check_sharing(sharing: str) -> None:
     Raises:
         ValueError: it is unknown, or "naive".
     """
-    if sharing == "naive":
-        raise ValueError(NAIVE)
-    if sharing not in ("scalar", "root", "half"):
-        raise ValueError(f"sharing must be 'root', 'scalar' or 'half', got {sharing!r}")
+    require(sharing != "naive", NAIVE)
+    one_of("sharing", sharing, Sharing)
 
 
 def part(factor: Array, shares: Array, sharing: Sharing) -> list[Array]:

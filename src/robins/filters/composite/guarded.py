@@ -36,6 +36,7 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
+from robins.filters.checks import sensor_names
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
@@ -115,7 +116,10 @@ def guarded(
             or a parameter is not of its range; at `init`, the model has no sensor of such a name,
             or the state no such component.
     """
-    assumed, judging = _names(assumption), _names(judges)
+    assumed, judging = (
+        sensor_names("guarded assumption", assumption),
+        sensor_names("guarded judges", judges),
+    )
     _check(assumed, judging, groups, ratio, limit, patience, leap)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
@@ -218,10 +222,6 @@ def guarded(
     return in_step(Filter(init, predict, update, reset))
 
 
-def _names(given: str | Sequence[str]) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
-
-
 def _given_out(watch: Watch) -> FilterState:
     belief = select(watch.trusted, watch.filter.belief, watch.reference.belief)
     return FilterState(belief, watch)
@@ -287,8 +287,6 @@ def _check(
     patience: Number,
     leap: Number,
 ) -> None:
-    if not assumed or not judging:
-        raise ValueError("guarded needs sensors of the assumption, and judges: name at least one")
     if both := set(assumed) & set(judging):
         raise ValueError(f"guarded: {sorted(both)} cannot judge, it belongs to the assumption")
     if groups is not None and (not groups or not all(len(set(one)) for one in groups)):

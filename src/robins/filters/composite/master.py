@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.checks import sensor_names
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman
 from robins.filters.model import Motion, Sensor
 
@@ -45,9 +46,7 @@ def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | Non
         ValueError: no sensor is named; at `init`, the model has no such sensor or has another one
             after it, or the filter is not a joined one.
     """
-    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-    if not names:
-        raise ValueError("at_master: name at least one sensor that the master is to use")
+    names = sensor_names("at_master", sensors)
     centre = kalman() if master is None else master
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:

@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.composite.channels import Channel
 from robins.filters.linearise import taylor
@@ -99,8 +100,7 @@ def observability_shares(
     """
     n = manifold.dim(belief.mean)
     count = n if steps is None else steps
-    if count < 1:
-        raise ValueError(f"observability over {count} steps: at least one is wanted")
+    require(count >= 1, f"observability over {count} steps: at least one is wanted")
     way, unit = taylor(), Belief(belief.mean, linalg.identity(n))
     F = np.asarray(way.transition(unit, model.motion, u).spread)  # F times the identity
     D = np.asarray(belief.sigma)

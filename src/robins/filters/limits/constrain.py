@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.iterated import iterated
 from robins.filters.kalman import updated
@@ -171,8 +172,7 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
         unit = linalg.identity(n)
         return Belief(belief.mean, unit), unit
     W = jnp.asarray(weight, float)
-    if W.shape != (n, n):
-        raise ValueError(f"weight is {W.shape}, the state needs ({n}, {n})")
+    require(W.shape == (n, n), f"weight is {W.shape}, the state needs ({n}, {n})")
     root = linalg.cholesky(W)
     return Belief(belief.mean, linalg.solve_lower_transposed(root, linalg.identity(n))), root
 

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.belief import Belief
+from robins.filters.checks import finite_numbers
 from robins.manifold import State
 
 Weight = Callable[[State], Array]  # mean -> (q, n)
@@ -30,14 +32,8 @@ def as_weight(weight: Any, whose: str) -> Weight:
     """
     if callable(weight):
         return lambda mean: _rows(jnp.asarray(weight(mean), float), whose)
-    numbers = np.asarray(weight)
-    if numbers.dtype.kind not in "iuf":
-        raise TypeError(f"{whose}: weight holds {numbers.dtype}, real numbers are wanted")
-    numbers = numbers.astype(float)
-    if not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{whose}: weight has entries that are not finite numbers")
-    if not np.any(numbers):
-        raise ValueError(f"{whose}: weight is zero, so no error would count")
+    numbers = finite_numbers(f"{whose}: weight", weight)
+    require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
     if numbers.ndim == 1:
         numbers = np.diag(numbers)
     if numbers.ndim == 2:

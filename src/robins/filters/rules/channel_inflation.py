@@ -7,10 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
+from robins.errors import require
 from robins.filters.belief import Belief, Number
+from robins.filters.checks import finite_numbers
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -63,11 +64,8 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
 
 
 def _matrix(B: Any) -> Array:
-    numbers = np.asarray(B, float)
-    if numbers.ndim != 2:
-        raise ValueError(f"channel_inflation B has shape {numbers.shape}, (n, q) is wanted")
-    if not np.all(np.isfinite(numbers)):
-        raise ValueError("channel_inflation B has entries that are not finite numbers")
+    numbers = finite_numbers("channel_inflation B", B)
+    require(numbers.ndim == 2, f"channel_inflation B has shape {numbers.shape}, (n, q) is wanted")
     return jax.device_put(numbers)
 
 

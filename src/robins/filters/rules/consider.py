@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -90,8 +91,7 @@ def _chosen(states: Sequence[Any] | ArrayLike) -> np.ndarray:
 
 def _mask(chosen: np.ndarray, n: int) -> np.ndarray:
     if chosen.dtype == bool:
-        if chosen.shape != (n,):
-            raise ValueError(f"consider mask is {chosen.shape}, the state needs ({n},)")
+        require(chosen.shape == (n,), f"consider mask is {chosen.shape}, the state needs ({n},)")
         return chosen
     if chosen.size and int(np.max(chosen)) >= n:
         raise ValueError(f"consider has state {np.max(chosen)}, the last one is {n - 1}")

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.checks import finite_numbers
 from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
@@ -42,18 +44,16 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
         ValueError: no gain, one with entries that are not finite; by `init`, a sensor that the
             model does not have or a gain that does not fit.
     """
-    if not gains:
-        raise ValueError("constant_gain: give at least one gain, {'sensor': (n, m) array}")
-    given = {name: jnp.asarray(value, float) for name, value in gains.items()}
-    for name, K in given.items():
-        if not bool(jnp.all(jnp.isfinite(K))):
-            raise ValueError(f"constant_gain: the gain of '{name}' has entries that are not finite")
+    require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
+    given = {
+        name: jnp.asarray(finite_numbers(f"constant_gain: the gain of '{name}'", value))
+        for name, value in gains.items()
+    }
 
     def init(belief: Belief, dims: Mapping[str, int]) -> Fixed:
         n = belief.factor.shape[0]
         for name, K in given.items():
-            if name not in dims:
-                raise ValueError(f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
+            require(name in dims, f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
             if K.shape != (n, dims[name]):
                 raise ValueError(
                     f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "

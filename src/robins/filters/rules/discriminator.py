@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.belief import Belief, Number
+from robins.filters.checks import one_of
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
@@ -87,10 +88,8 @@ def discriminator(
     require(patience >= 1, "discriminator patience must be at least 1", patience)
     require(0.0 < probability <= 1.0, "discriminator probability must lie in (0, 1]", probability)
     require(0.0 < rho <= 1.0, "discriminator rho must lie in (0, 1]", rho)
-    if fade not in get_args(Fade):
-        raise ValueError(f"discriminator fade must be one of {get_args(Fade)}, got {fade!r}")
-    if robust not in get_args(Robust):
-        raise ValueError(f"discriminator robust must be one of {get_args(Robust)}, got {robust!r}")
+    one_of("discriminator fade", fade, Fade)
+    one_of("discriminator robust", robust, Robust)
     require(threshold >= 0.0, "discriminator threshold must not be negative", threshold)
     require(1.0 <= limit < math.inf, "discriminator limit must be at least 1 and finite", limit)
     if weights is not None and fade != "multiple":

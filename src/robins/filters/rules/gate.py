@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief
+from robins.filters.checks import one_of
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
@@ -70,14 +71,11 @@ def gate(
             agree in, or recovery or scope is none of those above.
     """
     require(0.0 < probability < 1.0, "gate probability must lie between 0 and 1", probability)
-    if recovery not in get_args(Recovery):
-        raise ValueError(f"gate recovery must be one of {get_args(Recovery)}, got {recovery!r}")
-    require(scope in get_args(Scope), f"gate scope must be one of {get_args(Scope)}", repr(scope))
+    one_of("gate recovery", recovery, Recovery)
+    one_of("gate scope", scope, Scope)
     agreeing = recovery == "reinitialise"
-    if patience < int(agreeing):
-        raise ValueError(
-            f"gate patience must be at least {int(agreeing)} to {recovery}, got {patience}"
-        )
+    least = int(agreeing)
+    require(patience >= least, f"gate patience must be at least {least} to {recovery}", patience)
     joint = scope == "joint"
     kept = patience + 1 if agreeing else 0
 

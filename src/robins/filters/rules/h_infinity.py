@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,7 @@ from robins import manifold
 from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -78,12 +79,8 @@ def h_infinity(
             estimate is unknown or they do not go together, or the margin is not between 0 and 1.
     """
     asked = _as_gamma(gamma)
-    for name, value, known in (
-        ("policy", policy, get_args(Policy)),
-        ("estimate", estimate, get_args(Estimate)),
-    ):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}; got {value!r}")
+    one_of("h_infinity policy", policy, Policy)
+    one_of("h_infinity estimate", estimate, Estimate)
     require(0.0 < margin < 1.0, "margin must lie between 0 and 1", margin)
     judges_prior = estimate == "a-priori"
     if judges_prior and policy == "compensate":
@@ -185,8 +182,7 @@ def _as_gamma(gamma: Any) -> float:
     value = np.asarray(gamma)
     if value.dtype.kind not in "iuf" or value.ndim:
         raise TypeError(f"gamma must be one real number, got {gamma!r}")
-    if not value > 1e-300:  # its inverse must be finite
-        raise ValueError(f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    require(value > 1e-300, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
     return float(value)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.checks import sensor_names
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 
@@ -24,9 +25,7 @@ def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
     Raises:
         ValueError: no sensor is named; by `init`, the filter has none of them.
     """
-    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-    if not names:
-        raise ValueError(f"only: name at least one sensor for the rule '{rule.name}'")
+    names = sensor_names(f"only, for the rule '{rule.name}'", sensors)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> Memory:
         seen = {name: m for name, m in dims.items() if name in names}

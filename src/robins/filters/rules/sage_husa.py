@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from robins import manifold
 from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -71,8 +72,7 @@ def sage_husa(
     """
     _variances.check_forgetting("sage_husa", forgetting)
     _variances.check_band("sage_husa", floor, ceiling)
-    if adapt not in ("R", "Q", "QR"):
-        raise ValueError(f"sage_husa adapt must be 'R', 'Q' or 'QR', got {adapt!r}")
+    one_of("sage_husa adapt", adapt, ("R", "Q", "QR"))
     of_sensor, of_motion = "R" in adapt, "Q" in adapt
 
     def nominal(k: int) -> Scale:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -84,12 +85,10 @@ def strong_tracking(
     """
     require(0.0 < rho <= 1.0, "strong_tracking rho must lie in (0, 1]", rho)
     require(1.0 <= beta < math.inf, "strong_tracking beta must be at least 1 and finite", beta)
-    if form not in get_args(Form):
-        raise ValueError(f"strong_tracking form must be one of {get_args(Form)}, got {form!r}")
-    if power not in get_args(Power):
-        raise ValueError(f"strong_tracking power must be one of {get_args(Power)}, got {power!r}")
-    if threshold is not None and not threshold >= 0.0:
-        raise ValueError(f"strong_tracking threshold must not be negative, got {threshold}")
+    one_of("strong_tracking form", form, Form)
+    one_of("strong_tracking power", power, Power)
+    positive = threshold is None or threshold >= 0.0
+    require(positive, "strong_tracking threshold must not be negative", threshold)
     require(1.0 <= limit < math.inf, "strong_tracking limit must be at least 1 and finite", limit)
     if weights is not None and form != "multiple":
         raise ValueError(f"strong_tracking weights are for form 'multiple', not {form!r}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number
+from robins.filters.checks import one_of
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.rules._quantile import MOST
@@ -48,8 +49,7 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
     """
     require(dof > 0.0, "student_t dof must be positive", dof)
     require(iterations >= 1, "student_t iterations must be at least 1", iterations)
-    if whose not in get_args(Whose):
-        raise ValueError(f"student_t whose must be one of {get_args(Whose)}, got {whose!r}")
+    one_of("student_t whose", whose, Whose)
     nu = float(dof)
 
     def scales(o: Observation, n: int) -> tuple[Array, Array]:

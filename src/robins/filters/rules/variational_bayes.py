@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
@@ -77,8 +78,7 @@ def variational_bayes(
     """
     _variances.check_forgetting("variational_bayes", forgetting)
     _variances.check_band("variational_bayes", floor, ceiling)
-    if iterations < 1:
-        raise ValueError(f"variational_bayes iterations must be 1 or more, got {iterations}")
+    require(iterations >= 1, "variational_bayes iterations must be 1 or more", iterations)
     if not 0.0 < initial_dof < float("inf"):
         raise ValueError(
             f"variational_bayes initial_dof must be positive and finite, got {initial_dof}"

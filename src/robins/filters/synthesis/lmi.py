@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from robins.filters.checks import one_of
 from robins.filters.synthesis.attempts import attempt
 from robins.filters.synthesis.design import Design, certify
 from robins.filters.synthesis.inequalities import Aim
@@ -61,8 +62,7 @@ def h2(plant: Plant) -> Design:
 
 def check_form(form: str) -> None:
     """Raise a ValueError unless the form is "common" or "slack"."""
-    if form not in ("common", "slack"):
-        raise ValueError(f'form must be "common" or "slack", got {form!r}')
+    one_of("form", form, ObserverForm)
 
 
 def gain_of(answer: Answer, scales: Scales) -> np.ndarray:
