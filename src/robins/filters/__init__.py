@@ -1,4 +1,4 @@
-"""Filters: a way to linearise and a chain of rules. Knows no navigation, no sensor, no file."""
+"""Filters: a way to linearise and a chain of rules; without navigation, sensors or files."""
 
 from robins.filters.analysis import (
     Bound,

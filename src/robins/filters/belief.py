@@ -1,4 +1,4 @@
-"""What a filter believes, what it says about a step, and the outcomes it can have."""
+"""The belief of a filter, the information of an update, and the outcomes of a step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Number = float | int  # where types are checked an int is no float
 
 
 class Belief(NamedTuple):
-    """What is believed about the state at one instant.
+    """Mean and covariance of the state at one instant.
 
     The true state is ``retract(mean, e)`` with e ~ N(0, factor factor').
     """
@@ -107,7 +107,7 @@ def with_notes(known: Mapping[str, Any], rule: str, notes: dict[str, Any]) -> di
 
 
 class StepInfo(NamedTuple):
-    """What an update saw, and what it made of it. m is the measurement's tangent dimension."""
+    """Innovation, gain and outcome of an update. m is the measurement's tangent dimension."""
 
     innovation: Array  # (m,) y minus its prediction; NaN where missing
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used

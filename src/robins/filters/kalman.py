@@ -63,7 +63,7 @@ class Filter(NamedTuple):
         predict: ``(state, motion, u) -> (state, prediction)``.
         update: ``(state, sensor, y, aux) -> (state, info)``.
         reset: ``(state, belief) -> state``: go on from another belief, keeping what was learned of
-            the noise; a filter inside a federated filter or a mixture is told so.
+            the noise; for a filter inside a federated filter or a mixture.
         members: ``state -> (beliefs, follow)``: what the local filters of a joined filter believe,
             and ``follow(beliefs, belief) -> state``, the state in which they go on from others and
             the whole from their fusion. The only question that a filter asks of the parts of
@@ -197,7 +197,7 @@ def _failure(inputs: Any, factor: Array) -> Array:
 
 
 def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
-    """What an update that was not taken says of itself: nothing used, and utterly unlikely."""
+    """The information of an update, or of one that was not taken: nothing used, likelihood zero."""
     return info._replace(
         used=info.used & ok,
         nis=jnp.where(ok, info.nis, 0.0),

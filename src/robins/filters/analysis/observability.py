@@ -1,4 +1,4 @@
-r"""Observability: what the measurements of a window tell of the state at its beginning.
+r"""Observability: the information of a window's measurements about the state at its beginning.
 
 The observability Gramian of the linearised system, in units that make it comparable between states
 and between sensors (Ham & Brown 1983; Chen 1999, ch. 6),
@@ -10,8 +10,8 @@ An eigenvalue of W says how many times as much is measured of a direction as was
 below one the prior knows more.
 
 The Gramian itself is never summed up: Phi may grow without bound, and small eigenvalues would drown
-in the rounding of large ones. Carried are two factors, of the error e_0 at the beginning and e_k
-now, given the measurements so far and no process noise,
+in the rounding of large ones. The recursion carries two factors, of the error e_0 at the beginning
+and e_k now, given the measurements so far and no process noise,
 
     e_0 = D L_k z,  e_k = M_k z,  z ~ N(0, I),  L_k L_k' = (I + W_k)^-1.
 

@@ -26,9 +26,14 @@ from robins.filters.belief import Belief, StepInfo
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Model
-from robins.filters.rules._feasibility import first_infeasible, least_gamma
 from robins.filters.rules._inflation import as_weight
-from robins.filters.rules.h_infinity import Estimate, h_infinity, with_gamma
+from robins.filters.rules.h_infinity import (
+    Estimate,
+    first_infeasible,
+    h_infinity,
+    least_gamma,
+    with_gamma,
+)
 from robins.filters.run import Solution, run
 
 

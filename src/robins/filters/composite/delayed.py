@@ -274,13 +274,13 @@ def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:
     return jnp.where(taken, change, -jnp.inf)
 
 
-def _check_same(what: str, found: Any, told: Any) -> None:
+def _check_same(what: str, found: Any, known: Any) -> None:
     """Raise if two pytrees differ in structure, shapes or kinds of number."""
-    if _form(found) != _form(told):
+    if _form(found) != _form(known):
         raise ValueError(
             f"{what} is of another form than delayed() was told of: {_form(found)}, not "
-            f"{_form(told)}; give it the model of the run and, where there are inputs, one of them "
-            "as u=... and one aux by sensor as aux={...}"
+            f"{_form(known)}; give it the model of the run and, where there are inputs, one of "
+            "them as u=... and one aux by sensor as aux={...}"
         )
 
 

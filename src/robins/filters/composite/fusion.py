@@ -19,7 +19,7 @@ Any root B conserves the information. Here B = D C^1/2 with D the standard devia
 correlations: no unit enters, and a share stays with the state it was given to, as nearly as a root
 can (C^1/2 is the root of C nearest to the identity).
 
-**Intersect** beliefs whose errors are correlated in a way nobody knows (Julier & Uhlmann 1997):
+**Intersect** beliefs whose errors have an unknown correlation (Julier & Uhlmann 1997):
 Y = sum_i w_i Y_i, sum_i w_i = 1, which is an upper bound for every correlation.
 """
 
@@ -178,11 +178,7 @@ def share(
 
 
 def check_sharing(sharing: str) -> None:
-    """Refuse a way of sharing that there is not.
-
-    Raises:
-        ValueError: it is unknown, or "naive".
-    """
+    """Refuse a way of sharing that there is not."""
     require(sharing != "naive", NAIVE)
     one_of("sharing", sharing, Sharing)
 
@@ -306,11 +302,7 @@ def _best_weights(beliefs: list[Belief], criterion: Criterion) -> Array:
 
 
 def check_criterion(criterion: Any, count: int) -> None:
-    """Refuse a criterion that there is not, or weights that are none.
-
-    Raises:
-        ValueError: see there.
-    """
+    """Refuse a criterion that there is not, or weights that are none."""
     if isinstance(criterion, str):
         if criterion not in _SLOPES:
             raise ValueError(f"criterion must be 'trace', 'det' or weights, got {criterion!r}")

@@ -43,7 +43,7 @@ from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import finite, select
 
-_GENERATOR = "threefry2x32"  # named, so that a key gives the same draws whatever JAX is set to
+_GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
 
 
 class Cloud(NamedTuple):

@@ -25,10 +25,6 @@ def as_weight(weight: Any, whose: str) -> Weight:
     Args:
         weight: (q, n) matrix, (n,) diagonal, or ``mean -> `` one of these.
         whose: rule it belongs to, for messages.
-
-    Raises:
-        TypeError: it is not made of real numbers.
-        ValueError: it has another shape, is not finite or says that nothing counts.
     """
     if callable(weight):
         return lambda mean: _rows(jnp.asarray(weight(mean), float), whose)
@@ -52,11 +48,7 @@ def _rows(L: Array, whose: str) -> Array:
 
 
 def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, "q n"]:
-    """L S, whose greatest singular value is the local bound.
-
-    Raises:
-        ValueError: L has another number of columns than the state has components.
-    """
+    """L S, whose greatest singular value is the local bound."""
     L, n = weight(belief.mean), belief.factor.shape[0]
     if L.shape[1] != n:
         raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")

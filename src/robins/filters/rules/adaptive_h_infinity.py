@@ -64,7 +64,7 @@ def adaptive_h_infinity(
         ceiling: largest alpha.
         compensate_first: as the patent orders it: where P does not allow the xi of the step before,
             shrink it (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before choosing the
-            new one. This claims knowledge that nobody has.
+            new one. The smaller P has no justification in the data.
 
     Raises:
         TypeError: the weight is not of real numbers.

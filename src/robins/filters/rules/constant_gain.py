@@ -1,4 +1,4 @@
-"""Update with a gain that was designed beforehand."""
+"""Update with a gain that was designed offline."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
     holds for any gain (Joseph's form; Brown & Hwang 2012, eq. 4.2.11), so the stated sigma is that
     of this filter in this model, not of the best one, and grows while the sensor is lost. Columns
     of components that are missing or refused are left out. Put it last, so that rules that fade the
-    prior come before it; sensors without a gain are updated as ever.
+    prior come before it; sensors without a gain are updated as usual.
 
     Notes: ``constant_gain.moved``, the largest component that the update moved the mean by.
 

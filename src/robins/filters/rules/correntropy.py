@@ -1,4 +1,4 @@
-"""Agree with most of the measurement: maximum correntropy."""
+"""Maximum correntropy: weigh components by a Gaussian kernel of their residuals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._shares import shares
+from robins.filters.rules._robust import shares
 
 
 def _least(e: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Tell outliers from model errors by how long they last: weigh the ones, fade for the others."""
+"""Tell outliers from model errors by how long they last; weigh outliers down, fade for errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
-from robins.filters.rules._quantile import scale_to_quantile
+from robins.filters.rules._robust import scale_to_quantile
 
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
@@ -57,16 +57,16 @@ def discriminator(
                            lambda = (tr V - m) / tr H P H'
 
     with r, H whitened by R^-1/2 as in `strong_tracking`, and "significantly" as its "ewma" has it.
-    Faded is only what the channel sees ("projected": P + (lambda-1) P H' (H P H')^+ H P), or
-    Lam^1/2 P Lam^1/2, Lam_j = max(1, a_j lambda), by weights a_j ("multiple").
+    "projected" fades only what the channel sees, P + (lambda-1) P H' (H P H')^+ H P; "multiple"
+    fades by weights a_j, Lam^1/2 P Lam^1/2 with Lam_j = max(1, a_j lambda).
 
     A true change with g > k2 from the start goes unnoticed for ``patience`` measurements, and a
     fault of the sensor that lasts longer is taken for a change of the model: patience is a
     statement about how long the sensor's faults last.
 
-    Noted are ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
+    Notes: ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
     ``.state`` (a `Verdict`: 0 clean, 1 outlier, 2 the model is wrong: faded, or c >= patience).
-    What is missing, refused by a rule before or has no noise of its own leaves V and c alone. The
+    A component that is missing, refused before or without noise does not change V and c. The
     Kalman filter is ``probability=1`` with ``threshold=inf`` or ``limit=1``.
 
     Args:
@@ -92,12 +92,10 @@ def discriminator(
     one_of("discriminator robust", robust, Robust)
     require(threshold >= 0.0, "discriminator threshold must not be negative", threshold)
     require(1.0 <= limit < math.inf, "discriminator limit must be at least 1 and finite", limit)
-    if weights is not None and fade != "multiple":
-        raise ValueError(f"discriminator weights are for fade 'multiple', not {fade!r}")
-    shares = _fading.checked_weights("discriminator", weights)
+    a = _fading.checked_weights("discriminator", weights, fade)
 
     def init(belief: Belief, dims):
-        _fading.check_size("discriminator", shares, belief.factor.shape[0])
+        _fading.check_size("discriminator", a, belief)
         power = {name: jnp.ones(m) for name, m in dims.items()}
         return _Memory(power, {name: jnp.zeros((), int) for name in dims})
 
@@ -114,7 +112,7 @@ def discriminator(
         power = jnp.where(outlier, power, _fading.averaged(power, white, rho))
         lasting = ~outlier & _fading.significant(_fading.total(power, white), white, rho, threshold)
         N = jnp.where(lasting, _fading.total(power, white) - white.dof, 0.0)
-        S, factor = _fading.faded(prior.factor, white, N, fade, shares, limit)
+        S, factor = _fading.faded(prior.factor, white, N, fade, a, limit)
 
         if robust == "gate":
             weight = jnp.where(outlier, 0.0, 1.0)

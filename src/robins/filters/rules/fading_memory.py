@@ -1,4 +1,4 @@
-"""Trust the past a little less with every step."""
+"""Inflate the covariance by a constant factor in every step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refuse a measurement whose innovation is too large to be chance, but not for ever."""
+"""Refuse a measurement whose innovation is too large to be chance, with a way to recover."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from robins.filters.checks import one_of
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._reopen import reopened
+from robins.filters.rules._robust import widened
 
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
 
-# Doubt added on re-initialisation, in units of R: the gain is then at least 0.99 of a copy.
+# Covariance added on re-initialisation, in units of R: the gain is then at least 0.99 of a copy.
 _OPEN = 100.0
 
 
@@ -48,13 +48,13 @@ def gate(
     measurement that is too large recovers it:
 
     - ``accept`` uses it with the gain there is;
-    - ``inflate`` first doubts the prior along the innovation until the NIS is q,
+    - ``inflate`` first widens the prior covariance along the innovation until the NIS is q,
       P' = P + a G r r' G', G = P H' (H P H')^-1, a = 1 / q - 1 / NIS; by component D = diag(a_i
       r_i^2) stands in for a r r', with a_i = 1 / q - S_ii / r_i^2;
-    - ``reinitialise`` believes it only if it and the refused ones before it *agree*: their scatter
+    - ``reinitialise`` uses it only if it and the refused ones before it *agree*: their scatter
       about their mean, sum (r_k - mean)' R^-1 (r_k - mean), is within the chi-square quantile of
-      patience times m degrees of freedom. It then re-opens what is seen, D = r r' + 100 R, and
-      the measurement is followed. Refusals that disagree go on being refused.
+      patience times m degrees of freedom. It then widens what is seen by D = r r' + 100 R, and
+      the state follows the measurement. Refusals that disagree go on being refused.
 
     Notes: ``gate.ratio``, min(NIS / q, 1), where 1 is refused or recovered (the innovation test
     ratio of autopilots; by component the greatest), ``gate.refused``, refusals in a row (the most),
@@ -108,15 +108,15 @@ def gate(
         now = _Channel(refused, worst, residual, known)
 
         if recovery != "accept":
-            doubted = due & used
-            jump = jnp.where(doubted, o.residual, 0.0)
+            chosen = due & used
+            jump = jnp.where(chosen, o.residual, 0.0)
             if not agreeing:
                 excess = jnp.where(due, 1.0 - 1.0 / jnp.where(due, ratio, 2.0), 0.0)
                 jump = jump * jnp.sqrt(excess / q)
             root = jump[:, None] if joint else jnp.diag(jump)
             if agreeing:
                 root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
-            prior = reopened(jnp.any(due), prior, o, doubted, root)
+            prior = widened(jnp.any(due), prior, o, chosen, root)
         most = jnp.max(refused, initial=0)
         o = o.noted("gate", ratio=worst, refused=most, recovered=jnp.any(due))
         return {**memory, o.sensor: now}, prior, o._replace(accepted=o.accepted & passed)

@@ -1,4 +1,4 @@
-"""Give a measurement that is too large to be chance the noise that makes it chance."""
+"""Raise the noise of a measurement whose innovation is too large to be chance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from robins.filters.belief import Belief, Number
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._quantile import scale_to_quantile
+from robins.filters.rules._robust import scale_to_quantile
 
 
 def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
@@ -21,7 +21,7 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
 
     solved exactly (Chang iterates his eq. 23, s <- s NIS(s) / k^2). One weight for the whole
     measurement: correlated noise stays what it is, and no unit enters. The state is pulled by about
-    k^2 / |r| at the most, less the further off the measurement: what is absurd is forgotten.
+    k^2 / |r| at the most: the further off a measurement is, the less it moves the state.
 
     Notes: ``huber.weight``, 1 / s. Components without noise of their own cannot be weighed down.
     The Kalman filter is ``probability=1`` or ``threshold=inf``.

@@ -1,4 +1,4 @@
-"""Equivalent weights in three zones: believe, doubt, leave out."""
+"""Equivalent weights in three zones: full weight, reduced weight, none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._reopen import reopened
+from robins.filters.rules._robust import widened
 
 
 def igg3(
@@ -26,10 +26,12 @@ def igg3(
 
     With the floor at zero a component beyond k1 is refused.
 
-    A filter that has gone wrong would doubt everything for ever: when no component of a sensor has
-    had more weight than the floor ``patience`` times in a row, its next such measurement is used
-    with all its weight, after the prior has been doubted along the innovation until no t_i exceeds
-    k0: P' = P + a G r r' G', G = P H' (H P H')^-1, a = max_i (1 / k0^2 - 1 / t_i^2).
+    A filter that has gone wrong would give weight to no measurement any more. So when no component
+    of a sensor has had more weight than the floor ``patience`` times in a row, its next such
+    measurement is used with full weight, and the prior covariance is first widened along the
+    innovation until no t_i exceeds k0:
+
+        P' = P + a G r r' G',   G = P H' (H P H')^-1,   a = max_i (1 / k0^2 - 1 / t_i^2)
 
     Notes: ``igg3.weight``, the least of the measurement, and ``igg3.recovered``. The Kalman filter
     is the limit of k0 above every t_i.
@@ -38,7 +40,7 @@ def igg3(
         k0: end of full weight, in standard deviations of the innovation.
         k1: begin of none.
         floor: least weight, in [0, 1).
-        patience: measurements in a row that may be doubted whole; None never recovers.
+        patience: measurements in a row that may be left without weight; None never recovers.
 
     Raises:
         ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
@@ -68,7 +70,7 @@ def igg3(
             recovered = hopeless & (earlier >= patience)
             a = jnp.max(jnp.where(far, 1.0 / k0**2 - 1.0 / beyond**2, 0.0))
             root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
-            prior = reopened(recovered, prior, o, seen.used, root)
+            prior = widened(recovered, prior, o, seen.used, root)
         weight = jnp.where(recovered, 1.0, weight)
         count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
         count = jnp.where(measured, count, earlier)

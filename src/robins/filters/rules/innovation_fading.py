@@ -47,10 +47,10 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
     A step is faded once: by the first of its sensors whose lambda exceeds 1; those after it see the
     prior that this one has left.
 
-    One factor for all states also fades those that no sensor of the filter sees, and nothing brings
-    these back: in a filter of a star sensor the position doubts itself until nothing is linear any
-    more. So a step that would take any standard deviation beyond ``reach`` times what it was at the
-    start is not faded.
+    One factor for all states also fades those that no sensor of the filter sees, and no measurement
+    reduces their covariance again: with a star sensor alone the covariance of the position grows
+    until the model is no longer linear over it. So a step that would take any standard deviation
+    beyond ``reach`` times what it was at the start is not faded.
 
     Notes: ``innovation_fading.lambda``. limit = 1 is the Kalman filter, bit for bit.
 

@@ -1,4 +1,4 @@
-"""Let a rule see some sensors alone."""
+"""Restrict a rule to some sensors."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from robins.filters.rule import Memory, Rule
 
 
 def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
-    """A rule that acts on measurements of the named sensors, and of others knows nothing.
+    """A rule that acts on measurements of the named sensors only.
 
     Its `before` and `after` are called for these alone, and it begins with their dimensions alone.
-    What it does once a step (`process`, `settle`) it does as ever. Other sensors carry no notes of
+    Its hooks of a step (`process`, `settle`) are called as usual. Other sensors carry no notes of
     it.
 
     Args:

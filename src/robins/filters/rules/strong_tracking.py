@@ -65,7 +65,7 @@ def strong_tracking(
     samples, and lambda follows noise. ``power="ewma"`` takes keep = rho, starts at R, and fades
     only when tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
 
-    Noted as ``strong_tracking.lambda``: lambda, for multiple the greatest. Components that are
+    Notes: ``strong_tracking.lambda``, for multiple the greatest. Components that are
     missing, refused, or without noise of their own leave V and lambda alone. The Kalman filter is
     ``limit=1``, ``threshold=inf`` or beta large enough.
 
@@ -90,16 +90,14 @@ def strong_tracking(
     positive = threshold is None or threshold >= 0.0
     require(positive, "strong_tracking threshold must not be negative", threshold)
     require(1.0 <= limit < math.inf, "strong_tracking limit must be at least 1 and finite", limit)
-    if weights is not None and form != "multiple":
-        raise ValueError(f"strong_tracking weights are for form 'multiple', not {form!r}")
-    shares = _fading.checked_weights("strong_tracking", weights)
+    a = _fading.checked_weights("strong_tracking", weights, form)
     classic = power == "classic"
     keep = rho / (1.0 + rho) if classic else rho
     sigmas = threshold if classic or threshold is not None else 3.0
 
     def init(belief: Belief, dims):
         n = belief.factor.shape[0]
-        _fading.check_size("strong_tracking", shares, n)
+        _fading.check_size("strong_tracking", a, belief)
         return _Memory(
             power={name: jnp.ones(m) for name, m in dims.items()},
             begun={name: jnp.full(m, not classic) for name, m in dims.items()},
@@ -126,7 +124,7 @@ def strong_tracking(
         if form == "outside":
             S, factor = _faded_outside(memory, prior.factor, white, N, limit)
         else:
-            S, factor = _fading.faded(prior.factor, white, N, form, shares, limit)
+            S, factor = _fading.faded(prior.factor, white, N, form, a, limit)
         memory = memory._replace(
             power={**memory.power, o.sensor: V},
             begun={**memory.begun, o.sensor: begun | white.counts},

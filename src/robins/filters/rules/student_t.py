@@ -1,4 +1,4 @@
-"""Noise with heavy tails: a measurement says itself how much it is to be believed."""
+"""Noise with heavy tails: the weight of a measurement is estimated with the state."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._quantile import MOST
-from robins.filters.rules._shares import shares
+from robins.filters.rules._robust import MOST, shares
 
 Whose = Literal["R", "both"]
 
