@@ -31,7 +31,7 @@ from robins.filters import Model, Motion, kalman
 from robins.filters.rules import huber
 from robins.scenario import load
 from robins.systems import transfer_alignment
-from robins.systems.system import Contender, Problem
+from robins.systems.study import Contender, Problem
 from robins.systems.transfer_alignment.pair_parameters import Structure
 from robins.systems.transfer_alignment.patent import Patent, patent_problem
 from robins.systems.transfer_alignment.product_filters import (

@@ -13,7 +13,7 @@ from robins.campaign import chunks, collect, monte_carlo, rms_with_bounds, simul
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
 from robins.filters.rules import h_infinity
 from robins.sim.random import Component, stream
-from robins.systems.system import Case, Contender, Limit, Problem, SensorAxes, StateBlock
+from robins.systems.study import Case, Contender, Limit, Problem, SensorAxes, StateBlock
 
 STEPS = 60
 F = jnp.array([[1.0, 0.5], [0.0, 1.0]])

@@ -15,7 +15,7 @@ from robins.filters import Belief, Model, Motion, Sensor, kalman, run
 from robins.manifold import Angle
 from robins.results import solution as stored
 from robins.rotation import Rotation
-from robins.systems.system import Case, Contender, Problem, SensorAxes, StateBlock
+from robins.systems.study import Case, Contender, Problem, SensorAxes, StateBlock
 
 STEPS = 30
 F = jnp.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robins.campaign.statistics import Statistics
-from robins.systems.system import Norm, StateBlock
+from robins.systems.study import Norm, StateBlock
 
 RUNS, EPOCHS, FIRST, LAST = 7, 40, 11, 33
 BLOCKS = (StateBlock("all", slice(0, 4), "m", "m", "NED", ("a", "b", "c", "d")),)

@@ -8,7 +8,7 @@ import xarray as xr
 from robins import results
 from robins.campaign import simulate
 from robins.filters import Belief, Model, Motion, Sensor, kalman
-from robins.systems.system import Case, Contender, Limit, Output, Problem, SensorAxes, StateBlock
+from robins.systems.study import Case, Contender, Limit, Output, Problem, SensorAxes, StateBlock
 
 XV = ("x", "v")
 

@@ -13,7 +13,7 @@ from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.systems.rocket import SYSTEM
 from robins.systems.rocket.world import PEAK_S, World
-from robins.systems.system import Problem
+from robins.systems.study import Problem
 
 RUNS = 20
 QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run

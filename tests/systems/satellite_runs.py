@@ -14,7 +14,7 @@ from robins.filters import run_closed
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.systems.satellite import SYSTEM
-from robins.systems.system import Problem
+from robins.systems.study import Problem
 
 ARCSEC = math.pi / 648000.0
 QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run

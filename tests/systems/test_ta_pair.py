@@ -11,7 +11,7 @@ from robins.ins.mechanise import mechanise
 from robins.manifold import local, retract
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.scenario import ScenarioError
-from robins.systems.system import Scenario
+from robins.systems.study import Scenario
 from robins.systems.transfer_alignment.pair import simulate_pair, start_estimate
 from robins.systems.transfer_alignment.pair_course import lay_out, motion_of
 from robins.systems.transfer_alignment.pair_parameters import PairParameters

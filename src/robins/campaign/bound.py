@@ -27,7 +27,7 @@ from robins.filters.analysis.observability import (
 from robins.filters.run import nothing
 from robins.manifold import State, dim, is_element
 from robins.results import array, variable
-from robins.systems.system import Case, Problem, StateBlock
+from robins.systems.study import Case, Problem, StateBlock
 from robins.systems.tables import block_array
 
 FEW = 1.0  # eigenvalue of the Gramian below which the prior still knows more of a direction

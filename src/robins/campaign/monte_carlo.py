@@ -22,7 +22,7 @@ from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.analysis.consistency import nees, normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
-from robins.systems.system import Case, Contender, Problem
+from robins.systems.study import Case, Contender, Problem
 from robins.systems.tables import updates
 
 CHUNK = 64  # runs; large enough to fill a core's vectors, small enough for the cache

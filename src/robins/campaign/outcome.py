@@ -14,7 +14,7 @@ from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
 from robins.results import Outcome, Progress, array, keeping, silent, variable
-from robins.systems.system import Problem
+from robins.systems.study import Problem
 from robins.systems.tables import block_array, innovation_tables
 
 

@@ -16,7 +16,7 @@ from scipy import stats
 from robins.filters import Tally
 from robins.filters.analysis.consistency import Verdict, grand_mean_nis
 from robins.filters.chi_square import chi2_band
-from robins.systems.system import Limit, Norm, StateBlock
+from robins.systems.study import Limit, Norm, StateBlock
 
 
 @dataclass

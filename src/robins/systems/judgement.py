@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robins import units
 from robins.errors import require_known
 
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
@@ -71,6 +72,22 @@ def _verdicts(claims: Mapping[str, Claim], metrics: Metrics) -> list[dict[str, A
             }
         )
     return out
+
+
+def pooled_rms(statistics: Any, block: Any) -> float:
+    """RMS length of the error of a block in its display unit, over runs and epochs that count."""
+    rms = statistics.rms[statistics.counted, block.where]
+    size = np.sqrt(np.mean(np.sum(rms**2, axis=1)))
+    return float(units.convert(size, block.units, block.display_unit))
+
+
+def standard_metrics(statistics: Any) -> dict[str, Any]:
+    """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
+    errors = {
+        f"{block.name}_rms_{units.as_ending(block.display_unit)}": pooled_rms(statistics, block)
+        for block in statistics.blocks
+    }
+    return errors | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
 def consistency(statistics: Any) -> dict[str, Any]:

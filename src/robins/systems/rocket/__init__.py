@@ -13,7 +13,8 @@ from robins.systems.rocket.parameters import (
     MagneticAttitude,
 )
 from robins.systems.rocket.problem import angle_problem, field_problem
-from robins.systems.system import Study, System
+from robins.systems.study import Study
+from robins.systems.system import System
 
 SYSTEM = System(
     name="rocket",

@@ -27,7 +27,7 @@ from robins.systems.rocket.field import bridged
 from robins.systems.rocket.filters import BY_STATE, KINDS, Kind, Sight, make_filter
 from robins.systems.rocket.parameters import MagneticAttitude
 from robins.systems.rocket.world import World, body_of, wrong_by
-from robins.systems.system import Case, Contender
+from robins.systems.study import Case, Contender
 
 FORGETS = (10.0, 10.0)  # rad, rad/s: noise of a step that leaves nothing of what was before
 

@@ -22,7 +22,7 @@ from robins.systems.rocket.field import (
 from robins.systems.rocket.filters import FIELD_KINDS, FieldKind, make_field_filter
 from robins.systems.rocket.parameters import FieldVector
 from robins.systems.rocket.world import Course, World
-from robins.systems.system import Case, Contender
+from robins.systems.study import Case, Contender
 
 FORGETS = 10.0  # rad: noise of a step that leaves nothing of a direction that was seen before
 REPORTED = 9  # attitude in body axes, attitude about and across the field, bias

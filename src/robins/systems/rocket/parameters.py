@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Span, default
-from robins.systems.limits import Names, refuse_too_long, refuse_unsettled
-from robins.systems.system import Scenario
+from robins.systems.parts import Names, refuse_too_long, refuse_unsettled
+from robins.systems.study import Scenario
 
 Three = tuple[float, float, float]
 

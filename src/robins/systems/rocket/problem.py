@@ -19,7 +19,7 @@ from robins.systems.rocket.metrics import angle_metrics, field_metrics
 from robins.systems.rocket.parameters import FieldVector, Flight, MagneticAttitude
 from robins.systems.rocket.unobserved import sentence, unobserved
 from robins.systems.rocket.world import Course, lay_out, simulate
-from robins.systems.system import Norm, Problem, SensorAxes, StateBlock
+from robins.systems.study import Norm, Problem, SensorAxes, StateBlock
 from robins.systems.tables import block_array
 
 BODY = ("x", "y", "z")

@@ -5,7 +5,8 @@
 - study "product": total state with mounting and flexure, closed loop; also for recorded pairs.
 """
 
-from robins.systems.system import Study, System
+from robins.systems.study import Study
+from robins.systems.system import System
 from robins.systems.transfer_alignment import (
     matching_claims,
     matching_parameters,

@@ -26,7 +26,7 @@ from robins.results import array
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.random import Component, stream, unit
 from robins.systems.judgement import judging
-from robins.systems.system import Limit, Problem, SensorAxes, StateBlock
+from robins.systems.study import Limit, Problem, SensorAxes, StateBlock
 from robins.systems.transfer_alignment.attitude_matching import ATTITUDE
 from robins.systems.transfer_alignment.bank_turn import (
     BankTurn,

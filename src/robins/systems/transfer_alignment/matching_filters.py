@@ -21,7 +21,7 @@ from robins.filters import Filter, Step, kalman, run
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
 from robins.rotation import Rotation
 from robins.sim.flexure import Flexure
-from robins.systems.system import Case, Contender
+from robins.systems.study import Case, Contender
 from robins.systems.transfer_alignment.attitude_matching import (
     ATTITUDE,
     STATES,

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
-from robins.systems.limits import Names, Runs, refuse_too_long, refuse_unsettled
-from robins.systems.system import Scenario
+from robins.systems.parts import Names, Runs, refuse_too_long, refuse_unsettled
+from robins.systems.study import Scenario
 
 Three = tuple[float, float, float]
 

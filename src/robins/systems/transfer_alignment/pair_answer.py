@@ -12,7 +12,7 @@ from robins import units
 from robins.dataset import Trajectory
 from robins.filters import Belief, StepInfo, Tally
 from robins.results import array, variable
-from robins.systems.system import SensorAxes, StateBlock
+from robins.systems.study import SensorAxes, StateBlock
 from robins.systems.tables import (
     EULER,
     block_array,

@@ -40,8 +40,8 @@ from robins.results import array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
 from robins.systems.judgement import judging
-from robins.systems.limits import Names, Runs
-from robins.systems.system import Case, Contender, Limit, Problem, Scenario, SensorAxes, StateBlock
+from robins.systems.parts import Names, Runs
+from robins.systems.study import Case, Contender, Limit, Problem, Scenario, SensorAxes, StateBlock
 from robins.systems.transfer_alignment import velocity_attitude as va
 from robins.systems.transfer_alignment.open_loop import (
     as_master_sees,

@@ -20,7 +20,7 @@ from robins.ins.state import InsNoise, InsState
 from robins.rotation import Rotation
 from robins.scenario import Parameters, Quantity, default
 from robins.sim.flexure import Flexure, transition
-from robins.systems.system import Case, Contender
+from robins.systems.study import Case, Contender
 from robins.systems.transfer_alignment.pair import PairRun, start_estimate
 from robins.systems.transfer_alignment.pair_parameters import PairParameters, Structure, Three
 from robins.systems.transfer_alignment.product import (

@@ -17,8 +17,8 @@ import xarray as xr
 from robins import units
 from robins.scenario import Quantity, default
 from robins.systems.judgement import judging
-from robins.systems.limits import Names
-from robins.systems.system import Limit, Problem, Scenario
+from robins.systems.parts import Names
+from robins.systems.study import Limit, Problem, Scenario
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.pair import simulate_pair
 from robins.systems.transfer_alignment.pair_answer import BLOCKS, SENSORS

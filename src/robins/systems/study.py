@@ -1,0 +1,242 @@
+"""A study: what is simulated, who navigates it, what is claimed; and the problem made of it.
+
+A study follows one course of work: parameters -> `lay_out` (what all runs share) -> `simulate` (one
+run) -> a `Contender` for each filter -> metrics -> verdicts. `Study.problem` is that course; the
+campaign runs any `Problem` and does not know which system it came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from robins.errors import require_known
+from robins.filters import Belief, Filter, Loop, Model, Sensor
+from robins.manifold import State
+from robins.scenario import Parameters
+from robins.systems.judgement import Claim, Metrics, judging, standard_metrics
+from robins.systems.parts import Names, Runs
+
+
+class StateBlock(NamedTuple):
+    """Some components of the tangent space, under a name."""
+
+    name: str
+    where: slice
+    units: str  # SI
+    display_unit: str  # of figures and metrics
+    frame: str
+    axes: tuple[str, ...]
+
+
+class SensorAxes(NamedTuple):
+    """What the components of a sensor's innovation are."""
+
+    units: str
+    frame: str
+    axes: tuple[str, ...]
+    display_unit: str = ""  # of figures, where it is another
+
+
+class Case(NamedTuple):
+    """One simulated run: what a filter is given, and what it should find.
+
+    In closed loop the loop gives all of this but the start.
+    """
+
+    start: Belief  # or the state of a filter
+    u: Any  # input of the motion, leading axis E epochs
+    y: Mapping[str, Any]
+    aux: Mapping[str, Any]
+    truth: State | None  # leading axis E
+    # (E, r, n) reported = rows @ tangent error, where what is reported turns with the time; it
+    # takes the place of the contender's
+    rows: Array | None = None
+    outputs: Mapping[str, Array] = {}  # (E, k) what else is known of the run, by name
+    loop: Loop | None = None
+
+
+def as_simulated(world: Any) -> Case:
+    """The case of a problem whose filters all take what is simulated as it is."""
+    return world
+
+
+class Contender(NamedTuple):
+    """A filter with the model it believes in.
+
+    Filters of one problem may have states of their own: each makes its own case of the simulated
+    world, and all report the same components.
+    """
+
+    filter: Filter
+    model: Model
+    case: Callable[[Any], Case] = as_simulated  # from what the problem simulates
+    reported: np.ndarray | None = None  # (r, n) reported = this @ tangent error; None: all of it
+    bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
+    facts: Mapping[str, Any] = {}  # figures known without a run, put among its metrics
+
+
+class Limit(NamedTuple):
+    """A size that the errors of a block should stay below."""
+
+    name: str  # "5_arcmin"
+    block: str
+    value: float  # SI, of the largest component
+
+
+class Output(NamedTuple):
+    """What a vehicle does beside what is estimated of it: where it points, what its wheels hold."""
+
+    name: str
+    units: str  # SI
+    display_unit: str
+    frame: str
+    axes: tuple[str, ...]
+    text: str  # a sentence for the caption of its figure
+    is_error: bool = False  # it should be zero, so its RMS over the runs says something
+
+
+class Norm(NamedTuple):
+    """The length of some reported components of the error, such as the horizontal ones."""
+
+    name: str
+    components: tuple[int, ...]
+
+
+class Instrument(NamedTuple):
+    """A sensor of a vehicle, declared in one place."""
+
+    name: str
+    axes: SensorAxes
+    # (parameters, course, key of a component, true motion) -> its reading, leading axis E, NaN
+    # where there is none; None: it takes what another instrument has read
+    measure: Callable[..., Any] | None
+    # (parameters, course) -> h(x) and R, as a filter believes; None: it is not aboard
+    believed: Callable[..., Sensor | None]
+    # world -> the measurement, and what h(x) needs besides the state
+    taken: Callable[[Any], tuple[Any, Any]]
+
+
+@dataclass(frozen=True)
+class View:
+    """What is reported of every filter, and what figures and metrics need to know of it."""
+
+    epoch_s: np.ndarray  # (E,)
+    blocks: Sequence[StateBlock]  # of the reported components
+    sensors: Mapping[str, SensorAxes]
+    metrics: Callable[[Any], dict[str, Any]] = standard_metrics  # campaign statistics -> metrics
+    # truth, fixes, outages: what figures show beside the filters
+    context: xr.Dataset = field(default_factory=xr.Dataset)
+    # means of the first run by filter -> more variables of the solution, such as the track. A
+    # mean is the state of its own filter.
+    shown: Callable[[Mapping[str, State]], dict[str, Any]] = lambda means: {}
+    count_from: int = 0  # first epoch that counts for figures pooled over time
+    limits: Sequence[Limit] = ()
+    count_to: int | None = None  # epoch after the last that counts; None: to the end
+    bound_of: str | None = None  # the contender whose model's covariance bound is drawn in
+    norms: Sequence[Norm] = ()  # whose mean and spread over time are kept of each run
+    windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept of each run
+    notes: Sequence[str] = ()  # sentences for the reader of the report
+    outputs: Sequence[Output] = ()  # of its cases
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem(View):
+    """A simulated scenario, ready to be run any number of times.
+
+    Raises:
+        ValueError: names clash, or what one part names no other part has; it says so before a
+            campaign is computed whose result could not be written.
+    """
+
+    simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it batches
+    contenders: Mapping[str, Contender]
+    claims: Callable[[Metrics], list[dict[str, Any]]]
+
+    def __post_init__(self) -> None:
+        """Check that all names fit each other."""
+        named: dict[str, str] = {}  # what has an axis of its own, in the result
+        for kind, names in (
+            ("block", [b.name for b in self.blocks]),
+            ("output", [o.name for o in self.outputs]),
+            ("sensor", list(self.sensors)),
+            ("context", [str(c).removeprefix("axis_") for c in self.context.coords]),
+        ):
+            for name in names:
+                if other := named.get(name):
+                    raise ValueError(
+                        f"{name}: names a {kind} and a {other}, whose axes could not be told "
+                        "apart in the result; rename one of them"
+                    )
+                named[name] = kind
+        for limit in self.limits:
+            if named.get(limit.block) != "block":
+                raise ValueError(f"limit {limit.name}: there is no block '{limit.block}'")
+        for name, contender in self.contenders.items():
+            for sensor, dim in contender.model.dims.items():
+                if sensor not in self.sensors:
+                    raise ValueError(
+                        f"filter '{name}' has a sensor '{sensor}' whose axes nobody declares; "
+                        f"declared are {', '.join(self.sensors)}"
+                    )
+                if dim != len(self.sensors[sensor].axes):
+                    raise ValueError(
+                        f"filter '{name}': sensor '{sensor}' has {dim} components and "
+                        f"{len(self.sensors[sensor].axes)} declared axes; sensors that differ "
+                        "need names of their own"
+                    )
+
+
+class Scenario(Parameters):
+    """What every simulated scenario says; a study adds its own, and `study`, its name."""
+
+    system: str = ""
+    study: str = ""
+    title: str = ""
+    runs: Runs = 50
+    filters: Names = ()  # all of the study where none is named
+    claims: tuple[str, ...] | None = None  # ids of those it checks; None: all of the study
+
+
+class Study(NamedTuple):
+    """One kind of scenario of a system: its parts, from which one function makes a problem.
+
+    `lay_out` and what follows may raise a ValueError on parameters that do not fit together.
+    """
+
+    parameters: type[Scenario]
+    filters: tuple[str, ...]
+    # (parameters, course, seed, run number) -> world, or a `Case` where all filters take the same;
+    # pure, the run number may be traced
+    simulate: Callable[..., Any]
+    contender: Callable[..., Contender]  # (parameters, course, name of the filter)
+    view: Callable[..., View]  # (parameters, course)
+    lay_out: Callable[[Any], Any] = lambda given: None  # parameters -> course: what all runs share
+    claims: Mapping[str, Claim] = {}  # by id, what its scenarios check
+
+    def problem(self, given: Any, filters: Sequence[str], seed: int) -> Problem:
+        """The scenario with these filters, ready for a campaign.
+
+        Args:
+            given: parameters of this study.
+            filters: names.
+            seed: of the random streams.
+
+        Raises:
+            ValueError: the parameters do not fit together, or a filter or claim is not known.
+        """
+        for name in filters:
+            require_known("filter", name, self.filters)
+        course = self.lay_out(given)
+        return Problem(
+            simulate=partial(self.simulate, given, course, seed),
+            contenders={name: self.contender(given, course, name) for name in filters},
+            claims=judging(self.claims, given.claims),
+            **vars(self.view(given, course)),
+        )
