@@ -18,8 +18,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from robins.filters import kalman, run
+from robins.filters.analysis.worst_case import gamma_min, worst_case_gain
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
-from robins.filters.worst_case import gamma_min, worst_case_gain
 
 HERE = Path(__file__).resolve().parent
 

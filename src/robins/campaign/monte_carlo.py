@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
-from robins.filters.consistency import nees, normalised_sq
+from robins.filters.analysis.consistency import nees, normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
 from robins.systems.study import Case, Contender, Problem

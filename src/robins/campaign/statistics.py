@@ -14,7 +14,8 @@ import numpy as np
 from scipy import stats
 
 from robins.filters import Tally
-from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
+from robins.filters.analysis.consistency import Verdict, grand_mean_nis
+from robins.filters.chi_square import chi2_band
 from robins.systems.study import Limit, Norm, StateBlock
 
 

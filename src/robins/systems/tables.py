@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.filters import Code
-from robins.filters.consistency import grand_mean_nis
+from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.results import array, variable
 from robins.systems.study import Output, SensorAxes, StateBlock

@@ -4,7 +4,7 @@ A disturbed record is no reason to doubt the gyros, and a disturbed gyro none to
 an innovation alone does not say which it was. What tells them apart is how it goes on, and what the
 velocity says, which neither flexure nor gyro noise reach directly. So several filters of the same
 24 states run side by side, each with a hypothesis of its own, as an interacting multiple model
-(`robins.filters.imm`):
+(`robins.filters.composite.imm`):
 
                 stiff structure           flexing structure
     quiet       the stated noise          and the flexure of the model

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief
-from robins.filters.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
+from robins.filters.limits.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
 from robins.filters.observation import Observation
 
@@ -29,7 +29,7 @@ class Bounded(NamedTuple):
 
 
 def _seen(belief: Belief, g: Function) -> Observation:
-    """What the bounds are on, as a measurement that has read zero: its residual is -g(x)."""
+    """g(x), which is bounded, as a measurement that reads zero: its residual is -g(x)."""
     sensor, zero = as_sensor(belief.mean, g, None, None)
     return taylor().observation(belief, sensor, zero, None)
 
@@ -84,7 +84,7 @@ def _active(spread: Array, size: Array, low: Array, high: Array) -> tuple[Array,
     b = jnp.concatenate([low / length, -high / length])
     b = jnp.where(jnp.concatenate([free, free]), b, -jnp.inf)
     rounding = 1e-12 * (1.0 + jnp.where(jnp.isfinite(b), jnp.abs(b), 0.0))
-    nobody = jnp.full((), -1)
+    no_row = jnp.full((), -1)
 
     def slack(t):
         return N @ t - b + rounding
@@ -115,10 +115,10 @@ def _active(spread: Array, size: Array, low: Array, high: Array) -> tuple[Array,
         enters = full <= partial[leaving]
         active = jnp.where(enters, active.at[p].set(True), active.at[leaving].set(False))
         u = jnp.where(active | (jnp.arange(2 * c) == p), u, 0.0)
-        return t, active, u, jnp.where(enters, nobody, p), infeasible, count + 1
+        return t, active, u, jnp.where(enters, no_row, p), infeasible, count + 1
 
     none = jnp.zeros(2 * c, bool)
-    start = jnp.zeros(N.shape[1]), none, jnp.zeros(2 * c), nobody, jnp.zeros((), bool), 0
+    start = jnp.zeros(N.shape[1]), none, jnp.zeros(2 * c), no_row, jnp.zeros((), bool), 0
     end = jax.lax.while_loop(go_on, step, start)
     return end[1][:c], end[1][c:], end[4] | go_on((*end[:5], 0))
 
@@ -127,7 +127,7 @@ def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bou
     """Cut the density at ``lower <= g(x) <= upper`` and keep its mean and covariance.
 
     Row by row: z = D_i x is N(mu, s^2), its density cut to the bounds has mean mu + s alpha and
-    variance s^2 v, and what z tells of the rest of the state stays (Simon & Simon 2010, sec. 2.4),
+    variance s^2 v, and the regression of the state on z stays (Simon & Simon 2010, sec. 2.4),
 
         x := x + P D_i' alpha / s,   S := S (I - (1 - v^1/2) a a'),   a = S' D_i' / s
 

@@ -19,7 +19,7 @@ Any root B conserves the information. Here B = D C^1/2 with D the standard devia
 correlations: no unit enters, and a share stays with the state it was given to, as nearly as a root
 can (C^1/2 is the root of C nearest to the identity).
 
-**Intersect** beliefs whose errors are correlated in a way nobody knows (Julier & Uhlmann 1997):
+**Intersect** beliefs whose errors have an unknown correlation (Julier & Uhlmann 1997):
 Y = sum_i w_i Y_i, sum_i w_i = 1, which is an upper bound for every correlation.
 """
 
@@ -36,7 +36,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
+from robins.filters.checks import one_of
 from robins.filters.run import is_traced
 
 Sharing = Literal["scalar", "root", "half"]
@@ -69,8 +71,7 @@ def fuse(beliefs: Sequence[Belief]) -> Belief:
 
 def _looked_at(beliefs: Sequence[Belief], doing: str) -> list[Belief]:
     beliefs = list(beliefs)
-    if not beliefs:
-        raise ValueError(f"nothing to {doing}: at least one belief is wanted")
+    require(beliefs, f"nothing to {doing}: at least one belief is wanted")
     if not is_traced(beliefs):
         for i, belief in enumerate(beliefs):
             if bool(is_singular(belief)):
@@ -177,15 +178,9 @@ def share(
 
 
 def check_sharing(sharing: str) -> None:
-    """Refuse a way of sharing that there is not.
-
-    Raises:
-        ValueError: it is unknown, or "naive".
-    """
-    if sharing == "naive":
-        raise ValueError(NAIVE)
-    if sharing not in ("scalar", "root", "half"):
-        raise ValueError(f"sharing must be 'root', 'scalar' or 'half', got {sharing!r}")
+    """Refuse a way of sharing that there is not."""
+    require(sharing != "naive", NAIVE)
+    one_of("sharing", sharing, Sharing)
 
 
 def part(factor: Array, shares: Array, sharing: Sharing) -> list[Array]:
@@ -307,11 +302,7 @@ def _best_weights(beliefs: list[Belief], criterion: Criterion) -> Array:
 
 
 def check_criterion(criterion: Any, count: int) -> None:
-    """Refuse a criterion that there is not, or weights that are none.
-
-    Raises:
-        ValueError: see there.
-    """
+    """Refuse a criterion that there is not, or weights that are none."""
     if isinstance(criterion, str):
         if criterion not in _SLOPES:
             raise ValueError(f"criterion must be 'trace', 'det' or weights, got {criterion!r}")

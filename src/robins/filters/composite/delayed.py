@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, compiled
@@ -102,8 +103,7 @@ def delayed(
             of other shapes than were given here.
     """
     depth = operator.index(depth)
-    if depth < 0:
-        raise ValueError(f"depth of a delayed filter must not be negative, got {depth}")
+    require(depth >= 0, "depth of a delayed filter must not be negative", depth)
     names = tuple(model.dims)
     given = dict(aux or {})
     if unknown := set(given) - set(names):
@@ -274,13 +274,13 @@ def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:
     return jnp.where(taken, change, -jnp.inf)
 
 
-def _check_same(what: str, found: Any, told: Any) -> None:
+def _check_same(what: str, found: Any, known: Any) -> None:
     """Raise if two pytrees differ in structure, shapes or kinds of number."""
-    if _form(found) != _form(told):
+    if _form(found) != _form(known):
         raise ValueError(
             f"{what} is of another form than delayed() was told of: {_form(found)}, not "
-            f"{_form(told)}; give it the model of the run and, where there are inputs, one of them "
-            "as u=... and one aux by sensor as aux={...}"
+            f"{_form(known)}; give it the model of the run and, where there are inputs, one of "
+            "them as u=... and one aux by sensor as aux={...}"
         )
 
 

@@ -17,11 +17,13 @@ from jaxtyping import Array
 from robins.errors import require
 from robins.filters.audit import Again, audit
 from robins.filters.belief import Belief, Code, StepInfo
-from robins.filters.fusion import is_singular
-from robins.filters.kalman import Filter, FilterState, Prediction, kalman, not_taken
+from robins.filters.checks import sensor_names
+from robins.filters.composite.fusion import is_singular
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman, not_taken
 from robins.filters.linearise import Transition
 from robins.filters.model import Motion, Sensor, as_noise
 from robins.filters.trees import equal, finite, select
+from robins.manifold import State
 
 
 class Channel(NamedTuple):
@@ -51,7 +53,7 @@ class Joined(NamedTuple):
     names: Names
 
     def audit(self, start: Joined, again: Again | None, time: Any) -> None:
-        """Ask the members, then tell of steps that could not be taken (`robins.filters.audit`)."""
+        """Ask the members, then raise for steps not taken (`robins.filters.audit`)."""
         rerun = None if again is None else lambda m: again(start._replace(members=m)).members
         audit(start.members, self.members, rerun, time)
         for i, count in enumerate(np.asarray(self.singular).tolist()):
@@ -77,18 +79,13 @@ def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Chann
     Raises:
         ValueError: no sensor is named, or one twice.
     """
-    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"a channel needs sensors, each named once, got {list(names)}")
+    names = sensor_names("channel", sensors)
+    require(len(set(names)) == len(names), "a channel names each sensor once", list(names))
     return Channel(names, kalman() if filter is None else filter)
 
 
 def owners(channels: Sequence[Channel]) -> dict[str, int]:
-    """Which channel has which sensor.
-
-    Raises:
-        ValueError: there is no channel, or a sensor belongs to two.
-    """
+    """Which channel has which sensor."""
     require(channels, "no channels: at least one local filter is wanted")
     owner: dict[str, int] = {}
     for i, one in enumerate(channels):
@@ -102,12 +99,7 @@ def owners(channels: Sequence[Channel]) -> dict[str, int]:
 
 
 def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dict[str, int]]:
-    """Sensor dimensions by channel, in the model's order.
-
-    Raises:
-        ValueError: a sensor of the model belongs to no channel, or a channel names one that the
-            model has not.
-    """
+    """Sensor dimensions by channel, in the model's order."""
     owner = owners(channels)
     if homeless := [name for name in dims if name not in owner]:
         raise ValueError(
@@ -119,6 +111,22 @@ def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dic
             f"has {sorted(dims)}"
         )
     return [{k: v for k, v in dims.items() if owner[k] == i} for i in range(len(channels))]
+
+
+def members_of(filters: Sequence[Filter]):
+    """The `members` of a joined filter: each goes on by its own `reset`."""
+
+    def members(state: FilterState):
+        joined: Joined = state.memory
+
+        def follow(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            each = zip(filters, joined.members, beliefs, strict=True)
+            states = tuple(f.reset(member, own) for f, member, own in each)
+            return FilterState(belief, joined._replace(members=states))
+
+        return tuple(member.belief for member in joined.members), follow
+
+    return members
 
 
 # ----------------------------------------------------------------------------- steps of the whole
@@ -201,16 +209,110 @@ def starting(
     return FilterState(belief, Joined(tuple(states), shares, silent, singular, names))
 
 
-def with_noise(motion: Motion, scale: Callable[[Array], Array]) -> Motion:
-    """The same motion, its noise factor put through a function."""
+def followed_by(
+    motion: Motion,
+    noise: Callable[[Array], Array],
+    state: Callable[[State], State] = lambda x: x,
+    slope: Callable[[Array], Array] = lambda F: F,
+) -> Motion:
+    """A motion whose noise factor, new state and slope F are each put through a function."""
     known = motion.linear
-
-    def noise(x, u):
-        return scale(motion.noise_factor(x, u))
 
     def linear(x, u):
         assert known is not None
         mean, F, given = known(x, u)
-        return mean, F, scale(as_noise(given, F.shape[0], "the motion"))
+        return state(mean), slope(F), noise(as_noise(given, F.shape[0], "the motion"))
 
-    return Motion(motion.step, noise, None if known is None else linear)
+    return Motion(
+        lambda x, u: state(motion.step(x, u)),
+        lambda x, u: noise(motion.noise_factor(x, u)),
+        None if known is None else linear,
+    )
+
+
+class Mastered(NamedTuple):
+    """What a joined filter with sensors at its master carries besides the belief given out."""
+
+    joined: FilterState  # its belief is the one given out
+    master: FilterState
+
+
+def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | None = None) -> Filter:
+    """A joined filter, some of whose sensors update what was fused and no local filter.
+
+    A hard constraint makes the covariance of a local filter singular, so that it cannot be fused
+    (51 of the airship paper wants its inverse), and one that several locals use is counted several
+    times. Applied to what was fused, it is counted once and may be exact. Whether it lasts depends
+    on what the joined filter makes of the fused belief when it predicts:
+
+        distributed, intersecting   own: locals go on from their own, the constraint is output only
+                                    mean: its mean goes back; full: its mean and covariance
+        federated                   fusion-reset, zero-reset: shared out like all that was fused
+                                    no-reset, rescale: output only
+
+    The sensors must come last in the model: a local measurement after them is fused anew from the
+    locals, which know nothing of them.
+
+    Args:
+        filter: `distributed`, `intersecting` or `federated`, of the other sensors.
+        sensors: those that update what was fused.
+        master: how they do: its way to linearise and what its rules do before and after an update
+            (it never predicts). `kalman()` by default.
+
+    Raises:
+        ValueError: no sensor is named; at `init`, the model has no such sensor or has another one
+            after it, or the filter is not a joined one.
+    """
+    names = sensor_names("at_master", sensors)
+    centre = kalman() if master is None else master
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        if unknown := [name for name in names if name not in dims]:
+            raise ValueError(f"at_master: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
+        last = list(dims)[-len(names) :]
+        if late := [name for name in last if name not in names]:
+            raise ValueError(
+                f"at_master: sensor {late[0]!r} comes after one of the master's: put {list(names)} "
+                "last in the model"
+            )
+        joined = filter.init(belief, {k: m for k, m in dims.items() if k not in names})
+        require(
+            filter.members(joined)[0],
+            "at_master wants a filter of channels: one without locals uses the sensor itself",
+        )
+        own = centre.init(belief, {k: m for k, m in dims.items() if k in names})
+        return FilterState(joined.belief, Mastered(joined, own))
+
+    def predict(
+        state: FilterState, motion: Motion, u: Any = None
+    ) -> tuple[FilterState, Prediction]:
+        mastered: Mastered = state.memory
+        joined, prediction = filter.predict(mastered.joined, motion, u)
+        return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
+
+    def update(
+        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
+    ) -> tuple[FilterState, StepInfo]:
+        mastered: Mastered = state.memory
+        if sensor.name not in names:
+            joined, info = filter.update(mastered.joined, sensor, y, aux)
+            return FilterState(joined.belief, mastered._replace(joined=joined)), info
+        own, info = centre.update(centre.reset(mastered.master, state.belief), sensor, y, aux)
+        joined = mastered.joined._replace(belief=own.belief)
+        return FilterState(own.belief, Mastered(joined, own)), info
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        mastered: Mastered = state.memory
+        joined = filter.reset(mastered.joined, belief)
+        return FilterState(joined.belief, Mastered(joined, centre.reset(mastered.master, belief)))
+
+    def members(state: FilterState):
+        mastered: Mastered = state.memory
+        beliefs, follow = filter.members(mastered.joined)
+
+        def followed(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            return FilterState(belief, mastered._replace(joined=follow(beliefs, belief)))
+
+        return beliefs, followed
+
+    return in_step(Filter(init, predict, update, reset, members))

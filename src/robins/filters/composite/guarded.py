@@ -1,9 +1,9 @@
-r"""Guarded filters: an assumption is believed as long as no evidence speaks against it.
+r"""Guarded filters: an assumption is used as long as no evidence speaks against it.
 
-A filter that believes too much (an exact constraint, air data whose errors are taken for white)
-collapses its covariance, so its own residuals cannot tell it that it is wrong. A *reference* that
-does without the assumption can: where the assumption is right, the estimate x_c that uses it is
-efficient, and differs from the reference's x_u by exactly what was gained (Hausman 1978),
+A wrong assumption (an exact constraint, air data whose errors are modelled as white) makes the
+covariance of a filter too small, so its own residuals do not show the fault. A *reference* that
+does without the assumption shows it: where the assumption is right, the estimate x_c that uses it
+is efficient, and differs from the reference's x_u by exactly what was gained (Hausman 1978),
 
     E (x_c - x_u)(x_c - x_u)' = P_u - P_c
 
@@ -36,9 +36,8 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
-from robins.filters.channels import Joined
+from robins.filters.checks import sensor_names
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step
-from robins.filters.master import Mastered
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import select
 
@@ -47,7 +46,7 @@ Groups = Sequence[Sequence[int]]
 # Harm that is not worth a word: a tenth of the reference's variance, 5 % of its deviation.
 SLACK = 0.1
 
-# Patience doubles no more often than this: 64 times the first is for ever in most missions.
+# Patience doubles no more often than this: 64 times the first outlasts most missions.
 _DOUBLINGS = 6
 
 # A group that is renewed this much slower than the fastest is none the judges judge.
@@ -61,7 +60,7 @@ class Watch(NamedTuple):
     reference: FilterState
     trusted: Array  # () bool
     evidence: Array  # (groups,) g
-    looks: Array  # (groups,) renewals since there last was a doubt
+    looks: Array  # (groups,) renewals since evidence last exceeded half its limit
     failures: Array  # () how often the patience has doubled
     trips: Array  # () how often trust was lost
 
@@ -89,8 +88,8 @@ def guarded(
     doubles the patience, up to 64 times, so that what is always wrong costs a vanishing share of
     the time.
 
-    What is guarded against is harm to the estimate, as far as the reference's covariance is honest:
-    where it is overconfident (NEES per state above one) a ratio larger by that makes up for it.
+    The test is of harm to the estimate, and relies on the reference's covariance: where that is
+    overconfident (NEES per state above one) a ratio larger by that makes up for it.
 
     What an update says of itself is what the filter that is in charge says; a sensor of the
     assumption that is not trusted is refused. Notes: those of the filter, those of the reference as
@@ -101,14 +100,14 @@ def guarded(
         filter: believes the assumption.
         reference: does without; of the same state. Each may be a filter of filters.
         assumption: sensors that the reference does not use.
-        judges: sensors that both use and that no one doubts.
+        judges: sensors that both use and that are beyond question.
         groups: tangent components that are judged together, by their sum, such as
             ``[(3, 4), (6, 7)]``; others are not watched. Two axes tell twice as fast as one. By
             default each component by itself.
         ratio: how many times what it should be a squared difference may be on average: at 2 a
             filter that is no better than its reference is still believed.
         limit: of the evidence. Small: quick; large: rarely wrong.
-        patience: looks without a doubt before trust is given again.
+        patience: looks with evidence below half its limit before trust is given again.
         leap: deviations of the reference that no difference exceeds by chance; `inf` to leave out.
         trusted: whether the filter is in charge at the start.
 
@@ -117,8 +116,17 @@ def guarded(
             or a parameter is not of its range; at `init`, the model has no sensor of such a name,
             or the state no such component.
     """
-    assumed, judging = _names(assumption), _names(judges)
-    _check(assumed, judging, groups, ratio, limit, patience, leap)
+    assumed, judging = (
+        sensor_names("guarded assumption", assumption),
+        sensor_names("guarded judges", judges),
+    )
+    both = sorted(set(assumed) & set(judging))
+    require(not both, f"guarded: {both} cannot judge, it belongs to the assumption")
+    named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
+    require(named, "guarded groups must each name a component", groups)
+    require(ratio >= 1.0, "guarded ratio must be at least 1", ratio)
+    for name, value in (("limit", limit), ("patience", patience), ("leap", leap)):
+        require(value > 0.0, f"guarded {name} must be positive", value)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
         if unknown := [name for name in (*assumed, *judging) if name not in dims]:
@@ -136,13 +144,25 @@ def guarded(
         )
         return _given_out(watch)
 
+    def taken_over(watch: Watch) -> FilterState:
+        """The filter gone on from what the reference believes.
+
+        Where both are filters of as many locals, local by local: a joined filter that is reset to
+        one belief would have it in every local, and so count it more than once.
+        """
+        mine, follow = filter.members(watch.filter)
+        others, _ = reference.members(watch.reference)
+        if mine and len(mine) == len(others):
+            return follow(others, watch.reference.belief)
+        return filter.reset(watch.filter, watch.reference.belief)
+
     def judged(watch: Watch, failed: Array, renewed: Array | float) -> Watch:
         """The verdict after a step: evidence taken, trust lost or given."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
         renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
         M = _members(groups, len(square))
-        told = M @ (renewed * (square - ratio * gained - SLACK))
-        evidence = jnp.maximum(watch.evidence + told, 0.0)
+        fresh = M @ (renewed * (square - ratio * gained - SLACK))
+        evidence = jnp.maximum(watch.evidence + fresh, 0.0)
         looks = watch.looks + M @ renewed / np.sum(M, axis=1)
         off = jnp.any(np.any(M > 0.0, axis=0) & (square > leap**2))
         wrong = failed | off | jnp.any(evidence > limit)
@@ -154,7 +174,7 @@ def guarded(
         most = jnp.max(looks)
         earned = (most >= wait) & jnp.all((looks >= wait) | (looks < _JUDGED * most))
         return Watch(
-            select(wrong, _taken_over(filter, watch.filter, watch.reference), watch.filter),
+            select(wrong, taken_over(watch), watch.filter),
             watch.reference,
             (watch.trusted & ~wrong) | earned,
             jnp.where(wrong, 0.0, evidence),
@@ -208,10 +228,6 @@ def guarded(
     return in_step(Filter(init, predict, update, reset))
 
 
-def _names(given: str | Sequence[str]) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
-
-
 def _given_out(watch: Watch) -> FilterState:
     belief = select(watch.trusted, watch.filter.belief, watch.reference.belief)
     return FilterState(belief, watch)
@@ -232,11 +248,7 @@ def _difference(mine: Belief, other: Belief) -> tuple[Array, Array]:
 
 
 def _members(groups: Groups | None, n: int) -> np.ndarray:
-    """(groups, n) ones where a component belongs to a group.
-
-    Raises:
-        ValueError: the state has no such component.
-    """
+    """(groups, n) ones where a component belongs to a group."""
     if groups is None:
         return np.eye(n)
     M = np.zeros((len(groups), n))
@@ -266,51 +278,3 @@ def _not_believed(info: StepInfo) -> StepInfo:
         code=jnp.where(missing, info.code, int(Code.REFUSED)),
         notes={},
     )
-
-
-def _taken_over(filter: Filter, mine: FilterState, other: FilterState) -> FilterState:
-    """The filter gone on from what the reference believes.
-
-    Where both are filters of as many locals, local by local: a joined filter that is reset to one
-    belief would have it in every local, and so count it more than once.
-    """
-    state = filter.reset(mine, other.belief)
-    followed = _local_by_local(mine, other)
-    return state if followed is None else followed
-
-
-def _local_by_local(mine: FilterState, other: FilterState) -> FilterState | None:
-    """A joined filter, each local at the belief of the other's; None where that cannot be."""
-    a, b = mine.memory, other.memory
-    if isinstance(a, Mastered):
-        joined = _local_by_local(a.joined, b.joined if isinstance(b, Mastered) else other)
-        if joined is None:
-            return None
-        return FilterState(joined.belief, a._replace(joined=joined))
-    if not (isinstance(a, Joined) and isinstance(b, Joined)) or len(a.members) != len(b.members):
-        return None
-    pairs = list(zip(a.members, b.members, strict=True))
-    if any(m.points != () or m.belief.factor.shape != o.belief.factor.shape for m, o in pairs):
-        return None
-    members = tuple(m._replace(belief=o.belief, current=o.current) for m, o in pairs)
-    return FilterState(other.belief, a._replace(members=members))
-
-
-def _check(
-    assumed: tuple[str, ...],
-    judging: tuple[str, ...],
-    groups: Groups | None,
-    ratio: Number,
-    limit: Number,
-    patience: Number,
-    leap: Number,
-) -> None:
-    if not assumed or not judging:
-        raise ValueError("guarded needs sensors of the assumption, and judges: name at least one")
-    if both := set(assumed) & set(judging):
-        raise ValueError(f"guarded: {sorted(both)} cannot judge, it belongs to the assumption")
-    if groups is not None and (not groups or not all(len(set(one)) for one in groups)):
-        raise ValueError(f"guarded groups must each name a component, got {groups}")
-    require(ratio >= 1.0, "guarded ratio must be at least 1", ratio)
-    for name, value in (("limit", limit), ("patience", patience), ("leap", leap)):
-        require(value > 0.0, f"guarded {name} must be positive", value)

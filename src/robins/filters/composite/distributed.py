@@ -12,7 +12,7 @@ the three readings are ``feedback``:
     full   each takes the fused mean and covariance: all information counted again at every step
 
 Locals with the same prior and process noise are not independent, so even the first is somewhat
-overconfident. The federated filter (`robins.filters.federated`) shares both out and is not;
+overconfident. The federated filter (`federated`) shares both out and is not;
 covariance intersection is safe whatever the correlation.
 
 States that only one local has (the errors of a wind that only its sensors see) cannot be fused:
@@ -29,19 +29,22 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
+from robins.errors import require
 from robins.filters.belief import Belief
-from robins.filters.channels import (
+from robins.filters.checks import one_of
+from robins.filters.composite.channels import (
     Channel,
     Fuse,
     Joined,
     Moved,
     concluded,
     local_dims,
+    members_of,
     owners,
     starting,
     updating,
 )
-from robins.filters.fusion import (
+from robins.filters.composite.fusion import (
     Criterion,
     check_criterion,
     common_information_sum,
@@ -85,14 +88,12 @@ def distributed(
         ValueError: a sensor in two channels, an unknown feedback, no common component; at `init`, a
             sensor without a channel, or a state with fewer components than are common.
     """
-    if feedback not in ("own", "mean", "full"):
-        raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
+    one_of("feedback", feedback, Feedback)
     if feedback == "full":
         warnings.warn(FULL, UserWarning, stacklevel=2)
     if common is None:
         return _side_by_side(channels, information_sum, feedback, "distributed")
-    if common < 1:
-        raise ValueError(f"distributed: at least one component must be common, got {common}")
+    require(common >= 1, "distributed: at least one component must be common", common)
     summed = partial(common_information_sum, common=common)
     return _side_by_side(channels, summed, feedback, "distributed", common)
 
@@ -116,8 +117,7 @@ def intersecting(
     Raises:
         ValueError: as `distributed`, or the criterion is none of these.
     """
-    if feedback not in ("own", "mean", "full"):
-        raise ValueError(f"feedback must be 'own', 'mean' or 'full', got {feedback!r}")
+    one_of("feedback", feedback, Feedback)
     check_criterion(criterion, len(channels))
 
     def intersect(beliefs: Sequence[Belief]) -> Belief:
@@ -163,9 +163,7 @@ def _side_by_side(
         return concluded(state, Moved(tuple(members), tuple(codes), fused, state.memory.shares))
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
-        joined: Joined = state.memory
-        pairs = zip(channels, joined.members, strict=True)
-        members = tuple(c.filter.reset(m, belief) for c, m in pairs)
-        return FilterState(belief, joined._replace(members=members))
+        return members(state)[1]([belief] * count, belief)
 
-    return in_step(Filter(init, predict, updating(channels, fuse, name), reset))
+    members = members_of([c.filter for c in channels])
+    return in_step(Filter(init, predict, updating(channels, fuse, name), reset, members))

@@ -1,13 +1,49 @@
-"""How much noise makes an innovation as likely as a limit says."""
+"""What robust rules share: parts of an innovation's covariance, heavier noise, wider priors."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg
-from robins.filters.observation import Normalised, Observation, normalised
+from robins.filters.belief import Belief
+from robins.filters.observation import Normalised, Observation, left_out, normalised, whiten
+
+
+class Shares(NamedTuple):
+    """Parts of S = H P H' + Omega + R in units of S = L L', where they add up to the identity.
+
+    With R and P rescaled, L^-1 S L^-T is a weighted sum of these parts: no subtraction, however
+    large the weights, and no factor larger than the measurement.
+    """
+
+    seen: Normalised  # the innovation, with L and w = L^-1 r
+    noise: Array  # (m, q) factor N of R, zero where not used
+    white_noise: Array  # (m, q) L^-1 N
+    prior: Array  # (m, m) L^-1 (H P H' + Omega) L^-T
+    idle: Array  # (m, m) ones on the diagonal where not used
+
+
+def shares(o: Observation) -> Shares:
+    """The parts of an innovation's covariance."""
+    # What `normalised` does, and its blocks again: looking for what is used twice costs time.
+    spread, excess, padded, deficit, used = left_out(o)
+    L = linalg.tria(spread, excess, padded)
+    if deficit is not None:
+        L = linalg.downdate(L, deficit)
+    seen, noise = whiten(L, used, o.residual), padded[:, : o.noise.shape[1]]
+    columns = [spread, excess, noise] + ([] if deficit is None else [deficit[:, None]])
+    white = linalg.solve_lower(L, jnp.concatenate(columns, axis=1))
+    known = spread.shape[1] + excess.shape[1]
+    W, rest = white[:, :known], white[:, known : known + noise.shape[1]]
+    prior = W @ W.T
+    if deficit is not None:
+        prior = prior - white[:, -1:] @ white[:, -1:].T
+    return Shares(seen, noise, rest, prior, jnp.diag(jnp.where(used, 0.0, 1.0)))
+
 
 MOST = 1e12  # noise raised this far is noise of infinity, and still leaves digits to compare with
 _STEPS = 40  # some four are needed; forty is a bound, not a plan
@@ -69,3 +105,29 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
     free = above & (s < MOST) & (slope > 0.0)
     turn = jnp.where(free, g / jnp.where(free, slope, 1.0), 0.0)
     return jnp.where(above, s + turn * (again * ratio - 1.0), 1.0)
+
+
+def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Array) -> Belief:
+    r"""The prior with a covariance D added to what some components see, where that is due.
+
+        P' = P + G D G',   G = P H' (H P H')^-1,   so that H G = I and H P' H' = H P H' + D,
+
+    H being the rows of those components. The state's other directions follow as far as they are
+    correlated with those seen; otherwise their variance stays. A component that is known exactly
+    stays so: its column of G is 0.
+
+    Args:
+        due: () bool; without it the prior stands.
+        prior: the belief.
+        o: the measurement as this belief sees it.
+        chosen: (m,) bool, the components.
+        root: (m, k) root of D; its other rows do not count.
+    """
+
+    def wider() -> Belief:
+        spread = jnp.where(chosen[:, None], o.spread, 0.0)
+        solid, _ = linalg.guard(spread, o.size)
+        G_root = prior.factor @ (spread.T @ linalg.solve_spd(solid, root))
+        return prior._replace(factor=linalg.tria(prior.factor, G_root))
+
+    return jax.lax.cond(due, wider, lambda: Belief(*prior))

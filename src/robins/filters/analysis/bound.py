@@ -3,7 +3,8 @@
 The recursion of the Kalman filter's covariance with the model linearised about the *true* states.
 For Gaussian noise of the stated size it is the posterior Cramer-Rao bound along that trajectory
 (Tichavsky, Muravchik & Nehorai 1998, eq. 34; Van Trees & Bell 2007, part I): no estimator that is
-told the same model has smaller mean square errors. For a linear model the Kalman filter reaches it.
+given the same model has smaller mean square errors. For a linear model the Kalman filter attains
+it.
 
 What was measured never enters, only which components were there. Where process noise depends on the
 state it is that at the true state.
@@ -175,8 +176,8 @@ def bound_along(
         factor: (n, n) of the prior covariance.
         use: (S,) bool, which sensors of the model to use, in its order, as `used_sensors` makes it;
             it is data, so a batch of subsets is one `jax.vmap`. All by default.
-        known: numbers of the tangent components that somebody else tells exactly, before every
-            prediction and every measurement.
+        known: numbers of the tangent components that are known exactly, before every prediction and
+            every measurement.
 
     Raises:
         ValueError: a component that is known does not exist.
@@ -188,7 +189,7 @@ def bound_along(
     use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
 
     def step(S: Array, row: Linearised):
-        predicted = _told(linalg.tria(row.F @ S, row.noise), known)
+        predicted = _given(linalg.tria(row.F @ S, row.noise), known)
         S = predicted
         for i, sight in enumerate(row.sights):
             if sight is not None:
@@ -196,15 +197,15 @@ def bound_along(
                 S = updated(seen.prior, seen, "sqrt")[0].factor
         return S, Bound(predicted, S)
 
-    return jax.lax.scan(step, _told(factor, known), line)[1]
+    return jax.lax.scan(step, _given(factor, known), line)[1]
 
 
-def _told(factor: Array, known: tuple[int, ...]) -> Array:
+def _given(factor: Array, known: tuple[int, ...]) -> Array:
     """Factor of what is left once some components of the error are known exactly."""
     if not known:
         return factor
     rows = jnp.eye(factor.shape[0])[np.array(known)]
     m = len(known)
-    told = Sight(rows, linalg.zeros(m, 0), jnp.ones(m, bool), jnp.zeros(m))
-    seen = told.seen_with(factor, jnp.ones((), bool))
+    exact = Sight(rows, linalg.zeros(m, 0), jnp.ones(m, bool), jnp.zeros(m))
+    seen = exact.seen_with(factor, jnp.ones((), bool))
     return updated(seen.prior, seen, "sqrt")[0].factor

@@ -1,4 +1,4 @@
-r"""The federated filter: local filters beside each other, and their information shared and fused.
+"""The federated filter: local filters beside each other, and their information shared and fused.
 
 Each local filter has sensors of its own, and a share of what is known and of the process noise, so
 that what they know is the whole when it is added up (Carlson 1990):
@@ -15,6 +15,20 @@ that what they know is the whole when it is added up (Carlson 1990):
 A local filter that measures nothing stays in the fusion: it holds a share of what was known, and to
 leave it out would multiply P by 1 / (1 - b_i). With linear models fusion-reset with scalar or root
 sharing, and zero-reset, *are* the centralised filter.
+
+A share a_ij in (0, 1) is what local filter i gets of the information about state j (or about all of
+them, b_i). Four ways to choose them (Zhao, Li & Wang 2016; Xiong et al. 2013):
+
+    equal          b_i  = 1 / N
+    trace          b_i  ~ 1 / tr P_i                        states scaled first
+    diagonal       a_ij ~ 1 / P_i,jj
+    observability  a_ij ~ sigma_ij,  sigma_ij^2 = (O_i' O_i)_jj,
+                   O_i = [R_i^-1/2 H_i; R_i^-1/2 H_i F; ...; R_i^-1/2 H_i F^(k-1)] D
+
+With a reset at every step and linear models shares cannot change the fused accuracy. They matter
+where a local filter judges its measurements by its own covariance, and where it is not reset. In
+terms of O = U S V' the last is sum_l S_l^2 V_jl^2: a singular value belongs to a direction, not to
+the state of the same number. D, the standard deviations of the belief, makes the states unit-free.
 """
 
 from __future__ import annotations
@@ -23,20 +37,104 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
 from robins.errors import require
-from robins.filters import channels as _channels
 from robins.filters.belief import Belief, Code, Number
-from robins.filters.channels import Channel, Joined, Moved, with_noise
-from robins.filters.fusion import Sharing, check_sharing, information_sum, part
+from robins.filters.checks import one_of
+from robins.filters.composite import channels as _channels
+from robins.filters.composite.channels import Channel, Moved, followed_by
+from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
 from robins.filters.kalman import Filter, FilterState, in_step, kalman
-from robins.filters.linearise import Linearisation
-from robins.filters.model import Motion, as_noise
-from robins.filters.shares import diagonal_shares, equal_shares, floored, trace_shares
+from robins.filters.linearise import Linearisation, taylor
+from robins.filters.model import Model, Motion
+
+# Without a floor a share of zero is an infinite covariance.
+FLOOR = 0.05
+
+
+def floored(weights: Array) -> Array:
+    """Shares from weights (N, ...): over N they sum to one, and none is below about `FLOOR`.
+
+    Where no filter has any weight, all get the same. Shares that sum to one and lie above the floor
+    come back unchanged but for rounding.
+    """
+    total = jnp.sum(weights, axis=0, keepdims=True)
+    some = total > 0.0
+    a = jnp.where(some, weights / jnp.where(some, total, 1.0), 1.0 / weights.shape[0])
+    a = jnp.maximum(a, FLOOR)
+    return a / jnp.sum(a, axis=0, keepdims=True)
+
+
+def equal_shares(count: int) -> Array:
+    """(N, 1), all the same."""
+    return jnp.full((count, 1), 1.0 / count)
+
+
+def trace_shares(beliefs: Sequence[Belief], sigma: Array) -> Array:
+    """(N, 1), inverse to the trace of each local covariance.
+
+    Args:
+        beliefs: of the local filters.
+        sigma: (n,) unit of each state, such as its fused standard deviation.
+    """
+    unit = jnp.where(sigma > 0.0, sigma, 1.0)
+    return floored(jnp.stack([1.0 / jnp.sum((b.sigma / unit) ** 2) for b in beliefs])[:, None])
+
+
+def diagonal_shares(beliefs: Sequence[Belief]) -> Array:
+    """(N, n), inverse to the variance of each state in each local filter."""
+    return floored(jnp.stack([1.0 / b.sigma**2 for b in beliefs]))
+
+
+def observability_shares(
+    model: Model,
+    belief: Belief,
+    channels: Sequence[Channel],
+    steps: int | None = None,
+    u: Any = None,
+    aux: dict[str, Any] | None = None,
+) -> np.ndarray:
+    """(N, n) shares by how well each channel sees each state; computed once, before a run.
+
+    A state that no channel sees is shared equally.
+
+    Args:
+        model: its motion and sensors, linearised at the belief.
+        belief: about which to linearise; its standard deviations are the units of the states.
+        channels: from `channel`.
+        steps: number k of blocks in O_i; by default n, the dimension of the state.
+        u: input of the motion for one step.
+        aux: what sensors need besides the state, by sensor name.
+
+    Raises:
+        KeyError: a channel names a sensor that the model has not.
+        ValueError: fewer than one step, or a sensor without noise, which sees infinitely well.
+    """
+    n = manifold.dim(belief.mean)
+    count = n if steps is None else steps
+    require(count >= 1, f"observability over {count} steps: at least one is wanted")
+    way, unit = taylor(), Belief(belief.mean, linalg.identity(n))
+    F = np.asarray(way.transition(unit, model.motion, u).spread)  # F times the identity
+    D = np.asarray(belief.sigma)
+    sees = np.zeros((len(channels), n))
+    for i, one in enumerate(channels):
+        for name in one.sensors:
+            sensor, extra = model.sensor(name), (aux or {}).get(name)
+            seen = way.observation(unit, sensor, sensor.read(belief.mean, extra), extra)
+            root = linalg.tria(seen.noise)
+            if not bool(jnp.all(jnp.diagonal(root) > 0.0)):
+                raise ValueError(f"sensor '{name}' has components without noise: give it some")
+            block = np.asarray(linalg.solve_lower(root, seen.spread))
+            for _ in range(count):
+                sees[i] += np.sum((block * D) ** 2, axis=0)
+                block = block @ F
+    return np.asarray(jax.device_get(floored(jnp.sqrt(jnp.asarray(sees)))))
+
 
 Mode = Literal["fusion-reset", "no-reset", "zero-reset", "rescale"]
 
@@ -78,7 +176,7 @@ def federated(
         mode: "fusion-reset", "no-reset", "zero-reset" or "rescale" (module docstring).
             Zero-reset leaves a local filter nothing to judge measurements by, and sigma points of
             an unknown state reach beyond any model: give it Taylor and no robust rules.
-        sharing: "root", "scalar" or "half"; how, see `robins.filters.fusion`.
+        sharing: "root", "scalar" or "half"; how, see `robins.filters.composite.fusion`.
         shares: "equal"; "trace" or "diagonal", from the local covariances at every step; or (N,) or
             (N, n) numbers that sum to one with the master's, such as `observability_shares`.
             Shares below 0.05 are raised to it.
@@ -97,10 +195,7 @@ def federated(
     """
     channels = tuple(channels)
     _channels.owners(channels)
-    if mode not in ("fusion-reset", "no-reset", "zero-reset", "rescale"):
-        raise ValueError(
-            "mode must be 'fusion-reset', 'no-reset', 'zero-reset' or 'rescale', got " + repr(mode)
-        )
+    one_of("mode", mode, Mode)
     check_sharing(sharing)
     _check_master(mode, shares, master, keep)
     fixed = _fixed_shares(shares, len(channels), master)
@@ -168,7 +263,7 @@ def federated(
         a = next_shares(state)
         members, codes = [], []
         for i, (f, member) in enumerate(zip(filters, begun(state, a), strict=True)):
-            own = with_noise(motion, lambda noise, i=i: part(noise, a, sharing)[i])
+            own = followed_by(motion, lambda noise, i=i: part(noise, a, sharing)[i])
             member, prediction = f.predict(member, own, u)
             members.append(member)
             codes.append(prediction.code)
@@ -181,7 +276,7 @@ def federated(
         beliefs = parted(common.belief, a)
         for f, member, belief in zip(filters, state.memory.members, beliefs, strict=True):
             code = int(Code.DONE)
-            if isinstance(member.memory, tuple) and not member.memory:  # no rules
+            if member.memory == ():  # a Kalman filter without rules
                 member = f.reset(member, belief)
             else:
                 own = True
@@ -200,13 +295,11 @@ def federated(
         return _channels.concluded(state, moved)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
-        joined: Joined = state.memory
-        beliefs = parted(belief, joined.shares)
-        members = [f.reset(m, b) for f, m, b in zip(filters, joined.members, beliefs, strict=True)]
-        return FilterState(belief, joined._replace(members=tuple(members)))
+        return members(state)[1](parted(belief, state.memory.shares), belief)
 
     update = _channels.updating(channels, information_sum, "federated")
-    return in_step(Filter(init, predict, update, reset))
+    members = _channels.members_of(filters)
+    return in_step(Filter(init, predict, update, reset, members))
 
 
 def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:
@@ -226,21 +319,11 @@ def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
     """
     solid, _ = linalg.guard(common.factor)
     T = linalg.solve_lower_transposed(solid, mine.factor.T).T
-    known = motion.linear
 
     def moved(x):
         return manifold.retract(common.mean, T @ manifold.local(common.mean, x))
 
-    def linear(x, u):
-        assert known is not None
-        mean, F, noise = known(x, u)
-        return moved(mean), T @ F, T @ as_noise(noise, F.shape[0], "the motion")
-
-    return Motion(
-        lambda x, u: moved(motion.step(x, u)),
-        lambda x, u: T @ motion.noise_factor(x, u),
-        None if known is None else linear,
-    )
+    return followed_by(motion, lambda noise: T @ noise, moved, lambda F: T @ F)
 
 
 def _check_master(mode: str, shares: Any, master: Number, keep: Number) -> None:

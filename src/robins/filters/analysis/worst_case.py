@@ -21,13 +21,19 @@ import scipy.linalg
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.kalman import kalman
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Model
-from robins.filters.rules._feasibility import first_infeasible, least_gamma
 from robins.filters.rules._inflation import as_weight
-from robins.filters.rules.h_infinity import Estimate, h_infinity, with_gamma
+from robins.filters.rules.h_infinity import (
+    Estimate,
+    first_infeasible,
+    h_infinity,
+    least_gamma,
+    with_gamma,
+)
 from robins.filters.run import Solution, run
 
 
@@ -298,8 +304,7 @@ def steady_h_infinity(
         ValueError: gamma is not positive, or no such filter exists.
     """
     F, Q, H, R, L = (np.asarray(a, dtype=float) for a in (F, Q, H, R, weight))
-    if not gamma > 0.0:
-        raise ValueError(f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    require(gamma > 0.0, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
     q = len(L)
     missing = f"no steady H-infinity filter with gamma = {gamma:g} exists: "
     C = np.concatenate([H, L / gamma])

@@ -30,6 +30,7 @@ from jaxtyping import Array
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, Code, Number, StepInfo
+from robins.filters.composite.mixture import innovation, log_normalised, matched
 from robins.filters.kalman import (
     Filter,
     FilterState,
@@ -39,11 +40,10 @@ from robins.filters.kalman import (
     updated,
 )
 from robins.filters.linearise import Linearisation, taylor
-from robins.filters.mixture import innovation, log_normalised, matched
 from robins.filters.model import Motion, Sensor
 from robins.filters.trees import finite, select
 
-_GENERATOR = "threefry2x32"  # named, so that a key gives the same draws whatever JAX is set to
+_GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
 
 
 class Cloud(NamedTuple):

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from robins import linalg, manifold
 from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.chi_square import chi_square
+from robins.filters.chi_square import chi2_band, chi_square
 from robins.manifold import State
 
 
@@ -41,17 +41,6 @@ def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Floa
     """
     solid, _ = linalg.guard(factor)
     return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
-
-
-def chi2_band(dof: ArrayLike, count: int = 1, level: float = 0.95) -> np.ndarray:
-    """Band that the mean of ``count`` independent chi-square(dof) numbers is in, at this level.
-
-    Returns:
-        (..., 2) lower and upper bound; divide by dof for a normalised statistic.
-    """
-    total = np.asarray(dof, dtype=float) * count
-    tail = (1.0 - level) / 2.0
-    return np.stack([chi_square(tail, total), chi_square(1.0 - tail, total)], -1) / count
 
 
 class Verdict(NamedTuple):

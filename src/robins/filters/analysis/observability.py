@@ -1,4 +1,4 @@
-r"""Observability: what the measurements of a window tell of the state at its beginning.
+r"""Observability: the information of a window's measurements about the state at its beginning.
 
 The observability Gramian of the linearised system, in units that make it comparable between states
 and between sensors (Ham & Brown 1983; Chen 1999, ch. 6),
@@ -10,8 +10,8 @@ An eigenvalue of W says how many times as much is measured of a direction as was
 below one the prior knows more.
 
 The Gramian itself is never summed up: Phi may grow without bound, and small eigenvalues would drown
-in the rounding of large ones. Carried are two factors, of the error e_0 at the beginning and e_k
-now, given the measurements so far and no process noise,
+in the rounding of large ones. The recursion carries two factors, of the error e_0 at the beginning
+and e_k now, given the measurements so far and no process noise,
 
     e_0 = D L_k z,  e_k = M_k z,  z ~ N(0, I),  L_k L_k' = (I + W_k)^-1.
 
@@ -31,8 +31,9 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg
+from robins.errors import require
+from robins.filters.analysis.bound import Linearised, linearised
 from robins.filters.belief import Belief
-from robins.filters.bound import Linearised, linearised
 from robins.filters.model import Model
 from robins.filters.observation import left_out
 from robins.manifold import State
@@ -56,7 +57,7 @@ def observability(
     Args:
         model: the motion and the sensors.
         start: belief before the first step; its standard deviations are the units.
-        truth: as `robins.filters.bound.linearised` takes it, and so y, u and aux.
+        truth: as `robins.filters.analysis.bound.linearised` takes it, and so y, u and aux.
         y: by sensor name.
         u: inputs of the motion.
         aux: what sensors need besides the state.
@@ -79,7 +80,7 @@ def observability_along(
     """The same of a model that has been linearised; one scan.
 
     Args:
-        line: from `robins.filters.bound.linearised`.
+        line: from `robins.filters.analysis.bound.linearised`.
         sigma: (n,) units of the states, their prior standard deviations.
         use: (S,) bool, which sensors of the model to use, in its order; all by default.
         window: number of steps after which to begin anew, each window with the same units. By
@@ -89,8 +90,7 @@ def observability_along(
     Raises:
         ValueError: a window is shorter than a step.
     """
-    if window is not None and window < 1:
-        raise ValueError(f"a window of {window} steps: at least one is wanted")
+    require(window is None or window >= 1, f"a window of {window} steps: at least one is wanted")
     unit, D = linalg.identity(sigma.shape[0]), jnp.diag(sigma)
     use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
 

@@ -1,8 +1,8 @@
 """Hold a belief to an equality: exact or noisy, linear or not, nearest in any metric.
 
 A constraint g(x) = d is a measurement of g that reads d, without noise if it is exact. So it is
-linearised and used as one, and what is known of it already is left out as there. Only its gain may
-be another: with V = P the constrained state is the most probable one, with V = W^-1 the one nearest
+linearised and used as one, and components that are known already are left out. Only its gain may
+differ: with V = P the constrained state is the most probable one, with V = W^-1 the one nearest
 to the mean in the metric W,
 
     G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.iterated import iterated
 from robins.filters.kalman import updated
@@ -120,13 +121,7 @@ def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array]:
 
 
 def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[Sensor, Any]:
-    """A constraint as a sensor, and what that sensor reads.
-
-    Raises:
-        ValueError: a matrix is not of the state's dimension or is given for a state that holds
-            elements, a function has values in elements and nothing says which, or the noise is not
-            one of the constraint.
-    """
+    """A constraint as a sensor, and what that sensor reads."""
     read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
     c = manifold.dim(value)
     if d is not None:
@@ -134,7 +129,7 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[
             lambda x: jnp.asarray(x, float), d, is_leaf=lambda x: isinstance(x, list)
         )
     elif any(manifold.is_element(leaf) for leaf in manifold.leaves(value)):
-        raise ValueError("a constraint on angles or rotations wants to be told d, its value")
+        raise ValueError("a constraint on angles or rotations needs d, its value")
     else:
         target = jax.tree_util.tree_map(jnp.zeros_like, value)
     root = linalg.zeros(c, 0) if noise is None else as_noise(noise, c, "the constraint")
@@ -171,8 +166,7 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
         unit = linalg.identity(n)
         return Belief(belief.mean, unit), unit
     W = jnp.asarray(weight, float)
-    if W.shape != (n, n):
-        raise ValueError(f"weight is {W.shape}, the state needs ({n}, {n})")
+    require(W.shape == (n, n), f"weight is {W.shape}, the state needs ({n}, {n})")
     root = linalg.cholesky(W)
     return Belief(belief.mean, linalg.solve_lower_transposed(root, linalg.identity(n))), root
 
@@ -218,11 +212,7 @@ def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
 
 
 def check_weight(rule: str, weight: Weight, n: int | None = None) -> None:
-    """The metric W of a rule; with n, whether it fits a state of that dimension.
-
-    Raises:
-        ValueError: a name that is none, or a matrix that is not positive definite or not (n, n).
-    """
+    """The metric W of a rule; with n, whether it fits a state of that dimension."""
     if isinstance(weight, str):
         if weight not in ("covariance", "identity"):
             raise ValueError(
