@@ -12,13 +12,11 @@ from robins.systems.transfer_alignment import (
     matching_parameters,
     patent,
     patent_claims,
-    product_claims,
-    product_filters,
 )
 from robins.systems.transfer_alignment.matching import matching_problem
 from robins.systems.transfer_alignment.matching_parameters import Matching
-from robins.systems.transfer_alignment.pair_replay import ALIGNMENT, orientation
-from robins.systems.transfer_alignment.product_problem import Product, product_problem
+from robins.systems.transfer_alignment.product import study as product
+from robins.systems.transfer_alignment.product.log import ALIGNMENT, orientation
 
 SYSTEM = System(
     name="transfer-alignment",
@@ -29,7 +27,7 @@ SYSTEM = System(
         "velocity-attitude": Study(
             patent.Patent, patent.patent_problem, patent.FILTERS, patent_claims.CLAIMS
         ),
-        "product": Study(Product, product_problem, product_filters.FILTERS, product_claims.CLAIMS),
+        "product": product.STUDY,
     },
     orientation=orientation,
     alignment=ALIGNMENT,

@@ -35,7 +35,6 @@ from robins.filters import Belief, Filter, gamma_min, kalman
 from robins.filters.rules import adaptive_h_infinity, h_infinity
 from robins.ins.frames import swap, swap_q
 from robins.ins.increments import Increments
-from robins.ins.mechanise import Nav
 from robins.results import array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
@@ -49,12 +48,15 @@ from robins.systems.transfer_alignment.open_loop import (
     start_with_error,
     true_errors,
 )
-from robins.systems.transfer_alignment.pair import PairRun, simulate_pair
-from robins.systems.transfer_alignment.pair_answer import SENSORS as PRODUCT_SENSORS
-from robins.systems.transfer_alignment.pair_course import Course, lay_out
-from robins.systems.transfer_alignment.pair_parameters import Disturbance, PairParameters, Structure
 from robins.systems.transfer_alignment.patent_claims import CLAIMS, patent_metrics
-from robins.systems.transfer_alignment.product_filters import product_contender
+from robins.systems.transfer_alignment.product.parameters import (
+    Disturbance,
+    PairParameters,
+    Structure,
+)
+from robins.systems.transfer_alignment.product.study import SENSORS as PRODUCT_SENSORS
+from robins.systems.transfer_alignment.product.study import product_contender
+from robins.systems.transfer_alignment.product.world import Course, PairRun, lay_out, simulate_pair
 
 ENU = ("east", "north", "up")
 RFU = ("right", "forward", "up")
@@ -85,7 +87,7 @@ ADAPTIVE: dict[str, dict[str, Any]] = {
     "hinf-patent-weights": {"weight": np.ones(va.STATES)},  # L = I, and R = I below
 }
 TOLD = {"kf": (), "kf-told-r": ("r",), "kf-told-q": ("q",), "kf-told-both": ("r", "q")}
-# Of `product_filters`: closed loop, with states for the mounting; the second costs seven filters.
+# Of `product.filters`: closed loop, with states for the mounting; the second costs seven filters.
 PRODUCT = ("product", "product-adaptive")
 FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
@@ -127,17 +129,19 @@ def simulate(given: Patent, course: Course, seed: int, index: Array) -> World:
     pair = simulate_pair(given, course, seed, index)
     loop = navigate(start_with_error(pair.start, pair.initial_error), pair.increments)
     own = loop.nav
-    master_q = multiply(pair.master_q_nb, jnp.asarray(course.q_nominal))  # as the slave's box sits
-    master = Nav(Rotation(master_q), pair.master_v_n, pair.master_position)
+    # as the slave's box sits
+    master_q = multiply(pair.master.q_nb.wxyz, jnp.asarray(course.q_nominal))
+    master = pair.master._replace(q_nb=Rotation(master_q))
     flight, C_nb = as_master_sees(loop, master)
-    t = pair.truth
+    assert pair.truth is not None
+    t = pair.truth.ins
     return World(
         pair=pair,
         flight=flight,
         C_nb=C_nb,
-        velocity=swap(own.v_n - pair.master_v_n)[..., :2],
+        velocity=swap(own.v_n - pair.master.v_n)[..., :2],
         attitude=va.euler_difference(swap_q(own.q_nb.wxyz), swap_q(master_q)),
-        error=true_errors(own, t.q_nb, t.v_n, t.position, t.gyro_bias, t.accel_bias),
+        error=true_errors(own, t.q_nb.wxyz, t.v_n, t.position, t.gyro_bias, t.accel_bias),
     )
 
 
