@@ -115,10 +115,10 @@ def test_lock_step_has_the_bits_of_one_program_even_if_a_part_is_stopped(plain):
 
 def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
     from robins.campaign.monte_carlo import record, worlds
-    from robins.systems.satellite.problem import attitude_problem
+    from robins.systems.satellite.study import STUDY
 
     done, _ = plain
-    problem = attitude_problem(flight().loop, ("mekf",), 0)
+    problem = STUDY.problem(flight().loop, ("mekf",), 0)
     ((world, count),) = worlds(problem, 1)
     found = record(problem, "mekf", world, count)
     for flown, wanted in (

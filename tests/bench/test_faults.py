@@ -15,8 +15,9 @@ from robins.bench.wire import Frame, Header, Receiver
 from robins.rotation import from_rotvec, multiply
 from robins.scenario import Parameters, ScenarioError, parse
 from robins.systems.satellite import nodes
-from robins.systems.satellite.course import Step, _star_says
+from robins.systems.satellite.nodes import Step
 from robins.systems.satellite.parameters import Star
+from robins.systems.satellite.world import _star_says
 
 S = 10**9
 WORKING = np.arange(1.0, 5.0)

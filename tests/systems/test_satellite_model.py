@@ -13,7 +13,7 @@ from robins.filters.linearise import taylor
 from robins.manifold import local, retract
 from robins.rotation import BodyRotation, multiply
 from robins.systems.satellite import design
-from robins.systems.satellite.design import Believed, Recipe
+from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.model import (
     AttitudeState,
     QuaternionState,
@@ -105,7 +105,7 @@ def test_both_forms_of_the_state_predict_alike():
 
 # -------------------------------------------------------------------------------------- the gains
 
-BELIEVED = Believed(1.2 * ARCSEC, equivalent_walk(0.005, 0.3, 300.0) * ARCSEC, 0.5, tuple(STAR))
+BELIEVED = SensorNoise(1.2 * ARCSEC, equivalent_walk(0.005, 0.3, 300.0) * ARCSEC, 0.5, tuple(STAR))
 
 
 def test_markov_drift_as_a_walk():
@@ -120,7 +120,7 @@ def test_markov_drift_as_a_walk():
     ],
 )
 def test_gains_with_n_on_the_bias(share, across, about):
-    K = design.gain(BELIEVED, Recipe("riccati", share, "bias"))
+    K = design.gain(BELIEVED, GainSpec("riccati", share, "bias"))
     for i, wanted in ((0, across), (1, across), (2, about)):
         np.testing.assert_allclose(K[[i, 3 + i], i], wanted, rtol=2e-3)
     off = K.copy()
@@ -134,12 +134,12 @@ def test_gains_against_the_riccati_equation_of_scipy():
     Q = walk_covariance(1.2, BELIEVED.rate_walk / ARCSEC, 0.5)
     P = scipy.linalg.solve_discrete_are(A.T, np.array([[1.0], [0.0]]), Q, np.array([[100.0]]))
     K = P[:, :1] / (P[0, 0] + 100.0)
-    np.testing.assert_allclose(design.gain(BELIEVED, Recipe("h2"))[[0, 3], 0], K[:, 0], rtol=1e-8)
+    np.testing.assert_allclose(design.gain(BELIEVED, GainSpec("h2"))[[0, 3], 0], K[:, 0], rtol=1e-8)
 
 
 def test_inflated_noise_makes_these_gains():
     # A Kalman filter with Q + (sqrt(lambda) Bn)(...)' settles on the gain of the design.
-    recipe = Recipe("riccati", 0.25, "bias")
+    recipe = GainSpec("riccati", 0.25, "bias")
     more = design.inflation(BELIEVED, recipe) / ARCSEC
     A = np.array([[1.0, -0.5], [0.0, 1.0]])
     for i, sigma in ((0, 10.0), (2, 40.0)):
@@ -151,17 +151,17 @@ def test_inflated_noise_makes_these_gains():
 
 
 def test_raw_takes_the_star_sensor_at_its_word():
-    K = design.gain(BELIEVED, Recipe("raw"))
+    K = design.gain(BELIEVED, GainSpec("raw"))
     np.testing.assert_array_equal(K, np.concatenate([np.eye(3), np.zeros((3, 3))]))
-    assert design.facts(BELIEVED, Recipe("raw")) == {}
+    assert design.facts(BELIEVED, GainSpec("raw")) == {}
 
 
 def test_facts_are_certified_norms():
-    found = design.facts(BELIEVED, Recipe("riccati", 0.5))
+    found = design.facts(BELIEVED, GainSpec("riccati", 0.5))
     assert found["worst_case_share"] == pytest.approx(0.5, rel=1e-6)
     # the covariance of the error at frames, by running its recursion
     total = 0.0
-    K = design.gain(BELIEVED, Recipe("riccati", 0.5))
+    K = design.gain(BELIEVED, GainSpec("riccati", 0.5))
     A = np.array([[1.0, -0.5], [0.0, 1.0]])
     Q, H = walk_covariance(1.2, BELIEVED.rate_walk / ARCSEC, 0.5), np.array([[1.0, 0.0]])
     for i, sigma in enumerate((10.0, 10.0, 40.0)):

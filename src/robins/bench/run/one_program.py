@@ -17,14 +17,14 @@ from robins.systems.satellite.nodes import STAR, react
 def in_process(flight: Flight, kit: Kit) -> Flown:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
     loop = Loop(
-        jax.tree_util.Partial(partial(react, kit.kind), kit.given),
+        jax.tree_util.Partial(partial(react, kit.form), kit.given),
         kit.vehicle,
         kit.rows,
         {STAR: kit.due},
     )
     done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
     mean, said = done.steps.mean, done.readings
-    q_est = as_numpy(jax.jit(jax.vmap(kit.kind.attitude))(mean))
+    q_est = as_numpy(jax.jit(jax.vmap(kit.form.attitude))(mean))
     q = np.asarray(jax.tree_util.tree_leaves(said.truth)[0])  # first of the state of each kind
     steps = len(q)
     none = np.full((steps, 3), np.nan)
@@ -33,7 +33,7 @@ def in_process(flight: Flight, kit: Kit) -> Flown:
         q_ib=np.asarray(q),
         omega_b=none,
         q_est_ib=np.asarray(q_est),
-        bias=np.asarray(kit.kind.bias(mean)),
+        bias=np.asarray(kit.form.bias(mean)),
         sigma=np.full((steps, 6), np.nan),
         flags=np.zeros(steps, np.int64),
         innovation=none,

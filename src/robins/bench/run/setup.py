@@ -25,8 +25,8 @@ from robins.bench.wire.schema import PARTS
 from robins.scenario import Parameters, Quantity, ScenarioError, default
 from robins.sim.rate_table import RateTable, rate_table
 from robins.systems.satellite import SYSTEM
-from robins.systems.satellite.filters import KINDS
 from robins.systems.satellite.parameters import AttitudeLoop
+from robins.systems.satellite.study import FILTERS
 
 Clock = Literal["lockstep", "realtime"]
 NODES = PARTS[1:]
@@ -90,12 +90,12 @@ class Setup(Parameters):
             raise ValueError(f"ports: there is no part '{unknown[0]}', only {', '.join(NODES)}")
         if self.rate is not None and self.clock == "lockstep":
             raise ValueError('rate: a clock in lock-step has none; choose the clock "realtime"')
-        if self.filter not in KINDS:
-            near = difflib.get_close_matches(self.filter, KINDS, 1)
+        if self.filter not in FILTERS:
+            near = difflib.get_close_matches(self.filter, FILTERS, 1)
             guess = f"; did you mean '{near[0]}'?" if near else "."
             raise ValueError(
                 f"filter: no filter '{self.filter}' for the satellite{guess} It has "
-                f"{', '.join(KINDS)}"
+                f"{', '.join(FILTERS)}"
             )
         return self
 

@@ -10,14 +10,14 @@ start much sooner without the campaign's packages.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robins.systems.satellite.system import SYSTEM
+    from robins.systems.satellite.study import SYSTEM
 
 __all__ = ["SYSTEM"]
 
 
 def __getattr__(name: str) -> Any:
     if name == "SYSTEM":
-        from robins.systems.satellite.system import SYSTEM
+        from robins.systems.satellite.study import SYSTEM
 
         return SYSTEM
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -14,19 +14,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from robins.filters.synthesis import Design, Plant, current_form, kalman_design, observer, riccati
-from robins.systems.satellite.filters import Enters, Recipe
-from robins.systems.satellite.model import walk_covariance
-from robins.systems.satellite.parameters import AttitudeLoop
-
-_ARCSEC = math.pi / 648000.0
+from robins.systems.satellite.model import ARCSEC, walk_covariance
 
 
-class Believed(NamedTuple):
+class GainSpec(NamedTuple):
+    """How the gain of an axis is found."""
+
+    method: Literal["raw", "h2", "lmi", "riccati"]
+    share: float = 1.0  # gamma over the H-infinity norm that the Kalman filter of the axis has
+    enters: Literal["rate", "bias"] = "rate"  # where the modelling error n does
+
+
+class SensorNoise(NamedTuple):
     """What is believed of gyro and star sensor, SI; hashable, for gains are kept."""
 
     random_walk: float
@@ -35,80 +39,75 @@ class Believed(NamedTuple):
     star_rad: tuple[float, float, float]
 
 
-def axis_plant(b: Believed, star_rad: float, enters: Enters) -> Plant:
+def axis_plant(b: SensorNoise, star_rad: float, enters: str) -> Plant:
     """Of one axis, in current form, arcsec and s."""
     T = b.period_s
-    Q = walk_covariance(b.random_walk / _ARCSEC, b.rate_walk / _ARCSEC, T)
+    Q = walk_covariance(b.random_walk / ARCSEC, b.rate_walk / ARCSEC, T)
     Bn = {"rate": [[T], [0.0]], "bias": [[-0.5 * T**2], [T]]}[enters]
     return current_form(
         np.array([[1.0, -T], [0.0, 1.0]]),
         np.linalg.cholesky(Q),
         np.array(Bn),
         np.array([[1.0, 0.0]]),
-        np.array([[star_rad / _ARCSEC]]),
+        np.array([[star_rad / ARCSEC]]),
         L=np.array([[1.0, 0.0]]),
     )
 
 
 @cache
-def axis_design(b: Believed, star_rad: float, recipe: Recipe) -> Design:
+def axis_design(b: SensorNoise, star_rad: float, spec: GainSpec) -> Design:
     """Gain and certified norms of one axis.
 
     Raises:
         robins.filters.synthesis.programs.MissingExtra: a design by LMI without the extra "lmi".
         robins.filters.synthesis.Unreachable: no gain of this way has such a worst case.
     """
-    plant = axis_plant(b, star_rad, recipe.enters)
+    plant = axis_plant(b, star_rad, spec.enters)
     best = kalman_design(plant)
-    if recipe.way == "h2":
+    if spec.method == "h2":
         return best
-    gamma = recipe.share * best.hinf
-    if recipe.way == "riccati":
+    gamma = spec.share * best.hinf
+    if spec.method == "riccati":
         return riccati(plant, gamma)
     return observer(plant, gamma, "common")
 
 
-def gain(b: Believed, recipe: Recipe) -> np.ndarray:
+def gain(b: SensorNoise, spec: GainSpec) -> np.ndarray:
     """(6, 3) gain of attitude and bias [1, 1/s] on what the star sensor reads."""
     K = np.zeros((6, 3))
     for i, star_rad in enumerate(b.star_rad):
         one = np.array([1.0, 0.0])
-        if recipe.way != "raw":
-            one = axis_design(b, star_rad, recipe).gain[:, 0]
+        if spec.method != "raw":
+            one = axis_design(b, star_rad, spec).gain[:, 0]
         K[i, i], K[3 + i, i] = one
     return K
 
 
-def inflation(b: Believed, recipe: Recipe) -> np.ndarray:
+def inflation(b: SensorNoise, spec: GainSpec) -> np.ndarray:
     """(6, 3) factor of the noise per frame that makes a Kalman filter of these gains, SI.
 
     sqrt(lambda) Bn of each axis, for a Riccati design.
     """
     B = np.zeros((6, 3))
     for i, star_rad in enumerate(b.star_rad):
-        lambda_ = axis_design(b, star_rad, recipe).lambda_
-        column = axis_plant(b, star_rad, recipe.enters).Bn[:, 0]
-        B[[i, 3 + i], i] = math.sqrt(lambda_) * column * _ARCSEC
+        lambda_ = axis_design(b, star_rad, spec).lambda_
+        column = axis_plant(b, star_rad, spec.enters).Bn[:, 0]
+        B[[i, 3 + i], i] = math.sqrt(lambda_) * column * ARCSEC
     return B
 
 
-def facts(b: Believed, recipe: Recipe) -> Mapping[str, Any]:
+def facts(b: SensorNoise, spec: GainSpec) -> Mapping[str, Any]:
     """What the certified norms say of a filter, for its metrics.
 
     ``predicted_rms_arcsec``: the H2 norms of the three axes as one, the error at star frames if the
     noise is as believed. ``worst_case_share``: the H-infinity norm over that of the Kalman filter,
     of the worst axis.
     """
-    if recipe.way == "raw":
+    if spec.method == "raw":
         return {}
-    designs = [axis_design(b, star_rad, recipe) for star_rad in b.star_rad]
-    best = [kalman_design(axis_plant(b, star_rad, recipe.enters)) for star_rad in b.star_rad]
+    designs = [axis_design(b, star_rad, spec) for star_rad in b.star_rad]
+    best = [kalman_design(axis_plant(b, star_rad, spec.enters)) for star_rad in b.star_rad]
     return {
         "predicted_rms_arcsec": float(np.sqrt(sum(d.h2**2 for d in designs))),
         "worst_case_share": max(d.hinf / k.hinf for d, k in zip(designs, best, strict=True)),
     }
-
-
-def believed(given: AttitudeLoop, walk: float) -> Believed:
-    """From the parameters, with a believed random walk of the rate."""
-    return Believed(given.gyro.random_walk, walk, given.star.period, given.star.noise)

@@ -1,4 +1,4 @@
-"""The states of the filters and what they believe of gyro and star sensor.
+"""The filters of the satellite: their states, and what they believe of gyro and star sensor.
 
 The attitude q_ib maps body to inertial, its error is seen in the body: q = q^ exp(dtheta). Over a
 sample of length T the gyro reports theta, and of attitude and bias b
@@ -16,7 +16,8 @@ Markley & Crassidis 2014, eq. 6.93) is exact at rest:
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,9 +25,15 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters import Belief, Model, Motion, Sensor
-from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, to_dcm
-from robins.systems.satellite.nodes import STAR, Kind
+from robins.filters import Belief, Filter, Model, Motion, Sensor, kalman, taylor
+from robins.filters.rules import constant_gain, gate
+from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
+from robins.systems.satellite.nodes import STAR, StateForm
+
+ARCSEC = math.pi / 648000.0
+GATE = 0.9999962  # chi-square of 3 at 27.9
+PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
+Build = Literal["mekf", "quaternion", "gated", "fixed", "fixed-gated"]
 
 
 class AttitudeState(NamedTuple):
@@ -87,16 +94,10 @@ def _linear(noise: Noise, x: AttitudeState, theta: Array):
     turn = _turn(x, theta, noise)
     back = to_dcm(conjugate(from_rotvec(turn)))
     # the right Jacobian to first order of the turn: I - [turn]x/2
-    J = jnp.eye(3) - 0.5 * _skew(turn)
+    J = jnp.eye(3) - 0.5 * skew(turn)
     top = jnp.concatenate([back, -T * J], axis=1)
     low = jnp.concatenate([jnp.zeros((3, 3)), jnp.eye(3)], axis=1)
     return moved, jnp.concatenate([top, low]), noise.factor
-
-
-def _skew(v: Array) -> Array:
-    x, y, z = v[0], v[1], v[2]
-    none = jnp.zeros(())
-    return jnp.stack([none, -z, y, z, none, -x, -y, x, none]).reshape(3, 3)
 
 
 def _read(x: AttitudeState, aux: Any) -> BodyRotation:
@@ -140,13 +141,13 @@ def _rows_additive(q_ib: Array) -> Array:
     return rows.at[:3, :4].set(2.0 * xi(q_ib).T).at[3:, 4:].set(jnp.eye(3))
 
 
-MULTIPLICATIVE = Kind(
+MULTIPLICATIVE = StateForm(
     attitude=lambda x: x.attitude.wxyz,
     bias=lambda x: x.gyro_bias,
     state=lambda q, b: AttitudeState(BodyRotation(q), b),
     rows=_none,
 )
-ADDITIVE = Kind(
+ADDITIVE = StateForm(
     attitude=lambda x: normalise(x.q_ib),
     bias=lambda x: x.gyro_bias,
     state=QuaternionState,
@@ -177,3 +178,12 @@ def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = Fals
     attitude = linalg.tria(0.5 * sizes[0] * xi(q_ib))
     factor = jnp.zeros((7, 7)).at[:4, :4].set(attitude).at[4:, 4:].set(jnp.diag(sizes[3:]))
     return Belief(QuaternionState(q_ib, jnp.zeros(3)), factor)
+
+
+@cache  # made before a run is traced: a rule checks its gain, which a trace cannot
+def make_filter(build: Build) -> Filter:
+    """The filter of a build; those that differ in their gains share it, for a gain is data."""
+    reopened = gate(GATE, PATIENCE, "reinitialise")
+    held = constant_gain({STAR: np.zeros((6, 3))})
+    rules = {"gated": [reopened], "fixed": [held], "fixed-gated": [reopened, held]}
+    return kalman(taylor(), rules.get(build, []))

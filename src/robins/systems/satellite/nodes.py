@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
+from robins.earth.star_index import StarIndex
 from robins.filters import Belief, Reading
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.sim.attitude_control import Controller, allocate_within, desaturation_dipole, torque
@@ -31,11 +32,42 @@ from robins.sim.spacecraft import (
     wheels_after,
     wheels_give,
 )
-from robins.sim.star_sensor import measure_attitude, read_star
-from robins.systems.satellite.driven import Lens, Step
+from robins.sim.star_sensor import StarCamera, measure_attitude, read_star
 
-STAR = "star"
+STAR = "star"  # the sensor
 UNIT = 1e-3  # that the length of a quaternion may be off by
+
+
+class StarSays(NamedTuple):
+    """What the star sensor makes of the truth at the end of a step, besides noise."""
+
+    seen: Array  # () bool, whether there is a frame
+    stuck: Array  # () bool, whether it is the last one again
+    turn: Array  # (3,) rad, rotation vector in sensor axes
+    factor: Array  # () of the components of the quaternion: 1, -1, or wrong
+
+
+class Step(NamedTuple):
+    """What acts in a step, from outside; with leading axis E in a course."""
+
+    ref_q_ib: Array  # (4,) wanted attitude at its beginning
+    ref_omega_b: Array  # (3,) its rate
+    ref_alpha_b: Array  # (3,) and angular acceleration
+    ref_end_q_ib: Array  # (4,) wanted attitude at its end
+    r_i_m: Array  # (3,) place in the middle of it
+    field_i_t: Array  # (3,) magnetic field there
+    disturbance_b: Array  # (3,) N m
+    wheel_works: Array  # (W,) 1, or 0 for a wheel that gives no torque
+    star: StarSays
+    number: Array  # () of the step, from 0
+
+
+class Lens(NamedTuple):
+    """The camera of a star sensor, and how it knows its stars."""
+
+    camera: StarCamera
+    sky: StarIndex
+    match_rad: Array  # () how near a star must be to where it is expected
 
 
 class Command(NamedTuple):
@@ -54,16 +86,16 @@ class Actuation(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Numbers of the loop that stay the same."""
+    """Numbers of the loop that stay the same in a run; the gyro and the stars are drawn for it."""
 
     craft: Spacecraft
     control: Controller
     pinv: Array  # (W, 3)
     step_s: Array  # ()
     quantum_rad: Array  # () of the gyro
-    gyro_matrix: Array  # (3, 3)
-    star_key: Array
     lens: Lens | None = None  # where the star sensor is a camera
+    gyro_matrix: Any = None  # (3, 3) scale factor errors and misalignments, of a run
+    star_key: Any = None  # of what a camera sees, of a run
 
 
 class Row(NamedTuple):
@@ -195,8 +227,8 @@ def begin(given: Given, craft: CraftState) -> Vehicle:
     return Vehicle(craft, jnp.zeros(3), theta, craft.q_ib)
 
 
-class Kind(NamedTuple):
-    """How a filter's state is read and its truth is written."""
+class StateForm(NamedTuple):
+    """How the state of a filter is read and its truth is written."""
 
     attitude: Callable[[Any], Array]  # mean -> q_ib
     bias: Callable[[Any], Array]
@@ -210,9 +242,9 @@ def apart(node: Callable, *args: Any) -> Any:
     return settled(node(*settled(args)))
 
 
-def react(kind: Kind, given: Given, v: Vehicle, belief: Belief, row: Row):
+def react(form: StateForm, given: Given, v: Vehicle, belief: Belief, row: Row):
     """The loop one step on: control acts on what is believed, sensors see what comes of it."""
-    q, bias = apart(kind.attitude, belief.mean), kind.bias(belief.mean)
+    q, bias = apart(form.attitude, belief.mean), form.bias(belief.mean)
     command = apart(acm, given, q, bias, v.theta, v.craft.wheel_h, row.course)
     acts = apart(actuators, given, v.craft.wheel_h, command, row.course)
     craft = apart(plant, given, v.craft, acts, row.course)
@@ -227,8 +259,8 @@ def react(kind: Kind, given: Given, v: Vehicle, belief: Belief, row: Row):
         u=theta,
         y={STAR: believable(frame.q_ib)},
         aux={} if frame.factor is None else {STAR: frame.factor},
-        truth=kind.state(craft.q_ib, row.gyro_bias),
-        rows=kind.rows(craft.q_ib),
+        truth=form.state(craft.q_ib, row.gyro_bias),
+        rows=form.rows(craft.q_ib),
         outputs=outputs,
     )
     return Vehicle(craft, residue, theta, frame.seen_q_ib), reading

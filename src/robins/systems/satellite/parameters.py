@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Entry, Parameters, Positive, Quantity, Span, default
-from robins.systems.parts import refuse_too_long, refuse_unsettled
+from robins.systems.parts import Three, refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
-Three = tuple[float, float, float]
 _TILTED = (3.0**-0.5, 3.0**-0.5, 3.0**-0.5)
 
 
@@ -182,10 +181,10 @@ class Believed(Parameters):
 class AttitudeLoop(Scenario, Parameters):
     """A satellite in closed loop."""
 
-    system: Literal["satellite"] = "satellite"
-    study: Literal["attitude-loop"] = "attitude-loop"
+    system: str = "satellite"
+    study: str = "attitude-loop"
     title: str = "Satellite attitude"
-    claims: tuple[str, ...] = ()  # ids of those the scenario checks
+    claims: tuple[str, ...] | None = ()
     duration: Annotated[float, Quantity("time", above="0 s")] = default("1500 s")
     step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
     counted_from: Annotated[float, Quantity("time", least="0 s")] = default("500 s")

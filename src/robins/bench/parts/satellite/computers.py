@@ -24,8 +24,7 @@ from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState
 from robins.rotation import normalise
 from robins.systems.satellite import nodes
-from robins.systems.satellite.filters import GATE, make_filter
-from robins.systems.satellite.model import start
+from robins.systems.satellite.model import GATE, make_filter, start
 from robins.systems.satellite.nodes import STAR, Command, Given, Row
 
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
@@ -52,19 +51,19 @@ class Determined(NamedTuple):
 
 def adm(kit: Kit) -> Part:
     """Attitude determination: predicts with the gyro, updates with the star sensor."""
-    kind, additive = kit.kind, kit.build == "quaternion"
+    form, additive = kit.form, kit.build == "quaternion"
     online = OnlineFilter(kit.filter, kit.model, kit.start)
     first = online.state
     period = int(np.max(np.diff(np.flatnonzero(kit.due)), initial=1))
 
-    attitude = jax.jit(kind.attitude)
+    attitude = jax.jit(form.attitude)
 
     @jax.jit
     def report(belief: Belief):
-        q = nodes.apart(kind.attitude, belief.mean)  # as in `nodes.react`
-        rows = kind.rows(q)
+        q = nodes.apart(form.attitude, belief.mean)  # as in `nodes.react`
+        rows = form.rows(q)
         factor = belief.factor if rows is None else rows @ belief.factor
-        return q, kind.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
+        return q, form.bias(belief.mean), jnp.sqrt(jnp.sum(factor * factor, -1))
 
     # A filter that refuses a frame does not say how far off it is; one without rules does.
     plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
@@ -79,7 +78,7 @@ def adm(kit: Kit) -> Part:
         q = normalise(q_ib)
         believed = start(q, kit.attitude_rad, 0.0, additive)
         old = state.belief
-        mean = kind.state(q, bias)
+        mean = form.state(q, bias)
         block = believed.factor.shape[-1] - 3
         factor = believed.factor.at[block:, :].set(old.factor[block:, :])
         return state._replace(belief=Belief(mean, factor))
@@ -99,7 +98,7 @@ def adm(kit: Kit) -> Part:
                 flags |= SHORT
             if lost and heard and trusted(gyro):
                 online.state, lost = (
-                    fresh(frame["q_ib"], kind.bias(online.belief.mean), first),
+                    fresh(frame["q_ib"], form.bias(online.belief.mean), first),
                     False,
                 )
                 flags |= USED
@@ -171,8 +170,8 @@ def acm(kit: Kit) -> Part:
     vehicle = kit.vehicle
     wheels = len(vehicle.craft.wheel_h)
     mean = kit.belief.mean
-    q0 = np.asarray(jax.jit(kit.kind.attitude)(mean))
-    known = (q0, np.asarray(kit.kind.bias(mean)), True)
+    q0 = np.asarray(jax.jit(kit.form.attitude)(mean))
+    known = (q0, np.asarray(kit.form.bias(mean)), True)
     begin = Steered(Held(known), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
 
     def act(state: Steered, k: int, inputs: Inputs):

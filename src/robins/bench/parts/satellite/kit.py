@@ -18,9 +18,8 @@ from robins import _float64  # noqa: F401
 from robins.filters import Belief, Filter, Model
 from robins.filters.kalman import FilterState
 from robins.sim.rate_table import RateTable
-from robins.systems.satellite.filters import Build, make_filter
-from robins.systems.satellite.model import ADDITIVE, MULTIPLICATIVE
-from robins.systems.satellite.nodes import Given, Kind, Row, Vehicle, apart
+from robins.systems.satellite.model import ADDITIVE, MULTIPLICATIVE, Build, make_filter
+from robins.systems.satellite.nodes import Given, Row, StateForm, Vehicle, apart
 
 
 class Kit(NamedTuple):
@@ -48,7 +47,7 @@ class Kit(NamedTuple):
         return self.start.belief if isinstance(self.start, FilterState) else self.start
 
     @property
-    def kind(self) -> Kind:
+    def form(self) -> StateForm:
         """How its state is read."""
         return ADDITIVE if self.build == "quaternion" else MULTIPLICATIVE
 

@@ -10,11 +10,9 @@ from jax.tree_util import Partial
 from robins.bench.parts.satellite.kit import Kit
 from robins.bench.wire.schema import WHEELS
 from robins.sim.rate_table import RateTable
-from robins.systems.satellite.contender import Numbers, contender, surroundings
-from robins.systems.satellite.course import lay_out
-from robins.systems.satellite.filters import KINDS
 from robins.systems.satellite.parameters import AttitudeLoop
-from robins.systems.satellite.world import simulate
+from robins.systems.satellite.study import FILTERS, contender
+from robins.systems.satellite.world import lay_out, simulate
 
 
 def kit_for(
@@ -30,8 +28,7 @@ def kit_for(
         table: what carries the gyro, if it lags.
 
     Raises:
-        ValueError: no such filter, more wheels than the wire carries, or what `attitude_problem`
-            refuses.
+        ValueError: no such filter, more wheels than the wire carries, or what the study refuses.
     """
     if (wheels := len(given.wheels.axes)) > WHEELS:
         raise ValueError(
@@ -43,16 +40,16 @@ def kit_for(
     # Compiled as in a campaign of one run, whose bits the bench is to have.
     world = jax.jit(lambda k: simulate(given, course, seed, k))(jnp.asarray(index))
     case = of.case(world)
-    assert isinstance(of.case, Partial)
-    numbers: Numbers = of.case.args[0]
-    around, rows, vehicle = surroundings(numbers, world)
+    loop = case.loop
+    assert loop is not None
+    assert isinstance(loop.react, Partial)
     return Kit(
         step_ns=round(given.step * 1e9),
         due=np.asarray(course.due),
-        given=around,
-        rows=jax.tree_util.tree_map(np.asarray, rows),
-        vehicle=vehicle,
-        build=KINDS[name].build,
+        given=loop.react.args[0],
+        rows=jax.tree_util.tree_map(np.asarray, loop.rows),
+        vehicle=loop.world,
+        build=FILTERS[name].build,
         model=of.model,
         start=case.start,
         attitude_rad=given.believed.attitude,

@@ -38,7 +38,7 @@ def star(kit: Kit) -> Part:
     at_first = np.asarray(kit.vehicle.star_q_ib)
 
     def begin() -> tuple[Any, Any, Any]:
-        return at_first, np.asarray(kit.kind.attitude(kit.belief.mean)), np.zeros(3)
+        return at_first, np.asarray(kit.form.attitude(kit.belief.mean)), np.zeros(3)
 
     def act(state: tuple[Any, Any, Any], k: int, inputs: Inputs):
         seen, q, bias = state

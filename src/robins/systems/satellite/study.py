@@ -1,0 +1,264 @@
+"""The study "attitude-loop": each filter with what it believes in the loop, and what is claimed.
+
+Claims are the document's, and those of robins marked so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins.errors import require_known
+from robins.filters import Loop
+from robins.filters.rules import with_gains
+from robins.filters.synthesis import MissingExtra
+from robins.results import array
+from robins.systems.judgement import Claim, ratio
+from robins.systems.recipes import recipe
+from robins.systems.satellite import design, model
+from robins.systems.satellite.design import GainSpec, SensorNoise
+from robins.systems.satellite.model import ARCSEC, Build, make_filter
+from robins.systems.satellite.nodes import STAR, Given, Row, Step, begin, react
+from robins.systems.satellite.parameters import AttitudeLoop
+from robins.systems.satellite.world import Course, World, lay_out, simulate
+from robins.systems.study import Case, Contender, Norm, Output, SensorAxes, StateBlock, Study, View
+from robins.systems.system import System
+
+AXES = ("x", "y", "z (boresight)")
+BLOCKS = (
+    StateBlock("attitude", slice(0, 3), "rad", "arcsec", "body", AXES),
+    StateBlock("gyro_bias", slice(3, 6), "rad/s", "arcsec/s", "body", AXES),
+)
+
+
+# ------------------------------------------------------------------------------------------ filters
+
+
+class FilterSpec(NamedTuple):
+    """A filter of the study."""
+
+    build: Build
+    gain: GainSpec | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
+    drift: float | None = None  # variance of the bias' walk over the believed; None: told the truth
+    text: str = ""
+
+
+FILTERS: Mapping[str, FilterSpec] = {
+    "raw": FilterSpec(
+        "fixed", GainSpec("raw"), 1.0, "the star sensor's reading, moved by the gyro"
+    ),
+    "mekf": FilterSpec("mekf", None, 1.0, "multiplicative EKF"),
+    "mekf-gate": FilterSpec("gated", None, 1.0, "the same with a gate that opens again"),
+    "mekf-tuned": FilterSpec("mekf", None, 30.0, "the same, noise of the bias times 30"),
+    "mekf-informed": FilterSpec("mekf", None, None, "the same, told the true drift"),
+    "ekf-quaternion": FilterSpec("quaternion", None, 1.0, "additive EKF of seven states"),
+    "h2": FilterSpec("fixed", GainSpec("h2"), 1.0, "steady Kalman gain"),
+    "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0, "mixed, by LMI, n on the rate"),
+    "mixed-riccati": FilterSpec(
+        "fixed", GainSpec("riccati", 0.5), 1.0, "mixed, by Riccati, n on the rate"
+    ),
+    "mixed-riccati-quarter": FilterSpec(
+        "fixed", GainSpec("riccati", 0.25), 1.0, "the same, gamma halved"
+    ),
+    "mixed-bias-half": FilterSpec(
+        "fixed", GainSpec("riccati", 0.5, "bias"), 1.0, "mixed, by Riccati, n on the bias"
+    ),
+    "mixed-bias": FilterSpec(
+        "fixed", GainSpec("riccati", 0.25, "bias"), 1.0, "the same, gamma halved"
+    ),
+    "mixed-bias-gate": FilterSpec(
+        "fixed-gated", GainSpec("riccati", 0.25, "bias"), 1.0, "the same with the gate"
+    ),
+    "mekf-inflated": FilterSpec(
+        "mekf", GainSpec("riccati", 0.25, "bias"), 1.0, "MEKF with the noise of mixed-bias"
+    ),
+    "hinf": FilterSpec("fixed", GainSpec("riccati", 0.1), 1.0, "worst case first: gamma a tenth"),
+}
+
+
+def believed_walk(given: AttitudeLoop, spec: FilterSpec) -> float:
+    """Random walk of the gyro's rate that a filter believes in [rad/s/sqrt(s)]."""
+    g = given.gyro
+    true = model.equivalent_walk(g.rate_walk, g.markov, g.markov_time)
+    if spec.drift is None:
+        return true
+    believed = true if given.believed.drift is None else given.believed.drift
+    return math.sqrt(spec.drift) * believed
+
+
+class Surroundings(NamedTuple):
+    """What surrounds a filter, as data: the loop, the first belief, and a constant gain."""
+
+    given: Given
+    steps: Step  # leading axis E
+    due: Array  # (E,) bool
+    attitude_rad: Array  # believed at the start
+    bias_rad_s: Array
+    gain: Array  # (6, 3); zeros where there is none
+
+
+def as_case(additive: bool, build: Build, around: Surroundings, world: World) -> Case:
+    """What a filter takes of a run; pure."""
+    reacts = partial(react, model.ADDITIVE if additive else model.MULTIPLICATIVE)
+    given = around.given._replace(gyro_matrix=world.gyro_matrix, star_key=world.star_key)
+    rows = Row(around.steps, world.gyro_angle, world.gyro_bias, world.star_error)
+    start: Any = model.start(world.start_q_ib, around.attitude_rad, around.bias_rad_s, additive)
+    if build.startswith("fixed"):
+        start = with_gains(make_filter(build).init(start, {STAR: 3}), {STAR: around.gain})
+    loop = Loop(Partial(reacts, given), begin(given, world.craft), rows, {STAR: around.due})
+    return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
+
+
+def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
+    """A filter with its model and its data.
+
+    Raises:
+        ValueError: there is no filter of this name, or its design needs a package that is not
+            there.
+    """
+    require_known("filter", name, FILTERS)
+    spec = FILTERS[name]
+    walk = believed_walk(given, spec)
+    noise = model.noise_of(given.gyro.random_walk, walk, given.step)
+    sensors = SensorNoise(given.gyro.random_walk, walk, given.star.period, given.star.noise)
+    gain, facts = np.zeros((6, 3)), {}
+    if spec.gain is not None:
+        try:
+            facts = dict(design.facts(sensors, spec.gain))
+        except MissingExtra as error:
+            raise ValueError(f"filter '{name}': {error}; or choose others by --filters") from error
+        if spec.build.startswith("fixed"):
+            gain = design.gain(sensors, spec.gain)
+        else:
+            more = design.inflation(sensors, spec.gain) * math.sqrt(given.step / given.star.period)
+            noise = noise._replace(factor=jnp.concatenate([noise.factor, more], axis=1))
+    start = (jnp.asarray(given.believed.attitude), jnp.asarray(given.believed.bias))
+    around = Surroundings(
+        course.given, course.steps, jnp.asarray(course.due), *start, jnp.asarray(gain)
+    )
+    additive = spec.build == "quaternion"
+    return Contender(
+        filter=make_filter(spec.build),
+        model=model.model(noise, given.star.noise, additive, given.star.camera is not None),
+        case=recipe(as_case, additive, spec.build, numbers=around),
+        facts=facts,
+    )
+
+
+# ------------------------------------------------------------------------------ metrics and claims
+
+
+def attitude_metrics(statistics: Any) -> dict[str, Any]:
+    """Of "attitude-loop": components 0 to 2 are the attitude's, body axes.
+
+    ``attitude_rms_arcsec`` is the root sum square of the three axes of the error of attitude
+    determination, pooled over epochs and runs, ``attitude_rms_spread_arcsec`` the standard
+    deviation of the same figure from run to run, ``pointing_rms_arcsec`` that of where the craft
+    points, whoever is to blame. Peaks are the greatest lengths of each, mean over the runs.
+    """
+    s = statistics
+    axes = np.sqrt(np.mean(s.run_rms[:, :3] ** 2, axis=0)) / ARCSEC
+    by_run = np.linalg.norm(s.run_rms[:, :3], axis=1) / ARCSEC
+    pointing = np.linalg.norm(s.run_output_rms("pointing"), axis=1) / ARCSEC
+    out: dict[str, Any] = {
+        "attitude_rms_arcsec": float(np.linalg.norm(axes)),
+        "attitude_rms_spread_arcsec": float(np.std(by_run, ddof=1)) if s.runs > 1 else float("nan"),
+        "pointing_rms_arcsec": float(np.sqrt(np.mean(pointing**2))),
+        **{f"{a}_rms_arcsec": float(x) for a, x in zip("xyz", axes, strict=True)},
+        "attitude_peak_arcsec": float(np.mean(s.norm_peaks("attitude"))) / ARCSEC,
+        "pointing_peak_arcsec": float(np.mean(s.run_output_worst("pointing"))) / ARCSEC,
+        "bias_rms_arcsec_s": float(np.linalg.norm(np.sqrt(np.mean(s.run_rms[:, 3:6] ** 2, axis=0))))
+        / ARCSEC,
+    }
+    blocks = s.block_anees()
+    out["nees_per_dim"] = float(np.mean(blocks["attitude"][s.counted]))
+    out["anees_share_inside"] = s.anees_share_inside()
+    out["diverged_runs"] = s.diverged
+    return out
+
+
+RMS, POINTING, SPREAD = "attitude_rms_arcsec", "pointing_rms_arcsec", "attitude_rms_spread_arcsec"
+BETTER, PARTLY = (0.0, 0.9), (0.0, 1.0)
+
+
+def _against(other: str, words: str) -> Claim:
+    return Claim(
+        f"The mixed filter improves the precision of attitude determination; read against {words}, "
+        f"value: RMS error of mixed-lmi over that of {other}",
+        ("mixed-lmi", other),
+        ratio("mixed-lmi", other, RMS),
+        BETTER,
+        PARTLY,
+    )
+
+
+CLAIMS: dict[str, Claim] = {
+    "improves-on-star": _against("raw", "the star sensor alone"),
+    "improves-on-mekf": _against("mekf", "a Kalman filter that believes the nominal noise"),
+    "improves-on-tuned": _against("mekf-tuned", "a Kalman filter with more noise on the bias"),
+    "improves-on-informed": _against("mekf-informed", "a Kalman filter told the true drift"),
+    "steadier": Claim(
+        "The mixed filter's error varies less from run to run (ours); value: the spread of its "
+        "RMS error over that of the nominal MEKF",
+        ("mixed-bias", "mekf"),
+        ratio("mixed-bias", "mekf", SPREAD),
+        (0.0, 0.5),
+        PARTLY,
+    ),
+    "bias-better": Claim(
+        "The modelling error belongs on the bias, not on the rate (ours); value: pointing error of "
+        "mixed-bias over that of mixed-riccati-quarter, both a quarter of the Kalman filter's gain",
+        ("mixed-bias", "mixed-riccati-quarter"),
+        ratio("mixed-bias", "mixed-riccati-quarter", POINTING),
+        BETTER,
+        PARTLY,
+    ),
+}
+"""Every claim that a scenario may state."""
+
+
+# -------------------------------------------------------------------------------------------- study
+
+
+def view(given: AttitudeLoop, course: Course) -> View:
+    """What is reported: attitude, gyro bias, where the craft points, what its wheels hold."""
+    counted = int(np.searchsorted(course.time_s, given.counted_from + 1e-9))
+    lost = (course.due & ~np.asarray(course.steps.star.seen)).astype(np.int8)
+    outage = array("outage", lost, long_name="star sensor lost") if np.any(lost) else {}
+    wheels = tuple(f"wheel {i}" for i in range(len(given.wheels.axes)))
+    where = "Where the craft points against where it should."
+    held = f"Momentum of the wheels, first run; each holds {given.wheels.momentum:g} N m s."
+    return View(
+        epoch_s=course.time_s,
+        blocks=BLOCKS,
+        sensors={STAR: SensorAxes("rad", "body", AXES, "arcsec")},
+        metrics=attitude_metrics,
+        context=xr.Dataset(outage),
+        count_from=counted,
+        outputs=(
+            Output("pointing", "rad", "arcsec", "reference", ("x", "y", "z"), where, is_error=True),
+            Output("wheel_momentum", "N m s", "N m s", "wheel axes", wheels, held),
+        ),
+        norms=(Norm("attitude", (0, 1, 2)),),
+        windows=(slice(counted, len(course.time_s)),),
+    )
+
+
+STUDY = Study(
+    parameters=AttitudeLoop,
+    filters=tuple(FILTERS),
+    lay_out=lay_out,
+    simulate=simulate,
+    contender=contender,
+    view=view,
+    claims=CLAIMS,
+)
+SYSTEM = System(name="satellite", studies={"attitude-loop": STUDY})
