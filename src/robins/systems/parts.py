@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import pydantic
+from jaxtyping import ArrayLike
 
+from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -57,3 +59,10 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
             "before the end"
         )
+
+
+class Block(NamedTuple):
+    """Input of one step of a motion that is mechanised from inertial samples."""
+
+    increments: Increments  # dt (K,), theta (K, 3), dv (K, 3)
+    noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap

@@ -1,10 +1,10 @@
 """The filters of the product model; one of them is told neither what shakes nor since when.
 
-That one, "product-adaptive", is a bank of hypotheses. A disturbed record is no reason to doubt the gyros, and a disturbed gyro none to doubt the records;
-an innovation alone does not say which it was. What tells them apart is how it goes on, and what the
-velocity says, which neither flexure nor gyro noise reach directly. So several filters of the same
-24 states run side by side, each with a hypothesis of its own, as an interacting multiple model
-(`robins.filters.imm`):
+That one, "product-adaptive", is a bank of hypotheses. A disturbed record is no reason to doubt the
+gyros, and a disturbed gyro none to doubt the records; an innovation alone does not say which it
+was. What tells them apart is how it goes on, and what the velocity says, which neither flexure nor
+gyro noise reach directly. So several filters of the same 24 states run side by side, each with a
+hypothesis of its own, as an interacting multiple model (`robins.filters.imm`):
 
                 stiff structure           flexing structure
     quiet       the stated noise          and the flexure of the model
@@ -64,10 +64,7 @@ def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
         one_axis = jnp.sqrt(jnp.sum(t.noise[_ATTITUDE] ** 2) / 3.0)
         wander = jnp.zeros((_STATES, 3)).at[_GYRO_BIAS].set(walk * one_axis * jnp.eye(3))
         noise = jnp.concatenate([t.noise * grown[None], wander], 1)
-        angle, rate = (
-            jnp.where(stiff, 0.0, x) for x in (t.mean.flexure_rad, t.mean.flexure_rate_rad_s)
-        )
-        mean = t.mean._replace(flexure_rad=angle, flexure_rate_rad_s=rate)
+        mean = t.mean._replace(flexure=jnp.where(stiff, 0.0, t.mean.flexure))
         spread, noise = t.spread * kept[:, None], noise * kept[:, None]
         return memory, t._replace(mean=mean, spread=spread, noise=noise)
 

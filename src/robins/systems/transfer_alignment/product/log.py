@@ -47,7 +47,6 @@ from robins.systems.transfer_alignment.product.model import Installation, Produc
 from robins.systems.transfer_alignment.product.parameters import PairParameters, Replay
 from robins.systems.transfer_alignment.product.study import (
     BLOCKS,
-    ENDINGS,
     SENSORS,
     installation_of,
     product_contender,
@@ -242,10 +241,9 @@ def _estimates(mean: ProductState) -> Mapping[str, Any]:
         "gyro_bias": mean.ins.gyro_bias,
         "accel_bias": mean.ins.accel_bias,
         "mounting": mean.mounting_rad,
-        "flexure": mean.flexure_rad,
         "euler": jnp.stack(mean.ins.q_nb.as_euler(), -1),
     }
-    return {name: value for name, value in found.items() if value is not None}
+    return found if mean.flexure is None else found | {"flexure": mean.flexure[..., :3]}
 
 
 REPORTED = Reported(
@@ -267,12 +265,13 @@ def metrics_of(answer: Answer) -> dict[str, Any]:
     found, last = _estimates(answer.mean), np.asarray(answer.sigma)[-1]
     for block in BLOCKS:
         name, shown = block.name, (block.units, block.display_unit)
+        ending = units.as_ending(block.display_unit)
         if name in _FOUND:
             value = units.convert(np.asarray(found[name])[-1], *shown)
-            out[f"{name}_{ENDINGS[name]}"] = value.tolist()
+            out[f"{name}_{ending}"] = value.tolist()
         if name in ("attitude", *_FOUND):
             sigma = units.convert(last[block.where], *shown)
-            out[f"{name}_sigma_{ENDINGS[name]}"] = sigma.tolist()
+            out[f"{name}_sigma_{ending}"] = sigma.tolist()
     return out
 
 

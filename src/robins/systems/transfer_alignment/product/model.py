@@ -67,8 +67,7 @@ from robins.ins.increments import Increments
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.rotation import Rotation, skew
 from robins.sim.flexure import Flexure, transition
-from robins.systems.ins_gnss.model import Block
-from robins.systems.parts import NED
+from robins.systems.parts import NED, Block
 from robins.systems.study import SensorAxes
 
 ATTITUDE, VELOCITY, POSITION = "master_attitude", "master_velocity", "master_position"
@@ -79,8 +78,7 @@ class ProductState(NamedTuple):
 
     ins: InsState  # of the slave: 15 components, no scale factors
     mounting_rad: Array  # (3,) mu, slave axes
-    flexure_rad: Array | None = None  # (3,) l, master axes
-    flexure_rate_rad_s: Array | None = None  # (3,)
+    flexure: Array | None = None  # (6,) l [rad], then l' [rad/s], master axes
 
 
 class Installation(NamedTuple):
@@ -110,8 +108,9 @@ class _Drive(NamedTuple):
     flexure: Flexure | None
 
 
-def _swing_step(flexure: Flexure, dt: Array) -> tuple[Array, Array]:
-    """Step of (l, l') of all axes by (2), in tangent order: Phi (6, 6) and a factor of Q (6, 6)."""
+def _swing(flexure: Flexure, block: Block) -> tuple[Array, Array]:
+    """(2) over a block: Phi (6, 6) of (l, l'), and a factor (6, 6) of Q."""
+    dt = jnp.sum(jnp.asarray(block.increments.dt))
     given = (flexure.sigma_rad, flexure.tau_s, flexure.damping)
     three = [jnp.broadcast_to(jnp.asarray(x, float), 3) for x in given]
     axes = jax.vmap(partial(transition, dt_s=dt))(*three)
@@ -120,23 +119,12 @@ def _swing_step(flexure: Flexure, dt: Array) -> tuple[Array, Array]:
     return Phi, L
 
 
-def _swing(x: ProductState) -> Array | None:
-    """(6,) l and l', where they are states."""
-    if x.flexure_rad is None or x.flexure_rate_rad_s is None:
-        return None
-    return jnp.concatenate([x.flexure_rad, x.flexure_rate_rad_s])
-
-
-def _swung(x: ProductState, Phi: Array) -> ProductState:
-    after = Phi @ _swing(x)
-    return x._replace(flexure_rad=after[:3], flexure_rate_rad_s=after[3:])
-
-
 def _step(drive: _Drive, x: ProductState, block: Block) -> ProductState:
     new = x._replace(ins=propagate(x.ins, block.increments, drive.noise))
     if drive.flexure is None:
         return new
-    return _swung(new, _swing_step(drive.flexure, jnp.sum(jnp.asarray(block.increments.dt)))[0])
+    Phi, _ = _swing(drive.flexure, block)
+    return new._replace(flexure=Phi @ x.flexure)
 
 
 def _step_linear(drive: _Drive, x: ProductState, block: Block):
@@ -145,8 +133,8 @@ def _step_linear(drive: _Drive, x: ProductState, block: Block):
     new = x._replace(ins=ins)
     Phis, Ls = [Phi, linalg.identity(3)], [L, jnp.zeros((3, 3))]
     if drive.flexure is not None:
-        Phi, L = _swing_step(drive.flexure, jnp.sum(jnp.asarray(block.increments.dt)))
-        new = _swung(new, Phi)
+        Phi, L = _swing(drive.flexure, block)
+        new = new._replace(flexure=Phi @ x.flexure)
         Phis, Ls = [*Phis, Phi], [*Ls, L]
     return new, block_diag(*Phis), block_diag(*Ls) * block.noise_scale
 
@@ -180,8 +168,7 @@ def _then(at: Installation, x: ProductState, lag: Lag) -> _Then:
     gained_n = ins.q_nb.apply(lag.dv - ins.accel_bias * dt)
     coriolis = jnp.cross(2.0 * omega_ie + omega_en, ins.v_n)
     v_n = ins.v_n - gained_n - (gravity_n(p.lat, p.alt) - coriolis) * dt
-    swing = _swing(x)
-    flexure = jnp.zeros(3) if swing is None else swing[:3] - swing[3:] * dt
+    flexure = jnp.zeros(3) if x.flexure is None else x.flexure[:3] - x.flexure[3:] * dt
     q_ms = Rotation.from_rotvec(flexure) @ at.q_ms @ Rotation.from_rotvec(x.mounting_rad)
     return _Then(v_n, q_ns, q_ns @ q_ms.inverse(), flexure, omega_ie + omega_en, gained_n)
 
@@ -226,7 +213,7 @@ def _attitude_rows(at: Installation, x: ProductState, lag: Lag, then: _Then) -> 
         jnp.zeros((3, 3)),
         -C_ns @ left_jacobian(-x.mounting_rad),
     ]
-    if x.flexure_rad is not None:
+    if x.flexure is not None:
         by_flexure = C_nm @ left_jacobian(then.flexure)
         columns += [-by_flexure, dt * by_flexure]
     return jnp.concatenate(columns, 1)
@@ -242,7 +229,8 @@ def _linear_velocity(at: Installation, x: ProductState, lag: Lag):
     then = _then(at, x, lag)
     dt = jnp.asarray(lag.dt, float)
     free = frame_dynamics(x.ins)
-    H = jnp.zeros((3, free.shape[0] + (9 if x.flexure_rad is None else 15)))
+    of_attitude = _attitude_rows(at, x, lag, then)
+    H = jnp.zeros_like(of_attitude)
     H = H.at[:, 0:3].set(skew(then.gained_n))
     H = H.at[:, 3:9].set(-dt * free[3:6, 3:]).at[:, 3:6].add(jnp.eye(3))
     H = H.at[:, 12:15].set(dt * x.ins.q_nb.as_dcm())
@@ -250,7 +238,7 @@ def _linear_velocity(at: Installation, x: ProductState, lag: Lag):
     C_nm, omega_m = then.q_nm.as_dcm(), jnp.asarray(lag.omega_m)
     arm = skew(C_nm @ at.lever_m)
     by_attitude = skew(C_nm @ jnp.cross(omega_m, at.lever_m)) - skew(then.omega_in) @ arm
-    H = H + by_attitude @ _attitude_rows(at, x, lag, then)
+    H = H + by_attitude @ of_attitude
     H = H.at[:, 3:9].add(arm @ free[:3, 3:])
     return then.v_n - _arm_velocity(at, then, lag), H
 
@@ -263,29 +251,14 @@ class Record(NamedTuple):
     sigma: str  # among the parameters of the master, by axis
     struck: bool  # an outlier spoils it
     read: Callable[[Installation, ProductState, Lag], Any]
-    linear: Callable[..., Any] | None  # likewise, with the Jacobian
+    linear: Callable[..., Any] | None = None  # likewise, with the Jacobian
 
 
+_NED = {unit: SensorAxes(unit, "NED", NED) for unit in ("rad", "m/s", "m")}
 RECORDS = {
-    ATTITUDE: Record(
-        SensorAxes("rad", "NED", NED),
-        "q_nb",
-        "attitude_noise",
-        True,
-        _read_attitude,
-        _linear_attitude,
-    ),
-    VELOCITY: Record(
-        SensorAxes("m/s", "NED", NED),
-        "v_n",
-        "velocity_noise",
-        True,
-        _read_velocity,
-        _linear_velocity,
-    ),
-    POSITION: Record(
-        SensorAxes("m", "NED", NED), "position", "position_noise", False, _read_position, None
-    ),
+    ATTITUDE: Record(_NED["rad"], "q_nb", "attitude_noise", True, _read_attitude, _linear_attitude),
+    VELOCITY: Record(_NED["m/s"], "v_n", "velocity_noise", True, _read_velocity, _linear_velocity),
+    POSITION: Record(_NED["m"], "position", "position_noise", False, _read_position),
 }
 
 

@@ -21,9 +21,8 @@ from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
 from robins.rotation import Rotation
 from robins.sim.flexure import Flexure, transition
-from robins.systems.ins_gnss.model import Block
 from robins.systems.judgement import Claim, consistency, consistency_claims
-from robins.systems.parts import FRD, NED, refuse_unsettled
+from robins.systems.parts import FRD, NED, Block, refuse_unsettled
 from robins.systems.recipes import recipe
 from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View
 from robins.systems.tables import place_arrays
@@ -58,16 +57,8 @@ BLOCKS = (
     StateBlock("flexure", slice(18, 21), "rad", "arcmin", _MASTER, FRD),
 )
 SENSORS = {name: record.axes for name, record in RECORDS.items()}
-# ends of the names of metrics
-ENDINGS = {
-    "attitude": "arcmin",
-    "velocity": "mps",
-    "position": "m",
-    "gyro_bias": "deg_per_h",
-    "accel_bias": "mg",
-    "mounting": "arcmin",
-}
-_REPORTED = BLOCKS[:6]  # of every filter, whether or not it has flexure states
+# by every filter, whether or not it has flexure states
+_REPORTED = {block.name: block for block in BLOCKS if block.name != "flexure"}
 _RIGID = 18  # components without flexure states
 # Nothing is known better than this (rad, m/s, m, rad/s, m/s^2, rad), so that covariances that begin
 # with zeros have full rank, as the Joseph form needs.
@@ -131,12 +122,10 @@ def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) ->
         run: the pair.
     """
     sigma, delay_s = start
-    mean = ProductState(InsState.start(start_estimate(run)), *jnp.zeros((3, 3)))
-    truth = run.truth
+    flexure, truth = jnp.zeros(6), run.truth
     if len(sigma) == _RIGID:
-        rigid = {"flexure_rad": None, "flexure_rate_rad_s": None}
-        mean = mean._replace(**rigid)
-        truth = None if truth is None else truth._replace(**rigid)
+        flexure, truth = None, truth and truth._replace(flexure=None)
+    mean = ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
     lag = lag_of(run.increments, delay_s, run.master_omega_b)
     return Case(
         start=Belief(mean, jnp.diag(sigma)),
@@ -147,7 +136,7 @@ def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) ->
     )
 
 
-def reported(n: int, blocks: Sequence[str] = tuple(ENDINGS), frame: str = "NED") -> np.ndarray:
+def reported(n: int, blocks: Sequence[str] = tuple(_REPORTED), frame: str = "NED") -> np.ndarray:
     """Rows (3 len(blocks), n) that take some blocks of the tangent error, in the order given.
 
     Args:
@@ -159,23 +148,19 @@ def reported(n: int, blocks: Sequence[str] = tuple(ENDINGS), frame: str = "NED")
     Raises:
         ValueError: a block or a frame that is not among these.
     """
-    where = {block.name: block.where for block in _REPORTED}
-    if frame not in ("NED", "ENU") or any(b not in where for b in blocks):
+    if frame not in ("NED", "ENU") or any(block not in _REPORTED for block in blocks):
         raise ValueError(
-            f"blocks are {', '.join(where)} in NED or ENU; got {', '.join(blocks)} in {frame}"
+            f"blocks are {', '.join(_REPORTED)} in NED or ENU; got {', '.join(blocks)} in {frame}"
         )
     turn = np.eye(3) if frame == "NED" else swap(np.eye(3))
-    rows = np.zeros((3 * len(blocks), n))
-    for k, block in enumerate(blocks):
-        rows[3 * k : 3 * k + 3, where[block]] = turn
-    return rows
+    return np.concatenate([turn @ np.eye(n)[_REPORTED[block].where] for block in blocks])
 
 
 def product_contender(
     pair: PairParameters,
     name: str = "product",
     believed: Believed | None = None,
-    blocks: Sequence[str] = tuple(ENDINGS),
+    blocks: Sequence[str] = tuple(_REPORTED),
     frame: str = "NED",
 ) -> Contender:
     """A filter of the product model, for a problem that simulates a `PairRun`.
@@ -243,15 +228,15 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
     sigma = np.sqrt(np.mean(statistics.sigma[start:] ** 2, axis=0))
     out: dict[str, Any] = {}
     for block in statistics.blocks:
-        name, ending, here = block.name, ENDINGS[block.name], block.where
-        shown = block.units, block.display_unit
-        size, last = (units.convert(x[here], *shown) for x in (rms, statistics.sigma[-1]))
-        if name == "attitude":
-            size, last = size[_ENU], last[_ENU]
-            out["attitude_rms_all_arcmin"] = float(np.sqrt(np.mean(size**2)))
-            ratio = np.sqrt(np.sum(rms[here] ** 2) / np.sum(sigma[here] ** 2))
-            out["attitude_over_sigma"] = float(ratio)
+        name, here, shown = block.name, block.where, (block.units, block.display_unit)
+        ending = "mps" if name == "velocity" else units.as_ending(block.display_unit)
+        order = _ENU if name == "attitude" else slice(None)
+        size, last = (units.convert(x[here][order], *shown) for x in (rms, statistics.sigma[-1]))
         out[f"{name}_rms_{ending}"] = size.tolist()
+        if name == "attitude":
+            ratio = np.sqrt(np.sum(rms[here] ** 2) / np.sum(sigma[here] ** 2))
+            out["attitude_rms_all_arcmin"] = float(np.sqrt(np.mean(size**2)))
+            out["attitude_over_sigma"] = float(ratio)
         if name in ("attitude", "mounting"):
             out[f"{name}_last_sigma_{ending}"] = last.tolist()
     settled = statistics.settled(FIVE_ARCMIN)
@@ -281,7 +266,7 @@ def _view(given: Product, course: Course) -> View:
     used = (ATTITUDE, VELOCITY, *((POSITION,) if given.believed.position else ()))
     return View(
         epoch_s=course.epoch_s,
-        blocks=_REPORTED,
+        blocks=tuple(_REPORTED.values()),
         sensors={name: SENSORS[name] for name in used},
         metrics=product_metrics,
         context=xr.Dataset(place_arrays("reference", (path.lat, path.lon, path.alt), "true {}")),

@@ -267,8 +267,7 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
         truth=ProductState(
             InsState(*true, *biases),
             jnp.broadcast_to(mounting, (shape[0], 3)),
-            at_epochs(angle[1:]),
-            at_epochs(rate[1:]),
+            jnp.concatenate([at_epochs(angle[1:]), at_epochs(rate[1:])], 1),
         ),
     )
 
