@@ -45,6 +45,7 @@ class Piece:
     world: Any  # of which a contender makes its case
     begin_s: float  # on the clock of the log
     epoch_s: np.ndarray  # (E,)
+    noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
 Prepared = TypeVar("Prepared", bound=Piece)
@@ -120,10 +121,26 @@ def prepared(
     return found, problems
 
 
-def across_gap(blocks: Blocks, dt_s: np.ndarray) -> np.ndarray:
-    """(E,) bool: samples are missing in a block that was cut from increments of length dt (N,)."""
+def noise_scale(blocks: Blocks, dt_s: np.ndarray, across_gap: float) -> np.ndarray:
+    """(E,) of the process noise factor: 1, and more in a block in which samples are missing.
+
+    Args:
+        blocks: cut from the increments.
+        dt_s: (N,) lengths of the increments.
+        across_gap: scale in such a block.
+    """
     gap = after_gap(dt_s)
-    return np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
+    missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
+    return np.where(missing, across_gap, 1.0)
+
+
+def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, int]:
+    """How many gaps ended a piece, and how many blocks lie across a shorter one."""
+    across = (np.sum(np.asarray(piece.noise_scale) > 1.0) for piece in pieces)
+    return {
+        "imu_gaps_declared": len(pieces) + len(problems) - 1,
+        "blocks_over_imu_gaps": int(sum(across)),
+    }
 
 
 # ----------------------------------------------------------------------------- pieces to answers

@@ -43,7 +43,6 @@ from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
 from robins.sim.trajectory import Motion
-from robins.systems.ins_gnss.legs import command_of
 from robins.systems.transfer_alignment.product.model import RECORDS, ProductState, Record
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,
@@ -103,7 +102,7 @@ def motion_of(manoeuvre: Aircraft | Ship | Vehicle) -> Motion:
         if any(waves is not None for waves in given):
             sea = Sea(*(_waves(waves or ()) for waves in given))
         return sail(start, m.seconds, m.speed, m.heading, sea)
-    legs = [command_of(leg) for leg in m.legs]
+    legs = [leg.command() for leg in m.legs]
     return roughen(from_commands(start, legs, m.heading, m.speed), _waves(m.roll), _waves(m.pitch))
 
 
