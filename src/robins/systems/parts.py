@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from typing import Annotated
 
+import numpy as np
 import pydantic
 
 from robins.scenario import Parameters, Quantity
@@ -56,4 +59,23 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
         raise ValueError(
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
             "before the end"
+        )
+
+
+LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take
+
+
+def warn_of_large_angles(reached_rad: Mapping[str, float]) -> None:
+    """Warn of errors beyond 5 deg, for which linear models do not hold.
+
+    Args:
+        reached_rad: by parameter the size [rad] that its error may reach.
+    """
+    large = {name: size for name, size in reached_rad.items() if size > LARGEST_RAD}
+    if large:
+        told = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())
+        warnings.warn(
+            f"{told}: the filters' model is linear in these angles and good below 5 deg; expect "
+            "biased estimates",
+            stacklevel=4,
         )
