@@ -297,6 +297,12 @@ def convert(value, from_unit: str, into_unit: str):
     return from_si(to_si(value, source), target)
 
 
+def as_ending(unit_: str) -> str:
+    """A unit as the end of a metric's name: "deg/sqrt(h)" is "deg_per_sqrt_h"."""
+    plain = unit_.replace("sqrt(", "sqrt_").replace(")", "").replace("^", "").lower()
+    return plain.replace("/", "_per_")
+
+
 def show(value_si, unit_: str, digits: int = 6) -> str:
     """Text of an SI value in some unit, to so many significant digits: ``"0.1 deg/h"``."""
     u = unit(unit_)

@@ -107,6 +107,7 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
     epilog=examples(
         "robins run ins-gnss/drive --runs 50 --filters ekf,ukf --out drive",
         'robins run my.toml --set gnss.sigma="2 m" --json',
+        "robins run my_system.py:study --runs 100",
         "robins run transfer-alignment/replay --master master.csv --slave slave.csv",
     ),
 )
@@ -125,7 +126,9 @@ def run(
     columns: tuple[Path, ...],
     **options: Any,
 ) -> None:
-    """Simulate SCENARIO, a name that `robins list` tells or a TOML file, with several filters.
+    """Simulate SCENARIO with several filters.
+
+    SCENARIO is a name that `robins list` tells, a TOML file, or FILE.py:STUDY of your own.
 
     All filters get the same random numbers; run k of seed S is the same whatever N is.
 

@@ -26,7 +26,8 @@ def listing(name: str | None, as_json: bool) -> None:
     cache.enable()
     with only_json(as_json):
         told = workbench.inventory(name)
-    say(told, "" if name is None else _details(told, *sections[name]), as_json)
+    section = sections.get(name or "", (told["summary"], {}) if name else ("", {}))
+    say(told, "" if name is None else _details(told, *section), as_json)
 
 
 def _section(name: str, summary: str, titles: Mapping[str, str]) -> str:

@@ -85,6 +85,8 @@ def choices(command: Callable) -> Callable:
 
 def folder_name(scenario: str) -> str:
     """Of the result folder of a scenario."""
+    if ".py:" in scenario:
+        return Path(scenario).name.replace(".py:", "-")
     return Path(scenario).stem if scenario.endswith(".toml") else scenario.replace("/", "-")
 
 

@@ -1,5 +1,8 @@
 """Systems: one problem each, with model, scenarios, filters and claims; here is the registry.
 
+A system of your own needs no place in here: `robins.systems.finding` takes it from your file or
+package.
+
 Names are imported when they are asked for: who needs the model of one system alone, such as a
 process of the test bench, does not wait for all of them, and `robins.systems.catalogue` tells of
 all without importing one.
@@ -11,7 +14,7 @@ import importlib
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from robins.systems.catalogue import SUMMARIES
+from robins.systems.catalogue import summaries
 
 if TYPE_CHECKING:
     from robins.systems.study import (
@@ -54,18 +57,18 @@ class _Registry(Mapping[str, "System"]):
     """Systems by name; each is imported when it is taken out."""
 
     def __getitem__(self, name: str) -> System:
-        if name not in SUMMARIES:
+        if name not in self:
             raise KeyError(name)
-        return importlib.import_module(f"{__name__}.{name.replace('-', '_')}").SYSTEM
+        return importlib.import_module(f"{__name__}.finding").find_system(name)
 
     def __contains__(self, name: object) -> bool:
-        return name in SUMMARIES
+        return name in summaries()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(SUMMARIES)
+        return iter(summaries())
 
     def __len__(self) -> int:
-        return len(SUMMARIES)
+        return len(summaries())
 
 
 SYSTEMS: Mapping[str, System] = _Registry()

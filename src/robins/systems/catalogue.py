@@ -1,9 +1,16 @@
-"""What systems there are and the scenarios that come with them, told without importing one."""
+"""What systems there are and the scenarios that come with them, told without importing one.
+
+Beside the systems of robins these are the systems of installed packages: an entry point of the
+group "robins.systems" names a `robins.systems.System` or `Study`, and the TOML files in the folder
+`scenarios` beside its module are its scenarios.
+"""
 
 from __future__ import annotations
 
 import tomllib
 from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +22,22 @@ SUMMARIES = {
     "satellite": "a satellite's attitude in closed loop: gyro, star sensor, mixed H2/H-infinity",
     "marg": "orientation from gyro, accelerometer and magnetometer, of recorded logs",
 }
+
+
+@cache
+def installed() -> dict[str, EntryPoint]:
+    """Systems of other packages by name; a name that robins has is that of robins."""
+    found = entry_points(group="robins.systems")
+    return {point.name: point for point in found if point.name not in SUMMARIES}
+
+
+def summaries() -> dict[str, str]:
+    """A sentence on each system; of an installed package it is that of the package."""
+
+    def sentence(point: EntryPoint) -> str:
+        return "" if point.dist is None else str(point.dist.metadata["Summary"])
+
+    return SUMMARIES | {name: sentence(point) for name, point in installed().items()}
 
 
 class Listed(NamedTuple):
@@ -49,5 +72,8 @@ def configurations(system: str) -> dict[str, Path]:
 
 
 def _files(system: str) -> list[Path]:
-    folder = Path(__file__).parent / system.replace("-", "_") / "scenarios"
-    return sorted(folder.glob("*.toml"))
+    home = Path(__file__).parent / system.replace("-", "_")
+    if system in installed():
+        spec = find_spec(installed()[system].module)
+        home = Path(str(spec.origin if spec else "")).parent
+    return sorted((home / "scenarios").glob("*.toml"))

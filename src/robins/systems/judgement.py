@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -100,15 +99,10 @@ def rms_by_axis(statistics: Any) -> dict[str, list[float]]:
 def standard_metrics(statistics: Any) -> dict[str, Any]:
     """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
     errors = {
-        f"{block.name}_rms_{_ending(block.display_unit)}": pooled_rms(statistics, block)
+        f"{block.name}_rms_{units.as_ending(block.display_unit)}": pooled_rms(statistics, block)
         for block in statistics.blocks
     }
     return errors | consistency(statistics) | {"diverged_runs": statistics.diverged}
-
-
-def _ending(unit: str) -> str:
-    """A unit as the end of a metric's name: "deg/sqrt(h)" is "deg_per_sqrt_h"."""
-    return re.sub(r"\W+", "_", unit.replace("/", "_per_")).strip("_").lower()
 
 
 def consistency(statistics: Any) -> dict[str, Any]:

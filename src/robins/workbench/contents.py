@@ -6,14 +6,13 @@ import tomllib
 from importlib.resources import files
 from typing import Any
 
-from robins import systems
 from robins.systems import catalogue
-from robins.workbench.errors import InputError
+from robins.systems.finding import find_system, is_file
 
 
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
     """A sentence on every system, on the bench and on design, and titles of what each can run."""
-    told = {name: (text, titles(name)) for name, text in catalogue.SUMMARIES.items()}
+    told = {name: (text, titles(name)) for name, text in catalogue.summaries().items()}
     bench = "the satellite part by part over serial lines, `robins bench up`"
     design = "gains between H2 and H-infinity, `robins design`"
     return told | {"bench": (bench, _benches()), "design": (design, designs())}
@@ -22,15 +21,15 @@ def overview() -> dict[str, tuple[str, dict[str, str]]]:
 def inventory(system: str | None = None) -> dict[str, Any]:
     """What there is, or what a system has: scenarios, filters, claims, whether it replays logs.
 
+    Args:
+        system: its name, or "file.py:study"; all where not given.
+
     Raises:
-        InputError: there is no such system.
+        robins.systems.finding.UnknownSystem: there is no such system.
     """
     if system is not None:
-        if system not in catalogue.SUMMARIES:
-            known = ", ".join(catalogue.SUMMARIES)
-            raise InputError(f"no system '{system}'; there are {known}.")
         return _told(system)
-    told = [_told(name) for name in catalogue.SUMMARIES]
+    told = [_told(name) for name in catalogue.summaries()]
     return {
         "scenarios": [name for one in told for name in one["scenarios"]],
         "systems": told,
@@ -42,11 +41,11 @@ def inventory(system: str | None = None) -> dict[str, Any]:
 
 
 def _told(name: str) -> dict[str, Any]:
-    system = systems.SYSTEMS[name]
+    system = find_system(name)
     return {
         "name": system.name,
-        "summary": catalogue.SUMMARIES[name],
-        "scenarios": list(titles(name)),
+        "summary": catalogue.summaries().get(name, ""),
+        "scenarios": [name] if is_file(name) else list(titles(name)),
         "filters": list(system.filters),
         "claims": [{"id": claim["id"], "text": claim["text"]} for claim in system.claims],
         "replays": system.replay is not None,

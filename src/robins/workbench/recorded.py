@@ -14,6 +14,7 @@ from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs import Finding
 from robins.results import Outcome, Progress, silent
+from robins.systems.finding import find_system
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.examination import parted
 from robins.workbench.publication import part
@@ -54,9 +55,7 @@ def replay(
         robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
     """
     _float64.require()
-    if system not in systems.SYSTEMS:
-        raise InputError(f"no system '{system}'; there are {', '.join(systems.SYSTEMS)}")
-    chosen_system = systems.SYSTEMS[system]
+    chosen_system = find_system(system)
     if chosen_system.replay is None or chosen_system.replay_parameters is None:
         raise InputError(f"{system} does not replay logs")
     files, configuration = parted(paths)

@@ -11,23 +11,26 @@ import jax
 from robins import scenario, systems
 from robins.errors import hint, require_known
 from robins.systems import Study, System
-from robins.systems.catalogue import configurations, listed
+from robins.systems.catalogue import configurations, installed, listed
+from robins.systems.finding import find_system, is_file
 from robins.workbench.errors import InputError, refusing
 
 
 def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
-    """System, name and text of a packaged scenario "system/name", or of a TOML file.
-
-    A file says its system in the key ``system``.
+    """System, name and text of a scenario.
 
     Args:
-        name: of the scenario, or a path that ends in .toml.
+        name: "system/name" of a packaged one; a path that ends in .toml, which says its system in
+            the key ``system``; or a system of the user's own, "file.py:study" or the name of an
+            installed one, whose parameters then have their defaults.
         recorded: a recorded pair takes the place of the simulation.
 
     Raises:
         InputError: there is no such scenario or file, the file names no system, or only a
             recorded pair fits it.
     """
+    if is_file(name) or name in installed():
+        return find_system(name), Path(name).name.replace(".py:", ":"), f'system = "{name}"\n'
     known = systems.SYSTEMS
     packaged = {f"{s}/{k}": (s, one.path) for s in known for k, one in listed(s).items()}
     others = {f"{s}/{k}": (s, path) for s in known for k, path in configurations(s).items()}
@@ -46,17 +49,17 @@ def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
     if not name.endswith(".toml"):
         raise InputError(
             f"no scenario '{name}'{hint(name, packaged)} `robins list` names those there are; "
-            "a path must end in .toml"
+            "a path must end in .toml, a study of your own is file.py:name"
         )
     text = scenario.read_text(name)
     chosen = scenario.mapping_of(text).get("system")
-    if not isinstance(chosen, str) or chosen not in known:
+    if not isinstance(chosen, str) or not (is_file(chosen) or chosen in known):
         raise InputError(
-            f'write system = "..." into its first lines, one of {", ".join(known)}; it says '
-            f"{chosen!r}",
+            f'write system = "..." into its first lines, one of {", ".join(known)}, or '
+            f"file.py:study for one of your own; it says {chosen!r}",
             name,
         )
-    return known[chosen], Path(name).stem, text
+    return find_system(chosen, Path(name).parent), Path(name).stem, text
 
 
 def study_of(system: System, text: str, source: str) -> Study:

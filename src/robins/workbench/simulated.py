@@ -26,7 +26,7 @@ def run(
     """Simulate a scenario with several filters on the same random numbers.
 
     Args:
-        name: "system/name" or the path of a TOML file.
+        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
         runs: how many; by default what the scenario says.
         seed: of the random streams.
         filters: names; by default those of the scenario.
@@ -41,7 +41,7 @@ def run(
     study = study_of(system, text, name)
     more = settings if runs is None else (*settings, f"runs={runs}")
     parameters = scenario.parse(study.parameters, text, more, source=name)
-    chosen = check_filters(label, study.filters, filters or parameters.filters)
+    chosen = check_filters(label, study.filters, filters or parameters.filters or study.filters)
     progress(0.0, "setting up the simulation")
     with refusing(name):
         problem = study.problem(parameters, chosen, seed)
@@ -69,7 +69,7 @@ def bound(
     """Tell what the sensors of a scenario allow at best, with the model of one of its filters.
 
     Args:
-        name: "system/name" or the path of a TOML file.
+        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
         filter_name: whose model; by default that of the scenario's first filter.
         runs: over how many simulated trajectories to average.
         seed: of the random streams.

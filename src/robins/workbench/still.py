@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from robins import units
 from robins.dataset import Dataset, ImuTable
 from robins.ins.allan import Allan, AllanFit, deviation, fit, in_field_units
 from robins.logs import formats_of, open_log
@@ -88,12 +89,6 @@ def longest_stretch(time_ns: np.ndarray) -> tuple[int, int]:
     return int(bounds[longest]), int(bounds[longest + 1])
 
 
-def suffix(unit: str) -> str:
-    """A unit as the end of a metric's name: "deg/sqrt(h)" is "deg_per_sqrt_h"."""
-    plain = unit.replace("sqrt(", "sqrt_").replace(")", "").replace("^", "").lower()
-    return plain.replace("/", "_per_")
-
-
 def expected(fitted: AllanFit, tau_s: np.ndarray) -> dict[str, np.ndarray]:
     """Allan deviation (T, axes) of each fitted term by itself, as in IEEE Std 952, Annex C."""
     tau = tau_s[:, None]
@@ -124,7 +119,7 @@ def _metrics(sensor: str, fitted: AllanFit) -> dict[str, dict[str, Any]]:
     """Parameters and their intervals by axis."""
     by_axis: dict[str, dict[str, Any]] = {axis: {} for axis in _AXES}
     for name, found in in_field_units(fitted, sensor).items():  # type: ignore[arg-type]
-        unit = suffix(found.unit)
+        unit = units.as_ending(found.unit)
         for k, axis in enumerate(_AXES):
             by_axis[axis][f"{sensor}_{name}_{unit}"] = found.value[k]
             by_axis[axis][f"{sensor}_{name}_interval_{unit}"] = [found.lower[k], found.upper[k]]

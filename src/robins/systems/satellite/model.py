@@ -16,6 +16,7 @@ Markley & Crassidis 2014, eq. 6.93) is exact at rest:
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -179,6 +180,7 @@ def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = Fals
     return Belief(QuaternionState(q_ib, jnp.zeros(3)), factor)
 
 
+@cache  # made before a run is traced: a rule checks its gain, which a trace cannot
 def make_filter(build: Build) -> Filter:
     """The filter of a build; those that differ in their gains share it, for a gain is data."""
     reopened = gate(GATE, PATIENCE, "reinitialise")

@@ -1,0 +1,101 @@
+"""Systems by name: of robins, of an installed package, or in a file of the user's.
+
+A file is named with what it defines, "my_system.py:study": a `System`, or a `Study`, which is taken
+for a system that has no other. The file is imported, so it runs; it can import what lies beside it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from robins.errors import RobinsError, hint
+from robins.systems.catalogue import SUMMARIES, installed, summaries
+from robins.systems.study import Study
+from robins.systems.system import System
+
+
+class UnknownSystem(RobinsError, ValueError):
+    """There is no such system, or what is said to be one is none."""
+
+
+def is_file(name: str) -> bool:
+    """Whether a name means a file of Python, such as "my_system.py:study"."""
+    return name.partition(":")[0].endswith(".py")
+
+
+def find_system(name: str, folder: Path = Path()) -> System:
+    """The system of a name.
+
+    Args:
+        name: as `robins list` tells it, or "file.py:name".
+        folder: that a relative path starts from.
+
+    Raises:
+        UnknownSystem: there is none; the message says what there is.
+    """
+    if is_file(name):
+        return _of_file(name, folder)
+    if name in SUMMARIES:
+        module = importlib.import_module(f"robins.systems.{name.replace('-', '_')}")
+        return module.SYSTEM
+    if (point := installed().get(name)) is not None:
+        return _as_system(name, point.load(), f"entry point {point.value}")
+    known = summaries()
+    raise UnknownSystem(
+        f"no system '{name}'{hint(name, known)} There are {', '.join(known)}",
+        fix="for one of your own write file.py:name",
+    )
+
+
+def _of_file(name: str, folder: Path) -> System:
+    where, _, wanted = name.partition(":")
+    path = (folder / where).resolve()
+    if not path.is_file():
+        raise UnknownSystem("there is no such file", path)
+    module = _imported(path)
+    offered = [key for key, value in vars(module).items() if isinstance(value, Study | System)]
+    if not offered:
+        raise UnknownSystem(
+            "it defines no study", path, "assign a robins.systems.Study to a name at its top level"
+        )
+    if wanted not in vars(module):
+        raise UnknownSystem(
+            f"no study '{wanted}' in it{hint(wanted, offered)}",
+            path,
+            f"write one of {', '.join(f'{where}:{key}' for key in offered)}",
+        )
+    return _as_system(f"{path.stem}:{wanted}", getattr(module, wanted), str(path))
+
+
+def _imported(path: Path) -> ModuleType:
+    """The file as a module, importable by its name as if Python had been started beside it."""
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))
+    try:
+        module = importlib.import_module(path.stem)
+    except Exception as error:
+        raise UnknownSystem(
+            f"importing it failed: {type(error).__name__}: {error}", path
+        ) from error
+    if Path(str(module.__file__)).resolve() != path:
+        raise UnknownSystem(
+            f"the name {path.stem} is that of another module, {module.__file__}",
+            path,
+            "give the file another name",
+        )
+    return module
+
+
+def _as_system(name: str, found: Any, where: str) -> System:
+    if isinstance(found, System):
+        return found
+    if isinstance(found, Study):
+        return System(name, {name.rpartition(":")[2]: found})
+    kind = type(found).__name__
+    raise UnknownSystem(
+        f"it is of type {kind}", where, "a system is a robins.systems.System or a Study"
+    )
