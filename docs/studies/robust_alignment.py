@@ -32,13 +32,9 @@ from robins.filters.rules import huber
 from robins.scenario import load
 from robins.systems import transfer_alignment
 from robins.systems.study import Contender, Problem
-from robins.systems.transfer_alignment.pair_parameters import Structure
 from robins.systems.transfer_alignment.patent import Patent, patent_problem
-from robins.systems.transfer_alignment.product_filters import (
-    Believed,
-    product_contender,
-    reported,
-)
+from robins.systems.transfer_alignment.product.parameters import Believed, Structure
+from robins.systems.transfer_alignment.product.study import product_contender, reported
 
 SCENARIOS = Path(transfer_alignment.__file__).parent / "scenarios"
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "robust_alignment.png"

@@ -21,8 +21,8 @@ from robins.systems.judgement import judging
 from robins.systems.tables import Update
 from robins.systems.transfer_alignment import patent
 from robins.systems.transfer_alignment import velocity_attitude as va
-from robins.systems.transfer_alignment.pair_course import lay_out
 from robins.systems.transfer_alignment.patent_claims import CLAIMS, patent_metrics
+from robins.systems.transfer_alignment.product.world import lay_out
 
 FOLDER = Path(patent.__file__).parent / "scenarios"
 RUNS = 100

@@ -89,7 +89,7 @@ def rms_by_axis(statistics: Any) -> dict[str, list[float]]:
     square = np.mean(statistics.rms[statistics.counted] ** 2, axis=0)
     out = {}
     for block in statistics.blocks:
-        ending = "mps" if block.display_unit == "m/s" else _ending(block.display_unit)
+        ending = "mps" if block.display_unit == "m/s" else units.as_ending(block.display_unit)
         sizes = np.sqrt(square[block.where])
         sizes = units.convert(sizes, block.units, block.display_unit)
         out[f"{block.name}_rms_{ending}"] = sizes.tolist()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pydantic
+from jaxtyping import ArrayLike
 
+from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
@@ -60,6 +62,13 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
             "before the end"
         )
+
+
+class Block(NamedTuple):
+    """Input of one step of a motion that is mechanised from inertial samples."""
+
+    increments: Increments  # dt (K,), theta (K, 3), dv (K, 3)
+    noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
 
 
 LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take

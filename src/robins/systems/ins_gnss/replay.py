@@ -20,7 +20,12 @@ from robins.systems.ins_gnss.model import ROAD, STANDSTILL, STILL_RATE, Mount, r
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.prepare import Log, Prepared, on_one_clock, pieces, prepare
 from robins.systems.ins_gnss.setup import SMOOTHED, make_filter, model_of, mount_of
-from robins.systems.tables import doubts_told_at_the_end, end_to_end, replay_warnings, together
+from robins.systems.replaying import (
+    doubts_told_at_the_end,
+    end_to_end,
+    replay_warnings,
+    together,
+)
 
 CAUSES = (
     "Likely causes: the lever arm or the latency of the GNSS, the mounting of the unit, sigmas "

@@ -17,7 +17,8 @@ from robins.systems.marg.model import REST_RATE, TRAVEL
 from robins.systems.marg.parameters import Replay
 from robins.systems.marg.prepare import Prepared, prepare
 from robins.systems.marg.setup import CAUSAL, SMOOTHED, filter_of, model_of
-from robins.systems.tables import doubts_told_at_the_end, replay_warnings, updates
+from robins.systems.replaying import doubts_told_at_the_end, replay_warnings
+from robins.systems.tables import updates
 
 CAUSES = (
     "Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, axes "

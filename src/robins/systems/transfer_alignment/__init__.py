@@ -7,13 +7,18 @@
 
 from robins.systems.system import System
 from robins.systems.transfer_alignment import attitude_matching, velocity_attitude
+from robins.systems.transfer_alignment.product import study as product
+from robins.systems.transfer_alignment.product.log import ALIGNMENT, orientation
 
 SYSTEM = System(
     name="transfer-alignment",
     studies={
         "attitude-matching": attitude_matching.STUDY,
         "velocity-attitude": velocity_attitude.STUDY,
+        "product": product.STUDY,
     },
+    orientation=orientation,
+    alignment=ALIGNMENT,
 )
 
 __all__ = ["SYSTEM"]

@@ -38,13 +38,14 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import _float64  # noqa: F401
-from robins.earth import OMEGA_E, Geodetic, curvature_radii
+from robins.earth import OMEGA_E, curvature_radii
 from robins.filters import Model, Motion, Sensor
 from robins.ins.frames import euler_enu_rfu, swap, swap_q
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, advance, rows, unpacked, vector
+from robins.ins.state import InsState
 from robins.manifold import retract, wrap
-from robins.rotation import Rotation, conjugate, multiply, rotate, to_dcm
+from robins.rotation import conjugate, multiply, rotate, to_dcm
 
 STATES = 12
 LAT, LON, VE, VN, PHI_E, PHI_N, PHI_U, NABLA_X, NABLA_Y, EPS_X, EPS_Y, EPS_Z = range(STATES)
@@ -302,22 +303,14 @@ def as_master_sees(own: Nav, flight: Flight, master: Nav) -> tuple[Flight, Float
     return about, turn @ dcm_enu(own.q_nb.wxyz)
 
 
-def true_errors(
-    computed: Nav,
-    q_nb: ArrayLike,
-    v_n: ArrayLike,
-    position: Geodetic,
-    gyro_bias: ArrayLike,
-    accel_bias: ArrayLike,
-) -> Float[Array, "*b 12"]:
+def true_errors(computed: Nav, true: InsState) -> Float[Array, "*b 12"]:
     """The state x as it truly is, from truth in NED/FRD; any leading axes."""
-    p, true = computed.position, Rotation(jnp.asarray(q_nb, float))
-    v_n, gyro_bias, accel_bias = (jnp.asarray(a, float) for a in (v_n, gyro_bias, accel_bias))
+    p, position = computed.position, true.position
     parts = (
         jnp.stack([p.lat - position.lat, p.lon - position.lon], -1),
-        swap(computed.v_n - v_n)[..., :2],
-        swap(Rotation(jnp.asarray(computed.q_nb.wxyz, float)).local(true)),
-        swap(accel_bias)[..., :2],
-        swap(gyro_bias),
+        swap(computed.v_n - true.v_n)[..., :2],
+        swap(computed.q_nb.local(true.q_nb)),
+        swap(jnp.asarray(true.accel_bias, float))[..., :2],
+        swap(jnp.asarray(true.gyro_bias, float)),
     )
     return jnp.concatenate(parts, -1)

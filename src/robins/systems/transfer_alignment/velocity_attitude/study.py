@@ -34,7 +34,6 @@ from robins.filters import Belief, Filter, gamma_min, kalman
 from robins.filters.rules import adaptive_h_infinity, h_infinity
 from robins.ins.frames import swap, swap_q
 from robins.ins.increments import Increments
-from robins.ins.mechanise import Nav
 from robins.results import array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
@@ -50,11 +49,14 @@ from robins.systems.study import (
     Study,
     View,
 )
-from robins.systems.transfer_alignment import pair_course
-from robins.systems.transfer_alignment.pair import PairRun, simulate_pair
-from robins.systems.transfer_alignment.pair_answer import SENSORS as PRODUCT_SENSORS
-from robins.systems.transfer_alignment.pair_parameters import Disturbance, PairParameters, Structure
-from robins.systems.transfer_alignment.product_filters import product_contender
+from robins.systems.transfer_alignment.product import world as product
+from robins.systems.transfer_alignment.product.parameters import (
+    Disturbance,
+    PairParameters,
+    Structure,
+)
+from robins.systems.transfer_alignment.product.study import SENSORS as PRODUCT_SENSORS
+from robins.systems.transfer_alignment.product.study import product_contender
 from robins.systems.transfer_alignment.velocity_attitude import model as va
 
 ARCMIN = units.parse("1 arcmin", "angle")
@@ -114,7 +116,7 @@ class Course:
     """What all runs share."""
 
     given: VelocityAttitude
-    pair: pair_course.Course
+    pair: product.Course
 
     @cached_property
     def least_gamma(self) -> float:
@@ -147,7 +149,7 @@ def lay_out(given: VelocityAttitude) -> Course:
             "lever_arm and master.delay must be zero in the study 'velocity-attitude', whose model "
             "takes both as compensated; the study 'product' knows them"
         )
-    pair = pair_course.lay_out(given)
+    pair = product.lay_out(given)
     end_s, d, seat = float(pair.epoch_s[-1]), given.disturbance, given.mounting
     refuse_unsettled("settle", given.settle, end_s)
     va.refuse_steep(pair.epoch_s, np.asarray(pair.path.q_nb.wxyz))
@@ -164,20 +166,20 @@ def lay_out(given: VelocityAttitude) -> Course:
 
 def simulate(given: VelocityAttitude, course: Course, seed: int, index: Array) -> World:
     """One run, from its number, which may be traced; pure."""
-    pair = simulate_pair(given, course.pair, seed, index)
+    pair = product.simulate_pair(given, course.pair, seed, index)
     own, flown = va.navigate(va.start_with_error(pair.start, pair.initial_error), pair.increments)
     # as the slave's box sits
-    master_q = multiply(pair.master_q_nb, jnp.asarray(course.pair.q_nominal))
-    master = Nav(Rotation(master_q), pair.master_v_n, pair.master_position)
+    master_q = multiply(pair.master.q_nb.wxyz, jnp.asarray(course.pair.q_nominal))
+    master = pair.master._replace(q_nb=Rotation(master_q))
     flight, C_nb = va.as_master_sees(own, flown, master)
-    t = pair.truth
+    assert pair.truth is not None
     return World(
         pair=pair,
         flight=flight,
         C_nb=C_nb,
-        velocity=swap(own.v_n - pair.master_v_n)[..., :2],
+        velocity=swap(own.v_n - pair.master.v_n)[..., :2],
         attitude=va.euler_difference(swap_q(own.q_nb.wxyz), swap_q(master_q)),
-        error=va.true_errors(own, t.q_nb, t.v_n, t.position, t.gyro_bias, t.accel_bias),
+        error=va.true_errors(own, pair.truth.ins),
     )
 
 
@@ -312,7 +314,7 @@ def of_product(given: VelocityAttitude, name: str) -> Contender:
     return made._replace(case=Partial(_of_pair, made.case), reported=made.reported[level])
 
 
-def _of_pair(case: Callable[[PairRun], Case], world: World) -> Case:
+def _of_pair(case: Callable[[product.PairRun], Case], world: World) -> Case:
     return case(world.pair)
 
 

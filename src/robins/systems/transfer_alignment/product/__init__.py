@@ -1,0 +1,1 @@
+"""The study "product": total state with mounting and flexure, closed loop; recorded pairs too."""
