@@ -81,6 +81,21 @@ def pooled_rms(statistics: Any, block: Any) -> float:
     return float(units.convert(size, block.units, block.display_unit))
 
 
+def rms_by_axis(statistics: Any) -> dict[str, list[float]]:
+    """RMS error of every axis of every block in its display unit, over runs and epochs that count.
+
+    Their names end as others write them: "mps" for m/s.
+    """
+    square = np.mean(statistics.rms[statistics.counted] ** 2, axis=0)
+    out = {}
+    for block in statistics.blocks:
+        ending = "mps" if block.display_unit == "m/s" else units.as_ending(block.display_unit)
+        sizes = np.sqrt(square[block.where])
+        sizes = units.convert(sizes, block.units, block.display_unit)
+        out[f"{block.name}_rms_{ending}"] = sizes.tolist()
+    return out
+
+
 def standard_metrics(statistics: Any) -> dict[str, Any]:
     """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
     errors = {

@@ -32,9 +32,10 @@ from robins.systems.replaying import (
     Answer,
     Piece,
     Reported,
-    across_gap,
     epochs_of,
+    gap_counts,
     navigated,
+    noise_scale,
     outcome,
     prepared,
     stacked,
@@ -146,9 +147,10 @@ def _prepare(pair: Pair, parameters: Replay, rows: slice) -> PairPiece:
     turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
     if (told := pair.master.omega_ib_b) is not None:
         turn = np.where(np.isfinite(told), told, turn)
+    scale = noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
     world = PairRun(
         increments=blocks.increments,
-        noise_scale=np.where(across_gap(blocks, increments.dt), recording.gap_noise, 1.0),
+        noise_scale=scale,
         start=_slave_of(jax.tree.map(lambda x: x[k], reported), at, jnp.asarray(turn[k])),
         initial_error=np.zeros(9),
         master=jax.tree.map(at_epochs, reported),
@@ -159,6 +161,7 @@ def _prepare(pair: Pair, parameters: Replay, rows: slice) -> PairPiece:
         world=jax.tree.map(jnp.asarray, world),
         begin_s=start_s,
         epoch_s=epochs,
+        noise_scale=scale,
         record=record,
         first=k,
     )
@@ -344,7 +347,6 @@ def replay(
     variables |= place_arrays("track", map(track, ("lat", "lon", "alt")), "{} of the slave")
     variables |= place_arrays("reference", path, "{} of the master", dims=time)
     used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
-    over_gaps = sum(int(np.sum(np.asarray(p.world.noise_scale) > 1.0)) for p in pieces)
     return outcome(
         epochs_of(pieces),
         answers,
@@ -352,11 +354,8 @@ def replay(
         metrics=metrics_of,
         variables=variables,
         counts=dict(dataset.counts)
-        | {
-            "imu_gaps_declared": len(pieces) + len(problems) - 1,
-            "blocks_over_imu_gaps": over_gaps,
-            "master_records_not_used": len(master) - used - len(pieces),
-        },
+        | gap_counts(pieces, problems)
+        | {"master_records_not_used": len(master) - used - len(pieces)},
         notes=notes,
     )
 
