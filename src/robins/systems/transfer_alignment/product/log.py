@@ -38,7 +38,6 @@ from robins.systems.replaying import (
     noise_scale,
     outcome,
     prepared,
-    stacked,
 )
 from robins.systems.study import Case, Contender
 from robins.systems.system import Alignment
@@ -51,6 +50,7 @@ from robins.systems.transfer_alignment.product.study import (
     SENSORS,
     installation_of,
     product_contender,
+    tracks,
 )
 from robins.systems.transfer_alignment.product.world import PairRun
 
@@ -338,13 +338,9 @@ def replay(
     if master.omega_ib_b is None and any(parameters.lever_arm):
         notes.append("The master's turn rate was not recorded; the slave's gyros stand in for it.")
     notes += [line for name, answer in answers.items() for line in remarks(name, answer)]
-
-    def track(field: str) -> np.ndarray:
-        return stacked(answers, lambda a: getattr(a.mean.ins.position, field))
-
     time, path = "master_time", (master.lat_rad, master.lon_rad, master.alt_m)
     variables = {time: variable(time, pair.master_s, "s", "time of the master's records")}
-    variables |= place_arrays("track", map(track, ("lat", "lon", "alt")), "{} of the slave")
+    variables |= tracks({name: answer.mean for name, answer in answers.items()})
     variables |= place_arrays("reference", path, "{} of the master", dims=time)
     used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
     return outcome(

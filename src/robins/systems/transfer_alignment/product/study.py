@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -251,13 +252,10 @@ def _contender(given: Product, course: Course, name: str) -> Contender:
     return product_contender(given, name, given.believed)
 
 
-def _tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
-    """Where each filter thought the slave was in the first run."""
-
-    def of(field: str) -> np.ndarray:
-        return np.stack([np.asarray(getattr(m.ins.position, field)) for m in means.values()])
-
-    return place_arrays("track", map(of, ("lat", "lon", "alt")))
+def tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
+    """Where each filter thought the slave was."""
+    places = zip(*(jax.tree.leaves(mean.ins.position) for mean in means.values()), strict=True)
+    return place_arrays("track", map(np.stack, places), "{} of the slave")
 
 
 def _view(given: Product, course: Course) -> View:
@@ -270,7 +268,7 @@ def _view(given: Product, course: Course) -> View:
         sensors={name: SENSORS[name] for name in used},
         metrics=product_metrics,
         context=xr.Dataset(place_arrays("reference", (path.lat, path.lon, path.alt), "true {}")),
-        shown=_tracks,
+        shown=tracks,
         count_from=int(np.searchsorted(course.epoch_s, given.settle)),
         limits=(Limit(FIVE_ARCMIN, "attitude", units.parse("5 arcmin", "angle")),),
         notes=("The pair is simulated; --master and --slave align a recorded one.",),

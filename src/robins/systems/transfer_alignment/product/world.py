@@ -145,7 +145,7 @@ def lay_out(pair: PairParameters) -> Course:
     described_ns = np.round(np.maximum(described_s, 0.0) * 1e9).astype(np.int64)
     there = described_s >= -SLACK_S
     for window in pair.disturbance.dropouts:
-        there &= ~_within(epoch_s, window)
+        there &= (epoch_s < window.begin - SLACK_S) | (epoch_s >= window.end - SLACK_S)
     return Course(
         motion=motion,
         epoch_s=epoch_s,
@@ -166,10 +166,6 @@ def lay_out(pair: PairParameters) -> Course:
 
 
 _compiled_gravity = jax.jit(gravity)
-
-
-def _within(time_s: np.ndarray, window: Window) -> np.ndarray:
-    return (time_s >= window.begin - SLACK_S) & (time_s < window.end - SLACK_S)
 
 
 def _samples_an_epoch(slave_hz: float, master_hz: float) -> int:
@@ -244,19 +240,18 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
     d = multiply(from_rotvec(in_slave_axes), from_rotvec(mounting))
     theta, dv = _felt(course, d)
     q_nb = multiply(jnp.asarray(course.q_nb), d)
-    errors = _slave_errors(pair, course, stream(seed, index, Component.IMU))
+    theta_error, dv_error, *biases = _slave_errors(pair, course, stream(seed, index, Component.IMU))
     shape = (len(course.epoch_s), course.each)
 
     def at_epochs(x: Array) -> Array:
         return x[course.each - 1 :: course.each]
 
     true = jax.tree.map(jnp.asarray, course.path)._replace(q_nb=Rotation(at_epochs(q_nb[1:])))
-    biases = at_epochs(errors.gyro_bias), at_epochs(errors.accel_bias)
     return PairRun(
         increments=Increments(
             jnp.asarray(course.dt).reshape(shape),
-            (theta + errors.theta).reshape(*shape, 3),
-            (dv + errors.dv).reshape(*shape, 3),
+            (theta + theta_error).reshape(*shape, 3),
+            (dv + dv_error).reshape(*shape, 3),
         ),
         noise_scale=jnp.ones(shape[0]),
         start=jax.tree.map(jnp.asarray, course.start)._replace(q_nb=Rotation(q_nb[0])),
@@ -264,7 +259,7 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
         master=_records(pair, course, seed, index),
         master_omega_b=jnp.asarray(course.master_omega_b),
         truth=ProductState(
-            InsState(*true, *biases),
+            InsState(*true, *map(at_epochs, biases)),
             jnp.broadcast_to(mounting, (shape[0], 3)),
             jnp.concatenate([at_epochs(angle[1:]), at_epochs(rate[1:])], 1),
         ),
@@ -295,15 +290,11 @@ def _felt(course: Course, d: Float[Array, "n 4"]) -> tuple[Array, Array]:
     return to_rotvec(turned), rotate(back, jnp.asarray(course.nominal.dv))
 
 
-class _SlaveErrors(NamedTuple):
-    theta: Array  # (N, 3) rad
-    dv: Array  # (N, 3) m/s
-    gyro_bias: Array  # (N, 3) rad/s at the end of each sample
-    accel_bias: Array  # (N, 3) m/s^2
+def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Array, ...]:
+    """Errors of theta and dv, biases of gyros and accelerometers after each sample; (N, 3) each.
 
-
-def _slave_errors(pair: PairParameters, course: Course, key: Array) -> _SlaveErrors:
-    """All errors add, so the unit is asked what it reports of a body at rest in free fall."""
+    All errors add, so the unit is asked what it reports of a body at rest in free fall.
+    """
     s, dt, still = pair.slave, jnp.asarray(course.dt), jnp.zeros((len(course.dt), 3))
     stated = ((s.gyro_bias, s.gyro_noise), (s.accel_bias, s.accel_noise))
     triads = (TriadErrors(bias_sigma=np.asarray(b), white=np.asarray(w)) for b, w in stated)
@@ -320,7 +311,7 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> _SlaveErr
         at = d.drift_step_time - SLACK_S
         step, turned = drift_step(jnp.asarray(course.begin_s), dt, at, jnp.asarray(d.drift_step))
         theta, bias = theta + turned, bias + step
-    return _SlaveErrors(theta, dv, bias, seen.accel.bias)
+    return theta, dv, bias, seen.accel.bias
 
 
 def _initial_error(start: Start, key: Array) -> Float[Array, "9"]:
