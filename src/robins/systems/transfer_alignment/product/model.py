@@ -17,7 +17,8 @@ flexure, so its attitude includes it: flexure has no part in the slave's mechani
 
     x' = F x + G w      F = diag(F_ins, 0, F_flexure)            Q = diag(Q_ins, 0, Q_flexure)   (1)
                         F_ins, Q_ins: `robins.ins.errors`, as Groves (2013), section 14.2
-    l'' + 2 zeta wn l' + wn^2 l = q,  wn = 2.146 / tau,  q of density 4 zeta wn^3 sigma^2        (2)
+    l'' + 2 zeta wn l' + wn^2 l = q,  wn = 2.146 / tau,  q of density 4 zeta wn^3 sigma^2,       (2)
+                        so by axis F_flexure = [0 1; -wn^2 -2 zeta wn]
 
 Measurement: what the master is expected to read, through mounting, flexure and the lever arm r,
 
