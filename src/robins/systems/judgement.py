@@ -81,18 +81,20 @@ def pooled_rms(statistics: Any, block: Any) -> float:
     return float(units.convert(size, block.units, block.display_unit))
 
 
-def rms_by_axis(statistics: Any) -> dict[str, list[float]]:
+def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
     """RMS error of every axis of every block in its display unit, over runs and epochs that count.
 
-    Their names end as others write them: "mps" for m/s.
+    Args:
+        statistics: of a campaign.
+        all_axes: blocks of which the RMS over all axes is told too.
     """
-    square = np.mean(statistics.rms[statistics.counted] ** 2, axis=0)
-    out = {}
+    square, out = np.mean(statistics.rms[statistics.counted] ** 2, axis=0), {}
     for block in statistics.blocks:
         ending = "mps" if block.display_unit == "m/s" else units.as_ending(block.display_unit)
-        sizes = np.sqrt(square[block.where])
-        sizes = units.convert(sizes, block.units, block.display_unit)
+        sizes = units.convert(np.sqrt(square[block.where]), block.units, block.display_unit)
         out[f"{block.name}_rms_{ending}"] = sizes.tolist()
+        if block.name in all_axes:
+            out[f"{block.name}_rms_all_{ending}"] = float(np.sqrt(np.mean(sizes**2)))
     return out
 
 

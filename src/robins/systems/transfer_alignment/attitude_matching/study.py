@@ -238,10 +238,8 @@ NO_RESULT: Mapping[str, Any] = {
 
 def metrics_of(statistics: Any) -> dict[str, Any]:
     """Metrics of one filter from its campaign statistics, over the epochs that count."""
-    out: dict[str, Any] = rms_by_axis(statistics)
     settled = statistics.settled(FIVE_ARCMIN.name)
-    return out | {
-        "attitude_rms_all_arcmin": float(np.sqrt(np.mean(np.square(out["attitude_rms_arcmin"])))),
+    return rms_by_axis(statistics, all_axes=("attitude",)) | {
         "share_below_5_arcmin": float(np.mean(settled <= statistics.count_from)),
         "diverged_runs": statistics.diverged,
     }
@@ -272,8 +270,8 @@ def _kf_lost(metrics: Metrics) -> str:
 
 
 def _gained(metrics: Metrics) -> str:
-    gained = 1.0 - metrics["hinf-deg"][ALL] / metrics["hinf-deg-inf"][ALL]
-    return graded(gained >= 0.1, gained >= 0.02)
+    left = ratio("hinf-deg", "hinf-deg-inf", ALL)(metrics)
+    return graded(left <= 0.9, left <= 0.98)
 
 
 def _existing_units(metrics: Metrics) -> int | None:

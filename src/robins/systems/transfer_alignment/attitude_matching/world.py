@@ -96,7 +96,12 @@ def simulate(given: AttitudeMatching, course: Course, seed: int, index: Array) -
     key = partial(stream, seed, index)
     c = jax.tree_util.tree_map(jnp.asarray, course)
     steps, dt = len(course.turned_n), given.step
-    phi0, eps, mu = _errors(given, key(Component.INITIAL_STATE))
+    sizes = (given.slave.attitude_error, given.slave.gyro_bias, given.mounting.error)
+    errors = jnp.stack([jnp.asarray(size) for size in sizes])
+    if given.signs == "random":
+        drawn = jax.random.rademacher(key(Component.INITIAL_STATE), errors.shape, float)
+        errors = drawn * errors
+    phi0, eps, mu = errors
     swing, flutter = (jax.random.fold_in(key(Component.FLEXURE), part) for part in range(2))
     f = given.flexure
     structure = Flexure(
@@ -147,12 +152,3 @@ def matched(q_nm: Array, q_nominal: Array, q_ns: Array) -> Array:
     M = rotation.to_dcm(product)
     pairs = ((2, 1), (0, 2), (1, 0))
     return jnp.stack([0.5 * (M[..., i, j] - M[..., j, i]) for i, j in pairs], -1)
-
-
-def _errors(given: AttitudeMatching, key: Array) -> tuple[Array, Array, Array]:
-    """Attitude error, drift and mounting error of a run."""
-    sizes = (given.slave.attitude_error, given.slave.gyro_bias, given.mounting.error)
-    values = jnp.stack([jnp.asarray(size) for size in sizes])
-    if given.signs == "random":
-        values = jax.random.rademacher(key, values.shape, float) * values
-    return values[0], values[1], values[2]

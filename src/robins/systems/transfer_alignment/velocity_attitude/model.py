@@ -45,7 +45,7 @@ from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, advance, rows, unpacked, vector
 from robins.ins.state import InsState
 from robins.manifold import retract, wrap
-from robins.rotation import conjugate, multiply, rotate, to_dcm
+from robins.rotation import conjugate, multiply, rotate, to_dcm, to_euler
 
 STATES = 12
 LAT, LON, VE, VN, PHI_E, PHI_N, PHI_U, NABLA_X, NABLA_Y, EPS_X, EPS_Y, EPS_Z = range(STATES)
@@ -183,7 +183,7 @@ def euler_difference(slave_q_enu: ArrayLike, master_q_enu: ArrayLike) -> Float[A
     return wrap(jnp.stack([a - b for a, b in zip(slave[::-1], master[::-1], strict=True)], -1))
 
 
-def refuse_steep(time_s: ArrayLike, q_nb: ArrayLike) -> None:
+def refuse_steep(time_s: np.ndarray, q_nb: ArrayLike) -> None:
     """Refuse attitudes at which roll and heading cannot be told apart; outside compiled code.
 
     Args:
@@ -193,14 +193,12 @@ def refuse_steep(time_s: ArrayLike, q_nb: ArrayLike) -> None:
     Raises:
         ValueError: the nose points more than 85 deg up or down at some time.
     """
-    times, q = np.atleast_1d(np.asarray(time_s, float)), np.atleast_2d(np.asarray(q_nb, float))
-    w, x, y, z = q.T
-    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
+    pitch = np.asarray(to_euler(jnp.asarray(q_nb, float))[1])
     steep = np.flatnonzero(np.abs(pitch) > STEEPEST_RAD)
     if len(steep):
         k = steep[0]
         raise ValueError(
-            f"pitch is {math.degrees(pitch[k]):.1f} deg at {times[k]:g} s: beyond 85 deg heading "
+            f"pitch is {math.degrees(pitch[k]):.1f} deg at {time_s[k]:g} s: beyond 85 deg heading "
             "and roll are hard to tell apart and their differences no measurement of attitude. "
             "Match rotation matrices instead, as the filter 'product' does"
         )

@@ -194,52 +194,33 @@ class Noise(NamedTuple):
     attitude: Any  # (E, 3) rad, heading, pitch, roll
 
 
-def stated_noise(given: VelocityAttitude, epoch_s: np.ndarray) -> Noise:
-    """The noise that the data sheets state; worst axis where axes differ."""
-    s, m, dt = given.slave, given.master, 1.0 / given.master.rate
-    process = np.asarray(va.process_sigma(max(s.gyro_noise), max(s.accel_noise), dt))
-    north, east, _ = m.velocity_noise
-    east_tilt = max(m.attitude_noise[:2])
-    rows = (process, [east, north], [m.attitude_noise[2], east_tilt, east_tilt])
-    return Noise(*(np.tile(row, (len(epoch_s), 1)) for row in rows))
+def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> Noise:
+    """The noise that a filter believes in: that of the data sheets, worst axis where axes differ.
 
-
-def told_of_measurement(noise: Noise, told: Informed) -> Noise:
-    """With the variance of outliers in all measurements and of flexure in attitude."""
-    d = told.disturbance
-    factor = math.sqrt(1.0 + d.outlier_share * (d.outlier_factor**2 - 1.0))
-    roll, pitch, heading = told.flexure.sigma
-    return noise._replace(
-        velocity=noise.velocity * factor,
-        attitude=np.hypot(noise.attitude * factor, [heading, pitch, roll]),
-    )
-
-
-def told_of_motion(noise: Noise, told: Informed, epoch_s: np.ndarray) -> Noise:
-    """With the gyro noise in its window, and a drift that walks from its step on."""
-    d, process = told.disturbance, noise.process.copy()
-    dt = float(epoch_s[0])  # epochs are even, and the first ends one after time zero
-    begin = epoch_s - dt + 1e-9  # of the interval that ends with the epoch
-    if d.gyro_noise_window is not None:
+    One that is told "r" adds the variance of outliers in all measurements and of flexure in
+    attitude; one told "q" the gyro noise in its window, and a drift that walks from its step on.
+    """
+    s, m, told, d = given.slave, given.master, TOLD.get(name, ()), given.told.disturbance
+    sigma = np.asarray(va.process_sigma(max(s.gyro_noise), max(s.accel_noise), 1.0 / m.rate))
+    (north, east, _), tilt = m.velocity_noise, max(m.attitude_noise[:2])
+    rows = (sigma, [east, north], [m.attitude_noise[2], tilt, tilt])
+    process, velocity, attitude = (np.tile(row, (len(epoch_s), 1)) for row in rows)
+    if name == "hinf-patent-weights":  # R = I in SI units, whatever that means
+        return Noise(process, np.ones_like(velocity), np.ones_like(attitude))
+    if "r" in told:
+        factor = math.sqrt(1.0 + d.outlier_share * (d.outlier_factor**2 - 1.0))
+        roll, pitch, heading = given.told.flexure.sigma
+        velocity = velocity * factor
+        attitude = np.hypot(attitude * factor, [heading, pitch, roll])
+    begin = epoch_s - epoch_s[0] + 1e-9  # of the interval that ends with an epoch; they are even
+    if "q" in told and d.gyro_noise_window is not None:
         inside = (begin >= d.gyro_noise_window.begin) & (begin < d.gyro_noise_window.end)
         process[inside, va.PHI] *= d.gyro_noise_factor
-    if d.drift_step_time is not None:
+    if "q" in told and d.drift_step_time is not None:
         after = begin >= d.drift_step_time
         step = np.abs(np.asarray(swap(np.asarray(d.drift_step))))
         process[after, va.EPS] = step / math.sqrt(max(np.count_nonzero(after), 1))
-    return noise._replace(process=process)
-
-
-def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> Noise:
-    """The noise that a filter believes in."""
-    noise = stated_noise(given, epoch_s)
-    if name == "hinf-patent-weights":  # R = I in SI units, whatever that means
-        ones = (np.ones_like(noise.velocity), np.ones_like(noise.attitude))
-        return Noise(noise.process, *ones)
-    told = TOLD.get(name, ())
-    if "r" in told:
-        noise = told_of_measurement(noise, given.told)
-    return told_of_motion(noise, given.told, epoch_s) if "q" in told else noise
+    return Noise(process, velocity, attitude)
 
 
 def start_sigma(given: VelocityAttitude) -> np.ndarray:
@@ -358,8 +339,7 @@ def metrics_of(epoch_s: np.ndarray, statistics: Any) -> dict[str, Any]:
     attitude axis stays there to the end; how long that takes is the median of all runs, infinite
     where most never do.
     """
-    out: dict[str, Any] = rms_by_axis(statistics)
-    out[RMS] = float(np.sqrt(np.mean(np.square(out["attitude_rms_arcmin"]))))
+    out = rms_by_axis(statistics, all_axes=("attitude",))
     for limit in statistics.limits:
         settled = statistics.settled(limit.name)
         # E stands for never, and a run that is out at the last epoch but one has shown nothing
