@@ -60,7 +60,7 @@ _ATTITUDE, _MOUNTING, _FLEXURE = slice(0, 3), slice(15, 18), slice(18, 21)
 # -------------------------------------------------------------------------------- log to pieces
 
 
-class Pair(NamedTuple):
+class Recorded(NamedTuple):
     """A recorded pair on one clock, whose zero is the slave's first sample; NED/FRD."""
 
     increments: Increments  # of the slave: (N,), (N, 3), (N, 3)
@@ -78,7 +78,7 @@ class PairPiece(Piece):
     first: int  # row that the slave starts from
 
 
-def on_one_clock(dataset: Dataset) -> Pair:
+def on_one_clock(dataset: Dataset) -> Recorded:
     """The tables of a pair that was examined and cleaned (`robins.logs`).
 
     Raises:
@@ -97,27 +97,27 @@ def on_one_clock(dataset: Dataset) -> Pair:
             f"{time_s[-1]:.1f} s, the master {master_s[0]:.1f} to {master_s[-1]:.1f} s; do both "
             "use the same time scale?"
         )
-    return Pair(
+    return Recorded(
         Increments(*(np.asarray(a, float) for a in increments[:3])), time_s, master, master_s
     )
 
 
-def pieces_of(pair: Pair, parameters: Replay) -> tuple[list[PairPiece], list[str]]:
+def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], list[str]]:
     """The pieces made ready for filters, and a sentence for each stretch that cannot be used.
 
     Raises:
         ValueError: no stretch can be used; the sentence says why.
     """
     longest = parameters.recording.longest_gap
-    prepare = partial(_prepare, pair, parameters)
-    return prepared(pair.time_s, np.asarray(pair.increments.dt), longest, prepare)
+    prepare = partial(_prepare, recorded, parameters)
+    return prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
 
 
-def _prepare(pair: Pair, parameters: Replay, rows: slice) -> PairPiece:
-    increments = Increments(*(np.asarray(a)[rows] for a in pair.increments[:3]))
-    time_s, master_s, delay = pair.time_s[rows], pair.master_s, parameters.master.delay
+def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
+    increments = Increments(*(np.asarray(a)[rows] for a in recorded.increments[:3]))
+    time_s, master_s, delay = recorded.time_s[rows], recorded.master_s, parameters.master.delay
     begin_s, end_s = float(time_s[0] - increments.dt[0]), float(time_s[-1])
-    reported = nav_at(pair.master, slice(None))
+    reported = nav_at(recorded.master, slice(None))
     whole = np.isfinite(np.asarray(vector(reported))).all(axis=1)
     within = (master_s - delay >= begin_s - 1e-9) & (master_s <= end_s + 1e-9)
     if not np.any(within & whole):
@@ -143,9 +143,9 @@ def _prepare(pair: Pair, parameters: Replay, rows: slice) -> PairPiece:
 
     at = installation_of(parameters)
     at_s = np.clip(master_s - delay, begin_s, end_s)
-    of_slave = _gyro_rate(increments, time_s, float(np.median(pair.increments.dt)), at_s)
+    of_slave = _gyro_rate(increments, time_s, float(np.median(recorded.increments.dt)), at_s)
     turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
-    if (told := pair.master.omega_ib_b) is not None:
+    if (told := recorded.master.omega_ib_b) is not None:
         turn = np.where(np.isfinite(told), told, turn)
     scale = noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
     world = PairRun(
@@ -220,7 +220,7 @@ def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
 
 
 def contender(parameters: Replay, name: str) -> Contender:
-    """A filter of the product model, for pieces of a recorded pair.
+    """A filter of the product model, for pieces of a recorded recorded.
 
     Raises:
         ValueError: no such filter; a noise of the master that is zero.
@@ -303,11 +303,11 @@ def remarks(name: str, answer: Answer) -> list[str]:
     return said
 
 
-def _started(piece: PairPiece, pair: Pair, delay_s: float) -> str:
+def _started(piece: PairPiece, recorded: Recorded, delay_s: float) -> str:
     old = f", which was {delay_s:g} s old" if delay_s else ""
     return (
         f"Aligned from {piece.begin_s:.2f} to {piece.epoch_s[-1]:.2f} s, starting from the "
-        f"master's record of {pair.master_s[piece.first]:.2f} s{old}."
+        f"master's record of {recorded.master_s[piece.first]:.2f} s{old}."
     )
 
 
@@ -328,18 +328,18 @@ def replay(
     Raises:
         ValueError: no such filter; or the pair cannot be aligned, the sentence says why.
     """
-    pair = on_one_clock(dataset)
-    pieces, problems = pieces_of(pair, parameters)
+    recorded = on_one_clock(dataset)
+    pieces, problems = pieces_of(recorded, parameters)
     wanted = tuple(filters) or parameters.filters
     answers = navigated(pieces, wanted, partial(contender, parameters), progress=progress)
-    master = pair.master
-    notes = [_started(piece, pair, parameters.master.delay) for piece in pieces]
+    master = recorded.master
+    notes = [_started(piece, recorded, parameters.master.delay) for piece in pieces]
     notes += [f"Not aligned, {problem}." for problem in problems]
     if master.omega_ib_b is None and any(parameters.lever_arm):
         notes.append("The master's turn rate was not recorded; the slave's gyros stand in for it.")
     notes += [line for name, answer in answers.items() for line in remarks(name, answer)]
     time, path = "master_time", (master.lat_rad, master.lon_rad, master.alt_m)
-    variables = {time: variable(time, pair.master_s, "s", "time of the master's records")}
+    variables = {time: variable(time, recorded.master_s, "s", "time of the master's records")}
     variables |= tracks({name: answer.mean for name, answer in answers.items()})
     variables |= place_arrays("reference", path, "{} of the master", dims=time)
     used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
