@@ -15,7 +15,7 @@ slave's gyros eps, which have white noise w of density N:
     eps' = 0,   mu' = 0                                (4)
     lambda'' + 2 zeta wn lambda' + wn^2 lambda = q     (5)   optional, see `robins.sim.flexure`
 
-Measured is the skew part of the product of the attitudes, with white noise v of variance R:
+The measurement is the skew part of the product of the attitudes, with white noise v of variance R:
 
     Z = vee(skew(C_hat_nm C_nominal C_hat_ns'))        (6)   eq. 6
       = phi - C_nm C_nominal mu - C_nm lambda + v      (7)   eq. 10
@@ -84,13 +84,7 @@ def attitude_enu(turn: BankTurn, t_s: np.ndarray | float) -> np.ndarray:
 
 
 def mean_attitude_enu(turn: BankTurn, begin_s: np.ndarray, period_s: float) -> np.ndarray:
-    """Mean of C_nb over each period, (E, 3, 3): what turns a constant drift over it.
-
-    Args:
-        turn: the manoeuvre.
-        begin_s: (E,) begins of the periods.
-        period_s: their length.
-    """
+    """Mean of C_nb over each period, (E, 3, 3), from its begin (E,): it turns a constant drift."""
     inside = (np.arange(MEAN_POINTS) + 0.5) / MEAN_POINTS * period_s
     return np.mean(attitude_enu(turn, np.asarray(begin_s)[:, None] + inside), axis=1)
 
@@ -160,12 +154,7 @@ def _seen(x, H):
 
 
 def error_dynamics(C_ns: np.ndarray, omega_in_n: np.ndarray) -> np.ndarray:
-    """F of x' = F x in continuous time, eqs. (3) and (4), (..., 9, 9).
-
-    Args:
-        C_ns: (..., 3, 3) slave axes to n.
-        omega_in_n: (..., 3) rad/s, rate of n.
-    """
+    """F of x' = F x in continuous time, eqs. (3) and (4), (..., 9, 9), for omega_in in rad/s."""
     #     phi           eps    mu
     #     -[omega_in x] -C_ns  0   phi
     #     0             0      0   eps
@@ -177,13 +166,7 @@ def error_dynamics(C_ns: np.ndarray, omega_in_n: np.ndarray) -> np.ndarray:
 
 
 def matching_matrix(C_nm: np.ndarray, C_nominal: np.ndarray, flexible: bool = False) -> np.ndarray:
-    """H of Z = H x, eq. (7), (..., 3, 9), or (..., 3, 15) with flexure.
-
-    Args:
-        C_nm: (..., 3, 3) master axes to n.
-        C_nominal: (3, 3) slave axes to master axes, as mounted on paper.
-        flexible: whether the state has flexure.
-    """
+    """H of Z = H x, eq. (7), (..., 3, 9), or (..., 3, 15) with states of the flexure."""
     #     phi  eps  mu              lambda  lambda'
     #     I    0    -C_nm C_nominal -C_nm   0
     H = np.zeros((*np.shape(C_nm)[:-2], 3, STATES_FLEXIBLE if flexible else STATES))
@@ -209,7 +192,7 @@ def linear_system(
         updates: how many.
         flexure: adds six states that swing so; its bending and tails are not modelled.
     """
-    turn, T, told = given.manoeuvre, given.period, given.believed
+    turn, T, spread = given.manoeuvre, given.period, given.believed
     nominal = np.asarray(Rotation.from_rotvec(given.mounting.nominal).as_dcm())
     begin_s = T * np.arange(updates)
     mean_C_ns = mean_attitude_enu(turn, begin_s, T) @ nominal
@@ -219,7 +202,7 @@ def linear_system(
         F=np.eye(STATES) + T * F,
         G=given.slave.gyro_noise * np.sqrt(T) * np.eye(STATES, 3),
         H=H,
-        sigma=np.repeat([told.attitude, told.gyro_bias, told.mounting], 3),
+        sigma=np.repeat([spread.attitude, spread.gyro_bias, spread.mounting], 3),
     )
     if flexure is None:
         return rigid

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -55,13 +55,22 @@ TOLD = {
     "kf-inflated": ("noise", "flutter", "swing"),
     "kf-flexure": ("noise", "flutter"),
 }
-# The paper's filter: unit of R = I, L = I and gamma; and whether P0 = I in that unit too.
+
+
+class InUnit(NamedTuple):
+    """The paper's filter: R = I, L = I and gamma in a unit of angle."""
+
+    unit: str
+    identity: bool = False  # P0 = I in that unit too
+    bounded: bool = True  # else gamma = inf
+
+
 IN_UNIT = {
-    "hinf-rad": ("rad", False),
-    "hinf-rad-identity": ("rad", True),
-    "hinf-deg": ("deg", False),
-    "hinf-deg-inf": ("deg", False),  # gamma = inf
-    "hinf-arcmin": ("arcmin", False),
+    "hinf-rad": InUnit("rad"),
+    "hinf-rad-identity": InUnit("rad", identity=True),
+    "hinf-deg": InUnit("deg"),
+    "hinf-deg-inf": InUnit("deg", bounded=False),
+    "hinf-arcmin": InUnit("arcmin"),
 }
 FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted")
 
@@ -99,11 +108,11 @@ def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
         share = given.h_infinity.weighted_over_least
         facts = existence(weighted_filter(), system, sigma, course, over_least=share)
         return _contender(weighted_filter(), system, sigma, facts)
-    unit, identity = IN_UNIT[name]
-    one = units.parse(f"1 {unit}", "angle")
-    if identity:
+    paper = IN_UNIT[name]
+    one = units.parse(f"1 {paper.unit}", "angle")
+    if paper.identity:
         system = system._replace(sigma=np.full(STATES, one))
-    gamma = np.inf if name.endswith("-inf") else given.h_infinity.gamma * one
+    gamma = given.h_infinity.gamma * one if paper.bounded else np.inf
     facts = existence(central_filter(), system, one, course, gamma)
     return _contender(central_filter(), system, one, facts, one)
 
@@ -118,25 +127,19 @@ def _contender(
     """A filter of a system; with facts, an H-infinity filter whose gamma has a unit."""
     model, start, (F, aux) = system.model(sigma), system.start(), system.inputs()
     rows = np.eye(STATES, F.shape[-1]) if F.shape[-1] > STATES else None
-    told: dict[str, Any] = dict(facts or {})
-    gamma = told.get("gamma", np.inf)
+    known: dict[str, Any] = dict(facts or {})
+    gamma = known.get("gamma", np.inf)
     if facts:
         start = with_gamma(filter_.init(start, model.dims), gamma)
-        told |= {key: told[key] / unit for key in ("gamma", "gamma_min")}
+        known |= {key: known[key] / unit for key in ("gamma", "gamma_min")}
     case = Partial(_case, start, F, aux[ATTITUDE])
-    return Contender(filter_, model, case, rows, bounds=bool(np.isfinite(gamma)), facts=told)
+    return Contender(filter_, model, case, rows, bounds=bool(np.isfinite(gamma)), facts=known)
 
 
 def _case(start: Any, F: Any, H: Any, world: World) -> Case:
-    """What a filter of n states is given, and what it should find.
-
-    Args:
-        start: a belief, or the state a filter begins with.
-        F: (E, n, n).
-        H: (E, 3, n).
-        world: the run.
-    """
-    return Case(start, F, {ATTITUDE: world.measured}, {ATTITUDE: H}, world.state[:, : F.shape[-1]])
+    """What a filter of n states takes of a run; F is (E, n, n) and H (E, 3, n)."""
+    truth = world.state[:, : F.shape[-1]]
+    return Case(start, F, {ATTITUDE: world.measured}, {ATTITUDE: H}, truth)
 
 
 def existence(

@@ -17,20 +17,20 @@ radii of curvature RM, RN (height included), its rate w, specific force f and om
     nabla' = 0,   eps' = 0                                                  (5)
 
 Phi = I + F T + (F T)^2 / 2 over an interval, Q = diag(0, (sa^2 T) I2, (sg^2 T) I3, 0) of white
-noise of accelerometers and gyros. Measured is the slave minus the master,
+noise of accelerometers and gyros. The measurement is the slave minus the master,
 
     Y = [VE, VN, heading, pitch, roll] = [dV, H1 phi] + v                   (6)
 
 as two sensors, for they have units of their own; updating with one after the other is updating with
-both. Left out, as by the patent: the accelerometer along z, which a bank turns into the horizontal,
-and mounting angles between the two units. Euler angles fail where the nose points up: see
-`refuse_steep`.
+both. As the patent does, the model leaves out the accelerometer along z, which a bank turns into
+the horizontal, and mounting angles between the two units. Euler angles fail where the nose points
+up: see `refuse_steep`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -107,19 +107,17 @@ def transition(interval: Interval) -> Float[Array, "12 12"]:
     return jnp.eye(STATES) + FT + 0.5 * FT @ FT
 
 
-def process_sigma(gyro_noise: Any, accel_noise: Any, dt_s: Any) -> Float[Array, "12"]:
-    """(12,) process noise of an interval: roots of the diagonal of Q.
-
-    Noise alike on all axes, so it does not matter how the body is turned.
+def process_sigma(gyro_noise: float, accel_noise: float, dt_s: float) -> np.ndarray:
+    """(12,) roots of the diagonal of Q; noise is alike on all axes, so no rotation changes it.
 
     Args:
         gyro_noise: angle random walk [rad/sqrt(s)].
         accel_noise: velocity random walk [m/s/sqrt(s)].
-        dt_s: [s].
+        dt_s: duration of the interval.
     """
-    root = jnp.sqrt(jnp.asarray(dt_s, float))
-    sigma = jnp.zeros(STATES).at[VELOCITY].set(accel_noise * root)
-    return sigma.at[PHI].set(gyro_noise * root)
+    sigma, root = np.zeros(STATES), math.sqrt(dt_s)
+    sigma[VELOCITY], sigma[PHI] = accel_noise * root, gyro_noise * root
+    return sigma
 
 
 def measurement_matrix(C_nb: Float[Array, "3 3"]) -> Float[Array, "5 12"]:
@@ -143,8 +141,9 @@ def _moved(x: Array, interval: Interval) -> tuple[Array, Array, Array]:
     return Phi @ x, Phi, interval.sigma
 
 
-def _angles(x: Array, told: tuple[Array, Array]) -> tuple[Array, Array]:
-    H = measurement_matrix(told[0])[2:]
+def _angles(x: Array, aux: tuple[Array, Array]) -> tuple[Array, Array]:
+    C_nb, _ = aux
+    H = measurement_matrix(C_nb)[2:]
     return H @ x, H
 
 
@@ -159,8 +158,8 @@ MODEL = Model(
             lambda x, sigma: (x[VELOCITY], jnp.eye(STATES)[VELOCITY]),
         ),
         Sensor(
-            lambda x, told: _angles(x, told)[0],
-            lambda x, told: told[1],
+            lambda x, aux: _angles(x, aux)[0],
+            lambda x, aux: aux[1],
             3,
             ATTITUDE_SENSOR,
             _angles,

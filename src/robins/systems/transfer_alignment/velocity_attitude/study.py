@@ -101,7 +101,7 @@ class VelocityAttitude(Scenario, PairParameters):
 
 
 class World(NamedTuple):
-    """One run: the pair, and the open-loop errors that the filters of this module estimate."""
+    """One run: the pair, and the open-loop errors that the filters of twelve states estimate."""
 
     pair: Any  # a `PairRun`, for the filters of the product model
     flight: va.Flight  # over each interval, as linearised about; leading axis E
@@ -201,7 +201,7 @@ def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> N
     attitude; one told "q" the gyro noise in its window, and a drift that walks from its step on.
     """
     s, m, told, d = given.slave, given.master, TOLD.get(name, ()), given.told.disturbance
-    sigma = np.asarray(va.process_sigma(max(s.gyro_noise), max(s.accel_noise), 1.0 / m.rate))
+    sigma = va.process_sigma(max(s.gyro_noise), max(s.accel_noise), 1.0 / m.rate)
     (north, east, _), tilt = m.velocity_noise, max(m.attitude_noise[:2])
     rows = (sigma, [east, north], [m.attitude_noise[2], tilt, tilt])
     process, velocity, attitude = (np.tile(row, (len(epoch_s), 1)) for row in rows)
