@@ -1,19 +1,20 @@
-"""Parameters of a master and a slave on one vehicle, with units.
+"""Parameters of a master and a slave on one vehicle, of the study "product", and of a recording.
 
-A scenario class takes them all by inheriting `PairParameters` beside `Scenario`. Vectors along the
-body are forward, right, down; along the Earth north, east, down.
+A scenario class takes those of the pair by inheriting `PairParameters` beside `Scenario`. Vectors
+along the body are forward, right, down; along the Earth north, east, down.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 import pydantic
 
 from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
-from robins.systems.parts import Departure, Leg, refuse_too_long, refuse_unsettled
-
-Three = tuple[float, float, float]
+from robins.sim.flexure import Flexure
+from robins.systems.parts import Departure, Leg, Names, Three, refuse_too_long, refuse_unsettled
+from robins.systems.study import Scenario
 
 
 class BankLeg(Parameters):
@@ -127,6 +128,12 @@ class Structure(Parameters):
     tail_dof: Dof | None = None
     bending: Annotated[Three, Quantity("angle")] = default("0 deg")  # per g of load factor above 1
 
+    @property
+    def flexure(self) -> Flexure:
+        """The same as simulator and filters take it."""
+        sigma, time, bending = (np.asarray(x) for x in (self.sigma, self.time, self.bending))
+        return Flexure(sigma, time, self.damping, self.tail_dof, bending)
+
 
 class Window(Parameters):
     """A stretch of time, its end not included."""
@@ -183,3 +190,53 @@ class PairParameters(Parameters):
             refuse_too_long("master.rate", lasts, self.master.rate)
             refuse_unsettled("settle", getattr(self, "settle", 0.0), lasts)
         return self
+
+
+class Believed(Parameters):
+    """What the filters are told; without a word the stated noise, start and mounting are true."""
+
+    # one sigma of the mounting error
+    mounting: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0.3 deg"
+    )
+    # flexure states are for what is given here; tails and bending are not modelled
+    flexure: Structure | None = None
+    gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")] = (
+        default("0 deg/h/sqrt(h)")
+    )
+    accel_bias_walk: Annotated[
+        Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")
+    ] = default("0 mg/sqrt(h)")
+    position: bool = False  # match positions too
+
+
+class Product(Scenario, PairParameters):
+    """A pair to be aligned by filters of the product model."""
+
+    system: Literal["transfer-alignment"] = "transfer-alignment"
+    study: Literal["product"] = "product"
+    title: str = "Transfer alignment, closed loop"
+    filters: Names = ("kf", "product")
+    believed: Believed = pydantic.Field(default_factory=Believed)
+    # figures pooled over time count from here, when the manoeuvre has shown what there is to see
+    settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+
+
+class Recording(Parameters):
+    """How a recorded pair is cut into steps of the filter."""
+
+    longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
+    # a gap in the slave's samples that is longer is declared: the alignment begins anew after it
+    longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    # process noise factor across one
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
+
+
+class Replay(Product):
+    """What is believed of a recorded pair; the log brings its own motion."""
+
+    manoeuvre: (  # pyright: ignore[reportIncompatibleVariableOverride]
+        Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None
+    ) = None
+    recording: Recording = pydantic.Field(default_factory=Recording)
+    filters: Names = ("product",)

@@ -1,10 +1,10 @@
-"""A filter that is told neither what shakes nor since when: one bank of hypotheses.
+"""The filters of the product model; one of them is told neither what shakes nor since when.
 
-A disturbed record is no reason to doubt the gyros, and a disturbed gyro none to doubt the records;
-an innovation alone does not say which it was. What tells them apart is how it goes on, and what the
-velocity says, which neither flexure nor gyro noise reach directly. So several filters of the same
-24 states run side by side, each with a hypothesis of its own, as an interacting multiple model
-(`robins.filters.composite.imm`):
+That one, "product-adaptive", is a bank of hypotheses. A disturbed record is no reason to doubt the
+gyros, and a disturbed gyro none to doubt the records; an innovation alone does not say which it
+was. What tells them apart is how it goes on, and what the velocity says, which neither flexure nor
+gyro noise reach directly. So several filters of the same 24 states run side by side, each with a
+hypothesis of its own, as an interacting multiple model (`robins.filters.composite.imm`):
 
                 stiff structure           flexing structure
     quiet       the stated noise          and the flexure of the model
@@ -20,16 +20,20 @@ on runs like those of scenarios B, C and D. How it does elsewhere is not shown b
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from robins.filters import Family, Filter, imm, kalman, taylor
+from robins.filters import Family, Filter, imm, kalman, taylor, unscented
 from robins.filters.linearise import Transition
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
+from robins.sim.flexure import Flexure
+from robins.systems.transfer_alignment.product.parameters import Structure
 
 _ATTITUDE, _GYRO_BIAS, _FLEXURE = slice(0, 3), slice(9, 12), slice(18, 24)
 _STATES = 24
@@ -60,10 +64,7 @@ def supposing(hypothesis: Hypothesis, stiff: ArrayLike) -> Rule:
         one_axis = jnp.sqrt(jnp.sum(t.noise[_ATTITUDE] ** 2) / 3.0)
         wander = jnp.zeros((_STATES, 3)).at[_GYRO_BIAS].set(walk * one_axis * jnp.eye(3))
         noise = jnp.concatenate([t.noise * grown[None], wander], 1)
-        angle, rate = (
-            jnp.where(stiff, 0.0, x) for x in (t.mean.flexure_rad, t.mean.flexure_rate_rad_s)
-        )
-        mean = t.mean._replace(flexure_rad=angle, flexure_rate_rad_s=rate)
+        mean = t.mean._replace(flexure=jnp.where(stiff, 0.0, t.mean.flexure))
         spread, noise = t.spread * kept[:, None], noise * kept[:, None]
         return memory, t._replace(mean=mean, spread=spread, noise=noise)
 
@@ -111,3 +112,35 @@ def adaptive() -> Filter:
     numbers = Hypothesis(*np.array(modes).T), np.arange(len(modes)) < len(_STIFF_MODES)
     start = 0.5 * np.array([*_STIFF_START, *_FLEXING_START])
     return imm(Family(one, numbers), changes(), start)
+
+
+# ----------------------------------------------------------------------------------- by name
+
+
+OUTLIERS = 0.999  # share of right records that keep their weight in the other filters
+# What a structure may do of which nothing is known. Too short a time is safe, too long is not.
+_TEN_ARCMIN = math.radians(10.0 / 60.0)
+UNKNOWN = Structure(sigma=(_TEN_ARCMIN, _TEN_ARCMIN, _TEN_ARCMIN), time=(3.0, 3.0, 3.0))
+
+
+class Variant(NamedTuple):
+    """How a filter of a name is made, and when the model it runs on has flexure states."""
+
+    flexes: Literal["never", "believed", "always"]
+    make: Callable[[], Filter]
+
+    def flexure(self, believed: Structure | None) -> Flexure | None:
+        """What the flexure states of the filter stand for; None where it has none."""
+        structure = UNKNOWN if believed is None and self.flexes == "always" else believed
+        return None if structure is None or self.flexes == "never" else structure.flexure
+
+
+VARIANTS = {
+    "kf": Variant("never", lambda: kalman(taylor())),
+    "product": Variant("believed", lambda: kalman(taylor(), (huber(OUTLIERS),))),
+    "product-joseph": Variant("believed", lambda: kalman(taylor(), (huber(OUTLIERS),), "joseph")),
+    "product-flexure": Variant("always", lambda: kalman(taylor(), (huber(OUTLIERS),))),
+    "product-ukf": Variant("believed", lambda: kalman(unscented(), (huber(OUTLIERS),))),
+    "product-adaptive": Variant("always", adaptive),
+}
+FILTERS = tuple(VARIANTS)

@@ -1,4 +1,4 @@
-"""Parameters of the study "attitude-matching": manoeuvre, errors, flexure, what filters believe."""
+"""What a scenario of attitude matching states: manoeuvre, errors, flexure, what filters believe."""
 
 from __future__ import annotations
 
@@ -7,36 +7,22 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
-from robins.systems.parts import Names, Runs, refuse_too_long, refuse_unsettled
+from robins.systems.parts import Runs, Three, refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
-Three = tuple[float, float, float]
 
-FILTERS = (
-    "kf",
-    "kf-told-flutter",
-    "kf-inflated",
-    "kf-flexure",
-    "hinf-rad",
-    "hinf-rad-identity",
-    "hinf-deg",
-    "hinf-deg-inf",
-    "hinf-arcmin",
-    "hinf-weighted",
-)
-
-
-class Manoeuvre(Parameters):
-    """A level bank turn: roll in from the start, turn, roll out, fly on."""
+class BankTurn(Parameters):
+    """A level bank turn: roll in from the start, turn, roll out, fly on; speed and height stay."""
 
     speed: Annotated[float, Quantity("speed", above="0 m/s")]
-    # horizontal, in the turn
+    # horizontal, in the turn, to the right; negative: a left turn
     acceleration: Annotated[float, Quantity("acceleration", least="-100 g", most="100 g")]
-    roll_time: Annotated[float, Quantity("time", above="0 s")]  # of each roll
+    roll_time: Annotated[float, Quantity("time", above="0 s")]  # of each roll, at a constant rate
     turn_time: Annotated[float, Quantity("time", least="0 s")]  # between the rolls
     duration: Annotated[float, Quantity("time", above="0 s")]  # of the run
     latitude: Annotated[float, Quantity("angle", least="-85 deg", most="85 deg")]
-    heading: Annotated[float, Quantity("angle")] = default("0 deg")  # at the start
+    # at the start, clockwise from north
+    heading: Annotated[float, Quantity("angle")] = default("0 deg")
 
 
 class Master(Parameters):
@@ -73,14 +59,14 @@ class Flexing(Parameters):
     flutter: Annotated[float, Quantity("angle", least="0 rad", most="180 deg")]
 
 
-class Believed(Parameters):
-    """What all filters are told of the start, and the one with flexure states of its flexure."""
+class Spread(Parameters):
+    """Standard deviations that filters are told of the start, and of flexure over the true ones."""
 
     attitude: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
     gyro_bias: Annotated[float, Quantity("angle rate", above="0 rad/s")]
     mounting: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
-    flexure_sigma_factor: Positive = 1.0  # believed over true
-    flexure_time_factor: Positive = 1.0
+    flexure_sigma_factor: Positive = 1.0
+    flexure_time_factor: Positive = 1.0  # of the correlation time
 
 
 class HInfinity(Parameters):
@@ -90,31 +76,30 @@ class HInfinity(Parameters):
     weighted_over_least: Positive = 1.05  # of the weighted one: gamma over its least
 
 
-class Matching(Scenario):
+class AttitudeMatching(Scenario):
     """Attitude matching in a bank turn; axes of the paper, ENU and RFU."""
 
     system: Literal["transfer-alignment"] = "transfer-alignment"
     study: Literal["attitude-matching"] = "attitude-matching"
     title: str = "Attitude matching in a bank turn"
     runs: Runs = 200
-    filters: Names = FILTERS
+    claims: tuple[str, ...] | None = ()
     step: Annotated[float, Quantity("time", above="0 s")] = default("10 ms")  # of the truth
     period: Annotated[float, Quantity("time", above="0 s")] = default("50 ms")  # of the filters
     # figures pooled over time count from here
     settle: Annotated[float, Quantity("time", least="0 s")] = default("15 s")
     # initial errors as given, or of that size with a sign drawn for each axis and run
     signs: Literal["fixed", "random"] = "fixed"
-    claims: tuple[str, ...] = ()  # ids of those the scenario checks
-    manoeuvre: Manoeuvre
+    manoeuvre: BankTurn
     master: Master
     slave: Slave
     mounting: Mounting
     flexure: Flexing
-    believed: Believed
+    believed: Spread
     h_infinity: HInfinity = pydantic.Field(default_factory=HInfinity)
 
     @pydantic.model_validator(mode="after")
-    def _fits(self) -> Matching:
+    def _fits(self) -> AttitudeMatching:
         lasts = self.manoeuvre.duration
         refuse_too_long("step", lasts, 1.0 / self.step)
         refuse_unsettled("settle", self.settle, lasts)
