@@ -65,6 +65,12 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
         )
 
 
+Duration = Annotated[float, Quantity("time", above="0 s")]
+Speed = Annotated[float, Quantity("speed", above="0 m/s")]
+Spread = Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
+"""One sigma of an angle."""
+
+
 class Departure(Place):
     """Where a vehicle begins, at what height, and its heading there."""
 
@@ -76,7 +82,7 @@ class Leg(Parameters):
     """One command of a motion over ground; which quantities it takes depends on what it does."""
 
     do: Literal["stop", "straight", "accelerate", "turn", "climb"]
-    seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
+    seconds: Duration | None = None
     speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
     # positive to the right
     angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None

@@ -52,8 +52,9 @@ Prepared = TypeVar("Prepared", bound=Piece)
 
 
 class Answer(NamedTuple):
-    """What one filter says of a log; leading axis E epochs of all pieces, as `end_to_end`."""
+    """What a filter or smoother says of a log; leading axis E epochs of all its pieces."""
 
+    name: str
     mean: Any
     sigma: Any  # (E, n)
     updates: Mapping[str, Update]  # by sensor; empty for a smoother
@@ -61,14 +62,6 @@ class Answer(NamedTuple):
     log_likelihood: float
     tally: Tally  # how the steps went, of each piece
     bounds: bool  # its sigmas are bounds of an H-infinity filter
-
-
-class Kept(NamedTuple):
-    """What is kept of a step where nothing is smoothed."""
-
-    mean: Any
-    sigma: Any  # (n,)
-    updates: dict[str, Update]  # by sensor
 
 
 class Reported(NamedTuple):
@@ -146,13 +139,13 @@ def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, in
 # ----------------------------------------------------------------------------- pieces to answers
 
 
-def kept(step: Step) -> Kept:
-    """Keep the posterior's mean and standard deviations and how the updates went."""
-    return Kept(step.posterior.mean, step.posterior.sigma, updates(step))
+def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
+    """Keep the posterior's mean and standard deviations and how the updates went, by sensor."""
+    return step.posterior.mean, step.posterior.sigma, updates(step)
 
 
 @jax.jit
-def _kept_of(steps: Step) -> Kept:
+def _kept_of(steps: Step) -> tuple[Any, Any, dict[str, Update]]:
     return jax.vmap(kept)(steps)
 
 
@@ -185,7 +178,7 @@ def navigated(
             asked = [name for name in causal if causal[name] == base]
             found = _of_piece(piece, chosen, smoothed=any(name != base for name in asked))
             for name in asked:
-                answers[name].append(found[name != base])
+                answers[name].append(found[name != base]._replace(name=name))
     return {name: _joined(parts) for name, parts in answers.items()}
 
 
@@ -201,7 +194,7 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
             found = run(*arguments, keep=kept, time_s=piece.epoch_s)
             of_steps = found.steps
     likelihood = float(found.log_likelihood)
-    answer = Answer(*of_steps, case.start, likelihood, found.tally, contender.bounds)
+    answer = Answer("", *of_steps, case.start, likelihood, found.tally, contender.bounds)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)
@@ -288,11 +281,6 @@ def outcome(
         notes=list(notes),
         warnings=replay_warnings(tallies, reported.causes, bounds, reported.assumed),
     )
-
-
-def stacked(answers: Mapping[str, Answer], pick: Callable[[Answer], Any]) -> np.ndarray:
-    """What is picked of every answer, by filter along the leading axis."""
-    return np.stack([np.asarray(pick(answer)) for answer in answers.values()])
 
 
 def _tables(

@@ -56,6 +56,12 @@ def place_arrays(
     return made
 
 
+def track_arrays(places: Iterable[Any], name: str = "{}") -> dict[str, Any]:
+    """Where each filter thought something was: a `Geodetic` of each, leading axis E epochs."""
+    rows = zip(*((place.lat, place.lon, place.alt) for place in places), strict=True)
+    return place_arrays("track", map(np.stack, rows), name)
+
+
 def innovation_tables(
     seen: Sequence[Mapping[str, Any]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
 ) -> dict[str, Any]:

@@ -31,9 +31,9 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay, Start
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
-from robins.systems.replaying import Answer, Piece, Reported
+from robins.systems.replaying import Piece, Reported
 from robins.systems.study import Case, Contender
-from robins.systems.tables import place_arrays
+from robins.systems.tables import place_arrays, track_arrays
 
 CAUSES = (
     "Likely causes: the lever arm or the latency of the GNSS, the mounting of the unit, sigmas "
@@ -354,15 +354,10 @@ def replay(
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
-
-    def antenna(answer: Answer) -> Geodetic:
-        return _antenna(mount, answer.mean, rate)
-
-    used = np.any([piece.used for piece in pieces], axis=0)
-    fields = ("lat", "lon", "alt")
-    track = (replaying.stacked(answers, lambda a, f=f: getattr(antenna(a), f)) for f in fields)
-    variables = place_arrays("track", track) | _fix_arrays(log)
+    antennas = {name: _antenna(mount, answer.mean, rate) for name, answer in answers.items()}
+    variables = track_arrays(antennas.values()) | _fix_arrays(log)
     variables |= array("outage", withheld.astype(np.int8), long_name="GNSS withheld")
+    used = np.any([piece.used for piece in pieces], axis=0)
     counts = replaying.gap_counts(pieces, problems) | {"pieces_not_navigated": len(problems)}
     return replaying.outcome(
         epoch_s,
@@ -374,7 +369,7 @@ def replay(
             causes=CAUSES,
             assumed=(model.STANDSTILL, model.STILL_RATE, model.ROAD),
         ),
-        metrics=lambda answer: _distances(log, used, epoch_s, antenna(answer)),
+        metrics=lambda answer: _distances(log, used, epoch_s, antennas[answer.name]),
         variables=variables,
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]

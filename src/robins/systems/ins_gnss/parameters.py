@@ -8,7 +8,17 @@ import numpy as np
 import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
-from robins.systems.parts import Departure, Leg, Names, Three, refuse_too_long, refuse_unsettled
+from robins.systems.parts import (
+    Departure,
+    Duration,
+    Leg,
+    Names,
+    Speed,
+    Spread,
+    Three,
+    refuse_too_long,
+    refuse_unsettled,
+)
 from robins.systems.study import Scenario
 
 
@@ -25,8 +35,8 @@ class Imu(Parameters):
     accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
     gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")]
     accel_bias_walk: Annotated[Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")]
-    gyro_bias_time: Annotated[float, Quantity("time", above="0 s")] | None = None
-    accel_bias_time: Annotated[float, Quantity("time", above="0 s")] | None = None
+    gyro_bias_time: Duration | None = None
+    accel_bias_time: Duration | None = None
     scale_states: bool = False
     gyro_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
     accel_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
@@ -51,25 +61,25 @@ class Gnss(Parameters):
 class Start(Parameters):
     """How well the start is known, and how the heading is found."""
 
-    tilt: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("2 deg")
-    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("20 deg")
-    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.2 m/s")
+    tilt: Spread = default("2 deg")
+    heading: Spread = default("20 deg")
+    velocity: Speed = default("0.2 m/s")
     position: Annotated[float, Quantity("length", above="0 m")] = default("0.1 m")
     # heading of the body at the start; without it, the course once above the speed
     known_heading: Annotated[float, Quantity("angle")] | None = None
-    course_speed: Annotated[float, Quantity("speed", above="0 m/s")] = default("1 m/s")
+    course_speed: Speed = default("1 m/s")
 
 
 class Aids(Parameters):
     """Knowledge about the motion, used as measurements."""
 
     zero_velocity: bool = True
-    standstill_velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.01 m/s")
+    standstill_velocity: Speed = default("0.01 m/s")
     standstill_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default(
         "0.05 deg/s"
     )
     # at rest: spread of the samples over the window stays below these
-    window: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    window: Duration = default("0.5 s")
     quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.15 m/s^2")
     quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.5 deg/s")
     non_holonomic: bool = False
@@ -88,9 +98,9 @@ class Aids(Parameters):
 class Outages(Parameters):
     """Times at which the GNSS is withheld, to see how long the inertial solution holds."""
 
-    length: Annotated[float, Quantity("time", above="0 s")]
+    length: Duration
     first: Annotated[float, Quantity("time", least="0 s")]  # after the first fix
-    gap: Annotated[float, Quantity("time", above="0 s")]  # between two outages
+    gap: Duration  # between two outages
     last: Annotated[float, Quantity("time", least="0 s")]  # before the last fix none begins
 
     def mask(self, time_s: np.ndarray, first_s: float, last_s: float) -> np.ndarray:
@@ -111,10 +121,10 @@ class Outages(Parameters):
 class Update(Parameters):
     """How the filter steps."""
 
-    longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
+    longest_block: Duration = default("0.25 s")
     gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
     # an IMU gap longer than this is declared instead of bridged
-    longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+    longest_gap: Duration = default("1 s")
     # process noise factor across one
     gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,6 @@ from robins import units
 from robins.errors import require_known
 from robins.filters import Filter, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
-from robins.ins.state import InsState
 from robins.results import array
 from robins.systems.ins_gnss.model import SENSORS, ins_gnss_model, state_blocks
 from robins.systems.ins_gnss.parameters import Drive, Imu
@@ -21,7 +20,7 @@ from robins.systems.ins_gnss.world import Course, lay_out, simulate
 from robins.systems.judgement import consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
 from robins.systems.study import Contender, StateBlock, Study, View
-from robins.systems.tables import place_arrays
+from robins.systems.tables import place_arrays, track_arrays
 
 FILTERS = {
     "ekf": lambda rules: kalman(taylor(), rules),
@@ -95,18 +94,9 @@ def view(drive: Drive, course: Course) -> View:
         sensors=SENSORS,
         metrics=partial(_metrics, course.outage, blocks),
         context=xr.Dataset(context),
-        shown=_tracks,
+        shown=lambda means: track_arrays(mean.position for mean in means.values()),
         count_from=int(np.searchsorted(epoch_s, drive.settle)),
     )
-
-
-def _tracks(means: Mapping[str, InsState]) -> dict[str, Any]:
-    """Where each filter thought it was in the first run."""
-
-    def of(field: str) -> np.ndarray:
-        return np.stack([np.asarray(getattr(m.position, field)) for m in means.values()])
-
-    return place_arrays("track", map(of, ("lat", "lon", "alt")))
 
 
 def _metrics(outage: np.ndarray, blocks: Sequence[StateBlock], statistics: Any) -> dict[str, Any]:
