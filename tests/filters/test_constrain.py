@@ -249,7 +249,7 @@ def test_a_heading_is_held_on_a_manifold():
     move = manifold.local(start, held.mean)
     slope = jax.jit(jax.grad(lambda e: heading(manifold.retract(start, e)).rad))(move)
     assert np.max(np.abs(slope @ held.factor)) < 1e-12
-    with pytest.raises(ValueError, match="wants to be told d"):
+    with pytest.raises(ValueError, match="rotations needs d"):
         constrain(belief, heading)
     with pytest.raises(ValueError, match="as a function of the state"):
         constrain(belief, np.eye(1, 5))

@@ -79,8 +79,9 @@ def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Chann
     Raises:
         ValueError: no sensor is named, or one twice.
     """
-    names = sensor_names("channel", sensors)
-    require(len(set(names)) == len(names), "a channel names each sensor once", list(names))
+    names = sensor_names("a channel needs sensors", sensors)
+    once = len(set(names)) == len(names)
+    require(once, "a channel needs sensors, each named once", list(names))
     return Channel(names, kalman() if filter is None else filter)
 
 
