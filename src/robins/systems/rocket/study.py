@@ -34,7 +34,7 @@ from robins.filters import (
     taylor,
     unscented,
 )
-from robins.filters.fusion import Sharing
+from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.results import array
 from robins.rotation import Rotation
