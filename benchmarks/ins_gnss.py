@@ -14,7 +14,7 @@ from timing import best_of, show
 from robins import scenario
 from robins.campaign.monte_carlo import _kept
 from robins.filters import OnlineFilter, run
-from robins.systems.ins_gnss import SYSTEM, Drive, drive_dataset, drive_problem
+from robins.systems.ins_gnss import SYSTEM, Drive, drive_dataset
 from robins.systems.ins_gnss.model import POSITION, VELOCITY
 
 BATCH = 256
@@ -77,13 +77,14 @@ def pyins_run(d):
 
 def main():
     d = drive()
-    problem = drive_problem(d, ("ekf",), 0)
+    problem = SYSTEM.studies["drive"].problem(d, ("ekf",), 0)
     samples = int(np.sum(np.asarray(problem.simulate.args[1].blocks.increments.dt) > 0))
     peer, peer_samples = pyins_run(d)
     case = jax.jit(problem.simulate)(jnp.asarray(0))
     cases = jax.jit(jax.vmap(problem.simulate))(jnp.arange(BATCH))
     contenders = {"pyins": peer}
-    for name, (f, model) in problem.contenders.items():
+    for name, contender in problem.contenders.items():
+        f, model = contender.filter, contender.model
 
         def single(f=f, model=model):
             return run(f, model, case.start, case.y, case.u, case.aux, keep=_kept)
@@ -101,8 +102,8 @@ def main():
         whole = seconds[f"{name}, batch of {BATCH}"] / BATCH
         show(f"{name}, batch of {BATCH}", whole / samples, 1.0, "IMU epoch and run", per_sample)
 
-    f, model = problem.contenders["ekf"]
-    online = OnlineFilter(f, model, case.start)
+    ekf = problem.contenders["ekf"]
+    online = OnlineFilter(ekf.filter, ekf.model, case.start)
     epoch = [jax.tree_util.tree_map(lambda x, k=k: x[k], (case.u, case.y, case.aux)) for k in (9,)]
 
     def stream():

@@ -16,15 +16,9 @@ from timing import best_of, show
 from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import OnlineFilter, rts_smoother, run
 from robins.manifold import Angle
-from robins.systems.marg import (
-    Replay,
-    causal_attitudes,
-    filter_of,
-    model_of,
-    prepare,
-    smoothed_attitudes,
-)
-from robins.systems.marg.replay import light
+from robins.systems.marg import Replay, filter_of, model_of, prepare
+from robins.systems.marg.model import causal_attitudes, smoothed_attitudes
+from robins.systems.replaying import kept
 
 
 def installed(name: str) -> Any:
@@ -54,17 +48,19 @@ def main():
     """Print the times."""
     log, parameters = made_log(), Replay()
     filter_, model = filter_of(parameters), model_of(parameters)
-    ready = prepare(log, parameters)
+    ready = prepare(log, parameters).world
     inputs = (filter_, model, ready.start, ready.y, ready.u, ready.aux)
 
     def causal():
         p = prepare(log, parameters)
-        mean = run(filter_, model, p.start, p.y, p.u, p.aux, keep=light).steps.mean
-        return causal_attitudes(p.start.mean, mean, p.samples)
+        w = p.world
+        mean, *_ = run(filter_, model, w.start, w.y, w.u, w.aux, keep=kept).steps
+        return causal_attitudes(w.start.mean, mean, p.samples)
 
     def smoothed():
         p = prepare(log, parameters)
-        belief = rts_smoother(run(filter_, model, p.start, p.y, p.u, p.aux))
+        w = p.world
+        belief = rts_smoother(run(filter_, model, w.start, w.y, w.u, w.aux))
         return smoothed_attitudes(belief.mean, p.samples)
 
     online = OnlineFilter(filter_, model, ready.start)
@@ -88,7 +84,7 @@ def main():
     tasks = {
         "replay, causal": causal,
         "replay, smoothed": smoothed,
-        "filter alone": lambda: run(*inputs, keep=light).steps.sigma,
+        "filter alone": lambda: run(*inputs, keep=kept).steps[1],
         "one predict": predict,
         "one step": whole,
     }

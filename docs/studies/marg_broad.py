@@ -18,13 +18,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from robins.dataset import Dataset
 from robins.ins.frames import to_ned_frd
 from robins.logs.broad import read_broad
+from robins.rotation import multiply
 from robins.systems.marg import Replay, replay
-from robins.systems.marg.accuracy import multiply, orientation_errors, rms_deg, truth_at
+from robins.systems.marg.replay import orientation_errors, rms_deg, truth_at
 
 # Without the package its columns stay empty.
 vqf: Any = importlib.import_module("vqf") if importlib.util.find_spec("vqf") else None
@@ -44,7 +46,7 @@ def peer(log: Dataset) -> tuple[float, float]:
     out = []
     causal = vqf.VQF(step).updateBatch(gyro, accel, field)
     for q in (causal, vqf.offlineVQF(gyro, accel, field, step)):
-        ned = multiply(np.broadcast_to(ENU_TO_NED, q["quat9D"].shape), q["quat9D"])
+        ned = np.asarray(multiply(jnp.asarray(ENU_TO_NED), jnp.asarray(q["quat9D"])))
         out.append(rms_deg(orientation_errors(ned[counts], true[counts]).total))
     return out[0], out[1]
 

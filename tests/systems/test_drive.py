@@ -5,11 +5,10 @@ import pytest
 from test_replay import DRIVE
 
 from robins import scenario
-from robins.campaign import chunks, collect
-from robins.systems.ins_gnss import Drive, drive_problem
-from robins.systems.ins_gnss.drive import lay_out
-from robins.systems.ins_gnss.drive_claims import CLAIMS
-from robins.systems.judgement import judging
+from robins.campaign import collect
+from robins.systems.ins_gnss import Drive
+from robins.systems.ins_gnss.study import DRIVE as STUDY
+from robins.systems.ins_gnss.world import lay_out
 
 RUNS = 100
 
@@ -21,10 +20,11 @@ def parsed(*settings):
 def campaign(*settings):
     # an EKF is right only about small errors, and a gate cuts the tails of a right one
     small = ("start.tilt=0.5 deg", "start.heading=2 deg", "update.gate=0")
-    problem = drive_problem(parsed(*small, *settings), ("ekf",), 1)
-    statistics = collect(chunks(problem, "ekf", RUNS, chunk=RUNS), problem.blocks)
+    problem = STUDY.problem(parsed(*small, *settings), ("ekf",), 1)
+    (runs,) = worlds(problem, RUNS, RUNS)
+    statistics = collect([record(problem, "ekf", *runs)], problem.blocks)
     metrics = problem.metrics(statistics)
-    return metrics, {c["id"]: c["verdict"] for c in judging(CLAIMS)({"ekf": metrics})}
+    return metrics, {c["id"]: c["verdict"] for c in problem.claims({"ekf": metrics})}
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +59,6 @@ def test_legs_and_filters_that_cannot_be():
     with pytest.raises(ValueError, match="'stop' does not take 'speed'"):
         lay_out(parsed('legs=[{do="stop", seconds="9 s", speed="2 m/s"}]'))
     with pytest.raises(ValueError, match="robins replay"):
-        drive_problem(parsed(), ("ekf+rts",), 0)
+        STUDY.problem(parsed(), ("ekf+rts",), 0)
     with pytest.raises(ValueError, match="multiple of gnss"):
         lay_out(parsed('update.longest_block="0.31 s"'))

@@ -5,9 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import AttitudeTable
-from robins.systems.marg.accuracy import orientation_errors, rms_deg, truth_at
-from robins.systems.marg.align import attitude_of
-from robins.systems.marg.answer import _down_in_body, _level_axes
+from robins.systems.marg.log import attitude_of
+from robins.systems.marg.replay import orientation_errors, rms_deg, truth_at
 
 
 def scalar_first(rotation):
@@ -77,15 +76,6 @@ def test_truth_is_the_nearest_and_counts_only_in_motion_and_where_it_is():
     assert counts.tolist() == [False, True, False, True, False]
     assert np.isnan(found[2]).all()
     assert np.isnan(found[4]).all()
-
-
-def test_axes_in_the_body_are_rows_of_the_attitude():
-    turn = Rotation.random(20, random_state=3)
-    q, C = scalar_first(turn), turn.as_matrix()
-    north, east = _level_axes(q)
-    np.testing.assert_allclose(north, C[:, 0], atol=1e-12)
-    np.testing.assert_allclose(east, C[:, 1], atol=1e-12)
-    np.testing.assert_allclose(_down_in_body(q), C[:, 2], atol=1e-12)
 
 
 def test_root_mean_square():

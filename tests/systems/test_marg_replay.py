@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from robins.dataset import ImuTable
 from robins.filters import OnlineFilter
-from robins.ins.increments import from_imu
-from robins.systems.marg import Replay, filter_of, model_of, orient, prepare, replay
+from robins.ins.increments import Increments, from_imu
+from robins.ins.rest import still_samples
+from robins.systems.marg import Replay, filter_of, model_of, prepare, replay
+from robins.systems.marg.log import as_means, at_samples, every
 from robins.systems.marg.model import MAGNETOMETER
-from robins.systems.marg.prepare import as_means, at_samples, every
-from robins.systems.marg.rest import still_samples
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
 PARAMETERS = Replay()
@@ -156,7 +156,7 @@ def test_always_undisturbed_never(moved):
     assert found["undisturbed"]["refused_magnetometer"] > 40
     assert found["undisturbed"]["nis_magnetometer"] < 1.0
     never = prepare(log, use("never"))
-    assert MAGNETOMETER not in never.y
+    assert MAGNETOMETER not in never.world.y
     assert [s.name for s in model_of(use("never")).sensors] == ["travel", "rest_rate"]
     assert never.look.heading_rad == pytest.approx(np.pi)
 
@@ -234,17 +234,14 @@ def test_a_log_without_truth_or_magnetometer_has_no_errors_but_consistency(moved
 
 def test_a_causal_replay_alone_gives_the_same(moved):
     log, outcome = moved
-    prepared = prepare(log, PARAMETERS)
-    alone, failed = orient(prepared, filter_of(PARAMETERS), model_of(PARAMETERS), ("marg",))
-    assert failed == 0
-    euler = np.degrees(np.abs(alone["marg"].sigma[:, :3]))
-    both = np.degrees(outcome.solution["sigma_attitude"].sel(filter="marg").values)
-    np.testing.assert_allclose(euler, both, rtol=1e-9)
+    alone = finite(replay(log, PARAMETERS, ("marg",)))
+    both = outcome.solution["sigma_attitude"].sel(filter="marg").values
+    np.testing.assert_allclose(alone.solution["sigma_attitude"].values[0], both, rtol=1e-9)
 
 
 def test_a_live_filter_gives_the_numbers_of_the_replay(moved):
     dataset, outcome = moved
-    log = prepare(dataset, PARAMETERS)
+    log = prepare(dataset, PARAMETERS).world
     online = OnlineFilter(filter_of(PARAMETERS), model_of(PARAMETERS), log.start)
     row = lambda tree, k: jax.tree_util.tree_map(lambda a: a[k], tree)  # noqa: E731
     for k in range(120):
@@ -269,15 +266,20 @@ def test_rest_is_told_after_a_while_and_ends_at_once():
     rate = np.zeros((1000, 3))
     rate[500:520, 0] = 0.2
     force = np.tile([0.0, 0.0, -GRAVITY], (1000, 1))
-    still = still_samples(dt, rate, force, PARAMETERS.rest)
+
+    def still_of(dt, rate):
+        increments = Increments(dt, rate * dt[:, None], force * dt[:, None])
+        return still_samples(increments, *PARAMETERS.rest.quiet)
+
+    still = still_of(dt, rate)
     assert not still[:149].any()
     assert still[151:500].all()
     assert not still[500:660].any()
     assert still[-1]
     # at a rate that lasts and is no bias of a gyro that can be believed, nothing is still
-    assert not still_samples(dt, rate + 0.1, force, PARAMETERS.rest).any()
+    assert not still_of(dt, rate + 0.1).any()
     # one sample a second tells nothing
-    assert not still_samples(np.ones(1000), rate, force, PARAMETERS.rest).any()
+    assert not still_of(np.ones(1000), rate).any()
 
 
 def test_readings_go_to_the_interval_they_fall_in_and_looks_are_spaced():

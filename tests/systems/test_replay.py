@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 from robins import logs, scenario
 from robins.dataset import Dataset
 from robins.earth import Geodetic, earth_rate_n
+from robins.ins.blocks import gained_in_window
 from robins.ins.state import InsState
 from robins.rotation import Rotation as Attitude
 from robins.systems import ins_gnss
-from robins.systems.ins_gnss import Drive, Replay, drive_dataset, drive_problem
+from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset
 from robins.systems.ins_gnss import replay as replay_log
+from robins.systems.ins_gnss.log import on_one_clock
 from robins.systems.ins_gnss.model import Mount, read_position
-from robins.systems.ins_gnss.prepare import gained_in_window, on_one_clock, pieces
 from robins.workbench import replay as replay_files
 
 DRIVE = """
@@ -152,7 +153,7 @@ def test_a_replay_that_contradicts_its_sigmas_ends_with_the_likely_causes(log, c
 def test_every_fix_falls_on_an_epoch_of_its_own_time(log):
     parameters = configuration()
     whole = on_one_clock(log, parameters)
-    assert len(pieces(whole, 1.0)) == 1
+    assert np.max(whole.increments.dt) < parameters.update.longest_gap
     assert np.all(np.diff(whole.gnss_s) == pytest.approx(FIX_RATE_S, abs=1e-9))
 
 
@@ -277,7 +278,7 @@ def test_the_walk_meets_its_figures(data_dir):
 
 
 def test_a_run_as_a_log_has_the_noise_of_the_campaign(drive, log):
-    problem = drive_problem(drive, ("ekf",), 3)
+    problem = SYSTEM.studies["drive"].problem(drive, ("ekf",), 3)
     case = jax.jit(problem.simulate)(0)
     here = np.isfinite(np.asarray(case.y["gnss_position"].lat))
     np.testing.assert_allclose(

@@ -1,18 +1,17 @@
 """Standstill and the start of a replay, on motion that is known."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from robins import rotation
+from robins.dataset import GnssTable
+from robins.ins.increments import Increments
+from robins.ins.rest import moving_statistics, standstill
+from robins.systems.ins_gnss.log import Log, find_start, with_heading
 from robins.systems.ins_gnss.parameters import Aids, Start
-from robins.systems.ins_gnss.still import (
-    find_start,
-    level,
-    moving_statistics,
-    standstill,
-    with_heading,
-)
 
 G = 9.80
 DT = 0.01
@@ -27,13 +26,10 @@ def test_moving_statistics_are_those_of_the_windows():
         np.testing.assert_allclose(spread[k], window.std(axis=0), atol=1e-9)
 
 
-def test_levelling_returns_the_tilt_of_every_attitude():
+def test_another_heading_leaves_the_tilt():
     rng = np.random.default_rng(2)
     for roll, pitch, heading in rng.uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (30, 3)):
-        C_nb = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading)))
-        q = level(C_nb.T @ [0.0, 0.0, -G], heading)
-        np.testing.assert_allclose(np.asarray(rotation.to_dcm(jnp.asarray(q))), C_nb, atol=1e-12)
-        turned = with_heading(q, heading + 1.0)
+        turned = with_heading(np.asarray(rotation.from_euler(roll, pitch, heading)), heading + 1.0)
         expected = rotation.from_euler(roll, pitch, heading + 1.0)
         np.testing.assert_allclose(
             np.asarray(rotation.to_dcm(jnp.asarray(turned))),
@@ -59,17 +55,21 @@ def _walk(rest_s, go_s, roll, pitch, heading_rest, course):
     gnss_s = np.arange(0.25, time[-1], 0.25)
     speed = np.where(gnss_s > rest_s + go_s - 0.5, 1.5, 0.0)
     v_n = np.c_[speed * np.cos(course), speed * np.sin(course), 0 * speed]
-    return time, dt, theta, dv + shake, gnss_s, v_n
+    each, one = np.ones(len(gnss_s)), np.ones((len(gnss_s), 3))
+    stamps = np.round(gnss_s * 1e9).astype(np.int64)
+    gnss = GnssTable(stamps, 0.7 * each, 0.2 * each, 100.0 * each, one, v_n, 0.1 * one)
+    increments = Increments(dt, theta, dv + shake)
+    return Log(increments, time, gnss, gnss_s, one, None, None, np.zeros(len(gnss_s), bool))
 
 
 def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
     roll, pitch, course = 0.2, -0.1, 2.0
     log = _walk(8.0, 4.0, roll, pitch, 0.5, course)
-    still, _ = standstill(*log[1:4], Aids())
+    still, _ = standstill(log.increments, *Aids().quiet)
     assert np.all(still[100:790])
     assert not np.any(still[900:])
-    found = find_start(*log, 0.7, 100.0, Start(), Aids())
-    assert found.time_s == pytest.approx(11.75, abs=0.3)
+    found = find_start(log, Start(), Aids())
+    assert log.gnss_s[found.fix] == pytest.approx(11.75, abs=0.3)
     _, _, heading = (float(a) for a in rotation.to_euler(jnp.asarray(found.q_nb)))
     assert heading == pytest.approx(course, abs=1e-9)
     # turning about the vertical keeps roll and pitch
@@ -80,13 +80,17 @@ def test_start_carries_the_tilt_by_gyro_and_takes_the_heading_from_the_course():
 
 
 def test_start_says_why_it_cannot():
-    time, dt, theta, dv, gnss_s, v_n = _walk(4.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    log = _walk(4.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    with_velocity = lambda v_n: log._replace(gnss=replace(log.gnss, v_n=v_n))  # noqa: E731
     with pytest.raises(ValueError, match=r"fastest fix moves at 0\.00 m/s.*start\.known_heading"):
-        find_start(time, dt, theta, dv, gnss_s, 0 * v_n, 0.7, 0.0, Start(), Aids())
+        find_start(with_velocity(0.0 * log.gnss.v_n), Start(), Aids())
     with pytest.raises(ValueError, match="no GNSS velocity"):
-        find_start(time, dt, theta, dv, gnss_s, None, 0.7, 0.0, Start(), Aids())
+        find_start(with_velocity(None), Start(), Aids())
+    falling = log.increments._replace(dv=0.01 * log.increments.dv)
     with pytest.raises(ValueError, match="cannot level"):
-        find_start(time, dt, theta, 0.01 * dv, gnss_s, v_n, 0.7, 0.0, Start(), Aids())
-    given = Start(known_heading=1.25)
-    found = find_start(time, dt, theta, dv, gnss_s, None, 0.7, 0.0, given, Aids())
+        find_start(log._replace(increments=falling), Start(), Aids())
+    lost = replace(log.gnss, alt_m=np.nan * log.gnss.alt_m)
+    with pytest.raises(ValueError, match="no whole GNSS fix"):
+        find_start(log._replace(gnss=lost), Start(), Aids())
+    found = find_start(with_velocity(None), Start(known_heading=1.25), Aids())
     assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(1.25, abs=1e-12)

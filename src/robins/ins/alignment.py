@@ -226,14 +226,29 @@ def gyrocompass(
             "vehicle turns, or the bias, the unit of the rates or the latitude is wrong"
         )
 
-    east = east / level_rate[..., None]
-    C_nb = np.stack([np.cross(east, down), east, down], axis=-2)
+    C_nb = triad(f, omega)
     force = _tilt_of_force(f, C_nb)
     force[..., 2, :] = -np.tan(lat)[..., None] * force[..., 0, :]
     rate = np.zeros_like(force)
     rate[..., 2, :] = C_nb[..., 1, :] / horizontal[..., None]
     covariance = _spread(force, sigma_f) + _spread(rate, sigma_omega)
     return Alignment(Rotation.from_dcm(C_nb), covariance, "gyrocompass")
+
+
+def triad(f_b: ArrayLike, north_b: ArrayLike) -> np.ndarray:
+    """C_nb (..., 3, 3) for which specific force points up and another vector north (Black 1964).
+
+    Gravity decides about the level, the other vector about the heading alone: it may dip.
+
+    Args:
+        f_b: (..., 3) specific force at rest, of any length above zero.
+        north_b: (..., 3) the Earth's rotation or its magnetic field, not along the vertical.
+    """
+    f = np.asarray(f_b, float)
+    down = -f / np.linalg.norm(f, axis=-1)[..., None]
+    east = np.cross(down, np.asarray(north_b, float))
+    east = east / np.linalg.norm(east, axis=-1)[..., None]
+    return np.stack([np.cross(east, down), east, down], axis=-2)
 
 
 def heading_from_velocity(

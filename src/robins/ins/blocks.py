@@ -125,3 +125,61 @@ def cut(
     out_parent[block, column] = parent
     duration = np.diff(np.concatenate([[start_s], epoch_s]))
     return Blocks(Increments(out_dt, out_theta, out_dv), epoch_s, duration, out_parent)
+
+
+def rate_about(increments: Increments, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    """(E, 3) rad/s, gyro rate about times: mean over the increments that end within 10 ms of each.
+
+    Args:
+        increments: dt (N,), theta (N, 3).
+        time_s: (N,) end of each.
+        at_s: (E,) times.
+    """
+    dt, theta = increments[:2]
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(theta, axis=0)])
+    length = np.concatenate([[0.0], np.cumsum(dt)])
+    half = max(0.01, 1.5 * float(np.median(dt)))
+    a = np.searchsorted(time_s, at_s - half)
+    b = np.minimum(np.maximum(np.searchsorted(time_s, at_s + half), a + 1), len(dt))
+    a = np.minimum(a, b - 1)
+    return (total[b] - total[a]) / (length[b] - length[a])[:, None]
+
+
+def gained_in_window(
+    increments: Increments, time_s: np.ndarray, at_s: np.ndarray, window_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How much velocity was gained from the average instant of a window to its end.
+
+    The mean over the window (t - T, t] of v(t) - v(s) is the integral of the specific force with a
+    weight that grows from 0 at t - T to 1 at t, seen in the body axes at t.
+
+    Args:
+        increments: dt (N,), theta (N, 3), dv (N, 3).
+        time_s: (N,) end of each.
+        at_s: (E,) ends of the windows.
+        window_s: length T; 0 for none.
+
+    Returns:
+        (E, 3) m/s, gravity not taken out, and (E,) the integral of the weight, T/2 where the
+        samples cover the window.
+    """
+    gained, age = np.zeros((len(at_s), 3)), np.zeros(len(at_s))
+    if window_s <= 0.0:
+        return gained, age
+    sample = np.searchsorted(time_s, at_s - 1e-9)
+    turned = SciRotation.identity(len(at_s))  # from the axes of the sample to those at t
+    while True:
+        inside = sample >= 0
+        k = np.clip(sample, 0, len(time_s) - 1)
+        end = np.minimum(time_s[k], at_s)
+        begin = np.maximum(time_s[k] - increments.dt[k], at_s - window_s)
+        length = np.where(inside, np.maximum(end - begin, 0.0), 0.0)
+        if not np.any(length > 0.0):
+            return gained, age
+        share = length / increments.dt[k]
+        weight = 1.0 - (at_s - 0.5 * (begin + end)) / window_s
+        # dv is in the axes at the start of its interval, so the turn over the interval comes first
+        turned = turned * SciRotation.from_rotvec(-share[:, None] * increments.theta[k])
+        gained += (weight * share)[:, None] * turned.apply(increments.dv[k])
+        age += weight * length
+        sample = sample - 1

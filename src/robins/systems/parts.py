@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Literal
 
 import pydantic
 
-from robins.scenario import Parameters, Quantity
+from robins.scenario import Parameters, Quantity, default
+from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
 ENU, RFU = ("east", "north", "up"), ("right", "forward", "up")
@@ -57,3 +59,60 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
             "before the end"
         )
+
+
+Duration = Annotated[float, Quantity("time", above="0 s")]
+Speed = Annotated[float, Quantity("speed", above="0 m/s")]
+Spread = Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
+"""One sigma of an angle."""
+
+
+class Departure(Place):
+    """Where a vehicle begins, at what height, and its heading there."""
+
+    height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
+    heading: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
+class Leg(Parameters):
+    """One command of a motion over ground; which quantities it takes depends on what it does."""
+
+    do: Literal["stop", "straight", "accelerate", "turn", "climb"]
+    seconds: Duration | None = None
+    speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
+    # positive to the right
+    angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None
+    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
+    # gained
+    height: Annotated[float, Quantity("length", least="-100 km", most="100 km")] | None = None
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration as of `robins.sim.commands`; 0 for a leg that does not say it."""
+        if self.seconds is not None or self.angle is None or self.rate is None:
+            return self.seconds or 0.0
+        hold = abs(self.angle) / self.rate
+        return hold + min(hold, 1.0)  # a turn takes a second to ease in and out
+
+    def command(self) -> Command:
+        """The leg as a command of `robins.sim.commands`.
+
+        Raises:
+            ValueError: it lacks a quantity it needs, or has one it does not take.
+        """
+        make, needed = _COMMANDS[self.do]
+        given = {name for name in Leg.model_fields if getattr(self, name) is not None} - {"do"}
+        if wrong := sorted(given ^ set(needed)):
+            what = "needs" if wrong[0] in needed else "does not take"
+            raise ValueError(f"legs: '{self.do}' {what} '{wrong[0]}'; it takes {', '.join(needed)}")
+        return make(*(getattr(self, name) for name in needed))
+
+
+# what each leg says, in the order its command takes it
+_COMMANDS: dict[str, tuple[Callable[..., Command], tuple[str, ...]]] = {
+    "stop": (stop, ("seconds",)),
+    "straight": (straight, ("seconds",)),
+    "accelerate": (accelerate, ("speed", "seconds")),
+    "turn": (turn, ("angle", "rate")),
+    "climb": (climb, ("height", "seconds")),
+}

@@ -1,17 +1,13 @@
-"""What replays and campaigns share: labelled time series, and why to doubt what came out."""
+"""What replays and campaigns share: updates of sensors, and labelled time series."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from robins.filters import Code, StepWarning, Tally, doubts
+from robins.filters import Code
 from robins.filters.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.results import array, variable
@@ -60,6 +56,12 @@ def place_arrays(
     return made
 
 
+def track_arrays(places: Iterable[Any], name: str = "{}") -> dict[str, Any]:
+    """Where each filter thought something was: a `Geodetic` of each, leading axis E epochs."""
+    rows = zip(*((place.lat, place.lon, place.alt) for place in places), strict=True)
+    return place_arrays("track", map(np.stack, rows), name)
+
+
 def innovation_tables(
     seen: Sequence[Mapping[str, Any]], axes: Mapping[str, SensorAxes], epoch_s: np.ndarray
 ) -> dict[str, Any]:
@@ -98,14 +100,6 @@ def _every(seen: Sequence[Mapping[str, Any]], sensor: str, what: str) -> np.ndar
     return np.stack([blank if row is None else np.asarray(row, dtype=float) for row in rows])
 
 
-@contextmanager
-def doubts_told_at_the_end() -> Iterator[None]:
-    """Runs in here do not warn: what they would say is among the warnings of the outcome."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", StepWarning)
-        yield
-
-
 def update_metrics(seen: Mapping[str, Any], bounds: bool = False) -> dict[str, Any]:
     """Grand mean NIS with its band, and how many were refused, of each sensor that spoke.
 
@@ -124,43 +118,3 @@ def update_metrics(seen: Mapping[str, Any], bounds: bool = False) -> dict[str, A
         if np.any(used) or np.any(refused):
             out[f"refused_{sensor}"] = int(np.sum(refused))
     return out
-
-
-def end_to_end(trees: Sequence[Any]) -> Any:
-    """Pieces of a log, a row of NaN between two of them so that no curve crosses a gap."""
-
-    def join(*leaves: Any) -> jax.Array:
-        rows = [np.asarray(leaf) for leaf in leaves]
-        blank = np.full_like(rows[0][:1], np.nan if rows[0].dtype.kind == "f" else 0)
-        return jnp.asarray(np.concatenate([rows[0], *(a for r in rows[1:] for a in (blank, r))]))
-
-    return jax.tree_util.tree_map(join, *trees)
-
-
-def together(tallies: Sequence[Tally | None]) -> Tally | None:
-    """The tallies of all pieces of a log, as one with a leading axis."""
-    some = [tally for tally in tallies if tally is not None]
-    return jax.tree_util.tree_map(lambda *x: np.stack(x), *some) if some else None
-
-
-def replay_warnings(
-    tallies: Mapping[str, Tally],
-    causes: str,
-    bounds: Collection[str] = (),
-    assumed: Collection[str] = (),
-) -> list[str]:
-    """Why a reader should doubt a replay, and the likely causes; empty where nothing is wrong.
-
-    Args:
-        tallies: by filter, of all pieces of the log.
-        causes: the sentence on what is mostly behind it in this system.
-        bounds: filters that state bounds, not standard deviations.
-        assumed: sensors that nobody built, such as "the wheels do not slip": their noise is a
-            guess on the cautious side, so that small innovations say nothing.
-    """
-    found = [
-        f"{name}: {sentence}."
-        for name, tally in tallies.items()
-        for sentence in doubts(tally, bounds=name in bounds, assumed=assumed)
-    ]
-    return [*found, causes] if found else []

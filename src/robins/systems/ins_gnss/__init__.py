@@ -2,34 +2,21 @@
 
 from pathlib import Path
 
-from robins.systems.ins_gnss.drive import drive_dataset, drive_problem
-from robins.systems.ins_gnss.drive_claims import CLAIMS
+from robins.systems.ins_gnss.log import replay
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
-from robins.systems.ins_gnss.replay import replay
-from robins.systems.ins_gnss.setup import FILTERS, SMOOTHED
-from robins.systems.study import Study
+from robins.systems.ins_gnss.study import DRIVE, NAMES
+from robins.systems.ins_gnss.world import drive_dataset
 from robins.systems.system import System
-
-_HERE = Path(__file__).parent / "scenarios"
-_FILTERS = (*FILTERS, *(name + SMOOTHED for name in FILTERS))
 
 SYSTEM = System(
     name="ins-gnss",
-    studies={"drive": Study(Drive, drive_problem, _FILTERS, CLAIMS)},
-    replay_filters=_FILTERS,
+    studies={"drive": DRIVE},
+    replay_filters=NAMES,
     replay_parameters=Replay,
-    replay_default=_HERE / "replay.toml",
+    replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
     orientation=lambda parameters: parameters.imu.orientation,
 )
 
-__all__ = [
-    "SYSTEM",
-    "Drive",
-    "Replay",
-    "drive_dataset",
-    "drive_problem",
-    "ins_gnss_model",
-    "replay",
-]
+__all__ = ["SYSTEM", "Drive", "Replay", "drive_dataset", "ins_gnss_model", "replay"]

@@ -1,22 +1,41 @@
 """Loosely coupled INS/GNSS: the motion and the sensors (Groves 2013, ch. 14).
 
 The navigation state itself is the filter's mean, so the estimate is fed back to the mechanisation
-by construction (closed loop). A step of the motion is a block of IMU increments; every sensor
-answers "what would it read here", and the Jacobian follows by differentiation on the manifold.
+by construction (closed loop)::
+
+    x = (q_nb, v, p, b_g, b_a [, s_g, s_a])          15 or 21 tangent components
+
+A step of the motion is a block of IMU increments; its transition F and noise Q are those of
+`robins.ins.transition`. With C = C(q_nb), the raw gyro rate w, the Earth rate w_ie, the turn rate
+against the Earth w_eb = w - b_g - C' w_ie, and lever arms l, the sensors read ::
+
+    gnss_position   p + C l - v_a latency            v_a = v + C (w_eb x l), of the antenna
+    gnss_velocity   v_a - C (gained - b_a age) - g age
+    zero_velocity   v
+    zero_rate       b_g + C' w_ie
+    non_holonomic   C' v + w_eb x l_axle, right and down
+
+and their Jacobians H follow by differentiation on the manifold.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.earth import Geodetic, earth_rate_n, gravity_n
-from robins.filters import Model, Motion, Sensor
+from robins.filters import Belief, Model, Motion, Sensor
 from robins.ins.increments import Increments
+from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
+from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
+from robins.systems.parts import FRD, NED
+from robins.systems.study import SensorAxes, StateBlock
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "gnss_position",
@@ -25,6 +44,27 @@ POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "zero_rate",
     "non_holonomic",
 )
+SENSORS = {
+    POSITION: SensorAxes("m", "NED", NED),
+    VELOCITY: SensorAxes("m/s", "NED", NED),
+    STANDSTILL: SensorAxes("m/s", "NED", NED),
+    STILL_RATE: SensorAxes("rad/s", "FRD", FRD),
+    ROAD: SensorAxes("m/s", "FRD", FRD[1:]),
+}
+
+
+def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:
+    """The tangent components of `InsState` under their names."""
+    blocks = (
+        StateBlock("attitude", slice(0, 3), "rad", "deg", "NED", NED),
+        StateBlock("velocity", slice(3, 6), "m/s", "m/s", "NED", NED),
+        StateBlock("position", slice(6, 9), "m", "m", "NED", NED),
+        StateBlock("gyro_bias", slice(9, 12), "rad/s", "deg/h", "FRD", FRD),
+        StateBlock("accel_bias", slice(12, 15), "m/s^2", "mg", "FRD", FRD),
+        StateBlock("gyro_scale", slice(15, 18), "1", "ppm", "FRD", FRD),
+        StateBlock("accel_scale", slice(18, 21), "1", "ppm", "FRD", FRD),
+    )
+    return blocks if scale_states else blocks[:5]
 
 
 class Block(NamedTuple):
@@ -118,21 +158,41 @@ def _read_road(mount: Mount, x: InsState, omega_b: Array):
     return v_b[1:]
 
 
-def ins_gnss_model(
-    noise: InsNoise,
-    mount: Mount,
-    standstill_sigma: Array,
-    still_rate_sigma: Array,
-    road_sigma: Array,
-) -> Model:
+def noise_of(imu: Imu) -> InsNoise:
+    """Noise of the inertial sensors, SI.
+
+    A Gauss-Markov bias of spread s and time tau is driven by noise of density s sqrt(2 / tau).
+    """
+
+    def drive(walk, spread, time):
+        if time is None:
+            return jnp.asarray(walk), jnp.full(3, jnp.inf)
+        return jnp.asarray(spread) * math.sqrt(2.0 / time), jnp.full(3, time)
+
+    gyro_walk, gyro_time = drive(imu.gyro_bias_walk, imu.gyro_bias, imu.gyro_bias_time)
+    accel_walk, accel_time = drive(imu.accel_bias_walk, imu.accel_bias, imu.accel_bias_time)
+    return InsNoise(
+        gyro_arw=jnp.asarray(imu.gyro_noise),
+        accel_vrw=jnp.asarray(imu.accel_noise),
+        gyro_bias_rw=gyro_walk,
+        accel_bias_rw=accel_walk,
+        gyro_bias_tau=gyro_time,
+        accel_bias_tau=accel_time,
+    )
+
+
+def mount_of(gnss: Gnss, aids: Aids) -> Mount:
+    """Lever arms and latency."""
+    return Mount(jnp.asarray(gnss.lever_arm), jnp.asarray(gnss.latency), jnp.asarray(aids.axle))
+
+
+def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
     """Loosely coupled INS/GNSS with zero-velocity, zero-rate and non-holonomic updates.
 
     Args:
-        noise: of the inertial sensors, as `InsNoise`.
-        mount: lever arms [m] and latency [s].
-        standstill_sigma: (3,) m/s, how still a vehicle at rest is.
-        still_rate_sigma: (3,) rad/s, the same for its turn rate.
-        road_sigma: (2,) m/s, sideways and vertical velocity of a vehicle on a road.
+        imu: the inertial sensors as a filter models them.
+        gnss: lever arm and latency.
+        aids: how still a vehicle at rest is, how little it slips on a road, and where its axle is.
 
     Returns:
         A model with sensors, in order: "gnss_position" (a `Geodetic`, aux `Fix`),
@@ -141,18 +201,42 @@ def ins_gnss_model(
         silent at an epoch where its measurement is NaN, and left out of a run that does not name
         it.
     """
+    noise, mount = noise_of(imu), mount_of(gnss, aids)
     motion = Motion(
         step=Partial(_step, noise),
         noise=Partial(_process_noise, noise),
         linear=Partial(_step_linear, noise),
     )
+    still, still_rate = aids.standstill_velocity, aids.standstill_rate
     return Model(
         motion,
         (
             Sensor(Partial(_read_position, mount), _fix_sigma, 3, POSITION),
             Sensor(Partial(_read_velocity, mount), _fix_sigma, 3, VELOCITY),
-            Sensor(_read_standstill, standstill_sigma, 3, STANDSTILL),
-            Sensor(_read_still_rate, still_rate_sigma, 3, STILL_RATE),
-            Sensor(Partial(_read_road, mount), road_sigma, 2, ROAD),
+            Sensor(_read_standstill, jnp.full(3, still), 3, STANDSTILL),
+            Sensor(_read_still_rate, jnp.full(3, still_rate), 3, STILL_RATE),
+            Sensor(Partial(_read_road, mount), jnp.asarray(aids.road_velocity), 2, ROAD),
         ),
     )
+
+
+def start_belief(
+    nav: Nav, imu: Imu, start: Start, tilt_rad: float, heading_rad: float, gyro_bias: Any = None
+) -> Belief:
+    """The belief at the start, uncorrelated.
+
+    Args:
+        nav: attitude, velocity and position of the IMU.
+        imu: spread of the sensors' errors.
+        start: spread of velocity and position.
+        tilt_rad: spread of roll and pitch.
+        heading_rad: spread of the heading.
+        gyro_bias: (3,) rad/s, where it is known from rest; else zero.
+    """
+    sigma = [[tilt_rad, tilt_rad, heading_rad], [start.velocity] * 3, [start.position] * 3]
+    sigma += [imu.gyro_bias, imu.accel_bias]
+    sigma += [imu.gyro_scale, imu.accel_scale] if imu.scale_states else []
+    mean = InsState.start(nav, imu.scale_states)
+    if gyro_bias is not None:
+        mean = mean._replace(gyro_bias=jnp.asarray(gyro_bias))
+    return Belief(mean, jnp.diag(jnp.asarray(np.concatenate(sigma))))

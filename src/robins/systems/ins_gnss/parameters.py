@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
-from robins.systems.parts import Names, refuse_too_long, refuse_unsettled
+from robins.systems.parts import (
+    Departure,
+    Duration,
+    Leg,
+    Names,
+    Speed,
+    Spread,
+    Three,
+    refuse_too_long,
+    refuse_unsettled,
+)
 from robins.systems.study import Scenario
-
-Three = tuple[float, float, float]
 
 
 class Imu(Parameters):
@@ -26,8 +35,8 @@ class Imu(Parameters):
     accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
     gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")]
     accel_bias_walk: Annotated[Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")]
-    gyro_bias_time: Annotated[float, Quantity("time", above="0 s")] | None = None
-    accel_bias_time: Annotated[float, Quantity("time", above="0 s")] | None = None
+    gyro_bias_time: Duration | None = None
+    accel_bias_time: Duration | None = None
     scale_states: bool = False
     gyro_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
     accel_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
@@ -52,25 +61,25 @@ class Gnss(Parameters):
 class Start(Parameters):
     """How well the start is known, and how the heading is found."""
 
-    tilt: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("2 deg")
-    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("20 deg")
-    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.2 m/s")
+    tilt: Spread = default("2 deg")
+    heading: Spread = default("20 deg")
+    velocity: Speed = default("0.2 m/s")
     position: Annotated[float, Quantity("length", above="0 m")] = default("0.1 m")
     # heading of the body at the start; without it, the course once above the speed
     known_heading: Annotated[float, Quantity("angle")] | None = None
-    course_speed: Annotated[float, Quantity("speed", above="0 m/s")] = default("1 m/s")
+    course_speed: Speed = default("1 m/s")
 
 
 class Aids(Parameters):
     """Knowledge about the motion, used as measurements."""
 
     zero_velocity: bool = True
-    standstill_velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.01 m/s")
+    standstill_velocity: Speed = default("0.01 m/s")
     standstill_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default(
         "0.05 deg/s"
     )
     # at rest: spread of the samples over the window stays below these
-    window: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    window: Duration = default("0.5 s")
     quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.15 m/s^2")
     quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.5 deg/s")
     non_holonomic: bool = False
@@ -80,23 +89,42 @@ class Aids(Parameters):
         "0.1 m/s"
     )
 
+    @property
+    def quiet(self) -> tuple[float, float, float]:
+        """Window [s], rate [rad/s] and force [m/s^2] of `robins.ins.rest.standstill`."""
+        return self.window, self.quiet_rate, self.quiet_accel
+
 
 class Outages(Parameters):
     """Times at which the GNSS is withheld, to see how long the inertial solution holds."""
 
-    length: Annotated[float, Quantity("time", above="0 s")]
+    length: Duration
     first: Annotated[float, Quantity("time", least="0 s")]  # after the first fix
-    gap: Annotated[float, Quantity("time", above="0 s")]  # between two outages
+    gap: Duration  # between two outages
     last: Annotated[float, Quantity("time", least="0 s")]  # before the last fix none begins
+
+    def mask(self, time_s: np.ndarray, first_s: float, last_s: float) -> np.ndarray:
+        """Which times lie in an outage (N,) bool; outages repeat until none may begin any more.
+
+        Args:
+            time_s: (N,) times to judge.
+            first_s: time of the first fix.
+            last_s: time of the last fix.
+        """
+        period = self.length + self.gap
+        since = time_s - (first_s + self.first)
+        begin = np.floor(since / period) * period
+        inside = (since >= 0.0) & (since - begin < self.length)
+        return inside & (first_s + self.first + begin < last_s - self.last)
 
 
 class Update(Parameters):
     """How the filter steps."""
 
-    longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
+    longest_block: Duration = default("0.25 s")
     gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
     # an IMU gap longer than this is declared instead of bridged
-    longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+    longest_gap: Duration = default("1 s")
     # process noise factor across one
     gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
@@ -114,35 +142,11 @@ class Replay(Parameters):
     outages: Outages | None = None
     filters: Names = ("ekf",)
 
-
-class Place(Parameters):
-    """Where a drive begins."""
-
-    latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
-    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
-    height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
-    heading: Annotated[float, Quantity("angle")] = default("0 deg")
-
-
-class Leg(Parameters):
-    """One command of a drive; which quantities it takes depends on what it does."""
-
-    do: Literal["stop", "straight", "accelerate", "turn", "climb"]
-    seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
-    speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
-    # positive to the right
-    angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None
-    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
-    # gained
-    height: Annotated[float, Quantity("length", least="-100 km", most="100 km")] | None = None
-
-    @property
-    def lasts_s(self) -> float:
-        """Duration as of `robins.sim.commands`; 0 for a leg that does not say it."""
-        if self.seconds is not None or self.angle is None or self.rate is None:
-            return self.seconds or 0.0
-        hold = abs(self.angle) / self.rate
-        return hold + min(hold, 1.0)  # a turn takes a second to ease in and out
+    def withheld(self, time_s: np.ndarray, fix_s: np.ndarray) -> np.ndarray:
+        """Which times (N,) lie in an outage, of a log with fixes at some times (M,)."""
+        if self.outages is None:
+            return np.zeros(len(time_s), dtype=bool)
+        return self.outages.mask(time_s, fix_s[0], fix_s[-1])
 
 
 class Receiver(Gnss):
@@ -169,7 +173,7 @@ class Drive(Scenario):
     imu_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default(
         "100 Hz"
     )
-    place: Place
+    place: Departure
     legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     imu: Imu
     gnss: Receiver

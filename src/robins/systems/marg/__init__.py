@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-from robins.systems.marg.blocks import Samples, causal_attitudes, integrate, smoothed_attitudes
-from robins.systems.marg.model import Block, MargState, marg_model
+from robins.systems.marg.filters import FILTERS, filter_of
+from robins.systems.marg.log import first_belief, first_look, prepare
+from robins.systems.marg.model import Block, Samples, integrate, model_of
 from robins.systems.marg.parameters import Replay
-from robins.systems.marg.prepare import Prepared, prepare
-from robins.systems.marg.replay import orient, replay
-from robins.systems.marg.rules import marg_filter
-from robins.systems.marg.setup import FILTERS, filter_of, model_of
+from robins.systems.marg.replay import replay
 from robins.systems.system import System
 
 SYSTEM = System(
@@ -24,18 +22,13 @@ SYSTEM = System(
 __all__ = [
     "SYSTEM",
     "Block",
-    "MargState",
-    "Prepared",
     "Replay",
     "Samples",
-    "causal_attitudes",
     "filter_of",
+    "first_belief",
+    "first_look",
     "integrate",
-    "marg_filter",
-    "marg_model",
     "model_of",
-    "orient",
     "prepare",
     "replay",
-    "smoothed_attitudes",
 ]

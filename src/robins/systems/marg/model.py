@@ -1,6 +1,13 @@
 """Orientation from gyro, accelerometer and magnetometer: the motion and the sensors.
 
-A step is a block of samples, integrated beforehand (`Block`). What is peculiar to it:
+With q body to NED, C = C(q), f the specific force, w the rate that is read::
+
+    q' = q (w + M w - b) / 2,   v' = C (f - b_a) + g,   p' = v
+    b' = white,   M' = 0,   b_a' = white,   field' = white
+    declination' = -declination / T + white while moving,   0 at rest
+
+A step is a block of samples, integrated beforehand (`Block`); F = exp of the linear form of these
+stands in `advance_linear`, Q in `_sigma`. What is peculiar to it:
 
 - the accelerometer is integrated, not looked at: it carries the velocity, and gravity shows in that
   a velocity and a place which do not run away leave no room for a tilt error. A swing of the hand
@@ -10,22 +17,38 @@ A step is a block of samples, integrated beforehand (`Block`). What is peculiar 
 - the magnetometer gives a heading and no tilt. North is where the field pointed at the start. How
   the field of other places is turned against that is a state, `declination`, which does not change
   while the unit lies still: reading the same place again tells nothing new.
+
+Samples become blocks by `integrate`; `causal_attitudes` and `smoothed_attitudes` go back, from
+states at the ends of blocks to an attitude at every sample.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from robins import rotation
 from robins.filters import Model, Motion, Sensor
 from robins.manifold import Angle
 from robins.rotation import Rotation, skew
+from robins.systems.marg.parameters import Replay
+from robins.systems.parts import NED
+from robins.systems.study import SensorAxes, StateBlock
 
+XYZ = ("x", "y", "z")
 TRAVEL, REST_RATE, MAGNETOMETER = "travel", "rest_rate", "magnetometer"
+_TRAVELLED = [
+    f"{what} {axis} [{u}]" for what, u in (("velocity", "m/s"), ("place", "m")) for axis in NED
+]
+SENSORS = {
+    TRAVEL: SensorAxes("m/s, m", "NED", tuple(_TRAVELLED)),
+    REST_RATE: SensorAxes("rad/s", "body", XYZ),
+    MAGNETOMETER: SensorAxes("rad, T", "NED", ("azimuth [rad]", "horizontal [T]", "down [T]")),
+}
 
 
 class MargState(NamedTuple):
@@ -41,13 +64,21 @@ class MargState(NamedTuple):
     field: Array  # (2,) T, strength along the horizontal and down
 
 
-TILT, HEADING = slice(0, 2), 2
-DECLINATION, FIELD = 24, slice(25, 27)
-DIM = 27
+HEADING, DECLINATION, FIELD, DIM = 2, 24, slice(25, 27), 27
+_NINE = tuple(f"{a} from {b}" for a in XYZ for b in XYZ)
+BLOCKS = (
+    StateBlock("attitude", slice(0, 3), "rad", "deg", "NED", NED),
+    StateBlock("velocity", slice(3, 6), "m/s", "m/s", "NED", NED),
+    StateBlock("gyro_bias", slice(9, 12), "rad/s", "deg/s", "body", XYZ),
+    StateBlock("gyro_gain", slice(12, 21), "1", "%", "body", _NINE),
+    StateBlock("accel_bias", slice(21, 24), "m/s^2", "mg", "body", XYZ),
+    StateBlock("declination", slice(24, 25), "rad", "deg", "NED", ("here",)),
+    StateBlock("field", slice(25, 27), "T", "uT", "NED", ("horizontal", "down")),
+)
 
 
-class Block(NamedTuple):
-    """Input of a step: what the raw samples of a block integrate to, in body axes at its start."""
+class Integrals(NamedTuple):
+    """What the raw samples of a block integrate to, in body axes at its start."""
 
     dt_s: ArrayLike  # ()
     turn: ArrayLike  # (4,) quaternion, body axes at the end to those at the start
@@ -55,6 +86,12 @@ class Block(NamedTuple):
     turn_time: ArrayLike  # (3, 3) s, integral of the rotation R(t)
     turn_rates: ArrayLike  # (3, 9) rad, integral of R_ij(t) times the k-th rate, at 3 j + k
     angle: ArrayLike  # () rad, turned in all
+
+
+class Block(NamedTuple):
+    """Input of a step."""
+
+    samples: Integrals
     still: ArrayLike  # () 1 where the unit lies still, else 0
     lost_turn: ArrayLike  # () rad, spread of what was not sampled
     lost_dv: ArrayLike  # () m/s, the same of the velocity
@@ -87,28 +124,30 @@ class Seen(NamedTuple):
 
 def correction(x: MargState, block: Block) -> Array:
     """(3,) rad, what bias and gain add to the turn of a block, in body axes at its start."""
-    gain = jnp.asarray(block.turn_rates) @ x.gyro_gain.reshape(9)
-    return gain - jnp.asarray(block.turn_time) @ x.gyro_bias
+    gain = jnp.asarray(block.samples.turn_rates) @ x.gyro_gain.reshape(9)
+    return gain - jnp.asarray(block.samples.turn_time) @ x.gyro_bias
 
 
 def persistence(noise: Noise, block: Block) -> Array:
     """Share of the declination that a block leaves: all of it while the unit lies still."""
-    moving_s = jnp.asarray(block.dt_s) * (1.0 - jnp.asarray(block.still))
+    moving_s = jnp.asarray(block.samples.dt_s) * (1.0 - jnp.asarray(block.still))
     return jnp.exp(-moving_s / noise.declination_time)
 
 
 def _velocity_gain(x: MargState, block: Block) -> Array:
     """(3,) m/s, navigation axes, without gravity. The turn was at fault by half on the way."""
-    dv = jnp.asarray(block.dv)
+    dv = jnp.asarray(block.samples.dv)
     dv = dv + jnp.cross(0.5 * correction(x, block), dv)
-    return x.q_nb.apply(dv - jnp.asarray(block.turn_time) @ x.accel_bias)
+    return x.q_nb.apply(dv - jnp.asarray(block.samples.turn_time) @ x.accel_bias)
 
 
 def advance(noise: Noise, x: MargState, block: Block) -> MargState:
     """The state after a block."""
-    dt = jnp.asarray(block.dt_s)
+    dt = jnp.asarray(block.samples.dt_s)
     gained = _velocity_gain(x, block) + jnp.array([0.0, 0.0, 1.0]) * noise.gravity * dt
-    turned = rotation.multiply(rotation.from_rotvec(correction(x, block)), jnp.asarray(block.turn))
+    turned = rotation.multiply(
+        rotation.from_rotvec(correction(x, block)), jnp.asarray(block.samples.turn)
+    )
     return x._replace(
         q_nb=Rotation(rotation.normalise(rotation.multiply(x.q_nb.wxyz, turned))),
         v_n=x.v_n + gained,
@@ -118,10 +157,10 @@ def advance(noise: Noise, x: MargState, block: Block) -> MargState:
 
 
 def _sigma(noise: Noise, x: MargState, block: Block) -> Array:
-    dt, moving = jnp.asarray(block.dt_s), 1.0 - jnp.asarray(block.still)
+    dt, moving = jnp.asarray(block.samples.dt_s), 1.0 - jnp.asarray(block.still)
     root = jnp.sqrt(dt)
     kept = persistence(noise, block)
-    angle = noise.turn_error * jnp.asarray(block.angle)
+    angle = noise.turn_error * jnp.asarray(block.samples.angle)
     turn = jnp.sqrt((noise.gyro * root) ** 2 + angle**2 + jnp.asarray(block.lost_turn) ** 2)
     push = jnp.sqrt((noise.accel * root) ** 2 + jnp.asarray(block.lost_dv) ** 2)
     walk = jnp.where(moving > 0.0, noise.gyro_bias_moving, noise.gyro_bias_still) * root
@@ -143,16 +182,16 @@ def _sigma(noise: Noise, x: MargState, block: Block) -> Array:
 
 def advance_linear(noise: Noise, x: MargState, block: Block):
     """`advance`, its Jacobian (27, 27) between tangent spaces, and the noise (27,)."""
-    dt, dv = jnp.asarray(block.dt_s), jnp.asarray(block.dv)
+    dt, dv = jnp.asarray(block.samples.dt_s), jnp.asarray(block.samples.dv)
     rate_map = jnp.concatenate(
-        [-jnp.asarray(block.turn_time), jnp.asarray(block.turn_rates)], axis=1
+        [-jnp.asarray(block.samples.turn_time), jnp.asarray(block.samples.turn_rates)], axis=1
     )
     R = x.q_nb.as_dcm()
     # the left Jacobian of a small rotation, to first order (Sola 2017, eq. 145)
     turn = R @ (jnp.eye(3) + 0.5 * skew(correction(x, block))) @ rate_map
     push = -0.5 * R @ skew(dv) @ rate_map
     tilt = -skew(_velocity_gain(x, block))
-    lean = -R @ jnp.asarray(block.turn_time)
+    lean = -R @ jnp.asarray(block.samples.turn_time)
     F = jnp.eye(DIM)
     F = F.at[0:3, 9:21].set(turn)
     for rows, share in ((slice(3, 6), 1.0), (slice(6, 9), 0.5 * dt)):
@@ -219,28 +258,40 @@ def _magnetometer_sigma(seen: Seen, x: MargState, field_b: Any):
     return jnp.stack([azimuth, jnp.asarray(seen.field), jnp.asarray(seen.field)])
 
 
-def marg_model(noise: Noise, seen: Seen, magnetometer: bool = True) -> Model:
+def model_of(parameters: Replay) -> Model:
     """Gyro and accelerometer carry the state; travel, rest and the magnetometer hold it.
 
     The Jacobian of the magnetometer has no columns of tilt: a disturbed field cannot tilt the
     attitude, at the price of the little it could tell of tilt.
 
-    Args:
-        noise: of the motion.
-        seen: of the sensors.
-        magnetometer: whether there is one.
-
     Returns:
         A model with sensors, in order: "travel" ((6,) zeros; NaN where nothing is claimed; aux 1
-        at rest, else 0), "rest_rate" ((3,) zeros at rest, else NaN; aux (3,) mean rate read) and
-        "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes [T]). The measurement
-        is zero and the reading what the state makes of aux: the innovation is minus the reading.
+        at rest, else 0), "rest_rate" ((3,) zeros at rest, else NaN; aux (3,) mean rate read) and,
+        where it is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes
+        [T]). The measurement is zero and the reading what the state makes of aux: the innovation is
+        minus the reading.
     """
+    gyro, accelerometer = parameters.gyro, parameters.accelerometer
+    magnetometer, travel, rest = parameters.magnetometer, parameters.travel, parameters.rest
+    noise = Noise(
+        gyro=gyro.noise,
+        turn_error=gyro.turn_error,
+        accel=accelerometer.noise,
+        gyro_bias_still=gyro.bias_walk,
+        gyro_bias_moving=gyro.bias_walk_moving,
+        accel_bias=accelerometer.bias_walk,
+        declination=magnetometer.declination,
+        declination_time=magnetometer.declination_time,
+        field=magnetometer.field_walk,
+        gravity=accelerometer.gravity,
+    )
+    seen = Seen(travel.velocity, travel.place, rest.velocity, rest.rate, magnetometer.noise)
+    noise, seen = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), (noise, seen))
     sensors = [
         Sensor(_read_travel, Partial(_travel_sigma, seen), 6, TRAVEL, _travel_linear),
         Sensor(_read_rest_rate, Partial(_rest_rate_sigma, seen), 3, REST_RATE, _rest_rate_linear),
     ]
-    if magnetometer:
+    if parameters.use_magnetometer != "never":
         sigma = Partial(_magnetometer_sigma, seen)
         sensors.append(Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear))
     motion = Motion(
@@ -249,3 +300,101 @@ def marg_model(noise: Noise, seen: Seen, magnetometer: bool = True) -> Model:
         linear=Partial(advance_linear, noise),
     )
     return Model(motion, tuple(sensors))
+
+
+# ------------------------------------------------------------------------------ samples and blocks
+
+
+class Samples(NamedTuple):
+    """Increments in blocks of n; a block that is not full ends in increments of no length."""
+
+    dt_s: Any  # (K, n)
+    theta: Any  # (K, n, 3) rad, rotation vector of each interval
+    dv: Any  # (K, n, 3) m/s
+    field_b: Any  # (K, n, 3) T at the end of each interval; NaN where there is none
+
+
+def _of_block(samples: Samples) -> tuple[Integrals, Array]:
+    """Of one block: leading axis n."""
+
+    def add(q, row):
+        dt, theta, dv, field_b = row
+        half = rotation.to_dcm(rotation.multiply(q, rotation.from_rotvec(0.5 * theta)))
+        pushed = rotation.rotate(q, dv)
+        q = rotation.multiply(q, rotation.from_rotvec(theta))
+        there = jnp.all(jnp.isfinite(field_b))
+        field = jnp.where(there, rotation.rotate(q, jnp.where(there, field_b, 0.0)), 0.0)
+        rates = (half[:, :, None] * theta[None, None, :]).reshape(3, 9)
+        angle = jnp.sqrt(jnp.sum(theta * theta))
+        return q, (pushed, half * dt, rates, angle, field, there.astype(float))
+
+    start = jnp.array([1.0, 0.0, 0.0, 0.0])
+    q, rows = jax.lax.scan(add, start, tuple(samples))
+    dv, turn_time, turn_rates, angle, field, count = (jnp.sum(r, axis=0) for r in rows)
+    q = rotation.normalise(q)
+    mean = field / jnp.where(count > 0.0, count, jnp.nan)
+    field_b = rotation.rotate(rotation.conjugate(q), mean)
+    return Integrals(jnp.sum(samples.dt_s), q, dv, turn_time, turn_rates, angle), field_b
+
+
+@jax.jit
+def integrate(samples: Samples) -> tuple[Integrals, Array]:
+    """What every block integrates to, leading axis K, and its mean field.
+
+    The field is in body axes at the end of the block, (K, 3) T; NaN where there is none.
+    """
+    return jax.vmap(_of_block)(samples)
+
+
+def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:
+    """(n, 4) attitude at each sample against the start of the block."""
+
+    def add(q, row):
+        dt, theta = row
+        true = theta + gain @ theta - bias * dt
+        q = rotation.multiply(q, rotation.from_rotvec(true))
+        return q, q
+
+    return jax.lax.scan(add, jnp.array([1.0, 0.0, 0.0, 0.0]), (dt, theta))[1]
+
+
+@jax.jit
+def causal_attitudes(
+    start: MargState, posterior: MargState, samples: Samples
+) -> Float[Array, "K n 4"]:
+    """Attitude at every sample from what was known by then.
+
+    Inside a block the last posterior is carried on by the gyro; at its end stands the new one.
+
+    Args:
+        start: the state before the first block.
+        posterior: states at the ends of the blocks, leading axis K.
+        samples: of the blocks.
+    """
+    before = jax.tree_util.tree_map(
+        lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b[:-1]]), start, posterior
+    )
+    turned = jax.vmap(_turns)(before.gyro_bias, before.gyro_gain, samples.dt_s, samples.theta)
+    q = rotation.normalise(rotation.multiply(before.q_nb.wxyz[:, None, :], turned))
+    return q.at[:, -1].set(posterior.q_nb.wxyz)
+
+
+@jax.jit
+def smoothed_attitudes(
+    smoothed: MargState, samples: Samples
+) -> tuple[Float[Array, "K n 4"], Float[Array, "4"]]:
+    """Attitude at every sample from smoothed states at the ends of blocks, and at the start.
+
+    The gyro carries each state over the next block; what it misses the next one by is laid over
+    the block in equal parts. The first block is gone through backwards.
+    """
+    bias, gain, q_end = smoothed.gyro_bias, smoothed.gyro_gain, smoothed.q_nb.wxyz
+    turned = jax.vmap(_turns)(bias, gain, samples.dt_s, samples.theta)
+    first = rotation.multiply(q_end[:1], rotation.conjugate(turned[:1, -1]))
+    start = jnp.concatenate([first, q_end[:-1]])
+    q = rotation.multiply(start[:, None, :], turned)
+    missed = rotation.to_rotvec(rotation.multiply(q_end, rotation.conjugate(q[:, -1])))
+    n = samples.dt_s.shape[1]
+    share = jnp.arange(1.0, n + 1.0) / float(n)
+    mend = rotation.from_rotvec(share[None, :, None] * missed[:, None, :])
+    return rotation.normalise(rotation.multiply(mend, q)), rotation.normalise(start[0])

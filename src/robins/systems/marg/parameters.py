@@ -11,9 +11,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Entry, Parameters, Quantity, default
-from robins.systems.parts import Names
+from robins.systems.parts import Duration, Names, Speed, Spread, Three
 
-Three = tuple[float, float, float]
 Row = tuple[Entry, Entry, Entry]
 Matrix = tuple[Row, Row, Row]
 Field = Annotated[Three, Quantity("magnetic field")]
@@ -69,10 +68,8 @@ class Magnetometer(Parameters):
     offset: Field = default("0 uT")
     matrix: Matrix = IDENTITY
     noise: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("2.5 uT")
-    declination: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
-        "6 deg"
-    )
-    declination_time: Annotated[float, Quantity("time", above="0 s")] = default("60 s")
+    declination: Spread = default("6 deg")
+    declination_time: Duration = default("60 s")
     # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
     # magnitudes outside are no field of the Earth: not used, counted
@@ -80,7 +77,7 @@ class Magnetometer(Parameters):
     most: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("200 uT")
     gate: Annotated[float, pydantic.Field(gt=0.0, lt=1.0)] = 0.95
     # so many seconds of motion in one and the same other field make that field the reference
-    patience: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
+    patience: Duration = default("20 s")
 
 
 class Travel(Parameters):
@@ -90,9 +87,9 @@ class Travel(Parameters):
     speed, and a large place.
     """
 
-    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.5 m/s")
+    velocity: Speed = default("0.5 m/s")
     place: Annotated[float, Quantity("length", above="0 m")] = default("0.3 m")
-    every: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+    every: Duration = default("1 s")
     weight: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.9999  # Huber's; 1: never less
 
 
@@ -100,28 +97,29 @@ class Rest(Parameters):
     """When the unit lies still, and what that says."""
 
     detect: bool = True
-    after: Annotated[float, Quantity("time", above="0 s")] = default("1.5 s")
+    after: Duration = default("1.5 s")
     quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2 deg/s")
     quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.5 m/s^2")
     # a mean rate above this is no bias but a turn
     most_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("4 deg/s")
     rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.03 deg/s")
-    velocity: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.01 m/s")
+    velocity: Speed = default("0.01 m/s")
+
+    @property
+    def quiet(self) -> tuple[float, float, float, float]:
+        """Thresholds of `robins.ins.rest.still_samples`: s, rad/s, m/s^2, rad/s."""
+        return self.after, self.quiet_rate, self.quiet_accel, self.most_rate
 
 
 class Start(Parameters):
     """How well the first attitude is known, when it is found at rest and when not."""
 
-    still: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
-    moving: Annotated[float, Quantity("time", above="0 s")] = default("3 s")
-    tilt: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
-    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
-    tilt_moving: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
-        "5 deg"
-    )
-    heading_moving: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
-        "30 deg"
-    )
+    still: Duration = default("0.5 s")
+    moving: Duration = default("3 s")
+    tilt: Spread = default("1 deg")
+    heading: Spread = default("1 deg")
+    tilt_moving: Spread = default("5 deg")
+    heading_moving: Spread = default("30 deg")
 
 
 class Update(Parameters):
@@ -129,7 +127,7 @@ class Update(Parameters):
 
     # a sample is the mean over the interval it ends, or the value at an instant
     samples: Literal["means", "instants"] = "means"
-    block: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+    block: Duration = default("0.1 s")
     # an interval between samples longer than this many usual ones is a gap
     gap: Annotated[float, pydantic.Field(gt=1.0, le=1e6)] = 3.0
     gap_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("60 deg/s")

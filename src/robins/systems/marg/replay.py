@@ -1,99 +1,116 @@
-"""Replay a nine-axis log: align, filter, smooth, and see how far it is from the truth if known."""
+"""Replay a nine-axis log: align, filter, smooth, and see how far it is from the truth if known.
+
+Errors of an orientation are those that BROAD defines (Laidig, Caruso, Cereatti & Seel 2021).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from robins.dataset import Dataset
-from robins.filters import Belief, Code, Filter, Model, rts_smoother, run
-from robins.filters.run import Step
-from robins.results import Outcome, Progress, silent
-from robins.systems.marg.answer import Answer, metrics, sentences, solution
-from robins.systems.marg.blocks import causal_attitudes, smoothed_attitudes
-from robins.systems.marg.model import REST_RATE, TRAVEL
-from robins.systems.marg.parameters import Replay
-from robins.systems.marg.prepare import Prepared, prepare
-from robins.systems.marg.setup import CAUSAL, SMOOTHED, filter_of, model_of
-from robins.systems.tables import doubts_told_at_the_end, replay_warnings, updates
-
-CAUSES = (
-    "Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, axes "
-    "or units of a sensor that differ from what the log says, or noise of the gyro told too small."
+from robins import rotation
+from robins.dataset import AttitudeTable, Dataset
+from robins.filters import Code
+from robins.ins.frames import to_ned_frd
+from robins.results import Outcome, Progress, array, silent
+from robins.systems import replaying
+from robins.systems.marg.filters import CAUSAL, SMOOTHED, filter_of
+from robins.systems.marg.log import Prepared, prepare
+from robins.systems.marg.model import (
+    BLOCKS,
+    MAGNETOMETER,
+    REST_RATE,
+    SENSORS,
+    TRAVEL,
+    MargState,
+    causal_attitudes,
+    model_of,
+    smoothed_attitudes,
 )
+from robins.systems.marg.parameters import Replay
+from robins.systems.replaying import Answer, Reported
+from robins.systems.study import Contender, StateBlock
+from robins.systems.tables import EULER, block_array
+
+_ESTIMATED = {block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in BLOCKS[1:]}
+_HEADING = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
+_INCLINATION = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("north", "east"))
 
 
-class Light(NamedTuple):
-    """What is kept of a step where nothing is smoothed."""
-
-    mean: Any
-    sigma: Any
-    info: Any  # by sensor, an `Update`
-    failed: Any  # () the prediction was not taken
+# --------------------------------------------------------------------------------------- accuracy
 
 
-def light(step: Step) -> Light:
-    """Keep the posterior's mean and standard deviations and how the updates went."""
-    return Light(
-        step.posterior.mean,
-        step.posterior.sigma,
-        updates(step),
-        step.prediction.code != int(Code.DONE),
+class OrientationErrors(NamedTuple):
+    """Angles [rad] of q_e = q_estimated conj(q_true), both from body to an earth frame.
+
+    Neither depends on which of the earth's axes is called first, so ENU and NED give the same, but
+    for the sign of the heading error, which here is clockwise as headings are.
+    """
+
+    total: np.ndarray  # (N,) 0 to pi
+    heading: np.ndarray  # (N,) -pi to pi, estimated minus true
+    inclination: np.ndarray  # (N,) 0 to pi
+
+
+def orientation_errors(q_estimated: np.ndarray, q_true: np.ndarray) -> OrientationErrors:
+    """Total, heading and inclination error; NaN where an attitude is missing.
+
+    With q_e = (w, x, y, z): total 2 acos |w|, heading 2 atan(z / w), inclination
+    2 acos sqrt(w^2 + z^2); written with the arc tangent, which is exact for small angles too.
+
+    Args:
+        q_estimated: (N, 4) q_nb, scalar first, NED.
+        q_true: (N, 4) the same.
+    """
+    q = rotation.conjugate(jnp.asarray(q_true))
+    e = np.asarray(rotation.multiply(jnp.asarray(q_estimated), q))
+    w, z = e[:, 0], e[:, 3]
+    across = np.hypot(e[:, 1], e[:, 2])
+    sign = np.where(w < 0.0, -1.0, 1.0)
+    return OrientationErrors(
+        total=2.0 * np.arctan2(np.linalg.norm(e[:, 1:], axis=1), np.abs(w)),
+        heading=2.0 * np.arctan2(sign * z, sign * w),
+        inclination=2.0 * np.arctan2(across, np.hypot(w, z)),
     )
 
 
-@jax.jit
-def _light_of(steps: Step) -> Light:
-    return jax.vmap(light)(steps)
+def truth_at(attitude: AttitudeTable, time_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """True q_nb (N, 4) NED at given times and whether they count; NaN where none is near.
 
-
-def orient(
-    log: Prepared, filter_: Filter, model: Model, wanted: tuple[str, ...]
-) -> tuple[dict[str, Answer], int]:
-    """Run the filter over a log once, and its smoother if that is wanted.
-
-    Args:
-        log: from `prepare`.
-        filter_: from `setup.filter_of`, or any other of the same model.
-        model: from `setup.model_of`.
-        wanted: names out of "marg" and "marg-smoothed".
-
-    Returns:
-        Answers by name, and the number of steps that could not be taken.
+    The nearest true attitude within half its own interval is taken, none is interpolated. A phase
+    counts where the author of the log said so, everywhere if nothing was said.
     """
-    smooth = SMOOTHED in wanted
-    arguments = (filter_, model, log.start, log.y, log.u, log.aux)
-    with doubts_told_at_the_end():
-        found = run(*arguments) if smooth else run(*arguments, keep=light)
-    kept = _light_of(found.steps) if smooth else found.steps
-    blocks = len(log.epoch_s)
-    kept, likelihood = _cut(kept, blocks), float(found.log_likelihood)
-    out = {}
-    if CAUSAL in wanted:
-        mean = found.steps.posterior.mean if smooth else found.steps.mean
-        q = causal_attitudes(log.start.mean, mean, log.samples)
-        q_nb = _by_sample(log, q, log.look.q_nb)
-        sigma = np.asarray(kept.sigma)
-        out[CAUSAL] = Answer(kept.mean, sigma, q_nb, kept.info, likelihood, found.tally)
-    if smooth:
-        belief: Belief = rts_smoother(found)
-        q, first = smoothed_attitudes(belief.mean, log.samples)
-        sigma = np.asarray(belief.sigma)[:blocks]
-        q_nb = _by_sample(log, q, first)
-        out[SMOOTHED] = Answer(_cut(belief.mean, blocks), sigma, q_nb, {}, likelihood)
-    return {name: out[name] for name in wanted}, int(np.sum(kept.failed))
+    table = to_ned_frd(attitude)
+    times = table.time_ns
+    later = np.clip(np.searchsorted(times, time_ns), 0, len(times) - 1)
+    sooner = np.maximum(later - 1, 0)
+    after, before = np.abs(times[later] - time_ns), np.abs(times[sooner] - time_ns)
+    nearest = np.where(after <= before, later, sooner)
+    reach = 0.51 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    near = np.abs(times[nearest] - time_ns) <= reach
+    q = np.where(near[:, None], table.q_nb[nearest], np.nan)
+    moving = np.ones(len(times), dtype=bool) if table.moving is None else table.moving
+    return q, moving[nearest] & np.all(np.isfinite(q), axis=1)
 
 
-def _cut(tree: Any, blocks: int) -> Any:
-    """Without the padding, as NumPy."""
-    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:blocks], tree)
+def rms_deg(angle_rad: np.ndarray) -> float:
+    """Root of the mean square [deg]; NaN of nothing."""
+    return float(np.degrees(np.sqrt(np.mean(angle_rad**2)))) if angle_rad.size else float("nan")
 
 
-def _by_sample(log: Prepared, q: Any, first: Any) -> np.ndarray:
-    rows = np.asarray(q).reshape(-1, 4)[: log.used]
-    return np.concatenate([np.asarray(first)[None], rows])
+# ----------------------------------------------------------------------------------------- replay
+
+
+class Errors(NamedTuple):
+    """True minus estimated at the ends of blocks."""
+
+    heading: np.ndarray  # (B,) rad
+    tilt: np.ndarray  # (B, 2) rad, about north and east
+    counts: np.ndarray  # (B,) bool
 
 
 def replay(
@@ -113,23 +130,154 @@ def replay(
     Raises:
         ValueError: the log cannot be used; the sentence says why.
     """
-    wanted = tuple(dict.fromkeys(tuple(filters) or parameters.filters))
     progress(0.0, "integrating blocks")
     log = prepare(dataset, parameters)
-    progress(0.2, "filtering")
-    answers, failed = orient(log, filter_of(parameters), model_of(parameters), wanted)
-    progress(0.9, "measuring")
-    notes = sentences(log, answers)
+    believed = Contender(filter_of(parameters), model_of(parameters))
+    wanted = filters or parameters.filters
+    contenders, smoothers = {CAUSAL: believed}, {SMOOTHED: CAUSAL}
+    answers = replaying.navigated([log], wanted, contenders.__getitem__, smoothers, progress)
+    q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
+    answers = {name: _without_padding(log, answer) for name, answer in answers.items()}
+    variables, errors = _variables(log, answers), {}
+    if dataset.attitude is not None:
+        errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
+        variables |= _error_arrays(answers, errors)
+
+    def metrics(answer: Answer) -> dict[str, Any]:
+        share = {"rest_share": float(np.mean(log.still))}
+        if dataset.attitude is None:
+            return share
+        found = _accuracy(dataset.attitude, log, q_nb[answer.name])
+        moving = errors[answer.name].counts
+        ratio = errors[answer.name].heading[moving] / answer.sigma[moving, 2]
+        # one where the stated spread of the heading is right
+        nees = float(np.mean(ratio**2)) if ratio.size else float("nan")
+        return found | {"heading_nees": nees} | share
+
+    notes = _sentences(log, answers)
     if dataset.mag is None:
         notes.append("There is no magnetometer in this log: the heading is that of the gyros.")
-    return Outcome(
-        solution=solution(dataset, log, answers),
-        metrics={name: metrics(dataset, log, answer) for name, answer in answers.items()},
-        counts=dict(dataset.counts) | log.counts | {"steps_not_taken": failed},
+    predictions = next(iter(answers.values())).tally.counts()
+    lost = sum(number for code, number in predictions.items() if code != Code.DONE)
+    return replaying.outcome(
+        log.epoch_s[: len(log.rows)],
+        answers,
+        REPORTED,
+        metrics=metrics,
+        variables=variables,
+        counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
         notes=notes,
-        warnings=replay_warnings(
-            {name: a.tally for name, a in answers.items() if a.tally is not None},
-            CAUSES,
-            assumed=(TRAVEL, REST_RATE),
-        ),
     )
+
+
+def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
+    """(N, 4) attitude at every sample."""
+    if answer.name == SMOOTHED:
+        q, first = smoothed_attitudes(answer.mean, log.samples)
+    else:
+        q, first = causal_attitudes(answer.start.mean, answer.mean, log.samples), log.look.q_nb
+    rows = np.asarray(q).reshape(-1, 4)[: len(log.time_ns) - 1]
+    return np.concatenate([np.asarray(first)[None], rows])
+
+
+def _without_padding(log: Prepared, answer: Answer) -> Answer:
+    """The answer at the blocks that are not padding, as NumPy."""
+    mean, sigma, seen = jax.tree_util.tree_map(
+        lambda x: np.asarray(x)[: len(log.rows)], (answer.mean, answer.sigma, answer.updates)
+    )
+    return answer._replace(mean=mean, sigma=sigma, updates=seen)
+
+
+def _estimates(mean: MargState) -> Mapping[str, Any]:
+    euler = jnp.stack(rotation.to_euler(jnp.asarray(mean.q_nb.wxyz)), axis=-1)
+    values = {name: np.asarray(getattr(mean, of)) for name, of in _ESTIMATED.items()}
+    return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"euler": euler}
+
+
+REPORTED = Reported(
+    blocks=BLOCKS,
+    sensors=SENSORS,
+    estimates=_estimates,
+    causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
+    "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
+    "small.",
+    assumed=(TRAVEL, REST_RATE),
+    euler=EULER._replace(frame="body to NED"),
+)
+
+
+def _accuracy(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> dict[str, Any]:
+    q_true, counts = truth_at(attitude, log.time_ns)
+    e = orientation_errors(q_nb[counts], q_true[counts])
+    return {
+        "total_rmse_deg": rms_deg(e.total),
+        "heading_rmse_deg": rms_deg(e.heading),
+        "inclination_rmse_deg": rms_deg(e.inclination),
+        "total_max_deg": float(np.degrees(np.max(e.total, initial=0.0))),
+        "samples_compared": int(np.sum(counts)),
+    }
+
+
+def _errors(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> Errors:
+    q_true, counts = truth_at(attitude, log.time_ns[log.rows])
+    q = q_nb[log.rows]
+    # how the true vertical leans against the estimated one, along estimated north and east
+    true_down = np.asarray(rotation.to_dcm(jnp.asarray(q_true)))[:, 2]
+    north, east, _ = np.moveaxis(np.asarray(rotation.to_dcm(jnp.asarray(q))), 1, 0)
+    tilt = np.stack([np.sum(east * true_down, axis=1), -np.sum(north * true_down, axis=1)], axis=1)
+    return Errors(-orientation_errors(q, q_true).heading, tilt, counts)
+
+
+def _error_arrays(answers: Mapping[str, Answer], errors: Mapping[str, Errors]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for block, values, words in (
+        (_HEADING, [e.heading[:, None] for e in errors.values()], "true minus estimated heading"),
+        (_INCLINATION, [e.tilt for e in errors.values()], "tilt of true against estimated"),
+    ):
+        out |= block_array("error", block, np.stack(values), words)
+        sigma = [answer.sigma[:, block.where] for answer in answers.values()]
+        out |= block_array("sigma", block, np.stack(sigma))
+    return out
+
+
+def _refused(log: Prepared, answer: Answer) -> np.ndarray:
+    """(B,) bool: the magnetometer was refused."""
+    update = answer.updates.get(MAGNETOMETER)
+    none = np.zeros(len(log.rows), dtype=bool)
+    return none if update is None else update.code == int(Code.REFUSED)
+
+
+def _variables(log: Prepared, answers: Mapping[str, Answer]) -> dict[str, Any]:
+    still = log.still.astype(np.int8)
+    data = array("context", still, "rest", unit="1", long_name="unit lies still")
+    return data | array(
+        "context",
+        np.stack([_refused(log, answer).astype(np.int8) for answer in answers.values()]),
+        "magnetic_disturbance",
+        unit="1",
+        long_name="magnetometer refused",
+        dims="filter time",
+    )
+
+
+def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
+    """What a reader of the report should know."""
+    c = log.counts
+    out = [
+        log.look.sentence,
+        f"At rest for {100.0 * float(np.mean(log.still)):.0f} % of the log; "
+        f"{c['imu_missing']} inertial samples missing, {c['imu_saturated']} at the end of their "
+        f"range, {c['imu_gaps']} gaps; {c['field_missing']} field readings missing, "
+        f"{c['field_implausible']} no field of the Earth; {c['blocks_in_free_fall']} blocks in "
+        f"free fall.",
+    ]
+    for name, answer in answers.items():
+        refused = _refused(log, answer)
+        update = answer.updates.get(MAGNETOMETER)
+        asked = 0 if update is None else int(np.sum((update.dof > 0) | refused))
+        if asked:
+            out.append(
+                f"{name}: the field was disturbed at {np.sum(refused)} of {asked} looks; heading "
+                "then came from the gyros."
+            )
+    return out

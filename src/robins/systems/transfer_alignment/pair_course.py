@@ -20,10 +20,8 @@ from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.sim.commands import from_commands
 from robins.sim.ideal_imu import ideal_increments
-from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.trajectory import Motion
-from robins.systems.ins_gnss.legs import command_of
 from robins.systems.transfer_alignment.pair_parameters import (
     Aircraft,
     Disturbance,
@@ -73,7 +71,7 @@ def motion_of(manoeuvre: Aircraft | Ship | Vehicle) -> Motion:
         if any(waves is not None for waves in given):
             sea = Sea(*(_waves(waves or ()) for waves in given))
         return sail(start, m.seconds, m.speed, m.heading, sea)
-    legs = [command_of(leg) for leg in m.legs]
+    legs = [leg.command() for leg in m.legs]
     return roughen(from_commands(start, legs, m.heading, m.speed), _waves(m.roll), _waves(m.pitch))
 
 

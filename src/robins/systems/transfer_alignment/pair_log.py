@@ -20,8 +20,7 @@ from robins.dataset import Dataset, ImuTable, Trajectory
 from robins.earth import Geodetic, earth_rate_n, transport_rate_n
 from robins.ins.blocks import cut, epochs_between
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
-from robins.ins.intervals import after_gap
+from robins.ins.increments import Increments, after_gap, from_imu
 from robins.ins.mechanise import Nav, as_trajectory, refuse_polar
 from robins.rotation import Rotation
 from robins.scenario import Parameters, Quantity, default

@@ -11,8 +11,7 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
-from robins.systems.ins_gnss.parameters import Leg, Place
-from robins.systems.parts import refuse_too_long, refuse_unsettled
+from robins.systems.parts import Departure, Leg, refuse_too_long, refuse_unsettled
 
 Three = tuple[float, float, float]
 
@@ -40,7 +39,7 @@ class Heave(Parameters):
     phase: Annotated[float, Quantity("angle")] = default("0 deg")
 
 
-class Aircraft(Place):
+class Aircraft(Departure):
     """Level flight at constant speed through commanded banks; see `robins.sim.manoeuvres.fly`."""
 
     kind: Literal["aircraft"]
@@ -55,7 +54,7 @@ class Aircraft(Place):
         return sum(leg.seconds for leg in self.legs)
 
 
-class Ship(Place):
+class Ship(Departure):
     """A straight course in the sea; without any sway the sea of `MODERATE_SEA`."""
 
     kind: Literal["ship"]
@@ -72,7 +71,7 @@ class Ship(Place):
         return self.seconds
 
 
-class Vehicle(Place):
+class Vehicle(Departure):
     """A ground vehicle that drives legs, on a road that may be rough."""
 
     kind: Literal["vehicle"]

@@ -23,9 +23,14 @@ from robins.ins.frames import to_ned_frd
 from robins.results import Outcome, Progress, silent
 from robins.rotation import Rotation
 from robins.systems.parts import Names
+from robins.systems.replaying import (
+    doubts_told_at_the_end,
+    end_to_end,
+    replay_warnings,
+    together,
+)
 from robins.systems.study import Contender
 from robins.systems.system import Alignment
-from robins.systems.tables import doubts_told_at_the_end, end_to_end, replay_warnings, together
 from robins.systems.transfer_alignment.pair_answer import (
     Answer,
     Recorded,

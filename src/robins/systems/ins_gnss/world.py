@@ -7,7 +7,6 @@ is consistent, and `Believed` makes it wrong on purpose.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,42 +14,25 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array
 
 from robins.dataset import Dataset
 from robins.earth import Geodetic
-from robins.filters import Belief
 from robins.ins.blocks import Blocks, cut, epochs_between
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.ins.state import InsState
 from robins.manifold import retract
-from robins.results import array
+from robins.sim.commands import from_commands
 from robins.sim.gnss_sensor import GnssErrorModel, as_table, fix_times, observe
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion
-from robins.systems.ins_gnss import model as names
-from robins.systems.ins_gnss.drive_claims import CLAIMS, drive_metrics
-from robins.systems.ins_gnss.legs import motion_of
-from robins.systems.ins_gnss.model import Block, Fix, Velocity
-from robins.systems.ins_gnss.outages import outage_mask
+from robins.systems.ins_gnss.model import POSITION, VELOCITY, Block, Fix, Velocity, start_belief
 from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.ins_gnss.setup import (
-    SENSORS,
-    SMOOTHED,
-    make_filter,
-    model_of,
-    sigma_of,
-    state_blocks,
-)
-from robins.systems.judgement import judging
-from robins.systems.parts import refuse_unsettled
-from robins.systems.study import Case, Contender, Problem
-from robins.systems.tables import place_arrays
+from robins.systems.study import Case
 
 
 class Course(NamedTuple):
@@ -67,6 +49,17 @@ class Course(NamedTuple):
     at_fix: tuple[np.ndarray, ...]  # the truth at each fix, as `observe` takes it
     fix: np.ndarray  # (E,) number of the fix at each epoch, -1 where there is none
     outage: np.ndarray  # (E,) bool
+
+
+def motion_of(drive: Drive) -> Motion:
+    """The motion that the legs describe, from rest.
+
+    Raises:
+        ValueError: a leg is not complete.
+    """
+    p = drive.place
+    start = Geodetic(p.latitude, p.longitude, p.height)
+    return from_commands(start, [leg.command() for leg in drive.legs], heading_rad=p.heading)
 
 
 def error_model(imu: Imu) -> ImuErrorModel:
@@ -107,7 +100,7 @@ def lay_out(drive: Drive) -> Course:
     Raises:
         ValueError: the legs are too short for two fixes.
     """
-    motion = motion_of(drive.place, drive.legs)
+    motion = motion_of(drive)
     time_ns = motion.times_ns(drive.imu_rate)
     trajectory = motion.trajectory(time_ns)
     table = ideal_increments(trajectory)
@@ -117,7 +110,7 @@ def lay_out(drive: Drive) -> Course:
     # A bias of the sensors passes through coning and sculling terms of 1e-3 of its size at most, so
     # the errors of a run are added to the compensated increments.
     times = fix_times(receiver_model(drive), 1.0 / drive.gnss.rate, float(time_s[-1]))
-    stamps, k = times.stamp_s, motion.at(times.valid_s)
+    stamps = times.stamp_s
     if len(stamps) < 2:
         raise ValueError(f"the legs last {time_s[-1]:.1f} s, too short for two fixes")
     # what comes after the last fix would end on no sample, so the run ends with the fix
@@ -135,7 +128,7 @@ def lay_out(drive: Drive) -> Course:
     fix[np.searchsorted(epochs, stamps - 1e-9)] = np.arange(len(stamps))
     outage = np.zeros(len(epochs), dtype=bool)
     if drive.outages is not None:
-        outage = outage_mask(epochs, 0.0, float(epochs[-1]), drive.outages)
+        outage = drive.outages.mask(epochs, 0.0, float(epochs[-1]))
     return Course(
         motion=motion,
         ideal=Increments(dt, table.gyro[1:], table.accel[1:]),
@@ -145,13 +138,19 @@ def lay_out(drive: Drive) -> Course:
         truth=jax.tree_util.tree_map(lambda x: x[index], path),
         sample=index,
         rate_b=motion.at(epochs).rates()[0],
-        at_fix=(times.valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0]),
+        at_fix=_at_fixes(motion, times.valid_s),
         fix=fix,
         outage=outage,
     )
 
 
-def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
+def _at_fixes(motion: Motion, valid_s: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The truth at some times, as `observe` takes it."""
+    k = motion.at(valid_s)
+    return valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0]
+
+
+def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     """One run, from its number; pure."""
     dt, theta, dv = (jnp.asarray(a) for a in course.ideal[:3])
     key = partial(stream, seed, index)
@@ -170,23 +169,20 @@ def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
         jnp.ones(len(parent)),
     )
     at = course.sample
-    scales: list[Any] = [None, None]
+    scales: tuple[Any, ...] = ()
     if drive.imu.scale_states:
-        count = len(at)
-        scales = [
-            jnp.broadcast_to(jnp.diagonal(e.matrix), (count, 3))
-            for e in (errors.gyro, errors.accel)
-        ]
+        each = (jnp.diagonal(e.matrix) for e in (errors.gyro, errors.accel))
+        scales = tuple(jnp.broadcast_to(scale, (len(at), 3)) for scale in each)
     truth = InsState(*course.truth, errors.gyro.bias[at], errors.accel.bias[at], *scales)
 
-    sigma = jnp.asarray(sigma_of(drive.imu, drive.start, drive.start.tilt, drive.start.heading))
-    zero = jnp.zeros(3)
-    none = zero if drive.imu.scale_states else None
-    known = InsState(*course.start, zero, zero, none, none)
     # true = retract(mean, e), and biases are drawn about zero by the sensors themselves
+    known = start_belief(
+        course.start, drive.imu, drive.start, drive.start.tilt, drive.start.heading
+    )
+    sigma = jnp.diagonal(known.factor)
     e = sigma * jax.random.normal(key(Component.INITIAL_STATE), sigma.shape)
     e = jnp.where(jnp.arange(len(sigma)) < 9, e, 0.0)
-    start = Belief(retract(known, -e), jnp.diag(sigma))
+    start = known._replace(mean=retract(known.mean, -e))
 
     receiver = receiver_model(drive)
     fixes = observe(receiver, key(Component.GNSS), *course.at_fix)
@@ -199,21 +195,18 @@ def _simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     shape = (len(course.fix), 3)
     r = np.sqrt(drive.believed.r_factor)
     rate = jnp.asarray(course.rate_b) + errors.gyro.bias[at]
-    y = {
-        names.POSITION: Geodetic(*(at_epochs(x) for x in fixes[:3])),
-        names.VELOCITY: at_epochs(fixes.v_n),
+    y: dict[str, Any] = {POSITION: Geodetic(*(at_epochs(x) for x in fixes[:3]))}
+    aux: dict[str, Any] = {
+        POSITION: Fix(jnp.broadcast_to(r * jnp.asarray(drive.gnss.sigma), shape), rate)
     }
-    aux = {
-        names.POSITION: Fix(jnp.broadcast_to(r * jnp.asarray(drive.gnss.sigma), shape), rate),
-        names.VELOCITY: Velocity(
+    if drive.gnss.use_velocity:
+        y[VELOCITY] = at_epochs(fixes.v_n)
+        aux[VELOCITY] = Velocity(
             jnp.broadcast_to(r * jnp.asarray(drive.gnss.velocity_sigma), shape),
             rate,
             jnp.zeros(shape),
             jnp.zeros(shape[0]),
-        ),
-    }
-    if not drive.gnss.use_velocity:
-        del y[names.VELOCITY], aux[names.VELOCITY]
+        )
     return Case(start, u, y, aux, truth)
 
 
@@ -222,7 +215,7 @@ def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:
 
     Its noise is that of the same run in a campaign.
     """
-    motion = motion_of(drive.place, drive.legs)
+    motion = motion_of(drive)
     truth = motion.trajectory(motion.times_ns(drive.imu_rate), source="simulated drive")
     key = partial(stream, seed, run)
     table = ideal_increments(truth)
@@ -238,64 +231,6 @@ def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:
     )
     receiver = receiver_model(drive)
     times = fix_times(receiver, 1.0 / drive.gnss.rate, motion.duration_s)
-    k = motion.at(times.valid_s)
-    at_fix = (times.valid_s, k.lat, k.lon, k.alt, k.v_n, k.q_nb, k.rates()[0])
-    gnss = as_table(observe(receiver, key(Component.GNSS), *at_fix), times.stamp_s)
+    fixes = observe(receiver, key(Component.GNSS), *_at_fixes(motion, times.valid_s))
+    gnss = as_table(fixes, times.stamp_s)
     return Dataset("simulated drive", imu, gnss, truth)
-
-
-def drive_problem(drive: Drive, filters: tuple[str, ...], seed: int) -> Problem:
-    """A drive as a problem for a campaign.
-
-    Raises:
-        ValueError: the drive cannot be laid out, or a filter is unknown or a smoother.
-    """
-    if smoothers := [name for name in filters if name.endswith(SMOOTHED)]:
-        raise ValueError(
-            f"{smoothers[0]}: campaigns compare causal filters; `robins replay` smooths a log"
-        )
-    course = lay_out(drive)
-    believed = drive.imu
-    if drive.believed.q_factor != 1.0:
-        factor = float(np.sqrt(drive.believed.q_factor))
-        believed = believed.model_copy(
-            update={
-                name: tuple(factor * x for x in getattr(believed, name))
-                for name in ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")
-            }
-        )
-    model = model_of(believed, drive.gnss, drive.aids)
-    blocks = state_blocks(drive.imu.scale_states)
-    count_from = int(np.searchsorted(course.blocks.epoch_s, drive.settle))
-    refuse_unsettled("settle", drive.settle, float(course.blocks.epoch_s[-1]) + 1e-9)
-    return Problem(
-        simulate=partial(_simulate, drive, course, seed),
-        contenders={
-            name: Contender(make_filter(name, drive.update.gate), model) for name in filters
-        },
-        epoch_s=course.blocks.epoch_s,
-        blocks=blocks,
-        sensors=SENSORS,
-        context=_context(course),
-        metrics=partial(drive_metrics, course.outage, blocks),
-        claims=judging(CLAIMS),
-        shown=_tracks,
-        count_from=count_from,
-    )
-
-
-def _tracks(means: Mapping[str, InsState]) -> dict[str, Any]:
-    """Where each filter thought it was in the first run."""
-
-    def of(field: str) -> np.ndarray:
-        return np.stack([np.asarray(getattr(m.position, field)) for m in means.values()])
-
-    return place_arrays("track", map(of, ("lat", "lon", "alt")))
-
-
-def _context(course: Course) -> xr.Dataset:
-    """The true path and the outages, for figures."""
-    p = course.truth.position
-    data = place_arrays("reference", (p.lat, p.lon, p.alt), "true {}")
-    data |= array("outage", course.outage.astype(np.int8), long_name="GNSS withheld")
-    return xr.Dataset(data)

@@ -1,9 +1,8 @@
-"""The rules of the filter: which measurements are believed, and how a new field is taken up."""
+"""The filter and its rules: which measurements are believed, and how a new field is taken up."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import jax.numpy as jnp
 
@@ -13,9 +12,12 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.trees import select
 from robins.systems.marg.model import DECLINATION, FIELD, MAGNETOMETER, REST_RATE, TRAVEL
+from robins.systems.marg.parameters import Replay
+
+CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
 
 
-def doubted(prior: Belief, field_t: float) -> Belief:
+def field_forgotten(prior: Belief, field_t: float) -> Belief:
     """Belief that knows nothing of the field any more, and all else as before.
 
     The heading too: the gyros know it better than a field that has changed. That the declination of
@@ -34,7 +36,7 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
     A chi-square gate on azimuth, strength and vertical component together. Refusals that agree with
     each other while the unit moves, ``patience`` in a row, are the field of a new place, or the
     first was disturbed: what was known of the field is then forgotten and learned from it
-    (`doubted`). What sits on the unit turns with it and does not agree.
+    (`field_forgotten`). What sits on the unit turns with it and does not agree.
 
     Args:
         probability: share of right measurements that pass.
@@ -46,19 +48,18 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
     def before(memory, prior: Belief, o: Observation):
         memory, reopened, o = inner.before(memory, prior, o)
         new = memory[o.sensor].recovered
-        return memory, select(new, doubted(prior, field_t), Belief(*reopened)), o
+        return memory, select(new, field_forgotten(prior, field_t), Belief(*reopened)), o
 
     return rules.only(MAGNETOMETER, inner._replace(before=before, name="undisturbed"))
 
 
-@lru_cache(maxsize=16)
 def marg_filter(
     gate: float | None = 0.95,
     patience: int = 20,
     weight: float = 0.9999,
     field_t: float = 1e-4,
 ) -> Filter:
-    """The filter of `marg_model`; the same object for the same arguments, so compiled once.
+    """The filter of `marg.model_of`.
 
     Args:
         gate: share of right magnetometer readings that pass; None believes every reading, and is
@@ -74,3 +75,14 @@ def marg_filter(
     if gate is not None:
         chain.append(undisturbed(gate, patience, field_t))
     return kalman(rules=chain)
+
+
+def filter_of(parameters: Replay) -> Filter:
+    """The filter, with its rules."""
+    m = parameters.magnetometer
+    return marg_filter(
+        gate=m.gate if parameters.use_magnetometer == "undisturbed" else None,
+        patience=max(1, round(m.patience / parameters.travel.every)),
+        weight=parameters.travel.weight,
+        field_t=m.most,
+    )

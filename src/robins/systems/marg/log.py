@@ -1,45 +1,72 @@
-"""A log made ready for the filter: one clock, calibrated field, blocks, measurements."""
+"""A log made ready for the filter: calibrated field, blocks, alignment, measurements."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import Belief
+from robins.ins.alignment import triad
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import from_imu
-from robins.ins.intervals import after_gap, usual_interval
+from robins.ins.increments import Increments, after_gap, from_imu, usual_interval
+from robins.ins.rest import still_samples
 from robins.manifold import Angle
 from robins.rotation import Rotation
-from robins.systems.marg.align import FirstLook, first_look
-from robins.systems.marg.blocks import Integrals, Samples, integrate
-from robins.systems.marg.model import MAGNETOMETER, REST_RATE, TRAVEL, Block, MargState
+from robins.systems.marg.model import (
+    MAGNETOMETER,
+    REST_RATE,
+    TRAVEL,
+    Block,
+    Integrals,
+    MargState,
+    Samples,
+    integrate,
+)
 from robins.systems.marg.parameters import Accelerometer, Gyro, Magnetometer, Replay
-from robins.systems.marg.rest import still_samples
+from robins.systems.replaying import Piece
+from robins.systems.study import Case
 
 _PACK = 512  # blocks are filled up to a multiple of this, so that logs alike compile once
 _FALLING = 0.3  # of gravity: below it nothing holds the unit up, and tilt cannot be seen
+# a unit at rest, by its first samples
+_STILL_RATE = np.radians(8.0)  # rad/s, mean length of the rate
+_STILL_SPREAD = np.radians(1.0)  # rad/s, mean length of its changes
+_STILL_FORCE = 0.5  # m/s^2
 
 
-class Prepared(NamedTuple):
-    """A log as the filter takes it; K blocks of n samples, N samples with the first."""
+class FirstLook(NamedTuple):
+    """Where the filter begins."""
 
-    time_s: np.ndarray  # (N,) of each sample, from the first one on
-    time_ns: np.ndarray  # (N,) int64
+    q_nb: np.ndarray  # (4,)
+    field_t: np.ndarray  # (2,) T along the horizontal and down; zeros where no field was seen
+    tilt_rad: float
+    heading_rad: float
+    still: bool
+    sentence: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared(Piece):
+    """A log as the filter takes it; K blocks of n samples, B of them not padding, N samples.
+
+    The world is a `Case`; epochs of padding repeat the last.
+    """
+
+    time_ns: np.ndarray  # (N,) int64, of each sample, from the first one on
     samples: Samples
-    used: int  # N - 1, samples that are not padding
-    epoch_s: np.ndarray  # (B,) ends of the blocks that are not padding, B <= K
-    start: Belief
+    rows: np.ndarray  # (B,) the sample that each block ends with
     look: FirstLook
-    u: Block
-    y: dict[str, Any]
-    aux: dict[str, Any]
     still: np.ndarray  # (B,) bool
     counts: dict[str, int]
+
+
+# ---------------------------------------------------------------------------------------- samples
 
 
 def whole_samples(
@@ -51,24 +78,13 @@ def whole_samples(
         ValueError: fewer than two samples are left.
     """
     finite = np.all(np.isfinite(imu.gyro), axis=1) & np.all(np.isfinite(imu.accel), axis=1)
-    kept = (
-        imu
-        if np.all(finite)
-        else replace(
-            imu,
-            time_ns=imu.time_ns[finite],
-            gyro=imu.gyro[finite],
-            accel=imu.accel[finite],
-            rows=None if imu.rows is None else imu.rows[finite],
-        )
-    )
+    columns = ("time_ns", "gyro", "accel", *(() if imu.rows is None else ("rows",)))
+    kept = replace(imu, **{name: getattr(imu, name)[finite] for name in columns})
     if len(kept) < 2:
         raise ValueError(f"orientation needs two whole inertial samples; this log has {len(kept)}")
-    if kept.kind == "rate":
-        full = np.any(np.abs(kept.gyro) >= 0.99 * gyro.range, axis=1)
-        full |= np.any(np.abs(kept.accel) >= 0.99 * accelerometer.range, axis=1)
-    else:
-        full = np.zeros(len(kept), dtype=bool)
+    full = np.any(np.abs(kept.gyro) >= 0.99 * gyro.range, axis=1)
+    full |= np.any(np.abs(kept.accel) >= 0.99 * accelerometer.range, axis=1)
+    full &= kept.kind == "rate"  # increments have no range
     counts = {"imu_missing": int(np.sum(~finite)), "imu_saturated": int(np.sum(full))}
     return kept, full, counts
 
@@ -132,8 +148,9 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     """
     p = parameters
     imu, full, counts = whole_samples(to_ned_frd(dataset.imu), p.gyro, p.accelerometer)
-    increments, _ = from_imu(as_means(imu) if p.update.samples == "means" else imu)
-    dt, theta, dv = (np.asarray(a, dtype=float) for a in increments[:3])
+    made, _ = from_imu(as_means(imu) if p.update.samples == "means" else imu)
+    increments = Increments(*(np.asarray(a, dtype=float) for a in made[:3]))
+    dt, theta, dv = increments[:3]
     field = np.full_like(theta, np.nan)
     counts |= {"field_missing": 0, "field_implausible": 0}
     if dataset.mag is not None and p.use_magnetometer != "never":
@@ -151,44 +168,114 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         _filled(dv, blocks, n, 0.0),
         _filled(field, blocks, n, np.nan),
     )
-    integrals = integrate(samples)
-    rate, force = theta / dt[:, None], dv / dt[:, None]
-    quiet = still_samples(dt, rate, force, p.rest)
+    integrals, block_field = jax.tree.map(np.asarray, integrate(samples))
+    quiet = np.zeros(len(dt), bool)
+    if p.rest.detect:
+        quiet = still_samples(increments, *p.rest.quiet)
     still = np.all(_filled(quiet, blocks, n, True), axis=1)
 
     gap = np.where(dt > p.update.gap * usual, dt, 0.0)
     lost = _filled(gap + dt * (full[1:] | full[:-1]), blocks, n, 0.0).sum(axis=1)
     counts["imu_gaps"] = int(np.sum(gap > 0.0))
-    time = np.asarray(integrals.dt_s)
-    falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < (
-        _FALLING * p.accelerometer.gravity * time
-    )
+    weight = p.accelerometer.gravity * integrals.dt_s
+    falling = np.linalg.norm(integrals.dv, axis=1) < _FALLING * weight
     counts["blocks_in_free_fall"] = int(np.sum(falling))
-    fall = np.where(falling, p.accelerometer.gravity * time, 0.0)
+    fall = np.where(falling, weight, 0.0)
     u = Block(
-        *(np.asarray(a) for a in integrals[:6]),
+        integrals,
         still=still.astype(float),
         lost_turn=np.minimum(p.update.gap_rate * lost, np.pi),
         lost_dv=np.hypot(p.update.gap_accel * lost, fall),
     )
-    look = first_look(dt, theta, dv, field, p.start, p.accelerometer)
-    y, aux = _measurements(integrals, u, still, parameters)
-    time_s = (imu.time_ns - imu.time_ns[0]) * 1e-9
-    ends = np.minimum((np.arange(whole) + 1) * n, len(dt))
+    look = first_look(increments, field, parameters)
+    ends = np.minimum((np.arange(blocks) + 1) * n, len(dt))
     return Prepared(
-        time_s=time_s,
+        world=Case(
+            first_belief(look, parameters),
+            u,
+            *_measurements(integrals, block_field, still, parameters),
+            None,
+        ),
+        begin_s=0.0,
+        epoch_s=(imu.time_ns[ends] - imu.time_ns[0]) * 1e-9,
         time_ns=np.asarray(imu.time_ns),
         samples=samples,
-        used=len(dt),
-        epoch_s=time_s[ends],
-        start=first_belief(look, parameters),
+        rows=ends[:whole],
         look=look,
-        u=u,
-        y=y,
-        aux=aux,
         still=still[:whole],
         counts=counts,
     )
+
+
+# -------------------------------------------------------------------------------------- the start
+
+
+def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
+    """q_nb (4,) for which specific force points up and the field north.
+
+    Without a field, or with one along the vertical, some heading.
+    """
+    level = np.eye(3)[np.argmin(np.abs(force_b))]
+    north = level if field_b is None else field_b
+    across = np.linalg.norm(np.cross(force_b / np.linalg.norm(force_b), north))
+    C_nb = triad(force_b, north if across > 1e-3 * np.linalg.norm(north) else level)
+    return np.asarray(Rotation.from_dcm(jnp.asarray(C_nb)).wxyz)
+
+
+def first_look(increments: Increments, field_b: np.ndarray, parameters: Replay) -> FirstLook:
+    """Align on the first samples: a short while of rest, or a longer one of motion.
+
+    In motion the gyros carry specific force and field back to the first sample, so that a swing
+    averages out.
+
+    Args:
+        increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
+        field_b: (N, 3) T, NaN where none.
+        parameters: of the start, and gravity.
+    """
+    dt, theta, dv = increments[:3]
+    start, time = parameters.start, np.cumsum(dt)
+    window = max(int(np.searchsorted(time, start.still, side="right")), 1)
+    rate, force = theta[:window] / dt[:window, None], dv[:window] / dt[:window, None]
+    still = bool(
+        np.mean(np.linalg.norm(rate, axis=1)) < _STILL_RATE
+        and np.mean(np.abs(rate - rate.mean(axis=0))) < _STILL_SPREAD
+        and np.max(np.std(force, axis=0)) < _STILL_FORCE
+    )
+    if not still:
+        window = max(int(np.searchsorted(time, start.moving, side="right")), 1)
+    turned = _turned(theta[:window])
+    force = np.sum(turned[:-1].apply(dv[:window]), axis=0) / time[window - 1]
+    there = np.all(np.isfinite(field_b[:window]), axis=1)
+    tilt = start.tilt if still else start.tilt_moving
+    size, how = float(np.linalg.norm(force)), f"over {float(time[window - 1]):.2g} s"
+    if not 0.5 < size / parameters.accelerometer.gravity < 1.5:
+        how += f"; the mean specific force is {size:.2f} m/s^2, so the tilt is hardly known"
+        tilt = np.pi / 2.0
+        force = force if size > 1e-3 else np.array([0.0, 0.0, -1.0])
+    how = f"{'at rest' if still else 'in motion'}, {how}"
+    if not np.any(there):
+        sentence = f"Levelled {how}; there is no field, so the heading is counted from the start."
+        return FirstLook(attitude_of(force, None), np.zeros(2), tilt, np.pi, still, sentence)
+    field = np.mean(turned[1:].apply(np.where(there[:, None], field_b[:window], 0.0)), axis=0)
+    field = field * window / np.sum(there)
+    q_nb = attitude_of(force, field)
+    north, _, down = SciRotation.from_quat(np.roll(q_nb, -1)).apply(field)
+    dip = np.degrees(np.arctan2(down, north))
+    sentence = (
+        f"Aligned {how}: the field there, {np.linalg.norm(field) * 1e6:.1f} uT at a dip of "
+        f"{dip:.1f} deg, is north."
+    )
+    heading = start.heading if still else start.heading_moving
+    return FirstLook(q_nb, np.array([north, down]), tilt, heading, still, sentence)
+
+
+def _turned(theta: np.ndarray) -> SciRotation:
+    """Attitude before each interval and after the last, against the first."""
+    out = [SciRotation.identity()]
+    for step in SciRotation.from_rotvec(theta):
+        out.append(out[-1] * step)
+    return SciRotation.concatenate(out)
 
 
 def first_belief(look: FirstLook, parameters: Replay) -> Belief:
@@ -219,41 +306,40 @@ def first_belief(look: FirstLook, parameters: Replay) -> Belief:
     return Belief(mean, jnp.diag(jnp.concatenate([jnp.asarray(s) for s in sigma])))
 
 
+# ----------------------------------------------------------------------------------- measurements
+
+
 def _measurements(
-    integrals: Integrals, u: Block, still: np.ndarray, parameters: Replay
+    integrals: Integrals, field_b: np.ndarray, still: np.ndarray, parameters: Replay
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What is known at the end of each block; NaN where nothing is."""
     p, time = parameters, np.asarray(integrals.dt_s)
     blocks, clock = len(time), np.cumsum(time)
-    known = every(clock, time > 0.0, p.travel.every)
-    travel = np.full((blocks, 6), np.nan)
     still = still & (time > 0.0)
+    travel = np.full((blocks, 6), np.nan)
     travel[still, :3] = 0.0
-    travel[known] = 0.0
     # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
-    rate = _mean_rate(u)
+    travel[every(clock, time > 0.0, p.travel.every)] = 0.0
     y: dict[str, Any] = {
         TRAVEL: travel,
         REST_RATE: np.where(still[:, None], np.zeros((blocks, 3)), np.nan),
     }
-    aux: dict[str, Any] = {TRAVEL: still.astype(float), REST_RATE: rate}
+    aux: dict[str, Any] = {TRAVEL: still.astype(float), REST_RATE: _mean_rate(integrals)}
     if p.use_magnetometer != "never":
-        field = np.asarray(integrals.field_b)
-        there = np.all(np.isfinite(field), axis=1)
+        there = np.all(np.isfinite(field_b), axis=1)
         look = every(clock, there & ~still, p.travel.every)
         y[MAGNETOMETER] = (
             Angle(np.where(look, 0.0, np.nan)),
             np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
         )
-        aux[MAGNETOMETER] = np.where(there[:, None], field, np.array([1e-5, 0.0, 0.0]))
+        aux[MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
     return y, aux
 
 
-def _mean_rate(u: Block) -> np.ndarray:
+def _mean_rate(integrals: Integrals) -> np.ndarray:
     """(K, 3) rad/s, mean over each block, from its rotation; meant for rest."""
-    q = np.asarray(u.turn)
+    q, dt = np.asarray(integrals.turn), np.asarray(integrals.dt_s)[:, None]
     vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])
-    dt = np.asarray(u.dt_s)[:, None]
     return np.where(dt > 0.0, vector / np.where(dt > 0.0, dt, 1.0), 0.0)
 
 

@@ -1,0 +1,104 @@
+"""When a unit stands still, told sample by sample from what came up to now.
+
+`standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops;
+`still_samples` at their distance from running means, and for how long it has been small, as suits a
+unit in a hand. `robins.ins.alignment.is_static` judges a whole record instead. None of them tells a
+smooth motion at constant speed from rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+
+from robins.ins.increments import Increments
+
+_MEMORY_S = 0.5  # time constant of the running means
+_FEWEST = 5  # samples in the memory, below which nothing can be told
+
+
+def moving_statistics(values: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation over the `width` samples up to each one.
+
+    Args:
+        values: (N, axes).
+        width: samples in a window; the first windows are shorter.
+
+    Returns:
+        (N, axes) each.
+    """
+    shift = np.mean(values, axis=0)  # keeps the difference of squares well conditioned
+    x = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - shift, axis=0)])
+    xx = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum((values - shift) ** 2, axis=0)])
+    end = np.arange(1, len(values) + 1)
+    begin = np.maximum(end - width, 0)
+    count = (end - begin)[:, None]
+    mean = (x[end] - x[begin]) / count
+    variance = np.maximum((xx[end] - xx[begin]) / count - mean**2, 0.0)
+    return mean + shift, np.sqrt(variance)
+
+
+def standstill(
+    increments: Increments, window_s: float, quiet_rate: float, quiet_force: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the unit stood still over the window up to each increment.
+
+    Still means: on every axis the spread of turn rate and specific force is below its threshold,
+    and the mean rate below four times its own.
+
+    Args:
+        increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
+        window_s: length of the window.
+        quiet_rate: rad/s.
+        quiet_force: m/s^2.
+
+    Returns:
+        (N,) bool, and (N, 3) mean gyro rate over the window [rad/s].
+    """
+    dt, theta, dv = increments[:3]
+    width = max(2, round(window_s / float(np.median(dt))))
+    mean_rate, spread_rate = moving_statistics(theta / dt[:, None], width)
+    _, spread_force = moving_statistics(dv / dt[:, None], width)
+    still = np.all(spread_rate < quiet_rate, axis=1)
+    still &= np.all(spread_force < quiet_force, axis=1)
+    still &= np.all(np.abs(mean_rate) < 4.0 * quiet_rate, axis=1)
+    still[: width - 1] = False
+    return still, mean_rate
+
+
+def still_samples(
+    increments: Increments, after_s: float, quiet_rate: float, quiet_force: float, most_rate: float
+) -> np.ndarray:
+    """(N,) bool: whether the unit has lain still for a while, sample by sample.
+
+    Still means that rate and specific force stay near their running means, and the mean rate near
+    zero, without a break. Samples that are too rare for a mean over half a second tell nothing.
+
+    Args:
+        increments: dt (N,) s, theta (N, 3) rad, dv (N, 3) m/s.
+        after_s: how long without a break.
+        quiet_rate: rad/s, largest distance from the mean.
+        quiet_force: m/s^2, the same.
+        most_rate: rad/s, a mean rate above is no bias but a turn.
+    """
+    dt, theta, dv = increments[:3]
+    rate, force = theta / dt[:, None], dv / dt[:, None]
+    step = float(np.median(dt)) if len(dt) else 0.0
+    if step <= 0.0 or _FEWEST * step > _MEMORY_S:
+        return np.zeros(len(dt), dtype=bool)
+    mean_rate, mean_force = _running_mean(rate, step), _running_mean(force, step)
+    quiet = np.linalg.norm(rate - mean_rate, axis=1) < quiet_rate
+    quiet &= np.linalg.norm(force - mean_force, axis=1) < quiet_force
+    quiet &= np.all(np.abs(mean_rate) < most_rate, axis=1)
+    quiet &= dt < after_s
+    time = np.cumsum(dt)
+    # time at which the quiet spell that holds now began
+    began = np.maximum.accumulate(np.where(quiet, -np.inf, time))
+    began = np.where(np.isfinite(began), began, 0.0)
+    return quiet & (time - began >= after_s)
+
+
+def _running_mean(values: np.ndarray, step: float) -> np.ndarray:
+    """First-order low-pass, begun at the first sample."""
+    share = -np.expm1(-step / _MEMORY_S)
+    return np.asarray(lfilter([share], [1.0, share - 1.0], values - values[0], axis=0)) + values[0]

@@ -1,0 +1,338 @@
+"""Recorded logs: pieces that can be run, what filters and smoothers say of them, the outcome.
+
+A log is cut where a gap is too long to bridge, and every piece is prepared as a world, of which a
+`Contender` makes its case just as it does of a simulated one. What the filters say of the pieces is
+laid end to end. A system gives the preparation, its contenders, and what only it has to report.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from robins.filters import Belief, StepWarning, Tally, doubts, rts_smoother, run
+from robins.filters.run import Step
+from robins.ins.blocks import Blocks
+from robins.ins.increments import after_gap
+from robins.results import Outcome, Progress, silent, variable
+from robins.systems.study import Contender, SensorAxes, StateBlock
+from robins.systems.tables import (
+    EULER,
+    Update,
+    block_array,
+    innovation_tables,
+    update_metrics,
+    updates,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Piece:
+    """A stretch of a log without a long gap, prepared for filters; E epochs.
+
+    A system derives its own, with what else it has to know of a piece.
+    """
+
+    world: Any  # of which a contender makes its case
+    begin_s: float  # on the clock of the log
+    epoch_s: np.ndarray  # (E,)
+    noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
+
+
+Prepared = TypeVar("Prepared", bound=Piece)
+
+
+class Answer(NamedTuple):
+    """What a filter or smoother says of a log; leading axis E epochs of all its pieces."""
+
+    name: str
+    mean: Any
+    sigma: Any  # (E, n)
+    updates: Mapping[str, Update]  # by sensor; empty for a smoother
+    start: Belief  # before the first step of the last piece
+    log_likelihood: float
+    tally: Tally  # how the steps went, of each piece
+    bounds: bool  # its sigmas are bounds of an H-infinity filter
+
+
+class Reported(NamedTuple):
+    """What the replays of a system report of every filter."""
+
+    blocks: Sequence[StateBlock]
+    sensors: Mapping[str, SensorAxes]
+    # mean, leading axis E -> (E, k) estimates by block, and "euler": roll, pitch, heading [rad]
+    estimates: Callable[[Any], Mapping[str, Any]]
+    causes: str  # the sentence on what is mostly behind it where a replay is to be doubted
+    # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
+    # cautious side, so that small innovations say nothing
+    assumed: Collection[str] = ()
+    euler: StateBlock = EULER
+
+
+# -------------------------------------------------------------------------------- log to pieces
+
+
+def prepared(
+    time_s: np.ndarray,
+    dt_s: np.ndarray,
+    longest_gap_s: float,
+    prepare: Callable[[slice], Prepared],
+) -> tuple[list[Prepared], list[str]]:
+    """The pieces of a log that can be run, and a sentence on each that cannot.
+
+    Args:
+        time_s: (N,) end of each increment of the inertial unit.
+        dt_s: (N,) its length.
+        longest_gap_s: a longer increment ends a piece and is in none.
+        prepare: rows of the log -> piece; it raises a ValueError where they cannot be run.
+
+    Raises:
+        ValueError: no piece can be run; the sentence says why.
+    """
+    edges = [-1, *np.flatnonzero(dt_s > longest_gap_s).tolist(), len(dt_s)]
+    found, problems = [], []
+    for before, end in pairwise(edges):
+        first = before + 1
+        if first == end:
+            continue
+        try:
+            found.append(prepare(slice(first, end)))
+        except ValueError as error:
+            begin_s = time_s[first] - dt_s[first]
+            problems.append(f"{begin_s:.1f} to {time_s[end - 1]:.1f} s: {error}")
+    if not found:
+        raise ValueError("; ".join(problems) or "the log has no two inertial samples in a row")
+    return found, problems
+
+
+def noise_scale(blocks: Blocks, dt_s: np.ndarray, across_gap: float) -> np.ndarray:
+    """(E,) of the process noise factor: 1, and more in a block in which samples are missing.
+
+    Args:
+        blocks: cut from the increments.
+        dt_s: (N,) lengths of the increments.
+        across_gap: scale in such a block.
+    """
+    gap = after_gap(dt_s)
+    missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
+    return np.where(missing, across_gap, 1.0)
+
+
+def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, int]:
+    """How many gaps ended a piece, and how many blocks lie across a shorter one."""
+    across = (np.sum(np.asarray(piece.noise_scale) > 1.0) for piece in pieces)
+    return {
+        "imu_gaps_declared": len(pieces) + len(problems) - 1,
+        "blocks_over_imu_gaps": int(sum(across)),
+    }
+
+
+# ----------------------------------------------------------------------------- pieces to answers
+
+
+def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
+    """Keep the posterior's mean and standard deviations and how the updates went, by sensor."""
+    return step.posterior.mean, step.posterior.sigma, updates(step)
+
+
+@jax.jit
+def _kept_of(steps: Step) -> tuple[Any, Any, dict[str, Update]]:
+    return jax.vmap(kept)(steps)
+
+
+def navigated(
+    pieces: Sequence[Piece],
+    wanted: Sequence[str],
+    contender: Callable[[str], Contender],
+    smoothers: Mapping[str, str] | None = None,
+    progress: Progress = silent,
+) -> dict[str, Answer]:
+    """What filters and smoothers say of all pieces; each filter runs over a piece once.
+
+    Args:
+        pieces: of a log, in the order of time.
+        wanted: names of filters and smoothers.
+        contender: the filter of a name, with its model.
+        smoothers: by the name of a smoother, the filter whose run it smooths.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        ValueError: what `contender` raises, for a name that it does not know.
+    """
+    causal = {name: (smoothers or {}).get(name, name) for name in wanted}
+    contenders = {name: contender(name) for name in dict.fromkeys(causal.values())}
+    answers: dict[str, list[Answer]] = {name: [] for name in causal}
+    for number, piece in enumerate(pieces):
+        for done, (base, chosen) in enumerate(contenders.items()):
+            share = (number + done / len(contenders)) / len(pieces)
+            progress(share, f"{base}, piece {number + 1} of {len(pieces)}")
+            asked = [name for name in causal if causal[name] == base]
+            found = _of_piece(piece, chosen, smoothed=any(name != base for name in asked))
+            for name in asked:
+                answers[name].append(found[name != base]._replace(name=name))
+    return {name: _joined(parts) for name, parts in answers.items()}
+
+
+def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answer, Answer]:
+    """What a filter says of a piece, and its smoother if that is asked for."""
+    filter_, model, case = contender.filter, contender.model, contender.case(piece.world)
+    arguments = filter_, model, case.start, case.y, case.u, case.aux
+    with doubts_told_at_the_end():
+        if smoothed:
+            found = run(*arguments, time_s=piece.epoch_s)
+            of_steps = _kept_of(found.steps)
+        else:
+            found = run(*arguments, keep=kept, time_s=piece.epoch_s)
+            of_steps = found.steps
+    likelihood = float(found.log_likelihood)
+    answer = Answer("", *of_steps, case.start, likelihood, found.tally, contender.bounds)
+    if not smoothed:
+        return answer, answer
+    belief = rts_smoother(found)
+    return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={})
+
+
+@contextmanager
+def doubts_told_at_the_end() -> Iterator[None]:
+    """Runs in here do not warn: what they would say is among the warnings of the outcome."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StepWarning)
+        yield
+
+
+def _joined(parts: Sequence[Answer]) -> Answer:
+    if len(parts) == 1:
+        return parts[0]
+    mean, sigma, seen = end_to_end([(a.mean, a.sigma, a.updates) for a in parts])
+    return parts[-1]._replace(
+        mean=mean,
+        sigma=sigma,
+        updates=seen,
+        log_likelihood=sum(a.log_likelihood for a in parts),
+        tally=together([a.tally for a in parts]),
+    )
+
+
+def epochs_of(pieces: Sequence[Piece]) -> np.ndarray:
+    """(E,) epochs of all pieces, as `end_to_end`: between two is the time the later begins at."""
+    rows = [a for piece in pieces for a in (np.array([piece.begin_s]), piece.epoch_s)]
+    return np.concatenate(rows[1:])
+
+
+def end_to_end(trees: Sequence[Any]) -> Any:
+    """What was found of each piece in one, a row of NaN between two so that no curve crosses a gap.
+
+    What holds no real number has a zero there.
+    """
+
+    def join(*leaves: Any) -> jax.Array:
+        rows = [np.asarray(leaf) for leaf in leaves]
+        blank = np.full_like(rows[0][:1], np.nan if rows[0].dtype.kind == "f" else 0)
+        return jnp.asarray(np.concatenate([rows[0], *(a for r in rows[1:] for a in (blank, r))]))
+
+    return jax.tree_util.tree_map(join, *trees)
+
+
+def together(tallies: Sequence[Tally | None]) -> Any:
+    """The tallies of all pieces of a log, as one with a leading axis."""
+    some = [tally for tally in tallies if tally is not None]
+    return jax.tree_util.tree_map(lambda *x: np.stack(x), *some) if some else None
+
+
+# ---------------------------------------------------------------------------- answers to outcome
+
+
+def outcome(
+    epoch_s: np.ndarray,
+    answers: Mapping[str, Answer],
+    reported: Reported,
+    *,
+    metrics: Callable[[Answer], dict[str, Any]],
+    variables: Mapping[str, Any],
+    counts: Mapping[str, int],
+    notes: Sequence[str],
+) -> Outcome:
+    """The outcome of a replay: solution, metrics and warnings that all systems have, and its own.
+
+    Args:
+        epoch_s: (E,) on the clock of the log.
+        answers: by filter.
+        reported: of every filter.
+        metrics: figures of merit of an answer, beside the consistency of its innovations.
+        variables: what else is in the solution, as `robins.results` lists it.
+        counts: of samples and pieces.
+        notes: sentences for the reader.
+    """
+    tallies = {name: a.tally for name, a in answers.items() if a.updates}
+    bounds = [name for name, a in answers.items() if a.bounds]
+    return Outcome(
+        solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables)),
+        metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
+        counts=dict(counts),
+        notes=list(notes),
+        warnings=replay_warnings(tallies, reported.causes, bounds, reported.assumed),
+    )
+
+
+def _tables(
+    epoch_s: np.ndarray, answers: Mapping[str, Answer], reported: Reported
+) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "filter": ("filter", list(answers)),
+        "time": variable("time", epoch_s, "s", "time since the first inertial sample"),
+    }
+    found = [reported.estimates(answer.mean) for answer in answers.values()]
+    for block in reported.blocks:
+        sigma = [_sigma(answer, block) for answer in answers.values()]
+        for role, rows in (("sigma", sigma), ("estimate", [of.get(block.name) for of in found])):
+            if any(row is not None for row in rows):
+                blank = np.full((len(epoch_s), len(block.axes)), np.nan)
+                values = np.stack([blank if row is None else np.asarray(row) for row in rows])
+                data |= block_array(role, block, values)
+    euler = np.stack([np.asarray(of["euler"]) for of in found])
+    data |= block_array("estimate", reported.euler, euler, "estimated roll, pitch, heading")
+    seen = [answer.updates for answer in answers.values()]
+    return data | innovation_tables(seen, reported.sensors, epoch_s)
+
+
+def _sigma(answer: Answer, block: StateBlock) -> np.ndarray | None:
+    """(E, k) standard deviations of a block; None where the filter has no such states."""
+    here = np.asarray(answer.sigma)[:, block.where]
+    return here if here.shape[1] == len(block.axes) else None
+
+
+def _innovations(answer: Answer) -> dict[str, Any]:
+    out = update_metrics(answer.updates, answer.bounds)
+    return out | ({"log_likelihood": answer.log_likelihood} if answer.updates else {})
+
+
+def replay_warnings(
+    tallies: Mapping[str, Tally],
+    causes: str,
+    bounds: Collection[str] = (),
+    assumed: Collection[str] = (),
+) -> list[str]:
+    """Why a reader should doubt a replay, and the likely causes; empty where nothing is wrong.
+
+    Args:
+        tallies: by filter, of all pieces of the log.
+        causes: the sentence on what is mostly behind it in this system.
+        bounds: filters that state bounds, not standard deviations.
+        assumed: sensors that nobody built, such as "the wheels do not slip": their noise is a
+            guess on the cautious side, so that small innovations say nothing.
+    """
+    found = [
+        f"{name}: {sentence}."
+        for name, tally in tallies.items()
+        for sentence in doubts(tally, bounds=name in bounds, assumed=assumed)
+    ]
+    return [*found, causes] if found else []
