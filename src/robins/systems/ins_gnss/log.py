@@ -299,12 +299,10 @@ def _known(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    y: dict[str, Any] = {}
-    if not (aids.zero_velocity or aids.non_holonomic):
-        return y, {}
     still, mean_rate = standstill(log.increments, *aids.quiet)
     last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
     at_rest = still[last][:, None]
+    y: dict[str, Any] = {}
     if aids.zero_velocity:
         y[model.STANDSTILL] = np.where(at_rest, np.zeros((len(epochs), 3)), np.nan)
         y[model.STILL_RATE] = np.where(at_rest, mean_rate[last], np.nan)
