@@ -15,7 +15,7 @@ from timing import best_of, show
 
 from robins import scenario
 from robins.campaign import record, worlds
-from robins.systems.airship import SYSTEM, Airship, airship_problem
+from robins.systems.airship import SYSTEM
 from robins.systems.airship.parameters import COMPARED
 
 RUNS, STEPS = 20, 1000
@@ -39,8 +39,9 @@ def filterpy_run():
 
 def main():
     warnings.simplefilter("ignore", UserWarning)
-    parameters = scenario.parse(Airship, SYSTEM.scenarios["s1"].read_text(), (), source="s1")
-    problem = airship_problem(parameters, COMPARED, seed=0)
+    study, text = SYSTEM.studies["navigation"], SYSTEM.scenarios["s1"].read_text()
+    parameters = scenario.parse(study.parameters, text, (), source="s1")
+    problem = study.problem(parameters, COMPARED, seed=0)
     simulate = jax.jit(jax.vmap(problem.simulate))
     batch, count = next(worlds(problem, RUNS))
     tasks = {"simulation": lambda: simulate(np.arange(RUNS))}

@@ -16,8 +16,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from robins.systems.airship.error_model import AS_PRINTED, SLIPS
-
 HERE = Path(__file__).resolve().parent
 
 # phi [rad], dv [m/s], position [m], by variant and misalignment
@@ -32,7 +30,6 @@ REFERENCE = {
     ("small-angle", 0): "7e-06 3e-03 3e-02",
     ("small-angle", 1): "3e-04 7e+00 8e+01",
 }
-VARIANTS = {"corrected": (), **{slip: (slip,) for slip in SLIPS}, "as printed": AS_PRINTED}
 
 
 def helper(name: str):
@@ -53,13 +50,14 @@ def main() -> None:
     degrees = mechanised.MISALIGNMENTS_DEG
     flown = mechanised.fly(np.radians(degrees))
     print(f"{'variant':<20}{'phi(0) [deg]':>16}{'rad     m/s     m':>23}{'reference':>23}")
-    for name, slips in VARIANTS.items():
+    one = {slip: (slip,) for slip in mechanised.SLIPS}
+    for name, slips in {"corrected": (), **one, "as printed": mechanised.AS_PRINTED}.items():
         off = np.array(mechanised.apart(flown, mechanised.model_end(flown, slips)))
         for at, phi in enumerate(degrees):
             angles = ", ".join(f"{angle:g}" for angle in phi)
             found = " ".join(f"{x:.0e}" for x in off[:, at])
             print(f"{name:<20}{angles:>16}{found:>23}{REFERENCE.get((name, at), '-'):>23}")
-    print("\n" + "\n".join(f"{name}: {text}" for name, text in SLIPS.items()))
+    print("\n" + "\n".join(f"{name}: {text}" for name, text in mechanised.SLIPS.items()))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ import warnings
 
 from robins import scenario
 from robins.campaign import simulate
-from robins.systems.airship import SYSTEM, Airship, airship_problem
-from robins.systems.airship.parameters import FILTERS
+from robins.systems.airship import SYSTEM
+
+STUDY = SYSTEM.studies["navigation"]
 
 
 def main() -> None:
@@ -24,14 +25,16 @@ def main() -> None:
     parser.add_argument("scenarios", nargs="*", default=list(SYSTEM.scenarios))
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--rate", default="100", help="of the inertial unit [Hz]")
-    parser.add_argument("--filters", default=",".join(FILTERS))
+    parser.add_argument("--filters", default=",".join(STUDY.filters))
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)  # what some filters warn of is shown here
     for name in given.scenarios:
         begun = time.perf_counter()
         text = SYSTEM.scenarios[name].read_text()
-        parameters = scenario.parse(Airship, text, (f'imu.rate="{given.rate} Hz"',), source=name)
-        problem = airship_problem(parameters, tuple(given.filters.split(",")), seed=0)
+        parameters = scenario.parse(
+            STUDY.parameters, text, (f'imu.rate="{given.rate} Hz"',), source=name
+        )
+        problem = STUDY.problem(parameters, tuple(given.filters.split(",")), seed=0)
         outcome = simulate(problem, given.runs)
         print(f"\n{name}: {parameters.title}, {given.runs} runs", flush=True)
         print(

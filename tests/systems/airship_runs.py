@@ -1,5 +1,6 @@
 """Flights of the airship's scenarios, and what its filters make of them; each computed once."""
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,13 +14,14 @@ from robins.filters import Code, run
 from robins.filters.consistency import nees
 from robins.manifold import local
 from robins.systems.airship import SYSTEM
-from robins.systems.airship.parameters import FILTERS, Airship
-from robins.systems.airship.problem import airship_problem
+from robins.systems.airship.instruments import SAR
+from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import World
 from robins.systems.study import Problem
 
 RUNS = 20
-UNWARNED = tuple(name for name in FILTERS if name != "distributed-full")
+STUDY = SYSTEM.studies["navigation"]
+UNWARNED = tuple(name for name in STUDY.filters if name != "distributed-full")
 TO_THE_END = ('imu.rate="10 Hz"', 'duration="800 s"')  # of what counts: 200 to 800 s
 QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, some times as fast to run
 OFTEN = ("ukf", "intersection")  # filters that run so often, or so slowly, that it is worth it
@@ -89,18 +91,23 @@ def parsed(name: str, settings: tuple[str, ...] = TO_THE_END) -> Airship:
 @cache
 def flights(name: str, settings: tuple[str, ...] = TO_THE_END, runs: int = RUNS) -> Flights:
     """Runs of a packaged scenario."""
-    problem = airship_problem(parsed(name, settings), UNWARNED, seed=0)
+    problem = STUDY.problem(parsed(name, settings), UNWARNED, seed=0)
     ((batch, _),) = worlds(problem, runs)
     return Flights(problem, batch)
 
 
 def without_radar(batch: World, begin: int, end: int) -> World:
     """Neither radar nor barometer at the ends of these epochs."""
-    gone = np.zeros(batch.height.shape[1], bool)
+    gone = np.zeros(batch.wind.shape[1], bool)
     gone[begin:end] = True
-    told = {"sar_position": batch.sar_position, "sar_heading": batch.sar_heading}
-    hidden = jax.tree.map(lambda x: jnp.where(gone[None], jnp.nan, x), told)
-    return batch._replace(**hidden, height=jnp.where(gone[None], jnp.nan, batch.height))
+    return told_by_radar(batch, lambda x, at: jnp.where(gone[at], jnp.nan, x))
+
+
+def told_by_radar(batch: World, changed: Callable[[Any, Any], Any]) -> World:
+    """What radar and barometer say changed: arrays (runs, E, ...), and what aligns epochs with."""
+    before = batch.readings[SAR]
+    after = jax.tree.map(lambda x: changed(x, (None, slice(None), *[None] * (x.ndim - 2))), before)
+    return batch._replace(readings=batch.readings | {SAR: after})
 
 
 @cache

@@ -7,10 +7,9 @@ the filter of the reference and the product; `make certify` the others.
 import jax
 import numpy as np
 import pytest
-from airship_runs import flights, found, parsed, without_radar
+from airship_runs import STUDY, flights, found, parsed, without_radar
 
 from robins.campaign.bound import bound_sigma
-from robins.systems.airship.problem import airship_problem
 
 FIRST_LOST, LAST_LOST = 399, 698  # numbers of the epochs that end at 400 s and 699 s
 ANY = (0.0, np.inf)
@@ -24,7 +23,7 @@ KNOWN = pytest.mark.filterwarnings("ignore:feedback='full' gives every local fil
 @KNOWN
 @pytest.mark.parametrize("name", CERTIFIED)
 def test_a_filter_of_the_campaigns_can_be_traced(name):
-    problem = airship_problem(parsed("s1"), (name,), seed=0)
+    problem = STUDY.problem(parsed("s1"), (name,), seed=0)
     error, nees = flights("s1")._replace(problem=problem).traced(name)
     assert error.shape == (20, 800, 9)
     assert nees.shape == (20, 800)
@@ -120,7 +119,7 @@ def test_information_shared_out_is_not_counted_twice():
 
 def test_the_covariance_fed_back_is_counted_again_and_again():
     with pytest.warns(UserWarning, match="counted again at the next fusion"):
-        problem = airship_problem(parsed("matched"), ("distributed-full",), seed=0)
+        problem = STUDY.problem(parsed("matched"), ("distributed-full",), seed=0)
     of = flights("matched")._replace(problem=problem)
     assert of.found("distributed-full").nees_per_dim > 100.0
 

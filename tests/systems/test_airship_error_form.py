@@ -2,10 +2,9 @@
 
 import jax
 import numpy as np
+from airship_runs import STUDY, parsed
 
-from robins import scenario
 from robins.filters import run
-from robins.systems.airship import SYSTEM, Airship, airship_problem
 
 SHORT = ('imu.rate="10 Hz"', 'duration="60 s"', 'counted={begin="10 s", end="60 s"}')
 STEEP = ('start.attitude=["2 deg", "3 deg", "20 deg"]',)  # no small angle
@@ -25,9 +24,8 @@ def compared(total, fed, truth):
 
 def solved(settings):
     """Estimates of both filters compared, (60, 9)."""
-    text = SYSTEM.scenarios["s0"].read_text()
-    given = scenario.parse(Airship, text, (*SHORT, *settings), source="s0")
-    problem = airship_problem(given, ("centralised", "centralised-errors"), seed=3)
+    given = parsed("s0", (*SHORT, *settings))
+    problem = STUDY.problem(given, ("centralised", "centralised-errors"), seed=3)
     world = jax.jit(problem.simulate)(0)
     beliefs = []
     for contender in problem.contenders.values():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from airship_runs import flights, parsed
+from airship_runs import flights, parsed, told_by_radar
 from scipy.linalg import expm
 
 from robins.earth import Geodetic
@@ -15,22 +15,24 @@ from robins.ins.state import InsNoise, InsState
 from robins.manifold import local, retract
 from robins.rotation import Rotation, from_euler
 from robins.scenario import ScenarioError
-from robins.systems.airship.model import (
-    Air,
-    Datum,
+from robins.systems.airship.instruments import (
+    INSTRUMENTS,
+    SAR,
+    STAR,
+    STAR_EARLY,
+    WIND,
     Early,
-    Sigmas,
-    WindIns,
-    WindNav,
-    WindNoise,
-    product_states,
+    level,
     read_early,
     read_wind,
-    sensors,
-    walk,
-    wind_states,
 )
-from robins.systems.airship.world import lay_out, simulate
+from robins.systems.airship.model import (
+    PRODUCT,
+    WIND_STATES,
+    WithWind,
+    walk,
+)
+from robins.systems.airship.world import lay_out, present, simulate
 from robins.workbench import InputError
 from robins.workbench import run as run_scenario
 
@@ -73,7 +75,7 @@ def seen_or_not():
     @jax.vmap
     def fly(unsensed, index):
         imu = given.imu.model_copy(update={"unsensed": unsensed})
-        return simulate(given.model_copy(update={"imu": imu}), course, 0, index)
+        return simulate(INSTRUMENTS, given.model_copy(update={"imu": imu}), course, 0, index)
 
     both = fly(jnp.array([0.0, 0.0, 1.0, 1.0]), jnp.array([0, 1, 0, 1]))
     return [jax.tree.map(lambda x, at=at: x[at], both) for at in (slice(2), slice(2, 4))]
@@ -121,10 +123,11 @@ def test_wind_changes_nothing_of_what_the_sensors_get_wrong(windy):
     for name in ("initial_error", "gyro_bias", "accel_bias", "wind_error"):
         np.testing.assert_array_equal(getattr(calm, name), getattr(gusty, name), err_msg=name)
     pair = (calm, gusty)
+    datum = lay_out(parsed("s0", SHORT)).datum
     for noise, rounding in (
-        ([w.height - w.truth.position.alt for w in pair], 1e-10),
-        ([w.sar_position.lat - w.truth.position.lat for w in pair], 1e-14),
-        ([w.air_measured_b - w.air_b for w in pair], 1e-12),
+        ([w.readings[SAR][2][..., 0] - w.truth.position.alt for w in pair], 1e-10),
+        ([(w.readings[SAR][0] - level(datum, w.truth.position))[..., 0] for w in pair], 1e-7),
+        ([w.readings[WIND] - w.air_b for w in pair], 1e-12),
     ):
         np.testing.assert_allclose(noise[0], noise[1], atol=rounding)
         assert np.std(noise[0]) > 1e3 * rounding
@@ -153,25 +156,26 @@ def test_gyros_carry_the_star_sights_of_an_epoch_to_its_end(perfect):
     world = one(perfect)
     age = jnp.full((EPOCHS, 1), 0.5)
     zero = jnp.zeros((EPOCHS, 3))
-    states = WindIns(as_ins(world.truth, zero, zero), world.wind_error)
+    states = WithWind(as_ins(world.truth, zero, zero), world.wind_error)
     read = jax.vmap(lambda x, turned, age: read_early(x, Early(turned, age)))
     angles = np.stack([a.rad for a in read(states, world.since, age)], 1)
-    there = np.isfinite(world.euler[:, 0, 0])
+    euler = world.readings[STAR]
+    there = np.isfinite(euler[:, 0, 0])
     assert there.sum() == EPOCHS - 2  # those of 2.5 s and 3.5 s are lost
-    turned = np.abs(world.euler[:, 1] - world.euler[:, 0])[there]
+    turned = np.abs(euler[:, 1] - euler[:, 0])[there]
     assert np.nanmax(turned) > 100 * ARCSEC
-    np.testing.assert_allclose(angles[there], world.euler[there, 0], atol=0.01 * ARCSEC)
+    np.testing.assert_allclose(angles[there], euler[there, 0], atol=0.01 * ARCSEC)
 
 
 def test_the_reading_of_the_wind_errs_by_the_air_data_alone(windy):
     batch = windy.batch
     thought = batch.wind + batch.wind_error
     nothing = jnp.zeros((RUNS, EPOCHS, 2))
-    read = jax.vmap(jax.vmap(lambda x, air: read_wind(x, Air(air, jnp.ones(2), jnp.zeros(2)))))
-    ideal = read(WindNav(batch.truth, nothing), batch.air_b)
+    read = jax.vmap(jax.vmap(read_wind))
+    ideal = read(WithWind(batch.truth, nothing), batch.air_b)
     np.testing.assert_allclose(ideal, batch.wind, atol=1e-12)
-    measured = read(WindNav(batch.truth, batch.wind_error), batch.air_measured_b)
-    noise = np.asarray(batch.air_measured_b - batch.air_b)
+    measured = read(WithWind(batch.truth, batch.wind_error), batch.readings[WIND])
+    noise = np.asarray(batch.readings[WIND] - batch.air_b)
     along = [np.asarray(Rotation(q).apply(n))[:2] for q, n in _pairs(batch, noise)]
     np.testing.assert_allclose(np.reshape(thought - measured, (-1, 2)), np.array(along), atol=1e-12)
     count = noise.size
@@ -187,20 +191,24 @@ def _pairs(batch, noise):
 
 def test_sensors_are_missing_where_they_are_lost_and_nowhere_else(perfect):
     world, time = one(perfect), np.arange(1, EPOCHS + 1)
-    assert set(time[np.isnan(world.sar_heading)]) == {5, 6, 7, 8}
-    assert set(time[np.isnan(world.sar_position.lat)]) == {5, 6, 7, 8}
-    assert set(time[np.isnan(world.height)]) == {3, 20, 21, 22, 23}
-    assert set(time[np.isnan(world.air_measured_b[:, 0])]) == {1}
+    place, heading, height = world.readings[SAR]
+    assert set(time[np.isnan(heading.rad)]) == {5, 6, 7, 8}
+    assert set(time[np.isnan(place[:, 0])]) == {5, 6, 7, 8}
+    assert set(time[np.isnan(height[:, 0])]) == {3, 20, 21, 22, 23}
+    assert set(time[np.isnan(world.readings[WIND][:, 0])]) == {1}
     sights = 0.5 * np.arange(1, 2 * EPOCHS + 1)
-    gone = np.isnan(world.euler[..., 0]).reshape(-1)
+    gone = np.isnan(world.readings[STAR][..., 0]).reshape(-1)
     assert set(sights[gone]) == {2.5, 3.0, 3.5}
     assert np.all(np.isfinite(world.wind_error))
 
 
 def test_slower_sensors_read_at_the_end_of_their_own_intervals():
-    course = lay_out(parsed("s0", (*SHORT, 'sar.rate="0.25 Hz"', 'star.rate="5 Hz"')))
-    np.testing.assert_array_equal(np.flatnonzero(course.sar) + 1, np.arange(4, EPOCHS + 1, 4))
-    assert course.star.shape == (EPOCHS, 5)
+    given = parsed("s0", (*SHORT, 'sar.rate="0.25 Hz"', 'star.rate="5 Hz"'))
+    course = lay_out(given)
+    there = present(course.epoch_s, given.sar)
+    np.testing.assert_array_equal(np.flatnonzero(there) + 1, np.arange(4, EPOCHS + 1, 4))
+    assert course.sights == 5
+    assert np.all(present(course.sight_s, given.star))
     assert (course.samples, course.parts) == (2, 2)
 
 
@@ -211,9 +219,10 @@ def test_heading_south_is_as_good_as_heading_east(windy):
     """The heading then swings across +-180 deg, and here the longitude of fixes does as well."""
     course = ('hull.course="180 deg"', 'wind.towards="180 deg"', 'place.longitude="180 deg"')
     south = flights("s1", (*SHORT, *GUSTS, *course), RUNS)
-    fixes = np.asarray(south.batch.sar_position.lon)
-    assert np.nanmin(fixes) < -3.1 < 3.1 < np.nanmax(fixes)
-    heading = np.asarray(south.batch.euler[..., 2])
+    longitude = np.asarray(south.batch.truth.position.lon)
+    assert np.min(longitude) < -3.1 < 3.1 < np.max(longitude)
+    assert np.nanmax(np.abs(south.batch.readings[SAR][0][..., 1])) < 1e3  # m east
+    heading = np.asarray(south.batch.readings[STAR][..., 2])
     assert np.any(heading > 3.1)
     assert np.any(heading < -3.1)
     ways = [of.found("ekf") for of in (windy, south)]
@@ -228,15 +237,9 @@ def test_heading_south_is_as_good_as_heading_east(windy):
 
 def test_a_fix_that_is_no_number_is_left_out(windy):
     batch, at = windy.batch, 10
-    fix = batch.sar_position
 
     def with_fix(value):
-        lat, lon = (x.at[:, at].set(value) for x in (fix.lat, fix.lon))
-        return batch._replace(
-            sar_position=Geodetic(lat, lon, fix.alt),
-            sar_heading=batch.sar_heading.at[:, at].set(value),
-            height=batch.height.at[:, at].set(value),
-        )
+        return told_by_radar(batch, lambda x, _: x.at[:, at].set(value))
 
     missing, infinite, whole = (
         windy._replace(batch=b).found("ekf").error
@@ -255,10 +258,9 @@ NAV = Nav(
     jnp.array([3.0, 21.0, -0.5]),
     Geodetic(*(jnp.asarray(x) for x in (0.6, 1.9, 2.0e4))),
 )
-NOISE = InsNoise(jnp.full(3, 3e-6), jnp.full(3, 5e-3))
-WINDY = WindNoise(jnp.asarray(0.3), jnp.asarray(50.0))
-DATUM = Datum(jnp.asarray(0.6), jnp.asarray(1.9), jnp.array([6.37e6, 5.27e6]))
-LOOKS = sensors(DATUM, Sigmas(jnp.array([25.0, 25.0, 0.017, 20.0]), jnp.full(3, 1e-4)), 1)
+GIVEN = parsed("s1", ("believed.accel_noise_factor=2.0",))
+COURSE = lay_out(GIVEN)
+SENSORS = [i.believed(GIVEN, COURSE) for i in INSTRUMENTS]
 ONE = Increments(jnp.asarray(1.0), jnp.array([0.02, -0.01, 0.03]), jnp.array([0.3, -0.5, -9.8]))
 PARTS = Increments(
     jnp.full(4, 0.25), ONE.theta[None] / 4 * jnp.ones((4, 1)), ONE.dv[None] / 4 * jnp.ones((4, 1))
@@ -266,8 +268,8 @@ PARTS = Increments(
 WIND_ERROR = jnp.array([0.3, -0.2])
 INS = as_ins(NAV, jnp.array([1e-6, -2e-6, 3e-6]), jnp.array([0.01, -0.01, 0.02]))
 MODELS = {  # the slope of the nine states is a part of the first
-    "wind": (wind_states(3e-6, 0.07, WINDY, LOOKS), WindNav(NAV, WIND_ERROR), ONE),
-    "product": (product_states(NOISE, WINDY, LOOKS), WindIns(INS, WIND_ERROR), PARTS),
+    "wind": (WIND_STATES, WithWind(NAV, WIND_ERROR), ONE),
+    "product": (PRODUCT, WithWind(INS, WIND_ERROR), PARTS),
 }
 # what a change of each state is measured in: rad, m/s, m, m/s of wind or rad/s, m/s^2
 SIZES = {"wind": [0.3] * 2, "product": [1e-6] * 3 + [1e-2] * 3 + [0.3] * 2}
@@ -275,16 +277,17 @@ SIZES = {"wind": [0.3] * 2, "product": [1e-6] * 3 + [1e-2] * 3 + [0.3] * 2}
 
 @pytest.mark.parametrize("name", list(MODELS))
 def test_the_slope_of_a_step_is_its_slope(name):
-    model, x, u = MODELS[name]
+    states, x, u = MODELS[name]
+    motion = states.motion(GIVEN, COURSE)
     size = np.array([1e-3] * 3 + [1.0] * 3 + [10.0] * 3 + SIZES[name])
 
     @jax.jit
     def both(x, u):
-        new, F, L = model.motion.linear(x, u)
-        moved = model.motion.step(x, u)
+        new, F, L = motion.linear(x, u)
+        moved = motion.step(x, u)
 
         def from_(d):
-            return local(moved, model.motion.step(retract(x, d), u))
+            return local(moved, motion.step(retract(x, d), u))
 
         return local(moved, new), F, jax.jacfwd(from_)(jnp.zeros(len(size))), L @ L.T
 
@@ -300,15 +303,15 @@ def test_the_slope_of_a_step_is_its_slope(name):
     np.testing.assert_allclose(kept, 0.09 * np.eye(2), rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("at", range(len(LOOKS)), ids=[s.name for s in LOOKS])
+@pytest.mark.parametrize("at", range(len(SENSORS)), ids=[s.name for s in SENSORS])
 def test_sensors_read_with_the_slope_of_differences(at):
-    sensor, x = LOOKS[at], MODELS["product"][1]
+    sensor, x = SENSORS[at], MODELS["product"][1]
     sigma = jnp.asarray([1e-4] * 3 + [0.1] * 3 + [10.0] * 3 + SIZES["product"])
     aux = None
-    if sensor.name == "star_early":
+    if sensor.name == STAR_EARLY:
         aux = Early(jnp.array([[0.01, -0.02, 0.015]]), jnp.array([0.5]))
     if sensor.name.startswith("wind"):
-        aux = Air(jnp.array([9.0, 1.0, -0.5]), jnp.full(2, 0.3), jnp.zeros(2))
+        aux = jnp.array([9.0, 1.0, -0.5])
     y = sensor.read(x, aux)
     belief = Belief(x, jnp.diag(sigma))
     spread = jax.jit(lambda b, y: taylor().observation(b, sensor, y, aux).spread)(belief, y)
@@ -325,7 +328,7 @@ def test_sensors_read_with_the_slope_of_differences(at):
 
 def test_noise_of_a_step_is_that_of_a_random_walk():
     gyro, accel, dt = 3e-6, 0.07, 0.8
-    L = np.asarray(walk(gyro, accel, dt))
+    L = np.asarray(walk(InsNoise(gyro, accel), dt))
     A, G = np.zeros((9, 9)), np.zeros((9, 6))
     A[6:, 3:6] = np.eye(3)
     G[:3, :3], G[3:6, 3:] = gyro * np.eye(3), accel * np.eye(3)

@@ -1,15 +1,19 @@
 """A SINS and the truth as two mechanisations in continuous time, in ENU/RFU, NumPy alone.
 
 Both are integrated by the same RK4 steps; what the SINS says at the stages of each step is kept, so
-that an error model can be integrated by the same steps and compared with their difference.
+that an error model can be integrated by the same steps and compared with their difference, as it
+is or with mistakes.
 """
 
+from contextlib import nullcontext
 from typing import NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from robins import rotation
 from robins.systems.airship import error_model
 
 A_M, FLATTENING, GM, OMEGA_E = 6378137.0, 1.0 / 298.257223563, 3.986004418e14, 7.292115e-5
@@ -22,6 +26,18 @@ ACCEL_ERROR = np.array([0.03, -0.04, 0.033])  # m/s^2, 0.06 long
 VELOCITY_ERROR = np.array([-3.0, -2.0, 1.0])  # m/s
 METRES_ERROR = np.array([1300.0, 600.0, 300.0])  # east, north, up
 MISALIGNMENTS_DEG = np.array([[0.01, 0.02, 0.03], [5.0, -4.0, 20.0], [30.0, -25.0, 120.0]])
+
+SLIPS = {
+    "last-cross-term": "+ (2 w_ie + w_en) x dv with the true rates, where their errors belong: it "
+    "all but cancels the term before it",
+    "swapped-rows": "rows 7 and 8 are the rates of dlat, dlon; the state (38) has dlon, dlat",
+    "omitted-cross-term": "the last cross product left out, being of second order",
+    "gyro-sign": "the error of the gyro taken as true minus measured",
+    "small-angle": "C_cn = I - [phi x], and phi' = w_nc",
+}
+"""What may be got wrong in eq. (40) of the airship's paper; the first two are as printed."""
+
+AS_PRINTED = ("last-cross-term", "swapped-rows")
 
 
 class State(NamedTuple):
@@ -208,6 +224,29 @@ def difference(s: State) -> np.ndarray:
     return np.concatenate([phi, s.v[1:] - s.v[0], *place], -1)
 
 
+def slipped_rate(x, sins, errors, slips):
+    """The right-hand side of the error model, with mistakes of `SLIPS`."""
+    if "gyro-sign" in slips:
+        errors = errors._replace(gyro=-errors.gyro)
+    small = nullcontext()
+    if "small-angle" in slips:
+        matrices = {
+            "dcm_cn": lambda phi: jnp.eye(3) - rotation.skew(phi),
+            "rate_matrix_inverse": lambda phi: jnp.eye(3),
+        }
+        small = mock.patch.multiple(error_model, **matrices)
+    with small:
+        rate = error_model.error_rate(x, sins, errors)
+    dv, lat, alt = x[3:6], x[error_model.LAT], x[error_model.ALT]
+    here = error_model.surroundings(sins.lat, sins.alt, sins.v_n).coriolis
+    true = error_model.surroundings(sins.lat - lat, sins.alt - alt, sins.v_n - dv).coriolis
+    if "last-cross-term" in slips:
+        rate = rate.at[3:6].add(jnp.cross(2.0 * true - here, dv))
+    if "omitted-cross-term" in slips:
+        rate = rate.at[3:6].add(jnp.cross(true - here, dv))
+    return rate[jnp.array([0, 1, 2, 3, 4, 5, 7, 6, 8])] if "swapped-rows" in slips else rate
+
+
 @jax.jit(static_argnames="slips")
 def model_end(flown: Flown, slips=(), dt=DT_S, gyro=GYRO_ERROR, accel=ACCEL_ERROR):
     """Where the error model ends, (B, 9), from where the mechanisations begin, by their steps."""
@@ -217,7 +256,7 @@ def model_end(flown: Flown, slips=(), dt=DT_S, gyro=GYRO_ERROR, accel=ACCEL_ERRO
         x, k, total = carry
         at, weight, said = now
         sins = error_model.Sins(said.C, said.v, said.lat, said.alt, said.C @ said.f_b)
-        k = error_model.error_rate(x + at * dt * k, sins, errors, slips)
+        k = slipped_rate(x + at * dt * k, sins, errors, slips)
         return (x, k, total + weight * k), None
 
     def one_step(x, said):

@@ -114,11 +114,13 @@ class Instrument(NamedTuple):
 
     name: str
     axes: SensorAxes
-    # (parameters, course, key, true motion) -> what it reports at each epoch, NaN where nothing
-    measure: Callable[..., Any]
-    believed: Callable[
-        ..., Sensor
-    ]  # (parameters, course) -> reading and noise, as a filter believes
+    # (parameters, course, key of a component, true motion) -> its reading, leading axis E, NaN
+    # where there is none; None: it takes what another instrument has read
+    measure: Callable[..., Any] | None
+    # (parameters, course) -> h(x) and R, as a filter believes; None: it is not aboard
+    believed: Callable[..., Sensor | None]
+    # world -> the measurement, and what h(x) needs besides the state
+    taken: Callable[[Any], tuple[Any, Any]]
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,9 @@ After Zhao, Gao, Ding & Wei (2017), with their equations corrected; nine states 
 a product model with states for the biases and for the error of the wind.
 """
 
-from robins.systems.airship.claims import CLAIMS
-from robins.systems.airship.parameters import FILTERS, Airship
-from robins.systems.airship.problem import airship_problem
-from robins.systems.study import Study
+from robins.systems.airship.study import NAVIGATION
 from robins.systems.system import System
 
-SYSTEM = System(
-    name="airship",
-    studies={"navigation": Study(Airship, airship_problem, FILTERS, CLAIMS)},
-)
+SYSTEM = System(name="airship", studies={"navigation": NAVIGATION})
 
 __all__ = ["SYSTEM"]

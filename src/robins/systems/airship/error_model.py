@@ -1,8 +1,8 @@
-"""Nine error states of a SINS at misalignments of any size: eq. (40) of the airship's paper.
+"""Nine error states of a SINS at misalignments of any size: eqs. (38), (40) of the airship's paper.
 
 Zhao, Gao, Ding & Wei (2017), section 4.1, corrected. As there, navigation is east-north-up and the
 body right-forward-up; robins' own states are NED/FRD and come over by `sins_at`, `error_between`
-and `corrected`. Errors are *computed minus true*,
+and `corrected`. Errors are *computed minus true* (38),
 
     x = [phi_E, phi_N, phi_U  rad,  dv_E, dv_N, dv_U  m/s,  dlon, dlat  rad,  dalt  m]
 
@@ -15,45 +15,42 @@ Differences of nonlinear functions (rates, gravity, velocity over radius) are ta
 the sensors' errors known the model is exact: it is the difference of two mechanisations. Gravity is
 that of `robins.earth`, which above the ellipsoid has a small north component.
 
-Eq. (40) in print has slips, and other accounts of the model have others. Each can be asked for by
-name, one or several at once, so that a test can see what it costs; see `SLIPS`.
+Eq. (40) in print has two slips: the last cross product has the true rates in the place of their
+errors, which all but cancels the term before it, and the rates of dlat and dlon are exchanged.
+
+As a filter (`Fed`) the SINS navigates beside the estimate of its errors; once a step the estimate
+is taken off the SINS, and the errors begin anew at zero. It is the total-state form of `model`
+written differently, so it serves as its check; the paper's local filters are not built on it.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii, earth_rate_n, gravity_n, transport_rate_n
+from robins.filters import Belief, Code, Motion, Rule
 from robins.ins.frames import swap
+from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
+from robins.ins.mechanise import step as navigate
+from robins.ins.state import InsNoise
 from robins.manifold import wrap
-from robins.rotation import Rotation, skew
+from robins.rotation import Rotation, conjugate, rotate
+from robins.systems.airship.model import States, believed_noise, walk
+from robins.systems.airship.parameters import Airship
+from robins.systems.airship.world import Course, start_sigma
 
-STATES = 9
 PHI, VELOCITY = slice(0, 3), slice(3, 6)
 LON, LAT, ALT = 6, 7, 8
-
-STEEPEST_RAD = math.radians(85.0)
-
-SLIPS = {
-    "last-cross-term": "+ (2 w_ie + w_en) x dv with the true rates, where their errors belong: it "
-    "all but cancels the term before it",
-    "swapped-rows": "rows 7 and 8 are the rates of dlat, dlon; the state (38) has dlon, dlat",
-    "omitted-cross-term": "the last cross product left out, being of second order",
-    "gyro-sign": "the error of the gyro taken as true minus measured",
-    "small-angle": "C_cn = I - [phi x], and phi' = w_nc",
-}
-"""What may be got wrong in eq. (40), by name; the first two are as printed."""
-
-AS_PRINTED = ("last-cross-term", "swapped-rows")
 
 
 class Sins(NamedTuple):
@@ -102,48 +99,18 @@ def misalignment(C_cn: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     return jnp.stack([east, north, up], -1)
 
 
-def rate_matrix(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """C_w: turn rate of c against n from the rates of the angles, w_nc_c = C_w phi'."""
-    (sE, sN, _), (cE, cN, _) = _parts(jnp.sin(phi)), _parts(jnp.cos(phi))
-    o, one = jnp.zeros_like(sE), jnp.ones_like(sE)
-    return _matrix((cN, o, -sN * cE), (o, one, sE), (sN, o, cN * cE))
-
-
 def rate_matrix_inverse(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """C_w^-1, phi' = C_w^-1 w_nc_c; grows as 1/cos(phi_E), see `refuse_steep_misalignment`."""
+    """C_w^-1 of phi' = C_w^-1 w_nc_c, w_nc_c the turn rate of c against n.
+
+    It grows as 1/cos(phi_E): at a quarter turn the three angles are singular.
+    """
     (sE, sN, _), (cE, cN, _) = _parts(jnp.sin(phi)), _parts(jnp.cos(phi))
     o, one = jnp.zeros_like(sE), jnp.ones_like(sE)
     return _matrix((cN, o, sN), (sN * sE / cE, one, -cN * sE / cE), (-sN / cE, o, cN / cE))
 
 
-def refuse_steep_misalignment(x: ArrayLike) -> None:
-    """Refuse states near the singularity of the three angles; outside compiled code.
-
-    Args:
-        x: (..., 9) error states, or (..., 3) misalignments.
-
-    Raises:
-        ValueError: a phi_E is more than 85 deg from level, or is not a number.
-    """
-    phi_east = np.asarray(x, float)[..., 0].reshape(-1)
-    off = np.abs(np.remainder(phi_east + np.pi, 2.0 * np.pi) - np.pi)  # from zero, any turns off
-    steep = np.flatnonzero(~(np.minimum(off, np.pi - off) <= STEEPEST_RAD))
-    if len(steep):
-        value = math.degrees(phi_east[steep[0]])
-        where = f" of state {steep[0]}" if len(phi_east) > 1 else ""
-        raise ValueError(
-            f"phi_E{where} is {value:.3f} deg: within {90.0 - math.degrees(STEEPEST_RAD):g} deg of "
-            "a quarter turn the angles of the misalignment are singular. Feed the estimate back to "
-            "the SINS, so that phi begins anew at zero, or estimate the attitude itself, as a "
-            "robins.rotation.Rotation"
-        )
-
-
 def error_rate(
-    x: Float[Array, "9"],
-    sins: Sins,
-    errors: SensorErrors = NO_ERRORS,
-    slips: Collection[str] = (),
+    x: Float[Array, "9"], sins: Sins, errors: SensorErrors = NO_ERRORS
 ) -> Float[Array, "9"]:
     """The right-hand side f of x' = f (eq. 40).
 
@@ -161,43 +128,24 @@ def error_rate(
         x: error state, computed minus true.
         sins: what the SINS says.
         errors: of its sensors; zero in a filter, which has them as process noise.
-        slips: mistakes to make, of `SLIPS`; static under `jit`.
-
-    Raises:
-        ValueError: a slip has an unknown name, or two exclude each other.
     """
-    _check(slips)
     phi, dv = x[PHI], x[VELOCITY]
-    small = "small-angle" in slips
-    unit = jnp.eye(3)
-    C_cn = unit - skew(phi) if small else dcm_cn(phi)
-    per_rate = unit if small else rate_matrix_inverse(phi)
+    C_cn = dcm_cn(phi)
     C_cb, v, f_c = (jnp.asarray(a, float) for a in (sins.C_cb, sins.v_n, sins.f_c))
     gyro_c, accel_c = (C_cb @ jnp.asarray(e, float) for e in errors)
-    if "gyro-sign" in slips:
-        gyro_c = -gyro_c
 
-    here = _surroundings(sins.lat, sins.alt, v)
-    true = _surroundings(sins.lat - x[LAT], sins.alt - x[ALT], v - dv)
-    d = _Surroundings(*(a - b for a, b in zip(here, true, strict=True)))
+    here = surroundings(sins.lat, sins.alt, v)
+    true = surroundings(sins.lat - x[LAT], sins.alt - x[ALT], v - dv)
+    d = Surroundings(*(a - b for a, b in zip(here, true, strict=True)))
 
-    w_nc = (unit - C_cn) @ here.omega_in + C_cn @ d.omega_in - gyro_c
+    w_nc = (jnp.eye(3) - C_cn) @ here.omega_in + C_cn @ d.omega_in - gyro_c
     dv_rate = f_c - C_cn.T @ (f_c - accel_c) - jnp.cross(d.coriolis, v)
-    dv_rate = dv_rate - jnp.cross(here.coriolis, dv) + d.gravity
-    if "last-cross-term" in slips:
-        dv_rate = dv_rate + jnp.cross(true.coriolis, dv)
-    elif "omitted-cross-term" not in slips:
-        dv_rate = dv_rate + jnp.cross(d.coriolis, dv)
-    horizontal = d.lonlat_rate[::-1] if "swapped-rows" in slips else d.lonlat_rate
-    return jnp.concatenate([per_rate @ w_nc, dv_rate, horizontal, dv[2:]])
+    dv_rate = dv_rate - jnp.cross(here.coriolis, dv) + d.gravity + jnp.cross(d.coriolis, dv)
+    return jnp.concatenate([rate_matrix_inverse(phi) @ w_nc, dv_rate, d.lonlat_rate, dv[2:]])
 
 
 def step(
-    x: Float[Array, "9"],
-    over: Sins,
-    dt_s: ArrayLike,
-    errors: SensorErrors = NO_ERRORS,
-    slips: Collection[str] = (),
+    x: Float[Array, "9"], over: Sins, dt_s: ArrayLike, errors: SensorErrors = NO_ERRORS
 ) -> Float[Array, "9"]:
     """Move over one filter period by the midpoint rule: x + f(x + f(x) T/2) T.
 
@@ -205,24 +153,14 @@ def step(
 
     Args:
         x: error state at the begin.
-        over: the SINS on average over the period, see `average`.
+        over: the SINS on average over the period, or in the middle of it; f_c is then the velocity
+            gained over the length of the period.
         dt_s: length of the period.
         errors: as in `error_rate`.
-        slips: as in `error_rate`.
     """
     dt = jnp.asarray(dt_s, float)
-    middle = x + 0.5 * dt * error_rate(x, over, errors, slips)
-    return x + dt * error_rate(middle, over, errors, slips)
-
-
-def average(sins: Sins) -> Sins:
-    """Mean over the leading axis, of samples at the middles of equal parts of a period.
-
-    The mean of v, latitude and height is that of the middle but for terms that `step` leaves out as
-    well; f_c becomes the velocity gained over the length of the period, and C_cb, no longer a
-    rotation, what turns the constant error of a sensor.
-    """
-    return Sins(*(jnp.mean(jnp.asarray(a, float), axis=0) for a in sins))
+    middle = x + 0.5 * dt * error_rate(x, over, errors)
+    return x + dt * error_rate(middle, over, errors)
 
 
 # ------------------------------------------------------------------- to and from robins' own states
@@ -254,10 +192,107 @@ def corrected(computed: Nav, x: Float[Array, "9"]) -> Nav:
     return Nav(q_nb, computed.v_n - swap(x[VELOCITY]), place)
 
 
+def error_from_tangent(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Array, "9 9"]:
+    """The error state by the tangent vector of a `Nav`, to first order.
+
+    That is attitude, velocity, position north, east, down [m], true minus estimated. A small
+    misalignment is the same rotation vector in both, for it is defined by C_true = exp(phi x) C. So
+    rows H of a paper become ``-H @ error_from_tangent(...)`` for a measurement less computed one.
+    """
+    meridian, transverse = curvature_radii(lat_rad)
+    alt, enu = jnp.asarray(alt_m, float), swap(np.eye(3))
+    out = jnp.zeros((9, 9)).at[PHI, 0:3].set(enu).at[VELOCITY, 3:6].set(-enu)
+    out = out.at[LAT, 6].set(-1.0 / (meridian + alt))
+    out = out.at[LON, 7].set(-1.0 / ((transverse + alt) * jnp.cos(jnp.asarray(lat_rad, float))))
+    return out.at[ALT, 8].set(1.0)
+
+
+# ---------------------------------------------------------------------------------- as a filter
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Fed:
+    """A SINS and its errors x = (phi, dv, dlon, dlat, dalt), computed minus true; ENU, SI."""
+
+    sins: Nav
+    x: Any  # (9,)
+
+    dim = 9
+
+    def retract(self, delta: Array) -> Fed:
+        """Add to the errors."""
+        return Fed(self.sins, self.x + delta)
+
+    def local(self, other: Fed) -> Array:
+        """Errors of this SINS, were the other state true, less those it has here."""
+        return error_between(self.sins, other.nav) - self.x
+
+    @property
+    def nav(self) -> Nav:
+        """The SINS less its errors."""
+        return corrected(self.sins, self.x)
+
+
+def _motion(given: Airship, course: Course) -> Motion:
+    """Motion of a `Fed`; input of a step: one increment. Wants the rule `feedback`."""
+    return Motion(_step, Partial(_noise, believed_noise(given), course.datum.metres))
+
+
+def _step(fed: Fed, block: Increments) -> Fed:
+    """The SINS over the block, and its errors by (40) about the middle of it."""
+    before, after = fed.sins, navigate(fed.sins, block)
+    half = Rotation.from_rotvec(0.5 * block.theta)
+    p, q = before.position, after.position
+    middle = Nav(
+        before.q_nb @ half,
+        0.5 * (before.v_n + after.v_n),
+        Geodetic(0.5 * (p.lat + q.lat), p.lon, 0.5 * (p.alt + q.alt)),
+    )
+    force_b = rotate(conjugate(half.wxyz), block.dv / block.dt)
+    return Fed(after, step(fed.x, sins_at(middle, force_b), block.dt))
+
+
+def _noise(noise: InsNoise, metres_per_radian: Array, fed: Fed, block: Increments) -> Array:
+    """As of the total state; longitude and latitude in radians."""
+    per_metre = jnp.concatenate([jnp.ones(6), 1.0 / metres_per_radian[::-1], jnp.ones(1)])
+    return per_metre[:, None] * walk(noise, block.dt)
+
+
+def feedback() -> Rule:
+    """Take the estimated errors off the SINS, once a step when all its measurements are in."""
+
+    def settle(memory: Any, belief: Belief):
+        nav = belief.mean.nav
+        return memory, Belief(Fed(nav, jnp.zeros(9)), belief.factor), int(Code.DONE)
+
+    return Rule(settle=settle, name="feedback")
+
+
+def _start_sigma(given: Airship, course: Course) -> list[np.ndarray]:
+    """East, north, up; longitude and latitude in radians."""
+    enu = start_sigma(given).reshape(3, 3)[:, [1, 0, 2]].ravel()
+    return [enu / np.array([*np.ones(6), *course.datum.metres[::-1], 1.0])]
+
+
+def _reported(course: Course) -> np.ndarray:
+    """True minus estimated in metres: errors of velocity and position are the other way round."""
+    north, east = course.datum.metres
+    return np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -east, -north, -1.0])
+
+
+ERRORS = States(
+    _motion,
+    lambda nav, gyro, accel, wind: Fed(nav, jnp.zeros((*wind.shape[:-1], 9))),
+    _start_sigma,
+    _reported,
+)
+
+
 # --------------------------------------------------------------------------------- the small things
 
 
-class _Surroundings(NamedTuple):
+class Surroundings(NamedTuple):
     """What position and velocity decide; ENU."""
 
     omega_in: Array  # rad/s, w_ie + w_en
@@ -266,24 +301,18 @@ class _Surroundings(NamedTuple):
     lonlat_rate: Array  # rad/s
 
 
-def _surroundings(lat, alt, v) -> _Surroundings:
+def surroundings(lat: Any, alt: Any, v: Any) -> Surroundings:
+    """Rates, gravity and how the place changes [rad/s], at a place and velocity (ENU)."""
     omega_ie = swap(earth_rate_n(lat))
     omega_en = swap(transport_rate_n(lat, alt, swap(v)))
     meridian, transverse = curvature_radii(lat)
     lonlat_rate = [v[0] / ((transverse + alt) * jnp.cos(lat)), v[1] / (meridian + alt)]
-    return _Surroundings(
+    return Surroundings(
         omega_ie + omega_en,
         2.0 * omega_ie + omega_en,
         swap(gravity_n(lat, alt)),
         jnp.stack(lonlat_rate),
     )
-
-
-def _check(slips: Collection[str]) -> None:
-    if isinstance(slips, str) or not SLIPS.keys() >= set(slips):
-        raise ValueError(f"slips = {slips!r}: wanted is a tuple of some of {tuple(SLIPS)}")
-    if "last-cross-term" in slips and "omitted-cross-term" in slips:
-        raise ValueError("the last cross term is either wrong or left out, not both")
 
 
 def _swap_dcm(C):

@@ -1,61 +1,64 @@
-"""The airship's navigation models: nine states as in the paper, and those that a product needs.
+"""The airship's navigation states, and how they and their errors move.
 
 The mean is the navigation state itself, so the estimate is fed back to the inertial navigation by
 construction, and the paper's nonlinear error model (40) (see `error_model`) is the difference of
-two such states. On top of the nine states of attitude, velocity and position there may be
+two such states. An error is true minus estimated, in the order of the tangent:
 
-- the error w of what is thought to be the wind, a Gauss-Markov process of the two level axes, and
-- the biases of gyros and accelerometers.
+    phi    rad      C_true = exp(phi x) C, seen in n     Nav: nine states, as in the paper
+    dv_n   m/s      north, east, down
+    dp     m        north, east, down
+    db_g   rad/s    bias of the gyros, body axes         InsState: fifteen
+    db_a   m/s^2    bias of the accelerometers
+    dw     m/s      north, east                          WithWind: two more on either
 
-With v_air the velocity through the air, in body axes, what is thought to be the wind should read
+The mean moves by the mechanisation (`robins.ins.mechanise`), its error by dx/dt = F x + G n as in
+Groves (2013), section 14.2, but with position in metres (`robins.ins.errors`). With C = C_b^n,
+f = C (f_b - b_a), w_c = 2 w_ie + w_en and a subscript for a derivative, w_in,v = d w_in / d v,
 
-    v_w,thought = [v - C_b^n v_air]_NE + w
+          phi        dv                    dp                   db_g  db_a  dw
+    F = [ -[w_in x]  -w_in,v               -w_in,p              -C    .     .      ]
+        [ -[f x]     [v x] w_in,v - [w_c x]  g_,p + [v x] w_c,p   .     -C    .      ]
+        [ .          I                     dp/dt_,p             .     .     .      ]
+        [ .          .                     .                    .     .     .      ]  db_g, db_a
+        [ .          .                     .                    .     .     -I/tau ]
 
-which is the constraint of the paper (22), made of data, so it is a sensor. The paper's own D (49)
-and d (50), and its measurement rows (44), are there as a literal option: see `measurement_rows`.
+    Q = G diag(q_g^2 I, q_a^2 I, 2 sigma^2/tau I) G',   G: -C into phi, -C into dv, I into dw.
+
+A step of a filter is an epoch; Phi and L, with Q = L L' over the step, are those of
+`robins.ins.transition`, or `walk` where there are no biases. H is in `instruments`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import _float64  # noqa: F401
-from robins.earth import earth_rate_n, transport_rate_n
-from robins.filters import Model, Motion, Sensor
+from robins.filters import Motion
+from robins.ins.frames import swap
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, step
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
-from robins.manifold import Angle, wrap
-from robins.rotation import Rotation
-
-SAR = "sar_barometer"  # of the paper's first local filter: one vector
-STAR = "star"
-STAR_EARLY = "star_early"  # the sights of an epoch but the last
-WIND, WIND_OF_STAR = "wind", "wind_of_star"  # the second is the same, for the other local filter
+from robins.systems.airship.parameters import Airship
+from robins.systems.airship.world import Course, start_sigma
 
 
-class WindNav(NamedTuple):
-    """Navigation state and the error of the wind: eleven components."""
+class WithWind(NamedTuple):
+    """A navigation state and the error of what is thought to be the wind."""
 
-    nav: Nav
-    wind_error: Array  # (2,) m/s north east, thought minus true
-
-
-class WindIns(NamedTuple):
-    """Navigation state, biases of the inertial unit and the error of the wind: seventeen."""
-
-    ins: InsState
+    base: Any  # Nav or InsState
     wind_error: Array  # (2,) m/s north east, thought minus true
 
     @property
     def nav(self) -> Nav:
         """Attitude, velocity and position alone."""
-        return self.ins.nav
+        return navigation(self.base)
 
 
 class WindNoise(NamedTuple):
@@ -65,85 +68,103 @@ class WindNoise(NamedTuple):
     time_s: Array  # ()
 
 
-class Datum(NamedTuple):
-    """Where horizontal positions are counted from, and the metres in a radian there."""
-
-    lat: Array
-    lon: Array
-    metres: Array  # (2,) of latitude, longitude
+def navigation(x: Any) -> Nav:
+    """Attitude, velocity and position of any state of this study."""
+    return x if isinstance(x, Nav) else x.nav
 
 
-class Early(NamedTuple):
-    """What sights before the end of an epoch need besides the state."""
-
-    turned_b: ArrayLike  # (S - 1, 3) rad, raw turn of the body from each to the end
-    age_s: ArrayLike  # (S - 1,)
+# ------------------------------------------------------------------------------ nine states
 
 
-class Air(NamedTuple):
-    """What the wind's reading needs besides the state."""
+def nine_states(noise: InsNoise) -> Motion:
+    """Motion of the paper's states, a `Nav`; input of a step: one increment.
 
-    v_air_b: ArrayLike  # (3,) m/s, body axes
-    sigma: ArrayLike  # (2,) m/s
-    wind: ArrayLike  # (2,) m/s north east, what is thought; only the paper's own form asks for it
-
-
-# ---------------------------------------------------------------------------------- the motion
+    Args:
+        noise: of gyros and accelerometers as believed, one number for the three axes of each.
+    """
+    return Motion(step, Partial(_noise, noise), Partial(_linear, noise))
 
 
-def walk(gyro_noise: ArrayLike, accel_noise: ArrayLike, dt: ArrayLike) -> Float[Array, "9 9"]:
-    """Noise factor of attitude, velocity and position over a step of constant white noise.
+def walk(noise: InsNoise, dt: ArrayLike) -> Float[Array, "9 9"]:
+    """Factor L of Q over a step of constant white noise.
 
-    Position and velocity as of a random walk of velocity, Q = q^2 [[dt, dt^2/2], [., dt^3/3]].
+    Attitude walks by itself, velocity and position as of a random walk of velocity,
+
+        Q_phi = q_g^2 dt I,   Q_v,p = q_a^2 [dt  dt^2/2; dt^2/2  dt^3/3] (x) I.
     """
     root, eye, zero = jnp.sqrt(jnp.asarray(dt)), jnp.eye(3), jnp.zeros((3, 3))
-    phi, v = (root * jnp.asarray(s) * eye for s in (gyro_noise, accel_noise))
+    phi, v = (root * jnp.asarray(s) * eye for s in (noise.gyro_arw, noise.accel_vrw))
     shift, own = 0.5 * dt * v, dt / jnp.sqrt(12.0) * v
     return jnp.block([[phi, zero, zero], [zero, v, zero], [zero, shift, own]])
 
 
-def _wind_step(noise: WindNoise, dt: Array) -> tuple[Array, Array]:
-    """Decay and driving sigma over a step."""
-    decay = jnp.exp(-dt / noise.time_s)
-    return decay, noise.sigma * jnp.sqrt(-jnp.expm1(-2.0 * dt / noise.time_s))
+def _noise(noise: InsNoise, x: Nav, block: Increments) -> Array:
+    return walk(noise, block.dt)
 
 
-def _step(x: Nav, block: Increments) -> Nav:
-    return step(x, block)
-
-
-def _step_wind(noise: WindNoise, x: WindNav, block: Increments) -> WindNav:
-    decay, _ = _wind_step(noise, jnp.asarray(block.dt))
-    return WindNav(step(x.nav, block), decay * x.wind_error)
-
-
-def _noise(spread: Array, x: Nav, block: Increments) -> Array:
-    return walk(spread[0], spread[1], block.dt)
-
-
-def _noise_wind(spread: Array, noise: WindNoise, x: WindNav, block: Increments) -> Array:
-    _, drive = _wind_step(noise, jnp.asarray(block.dt))
-    return _diagonal(walk(spread[0], spread[1], block.dt), drive * jnp.eye(2))
-
-
-def _linear(spread: Array, x: Nav, block: Increments):
-    """The step and its slope, which is that of a state whose biases nobody asks for."""
+def _linear(noise: InsNoise, x: Nav, block: Increments):
+    """The step and its slope, the first nine rows and columns of that of fifteen states."""
     one = jax.tree.map(lambda a: jnp.asarray(a, float)[None], block)
-    still = InsNoise(spread[0], spread[1])
-    zero = jnp.zeros(3)
-    new, Phi, _ = propagate_linear(InsState(*x, zero, zero), one, still, segments=1)
-    return new.nav, Phi[:9, :9], walk(spread[0], spread[1], block.dt)
+    new, Phi, _ = propagate_linear(InsState.start(x), one, noise, segments=1)
+    return new.nav, Phi[:9, :9], walk(noise, block.dt)
 
 
-def _linear_wind(spread: Array, noise: WindNoise, x: WindNav, block: Increments):
-    nav, Phi, L = _linear(spread, x.nav, block)
-    decay, drive = _wind_step(noise, jnp.asarray(block.dt))
-    eye = jnp.eye(2)
-    return (
-        WindNav(nav, decay * x.wind_error),
-        _diagonal(Phi, decay * eye),
-        _diagonal(L, drive * eye),
+# --------------------------------------------------------------------------- fifteen states
+
+
+def with_biases(noise: InsNoise) -> Motion:
+    """Motion of an `InsState`; input of a step: K increments."""
+    moved = Partial(propagate, noise=noise)
+    return Motion(moved, Partial(_noise_ins, noise), Partial(_linear_ins, noise))
+
+
+def _linear_ins(noise: InsNoise, x: InsState, block: Increments):
+    return propagate_linear(x, block, noise, segments=1)
+
+
+def _noise_ins(noise: InsNoise, x: InsState, block: Increments) -> Array:
+    return _linear_ins(noise, x, block)[2]
+
+
+# ---------------------------------------------------------------------- the error of the wind
+
+
+def with_wind(base: Motion, wind: WindNoise) -> Motion:
+    """A motion with two more states, `WithWind`.
+
+    The error of the wind is a stationary Gauss-Markov process: over a step of dt
+
+        w' = e^(-dt/tau) w + v,   E v v' = sigma^2 (1 - e^(-2 dt/tau)) I.
+    """
+    return Motion(
+        step=Partial(_step_wind, base, wind),
+        noise=Partial(_noise_wind, base, wind),
+        linear=Partial(_linear_wind, base, wind),
     )
+
+
+def _wind_step(wind: WindNoise, block: Increments) -> tuple[Array, Array]:
+    """Decay and driving sigma over a step."""
+    ratio = jnp.sum(jnp.asarray(block.dt)) / wind.time_s
+    return jnp.exp(-ratio), wind.sigma * jnp.sqrt(-jnp.expm1(-2.0 * ratio))
+
+
+def _step_wind(base: Motion, wind: WindNoise, x: WithWind, block: Increments) -> WithWind:
+    decay, _ = _wind_step(wind, block)
+    return WithWind(base.step(x.base, block), decay * x.wind_error)
+
+
+def _noise_wind(base: Motion, wind: WindNoise, x: WithWind, block: Increments) -> Array:
+    _, drive = _wind_step(wind, block)
+    return _diagonal(base.noise(x.base, block), drive * jnp.eye(2))
+
+
+def _linear_wind(base: Motion, wind: WindNoise, x: WithWind, block: Increments):
+    assert base.linear is not None
+    new, Phi, L = base.linear(x.base, block)
+    (decay, drive), eye = _wind_step(wind, block), jnp.eye(2)
+    new = WithWind(new, decay * x.wind_error)
+    return new, _diagonal(Phi, decay * eye), _diagonal(L, drive * eye)
 
 
 def _diagonal(a: Array, b: Array) -> Array:
@@ -151,127 +172,55 @@ def _diagonal(a: Array, b: Array) -> Array:
     return jnp.block([[a, corner], [jnp.zeros((b.shape[0], a.shape[1])), b]])
 
 
-def _step_ins(noise: InsNoise, wind: WindNoise, x: WindIns, block: Increments) -> WindIns:
-    decay, _ = _wind_step(wind, jnp.sum(jnp.asarray(block.dt)))
-    return WindIns(propagate(x.ins, block, noise), decay * x.wind_error)
+# ------------------------------------------------------------------------- what a filter believes
 
 
-def _linear_ins(noise: InsNoise, wind: WindNoise, x: WindIns, block: Increments):
-    ins, Phi, L = propagate_linear(x.ins, block, noise, segments=1)
-    decay, drive = _wind_step(wind, jnp.sum(jnp.asarray(block.dt)))
-    eye = jnp.eye(2)
-    new = WindIns(ins, decay * x.wind_error)
-    return new, _diagonal(Phi, decay * eye), _diagonal(L, drive * eye)
+ENU_OF_NED = np.kron(np.eye(3), swap(np.eye(3)))  # (9, 9) of attitude, velocity, position
 
 
-def _noise_ins(noise: InsNoise, wind: WindNoise, x: WindIns, block: Increments) -> Array:
-    return _linear_ins(noise, wind, x, block)[2]
+class States(NamedTuple):
+    """The states of a filter: how they are believed to move and begin, what they are of a run."""
+
+    motion: Callable[[Airship, Course], Motion]
+    # navigation, biases of gyros and accelerometers, error of the wind -> state
+    of: Callable[[Nav, Array, Array, Array], Any]
+    sigma: Callable[[Airship, Course], list[Any]]  # at the start, to be put end to end
+    # (9, 9) reported = this @ the first nine errors
+    reported: Callable[[Course], np.ndarray] = lambda course: ENU_OF_NED
+    in_parts: bool = False  # an epoch comes as several increments
 
 
-# --------------------------------------------------------------------------------- the sensors
+def believed_noise(given: Airship) -> InsNoise:
+    """Of filters of nine states, whose noise of velocity stands for the biases."""
+    return InsNoise(jnp.asarray(given.believed.gyro_noise), jnp.asarray(given.believed.accel_noise))
 
 
-def navigation(x: Any) -> Nav:
-    """Attitude, velocity and position of any state of this study."""
-    return x if isinstance(x, Nav) else x.nav
+def _wind(given: Airship) -> WindNoise:
+    return WindNoise(jnp.asarray(given.air_data.wind_error), jnp.asarray(given.air_data.wind_time))
 
 
-def read_sar(datum: Datum, x: Any, aux: Any) -> tuple[Array, Angle, Array]:
-    """Horizontal position from the datum [m, north east], heading, and height [m] (1,)."""
-    q_nb, _, p = navigation(x)
-    away = jnp.stack([p.lat - datum.lat, wrap(p.lon - datum.lon)])
-    return away * datum.metres, Angle(q_nb.as_euler()[2]), jnp.reshape(p.alt, (1,))
+def _product_motion(given: Airship, course: Course) -> Motion:
+    imu, factor = given.imu, given.believed.accel_noise_factor
+    noise = InsNoise(jnp.asarray(imu.gyro_noise), factor * jnp.asarray(imu.accel_noise))
+    return with_wind(with_biases(noise), _wind(given))
 
 
-def read_euler(x: Any, aux: Any) -> tuple[Angle, Angle, Angle]:
-    """Pitch, roll, heading."""
-    roll, pitch, heading = navigation(x).q_nb.as_euler()
-    return Angle(pitch), Angle(roll), Angle(heading)
-
-
-def read_early(x: WindIns, early: Early) -> tuple[Angle, ...]:
-    """Pitch, roll, heading at each of the early sights, one after the other.
-
-    The body is taken back by what the gyros felt since, and the navigation frame by its turn:
-    q(t - age) = exp(omega_in age) q(t) exp(-turned).
-    """
-    (q_nb, v_n, p), out = x.nav, ()
-    omega = earth_rate_n(p.lat) + transport_rate_n(p.lat, p.alt, v_n)
-    turned, age = jnp.asarray(early.turned_b), jnp.asarray(early.age_s)
-    for j in range(age.shape[0]):
-        turn = turned[j] - age[j] * x.ins.gyro_bias
-        q = Rotation.from_rotvec(omega * age[j]) @ q_nb @ Rotation.from_rotvec(-turn)
-        roll, pitch, heading = q.as_euler()
-        out = (*out, Angle(pitch), Angle(roll), Angle(heading))
-    return out
-
-
-def read_wind(x: Any, air: Air) -> Array:
-    """(2,) m/s north east, what should be thought to be the wind."""
-    q_nb, v_n, _ = navigation(x)
-    thought = (v_n - q_nb.apply(jnp.asarray(air.v_air_b)))[:2]
-    return thought + x.wind_error if hasattr(x, "wind_error") else thought
-
-
-def _air_sigma(x: Any, air: Air) -> Any:
-    return air.sigma
-
-
-class Sigmas(NamedTuple):
-    """Standard deviations of what the sensors read."""
-
-    sar: Array  # (4,) m north east, rad, m of height
-    euler: Array  # (3,) rad
-
-
-def sensors(datum: Datum, sigmas: Sigmas, early: int) -> tuple[Sensor, ...]:
-    """Sights before the end of an epoch, radar with barometer, stars, and wind for either local.
-
-    Args:
-        datum: of horizontal positions.
-        sigmas: believed.
-        early: sights of the stars in an epoch before the one at its end.
-    """
-    repeated = jnp.tile(sigmas.euler, early)
-    return (
-        Sensor(read_early, repeated, 3 * early, STAR_EARLY),
-        Sensor(Partial(read_sar, datum), sigmas.sar, 4, SAR),
-        Sensor(read_euler, sigmas.euler, 3, STAR),
-        Sensor(read_wind, _air_sigma, 2, WIND),
-        Sensor(read_wind, _air_sigma, 2, WIND_OF_STAR),
-    )
-
-
-def nine_states(gyro_noise: ArrayLike, accel_noise: ArrayLike, looks: tuple[Sensor, ...]) -> Model:
-    """The paper's states as `Nav`; input of a step: one increment.
-
-    Args:
-        gyro_noise: believed, rad/sqrt(s).
-        accel_noise: believed, m/s/sqrt(s).
-        looks: from `sensors`.
-    """
-    spread = jnp.stack([jnp.asarray(gyro_noise), jnp.asarray(accel_noise)])
-    return Model(Motion(_step, Partial(_noise, spread), Partial(_linear, spread)), looks)
-
-
-def wind_states(
-    gyro_noise: ArrayLike, accel_noise: ArrayLike, wind: WindNoise, looks: tuple[Sensor, ...]
-) -> Model:
-    """With two states for the error of the wind, as `WindNav`; input as of `nine_states`."""
-    spread = jnp.stack([jnp.asarray(gyro_noise), jnp.asarray(accel_noise)])
-    motion = Motion(
-        step=Partial(_step_wind, wind),
-        noise=Partial(_noise_wind, spread, wind),
-        linear=Partial(_linear_wind, spread, wind),
-    )
-    return Model(motion, looks)
-
-
-def product_states(noise: InsNoise, wind: WindNoise, looks: tuple[Sensor, ...]) -> Model:
-    """With biases too, as `WindIns`; input of a step: K increments."""
-    motion = Motion(
-        step=Partial(_step_ins, noise, wind),
-        noise=Partial(_noise_ins, noise, wind),
-        linear=Partial(_linear_ins, noise, wind),
-    )
-    return Model(motion, looks)
+NINE = States(
+    lambda given, course: nine_states(believed_noise(given)),
+    lambda nav, gyro, accel, wind: nav,
+    lambda given, course: [start_sigma(given)],
+)
+WIND_STATES = States(
+    lambda given, course: with_wind(nine_states(believed_noise(given)), _wind(given)),
+    lambda nav, gyro, accel, wind: WithWind(nav, wind),
+    lambda given, course: [start_sigma(given), np.full(2, given.air_data.wind_error)],
+)
+PRODUCT = States(
+    _product_motion,
+    lambda nav, gyro, accel, wind: WithWind(InsState(*nav, gyro, accel), wind),
+    lambda given, course: [
+        *(start_sigma(given), given.imu.gyro_bias, given.imu.accel_bias),
+        np.full(2, given.air_data.wind_error),
+    ],
+    in_parts=True,
+)

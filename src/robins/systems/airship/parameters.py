@@ -11,34 +11,33 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Share, Span, default
-from robins.systems.parts import Names, Runs, refuse_too_long
+from robins.systems.parts import Names, Place, Runs, Three, refuse_too_long
 from robins.systems.study import Scenario
 
-Three = tuple[float, float, float]
 Draw = Literal["plus-sigma", "random-sign", "normal"]
+Rate = Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")]
+Time = Annotated[float, Quantity("time", above="0 s")]
+Speed = Annotated[float, Quantity("speed", least="0 m/s")]
+SpeedSigma = Annotated[float, Quantity("speed", above="0 m/s")]
+Length = Annotated[float, Quantity("length", above="0 m")]
+Angles = Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
 
 
-class Place(Parameters):
+class Position(Place):
     """Where the flight begins."""
 
-    latitude: Annotated[float, Quantity("angle", least="-89 deg", most="89 deg")]
-    longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
     height: Annotated[float, Quantity("length", least="0 m", most="100 km")]
 
 
 class Hull(Parameters):
     """How the airship moves: a velocity through the air, and how fast it is carried along."""
 
-    air_speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("10 m/s")
+    air_speed: Speed = default("10 m/s")
     course: Annotated[float, Quantity("angle")] = default("90 deg")
-    response: Annotated[float, Quantity("time", above="0 s")] = default("20 s")
+    response: Time = default("20 s")
     # amplitudes of roll, pitch and heading, and the periods of their sines
-    sway_calm: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "0.3 deg"
-    )
-    sway_gust: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "2.3 deg"
-    )
+    sway_calm: Angles = default("0.3 deg")
+    sway_gust: Angles = default("2.3 deg")
     sway_period: Annotated[Three, Quantity("time", above="0 s")] = default("60 s")
 
 
@@ -47,7 +46,7 @@ class Gusts(Parameters):
 
     speed: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
     spread: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default("45 deg")
-    every: Annotated[float, Quantity("time", above="0 s")] = default("10 s")
+    every: Time = default("10 s")
 
 
 class Turbulence(Parameters):
@@ -56,17 +55,22 @@ class Turbulence(Parameters):
     spectrum: Literal["dryden", "von-karman"]
     sigma: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
     length: Annotated[tuple[float, float], Quantity("length", above="0 m")] = default("533 m")
-    step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+    step: Time = default("0.1 s")
 
 
 class Wind(Parameters):
     """Wind that always blows, and what comes on top within `span`."""
 
-    constant: Annotated[float, Quantity("speed", least="0 m/s")] = default("10 m/s")
+    constant: Speed = default("10 m/s")
     towards: Annotated[float, Quantity("angle")] = default("90 deg")
     span: Span = Span(begin=200.0, end=800.0)
     gusts: Gusts | None = None
     turbulence: Turbulence | None = None
+
+    @property
+    def gusty(self) -> bool:
+        """Whether anything comes on top."""
+        return self.gusts is not None or self.turbulence is not None
 
     @pydantic.model_validator(mode="after")
     def _steps_fit(self) -> Wind:
@@ -82,7 +86,7 @@ class Wind(Parameters):
 class Imu(Parameters):
     """The inertial unit; biases are constant in a run."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("100 Hz")
+    rate: Rate = default("100 Hz")
     gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")] = default("0.1 deg/h")
     gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
         "0.01 deg/sqrt(h)"
@@ -96,56 +100,56 @@ class Imu(Parameters):
     unsensed: Share = 0.0
 
 
-class Sar(Parameters):
+class Readings(Parameters):
+    """What every instrument but the inertial unit has: how often it reads, when it is lost."""
+
+    rate: Rate = default("1 Hz")
+    lost: tuple[Span, ...] = ()
+
+
+class Sar(Readings):
     """Horizontal position and heading from a radar image matched with a map."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
-    position: Annotated[float, Quantity("length", above="0 m")] = default("25 m")  # each axis
+    position: Length = default("25 m")  # each axis
     heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
     outlier_share: Share = 0.0
     outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 5.0
-    lost: tuple[Span, ...] = ()
 
 
-class Barometer(Parameters):
+class Barometer(Readings):
     """Height from static pressure."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
-    height: Annotated[float, Quantity("length", above="0 m")] = default("20 m")
-    lost: tuple[Span, ...] = ()
+    height: Length = default("20 m")
 
 
-class Star(Parameters):
+class Star(Readings):
     """Pitch, roll and heading from stars, once an epoch or several times."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("2 Hz")
+    rate: Rate = default("2 Hz")
     attitude: Annotated[float, Quantity("angle", above="0 arcsec", most="180 deg")] = default(
         "20 arcsec"
     )
-    lost: tuple[Span, ...] = ()
 
 
-class AirData(Parameters):
+class AirData(Readings):
     """Velocity through the air, and what is thought to be the wind: both err."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("1 Hz")
-    noise: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")  # each axis
-    wind_error: Annotated[float, Quantity("speed", above="0 m/s")] = default("0.3 m/s")
-    wind_time: Annotated[float, Quantity("time", above="0 s")] = default("50 s")
-    lost: tuple[Span, ...] = ()
+    noise: SpeedSigma = default("0.3 m/s")  # each axis
+    wind_error: SpeedSigma = default("0.3 m/s")
+    wind_time: Time = default("50 s")
 
 
 class Start(Parameters):
     """What is not known at the start, in north, east, down; one standard deviation."""
 
-    attitude: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
+    attitude: Angles
     velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0.1 m/s")
     position: Annotated[Three, Quantity("length", least="0 m")]
     draw: Draw = "plus-sigma"
 
 
-class Believed(Parameters):
-    """Noise that the filters of nine states believe in, for want of states for the biases.
+class BelievedNoise(Parameters):
+    """Noise of the inertial unit that filters of nine states believe, for want of bias states.
 
     The product believes the noise of the inertial unit, times `accel_noise_factor` where the hull
     bends or the unit sits off the centre.
@@ -160,34 +164,22 @@ class Believed(Parameters):
     accel_noise_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 1.0
 
 
-FILTERS = (
-    *("ekf", "aekf", "ukf", "raukf"),
-    *("cukf-hard", "cukf-soft", "cukf-wind-states", "cukf-exact", "cukf-printed", "cukf-robust"),
-    *("cukf-master", "cukf-identity", "cukf-unprojected", "cukf-wind-known", "cukf-sideslip"),
-    *("cukf-hard-gated", "cukf-soft-gated", "cukf-wind-known-gated", "cukf-sideslip-gated"),
-    "ukf-printed-h",
-    *("centralised", "centralised-errors", "federated", "intersection"),
-    *("distributed-mean", "distributed-full"),
-    "product",
-)
-"""Every filter of the study."""
-
 COMPARED = ("ekf", "aekf", "ukf", "raukf", "cukf-wind-states", "cukf-robust", "product")
 """Those that a scenario compares unless it says otherwise."""
 
 
-class Airship(Scenario, Parameters):
+class Airship(Scenario):
     """An airship in the wind, navigated by SINS, stars, radar, barometer and air data."""
 
     system: Literal["airship"] = "airship"
     title: str = "Airship in the wind"
     runs: Runs = 20
     filters: Names = COMPARED
-    claims: tuple[str, ...] = ()  # ids of those the scenario checks
-    duration: Annotated[float, Quantity("time", above="0 s")] = default("1000 s")
-    epoch: Annotated[float, Quantity("time", above="0 s")] = default("1 s")  # step of the filters
+    claims: tuple[str, ...] | None = ()  # ids of those the scenario checks
+    duration: Time = default("1000 s")
+    epoch: Time = default("1 s")  # step of the filters
     counted: Span = Span(begin=200.0, end=800.0)  # figures pooled over time are of this span
-    place: Place
+    place: Position
     hull: Hull = pydantic.Field(default_factory=Hull)
     wind: Wind = pydantic.Field(default_factory=Wind)
     imu: Imu = pydantic.Field(default_factory=Imu)
@@ -196,7 +188,7 @@ class Airship(Scenario, Parameters):
     star: Star = pydantic.Field(default_factory=Star)
     air_data: AirData = pydantic.Field(default_factory=AirData)
     start: Start
-    believed: Believed = pydantic.Field(default_factory=Believed)
+    believed: BelievedNoise = pydantic.Field(default_factory=BelievedNoise)
 
     @pydantic.model_validator(mode="after")
     def _rates_fit(self) -> Airship:
@@ -209,7 +201,8 @@ class Airship(Scenario, Parameters):
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
                 of = "star.rate" if name == "imu" else "that of the epochs"
                 raise ValueError(f"{name}.rate must be a multiple of {of}, {among:g} Hz")
-        for name in ("sar", "barometer", "air_data"):
+        others = (name for name, of in self if isinstance(of, Readings) and name != "star")
+        for name in others:  # read at the end of an epoch
             ratio = 1.0 / (self.epoch * getattr(self, name).rate)
             if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
                 raise ValueError(

@@ -1,9 +1,10 @@
-"""An airship in the wind: its motion, and what its sensors make of it.
+"""An airship in the wind: its motion, its inertial unit, and one run of all instruments.
 
 A mass without much inertia of its own: it is carried by the wind, towards which its velocity
-settles with a time constant, and holds a course through the air, so in a gust it drifts sideways.
-The motion gives the increments that an ideal inertial unit would report; the truth is what the
-mechanisation makes of these, so that an error-free unit navigates to it exactly.
+settles with a time constant, dv/dt = (v_air + w - v) / T, and holds a course through the air, so in
+a gust it drifts sideways. The motion gives the increments that an ideal inertial unit would report;
+the truth is what the mechanisation makes of these, so that an error-free unit navigates to it
+exactly.
 
 The paper says nothing of the dynamics (time constant, sway); they are assumptions of the
 specification, and parameters here.
@@ -12,7 +13,7 @@ specification, and parameters here.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -27,17 +28,15 @@ from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments
 from robins.ins.joined import joined
 from robins.ins.mechanise import Nav, mechanise
-from robins.rotation import Rotation, conjugate, from_euler, rotate, to_euler
-from robins.sim.air_data import observe_air, wind_estimate_error
-from robins.sim.barometer import observe_height
+from robins.rotation import Rotation, conjugate, from_euler, rotate
+from robins.sim.air_data import wind_estimate_error
 from robins.sim.ideal_imu import increments_between
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
-from robins.sim.sar import SarErrorModel, observe_sar
-from robins.sim.star_tracker import observe_euler
 from robins.sim.turbulence import dryden, von_karman
 from robins.sim.wind import Carried, carried_at, carry, gusts, wind_at
-from robins.systems.airship.parameters import AirData, Airship, Barometer, Draw, Sar, Star
+from robins.systems.airship.parameters import Airship, Draw, Readings
+from robins.systems.study import Instrument
 
 PARTS = 2  # increments between two star sights that a filter with states for biases takes
 _BLEND_S = 20.0  # over which sway grows when gusts set in
@@ -45,47 +44,54 @@ _BLEND_S = 20.0  # over which sway grows when gusts set in
 # Streams folded into the keys of a run; part of the file format, as `Component` is.
 _GUSTS, _TURBULENCE = 0, 1  # of the wind
 _BIASES, _SAMPLES = 0, 1  # of the inertial unit
-_AIR, _WIND_ERROR = 0, 1  # of the air data
+AIR, WIND_ERROR = 0, 1  # of the air data
+
+
+class Datum(NamedTuple):
+    """Where horizontal positions are counted from, and the metres in a radian there."""
+
+    lat: Array
+    lon: Array
+    metres: Array  # (2,) of latitude, longitude
 
 
 class Course(NamedTuple):
     """What all runs share."""
 
     epoch_s: np.ndarray  # (E,)
-    sights: int  # S, of the stars in an epoch, the last at its end
+    sight_s: np.ndarray  # (E S,) of the stars, S in an epoch, the last at its end
     samples: int  # of the inertial unit between two of them
     parts: int  # a divisor of that
     start: Nav
-    metres_per_radian: np.ndarray  # (2,) of latitude and longitude, at the start
-    sar: np.ndarray  # (E,) bool, whether there is a fix; likewise below
-    barometer: np.ndarray
-    air_data: np.ndarray
-    star: np.ndarray  # (E, S)
+    datum: Datum  # the start
+
+    @property
+    def sights(self) -> int:
+        """S."""
+        return len(self.sight_s) // len(self.epoch_s)
 
 
 class World(NamedTuple):
-    """One run; E epochs, NED/FRD. Measurements are NaN where there is none."""
+    """One run; E epochs, NED/FRD."""
 
     whole: Increments  # (E,), (E, 3) as reported, one for an epoch
     parts: Increments  # (E, K), (E, K, 3) the same in K parts
     since: Array  # (E, S - 1, 3) rad, turn as reported from each early sight to the epoch's end
+    path: Nav  # (E S,) true, at each sight of the stars
     truth: Nav  # (E,) at the end of each epoch
     start: Nav  # true, at time zero
     initial_error: Array  # (9,) true = retract(estimate, error)
     gyro_bias: Array  # (3,) rad/s
     accel_bias: Array  # (3,) m/s^2
     wind: Array  # (E, 2) m/s, north east, true
+    steady_wind: Array  # (2,) m/s, the part of it that always blows
     wind_error: Array  # (E, 2) m/s, of what is thought to be the wind: thought minus true
     air_b: Array  # (E, 3) m/s, true velocity through the air, body axes
-    air_measured_b: Array  # (E, 3) m/s
-    sar_position: Geodetic  # (E,) height without meaning
-    sar_heading: Array  # (E,) rad
-    height: Array  # (E,) m
-    euler: Array  # (E, S, 3) rad, pitch, roll, heading by the stars
+    readings: dict[str, Any]  # of each instrument, leading axis E; NaN where there is none
 
 
 def lay_out(given: Airship) -> Course:
-    """Epochs, the start and who measures when, in NumPy.
+    """Epochs, sights of the stars and the start, in NumPy.
 
     Raises:
         ValueError: the flight is shorter than two epochs.
@@ -96,9 +102,7 @@ def lay_out(given: Airship) -> Course:
             f"duration {given.duration:g} s holds {count} epoch(s) of {given.epoch:g} s: two at "
             "least are wanted"
         )
-    epoch_s = given.epoch * np.arange(1, count + 1)
-    sights = round(given.star.rate * given.epoch)
-    sight_s = np.arange(1, count * sights + 1) / given.star.rate
+    sights = count * round(given.star.rate * given.epoch)
     place = given.place
     still = given.wind.constant * _towards(given.wind.towards)
     velocity = still + given.hull.air_speed * _towards(given.hull.course)
@@ -111,17 +115,14 @@ def lay_out(given: Airship) -> Course:
     )
     samples = round(given.imu.rate / given.star.rate)
     north, east = meridian + place.height, transverse + place.height
+    metres = jnp.array([north, east * math.cos(place.latitude)])
     return Course(
-        epoch_s=epoch_s,
-        sights=sights,
+        epoch_s=given.epoch * np.arange(1, count + 1),
+        sight_s=np.arange(1, sights + 1) / given.star.rate,
         samples=samples,
         parts=max(k for k in range(1, PARTS + 1) if samples % k == 0),
         start=start,
-        metres_per_radian=np.array([north, east * math.cos(place.latitude)]),
-        sar=_present(epoch_s, given.epoch, given.sar),
-        barometer=_present(epoch_s, given.epoch, given.barometer),
-        air_data=_present(epoch_s, given.epoch, given.air_data),
-        star=_present(sight_s, 1.0 / given.star.rate, given.star).reshape(count, sights),
+        datum=Datum(start.position.lat, start.position.lon, metres),
     )
 
 
@@ -129,13 +130,11 @@ def _towards(direction: float) -> np.ndarray:
     return np.array([math.cos(direction), math.sin(direction)])
 
 
-def _present(
-    time_s: np.ndarray, step_s: float, sensor: Sar | Barometer | AirData | Star
-) -> np.ndarray:
-    """Whether a sensor is there at times: at its own rate, and not where it is lost."""
-    every = round(1.0 / (step_s * sensor.rate))
+def present(time_s: np.ndarray, instrument: Readings) -> np.ndarray:
+    """Whether an instrument reads at times: at its own rate, and not where it is lost."""
+    every = round(1.0 / (time_s[0] * instrument.rate))  # the first step is as long as all
     there = (np.arange(1, len(time_s) + 1) % every) == 0
-    for span in sensor.lost:
+    for span in instrument.lost:
         there &= ~span.holds(time_s)
     return there
 
@@ -143,13 +142,12 @@ def _present(
 def _attitude(given: Airship, time_s: Any):
     """Roll, pitch, heading [rad] at times, NumPy or JAX: sines that grow in gusts."""
     hull, wind = given.hull, given.wind
-    gusty = wind.gusts is not None or wind.turbulence is not None
     xp = np if isinstance(time_s, np.ndarray) else jnp
 
     def rise(at: float):
         return 0.5 * (1.0 + xp.tanh((time_s - at) / (0.5 * _BLEND_S)))
 
-    share = rise(wind.span.begin) - rise(wind.span.end) if gusty else 0.0 * time_s
+    share = rise(wind.span.begin) - rise(wind.span.end) if wind.gusty else 0.0 * time_s
     out = []
     for i, mean in enumerate((0.0, 0.0, hull.course)):
         size = hull.sway_calm[i] + share * (hull.sway_gust[i] - hull.sway_calm[i])
@@ -160,39 +158,28 @@ def _attitude(given: Airship, time_s: Any):
 
 def blow(given: Airship, key: Array) -> tuple[Array, float]:
     """Wind held over steps: (M, 2) m/s north east, and the length of a step [s]."""
-    wind = given.wind
-    step = given.duration
-    if wind.gusts is not None:
-        step = wind.gusts.every
-    if wind.turbulence is not None:
-        step = wind.turbulence.step
-    count = math.ceil(given.duration / step - 1e-9)
-    total = jnp.broadcast_to(jnp.asarray(wind.constant * _towards(wind.towards)), (count, 2))
-    begin, end = wind.span.begin, wind.span.end
-    if wind.gusts is not None:
-        g = wind.gusts
-        coarse = math.ceil(given.duration / g.every - 1e-9)
-        drawn = gusts(
-            jax.random.fold_in(key, _GUSTS),
-            coarse,
-            begin,
-            end,
-            g.every,
-            g.speed,
-            (wind.towards, g.spread),
-        )
+    wind, g, t = given.wind, given.wind.gusts, given.wind.turbulence
+    step = t.step if t is not None else g.every if g is not None else given.duration
+    count, begin, end = _steps(given, step), wind.span.begin, wind.span.end
+    towards = _towards(wind.towards)
+    total = jnp.broadcast_to(jnp.asarray(wind.constant * towards), (count, 2))
+    if g is not None:
+        own, to = jax.random.fold_in(key, _GUSTS), (wind.towards, g.spread)
+        drawn = gusts(own, _steps(given, g.every), begin, end, g.every, g.speed, to)
         total = total + jnp.repeat(drawn, round(g.every / step), axis=0)[:count]
-    if wind.turbulence is not None:
-        t = wind.turbulence
+    if t is not None:
         shape = dryden if t.spectrum == "dryden" else von_karman
         own = jax.random.fold_in(key, _TURBULENCE)
         along_across = shape(own, count, step, given.hull.air_speed, t.sigma, t.length)
-        towards = _towards(wind.towards)
         turn = jnp.asarray(np.stack([towards, [-towards[1], towards[0]]]))
         time = step * jnp.arange(count, dtype=float)
         inside = (time >= begin) & (time < end)
         total = total + jnp.where(inside[:, None], along_across @ turn, 0.0)
     return total, step
+
+
+def _steps(given: Airship, step_s: float) -> int:
+    return math.ceil(given.duration / step_s - 1e-9)
 
 
 def signed(key: Array, size: Any, draw: Draw) -> Array:
@@ -209,19 +196,18 @@ def _desired(given: Airship, course: Course, carried: Carried, time_s: Float[Arr
     velocity, moved, _ = carried_at(carried, time_s)
     zero = jnp.zeros_like(time_s)
     start = course.start.position
-    lat, lon = (
-        at + moved[:, i] / course.metres_per_radian[i]
-        for i, at in enumerate((start.lat, start.lon))
-    )
+    north, east = (moved[:, i] / course.datum.metres[i] for i in range(2))
     return Nav(
         Rotation(from_euler(*_attitude(given, time_s))),
         jnp.stack([velocity[:, 0], velocity[:, 1], zero], 1),
-        Geodetic(lat, lon, zero + start.alt),
+        Geodetic(start.lat + north, start.lon + east, zero + start.alt),
     )
 
 
-def simulate(given: Airship, course: Course, seed: int, index: Array) -> World:
-    """One run, from its number, which may be traced; pure."""
+def simulate(
+    instruments: Sequence[Instrument], given: Airship, course: Course, seed: int, index: Array
+) -> World:
+    """One run of all instruments, from its number, which may be traced; pure."""
     key = partial(stream, seed, index)
     wind, step = blow(given, key(Component.WIND))
     commanded = jnp.asarray(given.hull.air_speed * _towards(given.hull.course))
@@ -265,65 +251,37 @@ def simulate(given: Airship, course: Course, seed: int, index: Array) -> World:
     single = jax.tree.map(by_epoch, single)
     truth = jax.tree.map(lambda x: by_epoch(x)[:, -1], path)
     blown = wind_at(wind, step, jnp.asarray(course.epoch_s) - 1e-6)  # as the epoch ends
-    return World(
+    through = jnp.concatenate([truth.v_n[:, :2] - blown, truth.v_n[:, 2:]], 1)
+    a, of_wind = given.air_data, jax.random.fold_in(key(Component.AIR_DATA), WIND_ERROR)
+    world = World(
         whole=jax.vmap(joined)(single),
         parts=parts,
         since=_turned_since(single),
+        path=path,
         truth=truth,
         start=jax.tree.map(jnp.asarray, course.start),
         initial_error=signed(key(Component.INITIAL_STATE), start_sigma(given), given.start.draw),
         gyro_bias=gyro_bias,
         accel_bias=accel_bias,
         wind=blown,
-        euler=by_epoch(_sighted(given, course, key, path)),
-        **_sensed(given, course, key, truth, blown),
+        steady_wind=jnp.asarray(given.wind.constant * _towards(given.wind.towards)),
+        wind_error=wind_estimate_error(of_wind, count, given.epoch, a.wind_error, a.wind_time),
+        air_b=rotate(conjugate(truth.q_nb.wxyz), through),
+        readings={},
     )
+    drawn = {i.name: i.measure(given, course, key, world) for i in instruments if i.measure}
+    return world._replace(readings=drawn)
 
 
 def _turned_since(single: Increments) -> Array:
     """Turn from each early sight of an epoch to its end, (E, S - 1, 3), from (E, S) increments."""
     sights = single.dt.shape[1]
-    rest = [
-        jax.vmap(joined)(jax.tree.map(lambda x, j=j: x[:, j:], single)).theta
-        for j in range(1, sights)
-    ]
+    late = (jax.tree.map(lambda x, j=j: x[:, j:], single) for j in range(1, sights))
+    rest = [jax.vmap(joined)(block).theta for block in late]
     return jnp.stack(rest, 1) if rest else jnp.zeros((single.dt.shape[0], 0, 3))
-
-
-def _sighted(given: Airship, course: Course, key: Callable[[Component], Array], path: Nav) -> Array:
-    """Angles by the stars along the path."""
-    there, sigma = jnp.asarray(course.star).reshape(-1), jnp.full(3, given.star.attitude)
-    return observe_euler(key(Component.STAR_SENSOR), path.q_nb.wxyz, sigma, there)
 
 
 def start_sigma(given: Airship) -> np.ndarray:
     """(9,) of attitude, velocity and position."""
     s = given.start
     return np.array([*s.attitude, *s.velocity, *s.position])
-
-
-def _sensed(
-    given: Airship, course: Course, key: Callable[[Component], Array], truth: Nav, wind: Array
-) -> dict[str, Any]:
-    """What the sensors other than the inertial unit report, and how the air data err."""
-    q, v_n, position = truth.q_nb.wxyz, truth.v_n, truth.position
-    through = jnp.concatenate([v_n[:, :2] - wind, v_n[:, 2:]], 1)
-    air_b = rotate(conjugate(q), through)
-    air, a, s = key(Component.AIR_DATA), given.air_data, given.sar
-    sar, barometer, air_data = (
-        jnp.asarray(there) for there in (course.sar, course.barometer, course.air_data)
-    )
-    model = SarErrorModel(s.position, s.heading, s.outlier_share, s.outlier_factor)
-    fix = observe_sar(model, key(Component.SAR), position, to_euler(q)[2], sar)
-    count, step = len(course.epoch_s), given.epoch
-    of_wind = jax.random.fold_in(air, _WIND_ERROR)
-    return {
-        "wind_error": wind_estimate_error(of_wind, count, step, a.wind_error, a.wind_time),
-        "air_b": air_b,
-        "air_measured_b": observe_air(jax.random.fold_in(air, _AIR), air_b, a.noise, air_data),
-        "sar_position": fix.position,
-        "sar_heading": fix.heading_rad,
-        "height": observe_height(
-            key(Component.BAROMETER), position.alt, given.barometer.height, barometer
-        ),
-    }
