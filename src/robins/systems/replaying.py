@@ -47,7 +47,7 @@ class Piece:
     noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
-Prepared = TypeVar("Prepared", bound=Piece)
+PieceT = TypeVar("PieceT", bound=Piece)
 
 
 class Answer(NamedTuple):
@@ -70,7 +70,7 @@ class Reported(NamedTuple):
     sensors: Mapping[str, SensorAxes]
     # mean, leading axis E -> (E, k) estimates by block, and "euler": roll, pitch, heading [rad]
     estimates: Callable[[Any], Mapping[str, Any]]
-    causes: str  # the sentence on what is mostly behind it where a replay is to be doubted
+    causes: str  # the sentence on the likely causes, said where there is a warning
     # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
     # cautious side, so that small innovations say nothing
     assumed: Collection[str] = ()
@@ -84,8 +84,8 @@ def prepared(
     time_s: np.ndarray,
     dt_s: np.ndarray,
     longest_gap_s: float,
-    prepare: Callable[[slice], Prepared],
-) -> tuple[list[Prepared], list[str]]:
+    prepare: Callable[[slice], PieceT],
+) -> tuple[list[PieceT], list[str]]:
     """The pieces of a log that can be run, and a sentence on each that cannot.
 
     Args:

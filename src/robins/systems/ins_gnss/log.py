@@ -18,6 +18,7 @@ import numpy as np
 from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.earth import Geodetic, gravity
+from robins.filters import Belief
 from robins.ins.alignment import level
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
 from robins.ins.frames import to_ned_frd
@@ -261,17 +262,23 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     )
 
 
-def _belief(log: Log, start: StartPoint, parameters: Replay) -> Any:
+def _belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
     """At the first fix, moved from the antenna to the IMU."""
-    g, row, told = log.gnss, start.fix, parameters.start
+    g, row = log.gnss, start.fix
     v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[row])
     antenna = Geodetic(*(jnp.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
     q_nb = Rotation(jnp.asarray(start.q_nb))
     arm = q_nb.apply(np.asarray(parameters.gnss.lever_arm))
     position = antenna.retract(-arm + jnp.asarray(v * parameters.gnss.latency))
     nav = Nav(q_nb, jnp.asarray(v), position)
-    sigmas = start.tilt_sigma_rad, told.heading
-    return model.start_belief(nav, parameters.imu, told, *sigmas, gyro_bias=start.gyro_bias)
+    return model.start_belief(
+        nav,
+        parameters.imu,
+        parameters.start,
+        tilt_rad=start.tilt_sigma_rad,
+        heading_rad=parameters.start.heading,
+        gyro_bias=start.gyro_bias,
+    )
 
 
 def _fixes(
