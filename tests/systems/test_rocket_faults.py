@@ -1,6 +1,5 @@
 """What the rocket's filters make of bad samples, lost sensors and scenarios that cannot be."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,15 +14,11 @@ from robins.filters.rules.discriminator import Verdict
 from robins.rotation import Rotation
 from robins.scenario import ScenarioError
 from robins.systems.rocket import SYSTEM
-from robins.systems.rocket.angle_contender import angle_contender
 from robins.systems.rocket.angles import GYRO, MAGNETIC
-from robins.systems.rocket.field import FIELD, FieldState
+from robins.systems.rocket.field import FIELD, FieldState, plausible
 from robins.systems.rocket.field import Turn as Turned
-from robins.systems.rocket.field_contender import plausible
-from robins.systems.rocket.filters import PATIENCE, Sight
 from robins.systems.rocket.parameters import FieldVector, MagneticAttitude
-from robins.systems.rocket.problem import field_problem
-from robins.systems.rocket.world import lay_out, simulate
+from robins.systems.rocket.study import FIELD_VECTOR, MAGNETIC_ATTITUDE, PATIENCE
 
 DEG = np.pi / 180.0
 AT = 150  # the sample that is bad, or the first of them
@@ -82,10 +77,10 @@ class Flight(NamedTuple):
 
 def turned_away(world, field_n):
     """The measured field turned by 40 deg about an axis across it, from a sample to the end."""
-    body = Turn.from_quat(np.array(world.q_nb), scalar_first=True).inv().apply(field_n)
+    body = Turn.from_quat(np.array(world.q_nb[1:]), scalar_first=True).inv().apply(field_n)
     across = np.cross(body, [1.0, 0.0, 0.0])
     across *= 40 * DEG / np.linalg.norm(across, axis=1, keepdims=True)
-    z = np.array(world.field_b)
+    z = np.array(world.y[FIELD])
     z[AT:] = Turn.from_rotvec(across[AT:]).apply(z[AT:])
     return z
 
@@ -101,9 +96,9 @@ IMPOSSIBLE = ("nan", "one axis", "inf", "-inf", "zero", "denormal", "weak", "str
 
 @pytest.fixture(scope="module", name="flight")
 def of_the_field():
-    problem = field_problem(parsed(FieldVector, "b4"), ("gate", "discriminator"), 0)
+    problem = FIELD_VECTOR.problem(parsed(FieldVector, "b4"), ("gate", "discriminator"), 0)
     world = jax.jit(problem.simulate)(0)
-    good = np.array(world.field_b)
+    good = np.array(world.y[FIELD])
     field_n = np.array(problem.context["field_n"])
     unit = good[AT] * np.linalg.norm(field_n[AT]) / np.linalg.norm(good[AT])
     one_axis, stopped = good[AT].copy(), good[AT].copy()
@@ -115,11 +110,11 @@ def of_the_field():
         cases[case] = good.copy()
         cases[case][AT] = row
     cases["turned"] = turned_away(world, field_n)
-    worlds = [world._replace(field_b=jnp.asarray(z)) for z in cases.values()]
-    worlds.append(world._replace(theta=world.theta.at[AT : AT + 10].set(jnp.nan)))
+    worlds = [world._replace(y={FIELD: jnp.asarray(z)}) for z in cases.values()]
+    worlds.append(world._replace(theta_b=world.theta_b.at[AT : AT + 10].set(jnp.nan)))
     up, way = direction_of(field_n[0])
     along = (f'body.elevation="{up} deg"', f'body.azimuth="{way} deg"', 'body.cone="0 deg"')
-    spinning = field_problem(parsed(FieldVector, "b4", *along), (), 0)
+    spinning = FIELD_VECTOR.problem(parsed(FieldVector, "b4", *along), (), 0)
     worlds.append(jax.jit(spinning.simulate)(0))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
     gated = found(problem.contenders["gate"], stacked)
@@ -274,25 +269,24 @@ def test_a_covariance_that_is_none_cannot_be_believed(row, column, value):
 
 LOST = {"gyro": (True, False), "magnetometer": (False, True), "both": (True, True)}
 TAKEN = slice(80, 150)
-SHARES = ((0.7, 0.3, 0.5, 0.8, 0.4, 0.2), (0.3, 0.7, 0.5, 0.2, 0.6, 0.8))  # of gyro, magnetometer
 
 
 @pytest.fixture(scope="module", name="dropped")
 def of_lost_sensors():
     """The two filters that are one, with each sensor lost for 7 s, and with both."""
-    given = parsed(MagneticAttitude, "a8")
-    course = lay_out(given)
-    world = jax.jit(partial(simulate, given, course, 0))(0)
-    time = np.arange(len(course.time_s))
-    gone = np.array([(time >= TAKEN.start) & (time < TAKEN.stop)])
+    names = ("ukf", "federated-root")
+    problem = MAGNETIC_ATTITUDE.problem(parsed(MagneticAttitude, "a8"), names, 0)
+    world = jax.jit(problem.simulate)(0)
 
-    def without(no_gyro, no_magnet):
-        hide = lambda x, no: jnp.where((gone[0] & no)[:, None], jnp.nan, x)  # noqa: E731
-        return world._replace(rate=hide(world.rate, no_gyro), angles=hide(world.angles, no_magnet))
+    def without(*lost):
+        y = dict(world.y)
+        for name, no in zip((GYRO, MAGNETIC), lost, strict=True):
+            if no:
+                y[name] = jax.tree.map(lambda x: x.at[TAKEN].set(jnp.nan), y[name])
+        return world._replace(y=y)
 
     worlds = jax.tree.map(lambda *x: jnp.stack(x), *(without(*one) for one in LOST.values()))
-    names = ("ukf", "federated-root")
-    return {name: found(angle_contender(given, name, Sight(SHARES)), worlds) for name in names}
+    return {name: found(problem.contenders[name], worlds) for name in names}
 
 
 @pytest.mark.parametrize("case", LOST)
@@ -327,7 +321,7 @@ def test_without_either_what_is_known_fades_and_comes_back(dropped, name):
 
 def test_a_spin_about_the_field_is_said_to_be_unobserved(flight):
     field_n = np.array(flight.along.context["field_n"])
-    q = Turn.from_quat(np.array(flight.along_world.q_nb), scalar_first=True)
+    q = Turn.from_quat(np.array(flight.along_world.q_nb[1:]), scalar_first=True)
     nose = q.apply([1.0, 0.0, 0.0])
     cosine = np.sum(nose * field_n, axis=1) / np.linalg.norm(field_n, axis=1)
     assert np.all(cosine > np.cos(1.5 * DEG))
@@ -355,7 +349,7 @@ def test_a_spin_about_the_field_is_said_to_be_unobserved(flight):
 def test_a_flight_out_of_the_magnetic_model_is_refused(settings, words):
     given = parsed(FieldVector, "b4", 'duration="600 s"', *settings)
     with pytest.raises(ValueError, match=words):
-        field_problem(given, ("usque",), 0)
+        FIELD_VECTOR.problem(given, ("usque",), 0)
 
 
 @pytest.mark.parametrize(

@@ -25,19 +25,22 @@ from robins.sim.free_body import FreeBody, coning_start, free_body
 from robins.systems.rocket import SYSTEM
 from robins.systems.rocket.angles import Coefficients, angle_state, reckon, step
 from robins.systems.rocket.field import (
+    FIELD,
     FieldState,
     GyroNoise,
     ScaledState,
     Turn,
     bridged,
     observed,
+    plausible,
     propagate,
     propagated,
     read_field,
+    rows_of,
+    sentence,
+    unobserved,
 )
-from robins.systems.rocket.field_contender import plausible, rows_of
 from robins.systems.rocket.parameters import FieldVector
-from robins.systems.rocket.unobserved import sentence, unobserved
 from robins.systems.rocket.world import lay_out, simulate
 
 BODY = FreeBody(0.70, 1.0 / 3000.0, 1.0 / 400.0)
@@ -198,8 +201,8 @@ def test_a_flight_has_the_field_of_its_path_the_iron_and_the_limit_of_its_sensor
     np.testing.assert_allclose(course.field_n[0], start, rtol=2e-3, atol=2e-8)
     assert course.alt_m[-1] > 10e3
     one, other = (jax.jit(partial(simulate, p, course, 0))(0) for p in (plain, given))
-    shifted = np.asarray(one.field_b) + np.array([3e-6, -2e-6, 1e-6])
-    np.testing.assert_allclose(other.field_b, np.clip(shifted, -36e-6, 36e-6), atol=1e-18)
+    shifted = np.asarray(one.y[FIELD]) + np.array([3e-6, -2e-6, 1e-6])
+    np.testing.assert_allclose(other.y[FIELD], np.clip(shifted, -36e-6, 36e-6), atol=1e-18)
     assert np.any(np.abs(shifted) > 36e-6)
 
 

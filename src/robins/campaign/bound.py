@@ -15,8 +15,8 @@ from jaxtyping import Array
 
 from robins.campaign.monte_carlo import contender, solved, worlds
 from robins.filters import Belief, Filter, Model
-from robins.filters.bound import bound_along, linearised, used_sensors
-from robins.filters.observability import (
+from robins.filters.analysis.bound import bound_along, linearised, used_sensors
+from robins.filters.analysis.observability import (
     NOTHING,
     bits,
     observability_along,

@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
-from robins.filters.consistency import nees, normalised_sq
+from robins.filters.analysis.consistency import nees, normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
 from robins.systems.study import Case, Contender, Problem
@@ -157,32 +157,3 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
     found = _records(c.filter, blocks, c.model, c.case, c.reported, worlds)
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
-
-
-def chunks(
-    problem: Problem,
-    name: str,
-    runs: int,
-    chunk: int = CHUNK,
-    first: int = 0,
-    progress: Callable[[int], None] | None = None,
-) -> Iterator[dict[str, Any]]:
-    """Records of one filter over runs first .. first + runs - 1, as `record` gives them.
-
-    Args:
-        problem: what to simulate.
-        name: which of its contenders.
-        runs: how many.
-        chunk: runs per batch.
-        first: number of the first run.
-        progress: called with the number of runs done after each chunk.
-
-    Raises:
-        ValueError: runs or chunk is not positive, or there is no such contender.
-    """
-    done = 0
-    for batch, count in worlds(problem, runs, chunk, first):
-        yield record(problem, name, batch, count)
-        done += count
-        if progress is not None:
-            progress(done)

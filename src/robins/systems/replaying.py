@@ -19,10 +19,10 @@ import numpy as np
 import xarray as xr
 
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
-from robins.filters.consistency import grand_mean_nis
+from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.ins.blocks import Blocks
-from robins.ins.intervals import after_gap
+from robins.ins.increments import after_gap
 from robins.results import Outcome, Progress, silent, variable
 from robins.systems.study import Contender, SensorAxes, StateBlock
 from robins.systems.tables import (
@@ -194,8 +194,9 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
         else:
             found = run(*arguments, keep=kept, time_s=piece.epoch_s)
             of_steps = found.steps
-    likelihood = float(found.log_likelihood)
-    answer = Answer("", *of_steps, case.start, likelihood, found.tally, contender.bounds)
+    mean, sigma, seen = of_steps
+    likelihood, bounds = float(found.log_likelihood), contender.bounds
+    answer = Answer("", mean, sigma, seen, case.start, likelihood, found.tally, bounds)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)

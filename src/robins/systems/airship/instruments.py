@@ -37,11 +37,10 @@ from robins.ins.frames import swap
 from robins.ins.mechanise import Nav
 from robins.manifold import Angle, wrap
 from robins.rotation import Rotation, to_euler
-from robins.sim.air_data import observe_air
-from robins.sim.barometer import observe_height
+from robins.sim.air_data import observe_air, observe_height
 from robins.sim.random import Component
 from robins.sim.sar import SarErrorModel, observe_sar
-from robins.sim.star_tracker import observe_euler
+from robins.sim.star_sensor import observe_euler
 from robins.systems.airship.error_model import error_from_tangent
 from robins.systems.airship.model import WithWind, navigation
 from robins.systems.airship.parameters import AirData, Airship

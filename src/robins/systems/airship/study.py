@@ -157,14 +157,14 @@ def as_case(states: States, taken: tuple[tuple[str, Any], ...], sigma: Array, wo
     """
     estimate, zero = retract(world.start, -world.initial_error), jnp.zeros(3)
     count = world.wind.shape[0]
-    biases = (jnp.tile(b, (count, 1)) for b in (world.gyro_bias, world.accel_bias))
+    gyro, accel = (jnp.tile(b, (count, 1)) for b in (world.gyro_bias, world.accel_bias))
     seen = {name: take(world) for name, take in taken}
     return Case(
         start=Belief(states.of(estimate, zero, zero, jnp.zeros(2)), jnp.diag(sigma)),
         u=world.parts if states.in_parts else world.whole,
         y={name: y for name, (y, _) in seen.items()},
         aux={name: aux for name, (_, aux) in seen.items() if aux is not None},
-        truth=states.of(world.truth, *biases, world.wind_error),
+        truth=states.of(world.truth, gyro, accel, world.wind_error),
     )
 
 

@@ -207,10 +207,11 @@ def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
             f"{np.linalg.norm(force):.2f} m/s^2, gravity is {here:.2f}"
         )
     sentence = f"levelled {how} at {time_s[at]:.1f} s"
-    q_nb = np.asarray(level(force, 0.0, start.known_heading or 0.0).q_nb.wxyz)
+    heading = start.known_heading or 0.0
+    q_nb = np.asarray(level(force, 0.0, heading).q_nb.wxyz)
     begin_s = float(time_s[at])
     if fast is None:
-        sentence += f", heading given as {np.degrees(start.known_heading):.1f} deg"
+        sentence += f", heading given as {np.degrees(heading):.1f} deg"
     else:
         assert v_n is not None
         carried = jnp.asarray(theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None])

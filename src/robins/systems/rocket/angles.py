@@ -1,13 +1,21 @@
 """Test-bed A: roll, pitch, yaw and rates of a spinning body, as the paper states the problem.
 
-    p' = -e2 p ,   q' = e1 p r - e3 q ,   r' = -e1 p q - e3 r
-    roll'  = p + (q sin roll + r cos roll) tan pitch
-    pitch' = q cos roll - r sin roll
-    yaw'   = (q sin roll + r cos roll) / cos pitch
+State x = (roll, pitch, yaw, p, q, r): Euler angles and the rates of the body. The paper does not
+print its state equation; this is the free axisymmetric body that a sounding rocket is above the
+air (k = 1, unless the filters believe wrong kinematic rows):
 
-The paper does not print its state equation; this is the free axisymmetric body that a sounding
-rocket is above the air. It is singular at a pitch of 90 deg. "Magnetic attitude", three angles from
-one vector, cannot be measured: it is kept because the paper's filters are fed with it.
+    roll'  = k (p + (q sin roll + r cos roll) tan pitch)                        (A1)
+    pitch' = k (q cos roll - r sin roll)                                        (A2)
+    yaw'   = k (q sin roll + r cos roll) / cos pitch                            (A3)
+    p' = -e2 p ,   q' = e1 p r - e3 q ,   r' = -e1 p q - e3 r                   (A4)
+
+    F  by differentiating a step of Runge and Kutta of (A1) to (A4)
+    Q = diag(angle^2 I, rate^2 I) T                                             (A5)
+    z = (p, q, r) + v ,            H = [0  I]    a gyro                         (A6)
+    z = (roll, pitch, yaw) + v ,   H = [I  0]    an integrated gyro, "magnetic attitude"   (A7)
+
+It is singular at a pitch of 90 deg. "Magnetic attitude", three angles from one vector, cannot be
+measured: it is kept because the paper's filters are fed with it.
 """
 
 from __future__ import annotations
@@ -15,10 +23,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import Model, Motion, Sensor
 from robins.manifold import Angle
 from robins.rotation import from_euler, from_rotvec, multiply, to_euler
 
@@ -35,7 +41,7 @@ class AngleState(NamedTuple):
 
 
 class Coefficients(NamedTuple):
-    """Of the motion: e1 (no unit), e2, e3 [1/s], a factor of the kinematic rows, the step [s]."""
+    """Of the motion: e1 (no unit), e2, e3 [1/s], k of the kinematic rows, the step T [s]."""
 
     e1: Any
     e2: Any
@@ -46,12 +52,12 @@ class Coefficients(NamedTuple):
 
 def angle_state(q_nb: Array, omega_b: Array) -> AngleState:
     """The state, or a run of them, of an attitude and its rates."""
-    roll, pitch, yaw = to_euler(q_nb)
-    return AngleState(Angle(roll), Angle(pitch), Angle(yaw), omega_b)
+    return AngleState(*map(Angle, to_euler(q_nb)), omega_b)
 
 
+# (A1) to (A4)
 def slope(c: Coefficients, x: Array) -> Array:
-    """(6,) time derivative of (roll, pitch, yaw, p, q, r); module docstring."""
+    """(6,) time derivative of (roll, pitch, yaw, p, q, r)."""
     roll, pitch, _, p, q, r = x
     sin, cos = jnp.sin(roll), jnp.cos(roll)
     across = q * sin + r * cos
@@ -73,8 +79,8 @@ def step(c: Coefficients, state: AngleState, u: Any) -> AngleState:
     return AngleState(roll, pitch, yaw, state.omega_b + moved[3:])
 
 
-def stand_still(step_s: Any, state: AngleState, u: Any) -> AngleState:
-    """No motion at all: what is believed next is only what is measured next."""
+def stand_still(state: AngleState, u: Any) -> AngleState:
+    """No motion; with much noise, what is believed next is only what is measured next."""
     return state
 
 
@@ -84,36 +90,13 @@ def reckon(step_s: Any, state: AngleState, theta_b: Array) -> AngleState:
     return angle_state(q, theta_b / step_s)
 
 
+# (A6)
 def read_rate(state: AngleState, aux: Any) -> Array:
-    """What the gyro reads as a rate."""
+    """(3,) what the gyro reads as a rate [rad/s]."""
     return state.omega_b
 
 
+# (A7)
 def read_angles(state: AngleState, aux: Any) -> tuple[Angle, Angle, Angle]:
     """Roll, pitch, yaw: what the "magnetic attitude" reads, or a gyro that has been integrated."""
     return state[:3]
-
-
-def rate_sensor(sigma_rad_s: Array) -> Sensor:
-    """The gyro; sigma (3,)."""
-    return Sensor(read_rate, sigma_rad_s, 3, GYRO)
-
-
-def angle_sensor(name: str, sigma_rad: Array) -> Sensor:
-    """Three angles; sigma (3,)."""
-    return Sensor(read_angles, sigma_rad, 3, name)
-
-
-def body_model(c: Coefficients, noise: Array, sensors: tuple[Sensor, ...]) -> Model:
-    """The spinning body; noise (6,) of a step."""
-    return Model(Motion(Partial(step, c), noise), sensors)
-
-
-def reckoned_model(step_s: Array, noise: Array) -> Model:
-    """Dead reckoning: the gyro as the input of the motion, and no sensor."""
-    return Model(Motion(Partial(reckon, step_s), noise), ())
-
-
-def unmoved_model(step_s: Array, noise: Array, sensor: Sensor) -> Model:
-    """A sensor taken at its word: noise far above its own forgets what was before."""
-    return Model(Motion(Partial(stand_still, step_s), noise), (sensor,))

@@ -1,13 +1,30 @@
 """Test-bed B: attitude on SO(3), driven by the gyro and corrected by the measured field.
 
-    q <- q exp(theta / (1 + s) - b dt) ,      z = R(q)' B_n + v
+State x = (q, b, s): attitude q_nb, whose error phi is seen in n (q = exp(phi) q^), bias b of the
+gyro and, in some filters, its scale factors s. Input theta: the angle that the gyro reports of a
+step T. With C = R(q) J(w), J the left Jacobian of the rotations:
 
-with theta the angle that the gyro reports of a step, b its bias and s its scale factors, where they
-have states. After Crassidis & Markley (2003), with rotation vectors in place of their modified
-Rodrigues parameters: the two differ in the third order of a sigma point's length.
+    w = (theta - T b) / (1 + s) ,      q <- q exp(w)                            (B1)
+
+        [I  -T C/(1 + s)  -C w/(1 + s)]
+    F = [0       I              0     ]  ,   columns of C divided by axis       (B2)
+        [0       0              I     ]
+
+    Q = diag((angle^2 + doubt^2) I, walk^2 I, 0)                                (B3)
+    z = R(q)' B_n + v ,      H = [R(q)' [B_n]x   0   0]                         (B4)
+    R = (|B_n| sin sigma)^2 I                                                   (B5)
+
+After Crassidis & Markley (2003), with rotation vectors in place of their modified Rodrigues
+parameters: the two differ in the third order of a sigma point's length.
 
 One vector leaves the turn about itself open; only because B_n turns along the flight, and because
-the gyro carries the attitude, does it become known in the end.
+the gyro carries the attitude, does it become known in the end. How well, K vectors with an angle
+noise sigma tell by their information about a constant turn of the attitude, H'R^-1 H of (B4):
+
+    Y = 1/sigma^2 sum_k (I - b_k b_k') ,    b_k = B_k / |B_k|                   (B6)
+
+Its eigenvector of the least eigenvalue is the least known direction; for one vector that is b, with
+an eigenvalue of zero. It is what a perfect gyro would allow: a real one lets old vectors fade.
 """
 
 from __future__ import annotations
@@ -16,17 +33,32 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters import Model, Motion, Sensor
-from robins.rotation import Rotation, conjugate, from_rotvec, multiply, normalise, rotate, to_dcm
+from robins.errors import require
+from robins.filters import Motion, Sensor
+from robins.ins.extended_pose import left_jacobian
+from robins.manifold import dim
+from robins.rotation import (
+    Rotation,
+    conjugate,
+    from_rotvec,
+    multiply,
+    normalise,
+    rotate,
+    skew,
+    to_dcm,
+)
 
 FIELD, SNAPSHOT = "field", "snapshot"  # the sensor; the same taken at its word
+REPORTED = 9  # attitude in body axes, attitude about and across the field, bias
 
 # Of a turn that is held over a lost sample of the gyro: what a coning body may have changed.
 HELD_DOUBT = 0.1
+_LEAST, _MOST = 0.3, 3.0  # of the size of the field that is expected
 
 
 class FieldState(NamedTuple):
@@ -59,11 +91,68 @@ class GyroNoise(NamedTuple):
     step_s: Any
 
 
-def turned(x: Any, theta_b: Array, step_s: Any) -> Array:
-    """(3,) the true turn of a step, as the state sees it through what the gyro reports."""
-    theta = theta_b - step_s * x.bias
-    # (1 + s) is far from zero wherever a gyro is worth the name
-    return theta / (1.0 + x.scale) if isinstance(x, ScaledState) else theta
+def field_motion(gyro: GyroNoise) -> Motion:
+    """Attitude and gyro errors, (B1) to (B3)."""
+    return Motion(Partial(propagate, gyro), Partial(noise_of, gyro), Partial(propagated, gyro))
+
+
+def field_sensor(sine: Array) -> Sensor:
+    """The magnetometer, (B4) and (B5); sine of the standard deviation of the field's direction."""
+    return Sensor(read_field, Partial(field_noise, sine), 3, FIELD, observed)
+
+
+# (B1)
+def propagate(g: GyroNoise, x: Any, u: Turn) -> Any:
+    """Turn by what the gyro reports of a step."""
+    return x._replace(q_nb=Rotation(normalise(multiply(x.q_nb.wxyz, from_rotvec(_turn(g, x, u))))))
+
+
+def _turn(g: GyroNoise, x: Any, u: Turn) -> Array:
+    """(3,) the true turn w of a step, as the state sees it through what the gyro reports."""
+    return (u.theta_b - g.step_s * x.bias) / _stretch(x)
+
+
+def _stretch(x: Any) -> Array:
+    """(3,) 1 + s, which is far from zero wherever a gyro is worth the name."""
+    return 1.0 + x.scale if isinstance(x, ScaledState) else jnp.ones(3)
+
+
+# (B2)
+def propagated(g: GyroNoise, x: Any, u: Turn):
+    """`propagate` with its Jacobian and noise."""
+    w, gain = _turn(g, x, u), 1.0 / _stretch(x)
+    # a step turns little, but coning bodies turn fast
+    C = to_dcm(x.q_nb.wxyz) @ left_jacobian(w)
+    rows = [jnp.eye(3), -g.step_s * C * gain[None, :], -C * (gain * w)[None, :]]
+    n = dim(x)
+    F = jnp.eye(n).at[:3].set(jnp.concatenate(rows, axis=1)[:, :n])
+    return propagate(g, x, u), F, noise_of(g, x, u)
+
+
+# (B3)
+def noise_of(g: GyroNoise, x: Any, u: Turn) -> Array:
+    """(n,) of a step: alike on all axes, so the same in body and navigation axes."""
+    angle = jnp.sqrt(g.angle**2 + u.doubt**2)
+    return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), jnp.zeros(dim(x) - 6)])
+
+
+# (B4)
+def read_field(x: Any, field_n: Array) -> Array:
+    """(3,) field in body axes, in the unit of ``field_n``."""
+    return rotate(conjugate(x.q_nb.wxyz), field_n)
+
+
+def observed(x: Any, field_n: Array):
+    """`read_field` with its Jacobian: R(q)' exp(-phi) B = R(q)' (B + B x phi)."""
+    C_bn = to_dcm(x.q_nb.wxyz).T
+    H = jnp.concatenate([C_bn @ skew(field_n), linalg.zeros(3, dim(x) - 3)], axis=1)
+    return C_bn @ field_n, H
+
+
+# (B5)
+def field_noise(sine: Array, x: Any, field_n: Array) -> Array:
+    """(3,) standard deviations: an angle, so in proportion to the field."""
+    return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
 
 
 def bridged(theta_b: Array) -> Turn:
@@ -82,75 +171,97 @@ def bridged(theta_b: Array) -> Turn:
     return jax.lax.scan(hold, jnp.zeros(3), theta_b)[1]
 
 
-def propagate(g: GyroNoise, x: Any, u: Turn) -> Any:
-    """Turn by what the gyro reports of a step."""
-    q = normalise(multiply(x.q_nb.wxyz, from_rotvec(turned(x, u.theta_b, g.step_s))))
-    return x._replace(q_nb=Rotation(q))
+def plausible(field_b: Array, expected_n: Array, full_scale_t: float | None = None) -> Array:
+    """Fields (..., 3) with NaN for those that no magnetometer in order would read.
+
+    A field of no size, or of less than 0.3 or more than 3 times the expected one, has no direction
+    that could be believed; nor has one with an axis at full scale, where that is known.
+    """
+    size, expected = (jnp.sqrt(jnp.sum(x**2, axis=-1)) for x in (field_b, expected_n))
+    fits = (size >= _LEAST * expected) & (size <= _MOST * expected)
+    if full_scale_t is not None:
+        fits = fits & jnp.all(jnp.abs(field_b) < full_scale_t, axis=-1)
+    return jnp.where(fits[..., None], field_b, jnp.nan)
 
 
-def propagated(g: GyroNoise, x: Any, u: Turn):
-    """`propagate` with its Jacobian and noise; tangent of the attitude in n."""
-    theta = turned(x, u.theta_b, g.step_s)
-    after = propagate(g, x, u)
-    # exp(R J_r(theta) d theta) on the left: a step turns little, but coning bodies turn fast
-    C = to_dcm(x.q_nb.wxyz) @ _left_jacobian(theta)
-    gain = jnp.ones(3) / (1.0 + x.scale) if isinstance(x, ScaledState) else jnp.ones(3)
-    parts = [jnp.eye(3), -g.step_s * C * gain[None, :]]
-    if isinstance(x, ScaledState):
-        parts.append(-C * (gain * theta)[None, :])
-    n = 3 * len(parts)
-    F = jnp.eye(n).at[:3].set(jnp.concatenate(parts, axis=1))
-    return after, F, noise_of(g, x, u)
+def rows_of(q_nb: Array, field_n: Array, n: int) -> Array:
+    """(E, 9, n) from a tangent error, whose attitude is in n, to what is reported.
+
+    Attitude in body axes; in axes along the field, and across it by the vertical; the bias.
+    """
+    b = field_n / jnp.sqrt(jnp.sum(field_n**2, axis=1, keepdims=True))
+    level = jnp.cross(jnp.array([[0.0, 0.0, 1.0]]), b)
+    level = level / jnp.sqrt(jnp.sum(level**2, axis=1, keepdims=True))
+    along = jnp.stack([b, level, jnp.cross(b, level)], axis=1)
+    attitude = jnp.concatenate([jnp.swapaxes(to_dcm(q_nb), 1, 2), along], axis=1)
+    rows = jnp.zeros((len(field_n), REPORTED, n))
+    return rows.at[:, :6, :3].set(attitude).at[:, 6:, 3:6].set(jnp.eye(3)[None])
 
 
-def _left_jacobian(theta: Array) -> Array:
-    """J_l of a rotation vector: exp(theta + d) = exp(J_l d) exp(theta) to first order."""
-    angle_sq = theta @ theta
-    small = angle_sq < 1e-6
-    safe = jnp.where(small, 1.0, angle_sq)
-    angle = jnp.sqrt(safe)
-    one = jnp.where(small, 0.5 - angle_sq / 24.0, (1.0 - jnp.cos(angle)) / safe)
-    two = jnp.where(small, 1.0 / 6.0 - angle_sq / 120.0, (angle - jnp.sin(angle)) / (safe * angle))
-    K = jnp.array(
-        [[0.0, -theta[2], theta[1]], [theta[2], 0.0, -theta[0]], [-theta[1], theta[0], 0.0]]
-    )
-    return jnp.eye(3) + one * K + two * K @ K
+class Unobserved(NamedTuple):
+    """The least known direction, and how well the attitude could be known at best."""
+
+    direction_n: np.ndarray  # (3,) unit vector
+    sigma_rad: float  # about it; infinite where nothing is known
+    across_rad: float  # about the best known direction
+    from_field_rad: float  # angle between it and the mean field
+    field_turn_rad: float  # largest angle between any vector and the first
 
 
-def noise_of(g: GyroNoise, x: Any, u: Turn) -> Array:
-    """(n,) of a step: alike on all axes, so the same in body and navigation axes."""
-    rest = [jnp.zeros(3)] if isinstance(x, ScaledState) else []
-    angle = jnp.sqrt(g.angle**2 + u.doubt**2)
-    return jnp.concatenate([jnp.full(3, angle), jnp.full(3, g.bias), *rest])
-
-
-def read_field(x: Any, field_n: Array) -> Array:
-    """(3,) field in body axes, in the unit of ``field_n``."""
-    return rotate(conjugate(x.q_nb.wxyz), field_n)
-
-
-def observed(x: Any, field_n: Array):
-    """`read_field` with its Jacobian: R(q)' exp(-phi) B = R(q)' (B + B x phi)."""
-    C_bn = to_dcm(x.q_nb.wxyz).T
-    b0, b1, b2 = field_n
-    cross = jnp.array([[0.0, -b2, b1], [b2, 0.0, -b0], [-b1, b0, 0.0]])
-    n = 9 if isinstance(x, ScaledState) else 6
-    return C_bn @ field_n, jnp.concatenate([C_bn @ cross, linalg.zeros(3, n - 3)], axis=1)
-
-
-def field_noise(sine: Array, x: Any, field_n: Array) -> Array:
-    """(3,) standard deviations: an angle, so in proportion to the field."""
-    return jnp.full(3, sine * jnp.sqrt(field_n @ field_n))
-
-
-def field_model(gyro: GyroNoise, sine: Array, sensor: str = FIELD) -> Model:
-    """Attitude and gyro errors.
+# (B6)
+def unobserved(field_n: np.ndarray, sigma_rad: float) -> Unobserved:
+    """The least known direction of a run of measured fields, and bounds for a perfect gyro.
 
     Args:
-        gyro: its noise.
-        sine: of the standard deviation of the field's direction.
-        sensor: name of the magnetometer; "" leaves dead reckoning.
+        field_n: (K, 3) field where it is measured, in any unit; NaN rows count for nothing.
+        sigma_rad: of the direction of each vector, about each axis across it.
+
+    Raises:
+        ValueError: no vector is left, one has no direction, or sigma is not positive.
     """
-    motion = Motion(Partial(propagate, gyro), Partial(noise_of, gyro), Partial(propagated, gyro))
-    field = Sensor(read_field, Partial(field_noise, sine), 3, sensor, observed)
-    return Model(motion, (field,) if sensor else ())
+    field = np.asarray(field_n, float)
+    require(field.shape[1:] == (3,), "field_n must have shape (K, 3)", field.shape)
+    require(sigma_rad > 0.0, "sigma_rad must be positive", sigma_rad)
+    field = field[np.all(np.isfinite(field), axis=1)]
+    size = np.linalg.norm(field, axis=1)
+    if len(field) == 0 or np.any(size == 0.0):
+        raise ValueError("a field without a direction says nothing: omit NaN and zero vectors")
+    b = field / size[:, None]
+    Y = (len(b) * np.eye(3) - b.T @ b) / sigma_rad**2
+    values, vectors = np.linalg.eigh(Y)
+    # K vectors of one direction leave rounding of the size of eps K
+    floor = 1e-12 * values[-1]
+    with np.errstate(divide="ignore"):
+        sigma = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), np.inf)
+    mean = np.mean(b, axis=0)
+    mean = mean / np.linalg.norm(mean)
+    direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean >= 0.0 else -1.0)
+
+    def between(x: np.ndarray, y: np.ndarray) -> Any:
+        return np.arctan2(np.linalg.norm(np.cross(x, y), axis=-1), np.sum(x * y, axis=-1))
+
+    return Unobserved(
+        direction_n=direction,
+        sigma_rad=float(sigma[0]),
+        across_rad=float(sigma[-1]),
+        from_field_rad=float(between(direction, mean)),
+        field_turn_rad=float(np.max(between(b, b[:1]))),
+    )
+
+
+def sentence(found: Unobserved) -> str:
+    """The same in words."""
+    north, east, down = found.direction_n
+    elevation = np.degrees(np.arcsin(-down))
+    azimuth = np.degrees(np.arctan2(east, north)) % 360.0
+    known = (
+        "nothing is known about it"
+        if not np.isfinite(found.sigma_rad)
+        else f"a perfect gyro would allow {np.degrees(found.sigma_rad):.2g} deg (1 sigma) about it"
+    )
+    return (
+        f"Least observed: turns about azimuth {azimuth:.0f} deg, elevation {elevation:.0f} deg, "
+        f"which is {np.degrees(found.from_field_rad):.1f} deg from the mean field; {known} and "
+        f"{np.degrees(found.across_rad):.2g} deg across. The field turns by "
+        f"{np.degrees(found.field_turn_rad):.1f} deg along the flight."
+    )

@@ -1,10 +1,14 @@
-"""A rocket in free flight as it is simulated: truth, gyro, magnetometer in both of its readings."""
+"""A rocket in free flight as it is simulated: truth, gyro, magnetometer in both of its readings.
+
+The two studies share the body, the gyro and the disturbances. Their instruments are declared here.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,24 +16,30 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.earth.magnetic import field_along, wmm_for
-from robins.manifold import wrap
+from robins.filters import Sensor
+from robins.manifold import Angle, wrap
 from robins.rotation import conjugate, from_euler, multiply, rotate, to_euler, to_rotvec
 from robins.scenario import Span
 from robins.sim.ballistic import ballistic
 from robins.sim.free_body import FreeBody, coning_start, free_body
+from robins.sim.gyro import MemsErrors, MemsGyro, delta_angles, integrate_angles
 from robins.sim.magnetometer import (
     angle_bursts,
     field_bursts,
     observe_field,
     observe_magnetic_attitude,
 )
-from robins.sim.mems_gyro import MemsGyro, delta_angles, integrate_angles
 from robins.sim.random import Component, stream
-from robins.systems.rocket.parameters import Flight
+from robins.systems.parts import Three
+from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate
+from robins.systems.rocket.field import FIELD, field_sensor
+from robins.systems.rocket.parameters import Flight, MagneticAttitude
+from robins.systems.study import Instrument, SensorAxes
 
 PEAK_S = 3.0  # after the beginning of a disturbance, in which its largest error is looked for
+EULER, BODY = ("roll", "pitch", "yaw"), ("x", "y", "z")
 _SECONDS_A_YEAR = 365.25 * 86400.0
-# Streams folded into the keys of a run.
+# Streams folded into the key of the magnetometer; the noise of the integrated gyro is one too.
 _VECTOR, _ANGLES, _DISTURBED, _INTEGRATED = range(4)
 
 
@@ -48,17 +58,18 @@ class Course(NamedTuple):
 class World(NamedTuple):
     """One run; E steps. Measurements are NaN where there is none."""
 
-    q_nb: Array  # (E, 4) true attitude at the end of each step
-    omega_b: Array  # (E, 3) true rate [rad/s]
+    q_nb: Array  # (E + 1, 4) true attitude at the start and at the end of each step
+    omega_b: Array  # (E + 1, 3) true rate [rad/s]
+    errors: MemsErrors  # of the gyro
     start_q_nb: Array  # (4,) that filters begin with
     start_omega_b: Array  # (3,)
-    bias: Array  # (E, 3) constant and slow error of the gyro in each step [rad/s]
-    scale: Array  # (3,)
-    theta: Array  # (E, 3) what the gyro turned by in each step [rad]
-    rate: Array  # (E, 3) rate at the end of each step [rad/s]
-    integrated: Array  # (E, 3) roll, pitch, yaw that the gyro has been integrated to [rad]
-    angles: Array  # (E, 3) "magnetic attitude" [rad]
-    field_b: Array  # (E, 3) measured field [T]
+    theta_b: Array  # (E, 3) what the gyro turned by in each step [rad]
+    y: Mapping[str, Any] = {}  # what the instruments of the study read, leading axis E
+
+    @property
+    def bias(self) -> Array:
+        """(E, 3) constant and slow error of the gyro in each step [rad/s]."""
+        return self.errors.bias_rad_s[None] + self.errors.markov_rad_s
 
 
 def lay_out(given: Flight) -> Course:
@@ -117,77 +128,119 @@ def body_of(given: Flight) -> FreeBody:
     return FreeBody(b.e1, *(0.0 if t is None else 1.0 / t for t in (b.spin_decay, b.cone_decay)))
 
 
-def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
-    """One run, from its number, which may be traced; pure."""
-    key = partial(stream, seed, index)
-    count = len(course.time_s)
-    q, omega = _moved(given, key(Component.TRAJECTORY), count)
-    unit = key(Component.IMU)
-    g = given.gyro
-    theta, errors = delta_angles(
-        unit,
-        q,
-        given.step,
-        MemsGyro(g.bias, g.drift, g.drift_time, g.white, g.scale_factor),
-    )
-    bias = errors.bias_rad_s[None] + errors.markov_rad_s
-    rate = (1.0 + errors.scale_factor)[None] * omega[1:] + bias + errors.white_rad_s
-    felt = jnp.asarray(course.felt)[:, None]
-    begin, m = key(Component.INITIAL_STATE), key(Component.MAGNETOMETER)
-    start = wrong_by(q[0], given.start.attitude_error)
-    vector, angles, disturbed, integrated = (
-        jax.random.fold_in(m, i) for i in (_VECTOR, _ANGLES, _DISTURBED, _INTEGRATED)
-    )
-    magnet, time = given.magnetometer, jnp.asarray(course.time_s)
-    seen = jnp.asarray(course.seen)
-    field_n = jnp.asarray(course.field_n)
-    euler = jnp.stack(to_euler(q[1:]), 1)
-    wrong = turn = None
-    if (burst := magnet.disturbance) is not None:
-        sizes = (burst.angle, burst.every, burst.length)
-        wrong = angle_bursts(disturbed, time, *sizes)
-        turn = field_bursts(disturbed, time, *sizes)
-    size = jnp.sqrt(jnp.sum(field_n**2, axis=1))
-    white = jax.random.normal(integrated, (count, 3))
-    drifted = _integrated(given, start, q, bias)
-    return World(
-        q_nb=q[1:],
-        omega_b=omega[1:],
-        start_q_nb=start,
-        start_omega_b=omega[0] + given.start.rate * jax.random.normal(begin, (3,)),
-        bias=bias,
-        scale=errors.scale_factor,
-        theta=jnp.where(felt, theta, jnp.nan),
-        rate=jnp.where(felt, rate, jnp.nan),
-        integrated=jnp.where(felt, wrap(drifted + given.gyro.attitude_noise * white), jnp.nan),
-        angles=observe_magnetic_attitude(angles, euler, magnet.noise, wrong, seen),
-        field_b=observe_field(
-            vector,
-            q[1:],
-            field_n,
-            size * math.sin(magnet.noise),
-            seen,
-            turn=turn,
-            hard_iron_t=jnp.asarray(magnet.hard_iron),
-            range_t=magnet.full_scale,
-        ),
-    )
+def start_of(given: Flight) -> tuple[Array, Array]:
+    """True attitude q_nb (4,) and rate (3,) at the start."""
+    b = given.body
+    return coning_start(b.spin, b.cone, b.elevation, b.azimuth, body_of(given))
 
 
-def _moved(given: Flight, key: Array, count: int) -> tuple[Array, Array]:
-    """Attitude (E + 1, 4) and rate (E + 1, 3) of the body."""
-    b, body = given.body, body_of(given)
-    q0, omega0 = coning_start(b.spin, b.cone, b.elevation, b.azimuth, body)
-    return free_body(key, body, q0, omega0, given.step, count, b.torque)
-
-
-def wrong_by(q_nb: Array, error_rad: tuple[float, float, float]) -> Array:
+def wrong_by(q_nb: Array, error_rad: Three) -> Array:
     """An attitude with errors of its roll, pitch and yaw."""
     return from_euler(*(a + e for a, e in zip(to_euler(q_nb), error_rad, strict=True)))
 
 
-def _integrated(given: Flight, start: Array, q: Array, bias: Array) -> Array:
-    """Roll, pitch, yaw (E, 3) by a gyro integrated from a start, with its slow errors alone."""
-    turned = to_rotvec(multiply(conjugate(q[:-1]), q[1:]))
-    path = integrate_angles(start, turned + given.step * bias)
-    return jnp.stack(to_euler(path[1:]), 1)
+def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
+    """One run, from its number, which may be traced; pure."""
+    key = partial(stream, seed, index)
+    g, T, torque, count = given.gyro, given.step, given.body.torque, len(course.time_s)
+    body, (q0, omega0) = body_of(given), start_of(given)
+    q, omega = free_body(key(Component.TRAJECTORY), body, q0, omega0, T, count, torque)
+    gyro = MemsGyro(g.bias, g.drift, g.drift_time, g.white, g.scale_factor)
+    theta, errors = delta_angles(key(Component.IMU), q, T, gyro)
+    start = wrong_by(q[0], given.start.attitude_error)
+    wrong = given.start.rate * jax.random.normal(key(Component.INITIAL_STATE), (3,))
+    world = World(q, omega, errors, start, omega[0] + wrong, _felt(course, theta))
+    it = given, course, key(Component.MAGNETOMETER), world
+    return world._replace(y={i.name: i.measure(*it) for i in instruments(given)})
+
+
+def _felt(course: Course, rows: Array) -> Array:
+    return jnp.where(jnp.asarray(course.felt)[:, None], rows, jnp.nan)
+
+
+# ------------------------------------------------------------------------------------ instruments
+
+
+def instruments(given: Flight) -> tuple[Instrument, ...]:
+    """Those whose readings are measurements; in "field-vector" the gyro drives the motion."""
+    if isinstance(given, MagneticAttitude):
+        return (RATE_GYRO if given.gyro_reads == "rate" else INTEGRATED_GYRO, MAGNETIC_ATTITUDE)
+    return (MAGNETOMETER,)
+
+
+def _rate(given: Flight, course: Course, key: Array, world: World) -> Array:
+    """(E, 3) rate at the end of each step [rad/s]."""
+    e = world.errors
+    true = (1.0 + e.scale_factor)[None] * world.omega_b[1:]
+    return _felt(course, true + world.bias + e.white_rad_s)
+
+
+def _integrated(given: Flight, course: Course, key: Array, world: World) -> tuple[Angle, ...]:
+    """Roll, pitch, yaw by a gyro integrated from a start, with its slow errors, and white noise."""
+    turned = to_rotvec(multiply(conjugate(world.q_nb[:-1]), world.q_nb[1:]))
+    path = integrate_angles(world.start_q_nb, turned + given.step * world.bias)
+    white = jax.random.normal(jax.random.fold_in(key, _INTEGRATED), turned.shape)
+    angles = jnp.stack(to_euler(path[1:]), 1) + given.gyro.attitude_noise * white
+    return _as_angles(_felt(course, wrap(angles)))
+
+
+def _magnetic(given: Flight, course: Course, key: Array, world: World) -> tuple[Angle, ...]:
+    """Roll, pitch, yaw as papers have a magnetometer measure them."""
+    magnet, euler = given.magnetometer, jnp.stack(to_euler(world.q_nb[1:]), 1)
+    wrong, seen = _burst(angle_bursts, given, course, key), jnp.asarray(course.seen)
+    white = jax.random.fold_in(key, _ANGLES)
+    return _as_angles(observe_magnetic_attitude(white, euler, magnet.noise, wrong, seen))
+
+
+def _field(given: Flight, course: Course, key: Array, world: World) -> Array:
+    """(E, 3) T."""
+    magnet, field_n = given.magnetometer, jnp.asarray(course.field_n)
+    return observe_field(
+        jax.random.fold_in(key, _VECTOR),
+        world.q_nb[1:],
+        field_n,
+        jnp.sqrt(jnp.sum(field_n**2, axis=1)) * math.sin(magnet.noise),
+        jnp.asarray(course.seen),
+        turn=_burst(field_bursts, given, course, key),
+        hard_iron_t=jnp.asarray(magnet.hard_iron),
+        range_t=magnet.full_scale,
+    )
+
+
+def _burst(draw: Any, given: Flight, course: Course, key: Array) -> Array | None:
+    """(E, 3) rad, disturbances of the magnetometer."""
+    if (burst := given.magnetometer.disturbance) is None:
+        return None
+    sizes = burst.angle, burst.every, burst.length
+    return draw(jax.random.fold_in(key, _DISTURBED), jnp.asarray(course.time_s), *sizes)
+
+
+def _as_angles(rows: Array) -> tuple[Angle, ...]:
+    return tuple(Angle(rows[:, i]) for i in range(3))
+
+
+_ANGLE_AXES = SensorAxes("rad", "launch NED", EULER, "deg")
+RATE_GYRO = Instrument(
+    GYRO,
+    SensorAxes("rad/s", "FRD", ("p", "q", "r"), "deg/s"),
+    _rate,
+    lambda given, course: Sensor(read_rate, jnp.full(3, given.gyro.white), 3, GYRO),
+)
+INTEGRATED_GYRO = Instrument(
+    GYRO,
+    _ANGLE_AXES,
+    _integrated,
+    lambda given, course: Sensor(read_angles, jnp.full(3, given.gyro.attitude_noise), 3, GYRO),
+)
+MAGNETIC_ATTITUDE = Instrument(
+    MAGNETIC,
+    _ANGLE_AXES,
+    _magnetic,
+    lambda given, course: Sensor(read_angles, jnp.full(3, given.magnetometer.noise), 3, MAGNETIC),
+)
+MAGNETOMETER = Instrument(
+    FIELD,
+    SensorAxes("T", "FRD", BODY, "uT"),
+    _field,
+    lambda given, course: field_sensor(jnp.asarray(math.sin(given.magnetometer.noise))),
+)

@@ -1,0 +1,348 @@
+"""The two studies of the rocket: the filters that are compared, what each believes and is given.
+
+The paper's filter is "federated-vector-stukf": two local unscented filters, for gyro and
+magnetometer, each with strong tracking in its simplified (lumped) form; shares by the observability
+of each state; information shared as A^-1/2 P A^-1/2 ("half"), with a reset at every step. It is no
+upper bound (`robins.filters.federated`), hence the warning that is silenced here: the study is
+about it.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins.filters import (
+    Belief,
+    Filter,
+    Model,
+    Motion,
+    Rule,
+    channel,
+    federated,
+    kalman,
+    observability_shares,
+    taylor,
+    unscented,
+)
+from robins.filters.fusion import Sharing
+from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
+from robins.results import array
+from robins.rotation import Rotation
+from robins.systems.parts import NED
+from robins.systems.recipes import recipe
+from robins.systems.rocket import angles, field
+from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
+from robins.systems.rocket.claims import CLAIMS, angle_metrics, field_metrics
+from robins.systems.rocket.field import FIELD, SNAPSHOT, FieldState, ScaledState
+from robins.systems.rocket.parameters import FieldVector, Flight, MagneticAttitude
+from robins.systems.rocket.world import (
+    BODY,
+    EULER,
+    MAGNETOMETER,
+    Course,
+    World,
+    body_of,
+    instruments,
+    lay_out,
+    simulate,
+    start_of,
+    wrong_by,
+)
+from robins.systems.study import Case, Contender, Norm, StateBlock, Study, View
+from robins.systems.tables import block_array
+
+PROBABILITY = 0.999  # of the chi-square tests
+PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a loss of track to be borne
+FORGETS = (10.0, 10.0)  # rad, rad/s: noise of a step that leaves nothing of what was before
+ANGLES_SEEN, RATES_SEEN = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+_POINTS = unscented(alpha=0.5, beta=2.0, kappa=0.0)
+
+# ------------------------------------------------------------------------- what filters are made of
+
+
+def ukf(*rules: Rule) -> Filter:
+    """Unscented filter with the sigma points of the studies."""
+    return kalman(_POINTS, rules)
+
+
+def fading(fade: Literal["lumped", "multiple", "projected"] = "lumped", beta: float = 1.0) -> Rule:
+    """Strong tracking; "lumped", the simplified form, as the paper prints it."""
+    return strong_tracking(0.95, beta, fade, "classic", limit=1e3)
+
+
+def patient() -> Rule:
+    """A gate that gives in when it has refused for too long, and says so."""
+    return gate(PROBABILITY, PATIENCE, "inflate")
+
+
+def discriminator_of(sensor: str, given: MagneticAttitude) -> Rule:
+    """Outliers told from model errors; faded are the states that the sensor reads."""
+    rates = sensor == GYRO and given.gyro_reads == "rate"
+    seen = RATES_SEEN if rates else ANGLES_SEEN
+    return only((sensor,), discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", weights=seen))
+
+
+def projected_discriminator(robust: Literal["huber", "gate"]) -> Rule:
+    """The same for one vector, that sees none of the states whole."""
+    return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust)
+
+
+# ------------------------------------------------------------------------------- magnetic attitude
+
+
+class AngleFilter(NamedTuple):
+    """A filter of "magnetic-attitude"."""
+
+    sharing: Sharing | None = None  # of the information of two local filters; None: there is one
+    rule: Rule | None = None
+    sensors: tuple[str, ...] = (GYRO, MAGNETIC)
+    raw: bool = False  # its sensor is taken at its word, without a model of the motion
+    discriminates: bool = False  # outliers from model errors, of each sensor
+
+
+ANGLE_FILTERS: dict[str, AngleFilter] = {
+    "gyro": AngleFilter(sensors=(GYRO,), raw=True),
+    "magnetic-raw": AngleFilter(sensors=(MAGNETIC,), raw=True),
+    "magnetometer": AngleFilter(sensors=(MAGNETIC,)),
+    "gyro-ukf": AngleFilter(sensors=(GYRO,)),
+    "ukf": AngleFilter(),
+    "federated-scalar-ukf": AngleFilter("scalar"),
+    "federated-vector-ukf": AngleFilter("half"),
+    "federated-root": AngleFilter("root"),
+    "stukf": AngleFilter(None, fading()),
+    "federated-scalar-stukf": AngleFilter("scalar", fading()),
+    "federated-vector-stukf": AngleFilter("half", fading()),
+    "federated-vector-multiple": AngleFilter("half", fading("multiple")),
+    "federated-vector-weakened": AngleFilter("half", fading(beta=4.0)),
+    "huber": AngleFilter(None, huber(PROBABILITY)),
+    "gate": AngleFilter(None, patient()),
+    "discriminator": AngleFilter(discriminates=True),
+    "federated-root-discriminator": AngleFilter("root", discriminates=True),
+}
+
+
+def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
+    """The filter itself. Two local filters are reset at every step; scalar shares are halves."""
+
+    def own(*sensors: str) -> Filter:
+        rules = [discriminator_of(s, given) for s in sensors] if chosen.discriminates else []
+        return ukf(*rules, *(() if chosen.rule is None else (chosen.rule,)))
+
+    if chosen.raw:
+        return kalman(taylor())
+    if chosen.sharing is None:
+        return own(*chosen.sensors)
+    channels = [channel((sensor,), own(sensor)) for sensor in chosen.sensors]
+    shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
+        return federated(channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS)
+
+
+@cache  # half a second, the same for all filters of a scenario
+def shares_by_state(given: MagneticAttitude) -> np.ndarray:
+    """(2, 6) by how well gyro and magnetometer see each state at the start."""
+    q, omega = start_of(given)
+    start = angle_state(wrong_by(q, given.start.attitude_error), omega)
+    channels = [channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
+    model = angle_model(given, lay_out(given), ANGLE_FILTERS["ukf"])
+    return observability_shares(model, Belief(start, jnp.diag(angle_sigma(given))), channels)
+
+
+def angle_sigma(given: MagneticAttitude) -> Array:
+    """(6,) initial, of angles and rates."""
+    return jnp.repeat(jnp.array([given.start.attitude, given.start.rate]), 3)
+
+
+def angle_model(given: MagneticAttitude, course: Course, chosen: AngleFilter) -> Model:
+    """Motion and sensors that a filter believes."""
+    b, T, white = given.believed, given.step, given.gyro.white
+    found = {i.name: i.believed(given, course) for i in instruments(given)}
+    sensors = tuple(found[name] for name in chosen.sensors)
+    if not chosen.raw:
+        noise = np.array([b.attitude_noise, b.rate_noise]) * np.sqrt(T)
+        motion = Motion(Partial(angles.step, coefficients(given)), jnp.repeat(noise, 3))
+    elif chosen.sensors == (GYRO,) and given.gyro_reads == "rate":  # dead reckoning
+        noise = jnp.repeat(jnp.array([T * white, white]), 3)
+        motion, sensors = Motion(Partial(angles.reckon, jnp.asarray(T)), noise), ()
+    else:
+        motion = Motion(angles.stand_still, jnp.repeat(jnp.array(FORGETS), 3))
+    return Model(motion, sensors)
+
+
+def coefficients(given: MagneticAttitude) -> angles.Coefficients:
+    """Of the motion as the filters believe it: the paper's equation is wrong by some per cent."""
+    wrong = 1.0 + given.believed.error
+    kinematic = wrong if given.believed.wrong == "all" else 1.0
+    e1, e2, e3 = (wrong * e for e in body_of(given))
+    return angles.Coefficients(*map(jnp.asarray, (e1, e2, e3, kinematic, given.step)))
+
+
+def angle_case(sensors: tuple[str, ...], sigma: Array, world: World) -> Case:
+    """What a filter of "magnetic-attitude" takes of a run; pure."""
+    return Case(
+        start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(sigma)),
+        u=field.bridged(world.theta_b).theta_b,
+        y={name: world.y[name] for name in sensors},
+        aux={},
+        truth=angle_state(world.q_nb[1:], world.omega_b[1:]),
+    )
+
+
+def angle_contender(given: MagneticAttitude, course: Course, name: str) -> Contender:
+    """A filter of "magnetic-attitude" with its model and its data."""
+    chosen = ANGLE_FILTERS[name]
+    model = angle_model(given, course, chosen)
+    case = recipe(angle_case, tuple(model.dims), numbers=angle_sigma(given))
+    return Contender(angle_filter(given, chosen), model, case)
+
+
+# ------------------------------------------------------------------------------------ field vector
+
+
+class FieldFilter(NamedTuple):
+    """A filter of "field-vector"."""
+
+    filter: Filter
+    sees: str = FIELD  # or SNAPSHOT, the field taken at its word; or ""
+    scaled: bool = False  # scale factors of the gyro are states
+
+
+FIELD_FILTERS: dict[str, FieldFilter] = {
+    "gyro": FieldFilter(kalman(taylor()), ""),
+    "magnetometer": FieldFilter(kalman(taylor()), SNAPSHOT),
+    "usque": FieldFilter(ukf()),
+    "huber": FieldFilter(ukf(huber(PROBABILITY))),
+    "gate": FieldFilter(ukf(patient())),
+    "discriminator": FieldFilter(ukf(projected_discriminator("huber"))),
+    "discriminator-gate": FieldFilter(ukf(projected_discriminator("gate"))),
+    "strong-tracking": FieldFilter(ukf(fading())),
+    "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
+    "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),
+    "usque-scale-factor": FieldFilter(ukf(), scaled=True),
+}
+
+
+def field_model(given: FieldVector, course: Course, chosen: FieldFilter) -> Model:
+    """Motion and sensor that a filter believes."""
+    g, T = given.gyro, given.step
+    # a drift of correlation time tau walks away from where it is by this in a step
+    walk = g.drift * math.sqrt(2.0 * T / g.drift_time)
+    angle = FORGETS[0] if chosen.sees == SNAPSHOT else g.white * T
+    sensor = replace(MAGNETOMETER.believed(given, course), name=chosen.sees)
+    motion = field.field_motion(field.GyroNoise(*map(jnp.asarray, (angle, walk, T))))
+    return Model(motion, (sensor,) if chosen.sees else ())
+
+
+def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
+    """(n,) initial, of attitude, bias and scale factors."""
+    bias = 0.0 if chosen.sees == SNAPSHOT else math.hypot(given.gyro.bias, given.gyro.drift)
+    scale = [given.scale_factor_sigma] if chosen.scaled else []
+    return jnp.repeat(jnp.array([given.start.attitude, bias, *scale]), 3)
+
+
+def field_case(
+    scaled: bool, sees: str, full_scale_t: float | None, numbers: tuple[Array, Array], world: World
+) -> Case:
+    """What a filter of "field-vector" takes of a run; pure.
+
+    Args:
+        scaled: scale factors are states.
+        sees: name of its magnetometer, or "".
+        full_scale_t: of the magnetometer, where it is known.
+        numbers: initial sigma (n,), and the field (E, 3) [T] in n.
+        world: the run.
+    """
+    sigma, field_n = numbers
+    start, zero = Rotation(world.start_q_nb), jnp.zeros(3)
+    q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, field_n.shape)
+    errors = (world.bias, scale) if scaled else (world.bias,)
+    kind = ScaledState if scaled else FieldState
+    return Case(
+        start=Belief(kind(start, *(zero for _ in errors)), jnp.diag(sigma)),
+        u=field.bridged(world.theta_b),
+        y={sees: field.plausible(world.y[FIELD], field_n, full_scale_t)} if sees else {},
+        aux={sees: field_n} if sees else {},
+        truth=kind(Rotation(q_nb), *errors),
+        rows=field.rows_of(q_nb, field_n, len(sigma)),
+    )
+
+
+def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
+    """A filter of "field-vector" with its model and its data."""
+    chosen = FIELD_FILTERS[name]
+    numbers = field_sigma(given, chosen), jnp.asarray(course.field_n)
+    kinds = chosen.scaled, chosen.sees, given.magnetometer.full_scale
+    case = recipe(field_case, *kinds, numbers=numbers)
+    return Contender(chosen.filter, field_model(given, course, chosen), case)
+
+
+# ------------------------------------------------------------------------------ what both report
+
+
+def _view(given: Flight, course: Course, **own: Any) -> View:
+    """What the two studies share: the path and the field for figures, and what is unobserved."""
+    height = array("context", course.alt_m, "height", unit="m", display_unit="km")
+    block = StateBlock("field_n", slice(0, 3), "T", "uT", "launch NED", NED)
+    about = {"long_name": "geomagnetic field", "dims": "time axis_field_n"}
+    notes = []
+    if np.any(course.seen):
+        measured = np.where(course.seen[:, None], course.field_n, np.nan)
+        notes.append(field.sentence(field.unobserved(measured, given.magnetometer.noise)))
+    return View(
+        epoch_s=course.time_s,
+        context=xr.Dataset(height | block_array("context", block, course.field_n, **about)),
+        count_from=int(np.searchsorted(course.time_s, given.counted_from + 1e-9)),
+        windows=course.bursts,
+        notes=notes,
+        **own,
+    )
+
+
+def angle_view(given: MagneticAttitude, course: Course) -> View:
+    """What "magnetic-attitude" reports."""
+    return _view(
+        given,
+        course,
+        blocks=(
+            StateBlock("attitude", slice(0, 3), "rad", "deg", "launch NED", EULER),
+            StateBlock("rate", slice(3, 6), "rad/s", "deg/s", "FRD", ("p", "q", "r")),
+        ),
+        sensors={i.name: i.axes for i in instruments(given)},
+        metrics=partial(angle_metrics, course),
+    )
+
+
+def field_view(given: FieldVector, course: Course) -> View:
+    """What "field-vector" reports."""
+    across = ("about", "level", "upright")
+    return _view(
+        given,
+        course,
+        blocks=(
+            StateBlock("attitude", slice(0, 3), "rad", "deg", "FRD", BODY),
+            StateBlock("field_attitude", slice(3, 6), "rad", "deg", "field", across),
+            StateBlock("gyro_bias", slice(6, 9), "rad/s", "deg/h", "FRD", BODY),
+        ),
+        sensors=dict.fromkeys((FIELD, SNAPSHOT), MAGNETOMETER.axes),
+        metrics=partial(field_metrics, course),
+        norms=(Norm("across_field", (4, 5)),),
+    )
+
+
+MAGNETIC_ATTITUDE = Study(
+    MagneticAttitude, tuple(ANGLE_FILTERS), simulate, angle_contender, angle_view, lay_out, CLAIMS
+)
+FIELD_VECTOR = Study(
+    FieldVector, tuple(FIELD_FILTERS), simulate, field_contender, field_view, lay_out, CLAIMS
+)
