@@ -10,7 +10,7 @@
 - `magnetometer_calibration`: hard and soft iron from turning about (import it by its name).
 - `vector_attitude`: attitude from stars; `star_identification`: which stars those
   are, lost in space or nearly known (import them by their names).
-- `alignment`: attitude at rest, from gravity, Earth rate or velocity.
+- `alignment`: attitude at rest, from gravity, Earth rate or velocity; `rest`: when that is.
 """
 
 from robins.ins.alignment import (
