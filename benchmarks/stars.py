@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from timing import best_of, show
 
-from robins.earth.star_catalogue import synthetic
+from robins.earth.stars import synthetic
 from robins.ins.star_identification import identify, index_pairs
 from robins.ins.vector_attitude import METHODS
 from robins.sim.random import Component, stream

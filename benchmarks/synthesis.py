@@ -19,8 +19,7 @@ import scipy.linalg
 from timing import best_of, show
 
 from robins.filters.synthesis import Plant, current_form, plant, programs
-from robins.filters.synthesis.every_step import EveryStep, FrozenTimeWarning
-from robins.filters.synthesis.lmi import observer
+from robins.filters.synthesis.lmi import EveryStep, FrozenTimeWarning, observer
 from robins.filters.synthesis.riccati import riccati
 from robins.filters.synthesis.scaling import balanced
 

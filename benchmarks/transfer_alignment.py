@@ -16,9 +16,8 @@ from timing import best_of, show
 import robins.systems
 from robins import scenario
 from robins.filters import run
-from robins.systems.transfer_alignment.attitude_matching import ATTITUDE
-from robins.systems.transfer_alignment.matching import matching_problem
-from robins.systems.transfer_alignment.matching_parameters import Matching
+from robins.systems.transfer_alignment.attitude_matching import STUDY
+from robins.systems.transfer_alignment.attitude_matching.model import ATTITUDE
 
 RUNS, CHUNK = 200, 50
 FILTERS = ("kf", "kf-flexure", "hinf-deg")
@@ -43,8 +42,8 @@ def attitude(step):
 
 
 def main():
-    parameters = scenario.load(Matching, S0)
-    problem = matching_problem(parameters, FILTERS, 0)
+    parameters = scenario.load(STUDY.parameters, S0)
+    problem = STUDY.problem(parameters, FILTERS, 0)
 
     def errors(contender, index):
         case = contender.case(problem.simulate(index))

@@ -150,22 +150,6 @@ def test_many_states_move_under_vmap():
         np.testing.assert_allclose(a[2], b, rtol=4 * EPS, atol=4 * EPS)
 
 
-def test_mean_of_vectors_is_the_weighted_mean():
-    points = [jnp.array([1.0, 2.0]), jnp.array([3.0, -4.0]), jnp.array([0.5, 0.0])]
-    weights = jnp.array([0.2, 0.3, 0.5])
-    mean = manifold.mean_about(points[0], points, weights)
-    np.testing.assert_allclose(mean, np.stack(points).T @ weights, atol=4 * EPS)
-
-
-def test_mean_of_rotations_about_one_axis_is_at_the_mean_angle():
-    # Angles across +-180 deg, where the mean of numbers would point the other way.
-    angles = np.deg2rad([170.0, -170.0, 175.0, -160.0])
-    points = [Rotation.from_rotvec(jnp.array([0.0, 0.0, a])) for a in angles]
-    mean = manifold.mean_about(points[0], points, jnp.full(4, 0.25))
-    expected = np.deg2rad(np.mean([170.0, 190.0, 175.0, 200.0]) - 360.0)
-    np.testing.assert_allclose(mean.as_rotvec(), [0, 0, expected], atol=8 * EPS)
-
-
 @pytest.mark.parametrize("length", [0, N - 1, N + 1])
 def test_a_step_of_wrong_length_is_refused(length):
     with pytest.raises(ValueError, match=rf"shape \({length},\), the state needs \({N},\)"):

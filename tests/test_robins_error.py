@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import robins
-from robins.bench.ports.port import PortLostError
+from robins.bench.broker import LinkLost
 from robins.errors import RobinsError
 from robins.logs import LogError
 from robins.results import ResultError
@@ -73,5 +73,4 @@ def test_a_failing_disk_is_not_bad_input():
     assert ResultError("out", "x", "y").bad_input
     assert not cannot("out", "write", OSError(28, "full")).bad_input
     assert cannot("out", "write", ValueError("a name")).bad_input
-    lost = PortLostError("is gone", "port 'a'")
-    assert (str(lost), lost.errno, lost.bad_input) == ("port 'a': is gone", None, False)
+    assert not LinkLost("adm", OSError(5, "gone")).bad_input

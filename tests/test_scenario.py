@@ -1,7 +1,6 @@
 """Scenarios: right ones read to the letter, wrong ones refused with one line a fault (F30)."""
 
 import datetime
-import hashlib
 import math
 import os
 import tomllib
@@ -414,10 +413,3 @@ def test_text_written_is_read_back_the_same(mapping):
 def test_a_changed_scenario_can_be_kept_and_run_again():
     changed = override(tomllib.loads(GOOD), ["imu.gyro_bias=2 deg/h", "runs=7"])
     assert read(text_of(changed)) == read(GOOD, "imu.gyro_bias=2 deg/h", "runs=7")
-
-
-def test_hash_is_that_of_the_text():
-    assert scenario.hash_of("") == hashlib.sha256(b"").hexdigest()
-    assert (
-        scenario.hash_of("wind = 3 # Böe") == hashlib.sha256("wind = 3 # Böe".encode()).hexdigest()
-    )

@@ -266,13 +266,10 @@ def test_show():
     assert show(math.nan, "m") == "nan m"
 
 
-def test_noise_is_shown_as_data_sheets_and_as_calibration_tools_say():
+def test_noise_of_data_sheets_is_that_of_calibration_tools():
     arw = parse("0.66 deg/sqrt(h)", "angle random walk")
     assert arw == pytest.approx(parse("0.011 deg/s/sqrt(Hz)", "angle random walk"), rel=1e-15)
-    text = units.show_gyro_noise(arw)
-    assert text == "0.66 deg/sqrt(h) = 0.011 deg/s/sqrt(Hz) = 0.000192 rad/s/sqrt(Hz)"
-    for part in text.split(" = "):
-        assert parse(part, "angle random walk") == pytest.approx(arw, rel=1e-3)
+    assert units.show(arw, "rad/s/sqrt(Hz)", 4) == "0.000192 rad/s/sqrt(Hz)"
     vrw = parse("0.1 m/s/sqrt(h)", "velocity random walk")
-    text = units.show_accelerometer_noise(vrw)
-    assert text == "0.1 m/s/sqrt(h) = 170 ug/sqrt(Hz) = 0.001667 m/s^2/sqrt(Hz)"
+    assert units.show(vrw, "ug/sqrt(Hz)", 4) == "170 ug/sqrt(Hz)"
+    assert units.show(vrw, "m/s^2/sqrt(Hz)", 4) == "0.001667 m/s^2/sqrt(Hz)"

@@ -1,8 +1,8 @@
-"""Tables of the doctor's findings and of what `clean` refuses, out of `robins.logs.checks`."""
+"""Tables of the doctor's findings and of what `clean` refuses, out of `robins.logs.doctor`."""
 
 from generated import setup_of, table
 
-from robins.logs.checks import ALONE, OF_READERS, REFUSALS, TOGETHER
+from robins.logs.doctor import ALONE, OF_READERS, REFUSALS, TOGETHER
 
 
 def findings() -> str:

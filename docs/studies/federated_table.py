@@ -32,9 +32,9 @@ from jax.tree_util import Partial
 
 from robins import linalg
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
-from robins.filters.channels import channel
-from robins.filters.federated import federated
-from robins.filters.fusion import fuse, share
+from robins.filters.composite.channels import channel
+from robins.filters.composite.federated import federated
+from robins.filters.composite.fusion import fuse, share
 
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "federated_table.png"
 

@@ -18,6 +18,7 @@ also run with flexure states that are too stiff or too soft, too fast or too slo
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,13 +33,9 @@ from robins.filters.rules import huber
 from robins.scenario import load
 from robins.systems import transfer_alignment
 from robins.systems.study import Contender, Problem
-from robins.systems.transfer_alignment.pair_parameters import Structure
-from robins.systems.transfer_alignment.patent import Patent, patent_problem
-from robins.systems.transfer_alignment.product_filters import (
-    Believed,
-    product_contender,
-    reported,
-)
+from robins.systems.transfer_alignment.product.parameters import Believed, Structure
+from robins.systems.transfer_alignment.product.study import product_contender, reported
+from robins.systems.transfer_alignment.velocity_attitude.study import STUDY, VelocityAttitude
 
 SCENARIOS = Path(transfer_alignment.__file__).parent / "scenarios"
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "robust_alignment.png"
@@ -89,7 +86,7 @@ def told_case(case, gyro, jump, world):
     return given._replace(u=Told(given.u, gyro, jump))
 
 
-def informed(given: Patent, epoch_s: np.ndarray) -> Contender:
+def informed(given: VelocityAttitude, epoch_s: np.ndarray) -> Contender:
     """The product filter that knows it all, but for what is random."""
     d, structure = given.disturbance, given.flexure
     flexes = any(structure.sigma)
@@ -123,13 +120,13 @@ def own(contender: Contender) -> Contender:
 # ------------------------------------------------------------------------------- the table
 
 
-def problem_of(name: str, seed: int) -> tuple[Patent, Problem]:
+def problem_of(name: str, seed: int) -> tuple[VelocityAttitude, Problem]:
     """A scenario with all filters of the table."""
-    given = load(Patent, SCENARIOS / f"{name}.toml")
-    problem = patent_problem(given, PATENT, seed)
+    given = load(VelocityAttitude, SCENARIOS / f"{name}.toml")
+    problem = STUDY.problem(given, PATENT, seed)
     more = {name: own(product_contender(given, name)) for name in UNTOLD}
     more[INFORMED] = informed(given, problem.epoch_s)
-    return given, problem._replace(contenders={**problem.contenders, **more})
+    return given, replace(problem, contenders={**problem.contenders, **more})
 
 
 def errors(problem: Problem, names, runs: int, chunk: int) -> dict[str, np.ndarray]:
@@ -145,7 +142,7 @@ def rms(error: np.ndarray, axis=None) -> np.ndarray:
     return np.sqrt(np.mean(error**2, axis=axis)) / MINUTE
 
 
-def priors(given: Patent, problem: Problem) -> dict[str, Contender]:
+def priors(given: VelocityAttitude, problem: Problem) -> dict[str, Contender]:
     """The adaptive filter with flexure states of other sizes and times."""
     out = {}
     for minutes, seconds in ((10.0, 3.0), (5.0, 3.0), (20.0, 3.0), (10.0, 1.5), (10.0, 6.0)):
@@ -202,7 +199,7 @@ def main() -> None:
         epoch_s = problem.epoch_s
         if arguments.priors:
             more = priors(given, problem)
-            problem = problem._replace(contenders={**problem.contenders, **more})
+            problem = replace(problem, contenders={**problem.contenders, **more})
             names = tuple(dict.fromkeys([*names, *more]))
         found = errors(problem, names, arguments.runs, arguments.chunk)
         for name, error in found.items():

@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robins.earth.star_catalogue import Stars, hipparcos, synthetic
+from robins.earth.stars import Stars, hipparcos, synthetic
 from robins.ins.star_identification import Identification, identify, index_pairs
 from robins.ins.vector_attitude import METHODS
 from robins.sim.random import Component, stream

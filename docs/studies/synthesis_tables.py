@@ -24,11 +24,9 @@ from robins.filters.synthesis import (
     riccati,
     spectral_radius,
 )
-from robins.filters.synthesis.full_order import full
 from robins.filters.synthesis.inequalities import full as full_order_inequalities
-from robins.filters.synthesis.lmi import observer
+from robins.filters.synthesis.lmi import full, observer, retuned
 from robins.filters.synthesis.programs import packages
-from robins.filters.synthesis.search import retuned
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "filters" / "synthesis"))
 

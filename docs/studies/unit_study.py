@@ -22,25 +22,24 @@ import robins.systems
 from robins import scenario, units
 from robins.filters import Filter, kalman, run
 from robins.filters.rules.h_infinity import h_infinity, with_gamma
-from robins.systems.transfer_alignment.attitude_matching import (
+from robins.systems.transfer_alignment.attitude_matching.model import (
     ATTITUDE,
-    AttitudeMatching,
-    Spread,
-    attitude_matching,
+    PHI,
+    LinearSystem,
+    linear_system,
 )
-from robins.systems.transfer_alignment.matching import lay_out, simulate, sizes_of, turn_of
-from robins.systems.transfer_alignment.matching_filters import (
+from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
+from robins.systems.transfer_alignment.attitude_matching.study import (
     ARCMIN,
-    World,
     central_filter,
     existence,
 )
-from robins.systems.transfer_alignment.matching_parameters import Matching
+from robins.systems.transfer_alignment.attitude_matching.world import World, lay_out, simulate
 
 PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "unit_study.png"
 PACKAGED = Path(robins.systems.__file__).parent / "transfer_alignment" / "scenarios" / "s0.toml"
-S0 = scenario.load(Matching, PACKAGED)
-COURSE, SIZES = lay_out(S0), sizes_of(S0)
+S0 = scenario.load(AttitudeMatching, PACKAGED)
+COURSE = lay_out(S0)
 FROM = int(np.searchsorted(COURSE.epoch_s, S0.settle - 1e-9))
 GAMMA = S0.h_infinity.gamma
 UNITS = ("rad", "deg", "arcmin")
@@ -62,17 +61,15 @@ class Row(NamedTuple):
     """A filter in a unit: state, R = sigma^2 and gamma in it."""
 
     filter: Filter
-    system: AttitudeMatching
+    system: LinearSystem
     sigma: float
     gamma: float
     per_rad: float
 
 
-def physical() -> AttitudeMatching:
+def physical() -> LinearSystem:
     """The system in radians."""
-    b = S0.believed
-    spread = Spread(b.attitude, b.gyro_bias, b.mounting, S0.slave.gyro_noise)
-    return attitude_matching(turn_of(S0.manoeuvre), S0.period, len(COURSE.at), spread)
+    return linear_system(S0, len(COURSE.at))
 
 
 def of(unit: str, P0: str) -> Row:
@@ -92,7 +89,7 @@ def weighted(unit: str) -> Row:
 
 @jax.jit
 def worlds(runs):
-    return jax.vmap(lambda index: simulate(COURSE, SIZES, 0, index))(runs)
+    return jax.vmap(lambda index: simulate(S0, COURSE, 0, index))(runs)
 
 
 def rms_over_time(row: Row, world: World) -> np.ndarray:
@@ -104,7 +101,7 @@ def rms_over_time(row: Row, world: World) -> np.ndarray:
         return run(row.filter, model, state, z, u, aux, keep=attitude).steps
 
     estimate = jax.vmap(one)(world.measured * row.per_rad) / row.per_rad
-    return np.sqrt(np.mean((np.asarray(world.phi - estimate) / ARCMIN) ** 2, axis=0))
+    return np.sqrt(np.mean((np.asarray(world.state[..., PHI] - estimate) / ARCMIN) ** 2, axis=0))
 
 
 def attitude(step):
@@ -124,13 +121,14 @@ def table(world: World) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for (unit, P0), (least, figures) in REFERENCE.items():
         row = of(unit, P0)
-        told = existence(row.filter, row.system, 1.0, GAMMA, COURSE.heard, COURSE.epoch_s)
-        if told.update is None:
+        told = existence(row.filter, row.system, 1.0, COURSE, GAMMA)
+        if told["feasible"]:
             found[f"{unit}, P0 {P0}"] = rms_over_time(row, world)
             shown = pooled(found[f"{unit}, P0 {P0}"])
         else:
-            shown = f"none: update {told.update}"
-        print(f"{unit + ', P0 ' + P0:<28}{told.gamma_min:10.4g}{least:>9}{shown:>18}{figures:>18}")
+            shown = f"none: update {told['infeasible_at_update']}"
+        ours = told["gamma_min"]
+        print(f"{unit + ', P0 ' + P0:<28}{ours:10.4g}{least:>9}{shown:>18}{figures:>18}")
     print(f"\nR = (1')^2, L = attitude, gamma = {WEIGHTED_ARCMIN:g}'")
     same = {unit: rms_over_time(weighted(unit), world) for unit in UNITS}
     for unit, rms in same.items():

@@ -3,10 +3,10 @@
 python docs/studies/worst_case_gain.py [picture]
 
 Attitude matching of a slave inertial unit with its master, nine states, weights R = I and L = I
-(`robins.systems.transfer_alignment.attitude_matching`). Three forms of the filter against each
-other, the gain that the worst disturbances have against the gamma asked for, and the least gamma in
-three units of angle: the same filter of the same aircraft is harmless in one and impossible in
-another. Reference values are those of an independent prototype.
+(`robins.systems.transfer_alignment.attitude_matching.model`). Three forms of the filter against
+each other, the gain that the worst disturbances have against the gamma asked for, and the least
+gamma in three units of angle: the same filter of the same aircraft is harmless in one and
+impossible in another. Reference values are those of an independent prototype.
 """
 
 import importlib.util
@@ -18,8 +18,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from robins.filters import kalman, run
+from robins.filters.analysis.worst_case import gamma_min, worst_case_gain
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
-from robins.filters.worst_case import gamma_min, worst_case_gain
 
 HERE = Path(__file__).resolve().parent
 
@@ -69,7 +69,7 @@ def three_forms(gamma: float) -> float:
     s = matching.in_unit("deg")
     ours = np.asarray(filtered("deg", gamma)[2].steps.prediction.belief.covariance)
     joseph, krein = (
-        form(s.F, s.Q, s.H, np.eye(3), s.P0, WEIGHT, gamma)
+        form(s.F, s.G @ s.G.T, s.H, np.eye(3), np.diag(s.sigma**2), WEIGHT, gamma)
         for form in (dense.joseph_riccati, dense.krein_riccati)
     )
     sigma = np.sqrt(np.diagonal(joseph, axis1=1, axis2=2))

@@ -11,7 +11,6 @@ nothing: `retract` is addition and `local` subtraction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,9 +112,3 @@ def local(x: State, y: State) -> Float[Array, "n"]:
         for a, b in zip(xs, ys, strict=True)
     ]
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
-
-
-def mean_about(x: State, points: Sequence[State], weights: Float[Array, "p"]) -> State:
-    """One Gauss-Newton step of the weighted mean of points, begun at x."""
-    deltas = jnp.stack([local(x, p) for p in points])
-    return retract(x, weights @ deltas)

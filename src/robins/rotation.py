@@ -3,25 +3,34 @@
 Quaternions are scalar first (w, x, y, z), Hamilton product; ``q_nb`` maps body coordinates to
 navigation coordinates, ``v_n = rotate(q_nb, v_b)``. All functions work on one or many alike: the
 last axis holds the components, leading axes broadcast. Euler angles are roll, pitch, heading of
-the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame.
+the aerospace (Z-Y-X) sequence between an NED navigation frame and an FRD body frame. Functions
+that take `Real` compute by NumPy where NumPy is given, with nothing to compile, else by JAX.
 
-Small-angle series live here, and for SE_2(3) in `ins.extended_pose`; they are exact to rounding on
-both sides of their switch and have finite derivatives at zero.
+Small-angle series live here; they are exact to rounding on both sides of their switch and have
+finite derivatives at zero. The exponential map to first order is ``I + skew(phi)``, its Jacobians
+are `left_jacobian(phi)` and, on the right, `left_jacobian(-phi)`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.linalg import scalars
+
+if TYPE_CHECKING:
+    Real = Any  # what goes in comes out
+else:
+    Real = Array | np.ndarray
 
 _SMALL = 1e-3  # rad^2; below it the series, of which no dropped term exceeds 1e-18
-
+_SMALL_TURN = 1e-2  # rad^2; below it those of `turn_coefficients`: 1e-16 of the first term
 
 _LOCK = 1e-14  # rad from the vertical, about; a unit quaternion is rounded to 3e-16
 
@@ -30,6 +39,14 @@ def _same_rank(*arrays):
     """Leading axes of length one where an array has fewer, for then the rest broadcasts itself."""
     most = max(a.ndim for a in arrays)
     return [a.reshape((1,) * (most - a.ndim) + a.shape) for a in arrays]
+
+
+def _library(*arrays):
+    return np if all(isinstance(a, np.ndarray) for a in arrays) else jnp
+
+
+def _components(q):
+    return q[..., 0], q[..., 1], q[..., 2], q[..., 3]
 
 
 def _sinc_cos(angle_sq):
@@ -46,33 +63,24 @@ def _sinc_cos(angle_sq):
     return sinc, jnp.where(small, cos_series, jnp.cos(angle))
 
 
-def skew(v: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+def skew(v: Float[Real, "*b 3"]) -> Float[Real, "*b 3 3"]:
     """Cross-product matrix: ``skew(a) @ b == cross(a, b)``."""
+    xp = _library(v)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    o = jnp.zeros_like(x)
-    rows = [jnp.stack(r, -1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))]
-    return jnp.stack(rows, -2)
+    o = xp.zeros_like(x)
+    rows = [xp.stack(r, -1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))]
+    return xp.stack(rows, -2)
 
 
-def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
+def multiply(p: Float[Real, "*#b 4"], q: Float[Real, "*#b 4"]) -> Float[Real, "*b 4"]:
     """Hamilton product p q: rotate by q first, then by p."""
-    p, q = _same_rank(p, q)
-    pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
-    qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return jnp.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        -1,
-    )
+    factors = (_components(a) for a in _same_rank(p, q))
+    return _library(p, q).stack(scalars.product(*factors), -1)
 
 
-def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+def conjugate(q: Float[Real, "*b 4"]) -> Float[Real, "*b 4"]:
     """Inverse of a unit quaternion."""
-    return jnp.concatenate([q[..., :1], -q[..., 1:]], -1)
+    return _library(q).concatenate([q[..., :1], -q[..., 1:]], -1)
 
 
 def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -94,30 +102,61 @@ def from_rotvec(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     return jnp.concatenate([cos, 0.5 * sinc * phi], -1)
 
 
-def to_rotvec(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+def to_rotvec(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3"]:
     """Rotation vector [rad] of length at most pi; q and -q give the same."""
-    q = jnp.where(q[..., :1] < 0.0, -q, q)
+    xp = _library(q)
+    q = xp.where(q[..., :1] < 0.0, -q, q)
     w, u = q[..., :1], q[..., 1:]
-    s_sq = jnp.sum(u * u, -1, keepdims=True)
+    s_sq = xp.sum(u * u, -1, keepdims=True)
     small = s_sq < _SMALL
-    safe = jnp.where(small, 1.0, s_sq)
-    s = jnp.sqrt(safe)
-    x = jnp.where(small, s_sq / jnp.where(small, w * w, 1.0), 0.0)
+    safe = xp.where(small, 1.0, s_sq)
+    s = xp.sqrt(safe)
+    x = xp.where(small, s_sq / xp.where(small, w * w, 1.0), 0.0)
     # 2 atan2(s, w)/s; the series is that of 2 atan(t)/t with t = s/w, over w
     series = 2.0 * (1.0 - x * (1 / 3 - x * (1 / 5 - x * (1 / 7 - x * (1 / 9 - x / 11)))))
-    series = series / jnp.where(small, w, 1.0)
-    return jnp.where(small, series, 2.0 * jnp.arctan2(s, jnp.where(small, 1.0, w)) / s) * u
+    series = series / xp.where(small, w, 1.0)
+    return xp.where(small, series, 2.0 * xp.arctan2(s, xp.where(small, 1.0, w)) / s) * u
 
 
-def to_dcm(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
-    """Direction cosine matrix: ``v_n = C_nb @ v_b``."""
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+def turn_coefficients(phi: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
+    """(1 - cos a)/a^2, (a - sin a)/a^3 and (1 - (a/2) cot(a/2))/a^2, each (...), for a = |phi|."""
+    sq = jnp.sum(phi * phi, -1)
+    # Double `where`, as above: the root has no slope at zero.
+    small = sq < _SMALL_TURN
+    a = jnp.sqrt(jnp.where(small, 1.0, sq))
+    x = jnp.where(small, sq, 0.0)
+    half = jnp.sin(0.5 * a) / a
+    once = 0.5 - x / 24.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0 * (1.0 - x / 90.0)))
+    twice = 1.0 / 6.0 - x / 120.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0 * (1.0 - x / 110.0)))
+    # 1/12 and the next Bernoulli numbers over factorials
+    back = 1.0 / 12.0 + x * (1 / 720 + x * (1 / 30240 + x * (1 / 1209600 + x / 47900160)))
+    return (
+        jnp.where(small, once, 2.0 * half**2),
+        jnp.where(small, twice, (a - jnp.sin(a)) / a**3),
+        jnp.where(small, back, (1.0 - 0.5 * jnp.cos(0.5 * a) / half) / a**2),
     )
-    return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
+
+
+def left_jacobian(
+    phi: Float[Array, "*b 3"], *, first_order: bool = False
+) -> Float[Array, "*b 3 3"]:
+    """J(phi): exp((phi + d) x) = exp((J d) x) exp(phi x) to first order in d (Sola 2017, eq. 145).
+
+    The right Jacobian, exp((phi + d) x) = exp(phi x) exp((J_r d) x), is J(-phi). To first order in
+    phi too, J = I + skew(phi) / 2.
+    """
+    turn = skew(phi)
+    unit = jnp.broadcast_to(jnp.eye(3), turn.shape)
+    if first_order:
+        return unit + 0.5 * turn
+    once, twice, _ = (c[..., None, None] for c in turn_coefficients(phi))
+    return unit + once * turn + twice * turn @ turn
+
+
+def to_dcm(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3 3"]:
+    """Direction cosine matrix: ``v_n = C_nb @ v_b``."""
+    xp = _library(q)
+    return xp.stack([xp.stack(row, -1) for row in scalars.dcm(_components(q))], -2)
 
 
 def from_dcm(C: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
@@ -167,7 +206,7 @@ def to_euler(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
     roll and heading (Bernardes & Viollet 2022), of which only one is lost near the vertical: so
     they describe the rotation to rounding at every pitch.
     """
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    w, x, y, z = _components(q)
     # Cosine and sine of (roll - heading)/2 and of (roll + heading)/2, each pair times sqrt(2) and
     # times the sine of half the angle between the pitch and -90 or +90 deg.
     nose_up, nose_down = (w + y, x - z), (w - y, x + z)
@@ -177,12 +216,6 @@ def to_euler(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
     total = jnp.where(at_top, -difference, total)
     difference = jnp.where(at_bottom, -total, difference)
     return _within_half_turn(total + difference), pitch, _within_half_turn(total - difference)
-
-
-def gimbal_lock(q: Float[Array, "*b 4"]) -> Bool[Array, "*b"]:
-    """Whether the pitch is so near +-90 deg that `to_euler` has set the roll to zero."""
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return _polar(w + y, x - z)[2] | _polar(w - y, x + z)[2]
 
 
 def _polar(c, s):

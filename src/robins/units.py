@@ -308,23 +308,3 @@ def show(value_si, unit_: str, digits: int = 6) -> str:
     u = unit(unit_)
     number = f"{from_si(value_si, u):.{digits}g}"
     return number if u.symbol == "1" else f"{number} {u.symbol}"
-
-
-def show_gyro_noise(arw_si, digits: int = 4) -> str:
-    """Angle random walk [rad/sqrt(s)] as data sheets and as calibration tools such as Kalibr say.
-
-    >>> show_gyro_noise(parse("0.15 deg/sqrt(h)", "angle random walk"))
-    '0.15 deg/sqrt(h) = 0.0025 deg/s/sqrt(Hz) = 4.363e-05 rad/s/sqrt(Hz)'
-    """
-    names = ("deg/sqrt(h)", "deg/s/sqrt(Hz)", "rad/s/sqrt(Hz)")
-    return " = ".join(show(arw_si, name, digits) for name in names)
-
-
-def show_accelerometer_noise(vrw_si, digits: int = 4) -> str:
-    """Velocity random walk [m/s/sqrt(s)] as data sheets and as calibration tools say.
-
-    >>> show_accelerometer_noise(parse("50 ug/sqrt(Hz)", "velocity random walk"))
-    '0.02942 m/s/sqrt(h) = 50 ug/sqrt(Hz) = 0.0004903 m/s^2/sqrt(Hz)'
-    """
-    names = ("m/s/sqrt(h)", "ug/sqrt(Hz)", "m/s^2/sqrt(Hz)")
-    return " = ".join(show(vrw_si, name, digits) for name in names)

@@ -1,6 +1,7 @@
 """The seven parts in one process: joined by bytes, or on threads in the place of processes."""
 
 import os
+import termios
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -145,3 +146,12 @@ class Loop:
 
     def flags(self) -> np.ndarray:
         return self.all("estimate", "flags").astype(int)
+
+
+GONE = (OSError, termios.error)
+"""What a port raises whose far end is gone."""
+
+
+def receive(port) -> bytes:
+    """All that has come in; waits for a first byte as long as the port's timeout says."""
+    return port.read(max(1, port.in_waiting))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from robins.bench.run.alarms import Alarms
+from robins.bench.run.telemetry import Alarms
 from robins.bench.wire.schema import FLAGS
 
 USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))

@@ -8,9 +8,10 @@ import threading
 
 import numpy as np
 import pytest
+from stations import GONE, receive
 
 from robins.bench import wire
-from robins.bench.ports.port import Address, PortLostError, open_port, receive, send
+from robins.bench.ports.port import Address, open_port
 from robins.bench.recording import Entry, Event, Record, Recorder, read_record
 from robins.bench.recording.differences import differences
 from robins.bench.recording.replay import ReplayError, recorded, replay
@@ -58,14 +59,14 @@ class Echo(threading.Thread):
         return self.code
 
     def run(self) -> None:
-        with contextlib.suppress(PortLostError), open_port(Address(self.path), 0.2) as port:
+        with contextlib.suppress(*GONE), open_port(Address(self.path), 0.2) as port:
             self.talk(port)
 
     def talk(self, port) -> None:
         receiver, run, sequence, total, answer = Receiver(), 0, 0, np.zeros(3), (-1, b"")
         said = {"part": PARTS.index(self.odd.get("part", "adm")), "schema": schema_number()}
         said["schema"] ^= self.odd.get("schema", 0)
-        send(port, encoded("hello", 0, 0, run=0, **said))
+        port.write(encoded("hello", 0, 0, run=0, **said))
         inbox: dict[int, np.ndarray] = {}
         while True:
             data = receive(port)
@@ -88,7 +89,7 @@ class Echo(threading.Thread):
                 if k == self.odd.get("hangs"):
                     continue
                 if k == self.odd.get("starts anew"):
-                    send(port, encoded("hello", 0, 0, run=0, **said))
+                    port.write(encoded("hello", 0, 0, run=0, **said))
                     continue
                 if k > answer[0]:
                     total = total + inbox.get(head.time_ns, 0.0)
@@ -99,7 +100,7 @@ class Echo(threading.Thread):
                     Header(wire.NUMBERS["estimate"], run, sequence, at), answer[1]
                 )
                 took = int(np.random.default_rng().integers(10**6))
-                send(port, out + encoded("done", sequence + 1, at, run, step=k, compute=took))
+                port.write(out + encoded("done", sequence + 1, at, run, step=k, compute=took))
                 sequence += 2
 
 

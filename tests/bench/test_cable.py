@@ -9,9 +9,10 @@ import time
 
 import numpy as np
 import pytest
+from stations import GONE, receive
 
 from robins.bench.ports.cable import cable
-from robins.bench.ports.port import Address, PortLostError, address, open_port, receive, send
+from robins.bench.ports.port import Address, address, open_port
 
 
 @pytest.fixture
@@ -27,7 +28,7 @@ def ends():
 def test_every_byte_gets_across(ends):
     every = bytes(range(256))
     for one, other in (ends, ends[::-1]):
-        send(one, every)
+        one.write(every)
         assert other.read(256) == every
         assert one.in_waiting == 0  # no echo
 
@@ -41,7 +42,7 @@ def test_a_megabyte_both_ways_at_once(ends):
         while len(into) < 1_000_000 and (more := receive(port)):
             into.extend(more)
 
-    threads = [threading.Thread(target=send, args=(p, d)) for p, d in zip(ends, sent, strict=True)]
+    threads = [threading.Thread(target=p.write, args=(d,)) for p, d in zip(ends, sent, strict=True)]
     threads += [threading.Thread(target=read, args=(p, g)) for p, g in zip(ends, got, strict=True)]
     for thread in threads:
         thread.start()
@@ -64,7 +65,7 @@ def test_what_nobody_reads_waits_and_holds_up_nothing_else(ends):
             except BlockingIOError:
                 break
     assert 4000 < filled < 1_000_000
-    send(board, b"back")
+    board.write(b"back")
     assert bench.read(4) == b"back"
     assert board.read(filled) == bytes(filled)
 
@@ -72,7 +73,7 @@ def test_what_nobody_reads_waits_and_holds_up_nothing_else(ends):
 def test_ends_are_gone_with_the_cable():
     with cable() as paths:
         bench = open_port(Address(paths.bench))
-    with bench, pytest.raises(PortLostError):
+    with bench, pytest.raises(GONE):
         receive(bench)
     assert not os.path.exists(paths.board)
 
@@ -84,7 +85,7 @@ def test_as_a_program():
         paths = [process.stdout.readline().split() for _ in range(2)]
         assert [name for name, _ in paths] == ["bench:", "board:"]
         with open_port(address(paths[0][1])) as one, open_port(address(paths[1][1]), 5.0) as other:
-            send(one, b"hello")
+            one.write(b"hello")
             assert other.read(5) == b"hello"
         process.send_signal(signal.SIGINT)
         try:

@@ -3,7 +3,7 @@
 from stations import RUN, Loop, kit
 
 from robins.bench.broker.revive import History, beginning
-from robins.bench.parts import memory
+from robins.bench.parts import station as memory
 from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station
 from robins.bench.wire import Header, Receiver, decode, encode_frame, message

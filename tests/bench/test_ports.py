@@ -5,10 +5,9 @@ import os
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
 
-from robins.bench.ports import listing
+from robins.bench.ports import port as listing
 from robins.bench.ports import port as one_port
-from robins.bench.ports.listing import PortInfo, list_ports, table
-from robins.bench.ports.port import BAUD, address, open_pair
+from robins.bench.ports.port import BAUD, PortInfo, address, list_ports, open_pair, table
 
 
 def known(path: str, description: str = "n/a", maker: str | None = None, serial: str | None = None):

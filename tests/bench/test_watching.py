@@ -1,6 +1,6 @@
 """Who looks on sees what matters, however much else happens."""
 
-from robins.bench.live.latest import latest
+from robins.bench.live.feed import latest
 from robins.bench.run import watching
 from robins.bench.run.watching import Looking
 from robins.bench.status import Status

@@ -127,14 +127,6 @@ def test_the_figure_shows_every_design(made):
     assert "Two states" in page  # the problem as it was given
 
 
-def test_the_report_can_be_made_again(made):
-    _, result = made
-    before = (result.path / "report.html").read_text()
-    report.attach(result.path)
-    assert "figures/trade_off.png" in results.read(result.path).summary["files"]["figures"]
-    assert len((result.path / "report.html").read_text()) == pytest.approx(len(before), rel=0.05)
-
-
 def test_json_is_the_summary_and_nothing_else(robins):
     answer = robins("design", "baro-height", "--gamma", "10,5", "--methods", "riccati", "--json")
     assert answer.status == 0

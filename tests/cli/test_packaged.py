@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from simulated_pair import pair_dataset
 
 from robins import logs, results, scenario
 from robins.campaign.monte_carlo import _each, _records, contender
@@ -28,8 +29,7 @@ from robins.report import numbers
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import configurations
 from robins.systems.ins_gnss import Drive, drive_dataset
-from robins.systems.transfer_alignment.pair_log import pair_dataset
-from robins.systems.transfer_alignment.pair_replay import Replay
+from robins.systems.transfer_alignment.product.parameters import Replay
 
 ROOT = Path(__file__).resolve().parents[2]
 

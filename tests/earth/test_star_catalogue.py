@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, uniform
 
-from robins.earth.star_catalogue import _read, hipparcos, synthetic
+from robins.earth.stars import _read, hipparcos, synthetic
 
 SKY = synthetic(6.5)
 

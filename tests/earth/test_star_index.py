@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.earth.star_catalogue import Stars, synthetic
-from robins.earth.star_index import _cube_points, index_stars, near
+from robins.earth.stars import Stars, _cube_points, index_stars, near, synthetic
 
 REACH = np.radians(10.0)
 SKY = synthetic(5.0)

@@ -7,8 +7,8 @@ import pytest
 from dense_kalman import random_system, simulate
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
-from robins.filters.bound import covariance_bound, used_sensors
-from robins.filters.observability import (
+from robins.filters.analysis.bound import covariance_bound, used_sensors
+from robins.filters.analysis.observability import (
     NOTHING,
     bits,
     gramian,

@@ -142,11 +142,6 @@ def test_unscented_polar(cases_dir):
         check(case, m=found.mean, P=found.covariance)
 
 
-def test_steady_state(cases_dir):
-    for case in cases(cases_dir, "steady_state"):
-        check(case, **linalg.steady_state(*given(case, "F", "Q", "H", "R"))._asdict())
-
-
 def test_discretize(cases_dir):
     for case in cases(cases_dir, "discretize"):
         A, Qc = given(case, "A", "Qc")

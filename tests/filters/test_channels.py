@@ -26,10 +26,10 @@ from robins.filters import (
     run,
     unscented,
 )
-from robins.filters.channels import channel
-from robins.filters.distributed import distributed, intersecting
-from robins.filters.federated import federated
-from robins.filters.fusion import fuse
+from robins.filters.composite.channels import channel
+from robins.filters.composite.distributed import distributed, intersecting
+from robins.filters.composite.federated import federated
+from robins.filters.composite.fusion import fuse
 from robins.filters.rules import gate
 from robins.manifold import Angle
 

@@ -9,15 +9,15 @@ from dense_kalman import System
 from scipy import stats
 
 from robins.filters import Belief, kalman, run
-from robins.filters.consistency import (
+from robins.filters.analysis.consistency import (
     anees,
     block_nees,
-    chi2_band,
     grand_mean_nis,
     nees,
     whitened_innovations,
     whiteness,
 )
+from robins.filters.chi_square import chi2_band
 from robins.rotation import Rotation
 
 # ---------------------------------------------------------------------- one number

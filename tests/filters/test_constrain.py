@@ -14,7 +14,7 @@ from two_sensors import by_sensor, split
 
 from robins import manifold
 from robins.filters import Belief, Code, kalman, run, taylor, unscented
-from robins.filters.constrain import constrain
+from robins.filters.limits.constrain import constrain
 from robins.filters.rules.equality import equality
 from robins.manifold import Angle
 from robins.rotation import Rotation

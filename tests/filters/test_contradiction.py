@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from robins.filters import Belief, Code, Sensor, Tally, imm, kalman, particle
-from robins.filters.consistency import grand_mean_nis
-from robins.filters.constrain import constrain
+from robins.filters.analysis.consistency import grand_mean_nis
+from robins.filters.limits.constrain import constrain
 
 ONE = kalman()
 SENSOR = Sensor(lambda x, aux: aux[0] @ x, lambda x, aux: aux[1], 2)

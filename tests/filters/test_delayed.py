@@ -19,7 +19,7 @@ from robins.filters import (
     normalised,
     run,
 )
-from robins.filters.delayed import Late, delayed
+from robins.filters.composite.delayed import Late, delayed
 from robins.filters.rules import gate
 from robins.manifold import Angle
 

@@ -8,7 +8,7 @@ from dense_kalman import System, random_system, simulate
 from scipy import optimize, stats
 
 from robins.filters import Belief, Code, Model, Motion, Observation, Sensor, kalman, run, unscented
-from robins.filters.rules._quantile import MOST, scale_to_quantile
+from robins.filters.rules._robust import MOST, scale_to_quantile
 from robins.filters.rules.discriminator import Verdict, discriminator
 from robins.manifold import Angle
 

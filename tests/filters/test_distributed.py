@@ -7,8 +7,8 @@ from dense_kalman import System
 from two_sensors import CHANNELS, ROWS, SYSTEMS, Y, added, centralised, corrected, one_run
 
 from robins.filters import Belief
-from robins.filters.distributed import distributed, intersecting
-from robins.filters.fusion import common_information_sum, covariance_intersection
+from robins.filters.composite.distributed import distributed, intersecting
+from robins.filters.composite.fusion import common_information_sum, covariance_intersection
 from robins.manifold import Angle
 
 # -------------------------------------------------------------------------- distributed, intersect

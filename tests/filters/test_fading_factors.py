@@ -87,10 +87,11 @@ def test_the_factor_by_hand():
     memory = rule.init(PRIOR, {"y": 2})
 
     def factor(memory, o):
-        memory, prior, _ = rule.before(memory, PRIOR, o)
+        memory, prior, o = rule.before(memory, PRIOR, o)
         times_ = np.asarray(prior.factor[0, 0] / PRIOR.factor[0, 0]) ** 2
-        assert float(memory.factor) == pytest.approx(times_, rel=1e-14)
-        return float(memory.factor), memory._replace(faded=jnp.array(False))
+        noted = float(o.notes["innovation_fading.lambda"])
+        assert noted == pytest.approx(times_, rel=1e-14)
+        return noted, memory._replace(faded=jnp.array(False))
 
     # one sample does not fill a window of two
     first, memory = factor(memory, seen([6.0, 4.0]))
@@ -111,10 +112,10 @@ def test_the_factor_by_hand():
 def test_a_step_is_faded_once():
     rule = innovation_fading(1, 100.0)
     memory = rule.init(PRIOR, {"y": 2})
-    memory, faded, _ = rule.before(memory, PRIOR, seen([9.0, 9.0]))
-    assert float(memory.factor) > 1.0
-    memory, again, _ = rule.before(memory, faded, seen([9.0, 9.0]))
-    assert float(memory.factor) == 1.0
+    memory, faded, o = rule.before(memory, PRIOR, seen([9.0, 9.0]))
+    assert float(o.notes["innovation_fading.lambda"]) > 1.0
+    memory, again, o = rule.before(memory, faded, seen([9.0, 9.0]))
+    assert float(o.notes["innovation_fading.lambda"]) == 1.0
     np.testing.assert_array_equal(again.factor, faded.factor)
 
 

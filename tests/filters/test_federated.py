@@ -27,8 +27,8 @@ from two_sensors import (
 
 from robins import linalg
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
-from robins.filters.channels import channel
-from robins.filters.federated import federated
+from robins.filters.composite.channels import channel
+from robins.filters.composite.federated import federated
 
 VECTOR = np.array([[0.8, 0.3, 0.5, 0.1], [0.2, 0.7, 0.5, 0.9]])
 

@@ -13,14 +13,19 @@ from scipy.optimize import minimize
 
 from robins import manifold
 from robins.filters import Belief, Model, Motion, Sensor
-from robins.filters.channels import channel
-from robins.filters.fusion import covariance_intersection, fuse, intersection_weights, share
-from robins.filters.shares import (
+from robins.filters.composite.channels import channel
+from robins.filters.composite.federated import (
     diagonal_shares,
     equal_shares,
     floored,
     observability_shares,
     trace_shares,
+)
+from robins.filters.composite.fusion import (
+    covariance_intersection,
+    fuse,
+    intersection_weights,
+    share,
 )
 from robins.manifold import Angle
 from robins.rotation import Rotation

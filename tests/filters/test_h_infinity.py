@@ -92,7 +92,7 @@ def test_three_forms_agree_to_1e_13(matching):
     solution = run(matching, model, state, np.zeros((400, 3)), F, aux)
     root = np.asarray(solution.steps.prediction.belief.covariance)
     joseph, krein = (
-        form(s.F, s.Q, s.H, np.eye(3), s.P0, np.eye(9), gamma)
+        form(s.F, s.G @ s.G.T, s.H, np.eye(3), np.diag(s.sigma**2), np.eye(9), gamma)
         for form in (joseph_riccati, krein_riccati)
     )
     sigma = np.sqrt(np.diagonal(joseph, axis1=1, axis2=2))

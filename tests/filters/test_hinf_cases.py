@@ -9,8 +9,8 @@ from test_cases import cases, check, given
 
 from robins import linalg
 from robins.filters import Belief, Code, Model, Motion, Sensor, kalman, run
+from robins.filters.analysis.worst_case import existence_margin, steady_h_infinity
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
-from robins.filters.worst_case import existence_margin, steady_h_infinity
 
 
 def move(x, u):

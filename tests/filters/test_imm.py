@@ -23,8 +23,8 @@ from robins.filters import (
     run,
     unscented,
 )
-from robins.filters.imm import imm, mode
-from robins.filters.mixture import log_normalised, matched, root
+from robins.filters.composite.imm import imm, mode
+from robins.filters.composite.mixture import log_normalised, matched, root
 from robins.filters.rules import gate
 from robins.manifold import Angle
 from robins.rotation import Rotation

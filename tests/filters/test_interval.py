@@ -10,7 +10,7 @@ from dense_kalman import random_system, simulate
 from scipy import stats
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
-from robins.filters.interval import clip, truncate, truncated_moments
+from robins.filters.limits.interval import clip, truncate, truncated_moments
 from robins.filters.rules.inequality import inequality
 from robins.manifold import Angle
 

@@ -9,7 +9,7 @@ from jax.tree_util import Partial
 from scipy import integrate, stats
 
 from robins.filters import Belief, Code, Model, Motion, OnlineFilter, Sensor, kalman, run
-from robins.filters.particle import Cloud, _systematic, particle, reseed
+from robins.filters.composite.particle import Cloud, _systematic, particle, reseed
 from robins.manifold import Angle
 
 A = np.array([[1.0, 0.5], [-0.1, 0.9]])

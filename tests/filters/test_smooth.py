@@ -21,7 +21,8 @@ from robins.filters import (
     run,
     unscented,
 )
-from robins.filters.consistency import chi2_band, nees
+from robins.filters.analysis.consistency import nees
+from robins.filters.chi_square import chi2_band
 from robins.rotation import Rotation
 
 N, M, T = 4, 2, 12

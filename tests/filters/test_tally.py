@@ -27,7 +27,7 @@ from robins.filters import (
     particle,
     run,
 )
-from robins.filters.delayed import Late
+from robins.filters.composite.delayed import Late
 
 LOST, STEPS = 2, 6  # the step that cannot be predicted, and all
 

@@ -8,9 +8,7 @@ from dense_h_infinity import greatest, h_infinity_filter, least_gamma
 from dense_kalman import SPLIT_W, random_system, simulate, split
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, unscented
-from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
-from robins.filters.rules.h_infinity import h_infinity, with_gamma
-from robins.filters.worst_case import (
+from robins.filters.analysis.worst_case import (
     Channel,
     error_operator,
     existence_margin,
@@ -19,6 +17,8 @@ from robins.filters.worst_case import (
     steady_h_infinity,
     worst_case_gain,
 )
+from robins.filters.rules.adaptive_h_infinity import adaptive_h_infinity
+from robins.filters.rules.h_infinity import h_infinity, with_gamma
 from robins.manifold import Angle
 
 T = 20

@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 
 from robins import linalg
 from robins.filters import Belief, Model, Motion, Sensor, run
-from robins.filters.channels import channel
+from robins.filters.composite.channels import channel
 
 N, SEEDS, STEPS = 4, 5, 200
 ROWS = {"a": slice(0, 2), "b": slice(2, 3)}

@@ -16,8 +16,7 @@ from robins.ins.alignment import (
     level,
     static_sigmas,
 )
-from robins.ins.imu_errors import ImuErrorModel, TriadErrors
-from robins.ins.imu_grades import grade
+from robins.ins.imu_errors import ImuErrorModel, TriadErrors, grade
 from robins.rotation import Rotation
 
 LAT = np.deg2rad(48.0)

@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 
 from robins import manifold
-from robins.ins.extended_pose import ExtendedPose, left_jacobian
-from robins.rotation import Rotation
+from robins.ins.extended_pose import ExtendedPose
+from robins.rotation import Rotation, left_jacobian
 
 SIDES = pytest.mark.parametrize("side", ["right", "left"])
 

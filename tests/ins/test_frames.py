@@ -112,11 +112,3 @@ def test_angles_of_an_enu_attitude_from_its_axes():
     np.testing.assert_allclose(heading, np.arctan2(forward[:, 0], forward[:, 1]), atol=1e-12)
     np.testing.assert_allclose(pitch, np.arcsin(forward[:, 2]), atol=1e-7)
     np.testing.assert_allclose(roll, np.arctan2(-right[:, 2], up[:, 2]), atol=1e-12)
-
-
-def test_yaw_turns_against_heading():
-    heading = np.deg2rad([0.0, 10.0, 90.0, 179.0, 181.0, 350.0])
-    yaw = np.rad2deg(np.asarray(frames.yaw_from_heading(heading)))
-    np.testing.assert_allclose(yaw, [0.0, -10.0, -90.0, -179.0, 179.0, 10.0], atol=1e-13)
-    again = frames.yaw_from_heading(frames.yaw_from_heading(heading))
-    np.testing.assert_allclose(again, frames.wrap(heading), atol=1e-15)

@@ -8,13 +8,14 @@ from scipy.integrate import dblquad, quad
 from scipy.optimize import minimize_scalar
 
 from robins.ins.imu_errors import (
+    FIGURES,
     MARKOV_PEAK,
     ImuErrorModel,
     TriadErrors,
     allan_deviation,
+    grade,
     mean_sigma,
 )
-from robins.ins.imu_grades import FIGURES, grade
 from robins.units import UnitError
 
 DEG_H = np.pi / 180.0 / 3600.0
@@ -82,9 +83,9 @@ def test_names_of_the_white_noise():
 @pytest.mark.parametrize(
     ("gyro", "accel", "message"),
     [
-        ({"bais": "1 deg/h"}, {}, r"gyro: no figure 'bais'; did you mean bias\?"),
-        ({"vrw": "1 ug/sqrt(Hz)"}, {}, "gyro: no figure 'vrw'"),
-        ({}, {"g_sensitivity": "1 deg/h/g"}, "accel: no figure 'g_sensitivity'"),
+        ({"bais": "1 deg/h"}, {}, r"no figure 'bais' in the gyro; did you mean 'bias'\?"),
+        ({"vrw": "1 ug/sqrt(Hz)"}, {}, "no figure 'vrw' in the gyro"),
+        ({}, {"g_sensitivity": "1 deg/h/g"}, "no figure 'g_sensitivity' in the accel"),
         ({"bias": "1 deg/sqrt(h)"}, {}, r"gyro\.bias: .*angle rate"),
         ({"bias": "1"}, {}, r"gyro\.bias: .*unit"),
         ({}, {"bias": ["1 mg", "2 mg", "3"]}, r"accel\.bias: .*unit"),
@@ -254,5 +255,5 @@ def test_grades_get_worse_from_first_to_last():
 
 
 def test_an_unknown_grade_is_refused():
-    with pytest.raises(ValueError, match=r"'tactcal'; did you mean tactical\?"):
+    with pytest.raises(ValueError, match=r"'tactcal' in robins; did you mean 'tactical'\?"):
         grade("tactcal")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robins.earth import Geodetic
-from robins.ins.increments import Increments, thin
-from robins.ins.joined import joined
+from robins.ins.increments import Increments, joined, thin
 from robins.ins.mechanise import Nav, mechanise
 from robins.rotation import Rotation, from_euler
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
-from robins.earth.star_catalogue import Stars, synthetic
+from robins.earth.stars import Stars, synthetic
 from robins.ins.star_identification import identify, index_pairs, pairs_between
 
 ARCSEC = np.pi / 648e3

@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from robins.earth.star_catalogue import synthetic
-from robins.earth.star_index import index_stars
-from robins.ins.star_tracking import track_stars
+from robins.earth.stars import index_stars, synthetic
+from robins.ins.star_identification import track_stars
 
 FIELD, TOLERANCE, POINTINGS, ROWS = np.radians(20.0), 2e-3, 100, 48
 SKY = synthetic(6.0)

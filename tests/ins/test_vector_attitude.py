@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from robins.earth.star_catalogue import synthetic
+from robins.earth.stars import synthetic
 from robins.ins.vector_attitude import METHODS, attitude_from_vectors
 
 ARCSEC = np.pi / 648e3

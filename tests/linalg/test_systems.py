@@ -1,4 +1,4 @@
-"""Discretisation and steady state against other ways to the same numbers."""
+"""Discretisation against other ways to the same numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -81,68 +81,3 @@ def test_no_step_adds_nothing():
     Phi, Q = discretise(jnp.array(stable(1, 3, 1.0)), jnp.eye(3), 0.0)
     np.testing.assert_array_equal(Phi, np.eye(3))
     np.testing.assert_array_equal(Q, np.zeros((3, 3)))
-
-
-# --------------------------------------------------------------------------- steady state
-
-
-def recursion(F, Q, H, R, steps=20_000):
-    """The Riccati recursion, run until it has settled."""
-    P = np.eye(len(F))
-    for _ in range(steps):
-        S = H @ P @ H.T + R
-        K = np.linalg.solve(S, H @ P).T
-        A = np.eye(len(F)) - K @ H
-        after = A @ P @ A.T + K @ R @ K.T
-        new = F @ after @ F.T + Q
-        if np.allclose(new, P, rtol=1e-15, atol=0.0):
-            break
-        P = new
-    return P, after, K
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_steady_state_is_where_the_recursion_settles(seed):
-    rng = np.random.default_rng(seed)
-    n, m = rng.integers(1, 6), rng.integers(1, 4)
-    F = rng.normal(size=(n, n)) / np.sqrt(n)
-    H, G = rng.normal(size=(m, n)), rng.normal(size=(n, n))
-    W = rng.normal(size=(m, m))
-    Q, R = G @ G.T, W @ W.T
-    P_pred, P, K = recursion(F, Q, H, R)
-    got = linalg.steady_state(F, Q, H, R)
-    np.testing.assert_allclose(got.P_pred, P_pred, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(got.P, P, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(got.K, K, rtol=1e-9, atol=1e-11)
-
-
-def test_steady_state_does_not_depend_on_units():
-    F = np.array([[1.0, 1.0], [0.0, 1.0]])
-    Q, H, R = np.array([[0.3, 0.1], [0.1, 0.2]]), np.array([[1.0, 0.0]]), np.array([[2.0]])
-    plain = linalg.steady_state(F, Q, H, R)
-    T = np.diag([1e-6, 1e5])  # x in other units
-    V = np.linalg.inv(T)
-    scaled = linalg.steady_state(T @ F @ V, T @ Q @ T, H @ V, R)
-    np.testing.assert_allclose(V @ scaled.P_pred @ V, plain.P_pred, rtol=1e-11)
-    np.testing.assert_allclose(V @ scaled.K, plain.K, rtol=1e-11)
-
-
-def test_a_state_that_dies_out_undriven_is_known_in_the_end():
-    got = linalg.steady_state(np.diag([0.5, 0.9]), np.diag([0.0, 1.0]), np.ones((1, 2)), np.eye(1))
-    np.testing.assert_allclose(got.P_pred[0], [0.0, 0.0], atol=1e-15)
-    alone = linalg.steady_state(0.9 * np.eye(1), np.eye(1), np.eye(1), np.eye(1))
-    assert got.P_pred[1, 1] == pytest.approx(alone.P_pred[0, 0], rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("F", "Q", "H"),
-    [
-        (np.diag([1.1, 0.9]), np.eye(2), [[0.0, 1.0]]),  # grows unseen
-        (np.diag([1.0, 0.9]), np.eye(2), [[0.0, 1.0]]),  # wanders unseen
-        (np.eye(1), np.zeros((1, 1)), [[1.0]]),  # a constant: the gain falls for ever
-        (np.array([[1, 0.1], [0, 1]]), np.zeros((2, 2)), [[1.0, 0.0]]),
-    ],
-)
-def test_what_has_no_steady_state_is_refused(F, Q, H):
-    with pytest.raises(ValueError, match="not observed through H or not driven by Q"):
-        linalg.steady_state(F, Q, np.array(H), np.eye(1))

@@ -3,7 +3,7 @@
 import pytest
 from made_spoilt import drive as make_drive
 
-from robins.logs.checks import Check
+from robins.logs.doctor import Check
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from spoilt import HEALTHY, SPOILT
 
 import robins.logs
 from robins.logs import clean, examine, open_log
-from robins.logs.checks import ALONE, OF_READERS, REFUSALS, TOGETHER
+from robins.logs.doctor import ALONE, OF_READERS, REFUSALS, TOGETHER
 from robins.logs.findings import SEVERITIES
 
 CHECKS = (*ALONE, *TOGETHER)

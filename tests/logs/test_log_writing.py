@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from robins.logs.findings import LogError
-from robins.logs.writing import write_lines
+from robins.logs.opening import write_lines
 
 
 def test_text_and_compressed_text(tmp_path):

@@ -7,7 +7,7 @@ from figure_reading import collisions, lines_of
 from scipy.stats import chi2
 
 from robins import report
-from robins.report import allan_curve, bands, bars, curves, series, style, updates
+from robins.report import comparing, curves, instruments, series, style, updates
 from robins.results import array
 
 
@@ -74,35 +74,35 @@ def test_an_angle_that_wraps_is_not_drawn_across_the_figure(drive):
 @pytest.mark.parametrize("degrees", [1.0, 3.0, 15.0, 750.0])
 @pytest.mark.parametrize("probability", [0.005, 0.025, 0.5, 0.975, 0.9995])
 def test_quantiles_are_those_of_scipy(degrees, probability):
-    got = bands.quantile(probability, degrees)
+    got = updates.quantile(probability, degrees)
     assert got == pytest.approx(chi2.ppf(probability, degrees), rel=1e-9)
 
 
 def test_bands_are_those_of_the_field(drive):
     """N = 50 runs, n = 15 states: the published band of ANEES is 13.5201 to 16.5557."""
     fifty = a_drive(2, runs=50, seconds=60.0)
-    band = bands.band(fifty["anees"])
+    band = updates.band(fifty["anees"])
     assert band.low[0, 0] == pytest.approx(13.5201, abs=5e-5)
     assert band.high[0, 0] == pytest.approx(16.5557, abs=5e-5)
     assert band.expected == 15.0
     fifty["anees"].attrs["normalised"] = 1
-    normalised = bands.band(fifty["anees"])
+    normalised = updates.band(fifty["anees"])
     np.testing.assert_allclose(normalised.low, band.low / 15.0)
     np.testing.assert_allclose(normalised.high, band.high / 15.0)
     assert normalised.expected == 1.0
-    single = bands.band(drive["nis_gnss_position"])
+    single = updates.band(drive["nis_gnss_position"])
     assert single.low[0, 0] == pytest.approx(chi2.ppf(0.025, 3))
     dof = drive["nis_gnss_position"] * 0.0 + 2.0
     dof[:, 0] = 0.0
-    varying = bands.band(drive["nis_gnss_position"], dof)
+    varying = updates.band(drive["nis_gnss_position"], dof)
     assert varying.high[0, 1] == pytest.approx(chi2.ppf(0.975, 2))
     assert np.isnan(varying.high[0, 0])
     nees = drive["nees"].copy()
     nees.attrs |= {"band_low": 3.0, "band_high": 4.0, "probability": 0.9}
-    given = bands.band(nees)
+    given = updates.band(nees)
     assert (given.low[0, 0], given.high[0, 0], given.probability) == (3.0, 4.0, 0.9)
     nees.attrs = {}
-    assert bands.band(nees) is None
+    assert updates.band(nees) is None
 
 
 def test_the_share_inside_the_band_is_counted_and_told(drive):
@@ -189,7 +189,7 @@ def test_the_height_profile_shows_all_there_is(drive):
 
 
 def test_bars_are_as_long_as_their_numbers(town):
-    picture = bars.comparison(town)
+    picture = comparing.comparison(town)
     shown = {axes.get_title(loc="left"): axes for axes in picture.figure.axes if axes.get_visible()}
     assert "Velocity RMS [m/s]" not in shown  # a list is not one number
     assert "Worst step [µs]" not in shown  # nobody has it
@@ -200,12 +200,12 @@ def test_bars_are_as_long_as_their_numbers(town):
 
 
 def test_one_filter_is_compared_with_nothing():
-    assert bars.comparison(a_summary(1)) is None
+    assert comparing.comparison(a_summary(1)) is None
 
 
 def test_a_missing_metric_has_no_bar():
     filters = {"a": {"x_m": 1.0}, "b": {"x_m": None}, "c": {"x_m": -2.0}}
-    picture = bars.comparison(a_summary() | {"filters": filters})
+    picture = comparing.comparison(a_summary() | {"filters": filters})
     axes = picture.figure.axes[0]
     assert [bar.get_width() for bar in axes.patches] == [1.0, 0.0, -2.0]
     assert [text.get_text() for text in axes.texts] == ["1", "–", "-2"]
@@ -214,7 +214,7 @@ def test_a_missing_metric_has_no_bar():
 
 def test_the_allan_curve_is_drawn_in_field_units_with_its_fit():
     solution = an_allan_curve()
-    figure = allan_curve.allan(solution, "gyro").figure
+    figure = instruments.allan(solution, "gyro").figure
     unit = 3600.0 * 180.0 / np.pi
     for k, axes in enumerate(figure.axes):
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")

@@ -6,7 +6,7 @@ import xarray as xr
 from figure_reading import collisions, lines_of
 
 from robins import report
-from robins.report import bands, curves, limits, style, updates
+from robins.report import curves, style, updates
 from robins.results import array, variable
 
 NAMES = ["kf", "hinf-deg", "adaptive-hinf"]
@@ -39,7 +39,7 @@ def aligned():
 
 
 def test_shares_are_drawn_as_they_are(aligned):
-    picture = limits.within(aligned, "5_arcmin")
+    picture = curves.within(aligned, "5_arcmin")
     (axes,) = picture.figure.axes
     for i in range(3):
         ((x, y),) = lines_of(axes, style.colour(i))
@@ -51,7 +51,7 @@ def test_shares_are_drawn_as_they_are(aligned):
 
 
 def test_worst_case_curves_are_of_the_filters_that_have_a_gamma(aligned):
-    picture = limits.worst_case(aligned)
+    picture = curves.worst_case(aligned)
     (axes,) = picture.figure.axes
     assert not lines_of(axes, style.colour(0))
     for i, gamma in ((1, 2.0), (2, 4.0)):
@@ -59,9 +59,9 @@ def test_worst_case_curves_are_of_the_filters_that_have_a_gamma(aligned):
         np.testing.assert_allclose(y, np.linspace(1.9, 0.5, 40) / gamma)
     picture.figure.canvas.draw()
     assert not collisions(picture.figure)
-    assert limits.worst_case(aligned.drop_vars("note_h_infinity_gamma")) is not None
+    assert curves.worst_case(aligned.drop_vars("note_h_infinity_gamma")) is not None
     plain = aligned.drop_vars([n for n in aligned if str(n).startswith("note_")])
-    assert limits.worst_case(plain) is None
+    assert curves.worst_case(plain) is None
 
 
 def test_bounds_are_never_called_covariances(aligned):
@@ -86,8 +86,8 @@ def test_a_filter_that_diverged_or_states_far_too_much_does_not_set_the_scale(al
 
 
 def test_the_band_is_that_of_the_filter_with_a_covariance(aligned):
-    band = bands.band(aligned["anees"], aligned["anees_dof"])
-    np.testing.assert_allclose(band.low[0], bands.quantile(0.025, 450.0) / 450.0)
+    band = updates.band(aligned["anees"], aligned["anees_dof"])
+    np.testing.assert_allclose(band.low[0], updates.quantile(0.025, 450.0) / 450.0)
     picture = updates.consistency(aligned, "anees")
     assert "hinf" not in picture.figure.axes[0].get_title(loc="left")
     assert picture.figure.axes[0].collections

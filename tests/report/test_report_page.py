@@ -212,17 +212,24 @@ def test_a_picture_of_one_colour_can_be_packed():
 
 
 @pytest.fixture
-def walk(tmp_path, town):
+def walk(town):
+    """What a folder holds beside its summary."""
     names = ["lat_rad", "lon_rad", "outage", "error_velocity", "sigma_velocity"]
-    few = a_drive(1, seconds=40.0)[names]
-    results.write(tmp_path / "walk", a_summary(1), few, scenario_text="x = 1")
-    return tmp_path / "walk"
+    return a_drive(1, seconds=40.0)[names]
 
 
-def test_a_result_gets_its_figures_and_page(walk):
+def written(path, walk, progress=None):
+    """A result with its report."""
+    with results.ResultWriter(path, scenario_text="x = 1", command="robins run x") as writer:
+        writer.save_summary(a_summary(1))
+        writer.save_solution(walk)
+        report.add(writer, progress)
+    return results.read(path)
+
+
+def test_a_result_gets_its_figures_and_page(tmp_path, walk):
     seen = []
-    report.attach(walk, "robins run x", lambda *told: seen.append(told))
-    back = results.read(walk)
+    back = written(tmp_path / "walk", walk, lambda *told: seen.append(told))
     assert set(back.figures) == {"track", "error_velocity"}
     assert back.summary["files"]["report"] == "report.html"
     assert back.manifest["command"] == "robins run x"
@@ -235,34 +242,34 @@ def test_a_result_gets_its_figures_and_page(walk):
     assert share[-1] == 1.0
 
 
-def attached(walk):
+def drawn(path, walk):
     """The figures that a result gets, byte for byte."""
-    return {n: p.read_bytes() for n, p in results.read(report.attach(walk)).figures.items()}
+    return {n: p.read_bytes() for n, p in written(path, walk).figures.items()}
 
 
-def test_the_same_result_gets_the_same_figures(walk):
-    assert attached(walk) == attached(walk)
+def test_the_same_result_gets_the_same_figures(tmp_path, walk):
+    assert drawn(tmp_path / "a", walk) == drawn(tmp_path / "b", walk)
 
 
-def test_the_settings_of_a_user_do_not_change_the_figures(walk):
+def test_the_settings_of_a_user_do_not_change_the_figures(tmp_path, walk):
     import matplotlib
 
-    plain = attached(walk)
+    plain = drawn(tmp_path / "a", walk)
     with matplotlib.rc_context({"font.size": 20, "axes.grid": False, "axes.facecolor": "pink"}):
-        assert attached(walk) == plain
+        assert drawn(tmp_path / "b", walk) == plain
 
 
-def test_an_interrupted_report_leaves_the_result_as_it_was(walk):
-    before = sorted(p.name for p in walk.iterdir())
+def test_an_interrupted_report_leaves_the_result_as_it_was(tmp_path, walk):
+    before = sorted(p.name for p in written(tmp_path / "walk", walk).path.iterdir())
 
     def interrupt(*_told):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        report.attach(walk, progress=interrupt)
-    assert sorted(p.name for p in walk.iterdir()) == before
-    assert [p.name for p in walk.parent.iterdir()] == ["walk"]
-    results.read(walk)
+        written(tmp_path / "walk", walk, interrupt)
+    assert sorted(p.name for p in (tmp_path / "walk").iterdir()) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["walk"]
+    results.read(tmp_path / "walk")
 
 
 def test_a_report_needs_a_summary(tmp_path):

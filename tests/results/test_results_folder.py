@@ -324,8 +324,6 @@ def test_the_second_writer_of_a_folder_is_refused_at_once(earlier):
             ResultWriter(path)
         assert f"process {os.getpid()} on " in str(refused.value)
         assert "wait for it to end, or choose another folder (--out)" in str(refused.value)
-    with pytest.raises(ResultError, match="is being written by process"):
-        results.extend(read(earlier))
     write(earlier.with_name("other"), a_summary())
     assert record.exists()
     first.commit()
@@ -418,29 +416,3 @@ def test_hidden_folders_of_others_are_not_touched(earlier):
 
 
 # -------------------------------------------------------------------------------------- extension
-
-
-def test_a_result_is_extended(earlier):
-    before = (earlier / "solution.nc").read_bytes()
-    with results.extend(read(earlier)) as writer:
-        writer.save_report("<p>")
-    after = read(earlier)
-    assert after.report.read_text() == "<p>"
-    assert after.summary["files"]["report"] == "report.html"
-    assert after.summary["seed"] == 1
-    assert (earlier / "solution.nc").read_bytes() == before
-
-
-def test_a_failed_extension_changes_nothing(earlier):
-    writer = results.extend(read(earlier))
-    writer.save_solution(a_solution(3.0))  # the file is a link into the earlier result
-    writer.save_summary(a_summary(seed=5))
-    writer.discard()
-    still_there(earlier)
-
-
-def test_an_extension_works_where_files_cannot_be_linked(earlier, monkeypatch):
-    monkeypatch.setattr(os, "link", failing(errno.EPERM))
-    with results.extend(read(earlier)) as writer:
-        writer.save_report("<p>")
-    assert read(earlier).solution.identical(a_solution())

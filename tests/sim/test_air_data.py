@@ -9,8 +9,7 @@ from scipy import stats
 from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from robins.sim.air_data import observe_air, wind_estimate_error
-from robins.sim.gauss_markov import gauss_markov
-from robins.sim.random import Component, stream
+from robins.sim.random import Component, gauss_markov, stream
 
 RUNS, COUNT = 800, 24
 KEYS = jax.vmap(lambda run: stream(2, run, Component.AIR_DATA))(jnp.arange(RUNS))

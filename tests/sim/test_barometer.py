@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.linalg import toeplitz
 
-from robins.sim.barometer import observe_height
+from robins.sim.air_data import observe_height
 from robins.sim.random import Component, stream
 
 RUNS, COUNT = 1000, 20

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation as SciRotation
 
 from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic
-from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import Bank, fly
+from robins.sim.trajectory import at_lever_arm
 
 LEVER = np.array([-1.5, 4.0, 0.6])
 

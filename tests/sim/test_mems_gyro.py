@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from robins.sim.free_body import FreeBody, coning_start, free_body
-from robins.sim.mems_gyro import MemsGyro, delta_angles, integrate_angles
+from robins.sim.gyro import MemsGyro, delta_angles, integrate_angles
 from robins.sim.random import Component, stream
 
 DEG = np.pi / 180.0

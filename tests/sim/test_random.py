@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.sim.random import Component, generator, stream, unit
+from robins.sim.random import Component, stream, unit
 
 SEED = 20250101
 
@@ -93,20 +93,11 @@ def test_units_of_a_kind_have_streams_of_their_own():
 def test_streams_of_neighbouring_names_are_uncorrelated():
     n = 4000
     rows = [draws(r, c, (n,)) for r in range(3) for c in (Component.IMU, Component.GNSS)]
-    rows += [generator(SEED, r, c).standard_normal(n) for r in range(3) for c in (1, 2)]
     correlation = np.corrcoef(np.stack([np.asarray(r) for r in rows]))
     off = correlation[~np.eye(len(rows), dtype=bool)]
     assert np.abs(off).max() < 5.0 / np.sqrt(n)  # five sigma of a sample correlation
 
 
-def test_generator_repeats_by_name_and_differs_between_names():
-    a = generator(SEED, 12, Component.WIND).standard_normal(9)
-    np.testing.assert_array_equal(a, generator(SEED, 12, Component.WIND).standard_normal(9))
-    for other in [(SEED + 1, 12, 4), (SEED, 13, 4), (SEED, 12, 5), (SEED, 4, 12)]:
-        assert not np.any(generator(*other).standard_normal(9) == a)
-
-
-@pytest.mark.parametrize("make", [stream, generator])
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [
@@ -118,16 +109,15 @@ def test_generator_repeats_by_name_and_differs_between_names():
         ((1, 0, -1), "component"),
     ],
 )
-def test_bad_names_are_refused(make, arguments, name):
+def test_bad_names_are_refused(arguments, name):
     with pytest.raises(ValueError, match=f"^{name} must be an integer"):
-        make(*arguments)
+        stream(*arguments)
 
 
 def test_the_largest_names_work():
     keys = [stream(2**63 - 1, 2**32 - 1, 2**32 - 1), stream(2**63 - 1, 2**32 - 2, 2**32 - 1)]
     a, b = (np.asarray(jax.random.key_data(k)) for k in keys)
     assert np.any(a != b)
-    generator(2**63 - 1, 2**32 - 1, 2**32 - 1)
 
 
 def test_a_run_that_is_not_whole_is_refused():

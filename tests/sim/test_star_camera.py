@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from robins.earth.star_catalogue import synthetic
+from robins.earth.stars import synthetic
 from robins.sim.random import Component, stream
 from robins.sim.star_sensor import ARCSEC, StarCamera, index_for, measure_attitude, photograph
 

@@ -1,15 +1,14 @@
-"""The star sensor: its errors read back by SciPy's rotations."""
+"""The angles of a star sensor against SciPy's rotations."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from drawn import assert_variance, rotation
+from drawn import assert_variance
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from robins.sim.random import Component, stream
-from robins.sim.star_tracker import observe_attitude, observe_euler
+from robins.sim.star_sensor import observe_euler
 
 COUNT = 4000
 KEY = stream(9, 1, Component.STAR_SENSOR)
@@ -17,15 +16,7 @@ SIGMA = np.array([1e-4, 1e-4, 1e-3])  # boresight along the third axis
 TRUE = Rotation.random(COUNT, rng=np.random.default_rng(8))
 Q_NB = TRUE.as_quat(scalar_first=True)
 PRESENT = np.arange(COUNT) % 5 != 0
-MOUNT = Rotation.from_euler("ZYX", [0.4, -1.1, 2.0])
-Q_BS = MOUNT.as_quat(scalar_first=True)
-
-attitude, euler = jax.jit(observe_attitude), jax.jit(observe_euler)
-
-
-def errors_of(q):
-    """Rotation vectors from true to measured body axes, body axes."""
-    return (TRUE[PRESENT].inv() * rotation(q[PRESENT])).as_rotvec()
+euler = jax.jit(observe_euler)
 
 
 def assert_normal(error, sigma):
@@ -33,22 +24,6 @@ def assert_normal(error, sigma):
     assert np.abs(np.corrcoef(error.T)[~np.eye(3, dtype=bool)]).max() < 4.0 / len(error) ** 0.5
     for axis in range(3):
         assert stats.kstest(error[:, axis] / sigma[axis], "norm").pvalue > 1e-3
-
-
-def test_the_error_is_a_turn_about_the_axes_of_the_body():
-    q = np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT))
-    assert np.all(np.isnan(q[~PRESENT]))
-    np.testing.assert_allclose(np.linalg.norm(q[PRESENT], axis=1), 1.0, rtol=1e-15)
-    assert_normal(errors_of(q), SIGMA)
-
-
-def test_or_about_the_axes_of_a_sensor_that_is_mounted_askew():
-    plain = errors_of(np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT)))
-    askew = errors_of(np.asarray(attitude(KEY, Q_NB, SIGMA, PRESENT, Q_BS)))
-    np.testing.assert_allclose(MOUNT.inv().apply(askew), plain, rtol=0.0, atol=1e-14)
-    # by the definition, one after the other
-    turned = TRUE[PRESENT] * MOUNT * Rotation.from_rotvec(plain) * MOUNT.inv()
-    np.testing.assert_allclose((TRUE[PRESENT].inv() * turned).as_rotvec(), askew, atol=1e-14)
 
 
 def test_angles_have_white_noise_each():
@@ -72,25 +47,13 @@ def test_heading_is_wrapped_where_north_passes_through_south():
 
 def test_numbers_do_not_depend_on_sigma_or_presence():
     there = np.ones(COUNT, bool)
-    some, every = (np.asarray(attitude(KEY, Q_NB, SIGMA, seen)) for seen in (PRESENT, there))
+    some, every = (np.asarray(euler(KEY, Q_NB, SIGMA, seen)) for seen in (PRESENT, there))
     np.testing.assert_array_equal(some[PRESENT], every[PRESENT])
-    half = errors_of(np.asarray(attitude(KEY, Q_NB, 0.5 * SIGMA, there)))
-    np.testing.assert_allclose(half, 0.5 * errors_of(some), rtol=0.0, atol=1e-15)
-    exact = np.asarray(attitude(KEY, Q_NB, 0.0, there))
-    np.testing.assert_allclose(exact, Q_NB, rtol=0.0, atol=1e-16)
     heading, pitch, roll = TRUE.as_euler("ZYX").T
     angles = np.asarray(euler(KEY, Q_NB, 0.0, there))
     np.testing.assert_allclose(angles, np.stack([pitch, roll, heading], 1), atol=1e-12)
 
 
-def test_it_has_gradients_without_noise():
-    def total(sigma):
-        return jnp.sum(observe_attitude(KEY, Q_NB[:3], sigma, jnp.ones(3, bool)))
-
-    assert np.isfinite(float(jax.grad(total)(0.0)))
-
-
-@pytest.mark.parametrize("observe", [observe_attitude, observe_euler])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -100,6 +63,6 @@ def test_it_has_gradients_without_noise():
         ((Q_NB, 1.0, PRESENT[:7]), r"q_nb must have shape \(7, 4\)"),
     ],
 )
-def test_what_cannot_be_is_refused(observe, arguments, message):
+def test_what_cannot_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
-        observe(KEY, *arguments)
+        observe_euler(KEY, *arguments)

@@ -17,10 +17,9 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.linalg import cho_factor, cho_solve, toeplitz
 
-from robins.sim import turbulence
+from robins.sim import wind
 from robins.sim.random import Component, stream
-from robins.sim.turbulence import dryden, von_karman
-from robins.sim.wind import gusts
+from robins.sim.wind import dryden, gusts, von_karman
 
 RUNS, COUNT = 600, 24
 SIGMA, AIRSPEED, LENGTH = (1.5, 0.8), 12.0, (400.0, 250.0)
@@ -121,7 +120,7 @@ def test_the_periodogram_follows_the_spectrum(form):
 @pytest.mark.parametrize("across", [False, True])
 def test_the_correlation_of_von_karman_is_the_transform_of_his_spectrum(across):
     for distance in (0.0, 0.01, 0.3, 1.0, 4.0):
-        got = turbulence._correlation(np.array([distance / turbulence._A]), across)
+        got = wind._correlation(np.array([distance / wind._A]), across)
         # The constant in print, 1.339, is rounded in the fifth place.
         wanted = correlation("von_karman", across, distance)
         np.testing.assert_allclose(got, wanted, rtol=0.0, atol=3e-5)
@@ -131,7 +130,7 @@ def test_a_circle_twice_as_long_as_the_record_is_enough():
     for step in np.geomspace(1e-5, 30.0, 40):
         for count in (1, 2, 5, 33, 513):
             for across in (False, True):
-                root = turbulence._root_spectrum(count, float(step), across)
+                root = wind._root_spectrum(count, float(step), across)
                 assert len(root) > count - 1
                 assert np.all(root > 0.0)
 

@@ -11,7 +11,7 @@ import numpy as np
 from robins import scenario
 from robins.campaign import worlds
 from robins.filters import Code, run
-from robins.filters.consistency import nees
+from robins.filters.analysis.consistency import nees
 from robins.manifold import local
 from robins.systems.airship import SYSTEM
 from robins.systems.airship.instruments import SAR

@@ -9,7 +9,7 @@ import numpy as np
 from robins import scenario
 from robins.campaign import worlds
 from robins.filters import run
-from robins.filters.consistency import normalised_sq
+from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.systems.rocket import SYSTEM
 from robins.systems.rocket.world import PEAK_S, World

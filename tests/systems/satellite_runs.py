@@ -11,7 +11,7 @@ import numpy as np
 from robins import scenario
 from robins.campaign import worlds
 from robins.filters import run_closed
-from robins.filters.consistency import normalised_sq
+from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
 from robins.systems.satellite import SYSTEM
 from robins.systems.study import Problem

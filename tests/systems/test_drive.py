@@ -5,7 +5,7 @@ import pytest
 from test_replay import DRIVE
 
 from robins import scenario
-from robins.campaign import chunks, collect
+from robins.campaign import collect
 from robins.systems.ins_gnss import Drive
 from robins.systems.ins_gnss.study import DRIVE as STUDY
 from robins.systems.ins_gnss.world import lay_out
@@ -21,7 +21,8 @@ def campaign(*settings):
     # an EKF is right only about small errors, and a gate cuts the tails of a right one
     small = ("start.tilt=0.5 deg", "start.heading=2 deg", "update.gate=0")
     problem = STUDY.problem(parsed(*small, *settings), ("ekf",), 1)
-    statistics = collect(chunks(problem, "ekf", RUNS, chunk=RUNS), problem.blocks)
+    (runs,) = worlds(problem, RUNS, RUNS)
+    statistics = collect([record(problem, "ekf", *runs)], problem.blocks)
     metrics = problem.metrics(statistics)
     return metrics, {c["id"]: c["verdict"] for c in problem.claims({"ekf": metrics})}
 

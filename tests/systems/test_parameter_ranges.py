@@ -15,7 +15,7 @@ from robins.bench.run import setup
 from robins.scenario import Parameters, Quantity, ScenarioError
 from robins.systems import SYSTEMS
 from robins.systems.ins_gnss.world import motion_of
-from robins.systems.transfer_alignment.pair_course import motion_of as pair_motion_of
+from robins.systems.transfer_alignment.product.world import motion_of as pair_motion_of
 
 DRIVE = SYSTEMS["ins-gnss"].scenarios["drive"]
 

@@ -1,39 +1,39 @@
 """The bank turn and the linear system of attitude matching, against rotation matrices."""
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 from scipy.spatial.transform import Rotation as R
 
-from robins import rotation
+from robins import rotation, scenario
 from robins.filters import kalman, run
 from robins.filters.rules.h_infinity import h_infinity, with_gamma
 from robins.sim.flexure import Flexure
-from robins.systems.transfer_alignment.attitude_matching import (
+from robins.systems import transfer_alignment
+from robins.systems.transfer_alignment.attitude_matching.model import (
     ATTITUDE,
-    Spread,
-    attitude_matching,
-    error_dynamics,
-    matching_matrix,
-)
-from robins.systems.transfer_alignment.bank_turn import (
-    BankTurn,
     attitude_enu,
+    error_dynamics,
     heading_rad,
+    linear_system,
     load_factor,
+    matching_matrix,
     mean_attitude_enu,
     rate_in_enu,
     roll_rad,
 )
-from robins.systems.transfer_alignment.matching_filters import central_filter, existence
+from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
+from robins.systems.transfer_alignment.attitude_matching.study import central_filter, existence
+from robins.systems.transfer_alignment.attitude_matching.world import lay_out
 
+S0 = Path(transfer_alignment.__file__).parent / "scenarios" / "s0.toml"
+GIVEN = scenario.load(AttitudeMatching, S0)
+TURN, COURSE, PERIOD_S, UPDATES = GIVEN.manoeuvre, lay_out(GIVEN), 0.05, 400
+SYSTEM = linear_system(GIVEN, UPDATES)
 DEG = np.pi / 180.0
-PERIOD_S, UPDATES = 0.05, 400
-TURN = BankTurn(240.0, 3.0 * 9.80665, 1.0, 11.0, 34.0 * DEG)
-SPREAD = Spread(0.5 * DEG, DEG / 3600.0, 0.3 * DEG, 0.1 * DEG / 60.0)
-SYSTEM = attitude_matching(TURN, PERIOD_S, UPDATES, SPREAD)
-HEARD, EPOCH_S = np.ones(UPDATES, bool), PERIOD_S * np.arange(1, UPDATES + 1)
 UNITS = {"rad": 1.0, "deg": DEG, "arcmin": DEG / 60.0}
 
 
@@ -81,7 +81,7 @@ def test_attitudes_are_those_of_the_house_relabelled():
     np.testing.assert_allclose(
         attitude_enu(TURN, t_s), T @ np.asarray(rotation.to_dcm(ned)) @ T, atol=1e-15
     )
-    left = TURN._replace(acceleration_m_s2=-TURN.acceleration_m_s2, heading_rad=0.4)
+    left = TURN.model_copy(update={"acceleration": -TURN.acceleration, "heading": 0.4})
     assert heading_rad(left, 3.0) < 0.4
     assert roll_rad(left, 3.0) < 0.0
 
@@ -181,17 +181,17 @@ def test_a_period_is_integrated_with_its_own_attitude():
 
 
 def test_noise_and_start_are_those_asked_for():
-    np.testing.assert_allclose(np.diag(SYSTEM.Q)[:3], (0.1 * DEG / 60.0) ** 2 * PERIOD_S)
-    assert np.count_nonzero(SYSTEM.Q) == 3
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(SYSTEM.P0)) / DEG, np.repeat([0.5, 1 / 3600, 0.3], 3)
-    )
-    np.testing.assert_allclose(SYSTEM.start().covariance, SYSTEM.P0)
+    Q = SYSTEM.G @ SYSTEM.G.T
+    np.testing.assert_allclose(np.diag(Q)[:3], (0.1 * DEG / 60.0) ** 2 * PERIOD_S)
+    assert np.count_nonzero(Q) == 3
+    P0 = np.diag(np.repeat([0.5, 1 / 3600, 0.3], 3) * DEG) ** 2
+    np.testing.assert_allclose(SYSTEM.start().covariance, P0)
 
 
 def test_flexure_swings_by_itself_and_enters_z_once():
     sigma, tau, zeta = np.array([20.0, 10.0, 0.0]) * DEG / 60.0, np.array([1.0, 3.0, 2.0]), 0.7
-    flexible = attitude_matching(TURN, PERIOD_S, 30, SPREAD, flexure=Flexure(sigma, tau, zeta))
+    flexible = linear_system(GIVEN, 30, Flexure(sigma, tau, zeta))
+    Q, P0 = flexible.G @ flexible.G.T, np.diag(flexible.sigma) ** 2
     assert flexible.F.shape == (30, 15, 15)
     np.testing.assert_array_equal(flexible.F[:, :9, :9], SYSTEM.F[:30])
     assert not np.any(flexible.F[:, :9, 9:])  # it drives no other state,
@@ -205,8 +205,8 @@ def test_flexure_swings_by_itself_and_enters_z_once():
         Phi = scipy.linalg.expm(A * PERIOD_S)
         S = sigma[axis] ** 2 * np.diag([1.0, wn**2])
         np.testing.assert_allclose(flexible.F[0][both], Phi, rtol=1e-12, atol=1e-15)
-        np.testing.assert_allclose(flexible.Q[both], S - Phi @ S @ Phi.T, rtol=1e-7, atol=1e-17)
-        np.testing.assert_allclose(flexible.P0[both], S, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(Q[both], S - Phi @ S @ Phi.T, rtol=1e-7, atol=1e-17)
+        np.testing.assert_allclose(P0[both], S, rtol=1e-9, atol=1e-15)
 
 
 def test_what_the_model_linearises_to_is_what_it_does():
@@ -283,22 +283,23 @@ def test_gamma_min_in_each_unit(unit, identity, least, exists):
     system = SYSTEM.in_unit(unit)
     if identity:
         system = system._replace(sigma=np.ones(9))
-    found = existence(central_filter(), system, 1.0, 50.0, HEARD, EPOCH_S)
-    assert found.gamma_min == pytest.approx(least, rel=0.01 if unit == "rad" else 1e-3)
-    assert (found.update is None) == exists
+    found = existence(central_filter(), system, 1.0, COURSE, 50.0)
+    assert found["gamma_min"] == pytest.approx(least, rel=0.01 if unit == "rad" else 1e-3)
+    assert found["feasible"] == exists
     if not exists:
-        assert (found.update, found.time_s) == (6, pytest.approx(0.30))
-        assert np.isnan(found.margin)
+        assert found["infeasible_at_update"] == 6
+        assert found["infeasible_at_s"] == pytest.approx(0.30)
+        assert np.isnan(found["margin"])
 
 
 def test_an_outage_counts_for_nothing():
     # local bounds only grow while nothing is measured, but the cost is not counted there
-    heard = HEARD.copy()
+    heard = COURSE.heard.copy()
     heard[100:200] = False
     system = SYSTEM.in_unit("deg")
-    with_gap = existence(central_filter(), system, 1.0, 50.0, heard, EPOCH_S)
-    whole = existence(central_filter(), system, 1.0, 50.0, HEARD, EPOCH_S)
-    assert with_gap.update is None
-    assert with_gap.gamma_min != pytest.approx(whole.gamma_min, rel=1e-2)
-    none = existence(central_filter(), system, 1.0, 50.0, ~HEARD, EPOCH_S)
-    assert (none.gamma_min, none.margin) == (0.0, 1.0)
+    with_gap = existence(central_filter(), system, 1.0, COURSE._replace(heard=heard), 50.0)
+    whole = existence(central_filter(), system, 1.0, COURSE, 50.0)
+    assert with_gap["feasible"]
+    assert with_gap["gamma_min"] != pytest.approx(whole["gamma_min"], rel=1e-2)
+    none = existence(central_filter(), system, 1.0, COURSE._replace(heard=~COURSE.heard), 50.0)
+    assert (none["gamma_min"], none["margin"]) == (0.0, 1.0)

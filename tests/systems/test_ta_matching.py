@@ -20,20 +20,21 @@ from robins.filters import run
 from robins.results import summary
 from robins.scenario import ScenarioError
 from robins.systems.judgement import judging
-from robins.systems.transfer_alignment.attitude_matching import ATTITUDE
-from robins.systems.transfer_alignment.matching import (
-    lay_out,
-    matched,
-    matching_problem,
-    simulate,
-    sizes_of,
+from robins.systems.transfer_alignment.attitude_matching.model import (
+    ATTITUDE,
+    LAMBDA,
+    MU,
+    PHI,
 )
-from robins.systems.transfer_alignment.matching_claims import (
+from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
+from robins.systems.transfer_alignment.attitude_matching.study import (
     CLAIMS,
+    FILTERS,
     NO_RESULT,
-    matching_metrics,
+    STUDY,
+    metrics_of,
 )
-from robins.systems.transfer_alignment.matching_parameters import FILTERS, Matching
+from robins.systems.transfer_alignment.attitude_matching.world import lay_out, matched, simulate
 
 SCENARIOS = Path(robins.systems.__file__).parent / "transfer_alignment" / "scenarios"
 RUNS, FROM = 200, 299  # the update at 15 s
@@ -41,17 +42,32 @@ MINUTE = np.pi / 10800.0
 
 
 def given(name="s0", *settings):
-    return scenario.load(Matching, SCENARIOS / f"{name}.toml", settings)
+    return scenario.load(AttitudeMatching, SCENARIOS / f"{name}.toml", settings)
 
 
 COURSE = lay_out(given())
 
 
+def sizes_of(parameters):
+    """How large what a run draws is, by table and key."""
+    tables = {name: dict(getattr(parameters, name)) for name in ("slave", "flexure", "mounting")}
+    return tables | {"master": {"attitude_noise": parameters.master.attitude_noise}}
+
+
 # slower to compile, faster to run
-@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
-def worlds(sizes):
-    """Sizes are data, so one compilation serves all scenarios."""
-    return jax.vmap(partial(simulate, COURSE, sizes, 0))(jnp.arange(RUNS))
+@partial(jax.jit, static_argnames="signs", compiler_options={"xla_backend_optimization_level": 1})
+def simulated(sizes, signs):
+    """Sizes are data, so one compilation serves all scenarios of the same signs."""
+    like = given("s0", f"signs={signs}")
+    tables = {k: getattr(like, k).model_copy(update=size) for k, size in sizes.items()}
+    of = like.model_copy(update=tables)
+    return jax.vmap(partial(simulate, of, COURSE, 0))(jnp.arange(RUNS))
+
+
+def worlds(parameters, **changed):
+    """All runs of a scenario, with some numbers changed: ``table={key: value}``."""
+    sizes = sizes_of(parameters)
+    return simulated({k: {**v, **changed.get(k, {})} for k, v in sizes.items()}, parameters.signs)
 
 
 def first(tree):
@@ -65,7 +81,7 @@ class Found(NamedTuple):
 
     def error(self, name):
         """(runs, E, 3) arcmin."""
-        return (self.world.phi - estimate(self.name, name)) / MINUTE
+        return (self.world.state[..., PHI] - estimate(self.name, name)) / MINUTE
 
     def rms(self, name):
         return np.sqrt(np.mean(self.error(name)[:, FROM:] ** 2, axis=(0, 1)))
@@ -91,8 +107,8 @@ def carried(K, F, H, z):
 @cache
 def found(name):
     parameters = given(name)
-    world = jax.tree.map(np.asarray, worlds(sizes_of(parameters)))
-    return Found(name, world, matching_problem(parameters, parameters.filters, 0))
+    world = jax.tree.map(np.asarray, worlds(parameters))
+    return Found(name, world, STUDY.problem(parameters, parameters.filters, 0))
 
 
 @cache
@@ -224,12 +240,13 @@ def test_gamma_min_and_feasibility_are_facts():
 
 def test_a_filter_that_does_not_exist_has_no_figures():
     class Any:
-        count_from, rms, diverged = 0, np.ones((4, 9)), 0
+        count_from, counted, rms, diverged = 0, slice(0, None), np.ones((4, 9)), 0
+        blocks = found("s0").problem.blocks
 
         def settled(self, limit):
             return np.zeros(3)
 
-    made = matching_metrics(Any())
+    made = metrics_of(Any())
     assert set(NO_RESULT) | {"diverged_runs"} == set(made)  # nothing of it is left
     merged = made | dict(found("s0").problem.contenders["hinf-arcmin"].facts)
     written = json.loads(summary.dumps(summary.plain(merged)))
@@ -246,15 +263,8 @@ def test_a_filter_that_does_not_exist_has_no_figures():
 def quiet():
     """All noise off; by scenario."""
 
-    def silent(name):
-        sizes = sizes_of(given(name))
-        return sizes._replace(
-            gyro_noise=0.0 * sizes.gyro_noise,
-            master_noise=0.0 * sizes.master_noise,
-            flutter=0.0 * sizes.flutter,
-        )
-
-    return {name: worlds(silent(name)) for name in ("s1", "s0")}
+    off = {"slave": {"gyro_noise": 0.0}, "master": {"attitude_noise": 0.0}}
+    return {name: worlds(given(name), **off, flexure={"flutter": 0.0}) for name in ("s1", "s0")}
 
 
 def test_without_noise_z_is_h_x_to_second_order(quiet):
@@ -270,39 +280,36 @@ def test_phi_moves_as_the_model_says_and_flexure_does_not_move_it(quiet):
     start = np.concatenate([np.full(3, 30.0), np.full(3, 1.0 / 60.0), np.full(3, 18.0)])  # arcmin
     for name in ("s1", "s0"):  # stiff, and with 20' of flexure that the gyros feel
         x = start.copy()
-        for k, phi in enumerate(np.asarray(quiet[name].phi[0])):
+        for k, phi in enumerate(np.asarray(quiet[name].state[0, :, PHI])):
             x = F[k] @ x
             assert np.max(np.abs(phi / MINUTE - x[:3])) < 0.003
-    assert np.std(np.asarray(quiet["s0"].flexure)) == pytest.approx(20.0 * MINUTE, rel=0.05)
+    assert np.std(np.asarray(quiet["s0"].state[..., LAMBDA])) == pytest.approx(
+        20.0 * MINUTE, rel=0.05
+    )
 
 
 def test_flutter_noise_and_signs_are_drawn_as_asked():
-    clean, random = found("s1").world, worlds(sizes_of(given("s0r")))
+    clean, random = found("s1").world, worlds(given("s0r"))
     H = found("s1").problem.contenders["kf"].case(first(clean)).aux[ATTITUDE]
-    bent = np.einsum("eij,j->ei", np.asarray(H)[:, :, 6:9], np.asarray(clean.mounting[0]))
-    noise = np.asarray(clean.measured) - np.asarray(clean.phi) - bent
+    bent = np.einsum("eij,j->ei", np.asarray(H)[:, :, MU], clean.state[0, 0, MU])
+    noise = clean.measured - clean.state[..., PHI] - bent
     assert np.std(noise, axis=(0, 1)) / MINUTE == pytest.approx(
         np.full(3, np.hypot(1.0, 2.4)), rel=0.01
     )
-    assert np.all(np.asarray(clean.mounting) > 0.0)
-    drawn = np.concatenate(
-        [np.sign(np.asarray(a)) for a in (random.mounting, random.gyro_bias, random.phi[:, 0])], 1
-    )
+    assert np.all(clean.state[..., MU] > 0.0)
+    drawn = np.sign(np.asarray(random.state[:, 0, :9]))
     assert np.all(np.abs(np.mean(drawn, axis=0)) < 0.25)  # 3.5 sigma of 200 coins
     assert np.max(np.abs(np.corrcoef(drawn.T) - np.eye(9))) < 0.3
 
 
 def test_the_problem_simulates_what_its_scenario_says():
-    call = matching_problem(given("s3"), (), 0).simulate
+    call = STUDY.problem(given("s3"), (), 0).simulate
     assert call.func is simulate
-    course, sizes, seed = call.args
+    of, course, seed = call.args
     for a, b in zip(course, COURSE, strict=True):
         np.testing.assert_array_equal(a, b)
-    wanted = sizes_of(given("s3"))
-    for a, b in zip(jax.tree.leaves(sizes), jax.tree.leaves(wanted), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert seed == 0
-    np.testing.assert_allclose(np.asarray(sizes.flexure.bending_rad_g) / MINUTE, [0.0, 10.0, 0.0])
+    assert (of, seed) == (given("s3"), 0)
+    np.testing.assert_allclose(np.asarray(of.flexure.bending) / MINUTE, [0.0, 10.0, 0.0])
 
 
 def test_z_takes_a_mounting_that_is_not_the_identity():
@@ -442,18 +449,18 @@ def test_an_unknown_filter_is_refused_with_those_there_are():
     with pytest.raises(
         ValueError, match=r"no filter 'hinf' .*did you mean 'hinf-.*'\? It has kf, .*hinf-weighted"
     ):
-        matching_problem(given(), ("kf", "hinf"), 0)
+        STUDY.problem(given(), ("kf", "hinf"), 0)
     assert tuple(given().filters) == FILTERS
 
 
 def test_large_angles_are_warned_of():
-    with pytest.warns(UserWarning, match=r"slave.attitude_error reaches 10\.4 deg.*linear"):
-        matching_problem(given("s0", 'slave.attitude_error="6 deg"'), ("kf",), 0)
+    with pytest.warns(UserWarning, match=r"slave.attitude_error may reach 10\.4 deg.*linear"):
+        STUDY.problem(given("s0", 'slave.attitude_error="6 deg"'), ("kf",), 0)
 
 
 def test_a_gamma_that_is_too_small_is_told_with_where_and_what_would_do():
     facts = (
-        matching_problem(given("s0", "h_infinity.gamma=4"), ("hinf-deg",), 0)
+        STUDY.problem(given("s0", "h_infinity.gamma=4"), ("hinf-deg",), 0)
         .contenders["hinf-deg"]
         .facts
     )
@@ -464,7 +471,7 @@ def test_a_gamma_that_is_too_small_is_told_with_where_and_what_would_do():
 
 
 def test_an_outage_is_bridged_without_updates():
-    problem = matching_problem(given("s0", 'master.outage=["5 s", "10 s"]'), ("hinf-deg",), 0)
+    problem = STUDY.problem(given("s0", 'master.outage=["5 s", "10 s"]'), ("hinf-deg",), 0)
     c, world = problem.contenders["hinf-deg"], first(found("s0").world)
     out = (problem.epoch_s > 5.0 - 1e-9) & (problem.epoch_s < 10.0 + 1e-9)
     np.testing.assert_array_equal(problem.context["outage"], out)

@@ -12,9 +12,13 @@ from robins.manifold import local, retract
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.scenario import ScenarioError
 from robins.systems.study import Scenario
-from robins.systems.transfer_alignment.pair import simulate_pair, start_estimate
-from robins.systems.transfer_alignment.pair_course import lay_out, motion_of
-from robins.systems.transfer_alignment.pair_parameters import PairParameters
+from robins.systems.transfer_alignment.product.parameters import PairParameters
+from robins.systems.transfer_alignment.product.world import (
+    lay_out,
+    motion_of,
+    simulate_pair,
+    start_estimate,
+)
 
 ARCMIN, DEG, DEG_H = np.pi / 10800.0, np.pi / 180.0, np.pi / 648000.0
 PLACE = 'latitude = "32 deg"\nlongitude = "118 deg"\nheight = "3000 m"\n'
@@ -90,7 +94,7 @@ def many(pair, course, what, runs=RUNS):
 
 
 def records(run):
-    return run.master_v_n, run.master_q_nb
+    return run.master.v_n, run.master.q_nb.wxyz
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +127,8 @@ def test_error_free_increments_navigate_to_the_truth_whatever_the_flexure(quiet)
     ]
     path = jax.tree.map(lambda *x: jnp.stack(x)[:, course.each - 1 :: course.each], *paths)
     q_nb, v_n, position = path
-    truth = jax.tree.map(lambda x: x[:3], truth)
-    miss = to_rotvec(multiply(truth.q_nb, conjugate(q_nb.wxyz)))
+    truth = jax.tree.map(lambda x: x[:3], truth.ins)
+    miss = to_rotvec(multiply(truth.q_nb.wxyz, conjugate(q_nb.wxyz)))
     # to rounding over 120 s; the bound wanted is 0.01 arcsec, 5e-8 rad
     assert np.abs(miss).max() < 1e-11
     assert np.abs(v_n - truth.v_n).max() < 1e-8
@@ -142,25 +146,25 @@ def test_the_slave_sits_where_flexure_mounting_and_lever_arm_put_it(quiet):
 
     q_nm = SciRotation.from_quat(k.q_nb, scalar_first=True)
     nominal = SciRotation.from_euler("ZYX", NOMINAL[::-1])
-    expected = q_nm * turn(truth.flexure_rad) * nominal * turn(truth.mounting_rad)
-    q_ns = SciRotation.from_quat(truth.q_nb, scalar_first=True)
+    expected = q_nm * turn(truth.flexure[:, :3]) * nominal * turn(truth.mounting_rad)
+    q_ns = SciRotation.from_quat(truth.ins.q_nb.wxyz, scalar_first=True)
     # north at the slave is turned by the lever arm over the radius of the Earth
     tilt = 2.0 * np.linalg.norm(LEVER) / 6.37e6
     assert np.linalg.norm((expected.inv() * q_ns).as_rotvec(), axis=1).max() < tilt
 
     arm = q_nm.apply(LEVER)
-    at = truth.position
+    at = truth.ins.position
     np.testing.assert_allclose((at.lat - k.lat) * 6.3573e6, arm[:, 0], atol=0.01)
     # true positions are the mechanisation's, which integrates the roll-in in steps of 20 ms
     np.testing.assert_allclose(k.alt - at.alt, arm[:, 2], rtol=0, atol=3e-4)
     # the vertical velocity needs neither Coriolis nor curvature at this size
     omega = np.cross(k.omega_nb_b, LEVER)
-    np.testing.assert_allclose(truth.v_n - k.v_n, q_nm.apply(omega), rtol=0, atol=2e-4)
+    np.testing.assert_allclose(truth.ins.v_n - k.v_n, q_nm.apply(omega), rtol=0, atol=2e-4)
 
 
 def test_flexure_and_mounting_are_as_large_as_stated(quiet):
     course, (_, _, truth) = quiet
-    angle, rate = (np.asarray(x) for x in (truth.flexure_rad, truth.flexure_rate_rad_s))
+    angle, rate = np.split(np.asarray(truth.flexure), 2, axis=-1)
     load = np.linalg.norm(course.motion.at(course.epoch_s).rates()[1], axis=1) / 9.786
     assert load[300] == pytest.approx(1.0 / np.cos(30.0 * DEG), abs=2e-3)
     assert load[1000] == pytest.approx(1.0, abs=3e-3)
@@ -183,7 +187,7 @@ def test_flexure_and_mounting_are_as_large_as_stated(quiet):
 
 def test_gyro_noise_steps_and_drift_appears(disturbed):
     _, course, runs, _ = disturbed
-    bias = np.asarray(runs.truth.gyro_bias)
+    bias = np.asarray(runs.truth.ins.gyro_bias)
     t = course.epoch_s
     np.testing.assert_allclose(
         bias[:, t > 7.95] - bias[:, :1], np.broadcast_to(STEP, (RUNS, 1121, 3))
@@ -210,7 +214,7 @@ def test_gyro_noise_steps_and_drift_appears(disturbed):
 
 def test_accelerometer_errors_are_as_stated(disturbed):
     _, course, runs, _ = disturbed
-    bias = np.asarray(runs.truth.accel_bias)
+    bias = np.asarray(runs.truth.ins.accel_bias)
     mg = 9.80665e-3
     np.testing.assert_allclose(bias[:, 0].std(0), mg, rtol=4.0 / np.sqrt(2 * RUNS))
     dv = np.asarray(in_one_row(runs.increments).dv)
@@ -224,7 +228,7 @@ def test_records_are_noisy_struck_and_lost_as_stated(disturbed):
     t, m = course.epoch_s, pair.master
     lost = ((t > 2.95) & (t < 3.95)) | (np.abs(t - 15.0) < 0.01)
     k = course.motion.at(t[~lost])
-    for x in (runs.master_v_n, runs.master_q_nb, runs.master_position.lat[..., None]):
+    for x in (runs.master.v_n, runs.master.q_nb.wxyz, runs.master.position.lat[..., None]):
         missing = np.isnan(np.asarray(x))
         assert np.all(missing == lost[:, None])
 
@@ -238,7 +242,7 @@ def test_records_are_noisy_struck_and_lost_as_stated(disturbed):
         phi = (q * q_true.inv()).as_rotvec().reshape(RUNS, -1, 3)
         return np.asarray(v_n)[:, ~lost] - k.v_n, phi
 
-    quiet, struck = errors(v_calm, q_calm), errors(runs.master_v_n, runs.master_q_nb)
+    quiet, struck = errors(v_calm, q_calm), errors(*records(runs))
     factors = []
     for (x, y), sigma in zip(
         zip(quiet, struck, strict=True), (m.velocity_noise, m.attitude_noise), strict=True
@@ -253,9 +257,9 @@ def test_records_are_noisy_struck_and_lost_as_stated(disturbed):
     share = np.mean(factors[0] == 10.0)
     assert share == pytest.approx(SHARE, abs=4.0 * np.sqrt(SHARE * (1 - SHARE) / factors[0].size))
 
-    down = k.alt - np.asarray(runs.master_position.alt)[:, ~lost]
+    down = k.alt - np.asarray(runs.master.position.alt)[:, ~lost]
     assert down.std() == pytest.approx(4.0, rel=4.0 / np.sqrt(2 * down.size))
-    north = (np.asarray(runs.master_position.lat)[:, ~lost] - k.lat) * 6.3573e6
+    north = (np.asarray(runs.master.position.lat)[:, ~lost] - k.lat) * 6.3573e6
     assert north.std() == pytest.approx(2.0, rel=4.0 / np.sqrt(2 * north.size))
     np.testing.assert_allclose(runs.master_omega_b[0][~lost], k.rates()[0], rtol=0, atol=1e-12)
 
@@ -264,7 +268,7 @@ def test_heavy_tails_keep_the_sigma(disturbed):
     _, course, _, _ = disturbed
     pair = parsed(LEVEL + SENSORS, "disturbance.tail_dof=5.0")
     course = course._replace(there=np.full(1200, True))
-    v_n = np.asarray(many(pair, course, lambda run: run.master_v_n))
+    v_n = np.asarray(many(pair, course, lambda run: run.master.v_n))
     x = (v_n - course.motion.at(course.epoch_s).v_n) / np.array(pair.master.velocity_noise)
     assert np.mean(x**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(8.0 / x.size))
     assert np.mean(np.abs(x) > 4.0) > 10.0 * 6.3e-5  # of a normal distribution

@@ -4,18 +4,17 @@ import dataclasses
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from simulated_pair import pair_dataset, recorded
 
 from robins import logs, scenario
 from robins.ins.mechanise import Nav, nav_at
 from robins.manifold import local
 from robins.rotation import Rotation
-from robins.systems.transfer_alignment.pair import simulate_pair
-from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.pair_log import Recording, pair_dataset, pieces_of, recorded
-from robins.systems.transfer_alignment.pair_parameters import PairParameters
+from robins.systems.transfer_alignment.product.log import on_one_clock, pieces_of
+from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.systems.transfer_alignment.product.world import lay_out, simulate_pair
 
 TEXT = """
 lever_arm = ["2 m", "-1 m", "0.5 m"]
@@ -53,11 +52,10 @@ attitude = "0.5 deg"
 
 
 def parameters(*settings):
-    return scenario.parse(PairParameters, TEXT, settings)
+    return scenario.parse(Replay, TEXT, settings)
 
 
 PAIR = parameters()
-RECORDING = Recording()
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +74,8 @@ def log(run, tmp_path_factory):
     return logs.load_pair(folder / "master.csv", folder / "slave.csv")
 
 
-def only_piece(dataset, pair=PAIR, recording=RECORDING):
-    pieces, problems = pieces_of(logs.clean(dataset), pair, recording)
+def only_piece(dataset, pair=PAIR):
+    pieces, problems = pieces_of(on_one_clock(logs.clean(dataset)), pair)
     assert not problems
     (piece,) = pieces
     return piece
@@ -86,26 +84,25 @@ def only_piece(dataset, pair=PAIR, recording=RECORDING):
 def test_what_is_read_back_is_what_was_simulated(run, log):
     piece = only_piece(log)
     # the first record, at the end of the first epoch, is where the slave starts from
-    assert piece.start_s == pytest.approx(0.1)
+    assert piece.begin_s == pytest.approx(0.1)
     assert piece.first == 0
     np.testing.assert_array_equal(piece.record, np.arange(1, 150))
     for name in ("theta", "dv", "dt"):
-        got, wanted = getattr(piece.run.increments, name), getattr(run.increments, name)
+        got, wanted = getattr(piece.world.increments, name), getattr(run.increments, name)
         width = wanted.shape[1]
         np.testing.assert_allclose(got[:, :width], np.asarray(wanted)[1:], rtol=0, atol=1e-12)
         assert not np.any(got[:, width:])
-    np.testing.assert_array_equal(piece.run.master_v_n, np.asarray(run.master_v_n)[1:])
-    np.testing.assert_array_equal(piece.run.master_omega_b, np.asarray(run.master_omega_b)[1:])
-    turned = jax.vmap(lambda a, b: Rotation(a).local(Rotation(b)))
-    off = turned(jnp.asarray(piece.run.master_q_nb), run.master_q_nb[1:])
+    np.testing.assert_array_equal(piece.world.master.v_n, np.asarray(run.master.v_n)[1:])
+    np.testing.assert_array_equal(piece.world.master_omega_b, np.asarray(run.master_omega_b)[1:])
+    off = jax.vmap(Rotation.local)(piece.world.master.q_nb, Rotation(run.master.q_nb.wxyz[1:]))
     assert np.max(np.abs(off)) < 1e-14
-    assert np.max(np.abs(piece.run.master_position.lat - run.master_position.lat[1:])) < 1e-15
+    assert np.max(np.abs(piece.world.master.position.lat - run.master.position.lat[1:])) < 1e-15
 
 
 def test_a_log_of_a_run_is_that_run_of_the_campaign(run):
     again = pair_dataset(PAIR, seed=5)
-    np.testing.assert_array_equal(again.master.v_n, run.master_v_n)
-    np.testing.assert_array_equal(again.truth.q_nb, run.truth.q_nb)
+    np.testing.assert_array_equal(again.master.v_n, run.master.v_n)
+    np.testing.assert_array_equal(again.truth.q_nb, run.truth.ins.q_nb.wxyz)
     other = pair_dataset(PAIR, seed=5, run=1)
     assert not np.allclose(again.master.v_n, other.master.v_n, atol=1e-3)
 
@@ -123,18 +120,18 @@ def test_the_slave_starts_where_the_record_was_true(delay):
     silent = replace(dataset, master=replace(dataset.master, omega_ib_b=None))
     piece, without_rates = only_piece(dataset, pair), only_piece(silent, pair)
     # the gyros are off by 5 deg/h and noise, and mean over a sample to either side of the record
-    told, found = (p.run.master_omega_b[:-1] for p in (piece, without_rates))
+    told, found = (p.world.master_omega_b[:-1] for p in (piece, without_rates))
     assert np.sqrt(np.mean(told**2)) > 0.03
     assert np.sqrt(np.mean((found - told) ** 2)) < 5e-4
-    assert np.max(np.abs(local(piece.run.start, without_rates.run.start))) < 2e-4
+    assert np.max(np.abs(local(piece.world.start, without_rates.world.start))) < 2e-4
     k = int(np.flatnonzero(np.isfinite(dataset.master.v_n[:, 0]))[0])
-    assert piece.start_s == pytest.approx(dataset.master.time_ns[k] * 1e-9 - pair.master.delay)
+    assert piece.begin_s == pytest.approx(dataset.master.time_ns[k] * 1e-9 - pair.master.delay)
     # before 3 s the flight is straight, so the true slave there lies on a line between epochs
     epoch_s = dataset.truth.time_ns * 1e-9
     early, late = (nav_at(dataset.truth, j) for j in (0, 1))
-    back = (piece.start_s - epoch_s[0]) / (epoch_s[1] - epoch_s[0])
+    back = (piece.begin_s - epoch_s[0]) / (epoch_s[1] - epoch_s[0])
     true = Nav(early.q_nb, *jax.tree.map(lambda a, b: a + back * (b - a), early[1:], late[1:]))
-    off = np.asarray(local(piece.run.start, true))
+    off = np.asarray(local(piece.world.start, true))
     assert np.max(np.abs(off[:3])) < 2e-5  # the frame turns with the Earth meanwhile
     assert np.max(np.abs(off[3:6])) < 2e-3
     assert np.max(np.abs(off[6:])) < 1e-3
@@ -150,8 +147,8 @@ def test_outages_of_the_master_leave_steps_without_a_record(log):
     silent = (piece.epoch_s > 5.0) & (piece.epoch_s < 7.0)
     assert np.all(piece.record[silent] == -1)
     assert np.max(np.diff(piece.epoch_s)) <= 0.25 + 1e-9
-    assert np.isnan(piece.run.master_v_n[silent]).all()
-    assert np.isfinite(piece.run.master_omega_b).all()
+    assert np.isnan(piece.world.master.v_n[silent]).all()
+    assert np.isfinite(piece.world.master_omega_b).all()
     np.testing.assert_array_equal(np.sort(piece.record[piece.record >= 0]), np.arange(1, len(rows)))
 
 
@@ -161,10 +158,10 @@ def test_missing_components_stay_missing_and_the_start_waits(log):
     v_n[9, 2] = np.nan
     piece = only_piece(replace(log, master=replace(log.master, v_n=v_n)))
     assert piece.first == 4
-    assert piece.start_s == pytest.approx(0.5)
+    assert piece.begin_s == pytest.approx(0.5)
     here = int(np.flatnonzero(piece.record == 9)[0])
-    np.testing.assert_array_equal(np.isnan(piece.run.master_v_n[here]), [False, False, True])
-    assert np.isfinite(piece.run.master_q_nb[here]).all()
+    np.testing.assert_array_equal(np.isnan(piece.world.master.v_n[here]), [False, False, True])
+    assert np.isfinite(piece.world.master.q_nb.wxyz[here]).all()
 
 
 def without_samples(dataset, begin_s, end_s):
@@ -177,25 +174,25 @@ def without_samples(dataset, begin_s, end_s):
 
 def test_a_short_gap_is_bridged_with_noise_and_a_long_one_divides_the_log(log):
     piece = only_piece(without_samples(log, 8.0, 8.2))
-    assert set(piece.noise_scale) == {1.0, 30.0}
+    assert set(np.asarray(piece.world.noise_scale)) == {1.0, 30.0}
     struck = (piece.epoch_s > 8.0) & (piece.epoch_s < 8.21)
-    np.testing.assert_array_equal(piece.noise_scale > 1.0, struck)
+    np.testing.assert_array_equal(piece.world.noise_scale > 1.0, struck)
     # lift goes on through the gap, 0.2 s of more than 9.8 m/s^2
     bridged, true = (
-        float(p.run.increments.dv[struck, :, 2].sum()) for p in (piece, only_piece(log))
+        float(p.world.increments.dv[struck, :, 2].sum()) for p in (piece, only_piece(log))
     )
     assert bridged == pytest.approx(true, abs=0.02)
     assert true < -1.9
-    pieces, _ = pieces_of(logs.clean(without_samples(log, 8.0, 9.0)), PAIR, RECORDING)
+    pieces, _ = pieces_of(on_one_clock(logs.clean(without_samples(log, 8.0, 9.0))), PAIR)
     assert [len(pieces), pieces[0].epoch_s[-1]] == [2, pytest.approx(8.0)]
-    assert pieces[1].start_s == pytest.approx(9.0)
-    assert np.all(pieces[1].noise_scale == 1.0)
+    assert pieces[1].begin_s == pytest.approx(9.0)
+    assert np.all(pieces[1].world.noise_scale == 1.0)
 
 
 def test_a_pair_that_cannot_be_aligned_says_why(log):
     def refused(words, **changes):
         with pytest.raises(ValueError, match=words):
-            pieces_of(logs.clean(replace(log, **changes)), PAIR, RECORDING)
+            pieces_of(on_one_clock(logs.clean(replace(log, **changes))), PAIR)
 
     refused("this log has none", master=None)
     late = replace(log.master, time_ns=log.master.time_ns + 10**12)

@@ -17,14 +17,14 @@ from numpy.testing import assert_allclose
 from robins import scenario
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, run
+from robins.systems import transfer_alignment
 from robins.systems.judgement import judging
 from robins.systems.tables import Update
-from robins.systems.transfer_alignment import patent
-from robins.systems.transfer_alignment import velocity_attitude as va
-from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.patent_claims import CLAIMS, patent_metrics
+from robins.systems.transfer_alignment.velocity_attitude import model as va
+from robins.systems.transfer_alignment.velocity_attitude import study
+from robins.systems.transfer_alignment.velocity_attitude.study import CLAIMS, STUDY, lay_out
 
-FOLDER = Path(patent.__file__).parent / "scenarios"
+FOLDER = Path(transfer_alignment.__file__).parent / "scenarios"
 RUNS = 100
 QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run
 COUNT_FROM = 300  # t > 30 s
@@ -41,14 +41,14 @@ REFERENCE = {
 
 
 def parsed(name, *settings):
-    return scenario.parse(patent.Patent, (FOLDER / f"{name}.toml").read_text(), settings)
+    return scenario.parse(study.VelocityAttitude, (FOLDER / f"{name}.toml").read_text(), settings)
 
 
 @cache
 def simulator_of(name):
     """Simulates scenarios that differ from this one in the sizes below; compiles once for all."""
     given = parsed(name)
-    course = lay_out(given)
+    course = course_of(name)
 
     def simulate(sizes, index):
         error, factor, step = sizes
@@ -58,7 +58,7 @@ def simulator_of(name):
                 update={"gyro_noise_factor": factor, "drift_step": step}
             ),
         }
-        return patent.simulate(given.model_copy(update=parts), course, 0, index)
+        return study.simulate(given.model_copy(update=parts), course, 0, index)
 
     batch = jax.jit(jax.vmap(simulate, (None, 0)), compiler_options=QUICK)
 
@@ -77,8 +77,7 @@ def kept(step):
 @partial(jax.jit, static_argnames="filter_", compiler_options=QUICK)
 @partial(jax.vmap, in_axes=(None, 0))
 def filtered(filter_, case):
-    model = va.velocity_attitude_model()
-    return run(filter_, model, case.start, case.y, case.u, case.aux, kept).steps
+    return run(filter_, va.MODEL, case.start, case.y, case.u, case.aux, kept).steps
 
 
 _cases = jax.jit(jax.vmap(lambda case, world: case(world), (None, 0)))
@@ -92,9 +91,8 @@ def errors_of(contender, world):
 
 
 @cache
-def least():
-    given = parsed("a")
-    return patent.least_gamma(given, lay_out(given))
+def course_of(name):
+    return lay_out(parsed(name))
 
 
 @cache
@@ -106,17 +104,15 @@ def flights(name):
 @cache
 def reached(name, filter_):
     """RMS of attitude over all axes ['], and the codes that predictions gave."""
-    given = parsed(name)
-    gamma = least() if filter_ in patent.FIXED else math.nan
-    contender = patent.contender(given, filter_, lay_out(given).epoch_s, gamma)
+    contender = study.contender(parsed(name), course_of(name), filter_)
     error, _, code = errors_of(contender, flights(name))
-    rms = math.sqrt(np.mean(error[:, COUNT_FROM:, :3] ** 2)) / patent.ARCMIN
+    rms = math.sqrt(np.mean(error[:, COUNT_FROM:, :3] ** 2)) / study.ARCMIN
     return rms, np.unique(code).tolist()
 
 
 def test_least_gamma_is_that_of_the_first_measurement():
     # R nominal seen through H1 at a pitch of 2 deg, next to 30' and more of initial uncertainty
-    assert least() == pytest.approx(1.0173, rel=1e-4)
+    assert course_of("a").least_gamma == pytest.approx(1.0173, rel=1e-4)
 
 
 @pytest.mark.parametrize("filter_", REFERENCE)
@@ -151,7 +147,7 @@ def test_the_kalman_filter_is_consistent_where_errors_are_small():
         'start.attitude=["0.05 deg", "0.05 deg", "0.1 deg"]',
         'slave.accel_bias=["1 mg", "1 mg", "0 mg"]',
     )
-    problem = patent.patent_problem(given, ("kf",), 0)
+    problem = STUDY.problem(given, ("kf",), 0)
     world = jax.jit(jax.vmap(problem.simulate))(jnp.arange(RUNS))
     contender = problem.contenders["kf"]
     error, sigma, code = errors_of(contender, world)
@@ -174,7 +170,7 @@ def test_the_kalman_filter_is_consistent_where_errors_are_small():
             "dim": np.full(RUNS, 12),
         }
     )
-    metrics = patent_metrics(problem.epoch_s, statistics)
+    metrics = study.metrics_of(problem.epoch_s, statistics)
     rms = np.sqrt(np.mean(error[:, late] ** 2, (0, 1)))
     assert_allclose(metrics["attitude_rms_arcmin"], rms[:3] / np.deg2rad(1 / 60), rtol=1e-12)
     assert_allclose(metrics["gyro_bias_rms_deg_per_h"], np.rad2deg(rms[5:8]) * 3600, rtol=1e-12)
@@ -192,7 +188,7 @@ def test_what_filters_are_told():
     given = parsed("a")
     epoch_s = np.arange(1, 1201) * 0.1
     minute = np.deg2rad(1.0 / 60.0)
-    plain, r, q, both = (patent.believed_noise(given, n, epoch_s) for n in patent.TOLD)
+    plain, r, q, both = (study.believed_noise(given, n, epoch_s) for n in study.TOLD)
     assert_allclose(plain.attitude, minute)
     assert_allclose(plain.velocity, 0.05)
     walk = np.deg2rad(0.05) / 60.0 * math.sqrt(0.1)
@@ -213,7 +209,7 @@ def test_what_filters_are_told():
     assert_allclose(total, np.deg2rad(200.0) / 3600.0)
     assert_allclose(both.process, q.process)
     assert_allclose(both.attitude, r.attitude)
-    identity = patent.believed_noise(given, "hinf-patent-weights", epoch_s)
+    identity = study.believed_noise(given, "hinf-patent-weights", epoch_s)
     assert_allclose(identity.attitude, 1.0)
     assert_allclose(identity.velocity, 1.0)
 
@@ -224,7 +220,7 @@ def test_initial_sigmas_are_those_of_the_scenario_in_the_frames_of_the_model():
         'start.attitude=["1 deg", "2 deg", "3 deg"]',
         'start.velocity=["1 m/s", "2 m/s", "0 m/s"]',
     )
-    sigma = patent.start_sigma(given)
+    sigma = study.start_sigma(given)
     assert_allclose(sigma[va.PHI], np.deg2rad([2.0, 1.0, 3.0]))
     assert_allclose(sigma[va.VELOCITY], [2.0, 1.0])
     assert_allclose(sigma[va.LAT] * 6.356e6, 10.0, rtol=0.01)
@@ -247,20 +243,20 @@ def test_initial_sigmas_are_those_of_the_scenario_in_the_frames_of_the_model():
 )
 def test_scenarios_that_cannot_be(settings, message):
     with pytest.raises((ValueError, scenario.ScenarioError), match=message):
-        patent.patent_problem(parsed("a", *settings), ("kf",), 0)
+        STUDY.problem(parsed("a", *settings), ("kf",), 0)
 
 
 def test_a_filter_nobody_knows_is_refused():
     with pytest.raises(
         ValueError, match=r"no filter 'kalmann' in this study\. It has kf, kf-told-r"
     ):
-        patent.patent_problem(parsed("a"), ("kalmann",), 0)
+        STUDY.problem(parsed("a"), ("kalmann",), 0)
 
 
 def test_errors_too_large_for_a_linear_model_are_said():
     given = parsed("a", 'start.attitude=["0.5 deg", "0.5 deg", "6 deg"]')
     with pytest.warns(UserWarning, match=r"start.attitude may reach 18.0 deg.*good below 5 deg"):
-        patent.patent_problem(given, ("kf",), 0)
+        STUDY.problem(given, ("kf",), 0)
 
 
 # --------------------------------------------------------------------------------------- claims

@@ -9,26 +9,26 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation as SciRotation
+from simulated_pair import recorded
 
 from robins import logs, scenario
-from robins.ins.state import InsState
+from robins.filters import run as run_filter
 from robins.manifold import local
 from robins.results.solution import check
-from robins.rotation import Rotation
-from robins.systems.transfer_alignment import pair_replay
-from robins.systems.transfer_alignment.pair import simulate_pair
-from robins.systems.transfer_alignment.pair_answer import remarks
-from robins.systems.transfer_alignment.pair_course import lay_out
-from robins.systems.transfer_alignment.pair_log import pieces_of, recorded
-from robins.systems.transfer_alignment.pair_replay import (
-    Replay,
-    aligned,
+from robins.systems import replaying
+from robins.systems.transfer_alignment.product.log import (
+    contender,
+    on_one_clock,
     orientation,
+    pieces_of,
+    remarks,
     replay,
     start_belief,
 )
-from robins.systems.transfer_alignment.product import ATTITUDE, VELOCITY, ProductState
-from robins.systems.transfer_alignment.product_filters import product_contender
+from robins.systems.transfer_alignment.product.model import ATTITUDE, VELOCITY
+from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.systems.transfer_alignment.product.study import product_contender
+from robins.systems.transfer_alignment.product.world import lay_out, simulate_pair
 from robins.workbench import InputError, publish
 from robins.workbench import align as align_pair
 
@@ -75,7 +75,6 @@ flexure = { sigma = "3 arcmin", time = "2 s" }
 longest_block = "0.2 s"
 """
 PAIR = scenario.parse(Replay, TEXT)
-PRODUCT = product_contender(PAIR, "product", PAIR.believed)
 SEVERAL = 8
 
 
@@ -108,7 +107,7 @@ def pairs(runs, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def answers(pairs):
-    return [aligned(only_piece(pair), PRODUCT, PAIR) for pair in pairs]
+    return [navigated([only_piece(pair)]) for pair in pairs]
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +115,23 @@ def clean(pairs):
     return replay(pairs[0], PAIR)
 
 
+def navigated(pieces):
+    names = ("product",)
+    return replaying.navigated(pieces, names, lambda name: contender(PAIR, name))["product"]
+
+
+def belief_of(piece):
+    """The beliefs at all epochs, of which an answer keeps less."""
+    chosen = contender(PAIR, "product")
+    case = chosen.case(piece.world)
+    found = run_filter(chosen.filter, chosen.model, case.start, case.y, case.u, case.aux)
+    return found.steps.posterior
+
+
 def only_piece(pair):
-    (piece,), problems = pieces_of(pair, PAIR, PAIR.recording)
+    (piece,), problems = pieces_of(on_one_clock(pair), PAIR)
     assert not problems
     return piece
-
-
-def true_state(run, epoch):
-    t = jax.tree.map(lambda x: jnp.asarray(x[epoch]), run.truth)
-    ins = InsState(Rotation(t.q_nb), t.v_n, t.position, t.gyro_bias, t.accel_bias)
-    return ProductState(ins, t.mounting_rad, t.flexure_rad, t.flexure_rate_rad_s)
 
 
 def at(tree, epoch):
@@ -138,12 +144,12 @@ def at(tree, epoch):
 def test_errors_are_as_large_as_stated_over_several_pairs(tmp_path):
     """NEES by a dense solve, of the whole state, over all pairs, early and late."""
     runs = simulated(SEVERAL)
-    answers = [aligned(only_piece(pair), PRODUCT, PAIR) for pair in written(runs, tmp_path)]
-    for epoch in (1, 60, len(answers[0].belief.factor) - 1):
+    beliefs = [belief_of(only_piece(pair)) for pair in written(runs, tmp_path)]
+    for epoch in (1, 60, len(beliefs[0].factor) - 1):
         total, n = 0.0, 24
-        for run, answer in zip(runs, answers, strict=True):
-            belief = at(answer.belief, epoch)
-            e = np.asarray(local(belief.mean, true_state(run, epoch)))
+        for run, of_pair in zip(runs, beliefs, strict=True):
+            belief = at(of_pair, epoch)
+            e = np.asarray(local(belief.mean, jax.tree.map(jnp.asarray, at(run.truth, epoch))))
             S = np.asarray(belief.factor)
             total += e @ np.linalg.solve(S @ S.T, e)
         low, high = stats.chi2.ppf([0.0005, 0.9995], n * SEVERAL)
@@ -155,8 +161,8 @@ def test_what_is_estimated_is_within_its_sigmas_and_they_have_shrunk(clean, runs
     arcmin, deg_h, mg = np.deg2rad(1 / 60), np.deg2rad(1 / 3600), 9.80665e-3
     for name, unit, true, before in (
         ("mounting", arcmin, truth.mounting_rad, PAIR.mounting.sigma),
-        ("gyro_bias", deg_h, truth.gyro_bias, PAIR.slave.gyro_bias),
-        ("accel_bias", mg, truth.accel_bias, PAIR.slave.accel_bias),
+        ("gyro_bias", deg_h, truth.ins.gyro_bias, PAIR.slave.gyro_bias),
+        ("accel_bias", mg, truth.ins.accel_bias, PAIR.slave.accel_bias),
     ):
         (estimate,) = (v for k, v in found.items() if k.startswith(name) and "sigma" not in k)
         (sigma,) = (v for k, v in found.items() if k.startswith(f"{name}_sigma"))
@@ -178,9 +184,9 @@ def test_innovations_that_contradict_the_sigmas_are_told_with_the_likely_causes(
 
 def test_the_start_is_correlated_as_its_making_is(pairs):
     piece = only_piece(pairs[0])
-    plain = PRODUCT.case(piece.run).start
+    plain = product_contender(PAIR, "product", PAIR.believed).case(piece.world).start
     P = np.asarray(start_belief(plain, PAIR).covariance)
-    q = SciRotation.from_quat(np.asarray(piece.run.start.q_nb.wxyz), scalar_first=True)
+    q = SciRotation.from_quat(np.asarray(piece.world.start.q_nb.wxyz), scalar_first=True)
     C_ns = q.as_matrix()
     C_nm = C_ns @ SciRotation.from_euler("ZYX", PAIR.mounting.nominal[::-1]).as_matrix().T
     P0 = np.asarray(plain.covariance)
@@ -195,9 +201,9 @@ def test_the_start_is_correlated_as_its_making_is(pairs):
 
 
 def test_the_solution_is_that_of_the_slave(clean, runs):
-    solution, truth = clean.solution.sel(filter="product"), runs[0].truth
+    solution, truth = clean.solution.sel(filter="product"), runs[0].truth.ins
     # from the second epoch on they are those of the simulation
-    q = SciRotation.from_quat(truth.q_nb, scalar_first=True)
+    q = SciRotation.from_quat(truth.q_nb.wxyz, scalar_first=True)
     heading, pitch, roll = q.as_euler("ZYX").T
     off = solution["estimate_euler"].values - np.stack([roll, pitch, heading], -1)
     off = np.angle(np.exp(1j * off))
@@ -284,12 +290,11 @@ def test_a_long_gap_of_the_slave_is_declared_and_the_pieces_are_joined(pairs, an
     keep = (t < 19.61) | (t > 20.51)
     arrays = {f: getattr(imu, f)[keep] for f in ("time_ns", "gyro", "accel", "rows")}
 
-    def instead(piece, contender, parameters):  # of a compilation for each piece's shape
-        rows = slice(0, len(piece.epoch_s))
-        info = {k: at(i, rows) for k, i in answers[0].info.items()}
-        return replace_belief(answers[0], rows)._replace(info=info)
+    def instead(piece, contender, smoothed):  # of a compilation for each piece's shape
+        answer = until(answers[0], len(piece.epoch_s))
+        return answer, answer
 
-    monkeypatch.setattr(pair_replay, "aligned", instead)
+    monkeypatch.setattr(replaying, "_of_piece", instead)
     outcome = replay(logs.clean(replace(pairs[0], imu=replace(imu, **arrays))), PAIR)
     assert outcome.counts["imu_gaps_declared"] == 1
     assert len([n for n in outcome.notes if n.startswith("Aligned from")]) == 2
@@ -304,7 +309,7 @@ def test_a_long_gap_of_the_slave_is_declared_and_the_pieces_are_joined(pairs, an
 
 def test_what_the_motion_does_not_show_is_said(answers, clean):
     """In the straight part, 3 s long, a mounting error and one of attitude are the same."""
-    early = replace_belief(answers[0], slice(0, 12))
+    early = until(answers[0], 12)
     (said,) = [n for n in remarks("product", early) if "mounting" in n]
     assert "product: mounting" in said
     assert "down" in said
@@ -312,8 +317,9 @@ def test_what_the_motion_does_not_show_is_said(answers, clean):
     assert not [n for n in clean.notes if "hardly observed" in n]
 
 
-def replace_belief(answer, rows):
-    return answer._replace(belief=at(answer.belief, rows))
+def until(answer, epoch):
+    kept = at((answer.mean, answer.sigma, answer.updates), slice(0, epoch))
+    return answer._replace(mean=kept[0], sigma=kept[1], updates=kept[2])
 
 
 def test_a_mounting_far_from_nominal_is_found_and_remarked(runs, pairs):

@@ -10,11 +10,11 @@ from robins.earth import Geodetic
 from robins.ins.frames import swap, swap_q
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav, mechanise
+from robins.ins.state import InsState
 from robins.rotation import Rotation, from_euler
-from robins.systems.transfer_alignment import open_loop
-from robins.systems.transfer_alignment import velocity_attitude as va
+from robins.systems.transfer_alignment.velocity_attitude import model as va
 
-navigate = jax.jit(open_loop.navigate)
+navigate = jax.jit(va.navigate)
 
 W = 7.292115e-5  # rad/s
 A_M, E2 = 6378137.0, 0.0066943799901413
@@ -181,14 +181,14 @@ def turning(count=200, per_block=5):
 
 def test_open_loop_holds_the_vertical_and_else_navigates():
     start, blocks = turning()
-    found = navigate(start, blocks)
-    assert_allclose(found.nav.position.alt, 1000.0, rtol=0, atol=0)
-    assert_allclose(found.nav.v_n[:, 2], 0.0, rtol=0, atol=0)
+    found, _ = navigate(start, blocks)
+    assert_allclose(found.position.alt, 1000.0, rtol=0, atol=0)
+    assert_allclose(found.v_n[:, 2], 0.0, rtol=0, atol=0)
     flat = Increments(*(np.reshape(a, (-1, *a.shape[2:])) for a in blocks[:3]))
     free = mechanise(start, flat)
     # 4 s with the vertical free: it enters the horizontal by rates of 1e-5 rad/s only
-    assert_allclose(found.nav.v_n[-1, :2], free.v_n[-1, :2], rtol=0, atol=2e-3)
-    angle = Rotation(found.nav.q_nb.wxyz[-1]).local(Rotation(free.q_nb.wxyz[-1]))
+    assert_allclose(found.v_n[-1, :2], free.v_n[-1, :2], rtol=0, atol=2e-3)
+    angle = Rotation(found.q_nb.wxyz[-1]).local(Rotation(free.q_nb.wxyz[-1]))
     assert_allclose(angle, 0.0, rtol=0, atol=1e-6)
 
 
@@ -202,18 +202,15 @@ def test_errors_of_the_open_loop_run_as_the_model_says():
     )
     dt = blocks.dt[..., None]
     raw = blocks._replace(theta=blocks.theta + gyro_bias * dt, dv=blocks.dv + accel_bias * dt)
-    truth = navigate(open_loop.start_with_error(start, np.zeros(9)), blocks)
-    wrong = navigate(open_loop.start_with_error(start, e), raw)
+    truth, _ = navigate(va.start_with_error(start, np.zeros(9)), blocks)
+    wrong, flown = navigate(va.start_with_error(start, e), raw)
 
     E = len(blocks.dt)
     given = [np.broadcast_to(b, (E, 3)) for b in (gyro_bias, accel_bias)]
-    x = open_loop.true_errors(
-        wrong.nav, truth.nav.q_nb.wxyz, truth.nav.v_n, truth.nav.position, *given
-    )
-    x = np.asarray(x)
+    x = np.asarray(va.true_errors(wrong, InsState(*truth, *given)))
     # one interval after the other from the true error, against the model's transition
     for k in range(1, E):
-        flight = va.Flight(*(np.asarray(a)[k] for a in wrong.flight))
+        flight = va.Flight(*(np.asarray(a)[k] for a in flown))
         Phi = np.asarray(va.transition(va.Interval(flight, np.array(0.1), np.zeros(12))))
         assert_allclose(Phi @ x[k - 1] / TYPICAL, x[k] / TYPICAL, rtol=0, atol=2e-6)
 
@@ -226,14 +223,14 @@ def test_true_errors_are_computed_minus_true_in_the_frames_of_the_model():
         np.array([11.0, 22.0, 0.0]),
         Geodetic(np.array(0.6), np.array(0.2), np.array(0.0)),
     )
-    x = open_loop.true_errors(
-        computed,
-        q,
+    true = InsState(
+        Rotation(jnp.asarray(q)),
         np.array([10.0, 20.0, 0.0]),
         Geodetic(np.array(0.5), np.array(0.1), np.array(0.0)),
         np.array([1.0, 2.0, 3.0]),
         np.array([4.0, 5.0, 6.0]),
     )
+    x = va.true_errors(computed, true)
     expected = [0.1, 0.1, 2.0, 1.0, *phi_enu, 5.0, 4.0, 2.0, 1.0, -3.0]
     assert_allclose(x, expected, rtol=0, atol=1e-15)
 
@@ -241,19 +238,19 @@ def test_true_errors_are_computed_minus_true_in_the_frames_of_the_model():
 def test_the_flight_is_turned_and_shifted_to_what_the_master_reports():
     start, blocks = turning(count=40)
     e = np.array([0.02, -0.03, 0.05, 1.0, -2.0, 0.0, 30.0, 20.0, 0.0])
-    truth = navigate(open_loop.start_with_error(start, np.zeros(9)), blocks)
-    wrong = navigate(open_loop.start_with_error(start, e), blocks)
-    flight, C_nb = open_loop.as_master_sees(wrong, truth.nav)
-    assert_allclose(C_nb, va.dcm_enu(truth.nav.q_nb.wxyz), rtol=0, atol=1e-12)
+    truth, flown = navigate(va.start_with_error(start, np.zeros(9)), blocks)
+    wrong, astray = navigate(va.start_with_error(start, e), blocks)
+    flight, C_nb = va.as_master_sees(wrong, astray, truth)
+    assert_allclose(C_nb, va.dcm_enu(truth.q_nb.wxyz), rtol=0, atol=1e-12)
     # within an interval the difference hardly moves
-    assert_allclose(flight.C_nb, truth.flight.C_nb, rtol=0, atol=1e-5)
-    assert_allclose(flight.f_enu, truth.flight.f_enu, rtol=0, atol=1e-4)
-    assert_allclose(flight.v_enu[:, :2], truth.flight.v_enu[:, :2], rtol=0, atol=0.05)
-    assert_allclose(flight.lat_rad, truth.flight.lat_rad, rtol=0, atol=1e-7)
+    assert_allclose(flight.C_nb, flown.C_nb, rtol=0, atol=1e-5)
+    assert_allclose(flight.f_enu, flown.f_enu, rtol=0, atol=1e-4)
+    assert_allclose(flight.v_enu[:, :2], flown.v_enu[:, :2], rtol=0, atol=0.05)
+    assert_allclose(flight.lat_rad, flown.lat_rad, rtol=0, atol=1e-7)
 
-    silent = jax.tree.map(lambda a: a.at[3].set(jnp.nan), truth.nav)
-    flight, C_nb = open_loop.as_master_sees(wrong, silent)
-    assert_allclose(C_nb[3], va.dcm_enu(wrong.nav.q_nb.wxyz)[3], rtol=0, atol=0)
-    assert_allclose(flight.f_enu[3], wrong.flight.f_enu[3], rtol=0, atol=0)
-    assert_allclose(flight.v_enu[3], wrong.flight.v_enu[3], rtol=0, atol=0)
-    assert_allclose(flight.lat_rad[3], wrong.flight.lat_rad[3], rtol=0, atol=0)
+    silent = jax.tree.map(lambda a: a.at[3].set(jnp.nan), truth)
+    flight, C_nb = va.as_master_sees(wrong, astray, silent)
+    assert_allclose(C_nb[3], va.dcm_enu(wrong.q_nb.wxyz)[3], rtol=0, atol=0)
+    assert_allclose(flight.f_enu[3], astray.f_enu[3], rtol=0, atol=0)
+    assert_allclose(flight.v_enu[3], astray.v_enu[3], rtol=0, atol=0)
+    assert_allclose(flight.lat_rad[3], astray.lat_rad[3], rtol=0, atol=0)

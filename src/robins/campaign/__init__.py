@@ -1,6 +1,6 @@
 """Campaigns: many runs of a problem, in chunks, with statistics that say how sure they are."""
 
-from robins.campaign.monte_carlo import CHUNK, chunks, record, worlds
+from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
 from robins.campaign.statistics import Statistics, collect, mean_with_bounds, rms_with_bounds
 
@@ -8,7 +8,6 @@ __all__ = [
     "CHUNK",
     "Statistics",
     "campaign_solution",
-    "chunks",
     "collect",
     "mean_with_bounds",
     "record",

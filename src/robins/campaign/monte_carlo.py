@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
-from robins.filters.consistency import nees, normalised_sq
+from robins.filters.analysis.consistency import nees, normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
 from robins.systems.study import Case, Contender, Problem
@@ -42,15 +42,14 @@ def _reported(belief: Belief, truth: State, rows: Array | None) -> tuple[Array, 
     return (error, factor) if rows is None else (rows @ error, rows @ factor)
 
 
-def reported_rows(contender: Contender, case: Case) -> tuple[Array | None, int | None]:
+def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
     """Rows that make of a tangent error what is reported, and their axis of time if they have one.
 
-    None: all of the error is reported.
+    (r, n) or (E, r, n); None: all of the error is reported.
     """
     if case.rows is not None:
         return case.rows, 0
-    fixed = contender.reported
-    return (None if fixed is None else jnp.asarray(fixed, float)), None
+    return (None if reported is None else jnp.asarray(reported, float)), None
 
 
 def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any, Case, Tally]:
@@ -72,7 +71,7 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
     """One run of one filter, to what statistics need."""
     steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
-    rows, along = reported_rows(contender, case)
+    rows, along = reported_rows(contender.reported, case)
     error, factor = jax.vmap(_reported, (0, 0, along))(posterior, case.truth, rows)
     # A filter that could not predict is no longer at the time of the truth: it has diverged.
     error = jnp.where((jnp.cumsum(~moved) > 0)[:, None], jnp.nan, error)
@@ -157,32 +156,3 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
     found = _records(c.filter, blocks, c.model, c.case, c.reported, worlds)
     return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
-
-
-def chunks(
-    problem: Problem,
-    name: str,
-    runs: int,
-    chunk: int = CHUNK,
-    first: int = 0,
-    progress: Callable[[int], None] | None = None,
-) -> Iterator[dict[str, Any]]:
-    """Records of one filter over runs first .. first + runs - 1, as `record` gives them.
-
-    Args:
-        problem: what to simulate.
-        name: which of its contenders.
-        runs: how many.
-        chunk: runs per batch.
-        first: number of the first run.
-        progress: called with the number of runs done after each chunk.
-
-    Raises:
-        ValueError: runs or chunk is not positive, or there is no such contender.
-    """
-    done = 0
-    for batch, count in worlds(problem, runs, chunk, first):
-        yield record(problem, name, batch, count)
-        done += count
-        if progress is not None:
-            progress(done)

@@ -14,7 +14,8 @@ import numpy as np
 from scipy import stats
 
 from robins.filters import Tally
-from robins.filters.consistency import Verdict, chi2_band, grand_mean_nis
+from robins.filters.analysis.consistency import Verdict, grand_mean_nis
+from robins.filters.chi_square import chi2_band
 from robins.systems.study import Limit, Norm, StateBlock
 
 
@@ -48,7 +49,6 @@ class Statistics:
     _dof: dict[str, Any] = field(default_factory=dict)
     _tallies: list[Tally] = field(default_factory=list)
     _run_rms: list[np.ndarray] = field(default_factory=list)
-    _run_worst: list[np.ndarray] = field(default_factory=list)
     _within: dict[str, Any] = field(default_factory=dict)
     _settled: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _norms: dict[str, list[np.ndarray]] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Statistics:
     _run_output_worst: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
-        """Take in a chunk as `robins.campaign.chunks` yields it."""
+        """Take in a chunk as `robins.campaign.record` gives it."""
         error, sigma = record["error"], record["sigma"]
         if self.example is None:
             self.example = jax.tree_util.tree_map(lambda x: x[0], record)
@@ -96,7 +96,6 @@ class Statistics:
                 worst = [np.max(whole[:, span], axis=1) for span in self.windows]
                 self._norm_peaks.setdefault(norm.name, []).append(np.stack(worst, axis=1))
         self._run_rms.append(np.sqrt(np.mean(counted**2, axis=1)))
-        self._run_worst.append(np.max(np.abs(counted), axis=1))
         if self.windows:
             worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
             self._peaks.append(np.stack(worst, axis=1))
@@ -163,11 +162,6 @@ class Statistics:
     def run_rms(self) -> np.ndarray:
         """(runs, r)."""
         return np.concatenate(self._run_rms)
-
-    @property
-    def run_worst(self) -> np.ndarray:
-        """(runs, r) largest error of each run over the epochs counted."""
-        return np.concatenate(self._run_worst)
 
     def share_within(self, limit: str) -> np.ndarray:
         """(E,) share of the runs whose largest error in the block is within a limit."""

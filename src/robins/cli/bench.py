@@ -152,7 +152,7 @@ def replay(record: Path, as_json: bool, **options: Any) -> int:
 @answers
 def ports(as_json: bool) -> None:
     """Name the serial ports of this machine, and whether we may use them."""
-    from robins.bench.ports.listing import list_ports, table
+    from robins.bench.ports.port import list_ports, table
 
     found = list_ports()
     say({"ports": [port._asdict() for port in found]}, table(found), as_json)

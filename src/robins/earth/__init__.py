@@ -1,21 +1,19 @@
 """The Earth: ellipsoid, gravity, rates of the local frame, magnetic field, positions as states.
 
-- `wgs84`: constants and functions of the WGS-84 ellipsoid.
-- `geodetic`: `Geodetic`, latitude, longitude and height with `retract` and `local` in metres.
+- `wgs84`: constants and functions of the WGS-84 ellipsoid; `Geodetic`, latitude, longitude and
+  height with `retract` and `local` in metres.
 - `magnetic`: the field of the WMM2020 and WMM2025 (import it by its name).
-- `star_catalogue`, `star_index`: stars, and those near a direction (import them by their names).
+- `stars`: a catalogue, and the stars near a direction (import it by its name).
 """
 
-from robins.earth.geodetic import Geodetic
 from robins.earth.wgs84 import (
     A_M,
     B_M,
     E2,
-    GAMMA_E,
-    GAMMA_P,
     GM,
     OMEGA_E,
     F,
+    Geodetic,
     curvature_radii,
     dcm_en,
     earth_rate_n,
@@ -30,8 +28,6 @@ __all__ = [
     "A_M",
     "B_M",
     "E2",
-    "GAMMA_E",
-    "GAMMA_P",
     "GM",
     "OMEGA_E",
     "F",

@@ -191,16 +191,6 @@ def field_n(
     return _field_n(model, *_floats(lat_rad, lon_rad, alt_m), years)
 
 
-def secular_variation_n(
-    model: MagneticModel, lat_rad: ArrayLike, lon_rad: ArrayLike, alt_m: ArrayLike
-) -> Float[Array, "*b 3"]:
-    """Change of the field [T per year] in north, east, down; constant over the model's life."""
-    none = np.zeros_like(model.g)
-    rates = MagneticModel(model.g_rate, model.h_rate, none, none, model.name, model.epoch)
-    lat, lon, alt = _floats(lat_rad, lon_rad, alt_m)
-    return _field_n(rates, lat, lon, alt, jnp.zeros_like(lat))
-
-
 def elements(field_n: ArrayLike) -> Elements:
     """Declination, inclination, horizontal and total intensity of fields (..., 3) [T] in NED.
 

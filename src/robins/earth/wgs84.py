@@ -6,15 +6,23 @@ take Python, NumPy or JAX numbers.
 
 The constants are those of NIMA TR8350.2 (3rd ed., 2000): four defining ones, the rest derived here
 to full precision.
+
+`Geodetic` is a position over the ellipsoid as an element of a state.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.manifold import wrap
 
 A_M = 6378137.0  # semi-major axis
 F = 1.0 / 298.257223563  # flattening
@@ -50,10 +58,6 @@ def _alternating(x, coefficients):
 
 
 _Q0 = _q(_EP2)
-_M = OMEGA_E**2 * A_M**2 * B_M / GM
-_EP_QP_OVER_Q = 3.0 * _q_prime(_EP2) / _Q0  # e' q0'/q0, dimensionless
-GAMMA_E = GM / (A_M * B_M) * (1.0 - _M - _M * _EP_QP_OVER_Q / 6.0)  # m/s^2, at the equator
-GAMMA_P = GM / A_M**2 * (1.0 + _M * _EP_QP_OVER_Q / 3.0)  # m/s^2, at the poles
 
 
 def _floats(*values: ArrayLike) -> list[Array]:
@@ -190,3 +194,72 @@ def transport_rate_n(lat_rad: ArrayLike, alt_m: ArrayLike, v_n: ArrayLike) -> Fl
     east = -v[..., 0] / (meridian + alt)
     north, east, down = jnp.broadcast_arrays(north, east, -north * jnp.tan(lat))
     return jnp.stack([north, east, down], -1)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Geodetic:
+    """Geodetic latitude and longitude [rad] and height above the ellipsoid [m]: one or many.
+
+    Tangent vectors are metres north, east, down, taken with the curvature radii at the point the
+    step begins. `local` is the exact inverse of `retract`, also across the 180 deg meridian; the
+    longitude stays in [-pi, pi). East is not defined at the poles, so neither are these two there.
+    """
+
+    lat: Any  # (...) array, rad
+    lon: Any  # (...) array, rad
+    alt: Any  # (...) array, m
+
+    dim = 3
+
+    @classmethod
+    def from_degrees(cls, lat_deg, lon_deg, alt_m) -> Geodetic:
+        """From latitude and longitude in degrees, height in metres; not for use under `jit`.
+
+        Raises:
+            ValueError: a latitude is beyond 90 deg, or a number is not finite.
+        """
+        lat, lon, alt = (np.asarray(v, float) for v in (lat_deg, lon_deg, alt_m))
+        for name, value in (("lat_deg", lat), ("lon_deg", lon), ("alt_m", alt)):
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{name} = {value}: every value must be finite")
+        if np.any(np.abs(lat) > 90.0):
+            raise ValueError(
+                f"lat_deg = {lat}: a latitude lies in [-90, 90] deg; "
+                "are latitude and longitude exchanged?"
+            )
+        lat, lon, alt = np.broadcast_arrays(np.deg2rad(lat), np.deg2rad(lon), alt)
+        return cls(jnp.asarray(lat), wrap(jnp.asarray(lon)), jnp.asarray(alt))
+
+    @classmethod
+    def from_ecef(cls, r_e) -> Geodetic:
+        """From an Earth-fixed position [m]."""
+        lat, lon, alt = geodetic_from_ecef(jnp.asarray(r_e, float))
+        return cls(lat, wrap(lon), alt)
+
+    def as_ecef(self) -> Float[Array, "*b 3"]:
+        """Earth-fixed position r_e [m]."""
+        return ecef_from_geodetic(self.lat, self.lon, self.alt)
+
+    def _metres_per_radian(self):
+        meridian, transverse = curvature_radii(self.lat)
+        return meridian + self.alt, (transverse + self.alt) * jnp.cos(self.lat)
+
+    def retract(self, delta: Float[Array, "*b 3"]) -> Geodetic:
+        """Move by metres north, east, down."""
+        north, east = self._metres_per_radian()
+        return Geodetic(
+            self.lat + delta[..., 0] / north,
+            wrap(self.lon + delta[..., 1] / east),
+            self.alt - delta[..., 2],
+        )
+
+    def local(self, other: Geodetic) -> Float[Array, "*b 3"]:
+        """Metres north, east, down for which ``self.retract(metres) == other``."""
+        north, east = self._metres_per_radian()
+        n, e, d = jnp.broadcast_arrays(
+            (other.lat - self.lat) * north,
+            wrap(other.lon - self.lon) * east,
+            self.alt - other.alt,
+        )
+        return jnp.stack([n, e, d], -1)

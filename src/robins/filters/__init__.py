@@ -1,15 +1,40 @@
-"""Filters: a way to linearise and a chain of rules. Knows no navigation, no sensor, no file."""
+"""Filters: a way to linearise and a chain of rules; without navigation, sensors or files."""
 
+from robins.filters.analysis import (
+    Bound,
+    bound_along,
+    covariance_bound,
+    existence_margin,
+    gamma_min,
+    linearised,
+    observability,
+    observability_along,
+    steady_h_infinity,
+    used_sensors,
+    worst_case_gain,
+)
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
-from robins.filters.bound import Bound, bound_along, covariance_bound, linearised, used_sensors
-from robins.filters.channels import Channel, channel
 from robins.filters.closed_loop import Closed, Loop, Reading, run_closed
-from robins.filters.delayed import Late, delayed
-from robins.filters.distributed import distributed, intersecting
-from robins.filters.federated import federated
-from robins.filters.fusion import covariance_intersection, fuse, share
-from robins.filters.guarded import guarded
-from robins.filters.imm import imm, mode
+from robins.filters.composite import (
+    Channel,
+    Family,
+    Late,
+    at_master,
+    channel,
+    covariance_intersection,
+    delayed,
+    distributed,
+    federated,
+    fuse,
+    guarded,
+    imm,
+    intersecting,
+    mode,
+    observability_shares,
+    particle,
+    reseed,
+    share,
+)
 from robins.filters.iterated import iterated
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
 from robins.filters.linearise import (
@@ -24,24 +49,13 @@ from robins.filters.linearise import (
     unscented,
     unscented_transform,
 )
-from robins.filters.master import at_master
 from robins.filters.model import Model, Motion, Sensor
-from robins.filters.modes import Family
-from robins.filters.observability import observability, observability_along
 from robins.filters.observation import Normalised, Observation, normalised
 from robins.filters.online import OnlineFilter
-from robins.filters.particle import particle, reseed
 from robins.filters.rule import Rule
 from robins.filters.run import Solution, Step, filter_step, run
-from robins.filters.shares import observability_shares
 from robins.filters.smooth import rts_smoother
 from robins.filters.tally import StepWarning, Tally, doubts
-from robins.filters.worst_case import (
-    existence_margin,
-    gamma_min,
-    steady_h_infinity,
-    worst_case_gain,
-)
 
 __all__ = [
     "SENTENCES",

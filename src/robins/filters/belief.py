@@ -1,23 +1,24 @@
-"""What a filter believes, what it says about a step, and the outcomes it can have."""
+"""The belief of a filter, the information of an update, and the outcomes of a step."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from robins import linalg, manifold
+from robins.filters.checks import finite_numbers
 from robins.manifold import State
 
 Number = float | int  # where types are checked an int is no float
 
 
 class Belief(NamedTuple):
-    """What is believed about the state at one instant.
+    """Mean and covariance of the state at one instant.
 
     The true state is ``retract(mean, e)`` with e ~ N(0, factor factor').
     """
@@ -34,7 +35,9 @@ class Belief(NamedTuple):
             ValueError: the mean is not finite, the covariance is not one, or its size is not the
                 state's.
         """
-        mean = jax.tree_util.tree_map(_as_state, mean)
+        mean = jax.tree_util.tree_map(
+            lambda leaf: jnp.asarray(finite_numbers("initial mean", leaf)), mean
+        )
         factor = linalg.factor(covariance, "initial covariance")
         n = manifold.dim(mean)
         if factor.shape != (n, n):
@@ -50,15 +53,6 @@ class Belief(NamedTuple):
     def sigma(self) -> Array:
         """(..., n) standard deviation of each tangent component."""
         return jnp.sqrt(jnp.sum(self.factor**2, axis=-1))
-
-
-def _as_state(leaf):
-    array = np.asarray(leaf)
-    if array.dtype.kind not in "iuf":
-        raise TypeError(f"initial mean holds {array.dtype}: real numbers are wanted")
-    if not np.all(np.isfinite(array)):
-        raise ValueError("initial mean has entries that are not finite numbers")
-    return jnp.asarray(array.astype(float))
 
 
 class Code(IntEnum):
@@ -107,8 +101,13 @@ SENTENCES: dict[Code, str] = {
 }
 
 
+def with_notes(known: Mapping[str, Any], rule: str, notes: dict[str, Any]) -> dict[str, Any]:
+    """Notes with those of a rule, each as ``rule.name``; a ``_`` at the end of a name is cut."""
+    return {**known} | {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
+
+
 class StepInfo(NamedTuple):
-    """What an update saw, and what it made of it. m is the measurement's tangent dimension."""
+    """Innovation, gain and outcome of an update. m is the measurement's tangent dimension."""
 
     innovation: Array  # (m,) y minus its prediction; NaN where missing
     factor: Array  # (m, m) lower factor of the innovation covariance; identity rows where not used
@@ -122,9 +121,8 @@ class StepInfo(NamedTuple):
     notes: dict[str, Any]  # what the rules add, by their names
 
     def noted(self, rule: str, **notes: Any) -> StepInfo:
-        """With what a rule notes, each as ``rule.name``; a ``_`` at the end of a name is cut."""
-        own = {f"{rule}.{name.rstrip('_')}": value for name, value in notes.items()}
-        return self._replace(notes={**self.notes, **own})
+        """With notes of a rule (`with_notes`)."""
+        return self._replace(notes=with_notes(self.notes, rule, notes))
 
     @property
     def sigma(self) -> Array:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
+from robins.errors import require
 from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState
@@ -147,8 +148,7 @@ def run_closed(
         StepWarning: as in `robins.filters.run`.
     """
     steps = {jnp.shape(x)[0] for x in jax.tree_util.tree_leaves((loop.rows, loop.due))}
-    if len(steps) != 1:
-        raise ValueError(f"rows and due of a loop must have one length, got {sorted(steps)}")
+    require(len(steps) == 1, "rows and due of a loop must have one length", sorted(steps))
     check_names(model, loop.due)
     state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
     as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)

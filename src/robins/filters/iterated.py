@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.linearise import Linearisation, taylor
 from robins.filters.model import Sensor
@@ -42,8 +43,7 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
     Raises:
         ValueError: iterations is not positive, or the way to linearise uses its points again.
     """
-    if iterations < 1:
-        raise ValueError(f"iterated: iterations must be at least 1, got {iterations}")
+    require(iterations >= 1, "iterated: iterations must be at least 1", iterations)
     way = taylor() if linearise is None else linearise
     if way.reuse is not None:
         raise ValueError(

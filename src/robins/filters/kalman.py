@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.model import Motion, Sensor
 from robins.filters.observation import Observation, contradicted, left_out, whiten
@@ -46,6 +47,14 @@ class Prediction(NamedTuple):
     origin: Belief | None = None  # where it began, if a rule has settled another belief
 
 
+Follow = Callable[[Sequence[Belief], Belief], FilterState]
+
+
+def no_members(state: FilterState) -> tuple[tuple[Belief, ...], Follow]:
+    """The default of `Filter.members`."""
+    return (), lambda beliefs, belief: state
+
+
 class Filter(NamedTuple):
     """Pure functions; a run, a campaign, a bench or a loop of yours calls them.
 
@@ -54,13 +63,18 @@ class Filter(NamedTuple):
         predict: ``(state, motion, u) -> (state, prediction)``.
         update: ``(state, sensor, y, aux) -> (state, info)``.
         reset: ``(state, belief) -> state``: go on from another belief, keeping what was learned of
-            the noise; a filter inside a federated filter or a mixture is told so.
+            the noise; for a filter inside a federated filter or a mixture.
+        members: ``state -> (beliefs, follow)``: what the local filters of a joined filter believe,
+            and ``follow(beliefs, belief) -> state``, the state in which they go on from others and
+            the whole from their fusion. The only question that a filter asks of the parts of
+            another one; by default there are none.
     """
 
     init: Callable[[Belief, Mapping[str, int]], FilterState]
     predict: Callable[[FilterState, Motion, Any], tuple[FilterState, Prediction]]
     update: Callable[[FilterState, Sensor, Any, Any], tuple[FilterState, StepInfo]]
     reset: Callable[[FilterState, Belief], FilterState]
+    members: Callable[[FilterState], tuple[tuple[Belief, ...], Follow]] = no_members
 
 
 def compiled(filter_: Filter) -> Filter:
@@ -171,7 +185,7 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         dof=seen.dof,
         log_likelihood=jnp.where(wrong, -jnp.inf, likely - linalg.log_diagonal(S_y, used)),
         code=_outcome(o, wrong),
-        notes={},
+        notes=dict(o.notes),
     )
     return posterior, info
 
@@ -183,7 +197,7 @@ def _failure(inputs: Any, factor: Array) -> Array:
 
 
 def not_taken(ok: Array, info: StepInfo, why: Array) -> StepInfo:
-    """What an update that was not taken says of itself: nothing used, and utterly unlikely."""
+    """The information of an update, or of one that was not taken: nothing used, likelihood zero."""
     return info._replace(
         used=info.used & ok,
         nis=jnp.where(ok, info.nis, 0.0),
@@ -240,8 +254,7 @@ def kalman(
         TypeError: linearise is not what `taylor` and its kin return, or rules are none.
         ValueError: the form is neither.
     """
-    if form not in ("sqrt", "joseph"):
-        raise ValueError(f"form must be 'sqrt' or 'joseph', got {form!r}")
+    one_of("form", form, Form)
     way, rules = _as_way(linearise), _as_rules(rules)
 
     settling = any(rule.settle is not keep_belief for rule in rules)
@@ -294,7 +307,7 @@ def kalman(
             if faded is not prior:  # the rule built another prior; seen while tracing
                 prior = faded
                 again = way.observation(prior, sensor, y, aux)
-                seen = again._replace(noise=seen.noise, accepted=seen.accepted)
+                seen = again._replace(noise=seen.noise, accepted=seen.accepted, notes=seen.notes)
         seen = seen._replace(accepted=seen.accepted & seen.present)
         posterior, info = updated(prior, seen, form)
         for i, rule in enumerate(rules):

@@ -94,12 +94,7 @@ def _magnitude(x: State) -> Array:
 def _observe(
     sensor: Sensor, prior: Belief, z: Any, y: Any, aux: Any, spread, excess, size, deficit=None
 ) -> Observation:
-    """An observation from what a linearisation found.
-
-    Raises:
-        ValueError: the sensor reads another number of components than it says, or its measurement
-            is of another form than its reading.
-    """
+    """An observation from what a linearisation found."""
     if (reads := _form(z)) != (given := _form(y)):
         reads, given = (tree.unflatten(shapes) for tree, shapes in (reads, given))
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What a filter is told of the world: a motion, and sensors.
+"""The model of a filter: a motion, and sensors.
 
 Functions in a model are part of its *shape*: exchanging one compiles anew. Everything else (noise
 factors, parameters bound with ``jax.tree_util.Partial``) is data: it may change, be batched with
@@ -17,14 +17,11 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
+from robins.errors import require
 
 
 def as_noise(value: Any, n: int, whose: str) -> Array:
-    """Noise factor from standard deviations or a factor.
-
-    Raises:
-        ValueError: it is neither (n,) nor (n, k).
-    """
+    """Noise factor from standard deviations or a factor."""
     noise = jnp.asarray(value, float)
     if noise.ndim not in (1, 2) or noise.shape[0] != n:
         raise ValueError(
@@ -44,7 +41,7 @@ def _settle_noise(own: Any, covariance: Any, whose: str) -> None:
         object.__setattr__(own, "noise", linalg.factor(covariance, f"noise covariance of {whose}"))
 
 
-def _told(tree: Any) -> Any:
+def _kinds(tree: Any) -> Any:
     """Kind and shape of each number of a pytree, for messages."""
     return jax.tree_util.tree_map(lambda a: f"{jnp.result_type(a)}{jnp.shape(a)}", tree)
 
@@ -123,7 +120,7 @@ class Motion:
         """
         new = self.step(x, u)
         _check_width("step of the motion", new)
-        if (found := str(_told(new))) != (wanted := str(_told(x))):
+        if (found := str(_kinds(new))) != (wanted := str(_kinds(x))):
             raise ValueError(f"step of the motion returns {found} of a state {wanted}")
         return new
 
@@ -202,8 +199,7 @@ class Model:
 
     def __post_init__(self):
         names = [s.name for s in self.sensors]
-        if len(set(names)) < len(names):
-            raise ValueError(f"sensors must have names of their own, got {names}")
+        require(len(set(names)) >= len(names), "sensors must have names of their own", names)
 
     @property
     def dims(self) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -10,10 +11,10 @@ import numpy as np
 from jaxtyping import Array
 
 from robins import linalg, manifold
-from robins.filters.belief import Belief
+from robins.filters.belief import Belief, with_notes
 
-# What is known exactly carries rounding, of many steps: a share of what it was summed from that is
-# far above that, and far below any sensor.
+# A quantity known exactly carries the rounding of many steps. This share of what it was summed from
+# is far above that rounding, and far below the noise of any sensor.
 _CONTRADICTS = 1e-9
 
 
@@ -30,6 +31,11 @@ class Observation(NamedTuple):
     noise: Array  # (m, q) measurement noise factor
     size: Array  # (m,) of what the spread was summed from: 1e-14 of it is rounding
     deficit: Array | None = None  # (m,) vector to take away again, for indefinite weights
+    notes: Mapping[str, Any] = {}  # what rules say of it before the update, by their names
+
+    def noted(self, rule: str, **notes: Any) -> Observation:
+        """With notes of a rule, which the update hands on to its `StepInfo` (`with_notes`)."""
+        return self._replace(notes=with_notes(self.notes, rule, notes))
 
 
 class Normalised(NamedTuple):
@@ -43,12 +49,7 @@ class Normalised(NamedTuple):
 
 
 def as_measurement(sensor: str, data: Any) -> Any:
-    """Measurements as 64-bit floats, from arrays of any real kind or lists of numbers.
-
-    Raises:
-        TypeError: something is not a real number.
-        ValueError: rows of a list differ in length.
-    """
+    """Measurements as 64-bit floats, from arrays of any real kind or lists of numbers."""
 
     def as_numbers(leaf):
         array = leaf if isinstance(leaf, jax.Array) else np.asarray(leaf)
@@ -87,10 +88,10 @@ def _present(predicted, measured) -> Array:
 def left_out(o: Observation) -> tuple[Array, Array, Array, Array | None, Array]:
     """Spread, excess, noise, deficit without the rows that are not used, and which ones are.
 
-    Not used is what was not accepted, and what has no noise and nothing of its own to say: it
-    repeats components above it, or reads what is known exactly, so that its spread is mere
-    rounding and would correlate it with everything. Such a row becomes unit noise, uncorrelated
-    with the rest, so shapes stay and nothing else changes.
+    A row is not used if it was not accepted, or if it has no noise and repeats components above it
+    or reads what is known exactly: its spread is then rounding, which would correlate it with
+    everything. Such a row becomes unit noise, uncorrelated with the rest, so shapes stay and
+    nothing else changes.
     """
     kept = [jnp.where(o.accepted[:, None], b, 0.0) for b in (o.spread, o.excess, o.noise)]
     exact = o.accepted & ~jnp.any(kept[2] != 0.0, axis=1)
@@ -114,10 +115,10 @@ def whiten(factor: Array, used: Array, residual: Array) -> Normalised:
 
 
 def contradicted(o: Observation, seen: Normalised) -> Array:
-    """(m,) bool: components that have nothing of their own to say, and yet say something else.
+    """(m,) bool: components that are known exactly, but measure something else.
 
-    Such a component is known exactly from the belief and the components that are used (R = 0 and P
-    = 0, or one exact sensor twice): its residual can only be what theirs make it.
+    They are known from the belief and the components that are used (R = 0 and P = 0, or one exact
+    sensor twice), so their residual follows from the other residuals.
     """
     idle = o.accepted & ~seen.used
 

@@ -50,9 +50,10 @@ class Rule(NamedTuple):
         process: ``(memory, transition) -> (memory, transition)``, after the model was linearised
             and before the covariance is formed: adapt ``noise``, remember ``spread``.
         before: ``(memory, prior, observation) -> (memory, prior, observation)``: fade the prior,
-            refuse components (``accepted``), scale ``noise``. A rule that hands back
-            *another* prior has the measurement linearised about it again, keeping the noise and the
-            refusals; one that does not touch the prior must hand back the same object.
+            refuse components (``accepted``), scale ``noise``, say so (`Observation.noted`). A rule
+            that hands back *another* prior has the measurement linearised about it again, keeping
+            noise, refusals and notes; one that does not touch the prior must hand back the same
+            object.
         after: ``(memory, posterior, info, observation) -> (memory, posterior, info)``: inflate,
             project, learn from the innovation; may add to ``info.notes``. The observation is the
             one the update used.

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from robins.errors import require
 from robins.filters.audit import audit
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
@@ -84,8 +85,7 @@ def _by_sensor(model: Model, data: Any) -> dict[str, Any]:
 def check_names(model: Model, data: Mapping[str, Any]) -> None:
     """Refuse data of sensors that the model does not have."""
     unknown = set(data) - set(model.dims)
-    if unknown:
-        raise ValueError(f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
+    require(not unknown, f"no sensor {sorted(unknown)}; this model has {sorted(model.dims)}")
 
 
 def _check_lengths(y: Mapping[str, Any], u: Any, aux: Mapping[str, Any]) -> None:
@@ -100,8 +100,7 @@ def _check_lengths(y: Mapping[str, Any], u: Any, aux: Mapping[str, Any]) -> None
             lengths[name] = jnp.shape(leaf)[0]
             if lengths[name] != next(iter(lengths.values())):
                 raise ValueError(f"measurements and inputs must have one length, got {lengths}")
-    if u is None and not y:
-        raise ValueError("nothing to run over: neither a measurement nor an input")
+    require(u is not None or y, "nothing to run over: neither a measurement nor an input")
 
 
 def filter_step(

@@ -95,7 +95,7 @@ def _content(x: Any, met: dict[int, tuple[int, Any]]) -> Hashable:
     Args:
         x: the thing.
         met: number in order, and the object, of what was taken apart before, by `id`; met again,
-            or from within itself, it is told by its number.
+            or from within itself, its number stands for it.
     """
     if isinstance(x, Tracer):
         raise _Traced

@@ -72,9 +72,9 @@ def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief
     # The state that followed in units of P-: mean and factor of e in x' = m- + S e, e ~ N(0, 1).
     ahead = linalg.solve_lower(S, manifold.local(prediction.belief.mean, later.mean)[:, None])[:, 0]
     M = linalg.solve_lower(S, later.factor)
-    told = jnp.maximum(jnp.max(jnp.abs(M @ M.T - linalg.identity(len(M))), axis=1), jnp.abs(ahead))
+    info = jnp.maximum(jnp.max(jnp.abs(M @ M.T - linalg.identity(len(M))), axis=1), jnp.abs(ahead))
     length = jnp.sqrt(jnp.sum(S**2, axis=1))
-    known = used & (told > _ROUNDING * length / jnp.abs(jnp.diagonal(S)))
+    known = used & (info > _ROUNDING * length / jnp.abs(jnp.diagonal(S)))
     step = cross @ jnp.where(known, ahead, 0.0)
     M = jnp.where(known[:, None], M, 0.0)
     blank = jnp.diag(jnp.where(known, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""How the steps of a run went, counted; and what of it should make a reader doubt the figures."""
+"""Outcomes of the steps of a run, counted, and what they say against its results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.filters.belief import SENTENCES, Code, StepInfo
-from robins.filters.consistency import chi2_band
+from robins.filters.chi_square import chi2_band
 
 # A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
 # share takes the model for right and the sensor for wrong.
@@ -99,7 +99,7 @@ def not_taken(tally: Tally) -> list[str]:
 
 
 def doubts(tally: Tally, bounds: bool = False, assumed: Collection[str] = ()) -> list[str]:
-    """Sentences why a reader should doubt a filter; none where nothing speaks against it.
+    """Sentences on why a reader should doubt the results of a filter; none if there is no reason.
 
     They name steps that were not taken, and contradictions; sensors more than a third of whose
     measurements the filter refused; and sensors whose mean NIS per degree of freedom is above 4

@@ -5,12 +5,12 @@
 - `mechanise`: attitude, velocity and position from increments (``step``, ``mechanise``).
 - `state`: the state of an aided INS, moved over a block, alone or with how errors go through it.
 - `errors`: the error dynamics F and G.
-- `imu_errors`, `imu_grades`: what is wrong with gyros and accelerometers, from data sheets.
+- `imu_errors`: what is wrong with gyros and accelerometers, from data sheets.
 - `allan`: Allan deviation with bounds, and the noises fitted to it (import it by its name).
 - `magnetometer_calibration`: hard and soft iron from turning about (import it by its name).
-- `vector_attitude`: attitude from stars; `star_identification`, `star_tracking`: which stars those
+- `vector_attitude`: attitude from stars; `star_identification`: which stars those
   are, lost in space or nearly known (import them by their names).
-- `alignment`: attitude at rest, from gravity, Earth rate or velocity.
+- `alignment`: attitude at rest, from gravity, Earth rate or velocity; `rest`: when that is.
 """
 
 from robins.ins.alignment import (
@@ -25,8 +25,7 @@ from robins.ins.alignment import (
 from robins.ins.errors import error_dynamics
 from robins.ins.extended_pose import ExtendedPose
 from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
-from robins.ins.imu_errors import ImuErrorModel, TriadErrors
-from robins.ins.imu_grades import grade
+from robins.ins.imu_errors import ImuErrorModel, TriadErrors, grade
 from robins.ins.increments import Increments, from_imu, thin
 from robins.ins.invariant import (
     InvariantState,

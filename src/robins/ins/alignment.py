@@ -246,7 +246,7 @@ def triad(f_b: ArrayLike, north_b: ArrayLike) -> np.ndarray:
     """
     f = np.asarray(f_b, float)
     down = -f / np.linalg.norm(f, axis=-1)[..., None]
-    east = np.cross(down, north_b)
+    east = np.cross(down, np.asarray(north_b, float))
     east = east / np.linalg.norm(east, axis=-1)[..., None]
     return np.stack([np.cross(east, down), east, down], axis=-2)
 

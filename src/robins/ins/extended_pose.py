@@ -23,43 +23,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
-from robins.rotation import Rotation, skew
-
-_SMALL = 1e-2  # rad^2; below it the series, of which no dropped term exceeds 1e-16 of the first
+from robins.rotation import Rotation, skew, turn_coefficients
 
 Side = Literal["right", "left"]
-
-
-def _coefficients(phi: Array) -> tuple[Array, Array, Array]:
-    """(1 - cos a)/a^2, (a - sin a)/a^3 and (1 - (a/2) cot(a/2))/a^2 for a = |phi|."""
-    sq = jnp.sum(phi * phi, -1)
-    # Double `where`, as in `robins.rotation`: the root has no slope at zero.
-    small = sq < _SMALL
-    a = jnp.sqrt(jnp.where(small, 1.0, sq))
-    x = jnp.where(small, sq, 0.0)
-    half = jnp.sin(0.5 * a) / a
-    once = 0.5 - x / 24.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0 * (1.0 - x / 90.0)))
-    twice = 1.0 / 6.0 - x / 120.0 * (1.0 - x / 42.0 * (1.0 - x / 72.0 * (1.0 - x / 110.0)))
-    # 1/12 and the next Bernoulli numbers over factorials
-    back = 1.0 / 12.0 + x * (1 / 720 + x * (1 / 30240 + x * (1 / 1209600 + x / 47900160)))
-    return (
-        jnp.where(small, once, 2.0 * half**2),
-        jnp.where(small, twice, (a - jnp.sin(a)) / a**3),
-        jnp.where(small, back, (1.0 - 0.5 * jnp.cos(0.5 * a) / half) / a**2),
-    )
 
 
 def _turn(phi: Array, v: Array, once: Array, twice: Array) -> Array:
     """(I + once phi x + twice phi x phi x) v."""
     cross = jnp.cross(phi, v)
     return v + once[..., None] * cross + twice[..., None] * jnp.cross(phi, cross)
-
-
-def left_jacobian(phi: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """J(phi): exp((phi + d) x) = exp((J d) x) exp(phi x) to first order in d."""
-    once, twice, _ = _coefficients(phi)
-    turn = skew(phi)
-    return jnp.eye(3) + once * turn + twice * turn @ turn
 
 
 @jax.tree_util.register_dataclass
@@ -90,14 +62,14 @@ class ExtendedPose:
     def exp(cls, xi: Float[Array, "*b 9"], error: Side = "right") -> ExtendedPose:
         """The group exponential."""
         phi = xi[..., :3]
-        once, twice, _ = _coefficients(phi)
+        once, twice, _ = turn_coefficients(phi)
         velocity, position = (_turn(phi, v, once, twice) for v in (xi[..., 3:6], xi[..., 6:]))
         return cls(Rotation.from_rotvec(phi), velocity, position, error)
 
     def log(self) -> Float[Array, "*b 9"]:
         """The xi, of attitude part at most pi, with ``exp(xi)`` this element."""
         phi = self.rotation.as_rotvec()
-        _, _, twice = _coefficients(phi)
+        _, _, twice = turn_coefficients(phi)
         half = jnp.full_like(twice, -0.5)
         parts = [phi, *(_turn(phi, v, half, twice) for v in (self.velocity, self.position))]
         return jnp.concatenate(parts, -1)

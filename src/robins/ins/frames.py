@@ -29,7 +29,6 @@ from robins.dataset import (
     NavFrame,
     Trajectory,
 )
-from robins.manifold import wrap
 from robins.rotation import multiply, to_euler
 
 Table = TypeVar("Table", ImuTable, GnssTable, Trajectory, MagTable, AttitudeTable)
@@ -96,9 +95,9 @@ def _turned(q, turn_nav: bool, turn_body: bool):
     if turn_nav and turn_body:
         return swap_q(q)
     if turn_nav:
-        return np.asarray(multiply(jnp.asarray(_HALF_TURN), jnp.asarray(q)))
+        return multiply(_HALF_TURN, q)
     if turn_body:
-        return np.asarray(multiply(jnp.asarray(q), jnp.asarray(-_HALF_TURN)))
+        return multiply(q, -_HALF_TURN)
     return q
 
 
@@ -109,8 +108,3 @@ def euler_enu_rfu(q_nb) -> tuple[Array, Array, Array]:
     the same vehicle in NED/FRD.
     """
     return to_euler(swap_q(jnp.asarray(q_nb)))
-
-
-def yaw_from_heading(heading_rad) -> Array:
-    """Yaw [rad] counter-clockwise from north in [-pi, pi), as in PSINS; and back again."""
-    return wrap(-jnp.asarray(heading_rad))

@@ -8,20 +8,26 @@ and 6)::
 with scale factor errors S, misalignments M, and for gyros a sensitivity G to the specific force f.
 The bias is the sum of a constant that changes from one switching on to the next, a first-order
 Gauss-Markov process, a random walk and a ramp; the noise is white. This module describes, from SI
-numbers or data sheets (by grade: `robins.ins.imu_grades`; from an Allan fit:
+numbers or data sheets (by grade: `grade`; from an Allan fit:
 `robins.ins.allan.triad_errors`), and says in closed form what to expect; `robins.sim.imu_sensor`
 draws.
 
 Units are SI, per axis: [y] stands for rad/s of a gyro and m/s^2 of an accelerometer.
+
+`grade` gives models by the grades of the field, for when there is no data sheet yet (Groves 2013,
+chapter 4; Titterton & Weston 2004, chapters 4 to 7). Figures are round ones from the middle of what
+such units are sold with, in the words of a data sheet, so that a reader can compare them with one.
+Within a grade products differ by a factor of three either way: take the figures of your sensor
+where you have them.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +35,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robins import _float64  # noqa: F401
-from robins.errors import require
-from robins.ins.records import checked_pytree
+from robins.errors import require, require_known
 from robins.units import UnitError, parse
+
+T = TypeVar("T", bound=type)
+
+
+def checked_pytree(cls: T) -> T:
+    """Register a frozen dataclass as a pytree whose rebuilding skips its ``__post_init__``.
+
+    JAX rebuilds a record with tracers, batches, axis numbers and stand-ins for leaves. Checks and
+    conversions are meant for what a person writes, so they run in the constructor and in
+    ``dataclasses.replace`` alone. A field that is None is structure, not a leaf.
+    """
+    names = tuple(f.name for f in dataclasses.fields(cls))
+
+    def flatten(record: Any) -> tuple[tuple[Any, ...], None]:
+        keys = (jax.tree_util.GetAttrKey(name) for name in names)
+        return tuple((key, getattr(record, key.name)) for key in keys), None
+
+    def unflatten(_: None, values: Iterable[Any]) -> Any:
+        record = object.__new__(cls)
+        for name, value in zip(names, values, strict=True):
+            object.__setattr__(record, name, value)
+        return record
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+    return cls
+
 
 MARKOV_PEAK = 0.6173642831
 """Largest Allan deviation of a Gauss-Markov process over its sigma, at 1.893 correlation times."""
@@ -183,10 +214,7 @@ def _from_figures(sensor: str, figures: Mapping[str, Any]) -> TriadErrors:
     }
     values: dict[str, Any] = {}
     for figure, text in figures.items():
-        if figure not in known:
-            near = difflib.get_close_matches(figure, known, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            raise ValueError(f"{sensor}: no figure {figure!r}{hint} (known: {', '.join(known)})")
+        require_known("figure", figure, known, f"the {sensor}")
         name, kind, factor = known[figure]
         require(name not in values, f"{sensor}.{figure}: {name} is given twice, by two figures")
         try:
@@ -253,3 +281,52 @@ def mean_sigma(errors: TriadErrors, duration_s: float) -> np.ndarray:
     if errors.quantum is not None:
         variance = variance + errors.quantum**2 / 6.0 / duration_s**2
     return np.sqrt(variance)
+
+
+# navigation: ring laser gyros and force-feedback pendulums of an airliner's inertial reference,
+# about one nautical mile per hour unaided, which is what 0.01 deg/h and 50 ug amount to. tactical:
+# fibre-optic gyros and quartz accelerometers of guided munitions and survey systems. industrial
+# MEMS: factory-calibrated modules, steady while on, a new bias at each switching on. consumer MEMS:
+# one-chip sensors of telephones and drones, not calibrated one by one.
+_GRADES = ("navigation", "tactical", "industrial MEMS", "consumer MEMS")
+_TABLE = {
+    "gyro": {
+        "bias": ("0.01 deg/h", "1 deg/h", "0.1 deg/s", "1 deg/s"),
+        "bias_instability": ("0.003 deg/h", "0.3 deg/h", "6 deg/h", "20 deg/h"),
+        "correlation_time": ("1 h", "300 s", "200 s", "100 s"),
+        "noise": ("0.002 deg/sqrt(h)", "0.1 deg/sqrt(h)", "0.3 deg/sqrt(h)", "0.01 deg/s/sqrt(Hz)"),
+        "scale_factor": ("5 ppm", "100 ppm", "0.3 %", "2 %"),
+        "misalignment": ("5 arcsec", "0.1 mrad", "0.05 deg", "1 deg"),
+        "g_sensitivity": (None, "0.1 deg/h/g", "0.01 deg/s/g", "0.1 deg/s/g"),
+        "full_scale": ("400 deg/s", "1000 deg/s", "450 deg/s", "2000 deg/s"),
+    },
+    "accel": {
+        "bias": ("50 ug", "1 mg", "5 mg", "40 mg"),
+        "bias_instability": ("5 ug", "50 ug", "100 ug", "500 ug"),
+        "correlation_time": ("1 h", "300 s", "200 s", "100 s"),
+        "noise": ("10 ug/sqrt(Hz)", "50 ug/sqrt(Hz)", "50 ug/sqrt(Hz)", "250 ug/sqrt(Hz)"),
+        "scale_factor": ("100 ppm", "300 ppm", "0.3 %", "2 %"),
+        "misalignment": ("5 arcsec", "0.1 mrad", "0.05 deg", "1 deg"),
+        "full_scale": ("20 g", "40 g", "18 g", "16 g"),
+    },
+}
+FIGURES: MappingProxyType[str, dict[str, dict[str, Any]]] = MappingProxyType(
+    {
+        grade: {
+            sensor: {figure: row[k] for figure, row in rows.items() if row[k] is not None}
+            for sensor, rows in _TABLE.items()
+        }
+        for k, grade in enumerate(_GRADES)
+    }
+)
+"""The figures of each grade, as `ImuErrorModel.from_datasheet` reads them."""
+
+
+def grade(name: str) -> ImuErrorModel:
+    """Error model of a grade: navigation, tactical, industrial MEMS or consumer MEMS.
+
+    Raises:
+        ValueError: no such grade.
+    """
+    require_known("IMU grade", name, FIGURES, "robins")
+    return ImuErrorModel.from_datasheet(**FIGURES[name])

@@ -8,8 +8,9 @@ inside an interval. One rule for each kind of sensor fills that in:
 *increment*: both ran linearly, with the slope that the previous sample shows. For equal intervals
 the coning term is then a 12th of (previous x this), that of Ignagni (1996) and Savage (1998, part
 1), and sculling goes likewise (part 2). Causal. The error of a path is of third order in the
-interval; after coning it is `coning_drift`. After lost samples the same line runs from the middle
-of the previous sample's own interval to that of this one's (`robins.ins.intervals`).
+interval; a cone of half angle a at rate W, sampled every T, leaves a drift of a^2 x^5 / (60 T),
+x = W T (Ignagni 1996). After lost samples the same line runs from the middle of the previous
+sample's own interval to that of this one's (`robins.ins.increments`).
 
 *rate*: both ran along the cubic through the four nearest samples. Fourth order; needs one sample
 ahead. Where there are fewer than four, or their intervals differ by more than a factor of two, both
@@ -18,19 +19,29 @@ ran along the straight line between two samples: second order.
 The integrals are then taken by the Gauss rule of two points, with the rotation at each point in
 closed form: exact in every product of the linear model up to the third order, of fourth order
 beyond (Iserles & Norsett 1999 for the rotation vector). All is NumPy over whole tables.
+
+`own_intervals` tells where samples are missing, and over which time the sample after a gap was
+taken. An increment is the integral since the sample before it. Where that one was lost, most
+sensors have put out the integral of their own interval only, and the motion of the others is lost
+with them; some go on summing up and have the motion of the whole gap. Stamps cannot tell the two
+apart, but rate and specific force can: the one that fits those of the sample before is true.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.spatial.transform import Rotation as _Rotation
 
+from robins import _float64  # noqa: F401
 from robins.dataset import ImuTable
 from robins.errors import require
 from robins.ins.frames import to_ned_frd
-from robins.ins.intervals import own_intervals
+from robins.rotation import from_rotvec, multiply, normalise, rotate, to_rotvec
 
 _EVEN = 2.0  # largest ratio of neighbouring intervals that a cubic is drawn through
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -210,14 +221,76 @@ def displacement(increments: Increments) -> Any:
     return dt[..., None] * (dv / 2.0 - _cross(theta, dv) / 12.0) if dr is None else dr
 
 
-def coning_drift(half_angle_rad: float, rate_rad_s: float, dt_s: float) -> float:
-    """Drift [rad/s] left by the two-sample rule about the axis of a coning motion.
+_MISSING = 1.5  # usual intervals; from here on at least one sample is missing
+_SPAN = 8  # intervals that are measured together, so that bursts of stamps average out
+_GRAVITY = 9.8  # m/s^2 that counts as much as 1 rad/s
 
-    The body axis runs around a cone of small half angle a at rate W, sampled every T. Truth and
-    rule differ by ``a^2 |(x - sin x)/2 - sin^2(x/2) sin(x)/3| / T`` with x = W T, which is
-    a^2 x^5 / (60 T) for small x (as Ignagni 1996, without the small-x limit). Terms in a^4 are left
-    out.
+
+def usual_interval(dt: np.ndarray) -> float:
+    """The interval [s] of a sensor from those between its samples (N,), of which some are missing.
+
+    Their median, unless stamps come in bursts: then a tenth percentile of the means over eight.
     """
-    x = rate_rad_s * dt_s
-    left = 0.5 * (x - np.sin(x)) - np.sin(0.5 * x) ** 2 * np.sin(x) / 3.0
-    return float(half_angle_rad**2 * abs(left) / dt_s)
+    span = min(_SPAN, len(dt))
+    ends = np.concatenate([[0.0], np.cumsum(dt)])
+    together = float(np.percentile(ends[span:] - ends[:-span], 10.0)) / span
+    usual = float(np.median(dt))
+    return usual if usual > 0.5 * together else together
+
+
+def after_gap(dt: np.ndarray) -> np.ndarray:
+    """(N,) bool: whether samples are missing in an interval, from the intervals (N,) [s].
+
+    A long interval with a short one behind it is a late stamp: nothing is missing there.
+    """
+    usual = usual_interval(dt)
+    late = np.append(dt[1:] < (2.0 - _MISSING) * usual, False)
+    return (dt > _MISSING * usual) & ~late
+
+
+def own_intervals(dt: np.ndarray, theta: np.ndarray, dv: np.ndarray) -> np.ndarray:
+    """How long each increment of a table lasted [s]: the interval before it, or less after a gap.
+
+    Args:
+        dt: (N - 1,) s, between the samples.
+        theta: (N, 3) rad, as recorded.
+        dv: (N, 3) m/s.
+
+    Returns:
+        (N,) s; the first as long as the second, or the usual interval if that ends a gap.
+    """
+    gap = after_gap(dt)
+    usual = usual_interval(dt)
+    own = np.concatenate([np.where(gap[:1], usual, dt[:1]), dt])
+    both = np.hstack([theta, dv / _GRAVITY])
+    for k in np.flatnonzero(gap) + 1:
+        before = both[k - 1] / own[k - 1]
+        alone, whole = (np.linalg.norm(both[k] / h - before) for h in (usual, own[k]))
+        if alone < whole:
+            own[k] = usual
+    return own
+
+
+def joined(increments: Increments) -> Increments:
+    """One increment for K in a row: dt (), theta, dv and dr (3,), by
+
+        q <- q exp(theta_k)     dr <- dr + dv dt_k + C(q) dr_k     dv <- dv + C(q) dv_k
+
+    Exact, but that a turn of the whole interval has to be less than one of pi; `jax.vmap` joins
+    many intervals.
+
+    Args:
+        increments: K of them, leading axis, with dr or without.
+    """
+    inc = Increments(*(None if a is None else jnp.asarray(a, float) for a in increments))
+
+    def add(sum_: tuple[Array, Array, Array, Array], one: Increments):
+        q, dv, dr, dt = sum_
+        dr = dr + dv * one.dt + rotate(q, one.dr)
+        dv = dv + rotate(q, one.dv)
+        return (normalise(multiply(q, from_rotvec(one.theta))), dv, dr, dt + one.dt), None
+
+    zero = jnp.zeros(3)
+    begin = (jnp.array([1.0, 0.0, 0.0, 0.0]), zero, zero, jnp.zeros(()))
+    (q, dv, dr, dt), _ = jax.lax.scan(add, begin, inc._replace(dr=displacement(inc)))
+    return Increments(dt, to_rotvec(q), dv, dr)

@@ -28,10 +28,10 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.filters.model import Motion, Sensor
-from robins.ins.extended_pose import ExtendedPose, left_jacobian
+from robins.ins.extended_pose import ExtendedPose
 from robins.ins.increments import Increments
 from robins.ins.state import InsNoise
-from robins.rotation import Rotation, skew
+from robins.rotation import Rotation, left_jacobian, skew
 
 GRAVITY = 9.80665  # m/s^2, down
 

@@ -27,6 +27,7 @@ from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, displacement
 from robins.ins.kernel import one_kernel, pack
 from robins.ins.zonal_gravity import gravity_nd
+from robins.linalg.scalars import cross, product, rotate
 from robins.rotation import Rotation
 
 POLAR_LAT_RAD = math.radians(89.9)
@@ -180,30 +181,6 @@ def _wrap(lon):
     )
 
 
-def _cross(a, b):
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
-
-
-def _product(p, q):
-    """Hamilton product of quaternions held as scalars."""
-    return (
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    )
-
-
-def _rotate(q, v):
-    t = tuple(2.0 * c for c in _cross(q[1:], v))
-    u = _cross(q[1:], t)
-    return tuple(v[i] + q[0] * t[i] + u[i] for i in range(3))
-
-
 @one_kernel
 def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"]:
     """The step, on scalars: see `robins.ins.kernel` for why."""
@@ -211,8 +188,8 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     dt, *rest = row
     q, v, q_bb = (w, qx, qy, qz), (v_north, v_east, v_down), tuple(rest[:4])
     half = 0.5 * dt
-    dv = _rotate(q, tuple(rest[4:7]))
-    dr = _rotate(q, tuple(rest[7:]))
+    dv = rotate(q, tuple(rest[4:7]))
+    dr = rotate(q, tuple(rest[7:]))
 
     # Latitude and height at the middle, and what depends on them. The shift in latitude is tiny
     # (2e-7 rad at 300 m/s and 100 Hz), so two terms carry sine, cosine and the radii over.
@@ -240,7 +217,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     def acceleration(v):
         """Gravity and Coriolis, and omega_in_n."""
         turn = over_earth(v[0], v[1])
-        coriolis = _cross([2.0 * e + t for e, t in zip(earth, turn, strict=True)], v)
+        coriolis = cross([2.0 * e + t for e, t in zip(earth, turn, strict=True)], v)
         omega = [e + t for e, t in zip(earth, turn, strict=True)]
         return (g_north - coriolis[0], -coriolis[1], g_down - coriolis[2]), omega
 
@@ -249,7 +226,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     a_mid, omega_in = acceleration(v_mid)
     # Specific force is felt in a frame that turns: by half of its turn on average over the
     # interval, and by a third of that half in the double integral.
-    turned = _cross([half * o for o in omega_in], dv)
+    turned = cross([half * o for o in omega_in], dv)
     v_new = tuple(v[i] + dv[i] - turned[i] + a_mid[i] * dt for i in range(3))
     r = tuple(v[i] * dt + dr[i] + dt * (half * a_mid[i] - turned[i] / 3.0) for i in range(3))
 
@@ -262,7 +239,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     sq = zeta[0] * zeta[0] + zeta[1] * zeta[1] + zeta[2] * zeta[2]
     sinc = 1.0 - sq * (1.0 / 6.0 - sq / 120.0)
     q_frame = (1.0 - sq * (0.5 - sq / 24.0), sinc * zeta[0], sinc * zeta[1], sinc * zeta[2])
-    q = _product(q_frame, _product(q, q_bb))
+    q = product(q_frame, product(q, q_bb))
     # One Newton step to unit length; none for a zero step, which must not touch a bit.
     excess = 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] - 1.0)
     scale = 1.0 - jnp.where(dt == 0.0, 0.0, excess)

@@ -11,9 +11,14 @@ false star aside after one attempt where nested loops would try it again and aga
 Nothing is guessed. With p the probability that some star lies by chance within the tolerance of a
 direction, m of n other directions agree by chance with probability P(Binomial(n, p) >= m); times
 the number of triangles asked so far that is `chance`, and the stars are named only where it is
-below a limit. So four stars are enough where they are bright and few, and are not where they
-are faint and many. A direction that two stars could be, or a star that two directions could be, has
-no name. The work is NumPy's; for an attitude that is nearly known see `robins.ins.star_tracking`.
+below a limit. So four stars are enough where they are bright and few, and are not where they are
+faint and many. A direction that two stars could be, or a star that two directions could be, has no
+name. The work is NumPy's.
+
+A sensor that has found its attitude need not search the sky again: the last attitude, carried on by
+the gyros, says where each star of the catalogue must be. `track_stars` gives a direction the star
+within a tolerance of it, unless a second star or a second direction lays claim to the same place;
+nothing is guessed. It is pure JAX and of fixed size, for use inside a loop.
 """
 
 from __future__ import annotations
@@ -21,14 +26,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from robins.earth.star_catalogue import Stars
+from robins import _float64  # noqa: F401
+from robins.earth.stars import StarIndex, Stars, near
 from robins.errors import require
+from robins.rotation import rotate
 
 _WIDE = 4.0
 """Sigmas of a tolerance: one angle in 16 000 is beyond them, one direction in 3 000."""
@@ -72,7 +81,7 @@ def index_pairs(stars: Stars, field_rad: float) -> PairIndex:
     """Make the table of pairs; once for a catalogue, a fraction of a second for 4559 stars.
 
     Args:
-        stars: those that a camera can see, from `robins.earth.star_catalogue`. Many more, or less,
+        stars: those that a camera can see, from `robins.earth.stars`. Many more, or less,
             than it sees make identification slower or impossible.
         field_rad: largest angle between two stars in its field of view [rad].
 
@@ -318,3 +327,33 @@ def _checked(vectors_b, sigma_rad, magnitude, magnitude_tolerance, most_chance):
     require(magnitude_tolerance > 0.0, "magnitude_tolerance must be positive", magnitude_tolerance)
     require(0.0 < most_chance < 1.0, "most_chance must be between 0 and 1", most_chance)
     return b, np.broadcast_to(sigma, (len(b),)), light
+
+
+def track_stars(
+    index: StarIndex,
+    vectors_b: Float[Array, "n 3"],
+    q_ib: Float[Array, "4"],
+    boresight_b: Float[Array, "3"],
+    tolerance_rad: Any,
+) -> Int[Array, "n"]:
+    """Match directions with stars of the catalogue.
+
+    Args:
+        index: of the catalogue, its reach half the field of view at least, plus the error of q_ib.
+        vectors_b: directions seen, unit vectors in body axes; NaN: none.
+        q_ib: attitude as far as known, body to inertial.
+        boresight_b: middle of the field, unit vector in body axes.
+        tolerance_rad: a star may be off by so much: some sigmas of the noise and of q_ib [rad]. It
+            should be well below the distance of neighbouring stars.
+
+    Returns:
+        (n,) place of each star in the catalogue; -1: none, or none without doubt.
+    """
+    unit = jnp.asarray(index.unit_i)
+    members = near(index, rotate(q_ib, boresight_b))
+    there = ~jnp.isnan(vectors_b[:, 0])
+    seen = rotate(q_ib, jnp.where(there[:, None], vectors_b, 0.0))
+    cosine = jnp.einsum("ni,ki->nk", seen, unit[members])  # zero where nothing was seen
+    close = (cosine > jnp.cos(jnp.asarray(tolerance_rad, float))) & (members >= 0)[None, :]
+    alone = (jnp.sum(close, 1) == 1) & ~jnp.any(close & (jnp.sum(close, 0) > 1)[None, :], 1)
+    return jnp.where(alone, members[jnp.argmax(close, 1)], -1)

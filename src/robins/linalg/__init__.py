@@ -23,10 +23,10 @@ from robins.linalg.dense import (
     solve_spd,
     symmetric_root,
     tria,
+    van_loan,
     where,
     zeros,
 )
-from robins.linalg.systems import steady_state, van_loan
 
 __all__ = [
     "as_factor",
@@ -44,7 +44,6 @@ __all__ = [
     "solve_lower",
     "solve_lower_transposed",
     "solve_spd",
-    "steady_state",
     "symmetric_root",
     "tria",
     "van_loan",

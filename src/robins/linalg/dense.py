@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
+from jax.scipy.linalg import expm, solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from robins import _float64  # noqa: F401
@@ -324,3 +324,37 @@ def factor(P: ArrayLike, name: str = "covariance") -> Float[Array, "n n"]:
     else:
         root = vector * np.sqrt(np.where(value > rounding, value, 0.0))
     return tria(jax.device_put(scale[:, None] * root))
+
+
+_DOUBLINGS = 20  # halves of a step tried at most: enough for |A| dt = 1e6
+
+
+def van_loan(
+    A: Float[Array, "n n"], Qc: Float[Array, "n n"], dt: float | Float[Array, ""]
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """Discretise ``dx = A x dt + dw``, ``E[dw dw'] = Qc dt`` over a step (Van Loan 1978).
+
+    His exponential holds exp(-A dt) too, which drowns the rest where A dt is large (a fast sensor
+    over a long step). So it is taken over a step with |A| h of order one, and doubled:
+    Q(2h) = Q(h) + Phi(h) Q(h) Phi(h)'.
+
+    Returns:
+        Phi = exp(A dt), and Qd, the covariance the noise adds over dt [s].
+    """
+    n = A.shape[0]
+    size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), axis=0)) * jnp.abs(dt))
+    halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 1.0))), 0, _DOUBLINGS)
+    top = jnp.concatenate([-A, Qc], axis=1)
+    bottom = jnp.concatenate([jnp.zeros((n, n)), A.T], axis=1)
+    G = expm(jnp.concatenate([top, bottom], axis=0) * (dt * 2.0**-halvings))
+    Phi = G[n:, n:].T
+    Qd = Phi @ G[:n, n:]
+
+    def double(i, pair):
+        Phi, Qd = pair
+        wanted = i < halvings
+        longer = Qd + Phi @ Qd @ Phi.T
+        return jnp.where(wanted, Phi @ Phi, Phi), jnp.where(wanted, longer, Qd)
+
+    Phi, Qd = jax.lax.fori_loop(0, _DOUBLINGS, double, (Phi, Qd))
+    return Phi, 0.5 * (Qd + Qd.T)

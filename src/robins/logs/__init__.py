@@ -14,8 +14,7 @@ from robins.logs.declared import columns_from, formats_of
 from robins.logs.doctor import examine
 from robins.logs.findings import Finding, LogError, LogWarning
 from robins.logs.loading import load_dataset, load_pair
-from robins.logs.local import Origin
-from robins.logs.mounting import Mounting
+from robins.logs.mounting import Mounting, Origin
 from robins.logs.registry import FORMATS, Format, open_log, write_log
 from robins.logs.text_format import Column, TextFormat
 

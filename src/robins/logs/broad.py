@@ -28,8 +28,8 @@ import numpy as np
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.opening import whole
+from robins.logs.tables import unit_quaternions
 from robins.logs.text import Head
-from robins.logs.unit_length import unit_quaternions
 from robins.units import to_si
 
 _COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}

@@ -16,7 +16,8 @@ from robins.logs.findings import Finding
 from robins.logs.motion import Steps, signed_permutations, steps_of
 from robins.logs.ordering import increasing
 from robins.logs.quiet import Signal, error, signal_of, warning, windows_of
-from robins.logs.unit_length import TOLERANCE
+from robins.logs.tables import TOLERANCE
+from robins.rotation import to_dcm
 
 _WRONG, _RIGHT, _BETTER = 0.4, 0.15, 0.25  # shares of the turning left unexplained
 _UPRIGHT = 0.9  # cosine between gravity by these attitudes and the vertical
@@ -87,7 +88,7 @@ def _left_over(
 ) -> np.ndarray:
     """(h,) share of the turning that the gyros leave over, seen along other axes."""
     S = np.eye(3)[None] if maps is None else maps
-    before, after = (_matrices(_at(when, time_s, q)) for when in (steps.begin_s, steps.end_s))
+    before, after = (to_dcm(_at(when, time_s, q)) for when in (steps.begin_s, steps.end_s))
     turned = np.swapaxes(before, 1, 2) @ after
     said = np.einsum("hij,njk,hlk->hnil", S, steps.C, S, optimize=True)
     rest = np.sum((turned - said) ** 2, axis=(1, 2, 3))
@@ -103,7 +104,7 @@ def _upright(
     known = windows.at_rest & (middle > time_s[0]) & (middle < time_s[-1])
     if not known.any():
         return
-    C = _matrices(_at(middle[known], time_s, q))
+    C = to_dcm(_at(middle[known], time_s, q))
     force = np.einsum("nij,nj->ni", C, windows.accel[known])
     x, y, z = np.median(force / np.linalg.norm(force, axis=1, keepdims=True), axis=0)
     up = z if attitude.nav == "ENU" else -z
@@ -130,10 +131,3 @@ def _at(when: np.ndarray, time_s: np.ndarray, q: np.ndarray) -> np.ndarray:
     share = (when - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
     between = one + share[:, None] * (other - one)
     return between / np.linalg.norm(between, axis=1, keepdims=True)
-
-
-def _matrices(q: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of unit quaternions, by turning the three axes."""
-    w, v = q[:, None, :1], q[:, None, 1:]
-    axes = np.eye(3)[None]
-    return np.swapaxes(axes + 2.0 * np.cross(v, np.cross(v, axes) + w * axes), 1, 2)

@@ -4,6 +4,10 @@ What is refused here leaves the tables exactly as if its rows had never been rec
 repaired, interpolated or smoothed. Time is put in order by refusing the fewest samples, see
 `robins.logs.ordering`. Gaps are declared, not filled: the system decides whether to bridge them.
 Denormal numbers and huge but possible ones pass; outliers are the business of filters.
+
+A magnetometer may miss samples for as long as it likes, and cameras lose a sensor behind a hand:
+the rows of magnetic field and attitude remain, NaN, so that both still run beside the inertial
+samples. Only rows whose stamps are out of order are refused.
 """
 
 from __future__ import annotations
@@ -14,13 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
-from robins.logs.arrays import checked
-from robins.logs.clean_mag import clean_attitude, clean_mag
+from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.logs.findings import LogError, refused
 from robins.logs.limits import (
     ACCEL_LIMIT,
     ALT_LIMIT_M,
+    FIELD_LIMIT_T,
     GYRO_LIMIT,
     LAT_LIMIT,
     LON_LIMIT,
@@ -29,7 +32,7 @@ from robins.logs.limits import (
     SPEED_LIMIT,
 )
 from robins.logs.ordering import Rows, refusals, rows_where
-from robins.logs.tables import place_of
+from robins.logs.tables import TOLERANCE, checked, place_of
 
 _PLACEHOLDER_SIGMA = 1.0
 _PLACE_LIMIT = np.array([LAT_LIMIT, LON_LIMIT, ALT_LIMIT_M])
@@ -189,6 +192,45 @@ def _gaps(imu: ImuTable, keep: np.ndarray) -> list[tuple[int, int]]:
     backward = (after >= 0) & (imu.time_ns[refused] < time_ns[np.maximum(after, 0)])
     long |= np.bincount(after[backward], minlength=len(kept))[:-1] > 2
     return [(int(time_ns[k]), int(time_ns[k + 1])) for k in np.flatnonzero(long)]
+
+
+def clean_mag(mag: MagTable) -> tuple[MagTable, dict[str, int]]:
+    """Clean one table of magnetic field, component by component.
+
+    Returns:
+        The table, and counts: rows with a component that is NaN (``mag_nan``), infinite
+        (``mag_inf``) or larger than `FIELD_LIMIT_T` (``mag_absurd``), which are or become NaN; and
+        rows refused as ``mag_duplicate``, ``mag_backward``, ``mag_ahead``.
+
+    Raises:
+        LogError: arrays that are no table.
+    """
+    mag = checked(mag)
+    nan, inf = np.isnan(mag.field_t), np.isinf(mag.field_t)
+    absurd = (np.abs(mag.field_t) > FIELD_LIMIT_T) & ~inf
+    field_t = np.where(inf | absurd, np.nan, mag.field_t)
+    bad = {"nan": nan.any(axis=1), "inf": inf.any(axis=1), "absurd": absurd.any(axis=1)}
+    keep, counts = refusals("mag", mag.time_ns, np.ones(len(mag), bool), bad)
+    return rows_where(dataclasses.replace(mag, field_t=field_t), keep), counts
+
+
+def clean_attitude(attitude: AttitudeTable) -> tuple[AttitudeTable, dict[str, int]]:
+    """Clean one table of attitude; an attitude is one thing, so it is missing whole.
+
+    Counts as `clean_mag`; ``attitude_absurd`` are quaternions that are not of unit length.
+
+    Raises:
+        LogError: arrays that are no table.
+    """
+    attitude = checked(attitude)
+    q_nb = attitude.q_nb
+    nan, inf = np.isnan(q_nb).any(axis=1), np.isinf(q_nb).any(axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        wrong = ~(np.abs(np.linalg.norm(q_nb, axis=1) - 1.0) < TOLERANCE) & ~nan & ~inf
+    q_nb = np.where((nan | inf | wrong)[:, None], np.nan, q_nb)
+    bad = {"nan": nan & ~inf, "inf": inf, "absurd": wrong}
+    keep, counts = refusals("attitude", attitude.time_ns, np.ones(len(attitude), bool), bad)
+    return rows_where(dataclasses.replace(attitude, q_nb=q_nb), keep), counts
 
 
 _CLEANERS: dict[str, Callable[[Any], tuple[Any, dict[str, int]]]] = {

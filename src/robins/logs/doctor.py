@@ -1,21 +1,311 @@
 """The doctor: reads tables as an engineer would before a run, and says what is wrong in sentences.
 
-What it asks, in which order and when, stands in the table `robins.logs.checks`. Errors mean that a
-run would be wrong; a healthy log has none.
+Errors mean that a run would be wrong; a healthy log has none. All findings stand in two tables,
+`ALONE` and `TOGETHER`: a row a check, with what it is asked about, when, and what it can say. The
+order of the rows is the order of the examination. A new finding is a row and its function; the
+table in the documents is made of these, and a test wants a way to cause each of their codes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
-from robins.logs.arrays import checked
-from robins.logs.checks import ALONE, TOGETHER, Check
+from robins.logs.checks_attitude import check_attitude
+from robins.logs.checks_gnss import check_gnss, check_velocity
+from robins.logs.checks_imu import check_columns, check_imu
+from robins.logs.checks_mag import check_mag, check_mag_axes
+from robins.logs.checks_master import check_master
+from robins.logs.checks_motion import check_motion, check_turning
+from robins.logs.checks_time import check_span, check_time
 from robins.logs.findings import Finding, by_severity
-from robins.logs.tables import Table, kind_of, tables_of
+from robins.logs.limits import check_limits
+from robins.logs.tables import Table, checked, kind_of, tables_of
+
+
+class Code(NamedTuple):
+    """What one finding says."""
+
+    name: str
+    severity: str  # "error", or several, "error or warning"
+    says: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """A function that yields findings, and when it is asked."""
+
+    topic: str  # heading in the documents
+    find: Callable[..., Iterable[Finding]]
+    needs: str  # what it is given, in this order; where one of these is missing it is not asked
+    codes: tuple[Code, ...]
+    silenced_by: str = ""  # codes; beside these it would blame the wrong thing
+    unless: str = ""  # it is not asked where one of these is there, for that tells more ...
+    but_after: str = ""  # ... but where it could tell nothing, by this code
+    proves: str = ""  # codes that, if found here, replace those found before
+    overrules: str = ""  # codes found before that it judges better ...
+    undecided: str = ""  # ... unless by this code it could not
+
+    def is_asked(self, things: Mapping[str, Any], found: set[str]) -> bool:
+        """Whether it is, about these things and after these codes."""
+        there = things.keys() >= set(self.needs.split())
+        kept_out = set(self.unless.split()) & things.keys() and self.but_after not in found
+        return there and not kept_out and not set(self.silenced_by.split()) & found
+
+    def ask(self, things: Mapping[str, Any]) -> list[Finding]:
+        """What it finds."""
+        return list(self.find(*(things[need] for need in self.needs.split())))
+
+    def outdated(self, found: set[str]) -> set[str]:
+        """Codes of earlier findings that need not be told beside what this check found."""
+        judged = "" if self.undecided in found else self.overrules
+        return set(self.proves.split()) & found | set(judged.split())
+
+
+# What readers leave out or doubt while they read.
+OF_READERS = (
+    Code("ends_early", "warning", "the recording or the copy was interrupted"),
+    Code("begins_midway", "warning", "the recording began in the middle of a line"),
+    Code("no_place", "note", "the path is in local metres; it was put at latitude 0, longitude 0"),
+    Code("no_velocity", "note", "RTKLIB did not solve for velocities"),
+    Code("height_above_geoid", "warning", "heights are above the geoid, not the ellipsoid"),
+    Code("dt_disagrees", "warning", "the column dt is not the time that has passed"),
+    Code("several_instances", "note", "a flight log holds several sensors of one kind"),
+    Code("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
+    Code("quaternion_length", "warning", "single quaternions of another length; likewise"),
+)
+
+_OF_VELOCITY = (
+    Code("velocity_unit", "error", "velocities that fit the positions in another unit"),
+    Code("velocity_axes", "error", "velocities that fit with axes exchanged or reversed"),
+    Code("velocity_disagrees", "warning", "velocities that fit the positions in no way"),
+    Code("velocity_late", "warning", "velocities that fit only with a delay"),
+)
+
+_NO_PLACE = "position_unit no_fix_as_zero"
+
+# Asked about each table by itself; only findings on that table silence.
+ALONE = (
+    Check(
+        "In time",
+        check_time,
+        "stamps unit_known",
+        (
+            Code("too_short", "error", "fewer than two samples; nothing can be run on that"),
+            Code("time_stands", "error", "a time column that is constant, or another one"),
+            Code("time_unit", "error", "the rate tells that time is in ms, us or ns"),
+            Code("time_slow", "warning", "inertial samples too far apart to navigate by"),
+            Code("time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"),
+            Code("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
+            Code("time_backward", "warning", "samples that step back; `clean` refuses them"),
+            Code("time_jump", "error or warning", "a leap second, a time zone, a counter"),
+            Code("gap_short", "warning or note", "samples are missing, for less than a second"),
+            Code("gap_long", "warning or note", "samples are missing, for a second or more"),
+            Code("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
+        ),
+    ),
+    Check(
+        "In the numbers of any table",
+        check_limits,
+        "table",
+        (Code("absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"),),
+    ),
+    Check(
+        "In the inertial samples",
+        check_columns,
+        "imu",
+        (
+            Code("column_missing", "error", "a column without a number"),
+            Code("not_finite", "warning", "single samples without a number"),
+            Code("axis_stuck", "error", "a value that never changes"),
+            Code("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
+            Code("saturated", "warning", "the range was too small"),
+            Code("coarse", "warning", "the bits or the decimals were too few"),
+        ),
+    ),
+    Check(
+        "In the inertial samples",
+        check_imu,
+        "imu in_vehicle",
+        (
+            Code("no_samples", "error", "fewer than ten samples have all six numbers"),
+            Code("gravity_bias", "note", "the unit is right, the accelerometers are a little off"),
+            Code("rates_as_increments", "error", "gravity tells that rates are read as increments"),
+            Code("increments_as_rates", "error", "gravity tells that increments are read as rates"),
+            Code("gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"),
+            Code("gravity_missing", "error", "gravity was taken off"),
+            Code("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
+            Code("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
+            Code("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
+            Code("z_axis_reversed", "error", "gravity points the wrong way"),
+            Code("not_level", "warning", "gravity points along another axis"),
+            Code("gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"),
+        ),
+    ),
+    Check(
+        "In the GNSS fixes",
+        check_gnss,
+        "gnss",
+        (
+            Code("gnss_missing", "error, warning or note", "components; the others are used"),
+            Code("position_unit", "error", "degrees for radians, longitude for latitude"),
+            Code("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
+            Code("position_in_radians", "warning", "radians were read as degrees"),
+            Code("height", "error or warning", "nobody drives, sails or flies by air there"),
+            Code("sigma_not_positive", "error", "zero, which means unknown, not exact"),
+            Code("sigma_missing", "error", "there is none in any fix"),
+            Code("sigma_absurd", "warning", "they are in another unit, or variances"),
+            Code("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
+            Code("position_resolution", "note", "too few decimals for so good a fix"),
+        ),
+    ),
+    Check(
+        "In the GNSS fixes",
+        check_velocity,
+        "gnss",
+        (*_OF_VELOCITY, Code("velocity_sign", "error", "a vertical velocity of the other sign")),
+        silenced_by=_NO_PLACE,
+    ),
+    Check(
+        "In the magnetic field",
+        check_mag,
+        "mag",
+        (
+            Code("field_missing", "warning", "samples without a number"),
+            Code("field_zero", "error or warning", "0 0 0 where there was no measurement"),
+            Code("field_stuck", "error", "an axis that never changes"),
+            Code("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
+            Code("field_stuck_for_a_while", "warning", "the sensor hung"),
+            Code("field_repeated", "note", "more rows than the sensor took measurements"),
+            Code("field_saturated", "warning", "a magnet drove it to its stop"),
+            Code("field_offset", "warning", "hard iron: run `robins calibrate`"),
+            Code("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
+            Code("field_disturbed", "note", "single stretches of another field than the Earth's"),
+        ),
+    ),
+)
+
+# Beside these, sensors seem to show two motions.
+_SPOILT = (
+    f"{_NO_PLACE} no_overlap rates_as_increments increments_as_rates time_unit time_slow "
+    "velocity_axes velocity_unit velocity_sign"
+)
+# With these, what is compared with the gyros would be blamed for them.
+_GYROS_WRONG = "gyro_unit gyro_axes gyro_reversed left_handed"
+
+# Asked about all tables of a log together.
+TOGETHER = (
+    Check(
+        "In time",
+        check_span,
+        "imu others",
+        (
+            Code("no_overlap", "error", "the files share no time; names the offset that would fit"),
+            Code("leap_seconds", "warning", "one file is in UTC, one in GPS time"),
+            Code("little_overlap", "warning", "the files share little of their time"),
+        ),
+    ),
+    Check(
+        "In a master and the IMU to be aligned to it",
+        check_master,
+        "imu master delay_s",
+        (
+            Code("master_missing", "error or warning", "position, velocity or attitude"),
+            *_OF_VELOCITY,
+            Code("velocity_sign", "error", "it changes against positions or specific forces"),
+            Code("turning_not_checked", "note", "the vehicle hardly turns"),
+            Code("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
+            Code("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
+            Code("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
+            Code("turning_disagrees", "error", "gyros and attitudes show two turnings"),
+            Code("master_late", "error or warning", "attitudes older or younger than stated"),
+            Code("force_not_checked", "note", "too few seconds of both"),
+            Code("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
+            Code("rates_as_increments", "error", "likewise"),
+            Code("increments_as_rates", "error", "likewise"),
+            Code("accel_reversed", "error", "they fit with the opposite sign"),
+            Code("accel_axes", "error", "they fit with axes exchanged or reversed"),
+            Code("force_disagrees", "error", "they feel something else than the velocities ask"),
+        ),
+        # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
+        overrules="gravity_unit gravity_unknown gravity_bias gravity_not_seen gravity_missing "
+        "z_axis_reversed not_level rates_as_increments increments_as_rates",
+        undecided="force_not_checked",
+    ),
+    Check(
+        "In IMU and GNSS together",
+        check_motion,
+        "imu gnss",
+        (
+            Code("motion_not_checked", "note", "too little motion to compare them"),
+            Code("motion_disagrees", "warning", "they do not describe one motion in any way"),
+            Code("time_offset", "error or warning", "they fit only if one file is shifted"),
+            Code("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
+            Code("gyro_unit", "error", "turns fit those of the velocities in another unit"),
+            Code("left_handed", "error", "axes or signs of both triads"),
+            Code("accel_reversed", "error", "the accelerometers have the opposite sign"),
+            Code("accel_axes", "error", "axes or signs of the accelerometers"),
+            Code("gyro_reversed", "error", "the gyros have the opposite sense"),
+            Code("gyro_axes", "error", "axes or signs of the gyros"),
+            Code("forward_axis", "warning", "the vehicle does not travel along its forward axis"),
+        ),
+        silenced_by=_SPOILT,
+        unless="master",
+        proves="gyro_unit",
+    ),
+    Check(
+        "In an IMU that was turned about",
+        check_turning,
+        "imu",
+        (
+            Code("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit"),
+            Code("left_handed", "error", "they do with the opposite sense, or triads reflected"),
+            Code("gyro_axes", "error", "they do with axes exchanged or reversed"),
+        ),
+        silenced_by=_SPOILT,
+        unless="master gnss",
+        but_after="motion_not_checked",
+        proves="gyro_unit",
+    ),
+    Check(
+        "In the magnetic field",
+        check_mag_axes,
+        "imu mag",
+        (Code("field_axes", "error", "it turns as the gyros say only with other columns"),),
+        silenced_by=f"{_SPOILT} {_GYROS_WRONG} field_unit field_stuck",
+        unless="master",
+    ),
+    Check(
+        "In the attitudes",
+        check_attitude,
+        "imu attitude",
+        (
+            Code("attitude_missing", "warning", "there is none"),
+            Code("attitude_order", "error", "they are scalar last, or navigation to body"),
+            Code("attitude_axes", "error", "they are of a body with other axes"),
+            Code("attitude_disagrees", "warning", "they are of another body or another time"),
+            Code("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
+        ),
+        silenced_by=f"{_SPOILT} {_GYROS_WRONG}",
+        unless="master",
+    ),
+)
+
+# Why `clean` refuses, as its counts name it.
+REFUSALS = {
+    "nan": "not a number",
+    "inf": "not finite",
+    "absurd": "a magnitude no vehicle has",
+    "duplicate": "the time of the sample before",
+    "backward": "time that steps back; as few samples as possible are refused",
+    "ahead": "time far ahead of what follows, likewise",
+    "sigma": "a sigma of a GNSS fix that is zero or negative",
+}
+
 
 Subject = Dataset | Table | Sequence[Table | Dataset]
 

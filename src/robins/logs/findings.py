@@ -68,6 +68,19 @@ def report(findings: list[Finding] | None, finding: Finding) -> None:
         findings.append(finding)
 
 
+def telling(
+    findings: list[Finding] | None,
+    severity: Severity,
+    code: str,
+    file: str,
+    where: str = "",
+    value: Value = "",
+) -> Callable[[str], None]:
+    """Reports the finding that `told` makes of its sentence."""
+    make = told(severity, code, file, where, value)
+    return lambda sentence: report(findings, make(sentence))
+
+
 def by_severity(findings: list[Finding]) -> list[Finding]:
     """Errors first, then warnings, then notes; otherwise in the order they were made."""
     return sorted(findings, key=lambda f: SEVERITIES.index(f.severity))

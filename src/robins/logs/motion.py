@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.logs.quiet import Signal
+from robins.rotation import skew
 
 GRAVITY = 9.8
 _RATE_HZ = 20
@@ -264,9 +265,7 @@ def _sum_unturned(turn: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.nd
 def rotations(phi: np.ndarray) -> np.ndarray:
     """(..., 3, 3) matrices of rotation vectors (..., 3), by Rodrigues' formula."""
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(phi, -1, 0)
-    o = np.zeros_like(x)
-    K = np.stack([np.stack(r, -1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+    K = skew(phi)
     half_sinc = np.sinc(0.5 * angle / np.pi)
     return np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half_sinc**2 * K @ K
 

@@ -17,6 +17,7 @@ from robins.dataset import ImuTable, Trajectory
 from robins.logs.motion import at
 from robins.logs.ordering import increasing
 from robins.logs.quiet import Signal, signal_of
+from robins.rotation import skew
 
 GRAVITY = 9.80665  # m/s^2
 _WINDOW_S = 0.5  # at most, so that the body hardly turns meanwhile
@@ -111,7 +112,7 @@ def fit_turning(q: Rotation, shared: Shared, gyro_map: np.ndarray | None = None)
     for _ in range(4):
         early, here, late = (by_gyros(fit.late_s + k * step_s) for k in (-1, 0, 1))
         slope = (late - early) / (2.0 * step_s)
-        design = np.concatenate([bias, _cross(here), slope[:, :, None]], axis=-1).reshape(-1, 7)
+        design = np.concatenate([bias, skew(here), slope[:, :, None]], axis=-1).reshape(-1, 7)
         left, found, sigma = _least_squares((of_master - here).ravel(), design)
         late_s = np.clip(fit.late_s + np.clip(found[6], -0.1, 0.1), LAGS_S[0], LAGS_S[-1])
         fit = Turning(float(left @ left / spread), float(late_s), float(sigma[6]))
@@ -165,17 +166,10 @@ def fit_velocity(v_n: np.ndarray, shared: Shared) -> np.ndarray | None:
     along = p.length_s[:, None, None]
     missing = p.gained - np.einsum("kij,kj->ki", p.C, p.pushed) - along[:, 0] * [0, 0, GRAVITY]
     early, late = (at(shared.time_s + k * _HALF_S, shared.sample_s, shared.angle) for k in (-1, 1))
-    swing = np.diff(shared.q.as_matrix() @ _cross((late - early) / (2.0 * _HALF_S)), axis=0)[p.at]
-    design = np.concatenate(
-        [p.C * along, np.eye(3) * along, p.C @ _cross(p.pushed), swing], axis=-1
-    )
+    swing = np.diff(shared.q.as_matrix() @ skew((late - early) / (2.0 * _HALF_S)), axis=0)[p.at]
+    design = np.concatenate([p.C * along, np.eye(3) * along, p.C @ skew(p.pushed), swing], axis=-1)
     left, _, _ = _least_squares(missing.ravel(), design.reshape(-1, 12))
     return np.sum(left.reshape(-1, 3) ** 2, axis=0)
-
-
-def _cross(a: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) matrices of the cross product with each of the vectors (n, 3)."""
-    return np.cross(a[:, None, :], np.eye(3)).transpose(0, 2, 1)
 
 
 def _least_squares(y: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robins.dataset import AttitudeTable, ImuTable, MagTable
-from robins.ins.intervals import own_intervals
+from robins.ins.increments import own_intervals
 from robins.logs.findings import SEVERITIES, Finding, Severity, Value, told
 from robins.logs.ordering import increasing
 from robins.logs.tables import Table

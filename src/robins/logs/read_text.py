@@ -23,15 +23,21 @@ from robins.dataset import (
     Trajectory,
 )
 from robins.ins.frames import swap, swap_q
-from robins.logs.axes import Axes
-from robins.logs.findings import Finding, LogError, refused, report, told
-from robins.logs.local import LocalPath, Origin, from_local
+from robins.logs.findings import Finding, LogError, refused, telling
+from robins.logs.mounting import LocalPath, Origin, from_local
 from robins.logs.quantities import QUANTITIES, TABLES, parts, words_of
-from robins.logs.tables import Table, kind_of
+from robins.logs.tables import Table, kind_of, unit_quaternions
 from robins.logs.text import COMMENTS, Head, Layout, peek, read_columns
-from robins.logs.text_format import PAIRS, Found, TextFormat, columns_of, decimals_of, header_of
+from robins.logs.text_format import (
+    PAIRS,
+    Axes,
+    Found,
+    TextFormat,
+    columns_of,
+    decimals_of,
+    header_of,
+)
 from robins.logs.timebase import WEEK_NS, stamps_to_ns, unrolled, weeks_of
-from robins.logs.unit_length import unit_quaternions
 from robins.units import from_si, to_si, unit
 
 NOWHERE = Origin(0.0, 0.0, 0.0)
@@ -252,13 +258,10 @@ def _path(read: Read, origin: Origin | None) -> Trajectory:
     omega = read.stack("omega") if read.has("omega") else None
     if read.has("local"):
         if origin is None:
-            report(
-                read.findings,
-                told("note", "no_place", read.file, value="0 0 0")(
-                    "positions are local metres; they are put at latitude 0, longitude 0, height "
-                    "0, x to the east. Gravity and Earth rate there are not those of the "
-                    "recording; give an origin if that matters."
-                ),
+            telling(read.findings, "note", "no_place", read.file, value="0 0 0")(
+                "positions are local metres; they are put at latitude 0, longitude 0, height "
+                "0, x to the east. Gravity and Earth rate there are not those of the "
+                "recording; give an origin if that matters."
             )
         local = LocalPath(read.time_ns, read.stack("local"), swap(v_n), q_nb)
         path = from_local(local, origin or NOWHERE, source=read.file)
@@ -314,12 +317,9 @@ def _within_limits(read: Read, quantity: str) -> None:
             "name the column with the unit it is in",
         )
     values[beyond] = np.nan
-    report(
-        read.findings,
-        told("warning", "angle_range", read.file, f"line {read.rows[k]}", shown)(
-            f"{found.name} is {shown:g}, beyond {allowed} ({count}). What cannot be is taken as "
-            "missing."
-        ),
+    telling(read.findings, "warning", "angle_range", read.file, f"line {read.rows[k]}", shown)(
+        f"{found.name} is {shown:g}, beyond {allowed} ({count}). What cannot be is taken as "
+        "missing."
     )
 
 
@@ -330,11 +330,8 @@ def _compare_dt(read: Read) -> None:
     if len(off):
         first = int(off[0]) + 1
         where, shown = f"line {read.rows[first]}", float(dt[first])
-        report(
-            read.findings,
-            told("warning", "dt_disagrees", read.file, where, shown)(
-                f"dt is {shown:g} s but the time has grown by {elapsed[first - 1]:g} s ({len(off)} "
-                "such rows). Increments are taken over the time since the row before; rows are "
-                "missing, or dt belongs to the next row."
-            ),
+        telling(read.findings, "warning", "dt_disagrees", read.file, where, shown)(
+            f"dt is {shown:g} s but the time has grown by {elapsed[first - 1]:g} s ({len(off)} "
+            "such rows). Increments are taken over the time since the row before; rows are "
+            "missing, or dt belongs to the next row."
         )

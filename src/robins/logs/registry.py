@@ -15,7 +15,7 @@ from typing import NamedTuple
 from robins.dataset import Dataset
 from robins.logs import broad, phone, rtklib, ulog
 from robins.logs.findings import Finding, LogError, refused
-from robins.logs.local import Origin
+from robins.logs.mounting import Origin
 from robins.logs.opening import beginning
 from robins.logs.quantities import words_of
 from robins.logs.read_text import read_text

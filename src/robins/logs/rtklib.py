@@ -13,7 +13,7 @@ import re
 import numpy as np
 
 from robins.dataset import GnssTable
-from robins.logs.findings import Finding, LogError, refused, report, told
+from robins.logs.findings import Finding, LogError, refused, telling
 from robins.logs.text import Head, Layout, peek, read_columns
 from robins.logs.timebase import calendar_to_ns, stamps_to_ns, week_to_ns, weeks_of
 
@@ -81,22 +81,16 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
         v_n, sigma_v = vectors("vn", "ve", "vu", -1.0), vectors("sdvn", "sdve", "sdvu", 1.0)
         if not (v_n.any() or sigma_v.any()):
             v_n = sigma_v = None
-            report(
-                findings,
-                told("note", "no_velocity", file, value=0.0)(
-                    "all velocities and their sigmas are zero, so RTKLIB did not solve for them; "
-                    "they are left out. Heading will be found from the positions alone; set "
-                    "out-outvel = on."
-                ),
+            telling(findings, "note", "no_velocity", file, value=0.0)(
+                "all velocities and their sigmas are zero, so RTKLIB did not solve for them; "
+                "they are left out. Heading will be found from the positions alone; set "
+                "out-outvel = on."
             )
     if any("/geodetic" in line for line in head.lines if line.startswith("%")):
-        report(
-            findings,
-            told("warning", "height_above_geoid", file, "header", "geodetic")(
-                "heights are above the geoid, and robins takes them as above the WGS-84 "
-                "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
-                "metre. Set out-height = ellipsoidal in RTKLIB."
-            ),
+        telling(findings, "warning", "height_above_geoid", file, "header", "geodetic")(
+            "heights are above the geoid, and robins takes them as above the WGS-84 "
+            "ellipsoid. Differences of height stay right; gravity errs by 3e-6 m/s^2 per "
+            "metre. Set out-height = ellipsoidal in RTKLIB."
         )
     quality = column("Q")
     return GnssTable(

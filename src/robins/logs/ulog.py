@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
-from robins.logs.findings import Finding, LogError, refused, report, told
+from robins.logs.findings import Finding, LogError, refused, report, telling
 from robins.logs.opening import whole
 from robins.logs.text import Head
 from robins.logs.timebase import LIMIT_NS
@@ -143,12 +143,9 @@ def _first(
     for name in topics:
         found = sorted((d for d in log.data_list if d.name == name), key=lambda d: d.multi_id)
         if len(found) > 1:
-            report(
-                findings,
-                told("note", "several_instances", file, value=len(found))(
-                    f"{name} was logged of {len(found)} sensors; the first, number "
-                    f"{found[0].multi_id}, is read and the others are left alone."
-                ),
+            telling(findings, "note", "several_instances", file, value=len(found))(
+                f"{name} was logged of {len(found)} sensors; the first, number "
+                f"{found[0].multi_id}, is read and the others are left alone."
             )
         if found:
             return Topic(name, dict(found[0].data))

@@ -13,14 +13,13 @@ import numpy as np
 from robins import rotation
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.ins.frames import swap
-from robins.logs.axes import Axes
 from robins.logs.findings import LogError, refused
-from robins.logs.local import Origin, to_local
+from robins.logs.mounting import Origin, to_local
+from robins.logs.opening import write_lines
 from robins.logs.quantities import CLOCKS, parts, words_of
 from robins.logs.tables import Table, kind_in_text, place_of, tables_of
-from robins.logs.text_format import ANY, PAIRS, Column, TextFormat
+from robins.logs.text_format import ANY, PAIRS, Axes, Column, TextFormat
 from robins.logs.timebase import GPS_EPOCH_NS, WEEK_NS, ns_to_decimal
-from robins.logs.writing import write_lines
 from robins.units import from_si, unit
 
 _ROWS = 50_000

@@ -1,16 +1,13 @@
 """Figures, tables and pages of results; knows what a result holds, not who made it.
 
-`attach` gives a result folder its figures and its page; `add` does so while the folder is still
-being written. Which figures there are follows from the roles of the arrays in the solution: one row
-each in `robins.report.figures`.
+`add` gives a result folder that is being written its figures and its page. Which figures there are
+follows from the roles of the arrays in the solution: one row each in `robins.report.figures`.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import xarray as xr
@@ -30,7 +27,6 @@ __all__ = [
     "Origin",
     "Picture",
     "add",
-    "attach",
     "draw",
     "page",
     "pictures",
@@ -79,22 +75,3 @@ def add(
     writer.save_report(page(writer.summary, drawn, origin))
     if progress is not None:
         progress(len(makers), len(makers), "drawing figures")
-
-
-def attach(
-    path: str | os.PathLike[str], command: str = "", progress: Progress | None = None
-) -> Path:
-    """Give a result folder its figures and page; the folder changes at once or not at all.
-
-    Args:
-        path: of the result.
-        command: how to make it again, if the result does not know yet.
-        progress: called with done, total and a word on what is done.
-
-    Raises:
-        ResultError: the result is damaged or cannot be written.
-    """
-    with results.extend(results.read(path)) as writer:
-        writer.command = writer.command or command
-        add(writer, progress)
-    return Path(path)

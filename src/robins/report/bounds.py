@@ -59,8 +59,7 @@ def beside(solution: xr.Dataset, block: str) -> Line | None:
 def draw(axes: Axes, bound: Line, k: int, seconds: float, times: float = 1.0) -> np.ndarray:
     """Draw a multiple of the bound of an axis beside filters; returns it."""
     y = times * bound.values[:, k]
-    x, thinned = series.thin(bound.x / seconds, y)
-    axes.plot(x, thinned, zorder=4, **_LOOK)
+    axes.plot(*series.thin(bound.x / seconds, y), zorder=4, **_LOOK)
     return y
 
 
@@ -85,25 +84,19 @@ def sigmas(solution: xr.Dataset, block: str) -> Picture:
     """The bound of a block over time, with all sensors, without each, and with none."""
     every, _, unaided, without = (line(solution, block, role) for role in _ROLES)
     names, labels = sensors(solution), series.coordinate(solution, f"axis_{block}")
-    figure, grid = style.new(len(labels), 1, 0.9 + 1.35 * len(labels), sharex=True)
-    clock = series.clock(every.x)
-    x = every.x / clock.seconds
-    for k, axes in enumerate(grid[:, 0]):
+    figure, stack, clock = series.stacked(solution, every.x, labels, every.unit)
+    for k, axes in enumerate(stack):
         lines = [(unaided.values[:, k], _NONE)]
         for i, one in enumerate(without.values[: len(names)], 1):
-            lines.append((one[:, k], {"color": style.colour(i), "linestyle": style.line(i)}))
+            lines.append((one[:, k], style.look(i)))
         lines.append((every.values[:, k], {"color": style.colour(0), "linewidth": 1.6}))
         for y, look in lines:
-            axes.plot(*series.thin(x, np.where(y > 0.0, y, np.nan)), **look)
+            clock.plot(axes, every.x, np.where(y > 0.0, y, np.nan), **look)
         _scale(axes, every.values[:, k], without.values[..., k], unaided.values[:, k])
-        axes.set_ylabel(f"{labels[k]} [{every.unit}]" if every.unit else labels[k])
-        axes.margins(x=0.0)
-    grid[-1, 0].set_xlabel(clock.label)
-    figure.align_ylabels()
     keys = [style.key("all sensors", color=style.colour(0), linewidth=1.6)]
-    for i, name in enumerate(names, 1):
-        look = {"color": style.colour(i), "linestyle": style.line(i)}
-        keys.append(style.key(f"without {words(name)}", **look))
+    keys += [
+        style.key(f"without {words(name)}", **style.look(i)) for i, name in enumerate(names, 1)
+    ]
     style.legend(figure, [*keys, style.key("no sensor", **_NONE)])
     caption = (
         "One standard deviation that no filter with this model can beat. What a sensor buys is the "

@@ -1,18 +1,101 @@
-"""Curves over time: errors in their envelopes, estimates, campaign statistics, height."""
+"""Curves over time: errors in their envelopes, estimates, campaign statistics, height.
+
+Curves of shares are among them: runs within a limit, and how much of its gamma a worst-case filter
+has used.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from robins.report import bounds, series, style
-from robins.report.bands import quantile
-from robins.report.limits import bound_names, bound_note
 from robins.report.numbers import words
 from robins.report.series import Series
 from robins.report.style import Picture
+from robins.report.updates import quantile
+from robins.results import find
+
+# rule: its local bound, and what that must stay below
+_WORST_CASE = {"h_infinity": "gamma", "adaptive_h_infinity": "xi"}
+
+
+@style.styled
+def within(solution: xr.Dataset, limit: str) -> Picture:
+    """Share of the runs of a campaign whose error is within a limit, over time."""
+    data = series.get(solution, "within", limit)
+    assert data is not None
+    filters = series.filters(solution)
+    figure, axes, clock = series.alone(solution, data.x, "share of the runs")
+    for i in range(len(filters)):
+        clock.plot(axes, data.x, data.values[i, :, 0], **style.look(i))
+    axes.set(ylim=(-0.02, 1.02))
+    style.legend(figure, style.filter_keys(filters))
+    runs = data.attrs.get("runs")
+    caption = "Share of the runs whose largest component is within the limit"
+    caption += f", of {int(runs)}." if runs else "."
+    title = data.attrs["long_name"]
+    return Picture(f"within_{limit}", title[:1].upper() + title[1:], caption, figure)
+
+
+def _used(solution: xr.Dataset) -> xr.DataArray | None:
+    """Local bound over gamma (filter, time), NaN for other filters; None if all are other."""
+    notes, ratio = find(solution, "note"), None
+    for rule, below in _WORST_CASE.items():
+        bound, gamma = (notes.get(f"{rule}_{kind}") for kind in ("bound", below))
+        if bound is None or gamma is None:
+            continue
+        part = bound / gamma
+        ratio = part if ratio is None else ratio.fillna(part)
+    return ratio
+
+
+@style.styled
+def worst_case(solution: xr.Dataset) -> Picture | None:
+    """How near each H-infinity filter comes to not existing; None if there is none."""
+    ratio = _used(solution)
+    if ratio is None:
+        return None
+    filters = series.filters(solution)
+    time, ratio = series.x_of(ratio, 1), ratio.values
+    shown = [i for i in range(len(filters)) if np.isfinite(ratio[i]).any()]
+    if not shown:
+        return None
+    figure, axes, clock = series.alone(solution, time, "local bound / gamma")
+    for i in shown:
+        clock.plot(axes, time, ratio[i], **style.look(i))
+    axes.axhline(1.0, color=style.TRUTH, linewidth=0.8)
+    axes.set(ylim=(-0.02, max(1.1, 1.1 * float(np.nanmax(ratio[shown])))))
+    keys = style.filter_keys(filters)
+    limit = style.key("the filter exists below", color=style.TRUTH, linewidth=0.8)
+    style.legend(figure, [*(keys[i] for i in shown), limit])
+    caption = (
+        "Root of the largest eigenvalue of L P L' over gamma (xi of the adaptive filter), first "
+        "run. The filter exists below one; near zero it is the Kalman filter. Margin: one less "
+        "the square."
+    )
+    return Picture("worst_case", "H-infinity: bound and gamma", caption, figure)
+
+
+def bound_names(solution: xr.Dataset) -> list[str]:
+    """Filters that state bounds, not standard deviations."""
+    flags = series.one(solution, "bounds")
+    if flags is None:
+        return []
+    return [name for name, flag in zip(series.filters(solution), flags.values, strict=True) if flag]
+
+
+def bound_note(solution: xr.Dataset) -> str:
+    """What must be said of them beside an envelope; empty where there is none."""
+    named = bound_names(solution)
+    if not named:
+        return ""
+    return (
+        f" Of {', '.join(words(n) for n in named)} the envelope is the root of P of an H-infinity "
+        "filter: a bound, not a covariance; it promises no share inside."
+    )
+
 
 _START = 0.2  # of the time axis
 _TINTED = 4  # filters whose tints can be told apart
@@ -65,20 +148,6 @@ def _top(lines: list[np.ndarray]) -> float:
     return 1.25 * float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
 
-def _stacked(data: Series, solution: xr.Dataset) -> tuple[Figure, np.ndarray, series.Clock]:
-    figure, grid = style.new(len(data.axes), 1, 0.9 + 1.35 * len(data.axes), sharex=True)
-    clock = series.clock(data.x)
-    outage = series.outage(solution)
-    for axes, label in zip(grid[:, 0], data.axes, strict=True):
-        if outage is not None:
-            style.shade(axes, outage[0] / clock.seconds, outage[1])
-        axes.set_ylabel(f"{label} [{data.unit}]" if data.unit else label)
-        axes.margins(x=0.0)
-    grid[-1, 0].set_xlabel(clock.label)
-    figure.align_ylabels()
-    return figure, grid[:, 0], clock
-
-
 def _or_bound(solution: xr.Dataset) -> str:
     return "; of H-infinity a bound, not a covariance" if bound_names(solution) else ""
 
@@ -96,12 +165,11 @@ def errors(solution: xr.Dataset, block: str) -> Picture:
     sigma = series.get(solution, "sigma", block)
     best = bounds.beside(solution, block)
     filters = series.filters(solution)
-    figure, stack, clock = _stacked(error, solution)
+    figure, stack, clock = series.stacked(solution, error.x, error.axes, error.unit)
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
-            look = {"color": style.colour(i), "linestyle": style.line(i)}
-            axes.plot(*series.thin(error.x / clock.seconds, error.values[i, :, k]), **look)
+            clock.plot(axes, error.x, error.values[i, :, k], **style.look(i))
             lines.append(error.values[i, :, k])
             if sigma is not None:
                 _envelope(axes, sigma, i, k, clock, len(filters))
@@ -141,7 +209,7 @@ def _envelope(
     reach = 3.0 * sigma.values[i, :, k]
     x, low, high = series.thin(sigma.x / clock.seconds, centre - reach, centre + reach)
     for bound in (low, high):
-        axes.plot(x, bound, color=style.colour(i), linestyle=style.line(i), linewidth=0.6)
+        axes.plot(x, bound, **style.look(i, linewidth=0.6))
     if count <= 2:  # more would hide each other
         axes.fill_between(x, low, high, color=style.colour(i), alpha=0.10, linewidth=0)
 
@@ -153,13 +221,12 @@ def estimates(solution: xr.Dataset, block: str, role: str = "estimate") -> Pictu
     assert found is not None
     sigma = series.get(solution, "sigma", block)
     filters = series.filters(solution)
-    figure, stack, clock = _stacked(found, solution)
+    figure, stack, clock = series.stacked(solution, found.x, found.axes, found.unit)
     turn = {"rad": 2.0 * np.pi, "deg": 360.0}.get(found.unit)
     for k, axes in enumerate(stack):
         for i in range(len(filters)):
             y = _broken(found.values[i, :, k], turn)
-            x, thinned = series.thin(found.x / clock.seconds, y)
-            axes.plot(x, thinned, color=style.colour(i), linestyle=style.line(i))
+            clock.plot(axes, found.x, y, **style.look(i))
             # About an angle that turns, an envelope would be drawn across the wrap.
             if sigma is not None and turn is None:
                 _envelope(axes, sigma, i, k, clock, len(filters), centre=y)
@@ -210,12 +277,11 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     best = bounds.beside(solution, block)
     filters = series.filters(solution)
     runs = int(rms.attrs.get("runs", 0))
-    figure, stack, clock = _stacked(rms, solution)
+    figure, stack, clock = series.stacked(solution, rms.x, rms.axes, rms.unit)
     for k, axes in enumerate(stack):
         lines = []
         for i in range(len(filters)):
-            x, y = series.thin(rms.x / clock.seconds, rms.values[i, :, k])
-            axes.plot(x, y, color=style.colour(i), linestyle=style.line(i))
+            clock.plot(axes, rms.x, rms.values[i, :, k], **style.look(i))
             lines.append(rms.values[i, :, k])
             if stated is not None:
                 x, y = series.thin(stated.x / clock.seconds, stated.values[i, :, k], points=600)
@@ -257,11 +323,7 @@ def height(solution: xr.Dataset) -> Picture | None:
     data = series.get(solution, "track", "alt_m")
     if data is None:
         return None
-    figure, grid = style.new(1, 1, 2.7)
-    axes, clock = grid[0, 0], series.clock(data.x)
-    outage = series.outage(solution)
-    if outage is not None:
-        style.shade(axes, outage[0] / clock.seconds, outage[1])
+    figure, axes, clock = series.alone(solution, data.x, "height [m]", 2.7)
     more = []
     fixes, truth = (series.one(solution, role, "alt_m") for role in ("gnss", "reference"))
     if fixes is not None:
@@ -269,13 +331,10 @@ def height(solution: xr.Dataset) -> Picture | None:
         axes.plot(series.x_of(fixes, 0) / clock.seconds, fixes.values, **look)
         more.append(style.key("GNSS fixes", **look))
     if truth is not None:
-        x, y = series.thin(series.x_of(truth, 0) / clock.seconds, np.asarray(truth, float))
-        axes.plot(x, y, color=style.TRUTH, linewidth=2.4, alpha=0.35)
-        more.append(style.key("reference", color=style.TRUTH, linewidth=2.4, alpha=0.35))
+        look = {"color": style.TRUTH, "linewidth": 2.4, "alpha": 0.35}
+        clock.plot(axes, series.x_of(truth, 0), np.asarray(truth, float), **look)
+        more.append(style.key("reference", **look))
     for i in range(len(filters)):
-        x, y = series.thin(data.x / clock.seconds, data.values[i, :, 0])
-        axes.plot(x, y, color=style.colour(i), linestyle=style.line(i))
-    axes.margins(x=0.0)
-    axes.set(xlabel=clock.label, ylabel="height [m]")
+        clock.plot(axes, data.x, data.values[i, :, 0], **style.look(i))
     style.legend(figure, _keys(filters, solution, *more))
     return Picture("height", "Height profile", "Height above the WGS-84 ellipsoid.", figure)

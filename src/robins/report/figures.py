@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from robins.report import allan_curve, bars, bounds, curves, iron, limits, maps, updates
+from robins.report import bounds, comparing, curves, instruments, maps, updates
 from robins.report.lateness import lateness
 from robins.report.style import Picture
-from robins.report.trade_off import trade_off
 from robins.results import find
 
 
@@ -49,18 +48,18 @@ FIGURES = (
     Figure(bounds.information, "information gramian_rank"),
     Figure(curves.errors, "error sigma bound bounds", EACH),
     Figure(curves.campaign, "rms mean_sigma bound bounds", EACH, _scatters),
-    Figure(limits.within, "within", EACH),
-    Figure(limits.worst_case, "note"),
+    Figure(curves.within, "within", EACH),
+    Figure(curves.worst_case, "note"),
     Figure(curves.estimates, "estimate sigma", EACH, _tells_more),
     Figure(curves.values, "value sigma", EACH),
     Figure(curves.height, "track reference gnss"),
     Figure(updates.innovations, "innovation innovation_sigma nis nis_dof refused", EACH),
     Figure(updates.consistency, "consistency consistency_dof", EACH),
-    Figure(allan_curve.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
-    Figure(trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
+    Figure(instruments.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
+    Figure(comparing.trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
     Figure(lateness, "lateness_steps lateness_edge"),
-    Figure(iron.planes, "field_calibrated field_measured"),
-    Figure(iron.size, "field_calibrated field_measured"),
+    Figure(instruments.planes, "field_calibrated field_measured"),
+    Figure(instruments.size, "field_calibrated field_measured"),
 )
 
 
@@ -73,5 +72,5 @@ def drawings(
         found += [partial(f.draw, solution, *of) for f in FIGURES for of in f.of(solution)]
     # Columns of a summary without filters are something else, such as the axes of a sensor.
     if solution is None or "filter" in solution.sizes:
-        found.append(partial(bars.comparison, summary))
+        found.append(partial(comparing.comparison, summary))
     return found

@@ -1,4 +1,4 @@
-"""What a solution holds, by the roles and dimensions that `robins.results` lists."""
+"""What a solution holds, by the roles and dimensions that `robins.results` lists, over time."""
 
 from __future__ import annotations
 
@@ -6,11 +6,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from robins import units
+from robins.report import style
 from robins.results import find
 
 _POINTS = 1200  # of a line; more than a figure has pixels
+
+
+class Clock(NamedTuple):
+    """A unit for a time axis."""
+
+    seconds: float
+    label: str
+
+    def plot(self, axes: Axes, x: np.ndarray, y: np.ndarray, **look: Any) -> None:
+        """Draw a line over time [s], of no more points than can be seen."""
+        axes.plot(*thin(x / self.seconds, y), **look)
+
+    def shade(self, axes: Axes, solution: xr.Dataset) -> None:
+        """Shade the outages."""
+        if (found := outage(solution)) is not None:
+            style.shade(axes, found[0] / self.seconds, found[1])
 
 
 class Series(NamedTuple):
@@ -74,13 +93,6 @@ def filters(solution: xr.Dataset) -> list[str]:
     return coordinate(solution, "filter") if "filter" in solution.sizes else []
 
 
-class Clock(NamedTuple):
-    """A unit for a time axis."""
-
-    seconds: float
-    label: str
-
-
 def clock(*times: np.ndarray) -> Clock:
     """The unit in which a time axis has short numbers."""
     longest = max((np.nanmax(np.abs(t)) for t in times if np.isfinite(t).any()), default=0.0)
@@ -89,6 +101,38 @@ def clock(*times: np.ndarray) -> Clock:
     if longest > 1200:
         return Clock(60.0, "time since start [min]")
     return Clock(1.0, "time since start [s]")
+
+
+def alone(
+    solution: xr.Dataset, x: np.ndarray, label: str, height: float = 2.8
+) -> tuple[Figure, Axes, Clock]:
+    """A figure of one pair of axes over time, outages shaded."""
+    figure, grid = style.new(1, 1, height)
+    axes, unit = grid[0, 0], clock(x)
+    unit.shade(axes, solution)
+    axes.margins(x=0.0)
+    axes.set(xlabel=unit.label, ylabel=label)
+    return figure, axes, unit
+
+
+def stacked(
+    solution: xr.Dataset, x: np.ndarray, axes: list[str], unit: str, more: int = 0
+) -> tuple[Figure, np.ndarray, Clock]:
+    """A figure of one pair of axes over time for each component, outages shaded.
+
+    So many more pairs stand below. Components of several units state their own.
+    """
+    rows = len(axes) + more
+    figure, grid = style.new(rows, 1, 0.9 + 1.35 * rows, sharex=True)
+    stack, time = grid[:, 0], clock(x)
+    for one in stack:
+        time.shade(one, solution)
+        one.margins(x=0.0)
+    for one, label in zip(stack, axes, strict=False):
+        one.set_ylabel(f"{label} [{unit}]" if unit and "[" not in label else label)
+    stack[-1].set_xlabel(time.label)
+    figure.align_ylabels()
+    return figure, stack, time
 
 
 def outage(solution: xr.Dataset) -> tuple[np.ndarray, np.ndarray] | None:

@@ -102,6 +102,11 @@ def line(index: int) -> Any:
     return LINES[index % len(LINES)]
 
 
+def look(index: int, **more: Any) -> dict[str, Any]:
+    """Colour and line style of the filter or axis of that number, and more properties of a line."""
+    return {"color": colour(index), "linestyle": line(index), **more}
+
+
 def key(label: str, **line_properties: Any) -> Line2D:
     """An entry of a legend."""
     return Line2D([], [], label=label, **line_properties)
@@ -109,7 +114,7 @@ def key(label: str, **line_properties: Any) -> Line2D:
 
 def filter_keys(filters: Sequence[str]) -> list[Line2D]:
     """Entries for the filters, in their colours."""
-    return [key(name, color=colour(i), linestyle=line(i)) for i, name in enumerate(filters)]
+    return [key(name, **look(i)) for i, name in enumerate(filters)]
 
 
 def outage_key() -> Patch:

@@ -1,17 +1,75 @@
-"""Innovations in their three-sigma bounds, and consistency statistics in their bands."""
+"""Innovations in their three-sigma bounds, and consistency statistics in their bands.
+
+The bands are those in which the statistics lie if a filter knows its own accuracy.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from scipy.special import gammaincinv
 
 from robins.report import series, style
-from robins.report.bands import Band, band, inside
 from robins.report.numbers import words
 from robins.report.style import Picture
+
+
+def quantile(probability: float, degrees: Any) -> np.ndarray:
+    """Inverse of the chi-square distribution, for one or many degrees of freedom."""
+    return np.asarray(2.0 * gammaincinv(np.asarray(degrees) / 2.0, probability))
+
+
+class Band(NamedTuple):
+    """Where a statistic of a consistent filter lies with the given probability."""
+
+    low: np.ndarray  # (filter, time)
+    high: np.ndarray
+    probability: float
+    expected: float
+
+
+def band(array: xr.DataArray, dof: xr.DataArray | None = None) -> Band | None:
+    """The band of a statistic, from its attributes; None if they do not give one.
+
+    Args:
+        array: the statistic, (filter, time).
+        dof: its degrees of freedom, of the same shape, if there is such an array.
+    """
+    attrs = array.attrs
+    probability = float(attrs.get("probability", 0.95))
+    runs = int(attrs.get("runs", 1))
+    if dof is not None:
+        degrees = np.asarray(dof.values, float)
+    elif "degrees_of_freedom" in attrs:
+        degrees = np.full(array.shape, float(attrs["degrees_of_freedom"]))
+    else:
+        degrees = None
+    if "band_low" in attrs and "band_high" in attrs:
+        low, high = (np.full(array.shape, float(attrs[f"band_{s}"])) for s in ("low", "high"))
+    elif degrees is not None:
+        # A mean of N independent chi-square variables of n degrees is chi2(N n)/N.
+        tail = (1.0 - probability) / 2.0
+        safe = np.where(degrees > 0.0, degrees, np.nan)
+        scale = runs * (safe if attrs.get("normalised") else 1.0)
+        low, high = (quantile(p, runs * safe) / scale for p in (tail, 1.0 - tail))
+    else:
+        return None
+    expected = np.nan
+    if degrees is not None and np.isfinite(degrees).any():
+        expected = 1.0 if attrs.get("normalised") else float(np.nanmean(degrees))
+    return Band(low, high, probability, expected)
+
+
+def inside(values: np.ndarray, limits: Band) -> np.ndarray:
+    """Share of the finite epochs of each filter that lie in the band; NaN where there are none."""
+    valid = np.isfinite(values) & np.isfinite(limits.high)
+    hits = valid & (values >= limits.low) & (values <= limits.high)
+    count = valid.sum(axis=1)
+    return np.where(count > 0, hits.sum(axis=1) / np.maximum(count, 1), np.nan)
+
 
 _FAR = 10.0  # an innovation this much larger than most bends the axis
 _STEEP = 15.0  # a statistic this far above its band is shown on a logarithmic axis
@@ -25,19 +83,12 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
     sigma = series.get(solution, "innovation_sigma", sensor)
     nis = series.one(solution, "nis", sensor)
     filters = series.filters(solution)
-    rows = len(data.axes) + (nis is not None)
-    figure, grid = style.new(rows, 1, 0.9 + 1.35 * rows, sharex=True)
-    stack, clock = grid[:, 0], series.clock(data.x)
+    told = data.x, data.axes, data.unit
+    figure, stack, clock = series.stacked(solution, *told, more=int(nis is not None))
     x = data.x / clock.seconds
-    outage = series.outage(solution)
     refused = _refused(solution, sensor, data.values.shape[:2])
     present = [i for i in range(len(filters)) if np.isfinite(data.values[i]).any()]
-    for axes in stack:
-        if outage is not None:
-            style.shade(axes, outage[0] / clock.seconds, outage[1])
-        axes.margins(x=0.0)
-    for k, label in enumerate(data.axes):
-        axes = stack[k]
+    for k, axes in enumerate(stack[: len(data.axes)]):
         shown = []
         for i in present:
             y = data.values[i, :, k]
@@ -49,13 +100,10 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
             if sigma is not None:
                 reach = 3.0 * sigma.values[i, :, k]
                 shown.append(np.where(np.isfinite(y), reach, np.nan))
-                look = {"color": style.colour(i), "linestyle": style.line(i), "linewidth": 0.8}
                 for sign in (-1.0, 1.0):
-                    axes.plot(*series.thin(x, sign * reach), **look)
+                    clock.plot(axes, data.x, sign * reach, **style.look(i, linewidth=0.8))
         _compress(axes, shown)
         axes.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
-        # components of several units say their own
-        axes.set_ylabel(f"{label} [{data.unit}]" if data.unit and "[" not in label else label)
     keys: list[Any] = [_dot(filters[i], i) for i in present]
     if sigma is not None:
         keys.append(style.key("±3σ expected", color=style.GREY, linewidth=0.8))
@@ -67,10 +115,8 @@ def innovations(solution: xr.Dataset, sensor: str) -> Picture:
         stack[-1].set_ylabel("NIS")
         keys.append(style.key("chi-square band", color=style.BAND, linewidth=6.0))
         style.remark(stack[-1], shares)
-    if outage is not None:
+    if series.outage(solution):
         keys.append(style.outage_key())
-    stack[-1].set_xlabel(clock.label)
-    figure.align_ylabels()
     style.legend(figure, keys)
     name = words(sensor)
     caption = (
@@ -149,8 +195,7 @@ def _statistic(
     joined = _is_smooth(array)
     for i in range(len(filters)):
         if joined:
-            look = {"color": style.colour(i), "linestyle": style.line(i), "linewidth": 0.9}
-            axes.plot(*series.thin(x, values[i]), **look)
+            axes.plot(*series.thin(x, values[i]), **style.look(i, linewidth=0.9))
         else:
             _points(axes, x, values[i], i)
     if limits is None or not np.isfinite(limits.high).any():
@@ -189,11 +234,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
     """NEES of a run, or its average over the runs of a campaign, in its chi-square band."""
     array = series.one(solution, "consistency", name)
     assert array is not None
-    figure, grid = style.new(1, 1, 2.8)
-    axes, clock = grid[0, 0], series.clock(series.x_of(array, 1))
-    outage = series.outage(solution)
-    if outage is not None:
-        style.shade(axes, outage[0] / clock.seconds, outage[1])
+    figure, axes, clock = series.alone(solution, series.x_of(array, 1), name.upper())
     limits = band(array, series.one(solution, "consistency_dof", name))
     filters = series.filters(solution)
     shares = _statistic(axes, array, limits, filters, clock)
@@ -205,9 +246,7 @@ def consistency(solution: xr.Dataset, name: str) -> Picture:
         if np.isfinite(limits.expected):
             axes.axhline(limits.expected, color=style.GREY, linewidth=0.7, zorder=1)
     style.remark(axes, shares)
-    axes.margins(x=0.0)
-    axes.set(xlabel=clock.label, ylabel=name.upper())
-    style.legend(figure, [*keys, style.outage_key()] if outage is not None else keys)
+    style.legend(figure, [*keys, style.outage_key()] if series.outage(solution) else keys)
     runs = array.attrs.get("runs")
     caption = "Squared estimation error, normalised by the stated covariance"
     caption += f", mean of {int(runs)} runs." if runs else "."

@@ -45,7 +45,7 @@ from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import array, variable
 from robins.results.summary import VERDICTS
-from robins.results.writer import ResultWriter, extend, write
+from robins.results.writer import ResultWriter, write
 
 __all__ = [
     "ROLES",
@@ -58,7 +58,6 @@ __all__ = [
     "ResultError",
     "ResultWriter",
     "array",
-    "extend",
     "find",
     "keeping",
     "read",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
@@ -16,7 +15,6 @@ from matplotlib.figure import Figure
 
 from robins.results import folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
-from robins.results.reader import Result
 
 SOLUTION, SUMMARY, REPORT, FIGURES = "solution.nc", "summary.json", "report.html", "figures"
 _OF_THE_DESKTOP = {".DS_Store", "Thumbs.db", "desktop.ini"}  # not put there by a person
@@ -127,7 +125,6 @@ class ResultWriter:
         path = self._stage.path / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)  # it may be a link into the earlier result
             path.write_bytes(content)
         except OSError as error:
             raise cannot(self.path, f"write {name}", error) from error
@@ -214,41 +211,6 @@ def write(
         if report is not None:
             writer.save_report(report)
     return Path(path)
-
-
-def extend(result: Result) -> ResultWriter:
-    """A writer that begins with a result's content and will take its place.
-
-    Files are linked, not copied, where the file system can; writing one again replaces the link.
-
-    Raises:
-        ResultError: as for `ResultWriter`.
-    """
-    made = result.manifest
-    writer = ResultWriter(
-        result.path,
-        scenario_text=made["scenario"]["text"],
-        device=made["device"],
-        command=made["command"],
-    )
-    try:
-        for name in made["files"]:
-            _link(result.path / name, writer._stage.path / name)
-    except BaseException as error:
-        writer.discard()
-        if isinstance(error, OSError):
-            raise cannot(result.path, "take the result over", error) from error
-        raise
-    writer.summary, writer.solution = dict(result.summary), result.solution
-    return writer
-
-
-def _link(source: Path, copy: Path) -> None:
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, copy)
-    except OSError:
-        shutil.copyfile(source, copy)
 
 
 def _check_replaceable(path: Path) -> None:

@@ -18,12 +18,18 @@ In a scenario a number without its unit is refused; in Python code a number is S
 with a scenario is one `ScenarioError` with one line a fault: path, value, what is allowed.
 """
 
-from robins.scenario.errors import ScenarioError
-from robins.scenario.parameters import Parameters, Quantity, default
-from robins.scenario.ranges import Dof, Entry, Positive, Share
+from robins.scenario.parameters import (
+    Dof,
+    Entry,
+    Parameters,
+    Positive,
+    Quantity,
+    Share,
+    Span,
+    default,
+)
 from robins.scenario.reading import load, parse, validate
-from robins.scenario.span import Span
-from robins.scenario.text import hash_of, mapping_of, override, read_text, text_of
+from robins.scenario.text import ScenarioError, mapping_of, override, read_text, text_of
 
 __all__ = [
     "Dof",
@@ -35,7 +41,6 @@ __all__ = [
     "Share",
     "Span",
     "default",
-    "hash_of",
     "load",
     "mapping_of",
     "override",

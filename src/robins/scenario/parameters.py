@@ -1,4 +1,9 @@
-"""Parameter classes: what a system can be told, with kinds of quantities and their bounds."""
+"""Parameter classes: what a system can be told, with kinds of quantities and their bounds.
+
+Each kind has a range, which keeps slips of a power of ten, and of a unit, out of a simulation; it
+is wider than what any vehicle does. A parameter that is narrower by nature says so where it is
+declared.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,64 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, get_args, get_origin
 
+import numpy as np
 import pydantic
 from pydantic_core import core_schema
 
 from robins import units
-from robins.scenario import ranges
+
+MOST: dict[str, str] = {
+    "angle": "360 deg",
+    "angle rate": "100000 deg/s",
+    "angular acceleration": "1e6 deg/s^2",
+    "angle random walk": "1000 deg/sqrt(s)",
+    "rate random walk": "1000 deg/s/sqrt(s)",
+    "acceleration": "10000 g",
+    "velocity random walk": "1000 m/s/sqrt(s)",
+    "acceleration random walk": "1000 m/s^2/sqrt(s)",
+    "g-sensitivity": "1000 deg/s/g",
+    "length": "100000 km",
+    "area": "1 km^2",
+    "speed": "100 km/s",
+    "position random walk": "1e6 m/sqrt(s)",
+    "time": "3650 d",
+    "frequency": "1 MHz",
+    "inverse time": "1e6 1/s",
+    "ratio": "1000",
+    "magnetic field": "1 T",
+    "magnetic noise": "1 T/sqrt(Hz)",
+    "magnetic moment": "1e6 A m^2",
+    "mass": "1e6 t",
+    "moment of inertia": "1e9 kg m^2",
+    "force": "1e9 N",
+    "torque": "1e9 N m",
+    "angular momentum": "1e9 N m s",
+    "density": "1e5 kg/m^3",
+    "pressure": "1e9 Pa",
+    "temperature": "1e5 K",
+    "specific force": "10000 g",
+    "scale factor": "1000000 ppm",
+}
+"""The greatest magnitude of a kind."""
+
+LEAST: dict[str, str] = {
+    kind: "0 K" if kind == "temperature" else f"-{most}" for kind, most in MOST.items()
+}
+"""The least value of a kind."""
+
+assert MOST.keys() == units.KINDS.keys(), "every kind has a range"
+
+Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
+"""A part of a whole."""
+
+Positive = Annotated[float, pydantic.Field(gt=0.0, le=1e6)]
+"""A factor or a figure above zero."""
+
+Dof = Annotated[float, pydantic.Field(gt=2.0, le=1e6)]
+"""Degrees of freedom of Student's t that has a variance."""
+
+Entry = Annotated[float, pydantic.Field(ge=-1e3, le=1e3)]
+"""An entry of a matrix, or of a vector that gives a direction."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +77,7 @@ class Quantity:
     """Marks a float, or a tuple of floats, as a quantity of a kind: text with a unit, kept as SI.
 
     Bounds are texts too: ``above`` and ``below`` exclude the bound, ``least`` and ``most`` include
-    it. A side without one has that of the kind, `robins.scenario.ranges`. On a tuple of fixed
+    it. A side without one has that of the kind, `robins.scenario.parameters`. On a tuple of fixed
     length each item is a quantity, and one serves for all.
 
     Raises:
@@ -40,8 +98,8 @@ class Quantity:
 
     def _bounds(self) -> list[tuple[str, str, Callable[[float, float], bool]]]:
         """The lower bound, then the upper: its word, its text, and how it is kept."""
-        low = ("at least", self.least or ranges.LEAST[self.kind], operator.ge)
-        high = ("at most", self.most or ranges.MOST[self.kind], operator.le)
+        low = ("at least", self.least or LEAST[self.kind], operator.ge)
+        high = ("at most", self.most or MOST[self.kind], operator.le)
         return [
             low if self.above is None else ("above", self.above, operator.gt),
             high if self.below is None else ("below", self.below, operator.lt),
@@ -104,3 +162,21 @@ class Parameters(pydantic.BaseModel):
             marked = any(isinstance(m, Quantity) for m in info.metadata)
             if marked and isinstance(info.default, str) and not info.validate_default:
                 raise TypeError(f"{cls.__name__}.{name}: write default({info.default!r})")
+
+
+class Span(Parameters):
+    """A time from `begin` (included) to `end` (not)."""
+
+    begin: Annotated[float, Quantity("time", least="0 s")]
+    end: Annotated[float, Quantity("time", above="0 s")]
+
+    @pydantic.model_validator(mode="after")
+    def _in_order(self) -> Span:
+        if self.end <= self.begin:
+            raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
+        return self
+
+    def holds(self, time_s: Any) -> np.ndarray:
+        """Which times lie in it; those of a grid are rounded."""
+        time = np.asarray(time_s, float)
+        return (time >= self.begin - 1e-9) & (time < self.end - 1e-9)

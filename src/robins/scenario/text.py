@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 import json
 import re
 import tomllib
@@ -11,7 +10,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from robins.scenario.errors import ScenarioError, named
+from robins.errors import RobinsError
+
+
+class ScenarioError(RobinsError, ValueError):
+    """A scenario that cannot be used; `faults` has one line for each thing that is wrong."""
+
+    def __init__(self, faults: Iterable[str]):
+        self.faults = tuple(faults)
+        super().__init__("\n".join(self.faults))
+
+
+def named(source: str, fault: str) -> str:
+    """The line of a fault, with the file or other source in front."""
+    return f"{source}: {fault}" if source else fault
+
 
 _LONGEST = 1_000_000  # bytes; keeps a log named by mistake out of memory
 
@@ -85,11 +98,6 @@ def override(mapping: Mapping[str, Any], settings: Iterable[str]) -> dict[str, A
 def text_of(mapping: Mapping[str, Any]) -> str:
     """TOML text of the tables, so that a changed scenario can be kept and run again."""
     return "\n".join(_toml_lines(mapping, ())) + "\n"
-
-
-def hash_of(text: str) -> str:
-    """SHA-256 of a scenario text, hexadecimal."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _copy(value: Any) -> Any:

@@ -1,34 +1,31 @@
 """Simulation: motions over the Earth and what sensors make of them.
 
-- `trajectory`: smooth motions from waypoints, velocity or a sine.
+- `trajectory`: smooth motions from waypoints, velocity or a sine; that of another point.
 - `commands`: smooth motions from manoeuvres (import the manoeuvres by their module).
 - `flexure`: structure that swings and bends between two inertial units.
 - `manoeuvres`: smooth motions of an aircraft that banks, a ship in the sea, a rough road.
-- `lever_arm`: the motion of another point of the body.
 - `disturbance`: heavy tails, outliers, steps of noise and drift (import it by its name).
 - `ideal_imu`: an IMU without errors, and the inversion of the mechanisation.
 - `imu_sensor`, `gnss_sensor`: what a real IMU and a real receiver make of it.
-- `wind`, `turbulence`: gusts and what they carry; Dryden and von Karman spectra.
-- `air_data`, `barometer`, `sar`, `star_tracker`: sensors of an airship.
+- `wind`: gusts and what they carry; Dryden and von Karman spectra.
+- `air_data`, `sar`: sensors of an airship.
 - `ballistic`, `free_body`: a rocket after burnout, the way it flies and the way it turns.
-- `mems_gyro`, `magnetometer`: its sensors.
+- `gyro`, `magnetometer`: its sensors.
 - `spacecraft`, `orbit`: a rigid body with wheels and magnetorquers, and what is about it.
 - `attitude_reference`, `attitude_control`: where it is to point, and the law that turns it there.
 - `rate_table`: what turns a gyro on the ground.
-- `gyro`, `star_sensor`: sensors of a spacecraft that turns as it is told to.
-- `gauss_markov`: first-order Gauss-Markov processes, exact at any step.
-- `random`: streams of random numbers by seed, run and component.
+- `star_sensor`, also `gyro`: sensors of a spacecraft that turns as it is told to.
+- `random`: streams of random numbers by seed, run and component; Gauss-Markov processes.
 """
 
 from robins.sim.commands import from_commands
 from robins.sim.flexure import Flexure, simulate_flexure
 from robins.sim.gnss_sensor import GnssErrorModel, GnssFixes, as_table, fix_times, observe
-from robins.sim.ideal_imu import ideal_increments, ideal_rates, true_increments
+from robins.sim.ideal_imu import ideal_increments, true_increments
 from robins.sim.imu_sensor import ImuTruth, corrupt, corrupt_table
-from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import fly, roughen, sail
-from robins.sim.random import Component, generator, stream
-from robins.sim.trajectory import Motion, from_velocity, from_waypoints, sine_velocity
+from robins.sim.random import Component, stream
+from robins.sim.trajectory import Motion, at_lever_arm, from_velocity, from_waypoints, sine_velocity
 
 __all__ = [
     "Component",
@@ -46,9 +43,7 @@ __all__ = [
     "from_commands",
     "from_velocity",
     "from_waypoints",
-    "generator",
     "ideal_increments",
-    "ideal_rates",
     "observe",
     "roughen",
     "sail",

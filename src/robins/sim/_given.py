@@ -11,6 +11,7 @@ from jax.core import Tracer
 
 from robins import _float64  # noqa: F401
 from robins.errors import require
+from robins.rotation import normalise
 
 
 def known(*values: Any) -> bool:
@@ -83,6 +84,17 @@ def rows(name: str, value: Any, *shape: int) -> jax.Array:
     x = jnp.asarray(value, float)
     require(x.shape == shape, f"{name} must have shape {shape}", x.shape)
     return x
+
+
+def unit_quaternion(name: str, value: Any) -> jax.Array:
+    """A quaternion (4,) of unit length to 1e-3, normalised.
+
+    Raises:
+        ValueError: it is not.
+    """
+    q = rows(name, value, 4)
+    number(f"{name} must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
+    return normalise(q)
 
 
 def presence(present: Any) -> jax.Array:

@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.linalg import scalars as u
 from robins.rotation import conjugate, multiply, rotate, to_rotvec
 from robins.sim import _given
-from robins.sim import _unrolled as u
 
 _ENOUGH = 1e-6  # determinant of W W' of unit axes that span space
 

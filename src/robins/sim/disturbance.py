@@ -34,18 +34,6 @@ def outlier_factor(
     return jnp.where(struck, float(factor), 1.0)
 
 
-def contaminated_normal(
-    key: Array, shape: Sequence[int], share: float, factor: float
-) -> Float[Array, "..."]:
-    """Normal noise of unit deviation, of which a share is `factor` times as large.
-
-    Raises:
-        ValueError: as `outlier_factor`.
-    """
-    normal, chance = jax.random.split(key)
-    return jax.random.normal(normal, tuple(shape)) * outlier_factor(chance, shape, share, factor)
-
-
 def student_t(key: Array, shape: Sequence[int], dof: float) -> Float[Array, "..."]:
     """Student-t noise scaled to unit standard deviation.
 

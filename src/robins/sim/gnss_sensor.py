@@ -25,8 +25,9 @@ from robins import _float64  # noqa: F401
 from robins.dataset import GnssTable
 from robins.earth import OMEGA_E, Geodetic, dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from robins.errors import require
-from robins.ins.records import checked_pytree
+from robins.ins.imu_errors import checked_pytree
 from robins.rotation import rotate
+from robins.sim import _given
 
 # What is drawn at a fix is part of the file format, as `robins.sim.random.Component` is.
 _NORMALS, _CHANCES = 0, 1  # streams folded into the key of the receiver
@@ -93,13 +94,8 @@ class GnssErrorModel:
             ("outlier_share", 0.0, 1.0),
             ("outlier_size", 0.0, np.inf),
         ):
-            value = getattr(self, name)
-            if not isinstance(value, jax.Array) and not (
-                np.isfinite(value) and low <= value <= high
-            ):
-                raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {value}")
-        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0.0):
-            raise ValueError(f"rate_hz must be a positive number, got {self.rate_hz}")
+            _given.number(name, getattr(self, name), low, high)
+        _given.number("rate_hz", self.rate_hz, 0.0, above=True)
         if self.outages_s is not None and len(self.outages_s) == 0:
             object.__setattr__(self, "outages_s", None)
         elif self.outages_s is not None:
@@ -117,11 +113,7 @@ class GnssErrorModel:
         x = np.asarray(value, float)
         if x.shape not in ((), (3,)):
             raise ValueError(f"{name} must be a number or of shape (3,), got shape {x.shape}")
-        require(np.all(np.isfinite(x)), f"{name} must be finite", value)
-        if np.any(x < low) or (open_end and np.any(x == low)):
-            raise ValueError(
-                f"{name} must {'be positive' if open_end else 'not be negative'}, got {value}"
-            )
+        _given.number(name, x, low, above=open_end)
         object.__setattr__(self, name, np.broadcast_to(x, (3,)))
 
 

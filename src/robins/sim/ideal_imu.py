@@ -24,12 +24,6 @@ from robins.sim.trajectory import Motion
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
-def ideal_rates(motion: Motion, time_ns: np.ndarray) -> ImuTable:
-    """Angular rate omega_ib_b and specific force f_b at given times [ns], FRD."""
-    gyro, accel = motion.at(np.asarray(time_ns) * 1e-9).rates()
-    return ImuTable(np.asarray(time_ns, np.int64), gyro, accel, "rate")
-
-
 def true_increments(motion: Motion, time_ns: np.ndarray) -> ImuTable:
     """Integrals of omega_ib_b and f_b over (time[k-1], time[k]], FRD.
 

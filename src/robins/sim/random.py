@@ -8,6 +8,13 @@ of its own and leaves the noise of the others as it was.
 
 The numbers of `Component` are part of the file format: a result folder that states its seed can
 be computed again only while they stay. Add at the end, never renumber, never reuse.
+
+`gauss_markov` is the first-order Gauss-Markov process at the instants of a sensor: steady, and
+exact at any step. Its correlation falls as ``exp(-|t|/tau)``. Sampled at equal steps h it is
+
+    x(k+1) = e^(-h/tau) x(k) + sqrt(1 - e^(-2h/tau)) n(k)
+
+with no approximation (Brown & Hwang 2012, section 5.4), so its statistics do not depend on h.
 """
 
 from __future__ import annotations
@@ -17,10 +24,11 @@ from enum import IntEnum
 from typing import Any, SupportsIndex
 
 import jax
-import numpy as np
-from jaxtyping import Array
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
+from robins.sim import _given
 
 UNITS_OF_A_KIND = 256  # stride between the streams of two sensors of one kind
 
@@ -74,22 +82,6 @@ def stream(seed: SupportsIndex, run: Any, component: SupportsIndex) -> Array:
     return jax.random.fold_in(jax.random.fold_in(key, run), _bounded("component", component, 2**32))
 
 
-def generator(
-    seed: SupportsIndex, run: SupportsIndex, component: SupportsIndex
-) -> np.random.Generator:
-    """NumPy generator of one component in one run, for work outside compiled code.
-
-    It has the independence of `stream`, not its numbers: the two use different generators. NumPy
-    keeps Philox's bits across versions but not the way normals are made from them.
-
-    Raises:
-        ValueError: as in `stream`.
-    """
-    name = (_bounded("run", run, 2**32), _bounded("component", component, 2**32))
-    seeds = np.random.SeedSequence(_bounded("seed", seed, 2**63), spawn_key=name)
-    return np.random.Generator(np.random.Philox(seeds))
-
-
 def _bounded(name: str, value: Any, limit: int) -> int:
     wrong = f"{name} must be an integer from 0 to {limit - 1}, got {value!r}"
     try:
@@ -99,3 +91,35 @@ def _bounded(name: str, value: Any, limit: int) -> int:
     if isinstance(value, bool) or not 0 <= number < limit:
         raise ValueError(wrong)
     return number
+
+
+def gauss_markov(
+    key: Array, count: int, width: int, step_s: Any, tau_s: Any
+) -> Float[Array, "{count} {width}"]:
+    """Independent processes of unit variance, begun in their steady state.
+
+    The normal numbers drawn do not depend on step or correlation time.
+
+    Args:
+        key: of the stream.
+        count: samples, at 0, h, 2h ...
+        width: processes.
+        step_s: h [s].
+        tau_s: correlation time [s], one or ``width`` of them; infinity makes constants.
+
+    Raises:
+        ValueError: no sample, a step or a correlation time that is not positive.
+    """
+    _given.count_of("count", count)
+    _given.number("step_s", step_s, 0.0, above=True)
+    tau = _given.vector("tau_s", tau_s, width, low=0.0, above=True, endless=True)
+    normal = jax.random.normal(key, (count, width))
+    x = step_s / tau
+    fade, drive = jnp.exp(-x), jnp.sqrt(-jnp.expm1(-2.0 * x))
+
+    def step(before, number):
+        now = fade * before + drive * number
+        return now, now
+
+    _, rest = jax.lax.scan(step, normal[0], normal[1:])
+    return jnp.concatenate([normal[:1], rest])

@@ -69,9 +69,7 @@ def table_state(q_ib: Any = (1.0, 0.0, 0.0, 0.0), rate_b: Any = 0.0) -> TableSta
     Raises:
         ValueError: not a unit quaternion, or a rate that is not finite.
     """
-    q = _given.rows("q_ib", q_ib, 4)
-    _given.number("q_ib must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
-    return TableState(normalise(q), _given.vector("rate_b", rate_b, 3))
+    return TableState(_given.unit_quaternion("q_ib", q_ib), _given.vector("rate_b", rate_b, 3))
 
 
 def step(

@@ -30,9 +30,9 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.earth.wgs84 import GM
-from robins.rotation import conjugate, normalise, rotate
+from robins.linalg import scalars as u
+from robins.rotation import conjugate, rotate
 from robins.sim import _given
-from robins.sim import _unrolled as u
 
 
 class Spacecraft(NamedTuple):
@@ -129,11 +129,9 @@ def craft_state(craft: Spacecraft, q_ib: Any, omega_b: Any, wheel_h: Any = 0.0) 
     Raises:
         ValueError: shapes that do not fit, or a quaternion that is not of unit length.
     """
-    q, omega = _given.rows("q_ib", q_ib, 4), _given.rows("omega_b", omega_b, 3)
-    _given.number("q_ib must be a unit quaternion: its length", jnp.sqrt(q @ q), 0.999, 1.001)
+    q, omega = _given.unit_quaternion("q_ib", q_ib), _given.rows("omega_b", omega_b, 3)
     _given.number("omega_b", omega)
     h = _given.vector("wheel_h", wheel_h, craft.wheel_axes_b.shape[1])
-    q = normalise(q)
     total = _times(craft.inertia_b, omega) + wheel_momentum_b(craft, h)
     return CraftState(q, rotate(q, total), h)
 
@@ -150,16 +148,12 @@ def rate_b(craft: Spacecraft, state: CraftState) -> Float[Array, "3"]:
     return jnp.stack(u.apply(u.symmetric_inverse(u.matrix(craft.inertia_b)), left))
 
 
-def gravity_gradient(inertia_b: Float[Array, "3 3"], r_b_m: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Torque [N m] of gravity on a body at r_b from the Earth's centre, 3 mu/r^5 (r_b x J r_b).
+def gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
+    """Torque [N m] of gravity on a body of inertia J at r from the Earth's centre, body axes.
 
-    Far from the Earth and for a body small beside its distance (Wertz 1978, eq. 17-31). None at
-    r_b = 0, which stands for no Earth.
+    3 mu/r^5 (r x J r), far from the Earth and for a body small beside its distance (Wertz 1978, eq.
+    17-31). None at r = 0, which stands for no Earth.
     """
-    return jnp.stack(_gravity_gradient(u.matrix(inertia_b), u.scalars(r_b_m)))
-
-
-def _gravity_gradient(J: u.Matrix, r: u.Three) -> u.Three:
     sq = u.dot(r, r)
     none = sq == 0.0
     safe = jnp.where(none, 1.0, sq)
@@ -217,7 +211,7 @@ def advance(
             *(_turned(g, v, -1.0) for v in (u.plus(total, added), place, field))
         )
         wheels = u.plus(held, u.times(share, gained))
-        torque = u.plus(_gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
+        torque = u.plus(gravity_gradient(J, r_b), u.cross(dipole, field_b), other)
         omega, torque = u.settled(u.apply(J_inv, u.minus(momentum, wheels)), torque)
         along = u.plus(omega, u.cross(g, omega), u.times(u.dot(g, omega), g))
         (rate,) = u.settled((*u.times(0.5, along), *_turned(g, torque, 1.0)))

@@ -3,8 +3,8 @@
 `star_errors` and `read_star` are the sensor as a data sheet states it: attitude with white noise,
 about the boresight commonly some times as large as across it, and a low-frequency error from
 warping and from stars that cross the field. All errors of a run are drawn beforehand, so a closed
-loop only turns its attitude by the next of them. (`robins.sim.star_tracker` observes a motion that
-is known beforehand.)
+loop only turns its attitude by the next of them. `observe_euler` puts white noise on pitch, roll
+and heading of a known motion, as papers do that state one accuracy for the three.
 
 `StarCamera` and `photograph` go a step further down: the stars of a catalogue that are in the field
 of view, each with an error of its own, some missed and some that are none. `measure_attitude` is
@@ -24,11 +24,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from robins import _float64  # noqa: F401
-from robins.earth.star_catalogue import Stars
-from robins.earth.star_index import StarIndex, index_stars, near
-from robins.ins.star_tracking import track_stars
+from robins.earth.stars import StarIndex, Stars, index_stars, near
+from robins.ins.star_identification import track_stars
 from robins.ins.vector_attitude import quest
-from robins.rotation import conjugate, from_rotvec, multiply, normalise, rotate
+from robins.manifold import wrap
+from robins.rotation import conjugate, from_rotvec, multiply, normalise, rotate, to_euler
 from robins.sim import _given
 
 # Folded into the key of the sensor; part of the file format, as `Component` is.
@@ -137,7 +137,7 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
 
     Args:
         camera: which is checked here.
-        stars: the catalogue, from `robins.earth.star_catalogue`.
+        stars: the catalogue, from `robins.earth.stars`.
         margin_rad: by which a list reaches beyond the field, for attitudes not exactly known [rad].
 
     Raises:
@@ -243,7 +243,7 @@ def measure_attitude(
         camera: the camera.
         turn_rad: an error that all stars share, see `photograph`.
         q_ib_prior: (4,) attitude as far as known; the stars are then those that
-            `robins.ins.star_tracking.track_stars` matches with it. None: each star is known.
+            `robins.ins.star_identification.track_stars` matches with it. None: each star is known.
         tolerance_rad: of the match [rad]; None: six sigmas of the faintest star that is reported.
 
     Returns:
@@ -271,3 +271,28 @@ def _shifted(unit: Float[Array, "n 3"], angles: Float[Array, "n 2"]) -> Float[Ar
     first = first / jnp.sqrt(jnp.sum(first**2, 1, keepdims=True))
     moved = unit + angles[:, :1] * first + angles[:, 1:] * jnp.cross(unit, first)
     return moved / jnp.sqrt(jnp.sum(moved**2, 1, keepdims=True))
+
+
+def observe_euler(key: Array, q_nb: Any, sigma_rad: Any, present: Any) -> Float[Array, "epochs 3"]:
+    """Measured pitch, roll, heading [rad] of the body, each with white noise.
+
+    The angles are those of `robins.rotation.to_euler`, in another order. Roll and heading are
+    wrapped to [-pi, pi); a pitch near the vertical is not turned over by its noise.
+
+    Args:
+        key: of the run, `Component.STAR_SENSOR` of `robins.sim.random.stream`.
+        q_nb: (E, 4) true attitude, scalar first.
+        sigma_rad: standard deviation, a number or one each for pitch, roll, heading.
+        present: (E,) bool, whether there is a sample; NaN where not.
+
+    Raises:
+        ValueError: shapes that do not fit together, or a negative sigma.
+    """
+    there = _given.presence(present)
+    count = len(there)
+    true = _given.rows("q_nb", q_nb, count, 4)
+    sigma = _given.vector("sigma_rad", sigma_rad, 3, low=0.0)
+    error = sigma[None] * jax.random.normal(key, (count, 3))
+    roll, pitch, heading = to_euler(true)
+    angles = pitch + error[:, 0], wrap(roll + error[:, 1]), wrap(heading + error[:, 2])
+    return jnp.where(there[:, None], jnp.stack(angles, 1), jnp.nan)

@@ -86,6 +86,23 @@ def rms_by_component(statistics: Any) -> np.ndarray:
     return np.sqrt(np.mean(statistics.rms[statistics.counted] ** 2, axis=0))
 
 
+def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
+    """RMS error of every axis of every block in its display unit, over runs and epochs that count.
+
+    Args:
+        statistics: of a campaign.
+        all_axes: blocks of which the RMS over all axes is told too.
+    """
+    rms, out = rms_by_component(statistics), {}
+    for block in statistics.blocks:
+        ending = "mps" if block.display_unit == "m/s" else units.as_ending(block.display_unit)
+        sizes = units.convert(rms[block.where], block.units, block.display_unit)
+        out[f"{block.name}_rms_{ending}"] = sizes.tolist()
+        if block.name in all_axes:
+            out[f"{block.name}_rms_all_{ending}"] = float(np.sqrt(np.mean(sizes**2)))
+    return out
+
+
 def standard_metrics(statistics: Any) -> dict[str, Any]:
     """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
     errors = {

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Literal
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 import pydantic
+from jaxtyping import ArrayLike
 
+from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, default
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
 
@@ -116,3 +120,29 @@ _COMMANDS: dict[str, tuple[Callable[..., Command], tuple[str, ...]]] = {
     "turn": (turn, ("angle", "rate")),
     "climb": (climb, ("height", "seconds")),
 }
+
+
+class Block(NamedTuple):
+    """Input of one step of a motion that is mechanised from inertial samples."""
+
+    increments: Increments  # dt (K,), theta (K, 3), dv (K, 3)
+    noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
+
+
+LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take
+
+
+def warn_of_large_angles(reached_rad: Mapping[str, float]) -> None:
+    """Warn of errors beyond 5 deg, for which linear models do not hold.
+
+    Args:
+        reached_rad: by parameter the size [rad] that its error may reach.
+    """
+    large = {name: size for name, size in reached_rad.items() if size > LARGEST_RAD}
+    if large:
+        told = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())
+        warnings.warn(
+            f"{told}: the filters' model is linear in these angles and good below 5 deg; expect "
+            "biased estimates",
+            stacklevel=4,
+        )

@@ -8,8 +8,7 @@ laid end to end. A system gives the preparation, its contenders, and what only i
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
@@ -19,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from robins.filters import Belief, StepWarning, Tally, doubts, rts_smoother, run
+from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
+from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.ins.blocks import Blocks
-from robins.ins.intervals import after_gap
+from robins.ins.increments import after_gap
 from robins.results import Outcome, Progress, silent, variable
 from robins.systems.study import Contender, SensorAxes, StateBlock
 from robins.systems.tables import (
@@ -30,7 +30,6 @@ from robins.systems.tables import (
     Update,
     block_array,
     innovation_tables,
-    update_metrics,
     updates,
 )
 
@@ -48,7 +47,7 @@ class Piece:
     noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
-Prepared = TypeVar("Prepared", bound=Piece)
+PieceT = TypeVar("PieceT", bound=Piece)
 
 
 class Answer(NamedTuple):
@@ -71,7 +70,7 @@ class Reported(NamedTuple):
     sensors: Mapping[str, SensorAxes]
     # mean, leading axis E -> (E, k) estimates by block, and "euler": roll, pitch, heading [rad]
     estimates: Callable[[Any], Mapping[str, Any]]
-    causes: str  # the sentence on what is mostly behind it where a replay is to be doubted
+    causes: str  # the sentence on the likely causes, said where there is a warning
     # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
     # cautious side, so that small innovations say nothing
     assumed: Collection[str] = ()
@@ -85,8 +84,8 @@ def prepared(
     time_s: np.ndarray,
     dt_s: np.ndarray,
     longest_gap_s: float,
-    prepare: Callable[[slice], Prepared],
-) -> tuple[list[Prepared], list[str]]:
+    prepare: Callable[[slice], PieceT],
+) -> tuple[list[PieceT], list[str]]:
     """The pieces of a log that can be run, and a sentence on each that cannot.
 
     Args:
@@ -186,27 +185,22 @@ def _of_piece(piece: Piece, contender: Contender, smoothed: bool) -> tuple[Answe
     """What a filter says of a piece, and its smoother if that is asked for."""
     filter_, model, case = contender.filter, contender.model, contender.case(piece.world)
     arguments = filter_, model, case.start, case.y, case.u, case.aux
-    with doubts_told_at_the_end():
+    with warnings.catch_warnings():
+        # what would be said here is among the warnings of the outcome
+        warnings.simplefilter("ignore", StepWarning)
         if smoothed:
             found = run(*arguments, time_s=piece.epoch_s)
             of_steps = _kept_of(found.steps)
         else:
             found = run(*arguments, keep=kept, time_s=piece.epoch_s)
             of_steps = found.steps
-    likelihood = float(found.log_likelihood)
-    answer = Answer("", *of_steps, case.start, likelihood, found.tally, contender.bounds)
+    mean, sigma, seen = of_steps
+    likelihood, bounds = float(found.log_likelihood), contender.bounds
+    answer = Answer("", mean, sigma, seen, case.start, likelihood, found.tally, bounds)
     if not smoothed:
         return answer, answer
     belief = rts_smoother(found)
     return answer, answer._replace(mean=belief.mean, sigma=belief.sigma, updates={})
-
-
-@contextmanager
-def doubts_told_at_the_end() -> Iterator[None]:
-    """Runs in here do not warn: what they would say is among the warnings of the outcome."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", StepWarning)
-        yield
 
 
 def _joined(parts: Sequence[Answer]) -> Answer:
@@ -218,7 +212,7 @@ def _joined(parts: Sequence[Answer]) -> Answer:
         sigma=sigma,
         updates=seen,
         log_likelihood=sum(a.log_likelihood for a in parts),
-        tally=together([a.tally for a in parts]),
+        tally=jax.tree_util.tree_map(lambda *x: np.stack(x), *[a.tally for a in parts]),
     )
 
 
@@ -240,12 +234,6 @@ def end_to_end(trees: Sequence[Any]) -> Any:
         return jnp.asarray(np.concatenate([rows[0], *(a for r in rows[1:] for a in (blank, r))]))
 
     return jax.tree_util.tree_map(join, *trees)
-
-
-def together(tallies: Sequence[Tally | None]) -> Any:
-    """The tallies of all pieces of a log, as one with a leading axis."""
-    some = [tally for tally in tallies if tally is not None]
-    return jax.tree_util.tree_map(lambda *x: np.stack(x), *some) if some else None
 
 
 # ---------------------------------------------------------------------------- answers to outcome
@@ -272,14 +260,18 @@ def outcome(
         counts: of samples and pieces.
         notes: sentences for the reader.
     """
-    tallies = {name: a.tally for name, a in answers.items() if a.updates}
-    bounds = [name for name, a in answers.items() if a.bounds]
+    doubtful = [
+        f"{name}: {sentence}."
+        for name, answer in answers.items()
+        if answer.updates
+        for sentence in doubts(answer.tally, bounds=answer.bounds, assumed=reported.assumed)
+    ]
     return Outcome(
         solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables)),
         metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
         counts=dict(counts),
         notes=list(notes),
-        warnings=replay_warnings(tallies, reported.causes, bounds, reported.assumed),
+        warnings=[*doubtful, reported.causes] if doubtful else [],
     )
 
 
@@ -311,28 +303,18 @@ def _sigma(answer: Answer, block: StateBlock) -> np.ndarray | None:
 
 
 def _innovations(answer: Answer) -> dict[str, Any]:
-    out = update_metrics(answer.updates, answer.bounds)
-    return out | ({"log_likelihood": answer.log_likelihood} if answer.updates else {})
+    """Grand mean NIS with its band, and how many were refused, of each sensor that spoke.
 
-
-def replay_warnings(
-    tallies: Mapping[str, Tally],
-    causes: str,
-    bounds: Collection[str] = (),
-    assumed: Collection[str] = (),
-) -> list[str]:
-    """Why a reader should doubt a replay, and the likely causes; empty where nothing is wrong.
-
-    Args:
-        tallies: by filter, of all pieces of the log.
-        causes: the sentence on what is mostly behind it in this system.
-        bounds: filters that state bounds, not standard deviations.
-        assumed: sensors that nobody built, such as "the wheels do not slip": their noise is a
-            guess on the cautious side, so that small innovations say nothing.
+    What a filter of bounds expects is no covariance, so it has no NIS.
     """
-    found = [
-        f"{name}: {sentence}."
-        for name, tally in tallies.items()
-        for sentence in doubts(tally, bounds=name in bounds, assumed=assumed)
-    ]
-    return [*found, causes] if found else []
+    out: dict[str, Any] = {}
+    for sensor, update in answer.updates.items():
+        refused = np.asarray(update.code) == Code.REFUSED
+        used = np.asarray(update.dof) * ~refused
+        if np.any(used) and not answer.bounds:
+            verdict = grand_mean_nis(np.asarray(update.nis), used)
+            out[f"nis_{sensor}"] = verdict.value
+            out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
+        if np.any(used) or np.any(refused):
+            out[f"refused_{sensor}"] = int(np.sum(refused))
+    return out | ({"log_likelihood": answer.log_likelihood} if answer.updates else {})

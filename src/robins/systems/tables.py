@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.filters import Code
-from robins.filters.consistency import grand_mean_nis
 from robins.filters.run import Step
 from robins.results import array, variable
 from robins.systems.study import Output, SensorAxes, StateBlock
@@ -98,23 +97,3 @@ def _every(seen: Sequence[Mapping[str, Any]], sensor: str, what: str) -> np.ndar
     rows = [getattr(of[sensor], what) if sensor in of else None for of in seen]
     blank = np.full(np.shape(next(row for row in rows if row is not None)), np.nan)
     return np.stack([blank if row is None else np.asarray(row, dtype=float) for row in rows])
-
-
-def update_metrics(seen: Mapping[str, Any], bounds: bool = False) -> dict[str, Any]:
-    """Grand mean NIS with its band, and how many were refused, of each sensor that spoke.
-
-    Args:
-        seen: by sensor, an `Update`.
-        bounds: the filter states bounds: what it expects is no covariance, so there is no NIS.
-    """
-    out: dict[str, Any] = {}
-    for sensor, update in seen.items():
-        refused = np.asarray(update.code) == Code.REFUSED
-        used = np.asarray(update.dof) * ~refused
-        if np.any(used) and not bounds:
-            verdict = grand_mean_nis(np.asarray(update.nis), used)
-            out[f"nis_{sensor}"] = verdict.value
-            out[f"nis_{sensor}_band"] = [verdict.low, verdict.high]
-        if np.any(used) or np.any(refused):
-            out[f"refused_{sensor}"] = int(np.sum(refused))
-    return out

@@ -14,7 +14,7 @@ from robins.ins.frames import to_ned_frd
 from robins.ins.magnetometer_calibration import Calibration, calibrated
 from robins.ins.magnetometer_calibration import calibrate as fitted
 from robins.logs import formats_of, open_log
-from robins.logs.clean_mag import clean_mag
+from robins.logs.clean import clean_mag
 from robins.logs.mounting import turned
 from robins.logs.tables import tables_of
 from robins.results import Outcome, Progress, array, silent, variable

@@ -11,16 +11,15 @@ from design_plants import attitude_axis, quaternion, two_states
 from robins.filters.synthesis import (
     NotCertified,
     Unreachable,
-    attempts,
     certify,
     error_system,
     h2_norm,
     kalman_gain,
+    lmi,
     programs,
     spectral_radius,
 )
-from robins.filters.synthesis.full_order import full
-from robins.filters.synthesis.lmi import h2, observer
+from robins.filters.synthesis.lmi import full, observer
 from robins.filters.synthesis.scaling import balanced
 
 
@@ -107,7 +106,7 @@ def test_attitude_designs_of_both_forms(gamma, common, slack):
 @pytest.mark.parametrize("given", [two_states(), attitude_axis(), quaternion()], ids=len)
 def test_without_a_modelling_error_it_is_the_kalman_filter(given):
     best = certify(given, kalman_gain(given), method="kalman").h2
-    for found in (h2(given), observer(given, np.inf, "slack")):
+    for found in (observer(given, np.inf, form) for form in ("common", "slack")):
         assert found.h2 == pytest.approx(best, rel=1e-8)
         assert found.bound == pytest.approx(best, rel=1e-6)
         assert found.gamma == np.inf
@@ -248,7 +247,7 @@ def test_full_order_is_refused_for_the_published_plant_before_any_solver_is_aske
     rate, step, radius, monkeypatch
 ):
     published = quaternion(rate_rad_s=rate * step, euler=True)
-    monkeypatch.setattr(attempts, "solve", lambda *_: pytest.fail("a solver was asked"))
+    monkeypatch.setattr(lmi, "solve", lambda *_: pytest.fail("a solver was asked"))
     with pytest.raises(ValueError, match=rf"spectral radius {radius}.*observer form"):
         full(published, 3.0)
 
@@ -269,7 +268,7 @@ def answers(monkeypatch, *given):
     def solve(scaled, form, aim):
         return next(turn)(programs.solve(scaled, form, aim))
 
-    monkeypatch.setattr(attempts, "solve", solve)
+    monkeypatch.setattr(lmi, "solve", solve)
 
 
 def wrong(answer):
@@ -378,7 +377,7 @@ def test_without_the_solvers_a_design_says_what_to_install(monkeypatch):
 
 def test_importing_the_designs_imports_no_solver():
     code = (
-        "import sys, robins.filters.synthesis.every_step, robins.filters.synthesis.search;"
+        "import sys, robins.filters.synthesis.lmi;"
         "print('cvxpy' in sys.modules, 'clarabel' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -15,8 +15,7 @@ from robins.filters.synthesis import (
     plant,
     spectral_radius,
 )
-from robins.filters.synthesis.full_order import full
-from robins.filters.synthesis.lmi import gain_of, observer
+from robins.filters.synthesis.lmi import full, gain_of, observer
 from robins.filters.synthesis.programs import solve
 from robins.filters.synthesis.scaling import balanced
 

@@ -1,5 +1,6 @@
 """The retuned LMI against the tables and a direct search for the best gain."""
 
+import inspect
 from functools import cache
 
 import numpy as np
@@ -7,9 +8,8 @@ import pytest
 from design_plants import attitude_axis, two_states
 from gain_search import best_by_search
 
-from robins.filters.synthesis import Unreachable, certify, kalman_gain, search
-from robins.filters.synthesis.lmi import observer
-from robins.filters.synthesis.search import retuned
+from robins.filters.synthesis import Unreachable, certify, kalman_gain
+from robins.filters.synthesis.lmi import observer, retuned
 
 
 @cache
@@ -92,4 +92,4 @@ def test_out_of_reach_and_bad_arguments():
     with pytest.raises(ValueError, match="gamma must be positive"):
         retuned(two_states(), 0.0)
     with pytest.raises(ValueError, match="form must be"):
-        search.check_form("full")
+        inspect.unwrap(retuned)(two_states(), 1.0, "full")

@@ -9,13 +9,12 @@ from design_plants import attitude_axis, quaternion, two_states
 from robins.filters.synthesis import (
     METHODS,
     Unreachable,
-    full_order,
     kalman_design,
     least_riccati_gamma,
     lmi,
     plant,
+    retuned,
     riccati,
-    search,
     trade_off,
 )
 
@@ -37,9 +36,9 @@ def test_every_method_is_its_own_design(found):
         "riccati": riccati(p, 1.0),
         "lmi-common": lmi.observer(p, 1.0, "common"),
         "lmi-slack": lmi.observer(p, 1.0, "slack"),
-        "retuned-common": search.retuned(p, 1.0, "common"),
-        "retuned-slack": search.retuned(p, 1.0, "slack"),
-        "full-order": full_order.full(p, 1.0),
+        "retuned-common": retuned(p, 1.0, "common"),
+        "retuned-slack": retuned(p, 1.0, "slack"),
+        "full-order": lmi.full(p, 1.0),
     }
     for name, design in alone.items():
         made = by_name[name, 1.0].design

@@ -6,10 +6,9 @@
 """
 
 from robins.bench.broker.broker import Broker, Wiring
-from robins.bench.broker.errors import BenchError, LinkLost
 from robins.bench.broker.faults import ROUTES, LinkFault
 from robins.bench.broker.injector import Injector, Piece
-from robins.bench.broker.link import Health, Link
+from robins.bench.broker.link import BenchError, Health, Link, LinkLost
 
 __all__ = [
     "ROUTES",

@@ -12,9 +12,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from robins.bench.broker.errors import BenchError, LinkLost
 from robins.bench.broker.injector import Injector
-from robins.bench.broker.link import Link
+from robins.bench.broker.link import BenchError, Link, LinkLost
 from robins.bench.broker.revive import History, beginning, catch_up
 from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame

@@ -23,6 +23,7 @@ from robins.bench.broker.faults import ROUTES, Direction, LinkFault
 from robins.bench.wire.frames import Frame, encode_frame
 from robins.bench.wire.records import decode, encode, size_of
 from robins.bench.wire.schema import FIRST_DATA, PARTS, message
+from robins.rotation import multiply
 
 __all__ = ["ROUTES", "Direction", "Injector", "LinkFault", "Piece"]
 
@@ -272,10 +273,9 @@ def _unsolved(payload: bytes) -> bool:
 
 
 def _turned(payload: bytes, angle_rad: float) -> bytes:
-    """Times a turn about body z, by hand: a bench that compiles nothing starts at once."""
-    w, x, y, z = decode("star", payload)["q_ib"]
-    c, s = math.cos(0.5 * angle_rad), math.sin(0.5 * angle_rad)
-    return _star(payload, np.array([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]))
+    """Times a turn about body z."""
+    about_z = np.array([math.cos(0.5 * angle_rad), 0.0, 0.0, math.sin(0.5 * angle_rad)])
+    return _star(payload, np.asarray(multiply(decode("star", payload)["q_ib"], about_z)))
 
 
 def _blind(payload: bytes) -> bytes:

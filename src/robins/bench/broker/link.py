@@ -19,6 +19,22 @@ from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
 from robins.bench.wire.records import Unsound, unsound
 from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS
+from robins.errors import RobinsError
+
+
+class BenchError(RobinsError, RuntimeError):
+    """A run on the bench that cannot go on; says which part, when and why."""
+
+    bad_input = False
+
+
+class LinkLost(BenchError):
+    """A port whose far end is gone."""
+
+    def __init__(self, part: str, why: OSError):
+        super().__init__(f"the port of '{part}' is gone: {why}")
+        self.part = part
+
 
 Direction = Literal["to", "from"]
 _MOST = 65536  # bytes read at once

@@ -12,9 +12,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from robins.bench.broker.errors import BenchError
-from robins.bench.broker.link import Link
-from robins.bench.parts.memory import is_due
+from robins.bench.broker.link import BenchError, Link
+from robins.bench.parts.station import is_due
 from robins.bench.wire.frames import Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.records import decode, encode

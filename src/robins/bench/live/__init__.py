@@ -7,7 +7,7 @@
 - `static`: the page; no build step, uPlot with its licence beside it.
 """
 
+from robins.bench.live.feed import Signal
 from robins.bench.live.handle import Live
-from robins.bench.live.signals import Signal
 
 __all__ = ["Live", "Signal"]

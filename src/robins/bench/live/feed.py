@@ -4,6 +4,8 @@ To the server: `length u32 | kind u8 | body`, little endian; a body is a sample 
 it, or JSON. Back: JSON, one object a line.
 
     sample: run u32 | sequence u32 | time_s f64 | values f64 ...
+
+The page draws signals, gathered in plots.
 """
 
 from __future__ import annotations
@@ -11,11 +13,67 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+
+Role = Literal["value", "sigma", "limit"]
+
+
+class Signal(NamedTuple):
+    """A number of each sample, and how it is drawn.
+
+    Signals of one plot share `plot`, its title, and their unit. Values of a plot get the colours
+    of x, y, z and a fourth in the order in which they come.
+    """
+
+    name: str
+    unit: str
+    plot: str
+    role: Role = "value"  # "sigma": a band of +-3 about zero; "limit": a dashed line
+    of: str = ""  # for "sigma": the value whose deviation from zero it states
+
+
+def check(signals: Sequence[Signal]) -> None:
+    """Raise if signals cannot be drawn.
+
+    Raises:
+        ValueError: there are none, two of one name, a plot of two units, an unknown role, a sigma
+            of something that is no value of the same plot, or an `of` where there is no sigma.
+    """
+    if not signals:
+        raise ValueError("a live page needs at least one signal")
+    by_name: dict[str, Signal] = {}
+    units: dict[str, str] = {}
+    for s in signals:
+        if s.name in by_name:
+            raise ValueError(f"two signals are named '{s.name}'; names tell them apart")
+        if s.role not in get_args(Role):
+            roles = ", ".join(get_args(Role))
+            raise ValueError(f"signal '{s.name}': role '{s.role}' is none of {roles}")
+        if units.setdefault(s.plot, s.unit) != s.unit:
+            raise ValueError(
+                f"signal '{s.name}' is in {s.unit}, but plot '{s.plot}' is in {units[s.plot]}; "
+                "give it a plot of its own or another unit"
+            )
+        by_name[s.name] = s
+    for s in signals:
+        if s.role != "sigma":
+            if s.of:
+                raise ValueError(f"signal '{s.name}' is a {s.role}; only a sigma is `of` another")
+            continue
+        of = by_name.get(s.of)
+        if of is None or of.role != "value" or of.plot != s.plot:
+            raise ValueError(f"sigma '{s.name}' is of '{s.of}', which is no value of its plot")
+
+
+def as_json(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+    """Signals as the page gets them."""
+    return [s._asdict() for s in signals]
+
 
 HEAD = struct.Struct("<IB")
 SAMPLE_HEAD = struct.Struct("<IId")
@@ -69,3 +127,30 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def latest(events: Sequence[Any], kind: Callable[[Any], Hashable], most: int) -> list[Any]:
+    """As many of the latest events as there is room for, in their order.
+
+    Each kind has the same room, and what one does not need is for the others; so a thousand
+    warnings leave the alarm that came before them.
+
+    Args:
+        events: the oldest first.
+        kind: of an event.
+        most: how many there is room for.
+    """
+    if len(events) <= most:
+        return list(events)
+    left = Counter(kind(one) for one in events)
+    room, kinds = most, len(left)
+    each: dict[Hashable, int] = {}
+    for name, count in sorted(left.items(), key=lambda item: item[1]):
+        each[name] = min(count, room // kinds)
+        room, kinds = room - each[name], kinds - 1
+    kept = []
+    for one in reversed(events):
+        if each[kind(one)]:
+            each[kind(one)] -= 1
+            kept.append(one)
+    return kept[::-1]

@@ -18,9 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from robins.bench.live import feed
-from robins.bench.live.feed import Kind
-from robins.bench.live.latest import latest
-from robins.bench.live.signals import Signal, as_json, check
+from robins.bench.live.feed import Kind, Signal, as_json, check, latest
 
 START_S = 20.0  # most that a server may take to listen
 END_S = 3.0  # most that it may take to end before it is killed

@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from robins.bench.live.feed import EVENTS, RECENT, Kind, sequence_of, to_json
-from robins.bench.live.latest import latest
+from robins.bench.live.feed import EVENTS, RECENT, Kind, latest, sequence_of, to_json
 
 QUEUE = 2 * RECENT  # samples that wait for a page
 

@@ -17,9 +17,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from robins.bench.parts.memory import path_of, put_aside
 from robins.bench.parts.satellite import BUILD
-from robins.bench.parts.station import Station, ready, serve
+from robins.bench.parts.station import Station, path_of, put_aside, ready, serve
 from robins.bench.ports.port import PortError, address, open_port
 
 REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: ask for SCHED_FIFO

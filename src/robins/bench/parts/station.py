@@ -2,25 +2,56 @@
 
 A part is a function from what has reached it to what it sends; what the wire does to frames, and
 the order in which they come, is settled here. Firmware does the same, see `bench/wire/firmware`.
+
+Every so many steps a part puts its memory aside for the one that is started in its place. That one
+goes on from the latest memory that is older than what it is told again, so a death costs
+the time of some hundred steps, however long the run has been. A memory is a file in the folder of
+the bench's processes; the part writes it before it answers the tick of that step.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import select
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from robins.bench.parts.memory import is_due
 from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
 from robins.bench.wire.records import RecordError, decode, encode, size_of
 from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS, PARTS
+
+EVERY = 256  # steps
+
+
+def is_due(step: int) -> bool:
+    """Whether a part puts its memory aside after a step."""
+    return (step + 1) % EVERY == 0
+
+
+def path_of(folder: Path, part: str, step: int) -> Path:
+    """Where the memory of a part after a step is."""
+    return folder / f"{part}.{step}.memory"
+
+
+def put_aside(folder: Path, part: str, step: int, memory: bytes) -> None:
+    """Write a memory, whole or not at all; the one before it stays, older ones go.
+
+    Where it cannot be written, those that are there stay, and the run goes on.
+    """
+    path = path_of(folder, part, step)
+    with contextlib.suppress(OSError):
+        path.with_suffix(".new").write_bytes(memory)
+        os.replace(path.with_suffix(".new"), path)
+        path_of(folder, part, step - 2 * EVERY).unlink(missing_ok=True)
+
 
 HELLO_EACH_S = 0.5
 _MOST = 65536  # bytes read at once

@@ -5,8 +5,16 @@
 """
 
 from robins.bench.ports.line import Line
-from robins.bench.ports.listing import PortInfo, list_ports
-from robins.bench.ports.port import Address, Pair, PortError, address, open_pair, open_port
+from robins.bench.ports.port import (
+    Address,
+    Pair,
+    PortError,
+    PortInfo,
+    address,
+    list_ports,
+    open_pair,
+    open_port,
+)
 
 __all__ = [
     "Address",

@@ -22,6 +22,7 @@ class Line:
 
     Attributes:
         dropped: bytes so far that found no room.
+        backlog: bytes sent and not taken yet.
     """
 
     def __init__(self, baud: int, bits_per_byte: int = BITS_PER_BYTE, most: int = 65536) -> None:
@@ -42,20 +43,20 @@ class Line:
         self._baud = baud
         self._most = most
         self._byte = bits_per_byte * _SECOND_NS  # time of one byte, in ns times baud
-        self._backlog = 0
+        self.backlog = 0
         # bursts without a pause: when the first byte left begins [ns times baud], what is left
         self._bursts: deque[tuple[int, bytes]] = deque()
         self._free = 0  # when the last byte is through; times begin at 0
 
     def send(self, data: bytes, now_ns: int) -> None:
         """Put bytes on the line; they begin now, or when those before them are through."""
-        room = self._most - self._backlog
+        room = self._most - self.backlog
         self.dropped += max(0, len(data) - room)
         if kept := bytes(data[:room]):
             begin = max(now_ns * self._baud, self._free)
             self._bursts.append((begin, kept))
             self._free = begin + len(kept) * self._byte
-            self._backlog += len(kept)
+            self.backlog += len(kept)
 
     def take(self, now_ns: int) -> bytes:
         """The bytes that are through by now and were not taken before."""
@@ -72,7 +73,7 @@ class Line:
                 self._bursts.appendleft((begin + through * self._byte, left[through:]))
                 break
         taken = b"".join(out)
-        self._backlog -= len(taken)
+        self.backlog -= len(taken)
         return taken
 
     @property
@@ -81,11 +82,6 @@ class Line:
         if not self._bursts:
             return None
         return -(-(self._bursts[0][0] + self._byte) // self._baud)
-
-    @property
-    def backlog(self) -> int:
-        """Bytes sent and not taken yet."""
-        return self._backlog
 
 
 def load(

@@ -3,6 +3,8 @@
 A link of the bench has two ends. Without hardware both are those of a pseudo-terminal: the bench
 holds the master, the part opens the path of the slave like any serial port. With hardware the part
 is a board, and the bench opens the device itself.
+
+`list_ports` lists those of this machine, and says whether we may use them.
 """
 
 from __future__ import annotations
@@ -13,11 +15,14 @@ import os
 import stat
 import termios
 import tty
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import serial
-from serial.tools import list_ports
+from serial.tools import list_ports as system
+from serial.tools.list_ports import comports
+from serial.tools.list_ports_common import ListPortInfo
 
 from robins.errors import RobinsError
 
@@ -26,12 +31,6 @@ BAUD = 460800
 
 class PortError(RobinsError, ValueError):
     """A port that cannot be had; says which, why, and what to do."""
-
-
-class PortLostError(RobinsError, ConnectionError):
-    """The far end of an open port is gone: pulled out, switched off, or its program ended."""
-
-    bad_input = False
 
 
 class Address(NamedTuple):
@@ -63,7 +62,7 @@ def obstacle(path: str) -> str:
     try:
         kind = os.stat(path).st_mode
     except OSError:
-        there = ", ".join(sorted(p.device for p in list_ports.comports())) or "none"
+        there = ", ".join(sorted(p.device for p in comports())) or "none"
         return f"there is no such path; serial ports of this machine: {there}"
     if not stat.S_ISCHR(kind):
         return "it is no character device; a serial port is one such as /dev/ttyUSB0"
@@ -115,30 +114,6 @@ def open_port(at: Address, timeout_s: float | None = 0.0) -> serial.Serial:
     return port
 
 
-def receive(port: serial.Serial) -> bytes:
-    """All that has come in; waits for a first byte as long as the port's timeout says.
-
-    Raises:
-        PortLostError: the far end is gone.
-    """
-    try:
-        return port.read(max(1, port.in_waiting))
-    except (OSError, termios.error) as error:
-        raise PortLostError(f"the far end is gone ({error})", f"port '{port.port}'") from None
-
-
-def send(port: serial.Serial, data: bytes) -> None:
-    """Write all of it.
-
-    Raises:
-        PortLostError: the far end is gone.
-    """
-    try:
-        port.write(data)
-    except (OSError, termios.error) as error:
-        raise PortLostError(f"the far end is gone ({error})", f"port '{port.port}'") from None
-
-
 @dataclass
 class Pair:
     """Two ends of a pseudo-terminal, as a cable between bench and part; closes as a context.
@@ -181,3 +156,76 @@ def open_pair() -> Pair:
     tty.setraw(slave)
     os.set_blocking(master, False)
     return Pair(master, slave, os.ttyname(slave))
+
+
+EXAMPLE = "gyro"  # the part that the next command is shown with
+
+
+class PortInfo(NamedTuple):
+    """A port that the system knows. Texts are empty where nothing is known."""
+
+    path: str
+    description: str
+    manufacturer: str
+    serial_number: str
+    usable: bool  # whether we may open it; who else has it open shows only when it is opened
+    why: str  # it is not usable, with what to do
+
+
+def list_ports() -> list[PortInfo]:
+    """All ports by path. None is opened, since that restarts some boards."""
+    found = (_info(p) for p in system.comports())
+    return sorted(found, key=lambda info: (_letters(info.path), _number(info.path), info.path))
+
+
+def _info(port: ListPortInfo) -> PortInfo:
+    why = obstacle(port.device)
+    texts = (_known(t) for t in (port.description, port.manufacturer, port.serial_number))
+    return PortInfo(port.device, *texts, usable=not why, why=why)
+
+
+def _known(text: str | None) -> str:
+    return "" if text is None or text == "n/a" else text
+
+
+def _letters(path: str) -> str:
+    return path.rstrip("0123456789")
+
+
+def _number(path: str) -> int:
+    """So that ttyUSB10 comes after ttyUSB9."""
+    digits = path[len(_letters(path)) :]
+    return int(digits) if digits else -1
+
+
+def table(ports: Sequence[PortInfo]) -> str:
+    """The ports for people, with what to type next."""
+    if not ports:
+        return (
+            "No serial port found.\n"
+            "A USB adapter appears as /dev/ttyUSB0 or /dev/ttyACM0 as soon as it is plugged in: "
+            "try another cable (some only charge), and look at what `dmesg` says of it.\n"
+            "In a container or a virtual machine the device has to be passed in, for example by "
+            "--device /dev/ttyUSB0.\n"
+            "No hardware is needed for a run: without --node every part talks over a "
+            "pseudo-terminal:\n"
+            "  robins bench up satellite/s1"
+        )
+    head = ("port", "device", "maker", "serial number", "usable")
+    rows = [
+        (p.path, p.description, p.manufacturer, p.serial_number, "yes" if p.usable else "no")
+        for p in ports
+    ]
+    widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in (head, *rows)
+    ]
+    lines += [f"{p.path}: {p.why}" for p in ports if not p.usable]
+    usable = [p for p in ports if p.usable]
+    if usable:
+        # a port that tells what it is has been plugged in; a built-in one may have no socket
+        likely = next((p for p in usable if p.description), usable[0])
+        given = f"robins bench up satellite/s1 --node {EXAMPLE}={likely.path},{BAUD}"
+        lines += ["", "To put a board in the place of a part:", f"  {given} --clock realtime"]
+    return "\n".join(lines)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Literal
 
-from robins.bench.broker.errors import BenchError
+from robins.bench.broker.link import BenchError
 
 Overrun = Literal["continue", "skip", "abort"]
 _SPIN_NS = 200_000  # before a deadline from which on we do not sleep

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robins.bench.parts.memory import path_of
 from robins.bench.parts.node import REALTIME
+from robins.bench.parts.station import path_of
 
 _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 _GRACE_S = 2.0  # between being told and being killed

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from robins.bench.live.latest import latest
+from robins.bench.live.feed import latest
 from robins.bench.run import telemetry
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, counted_from

@@ -15,10 +15,9 @@ import numpy as np
 
 from robins import __version__
 from robins.bench.broker.broker import Broker, Wiring
-from robins.bench.broker.errors import BenchError
 from robins.bench.broker.faults import ROUTES, LinkFault
 from robins.bench.broker.injector import Injector
-from robins.bench.broker.link import Direction, Health, Link
+from robins.bench.broker.link import BenchError, Direction, Health, Link
 from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
 from robins.bench.parts.satellite import BUILD, Kit
@@ -92,8 +91,9 @@ class Session:
         latencies: so far.
         telemetry: so far.
         injector: its faults; more may be added while it runs.
+        kit: what its parts are made from.
         crew: the processes.
-        broker: the middle.
+        clock: when a step begins.
         done: steps so far.
         step_ms: how long the last step took.
         pace: steps a second, of late.
@@ -129,8 +129,17 @@ class Session:
         self.steps = steps_of(flight)
         setup = flight.setup
         self.ports = {part: address(text) for part, text in setup.ports.items()}
-        self._record_path, self._kit = record, kit
+        if kit is None:
+            self._tell(0.0, "preparing")
+            kit = kit_of(flight)
+        self.kit = kit
+        self.telemetry = Telemetry(self.steps, kit.step_ns)
+        self.crew = Crew(kit, setup.fifo, setup.on_death == "restart")
         self.injector = Injector(setup.faults, setup.seed)
+        self.clock = LockStep() if setup.clock == "lockstep" else real_time(flight)
+        self._broker: Broker | None = None  # until the links are open
+        self._record_path = record
+        self._recorder: Recorder | None = None
         self.latencies = Latencies()
         self.events: list[Event] = []
         self.deaths = 0
@@ -155,18 +164,11 @@ class Session:
         Raises:
             KeyboardInterrupt: after all processes have ended and the record is whole.
         """
-        setup = self.flight.setup
-        if self._kit is None:
-            self._tell(0.0, "preparing")
-            self._kit = kit_of(self.flight)
-        self.kit = self._kit
-        self.telemetry = Telemetry(self.steps, self.kit.step_ns)
         failure, done, seconds = "", 0, 0.0
         with contextlib.ExitStack() as stack:
             self._recorder = self._open_record(stack)
-            restarts = setup.on_death == "restart"
-            self.crew = stack.enter_context(Crew(self.kit, setup.fifo, restarts))
-            self.broker = self._wire(stack)
+            stack.enter_context(self.crew)
+            self._broker = self._wire(stack)
             began = time.monotonic()
             try:
                 self._tell(0.0, "waiting for the parts")
@@ -203,15 +205,8 @@ class Session:
 
     def _go(self) -> int:
         """All steps."""
-        setup = self.flight.setup
-        rate = setup.rate or 1.0 / self.flight.loop.step
-        self.clock = (
-            LockStep()
-            if setup.clock == "lockstep"
-            else RealTime(rate, setup.overrun, setup.patience)
-        )
         told, counted, since = 0.0, 0, time.monotonic()
-        with few_collections(), realtime(setup.fifo) as refused:
+        with few_collections(), realtime(self.flight.setup.fifo) as refused:
             if refused:
                 self.event("scheduler", refused)
             for k in range(self.steps):
@@ -364,9 +359,15 @@ class Session:
     # -------------------------------------------------------------------------------- looking on
 
     @property
+    def broker(self) -> Broker:
+        """The middle, once the links are open."""
+        assert self._broker is not None
+        return self._broker
+
+    @property
     def time_s(self) -> float:
         """Of the run."""
-        return self.broker.time_ns * 1e-9 if hasattr(self, "broker") else 0.0
+        return 0.0 if self._broker is None else self._broker.time_ns * 1e-9
 
     @property
     def paused(self) -> bool:
@@ -474,6 +475,12 @@ class Session:
         """
         for death in self.crew.deaths(part):
             raise _DiedAgainError(death)
+
+
+def real_time(flight: Flight) -> RealTime:
+    """The clock of a run in real time."""
+    setup = flight.setup
+    return RealTime(setup.rate or 1.0 / flight.loop.step, setup.overrun, setup.patience)
 
 
 def kit_of(flight: Flight) -> Kit:

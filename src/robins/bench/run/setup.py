@@ -12,7 +12,6 @@ end = "601 s"
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -22,6 +21,7 @@ import pydantic
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
 from robins.bench.wire.schema import PARTS
+from robins.errors import hint
 from robins.scenario import Parameters, Quantity, ScenarioError, default
 from robins.sim.rate_table import RateTable, rate_table
 from robins.systems.satellite import SYSTEM
@@ -91,12 +91,8 @@ class Setup(Parameters):
         if self.rate is not None and self.clock == "lockstep":
             raise ValueError('rate: a clock in lock-step has none; choose the clock "realtime"')
         if self.filter not in FILTERS:
-            near = difflib.get_close_matches(self.filter, FILTERS, 1)
-            guess = f"; did you mean '{near[0]}'?" if near else "."
-            raise ValueError(
-                f"filter: no filter '{self.filter}' for the satellite{guess} It has "
-                f"{', '.join(FILTERS)}"
-            )
+            guess = f"{hint(self.filter, FILTERS)} It has {', '.join(FILTERS)}"
+            raise ValueError(f"filter: no filter '{self.filter}' for the satellite{guess}")
         return self
 
 
@@ -144,11 +140,8 @@ def _text(name: str) -> tuple[str, bool]:
     theirs = [f"satellite/{k}" for k in SYSTEM.scenarios]
     if name not in theirs:
         known = [*ours, *theirs]
-        near = difflib.get_close_matches(name, known, 1)
-        guess = f"; did you mean '{near[0]}'?" if near else "."
-        raise ScenarioError(
-            [f"no scenario '{name}' for the bench{guess} It has {', '.join(known)}"]
-        )
+        guess = f"{hint(name, known)} It has {', '.join(known)}"
+        raise ScenarioError([f"no scenario '{name}' for the bench{guess}"])
     return "", False
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from robins.bench.wire.records import decode
-from robins.bench.wire.schema import FLAGS, WHEELS
+from robins.bench.wire.schema import FLAGS, HELD, REFUSED, SAFE, SHORT, SILENT, USED, WHEELS
+from robins.rotation import conjugate, multiply, to_rotvec
 
 ARCSEC = np.pi / 648000.0
 _KEPT = ("motion", "estimate", "innovation", "star", "gyro", "wheels")
@@ -92,15 +93,7 @@ def padded(momenta: np.ndarray) -> np.ndarray:
 
 def turn(q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
     """(E, 3) rotation vectors [rad] of conj(q_from) q_to, in the axes of the first."""
-    w0, v0 = q_from[..., :1], -q_from[..., 1:]
-    w1, v1 = q_to[..., :1], q_to[..., 1:]
-    w = w0 * w1 - np.sum(v0 * v1, -1, keepdims=True)
-    v = w0 * v1 + w1 * v0 + np.cross(v0, v1)
-    v = np.where(w < 0.0, -v, v)
-    half = np.arctan2(np.linalg.norm(v, axis=-1, keepdims=True), np.abs(w))
-    size = np.linalg.norm(v, axis=-1, keepdims=True)
-    scale = np.divide(2.0 * half, size, out=np.full_like(size, 2.0), where=size > 0.0)
-    return scale * v
+    return np.asarray(to_rotvec(multiply(conjugate(q_from), q_to)))
 
 
 def attitude_error(flown: Flown) -> np.ndarray:
@@ -145,3 +138,50 @@ def difference(flown: Flown, loop: Any) -> float:
             return float("inf")
         worst = max(worst, float(np.max(off, initial=0.0)))
     return worst
+
+
+Level = Literal["info", "warning", "alarm"]
+_OF_FRAMES = USED | REFUSED | SHORT  # said of a star frame, so nothing between two frames
+
+
+class Said(NamedTuple):
+    """Something to tell people."""
+
+    level: Level
+    text: str
+
+
+class Alarms:
+    """Listens to the flags of one estimate after another."""
+
+    def __init__(self) -> None:
+        self._stands = 0  # flags that were said to have begun and not to have ended
+        self._frames = 0  # refused in a row
+
+    def hear(self, flags: int) -> list[Said]:
+        """What there is to say of the next estimate.
+
+        A sensor whose frames are refused one after another is said so once, and how many there were
+        when one is used again.
+        """
+        now, begun = flags, self._stands
+        if not flags & _OF_FRAMES:  # no frame: what was said of the last one stands
+            now |= begun & (REFUSED | SHORT)
+        new, over = now & ~begun, begun & ~now
+        if flags & REFUSED:
+            self._frames = 1 if new & REFUSED else self._frames + 1
+        self._stands = now & ~USED
+        said = []
+        if new & REFUSED:
+            said.append(Said("alarm", "star refused"))
+        if over & REFUSED:
+            frames = "one frame was" if self._frames == 1 else f"{self._frames} frames were"
+            said.append(Said("info", f"star used again, {frames} refused"))
+        for flag in (HELD, SILENT, SHORT):
+            if new & flag:
+                said.append(Said("warning", FLAGS[flag.bit_length() - 1]))
+        if new & SAFE:
+            said.append(Said("alarm", FLAGS[SAFE.bit_length() - 1]))
+        if over & SAFE:
+            said.append(Said("info", "the estimate can be steered by again"))
+        return said

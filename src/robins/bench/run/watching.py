@@ -11,10 +11,9 @@ import numpy as np
 
 from robins.bench.live import Live, Signal
 from robins.bench.run import telemetry
-from robins.bench.run.alarms import Alarms
 from robins.bench.run.session import Session
 from robins.bench.run.setup import Flight, steps_of
-from robins.bench.run.telemetry import ARCSEC
+from robins.bench.run.telemetry import ARCSEC, Alarms
 from robins.bench.status import STARTING, Status
 from robins.bench.wire.schema import FLAGS
 

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg
-from robins.filters.belief import Number
+from robins.errors import require
+from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
 
 Weights = ArrayLike | Sequence[Number] | None
@@ -162,25 +163,19 @@ def faded(
     return jnp.sqrt(jnp.maximum(weights * factor, 1.0))[:, None] * S, factor
 
 
-def checked_weights(rule: str, weights: Weights) -> np.ndarray | None:
-    """Weights of states, scaled to a greatest of 1.
-
-    Raises:
-        ValueError: some are negative or not finite, or none is positive.
-    """
+def checked_weights(rule: str, weights: Weights, form: str) -> np.ndarray | None:
+    """Weights a_j of the states for the form "multiple", scaled to a greatest of 1."""
     if weights is None:
         return None
-    w = np.asarray(weights, dtype=float)
-    if w.ndim != 1 or not np.all(np.isfinite(w)) or np.any(w < 0.0) or not np.any(w > 0.0):
-        raise ValueError(f"{rule} weights must be (n,) numbers >= 0, not all 0, got {weights}")
-    return w / np.max(w)
+    require(form == "multiple", f"{rule} weights are for 'multiple', not {form!r}")
+    a = np.asarray(weights, dtype=float)
+    sound = a.ndim == 1 and np.all(np.isfinite(a) & (a >= 0.0)) and np.any(a > 0.0)
+    require(sound, f"{rule} weights must be (n,) numbers >= 0, not all 0", weights)
+    return a / np.max(a)
 
 
-def check_size(rule: str, weights: np.ndarray | None, n: int) -> None:
-    """One weight a state.
-
-    Raises:
-        ValueError: there are more or fewer.
-    """
-    if weights is not None and len(weights) != n:
-        raise ValueError(f"{rule} weights are {len(weights)}, the state has {n} components")
+def check_size(rule: str, a: np.ndarray | None, belief: Belief) -> None:
+    """Refuse more or fewer weights than the state has components."""
+    n = belief.factor.shape[0]
+    count = n if a is None else len(a)
+    require(count == n, f"{rule} weights are {count}, the state has {n} components")

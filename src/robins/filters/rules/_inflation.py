@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.belief import Belief
+from robins.filters.checks import finite_numbers
 from robins.manifold import State
 
 Weight = Callable[[State], Array]  # mean -> (q, n)
@@ -23,21 +25,11 @@ def as_weight(weight: Any, whose: str) -> Weight:
     Args:
         weight: (q, n) matrix, (n,) diagonal, or ``mean -> `` one of these.
         whose: rule it belongs to, for messages.
-
-    Raises:
-        TypeError: it is not made of real numbers.
-        ValueError: it has another shape, is not finite or says that nothing counts.
     """
     if callable(weight):
         return lambda mean: _rows(jnp.asarray(weight(mean), float), whose)
-    numbers = np.asarray(weight)
-    if numbers.dtype.kind not in "iuf":
-        raise TypeError(f"{whose}: weight holds {numbers.dtype}, real numbers are wanted")
-    numbers = numbers.astype(float)
-    if not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{whose}: weight has entries that are not finite numbers")
-    if not np.any(numbers):
-        raise ValueError(f"{whose}: weight is zero, so no error would count")
+    numbers = finite_numbers(f"{whose}: weight", weight)
+    require(np.any(numbers), f"{whose}: weight is zero, so no error would count")
     if numbers.ndim == 1:
         numbers = np.diag(numbers)
     if numbers.ndim == 2:
@@ -56,11 +48,7 @@ def _rows(L: Array, whose: str) -> Array:
 
 
 def weighted_factor(weight: Weight, belief: Belief, whose: str) -> Float[Array, "q n"]:
-    """L S, whose greatest singular value is the local bound.
-
-    Raises:
-        ValueError: L has another number of columns than the state has components.
-    """
+    """L S, whose greatest singular value is the local bound."""
     L, n = weight(belief.mean), belief.factor.shape[0]
     if L.shape[1] != n:
         raise ValueError(f"{whose}: weight has {L.shape[1]} columns, the state has {n} components")

@@ -41,21 +41,9 @@ def numbered(name: str, values: Array) -> dict[str, Array]:
     return {f"{name}.{i}": values[i] for i in range(len(values))}
 
 
-def check_forgetting(rule: str, forgetting: Number) -> None:
-    """A share that is kept from sample to sample.
-
-    Raises:
-        ValueError: it is not in (0, 1].
-    """
+def check(rule: str, forgetting: Number, floor: Number, ceiling: Number) -> None:
+    """The share that is kept from sample to sample, and the bounds of a scale that begins at 1."""
     require(0.0 < forgetting <= 1.0, f"{rule} forgetting must lie in (0, 1]", forgetting)
-
-
-def check_band(rule: str, floor: Number, ceiling: Number) -> None:
-    """Bounds of a scale, which begins at 1.
-
-    Raises:
-        ValueError: not 0 < floor <= 1 <= ceiling < infinity.
-    """
     require(0.0 < floor <= 1.0, f"{rule} floor must lie in (0, 1]", floor)
-    if not 1.0 <= ceiling < float("inf"):
-        raise ValueError(f"{rule} ceiling must be finite and not below 1, got {ceiling}")
+    finite = 1.0 <= ceiling < float("inf")
+    require(finite, f"{rule} ceiling must be finite and not below 1", ceiling)

@@ -25,7 +25,6 @@ class AdaptiveMemory(NamedTuple):
     dof: Array  # (window,) components used in them
     at: Array  # () where in the ring this step is
     inverse: Array  # () 1 / xi of the last step; 0 before there was one
-    events: Array  # () steps in which P was compensated
 
 
 def adaptive_h_infinity(
@@ -65,7 +64,7 @@ def adaptive_h_infinity(
         ceiling: largest alpha.
         compensate_first: as the patent orders it: where P does not allow the xi of the step before,
             shrink it (``policy="compensate"`` of `h_infinity`, to 0.95 xi^2) before choosing the
-            new one. This claims knowledge that nobody has.
+            new one. The smaller P has no justification in the data.
 
     Raises:
         TypeError: the weight is not of real numbers.
@@ -85,8 +84,8 @@ def adaptive_h_infinity(
 
     def init(belief: Belief, dims):
         _inflation.weighted_factor(rows, belief, NAME)
-        counts = jnp.zeros((), int)
-        return AdaptiveMemory(jnp.zeros(window), jnp.zeros(window), counts, jnp.zeros(()), counts)
+        ring = jnp.zeros(window)
+        return AdaptiveMemory(ring, ring, jnp.zeros((), int), jnp.zeros(()))
 
     def compensate(memory: AdaptiveMemory, factor: Array, weighted: Array):
         """The factor that allows the last xi, and whether it had to be made."""
@@ -130,7 +129,6 @@ def adaptive_h_infinity(
             dof=memory.dof.at[following].multiply(jnp.where(counts, 0.0, 1.0)),
             at=following,
             inverse=jnp.where(counts, inverse, memory.inverse),
-            events=memory.events + (counts & asked).astype(int),
         )
         code = jnp.where(counts & ~exists, int(Code.INFEASIBLE), int(Code.DONE))
         return memory, belief._replace(factor=jnp.where(acts, wide, belief.factor)), code

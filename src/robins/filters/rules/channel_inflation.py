@@ -1,19 +1,20 @@
-"""Take a modelling error for noise."""
+"""Treat a modelling error as process noise."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.errors import require
+from robins.filters.belief import Belief, Number
+from robins.filters.checks import finite_numbers
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
+from robins.manifold import State
 
 
 def channel_inflation(lambda_: Number, B: Any) -> Rule:
@@ -39,41 +40,31 @@ def channel_inflation(lambda_: Number, B: Any) -> Rule:
         ValueError: lambda is negative or not finite, B is no matrix or not finite; when the filter
             is run, B has another number of rows than the state has components.
     """
-    if not 0.0 <= lambda_ < math.inf:
-        raise ValueError(f"channel_inflation lambda must be a number from 0 on, got {lambda_}")
-    fixed = None if callable(B) else _matrix(B)
+    finite = 0.0 <= lambda_ < math.inf
+    require(finite, "channel_inflation lambda must be a number from 0 on", lambda_)
+    fixed = None if callable(B) else jnp.asarray(finite_numbers("channel_inflation B", B))
+    shape = (0, 0) if fixed is None else fixed.shape
+    require(len(shape) == 2, f"channel_inflation B has shape {shape}, (n, q) is wanted")
     share = math.sqrt(lambda_)
 
+    def rows(mean: State, n: int) -> Array:
+        given = jnp.asarray(B(mean), float) if fixed is None else fixed
+        fits = given.ndim == 2 and given.shape[0] == n
+        require(fits, f"channel_inflation B is {given.shape}, the state needs ({n}, q)")
+        return given
+
     def init(belief: Belief, dims):
-        _rows(B(belief.mean) if fixed is None else fixed, belief.factor.shape[0])
+        rows(belief.mean, belief.factor.shape[0])
         return ()
 
     def process(memory, transition: Transition):
         if share == 0.0:
             return memory, transition
-        given = B(transition.mean) if fixed is None else fixed
-        channel = share * _rows(given, transition.spread.shape[0])
+        channel = share * rows(transition.mean, transition.spread.shape[0])
         noise = jnp.concatenate([transition.noise, channel], axis=1)
         return memory, transition._replace(noise=noise)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        said = jnp.asarray(float(lambda_))
-        return memory, posterior, info.noted("channel_inflation", lambda_=said)
+    def before(memory, prior: Belief, o: Observation):
+        return memory, prior, o.noted("channel_inflation", lambda_=jnp.asarray(float(lambda_)))
 
-    return Rule(init=init, process=process, after=after, name="channel_inflation")
-
-
-def _matrix(B: Any) -> Array:
-    numbers = np.asarray(B, float)
-    if numbers.ndim != 2:
-        raise ValueError(f"channel_inflation B has shape {numbers.shape}, (n, q) is wanted")
-    if not np.all(np.isfinite(numbers)):
-        raise ValueError("channel_inflation B has entries that are not finite numbers")
-    return jax.device_put(numbers)
-
-
-def _rows(B: Any, n: int) -> Array:
-    B = jnp.asarray(B, float)
-    if B.ndim != 2 or B.shape[0] != n:
-        raise ValueError(f"channel_inflation B is {B.shape}, the state needs ({n}, q)")
-    return B
+    return Rule(init=init, process=process, before=before, name="channel_inflation")

@@ -1,8 +1,7 @@
-"""Reckon with what is not to be estimated."""
+"""Account for states that are not estimated: the Schmidt filter."""
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -72,29 +72,23 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
 def _chosen(states: Sequence[Any] | ArrayLike) -> np.ndarray:
     """Indices, or a mask of booleans."""
     given = np.asarray(states)
-    if given.size == 0:
-        return np.zeros(0, int)
-    if given.ndim == 1 and given.dtype == bool:
-        return given
-    try:
-        indices = [operator.index(i) for i in given.reshape(-1).tolist()]
-    except TypeError:
-        indices = [-1]
-    if given.ndim != 1 or min(indices) < 0 or len(set(indices)) < len(indices):
-        raise ValueError(
-            "consider states must be different indices, counted from 0, or a mask of booleans, "
-            f"got {states}"
-        )
+    given = given if given.size else np.zeros(0, int)
+    indices = given.dtype.kind in "iu" and not np.any(given < 0)
+    sound = given.dtype == bool or (indices and len(np.unique(given)) == given.size)
+    require(
+        given.ndim == 1 and sound,
+        "consider states must be different indices, counted from 0, or a mask of booleans",
+        states,
+    )
     return given
 
 
 def _mask(chosen: np.ndarray, n: int) -> np.ndarray:
     if chosen.dtype == bool:
-        if chosen.shape != (n,):
-            raise ValueError(f"consider mask is {chosen.shape}, the state needs ({n},)")
+        require(chosen.shape == (n,), f"consider mask is {chosen.shape}, the state needs ({n},)")
         return chosen
-    if chosen.size and int(np.max(chosen)) >= n:
-        raise ValueError(f"consider has state {np.max(chosen)}, the last one is {n - 1}")
+    last = np.max(chosen, initial=-1)
+    require(last < n, f"consider has state {last}, the last one is {n - 1}")
     mask = np.zeros(n, bool)
     mask[chosen] = True
     return mask

@@ -1,4 +1,4 @@
-"""Update with a gain that was designed beforehand."""
+"""Update with a gain that was designed offline."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg, manifold
+from robins.errors import require
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.checks import finite_numbers
 from robins.filters.kalman import FilterState
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
@@ -20,7 +22,6 @@ class Fixed(NamedTuple):
     """Memory of the rule. Gains are data: exchange them in a state, and nothing compiles anew."""
 
     gains: dict[str, Array]  # (n, m) by sensor
-    prior: Belief  # of the last update
 
 
 def constant_gain(gains: Mapping[str, Any]) -> Rule:
@@ -32,7 +33,7 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
     holds for any gain (Joseph's form; Brown & Hwang 2012, eq. 4.2.11), so the stated sigma is that
     of this filter in this model, not of the best one, and grows while the sensor is lost. Columns
     of components that are missing or refused are left out. Put it last, so that rules that fade the
-    prior come before it; sensors without a gain are updated as ever.
+    prior come before it; sensors without a gain are updated as usual.
 
     Notes: ``constant_gain.moved``, the largest component that the update moved the mean by.
 
@@ -43,27 +44,22 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
         ValueError: no gain, one with entries that are not finite; by `init`, a sensor that the
             model does not have or a gain that does not fit.
     """
-    if not gains:
-        raise ValueError("constant_gain: give at least one gain, {'sensor': (n, m) array}")
-    given = {name: jnp.asarray(value, float) for name, value in gains.items()}
-    for name, K in given.items():
-        if not bool(jnp.all(jnp.isfinite(K))):
-            raise ValueError(f"constant_gain: the gain of '{name}' has entries that are not finite")
+    require(gains, "constant_gain: give at least one gain, {'sensor': (n, m) array}")
+    given = {
+        name: jnp.asarray(finite_numbers(f"constant_gain: the gain of '{name}'", value))
+        for name, value in gains.items()
+    }
 
     def init(belief: Belief, dims: Mapping[str, int]) -> Fixed:
         n = belief.factor.shape[0]
         for name, K in given.items():
-            if name not in dims:
-                raise ValueError(f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
+            require(name in dims, f"constant_gain: no sensor '{name}'; this model has {list(dims)}")
             if K.shape != (n, dims[name]):
                 raise ValueError(
                     f"constant_gain: the gain of '{name}' is {K.shape}, state and sensor need "
                     f"({n}, {dims[name]})"
                 )
-        return Fixed(given, belief)
-
-    def before(memory: Fixed, prior: Belief, o: Observation):
-        return memory._replace(prior=prior), prior, o
+        return Fixed(given)
 
     def after(memory: Fixed, posterior: Belief, info: StepInfo, o: Observation):
         if o.sensor not in memory.gains:
@@ -71,17 +67,17 @@ def constant_gain(gains: Mapping[str, Any]) -> Rule:
         spread, excess, noise, deficit, used = left_out(o)
         used = used & info.used
         K = jnp.where(used[None, :], memory.gains[o.sensor], 0.0)
-        S = memory.prior.factor
+        S = o.prior.factor
         moved = K @ jnp.where(used, o.residual, 0.0)
         factor = linalg.tria(S - K @ spread, K @ excess, K @ noise)
         if deficit is not None:
             factor = linalg.downdate(factor, K @ deficit)
-        belief = Belief(manifold.retract(memory.prior.mean, moved), factor)
+        belief = Belief(manifold.retract(o.prior.mean, moved), factor)
         belief = select(jnp.any(used), belief, posterior)
         info = info._replace(gain=K).noted("constant_gain", moved=jnp.max(jnp.abs(moved)))
         return memory, belief, info
 
-    return Rule(init=init, before=before, after=after, name="constant_gain")
+    return Rule(init=init, after=after, name="constant_gain")
 
 
 def with_gains(state: FilterState, gains: Mapping[str, Any]) -> FilterState:

@@ -1,4 +1,4 @@
-"""Agree with most of the measurement: maximum correntropy."""
+"""Maximum correntropy: weigh components by a Gaussian kernel of their residuals."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._shares import shares
+from robins.filters.rules._robust import shares
 
 
 def _least(e: Array) -> Array:
@@ -67,14 +67,9 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
 
         return jax.lax.fori_loop(0, iterations, better, jnp.ones(len(own)))
 
-    def init(belief, dims):
-        return jnp.ones(())  # of the update under way
-
     def before(memory, prior: Belief, o: Observation):
         w = weights(o)
-        return jnp.min(w), prior, o._replace(noise=o.noise / jnp.sqrt(w)[:, None])
+        o = o._replace(noise=o.noise / jnp.sqrt(w)[:, None])
+        return memory, prior, o.noted("correntropy", weight=jnp.min(w))
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        return jnp.ones(()), posterior, info.noted("correntropy", weight=memory)
-
-    return Rule(init=init, before=before, after=after, name="correntropy")
+    return Rule(before=before, name="correntropy")

@@ -1,21 +1,22 @@
-"""Tell outliers from model errors by how long they last: weigh the ones, fade for the others."""
+"""Tell outliers from model errors by how long they last; weigh outliers down, fade for errors."""
 
 from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
-from robins.filters.chi_square import limits
+from robins.filters.belief import Belief, Number
+from robins.filters.checks import one_of
+from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
-from robins.filters.rules._quantile import scale_to_quantile
+from robins.filters.rules._robust import scale_to_quantile
 
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
@@ -29,22 +30,9 @@ class Verdict(IntEnum):
     MODEL = 2
 
 
-class _Said(NamedTuple):
-    """Of the update under way; between updates as if there was nothing to say."""
-
-    weight: Array  # of the measurement's covariance R: 1 / s, 0 where refused
-    factor: Array  # lambda
-    state: Array  # a `Verdict`
-
-
 class _Memory(NamedTuple):
     power: dict[str, Array]  # (m,) averaged squares of each sensor's whitened residuals
     counter: dict[str, Array]  # () measurements in a row that were too large to be chance
-    said: _Said
-
-
-def _nothing() -> _Said:
-    return _Said(jnp.ones(()), jnp.ones(()), jnp.asarray(int(Verdict.CLEAN)))
 
 
 def discriminator(
@@ -69,16 +57,16 @@ def discriminator(
                            lambda = (tr V - m) / tr H P H'
 
     with r, H whitened by R^-1/2 as in `strong_tracking`, and "significantly" as its "ewma" has it.
-    Faded is only what the channel sees ("projected": P + (lambda-1) P H' (H P H')^+ H P), or
-    Lam^1/2 P Lam^1/2, Lam_j = max(1, a_j lambda), by weights a_j ("multiple").
+    "projected" fades only what the channel sees, P + (lambda-1) P H' (H P H')^+ H P; "multiple"
+    fades by weights a_j, Lam^1/2 P Lam^1/2 with Lam_j = max(1, a_j lambda).
 
     A true change with g > k2 from the start goes unnoticed for ``patience`` measurements, and a
     fault of the sensor that lasts longer is taken for a change of the model: patience is a
     statement about how long the sensor's faults last.
 
-    Noted are ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
+    Notes: ``discriminator.weight`` (1 / s, 0 if refused), ``.lambda``, ``.counter`` (c) and
     ``.state`` (a `Verdict`: 0 clean, 1 outlier, 2 the model is wrong: faded, or c >= patience).
-    What is missing, refused by a rule before or has no noise of its own leaves V and c alone. The
+    A component that is missing, refused before or without noise does not change V and c. The
     Kalman filter is ``probability=1`` with ``threshold=inf`` or ``limit=1``.
 
     Args:
@@ -100,25 +88,21 @@ def discriminator(
     require(patience >= 1, "discriminator patience must be at least 1", patience)
     require(0.0 < probability <= 1.0, "discriminator probability must lie in (0, 1]", probability)
     require(0.0 < rho <= 1.0, "discriminator rho must lie in (0, 1]", rho)
-    if fade not in get_args(Fade):
-        raise ValueError(f"discriminator fade must be one of {get_args(Fade)}, got {fade!r}")
-    if robust not in get_args(Robust):
-        raise ValueError(f"discriminator robust must be one of {get_args(Robust)}, got {robust!r}")
+    one_of("discriminator fade", fade, Fade)
+    one_of("discriminator robust", robust, Robust)
     require(threshold >= 0.0, "discriminator threshold must not be negative", threshold)
     require(1.0 <= limit < math.inf, "discriminator limit must be at least 1 and finite", limit)
-    if weights is not None and fade != "multiple":
-        raise ValueError(f"discriminator weights are for fade 'multiple', not {fade!r}")
-    shares = _fading.checked_weights("discriminator", weights)
+    a = _fading.checked_weights("discriminator", weights, fade)
 
     def init(belief: Belief, dims):
-        _fading.check_size("discriminator", shares, belief.factor.shape[0])
+        _fading.check_size("discriminator", a, belief)
         power = {name: jnp.ones(m) for name, m in dims.items()}
-        return _Memory(power, {name: jnp.zeros((), int) for name in dims}, _nothing())
+        return _Memory(power, {name: jnp.zeros((), int) for name in dims})
 
     def before(memory: _Memory, prior: Belief, o: Observation):
         seen = normalised(o)
         # quantile by number of components used; none used is never too much
-        quantile = jnp.asarray(limits(probability, len(o.residual)))[seen.dof]
+        quantile = jnp.asarray(quantiles(probability, len(o.residual)))[seen.dof]
         count, power = memory.counter[o.sensor], memory.power[o.sensor]
         longer = jnp.where(seen.nis > quantile, count + 1, 0)
         count = jnp.where(seen.dof == 0, count, longer)
@@ -128,7 +112,7 @@ def discriminator(
         power = jnp.where(outlier, power, _fading.averaged(power, white, rho))
         lasting = ~outlier & _fading.significant(_fading.total(power, white), white, rho, threshold)
         N = jnp.where(lasting, _fading.total(power, white) - white.dof, 0.0)
-        S, factor = _fading.faded(prior.factor, white, N, fade, shares, limit)
+        S, factor = _fading.faded(prior.factor, white, N, fade, a, limit)
 
         if robust == "gate":
             weight = jnp.where(outlier, 0.0, 1.0)
@@ -142,14 +126,8 @@ def discriminator(
         memory = _Memory(
             {**memory.power, o.sensor: power},
             {**memory.counter, o.sensor: count},
-            _Said(weight, factor, state),
         )
+        o = o.noted("discriminator", weight=weight, lambda_=factor, counter=count, state=state)
         return memory, Belief(prior.mean, S), o
 
-    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        said, count = memory.said, memory.counter[o.sensor]
-        notes = {"weight": said.weight, "lambda": said.factor, "counter": count}
-        info = info.noted("discriminator", **notes, state=said.state)
-        return memory._replace(said=_nothing()), posterior, info
-
-    return Rule(init=init, before=before, after=after, name="discriminator")
+    return Rule(init=init, before=before, name="discriminator")

@@ -11,8 +11,9 @@ import numpy as np
 from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, Number, StepInfo
-from robins.filters.chi_square import limits
-from robins.filters.constrain import (
+from robins.filters.checks import finite_numbers
+from robins.filters.chi_square import quantiles
+from robins.filters.limits.constrain import (
     ITERATIONS,
     Function,
     Numbers,
@@ -70,7 +71,9 @@ def equality(
     if gate is not None and not 0.0 < gate < 1.0:
         raise ValueError(f"equality gate must lie between 0 and 1, or be None, got {gate}")
     require(iterations >= 1, "equality iterations must be at least 1", iterations)
-    _check_finite(d=d, noise=noise)
+    for name, value in (("d", d), ("noise", noise)):
+        for leaf in jax.tree_util.tree_leaves(value):
+            finite_numbers(f"equality {name}", leaf)
     check_weight("equality", weight)
     if not callable(g):
         _check_rows(g, d, noise)
@@ -90,7 +93,7 @@ def equality(
         held = constrain(posterior, g, d, weight, noise, hard, iterations)
         refused = jnp.zeros((), bool)
         if gate is not None:
-            refused = held.nis > jnp.asarray(limits(gate, len(held.residual)))[held.dof]
+            refused = held.nis > jnp.asarray(quantiles(gate, len(held.residual)))[held.dof]
         skip = refused | used
         belief = trees.select(skip, posterior, held.belief)
         worst = jnp.max(jnp.abs(held.residual))
@@ -100,18 +103,10 @@ def equality(
     return Rule(init=init, process=process, after=after, name="equality")
 
 
-def _check_finite(**given) -> None:
-    for name, value in given.items():
-        for leaf in jax.tree_util.tree_leaves(value):
-            if not np.all(np.isfinite(np.asarray(leaf, float))):
-                raise ValueError(f"equality {name} has entries that are not finite numbers")
-
-
 def _check_rows(g: Numbers, d: Any, noise: Numbers | None) -> None:
-    D = np.asarray(g, float)
+    D = finite_numbers("equality D", g)
     if D.ndim != 2 or D.shape[0] == 0:
         raise ValueError(f"equality D must be (c, n), a row for each constraint, got {D.shape}")
-    _check_finite(D=D)
     value = np.zeros(len(D)) if d is None else np.asarray(d, float)
     if value.shape != (len(D),):
         raise ValueError(f"equality d is {value.shape}: ({len(D)},), one for each row of D")

@@ -1,4 +1,4 @@
-"""Trust the past a little less with every step."""
+"""Inflate the covariance by a constant factor in every step."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import jax.numpy as jnp
 
 from robins.errors import require
-from robins.filters.belief import Belief, Code, Number, StepInfo
+from robins.filters.belief import Belief, Code, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 
@@ -37,15 +37,15 @@ def fading_memory(factor: Number = 1.01) -> Rule:
     require(1.0 <= factor < math.inf, "fading_memory factor must be finite and not below 1", factor)
 
     def init(belief: Belief, dims):
-        return jnp.asarray(float(factor))
+        return jnp.asarray(float(factor))  # data of the state
 
     def settle(memory, belief: Belief):
         return memory, belief._replace(factor=memory * belief.factor), int(Code.DONE)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        return memory, posterior, info.noted("fading_memory", factor=memory)
+    def before(memory, prior: Belief, o: Observation):
+        return memory, prior, o.noted("fading_memory", factor=memory)
 
-    return Rule(init=init, settle=settle, after=after, name="fading_memory")
+    return Rule(init=init, before=before, settle=settle, name="fading_memory")
 
 
 def per_step(memory_s: Number, step_s: Number) -> float:

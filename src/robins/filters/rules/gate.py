@@ -1,9 +1,9 @@
-"""Refuse a measurement whose innovation is too large to be chance, but not for ever."""
+"""Refuse a measurement whose innovation is too large to be chance, with a way to recover."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +11,17 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.belief import Belief, StepInfo
-from robins.filters.chi_square import limits
+from robins.filters.belief import Belief
+from robins.filters.checks import one_of
+from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._reopen import reopened
+from robins.filters.rules._robust import widened
 
 Recovery = Literal["accept", "inflate", "reinitialise"]
 Scope = Literal["joint", "component"]
 
-# Doubt added on re-initialisation, in units of R: the gain is then at least 0.99 of a copy.
+# Covariance added on re-initialisation, in units of R: the gain is then at least 0.99 of a copy.
 _OPEN = 100.0
 
 
@@ -29,7 +30,6 @@ class _Channel(NamedTuple):
 
     refused: Array  # (g) refusals in a row
     ratio: Array  # () greatest test ratio of the last measurement
-    recovered: Array  # () bool, it was used although it was too large
     residual: Array  # (k, m) the last innovations that were too large, newest last
     known: Array  # (k, m) bool, components they had
 
@@ -48,13 +48,13 @@ def gate(
     measurement that is too large recovers it:
 
     - ``accept`` uses it with the gain there is;
-    - ``inflate`` first doubts the prior along the innovation until the NIS is q,
+    - ``inflate`` first widens the prior covariance along the innovation until the NIS is q,
       P' = P + a G r r' G', G = P H' (H P H')^-1, a = 1 / q - 1 / NIS; by component D = diag(a_i
       r_i^2) stands in for a r r', with a_i = 1 / q - S_ii / r_i^2;
-    - ``reinitialise`` believes it only if it and the refused ones before it *agree*: their scatter
+    - ``reinitialise`` uses it only if it and the refused ones before it *agree*: their scatter
       about their mean, sum (r_k - mean)' R^-1 (r_k - mean), is within the chi-square quantile of
-      patience times m degrees of freedom. It then re-opens what is seen, D = r r' + 100 R, and
-      the measurement is followed. Refusals that disagree go on being refused.
+      patience times m degrees of freedom. It then widens what is seen by D = r r' + 100 R, and
+      the state follows the measurement. Refusals that disagree go on being refused.
 
     Notes: ``gate.ratio``, min(NIS / q, 1), where 1 is refused or recovered (the innovation test
     ratio of autopilots; by component the greatest), ``gate.refused``, refusals in a row (the most),
@@ -71,23 +71,19 @@ def gate(
             agree in, or recovery or scope is none of those above.
     """
     require(0.0 < probability < 1.0, "gate probability must lie between 0 and 1", probability)
-    if recovery not in get_args(Recovery):
-        raise ValueError(f"gate recovery must be one of {get_args(Recovery)}, got {recovery!r}")
-    require(scope in get_args(Scope), f"gate scope must be one of {get_args(Scope)}", repr(scope))
+    one_of("gate recovery", recovery, Recovery)
+    one_of("gate scope", scope, Scope)
     agreeing = recovery == "reinitialise"
-    if patience < int(agreeing):
-        raise ValueError(
-            f"gate patience must be at least {int(agreeing)} to {recovery}, got {patience}"
-        )
+    least = int(agreeing)
+    require(patience >= least, f"gate patience must be at least {least} to {recovery}", patience)
     joint = scope == "joint"
     kept = patience + 1 if agreeing else 0
 
     def init(belief, dims):
         def channel(m):
             shape = () if joint else (m,)
-            no = jnp.zeros((), bool)
             residual = jnp.zeros((kept, m))
-            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), no, residual, residual > 0.0)
+            return _Channel(jnp.zeros(shape, int), jnp.zeros(()), residual, residual > 0.0)
 
         return {name: channel(m) for name, m in dims.items()}
 
@@ -109,37 +105,33 @@ def gate(
         refused = jnp.where(judged, jnp.where(passed, 0, was.refused + 1), was.refused)
         worst = jnp.max(jnp.where(over, 1.0, ratio), initial=0.0)
         worst = jnp.where(jnp.any(judged), worst, was.ratio)
-        now = _Channel(refused, worst, jnp.any(due), residual, known)
+        now = _Channel(refused, worst, residual, known)
 
         if recovery != "accept":
-            doubted = due & used
-            jump = jnp.where(doubted, o.residual, 0.0)
+            chosen = due & used
+            jump = jnp.where(chosen, o.residual, 0.0)
             if not agreeing:
                 excess = jnp.where(due, 1.0 - 1.0 / jnp.where(due, ratio, 2.0), 0.0)
                 jump = jump * jnp.sqrt(excess / q)
             root = jump[:, None] if joint else jnp.diag(jump)
             if agreeing:
                 root = jnp.concatenate([root, _OPEN**0.5 * o.noise], axis=1)
-            prior = reopened(jnp.any(due), prior, o, doubted, root)
+            prior = widened(jnp.any(due), prior, o, chosen, root)
+        most = jnp.max(refused, initial=0)
+        o = o.noted("gate", ratio=worst, refused=most, recovered=jnp.any(due))
         return {**memory, o.sensor: now}, prior, o._replace(accepted=o.accepted & passed)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        channel: _Channel = memory[o.sensor]
-        most = jnp.max(channel.refused, initial=0)
-        notes = {"ratio": channel.ratio, "refused": most, "recovered": channel.recovered}
-        return memory, posterior, info.noted("gate", **notes)
-
-    return Rule(init=init, before=before, after=after, name="gate")
+    return Rule(init=init, before=before, name="gate")
 
 
 def _judge(o: Observation, probability: float, joint: bool):
     """Limit, ratio to it, whether there is something to judge, and the components used."""
     seen = normalised(o)
     if joint:
-        table = jnp.asarray(limits(probability, len(o.residual)))
+        table = jnp.asarray(quantiles(probability, len(o.residual)))
         q = table[seen.dof]
         return q, seen.nis / q, seen.dof > 0, seen.used
-    q = limits(probability, 1)[1]
+    q = quantiles(probability, 1)[1]
     variance = jnp.sum(seen.factor**2, axis=1)
     square = jnp.where(seen.used, o.residual, 0.0) ** 2
     return q, square / variance / q, seen.used, seen.used
@@ -162,12 +154,12 @@ def _agree_as_one(probability: float, residual: Array, known: Array, noise: Arra
     # A component without noise agrees only if it repeats: the least pivot makes all else huge.
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) == 0.0, jnp.finfo(float).tiny, 0.0))
     white = linalg.solve_lower(L, _scatter(residual, known).T)
-    table = limits(probability, len(shared), len(residual) - 1)
+    table = quantiles(probability, len(shared), len(residual) - 1)
     count = jnp.sum(shared)
     return (count > 0) & (jnp.sum(white**2) <= jnp.asarray(table)[count])
 
 
 def _agree_each(probability: float, residual: Array, known: Array, noise: Array) -> Array:
-    limit = limits(probability, 1, len(residual) - 1)[1]
+    limit = quantiles(probability, 1, len(residual) - 1)[1]
     scatter = jnp.sum(_scatter(residual, known) ** 2, axis=0)
     return jnp.all(known, axis=0) & (scatter <= limit * jnp.sum(noise**2, axis=1))

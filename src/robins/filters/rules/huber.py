@@ -1,15 +1,15 @@
-"""Give a measurement that is too large to be chance the noise that makes it chance."""
+"""Raise the noise of a measurement whose innovation is too large to be chance."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
-from robins.filters.chi_square import limits
+from robins.filters.belief import Belief, Number
+from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._quantile import scale_to_quantile
+from robins.filters.rules._robust import scale_to_quantile
 
 
 def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
@@ -21,7 +21,7 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
 
     solved exactly (Chang iterates his eq. 23, s <- s NIS(s) / k^2). One weight for the whole
     measurement: correlated noise stays what it is, and no unit enters. The state is pulled by about
-    k^2 / |r| at the most, less the further off the measurement: what is absurd is forgotten.
+    k^2 / |r| at the most: the further off a measurement is, the less it moves the state.
 
     Notes: ``huber.weight``, 1 / s. Components without noise of their own cannot be weighed down.
     The Kalman filter is ``probability=1`` or ``threshold=inf``.
@@ -37,19 +37,14 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
     require(0.0 < probability <= 1.0, "huber probability must lie in (0, 1]", probability)
     require(threshold is None or threshold > 0.0, "huber threshold must be positive", threshold)
 
-    def init(belief, dims):
-        return jnp.ones(())  # of the update under way
-
     def before(memory, prior: Belief, o: Observation):
         seen = normalised(o)
         if threshold is None:
-            limit = jnp.asarray(limits(probability, len(o.residual)))[seen.dof]
+            limit = jnp.asarray(quantiles(probability, len(o.residual)))[seen.dof]
         else:
             limit = float(threshold) ** 2
         s = scale_to_quantile(o, limit, seen)
-        return 1.0 / s, prior, o._replace(noise=jnp.sqrt(s) * o.noise)
+        o = o._replace(noise=jnp.sqrt(s) * o.noise)
+        return memory, prior, o.noted("huber", weight=1.0 / s)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        return jnp.ones(()), posterior, info.noted("huber", weight=memory)
-
-    return Rule(init=init, before=before, after=after, name="huber")
+    return Rule(before=before, name="huber")

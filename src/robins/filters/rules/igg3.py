@@ -1,24 +1,16 @@
-"""Equivalent weights in three zones: believe, doubt, leave out."""
+"""Equivalent weights in three zones: full weight, reduced weight, none."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._reopen import reopened
-
-
-class _Memory(NamedTuple):
-    doubted: dict[str, Array]  # () measurements of each sensor in a row with no weight left
-    weight: Array  # () least weight of the update under way
-    recovered: Array  # () bool, in the update under way
+from robins.filters.rules._robust import widened
 
 
 def igg3(
@@ -34,10 +26,12 @@ def igg3(
 
     With the floor at zero a component beyond k1 is refused.
 
-    A filter that has gone wrong would doubt everything for ever: when no component of a sensor has
-    had more weight than the floor ``patience`` times in a row, its next such measurement is used
-    with all its weight, after the prior has been doubted along the innovation until no t_i exceeds
-    k0: P' = P + a G r r' G', G = P H' (H P H')^-1, a = max_i (1 / k0^2 - 1 / t_i^2).
+    A filter that has gone wrong would give weight to no measurement any more. So when no component
+    of a sensor has had more weight than the floor ``patience`` times in a row, its next such
+    measurement is used with full weight, and the prior covariance is first widened along the
+    innovation until no t_i exceeds k0:
+
+        P' = P + a G r r' G',   G = P H' (H P H')^-1,   a = max_i (1 / k0^2 - 1 / t_i^2)
 
     Notes: ``igg3.weight``, the least of the measurement, and ``igg3.recovered``. The Kalman filter
     is the limit of k0 above every t_i.
@@ -46,7 +40,7 @@ def igg3(
         k0: end of full weight, in standard deviations of the innovation.
         k1: begin of none.
         floor: least weight, in [0, 1).
-        patience: measurements in a row that may be doubted whole; None never recovers.
+        patience: measurements in a row that may be left without weight; None never recovers.
 
     Raises:
         ValueError: not 0 < k0 < k1 < inf, the floor is not in [0, 1), or patience is negative.
@@ -56,10 +50,9 @@ def igg3(
     require(patience is None or patience >= 0, "igg3 patience must not be negative", patience)
 
     def init(belief, dims):
-        doubted = {name: jnp.zeros((), int) for name in dims}
-        return _Memory(doubted, jnp.ones(()), jnp.zeros((), bool))
+        return {name: jnp.zeros((), int) for name in dims}  # in a row with no weight left
 
-    def before(memory: _Memory, prior: Belief, o: Observation):
+    def before(memory, prior: Belief, o: Observation):
         seen = normalised(o)
         deviation = jnp.sqrt(jnp.sum(seen.factor**2, axis=1))
         t = jnp.abs(jnp.where(seen.used, o.residual, 0.0)) / deviation
@@ -70,24 +63,20 @@ def igg3(
 
         measured = jnp.any(seen.used)
         hopeless = measured & jnp.all(~seen.used | (weight <= floor))
-        before_ = memory.doubted[o.sensor]
+        earlier = memory[o.sensor]
         if patience is None:
             recovered = jnp.zeros((), bool)
         else:
-            recovered = hopeless & (before_ >= patience)
+            recovered = hopeless & (earlier >= patience)
             a = jnp.max(jnp.where(far, 1.0 / k0**2 - 1.0 / beyond**2, 0.0))
             root = jnp.sqrt(jnp.where(recovered, a, 1.0)) * o.residual[:, None]
-            prior = reopened(recovered, prior, o, seen.used, root)
+            prior = widened(recovered, prior, o, seen.used, root)
         weight = jnp.where(recovered, 1.0, weight)
-        count = jnp.where(hopeless & ~recovered, before_ + 1, 0)
-        count = jnp.where(measured, count, before_)
-        now = _Memory({**memory.doubted, o.sensor: count}, jnp.min(weight), recovered)
+        count = jnp.where(hopeless & ~recovered, earlier + 1, 0)
+        count = jnp.where(measured, count, earlier)
         heavier = o.noise / jnp.sqrt(jnp.where(weight > 0.0, weight, 1.0))[:, None]
-        return now, prior, o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
+        o = o._replace(noise=heavier, accepted=o.accepted & (weight > 0.0))
+        o = o.noted("igg3", weight=jnp.min(weight), recovered=recovered)
+        return {**memory, o.sensor: count}, prior, o
 
-    def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        info = info.noted("igg3", weight=memory.weight, recovered=memory.recovered)
-        quiet = memory._replace(weight=jnp.ones(()), recovered=jnp.zeros((), bool))
-        return quiet, posterior, info
-
-    return Rule(init=init, before=before, after=after, name="igg3")
+    return Rule(init=init, before=before, name="igg3")

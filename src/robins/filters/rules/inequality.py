@@ -7,10 +7,12 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
+from robins.errors import require
 from robins.filters import trees
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.constrain import Function, Numbers, as_sensor
-from robins.filters.interval import clip, truncate
+from robins.filters.checks import finite_numbers, one_of
+from robins.filters.limits.constrain import Function, Numbers, as_sensor
+from robins.filters.limits.interval import clip, truncate
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -50,8 +52,7 @@ def inequality(
         ValueError: there is no bound, one is NaN, lower exceeds upper, a row of D is zero, the
             method is unknown; and by `init`, D does not fit the state.
     """
-    if method not in ("active-set", "truncation"):
-        raise ValueError(f"inequality method must be 'active-set' or 'truncation', got {method!r}")
+    one_of("inequality method", method, Method)
     low, high = _bounds(lower, upper)
     if not callable(g):
         _check_rows(g, len(low))
@@ -81,8 +82,7 @@ def inequality(
 
 
 def _bounds(lower: Numbers | None, upper: Numbers | None) -> tuple[np.ndarray, np.ndarray]:
-    if lower is None and upper is None:
-        raise ValueError("inequality wants lower or upper bounds")
+    require(lower is not None or upper is not None, "inequality wants lower or upper bounds")
     high = np.asarray(np.inf if upper is None else upper, float)
     low = np.full(high.shape, -np.inf) if lower is None else np.asarray(lower, float)
     high = np.full(low.shape, np.inf) if upper is None else high
@@ -98,10 +98,8 @@ def _bounds(lower: Numbers | None, upper: Numbers | None) -> tuple[np.ndarray, n
 
 
 def _check_rows(g: Numbers, count: int) -> None:
-    D = np.asarray(g, float)
+    D = finite_numbers("inequality D", g)
     if D.ndim != 2 or len(D) != count:
         raise ValueError(f"inequality D must be ({count}, n), a row for each bound, got {D.shape}")
-    if not np.all(np.isfinite(D)):
-        raise ValueError("inequality D has entries that are not finite numbers")
     for row in np.flatnonzero(~np.any(D != 0.0, axis=1)):
         raise ValueError(f"inequality: row {row} of D is zero and bounds nothing")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -27,7 +27,6 @@ class Memory(NamedTuple):
 
     windows: dict[str, Window]
     faded: Array  # () bool
-    factor: Array  # () lambda of the last update
     start: Array  # (n,) standard deviations at the start, which `reach` is counted in
 
 
@@ -48,10 +47,10 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
     A step is faded once: by the first of its sensors whose lambda exceeds 1; those after it see the
     prior that this one has left.
 
-    One factor for all states also fades those that no sensor of the filter sees, and nothing brings
-    these back: in a filter of a star sensor the position doubts itself until nothing is linear any
-    more. So a step that would take any standard deviation beyond ``reach`` times what it was at the
-    start is not faded.
+    One factor for all states also fades those that no sensor of the filter sees, and no measurement
+    reduces their covariance again: with a star sensor alone the covariance of the position grows
+    until the model is no longer linear over it. So a step that would take any standard deviation
+    beyond ``reach`` times what it was at the start is not faded.
 
     Notes: ``innovation_fading.lambda``. limit = 1 is the Kalman filter, bit for bit.
 
@@ -72,7 +71,7 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
         windows = {
             name: Window(jnp.zeros((window, m)), jnp.zeros(m, int)) for name, m in dims.items()
         }
-        return Memory(windows, jnp.zeros((), bool), jnp.ones(()), belief.sigma)
+        return Memory(windows, jnp.zeros((), bool), belief.sigma)
 
     def process(memory: Memory, transition: Transition):
         return memory._replace(faded=jnp.zeros((), bool)), transition
@@ -96,12 +95,8 @@ def innovation_fading(window: int = 10, limit: Number = 5.0, reach: Number = flo
         beyond = jnp.any(scaled & (jnp.sqrt(factor) * prior.sigma > most))
         factor = jnp.where(memory.faded | beyond, 1.0, factor)
         windows = {**memory.windows, o.sensor: Window(surplus, filled)}
-        memory = memory._replace(
-            windows=windows, faded=memory.faded | (factor > 1.0), factor=factor
-        )
-        return memory, prior._replace(factor=jnp.sqrt(factor) * prior.factor), o
+        memory = memory._replace(windows=windows, faded=memory.faded | (factor > 1.0))
+        prior = prior._replace(factor=jnp.sqrt(factor) * prior.factor)
+        return memory, prior, o.noted("innovation_fading", lambda_=factor)
 
-    def after(memory: Memory, posterior: Belief, info: StepInfo, o: Observation):
-        return memory, posterior, info.noted("innovation_fading", lambda_=memory.factor)
-
-    return Rule(init=init, process=process, before=before, after=after, name="innovation_fading")
+    return Rule(init=init, process=process, before=before, name="innovation_fading")

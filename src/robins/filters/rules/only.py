@@ -1,19 +1,20 @@
-"""Let a rule see some sensors alone."""
+"""Restrict a rule to some sensors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 from robins.filters.belief import Belief, StepInfo
+from robins.filters.checks import sensor_names
 from robins.filters.observation import Observation
 from robins.filters.rule import Memory, Rule
 
 
 def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
-    """A rule that acts on measurements of the named sensors, and of others knows nothing.
+    """A rule that acts on measurements of the named sensors only.
 
     Its `before` and `after` are called for these alone, and it begins with their dimensions alone.
-    What it does once a step (`process`, `settle`) it does as ever. Other sensors carry no notes of
+    Its hooks of a step (`process`, `settle`) are called as usual. Other sensors carry no notes of
     it.
 
     Args:
@@ -24,9 +25,7 @@ def only(sensors: str | Sequence[str], rule: Rule) -> Rule:
     Raises:
         ValueError: no sensor is named; by `init`, the filter has none of them.
     """
-    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-    if not names:
-        raise ValueError(f"only: name at least one sensor for the rule '{rule.name}'")
+    names = sensor_names(f"only, for the rule '{rule.name}'", sensors)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> Memory:
         seen = {name: m for name, m in dims.items() if name in names}

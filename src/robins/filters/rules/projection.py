@@ -9,7 +9,8 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.filters.belief import Belief, StepInfo
-from robins.filters.constrain import Weight, check_weight, metric_of, nearest
+from robins.filters.checks import sensor_names
+from robins.filters.limits.constrain import Weight, check_weight, metric_of, nearest
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 
@@ -50,9 +51,7 @@ def projection(
         ValueError: no sensor is named, or the weight is none; by `init`, it is not of the state's
             dimension, or a sensor has more components than the state.
     """
-    names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-    if not names:
-        raise ValueError("projection: name at least one sensor whose measurements are constraints")
+    names = sensor_names("projection", sensors)
     check_weight("projection", weight)
 
     def init(belief: Belief, dims: Mapping[str, int]):

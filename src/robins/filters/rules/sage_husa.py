@@ -1,4 +1,4 @@
-"""Learn the size of measurement or process noise from what the innovations leave over."""
+"""Estimate the variance of measurement or process noise from the innovations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from robins import manifold
 from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -51,7 +52,7 @@ def sage_husa(
     correlations stay), and each is clipped to [floor, ceiling] times its nominal value after every
     sample. The nominal values are those of the model at that step. For R that is the noise as the
     rules before this one leave it; so put a gate before it, and weights that belong to one
-    sample after it. A component that is missing or refused teaches nothing.
+    sample after it. A component that is missing or refused does not count.
 
     R and Q are not identifiable together from e: either explains an innovation that is too large.
     "QR" is for comparison with papers that do it; keep to "R", or to "Q" where the sensor is known.
@@ -69,10 +70,8 @@ def sage_husa(
     Raises:
         ValueError: a parameter is not of its range.
     """
-    _variances.check_forgetting("sage_husa", forgetting)
-    _variances.check_band("sage_husa", floor, ceiling)
-    if adapt not in ("R", "Q", "QR"):
-        raise ValueError(f"sage_husa adapt must be 'R', 'Q' or 'QR', got {adapt!r}")
+    _variances.check("sage_husa", forgetting, floor, ceiling)
+    one_of("sage_husa adapt", adapt, ("R", "Q", "QR"))
     of_sensor, of_motion = "R" in adapt, "Q" in adapt
 
     def nominal(k: int) -> Scale:

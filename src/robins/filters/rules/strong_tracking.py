@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.checks import one_of
 from robins.filters.linearise import Transition
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -27,7 +28,6 @@ class _Memory(NamedTuple):
     moved: Array  # (n, 2n + 1) F S and what its linearisation left over
     noise: Array  # (n, n) factor of Q
     fresh: Array  # () bool: nothing has been used since the prediction
-    factor: Array  # () lambda of the update under way, 1 between updates
 
 
 def strong_tracking(
@@ -65,7 +65,7 @@ def strong_tracking(
     samples, and lambda follows noise. ``power="ewma"`` takes keep = rho, starts at R, and fades
     only when tr V > (1 + threshold sqrt(2 (1 - keep) / ((1 + keep) m))) tr(H P H' + R).
 
-    Noted as ``strong_tracking.lambda``: lambda, for multiple the greatest. Components that are
+    Notes: ``strong_tracking.lambda``, for multiple the greatest. Components that are
     missing, refused, or without noise of their own leave V and lambda alone. The Kalman filter is
     ``limit=1``, ``threshold=inf`` or beta large enough.
 
@@ -85,30 +85,25 @@ def strong_tracking(
     """
     require(0.0 < rho <= 1.0, "strong_tracking rho must lie in (0, 1]", rho)
     require(1.0 <= beta < math.inf, "strong_tracking beta must be at least 1 and finite", beta)
-    if form not in get_args(Form):
-        raise ValueError(f"strong_tracking form must be one of {get_args(Form)}, got {form!r}")
-    if power not in get_args(Power):
-        raise ValueError(f"strong_tracking power must be one of {get_args(Power)}, got {power!r}")
-    if threshold is not None and not threshold >= 0.0:
-        raise ValueError(f"strong_tracking threshold must not be negative, got {threshold}")
+    one_of("strong_tracking form", form, Form)
+    one_of("strong_tracking power", power, Power)
+    positive = threshold is None or threshold >= 0.0
+    require(positive, "strong_tracking threshold must not be negative", threshold)
     require(1.0 <= limit < math.inf, "strong_tracking limit must be at least 1 and finite", limit)
-    if weights is not None and form != "multiple":
-        raise ValueError(f"strong_tracking weights are for form 'multiple', not {form!r}")
-    shares = _fading.checked_weights("strong_tracking", weights)
+    a = _fading.checked_weights("strong_tracking", weights, form)
     classic = power == "classic"
     keep = rho / (1.0 + rho) if classic else rho
     sigmas = threshold if classic or threshold is not None else 3.0
 
     def init(belief: Belief, dims):
         n = belief.factor.shape[0]
-        _fading.check_size("strong_tracking", shares, n)
+        _fading.check_size("strong_tracking", a, belief)
         return _Memory(
             power={name: jnp.ones(m) for name, m in dims.items()},
             begun={name: jnp.full(m, not classic) for name, m in dims.items()},
             moved=linalg.zeros(n, 2 * n + 1),
             noise=linalg.zeros(n, n),
             fresh=jnp.array(False),
-            factor=jnp.ones(()),
         )
 
     def process(memory: _Memory, t: Transition):
@@ -129,18 +124,15 @@ def strong_tracking(
         if form == "outside":
             S, factor = _faded_outside(memory, prior.factor, white, N, limit)
         else:
-            S, factor = _fading.faded(prior.factor, white, N, form, shares, limit)
+            S, factor = _fading.faded(prior.factor, white, N, form, a, limit)
         memory = memory._replace(
             power={**memory.power, o.sensor: V},
             begun={**memory.begun, o.sensor: begun | white.counts},
-            factor=factor,
         )
-        return memory, Belief(prior.mean, S), o
+        return memory, Belief(prior.mean, S), o.noted("strong_tracking", lambda_=factor)
 
     def after(memory: _Memory, posterior: Belief, info: StepInfo, o: Observation):
-        fresh = memory.fresh & ~jnp.any(info.used)
-        info = info.noted("strong_tracking", lambda_=memory.factor)
-        return memory._replace(fresh=fresh, factor=jnp.ones(())), posterior, info
+        return memory._replace(fresh=memory.fresh & ~jnp.any(info.used)), posterior, info
 
     return Rule(init=init, process=process, before=before, after=after, name="strong_tracking")
 

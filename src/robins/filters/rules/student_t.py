@@ -1,8 +1,8 @@
-"""Noise with heavy tails: a measurement says itself how much it is to be believed."""
+"""Noise with heavy tails: the weight of a measurement is estimated with the state."""
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,11 @@ from jaxtyping import Array
 
 from robins import linalg
 from robins.errors import require
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Number
+from robins.filters.checks import one_of
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._quantile import MOST
-from robins.filters.rules._shares import shares
+from robins.filters.rules._robust import MOST, shares
 
 Whose = Literal["R", "both"]
 
@@ -48,8 +48,7 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
     """
     require(dof > 0.0, "student_t dof must be positive", dof)
     require(iterations >= 1, "student_t iterations must be at least 1", iterations)
-    if whose not in get_args(Whose):
-        raise ValueError(f"student_t whose must be one of {get_args(Whose)}, got {whose!r}")
+    one_of("student_t whose", whose, Whose)
     nu = float(dof)
 
     def scales(o: Observation, n: int) -> tuple[Array, Array]:
@@ -76,18 +75,11 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
 
         return jax.lax.fori_loop(0, iterations, better, (jnp.ones(()), jnp.ones(())))
 
-    def init(belief, dims):
-        return jnp.ones(()), jnp.ones(())  # of the update under way
-
     def before(memory, prior: Belief, o: Observation):
         b, c = scales(o, prior.factor.shape[0])
         if whose == "both":
             prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
-        return (1.0 / c, 1.0 / b), prior, o._replace(noise=jnp.sqrt(c) * o.noise)
+        o = o._replace(noise=jnp.sqrt(c) * o.noise)
+        return memory, prior, o.noted("student_t", weight=1.0 / c, prior=1.0 / b)
 
-    def after(memory, posterior: Belief, info: StepInfo, o: Observation):
-        weight, other = memory
-        info = info.noted("student_t", weight=weight, prior=other)
-        return (jnp.ones(()), jnp.ones(())), posterior, info
-
-    return Rule(init=init, before=before, after=after, name="student_t")
+    return Rule(before=before, name="student_t")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.belief import Belief, Number, StepInfo
 from robins.filters.observation import Observation, left_out
 from robins.filters.rule import Rule
@@ -15,7 +16,7 @@ from robins.filters.rules import _variances
 
 
 class InverseGamma(NamedTuple):
-    """What is believed of each variance, as a multiple of its nominal value; mean rate / shape."""
+    """The distribution of each variance, as a multiple of its nominal value; mean rate / shape."""
 
     shape: Array  # (m,) alpha, half the number of samples it is worth
     rate: Array  # (m,) beta
@@ -58,8 +59,8 @@ def variational_bayes(
     Nominal correlations stay: rows of the noise factor are scaled. The nominal noise is that of the
     model at the step, as the rules before this one leave it. What is learnt is what the update did
     use, with the weights of rules behind this one; so put gates and weights behind it, where they
-    judge by the noise that was learnt. A component that is missing, or refused by any rule, neither
-    teaches nor ages.
+    judge by the noise that was learnt. A component that is missing, or refused by any rule, does
+    not change the estimate.
 
     Notes, a number a component: ``variational_bayes.r_scale.i``, the multiples in use.
     floor = ceiling = 1 is the Kalman filter, bit for bit.
@@ -75,14 +76,10 @@ def variational_bayes(
     Raises:
         ValueError: a parameter is not of its range.
     """
-    _variances.check_forgetting("variational_bayes", forgetting)
-    _variances.check_band("variational_bayes", floor, ceiling)
-    if iterations < 1:
-        raise ValueError(f"variational_bayes iterations must be 1 or more, got {iterations}")
-    if not 0.0 < initial_dof < float("inf"):
-        raise ValueError(
-            f"variational_bayes initial_dof must be positive and finite, got {initial_dof}"
-        )
+    _variances.check("variational_bayes", forgetting, floor, ceiling)
+    require(iterations >= 1, "variational_bayes iterations must be 1 or more", iterations)
+    finite = 0.0 < initial_dof < float("inf")
+    require(finite, "variational_bayes initial_dof must be positive and finite", initial_dof)
 
     def init(belief: Belief, dims):
         half = 0.5 * initial_dof

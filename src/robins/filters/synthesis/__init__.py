@@ -8,10 +8,8 @@ norms.
 
 from robins.filters.synthesis.closed_form import Isotropic, closed_form, isotropic
 from robins.filters.synthesis.design import Design, NotCertified, Unreachable, certify, certify_full
-from robins.filters.synthesis.every_step import EveryStep, FrozenTimeWarning
-from robins.filters.synthesis.full_order import full
 from robins.filters.synthesis.least import LeastGamma, least_gamma
-from robins.filters.synthesis.lmi import observer
+from robins.filters.synthesis.lmi import EveryStep, FrozenTimeWarning, full, observer, retuned
 from robins.filters.synthesis.norms import h2_norm, hinf_norm, peak_gain, spectral_radius
 from robins.filters.synthesis.plant import ErrorSystem, Plant, current_form, error_system, plant
 from robins.filters.synthesis.programs import MissingExtra
@@ -22,7 +20,6 @@ from robins.filters.synthesis.riccati import (
     least_riccati_gamma,
     riccati,
 )
-from robins.filters.synthesis.search import retuned
 from robins.filters.synthesis.trade_off import METHODS, Attempt, TradeOff, trade_off
 
 __all__ = [

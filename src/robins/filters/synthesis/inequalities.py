@@ -1,7 +1,7 @@
 """The linear matrix inequalities of filter designs, in the symbols of their equations.
 
 For a channel of white noise w and one of a modelling error n, as docs/filters/mixed.md numbers
-them. A function takes the module `cvxpy` (an optional package, which nobody else imports), the
+them. A function takes the module `cvxpy` (an optional package), the
 plant's matrices by name and what the inequalities are wanted for, and returns the unknowns by
 symbol and the matrices that must be positive semidefinite. Gains K are those of an observer.
 """

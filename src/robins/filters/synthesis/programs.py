@@ -35,7 +35,7 @@ class MissingExtra(RobinsError, ImportError):
 
 
 class Answer(NamedTuple):
-    """What a solver returned; nothing of it is checked."""
+    """The answer of a solver, unchecked."""
 
     status: str  # the solver's own word
     value: float  # Trace(H); nan without a solution

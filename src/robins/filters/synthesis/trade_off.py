@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.filters.synthesis import full_order, lmi, search
+from robins.filters.synthesis import lmi
 from robins.filters.synthesis.closed_form import closed_form, isotropic
 from robins.filters.synthesis.design import Design, NotCertified, Unreachable
 from robins.filters.synthesis.least import LeastGamma, least_gamma
@@ -21,9 +21,9 @@ _DESIGNERS: dict[str, Callable[[Plant, float], Design]] = {
     "closed-form": closed_form,
     "lmi-common": lambda plant, gamma: lmi.observer(plant, gamma, "common"),
     "lmi-slack": lambda plant, gamma: lmi.observer(plant, gamma, "slack"),
-    "retuned-common": lambda plant, gamma: search.retuned(plant, gamma, "common"),
-    "retuned-slack": lambda plant, gamma: search.retuned(plant, gamma, "slack"),
-    "full-order": full_order.full,
+    "retuned-common": lambda plant, gamma: lmi.retuned(plant, gamma, "common"),
+    "retuned-slack": lambda plant, gamma: lmi.retuned(plant, gamma, "slack"),
+    "full-order": lmi.full,
 }
 METHODS = tuple(_DESIGNERS)
 _PLAIN = ("riccati", "closed-form")  # need no solver
@@ -126,7 +126,7 @@ def _why_not(plant: Plant, name: str) -> str:
         elif name not in _PLAIN:
             packages()
         if name == "full-order":
-            full_order.refuse_unstable(plant)
+            lmi.refuse_unstable(plant)
     except (ValueError, MissingExtra) as error:
         return str(error)
     return ""

@@ -217,7 +217,9 @@ WIND_STATES = States(
 )
 PRODUCT = States(
     _product_motion,
-    lambda nav, gyro, accel, wind: WithWind(InsState(*nav, gyro, accel), wind),
+    lambda nav, gyro, accel, wind: WithWind(
+        InsState(nav.q_nb, nav.v_n, nav.position, gyro, accel), wind
+    ),
     lambda given, course: [
         *(start_sigma(given), given.imu.gyro_bias, given.imu.accel_bias),
         np.full(2, given.air_data.wind_error),

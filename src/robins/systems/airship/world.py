@@ -25,16 +25,14 @@ from jaxtyping import Array, Float
 from robins import _float64  # noqa: F401
 from robins.earth import Geodetic, curvature_radii
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
-from robins.ins.increments import Increments
-from robins.ins.joined import joined
+from robins.ins.increments import Increments, joined
 from robins.ins.mechanise import Nav, mechanise
 from robins.rotation import Rotation, conjugate, from_euler, rotate
 from robins.sim.air_data import wind_estimate_error
 from robins.sim.ideal_imu import increments_between
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
-from robins.sim.turbulence import dryden, von_karman
-from robins.sim.wind import Carried, carried_at, carry, gusts, wind_at
+from robins.sim.wind import Carried, carried_at, carry, dryden, gusts, von_karman, wind_at
 from robins.systems.airship.parameters import Airship, Draw, Readings
 from robins.systems.study import Instrument
 

@@ -18,6 +18,7 @@ import numpy as np
 from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.earth import Geodetic, gravity
+from robins.filters import Belief
 from robins.ins.alignment import level
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
 from robins.ins.frames import to_ned_frd
@@ -31,6 +32,7 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay, Start
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
+from robins.systems.parts import Block
 from robins.systems.replaying import Piece, Reported
 from robins.systems.study import Case, Contender
 from robins.systems.tables import place_arrays, track_arrays
@@ -206,10 +208,11 @@ def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
             f"{np.linalg.norm(force):.2f} m/s^2, gravity is {here:.2f}"
         )
     sentence = f"levelled {how} at {time_s[at]:.1f} s"
-    q_nb = np.asarray(level(force, 0.0, start.known_heading or 0.0).q_nb.wxyz)
+    heading = start.known_heading or 0.0
+    q_nb = np.asarray(level(force, 0.0, heading).q_nb.wxyz)
     begin_s = float(time_s[at])
     if fast is None:
-        sentence += f", heading given as {np.degrees(start.known_heading):.1f} deg"
+        sentence += f", heading given as {np.degrees(heading):.1f} deg"
     else:
         assert v_n is not None
         carried = jnp.asarray(theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None])
@@ -248,7 +251,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     rate = rate_about(increments, log.time_s, epochs)
     y, aux = _fixes(log, used, epochs, rate, parameters.gnss.velocity_window)
     known, about = _known(log, epochs, rate, parameters.aids)
-    belief, u = _belief(log, start, parameters), model.Block(blocks.increments, scale)
+    belief, u = _belief(log, start, parameters), Block(blocks.increments, scale)
     return Stretch(
         world=Case(belief, u, y | known, aux | about, None),
         begin_s=begin_s,
@@ -261,17 +264,23 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     )
 
 
-def _belief(log: Log, start: StartPoint, parameters: Replay) -> Any:
+def _belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
     """At the first fix, moved from the antenna to the IMU."""
-    g, row, told = log.gnss, start.fix, parameters.start
+    g, row = log.gnss, start.fix
     v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[row])
     antenna = Geodetic(*(jnp.asarray(a[row]) for a in (g.lat_rad, g.lon_rad, g.alt_m)))
     q_nb = Rotation(jnp.asarray(start.q_nb))
     arm = q_nb.apply(np.asarray(parameters.gnss.lever_arm))
     position = antenna.retract(-arm + jnp.asarray(v * parameters.gnss.latency))
     nav = Nav(q_nb, jnp.asarray(v), position)
-    sigmas = start.tilt_sigma_rad, told.heading
-    return model.start_belief(nav, parameters.imu, told, *sigmas, gyro_bias=start.gyro_bias)
+    return model.start_belief(
+        nav,
+        parameters.imu,
+        parameters.start,
+        tilt_rad=start.tilt_sigma_rad,
+        heading_rad=parameters.start.heading,
+        gyro_bias=start.gyro_bias,
+    )
 
 
 def _fixes(
@@ -299,12 +308,10 @@ def _known(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    y: dict[str, Any] = {}
-    if not (aids.zero_velocity or aids.non_holonomic):
-        return y, {}
     still, mean_rate = standstill(log.increments, *aids.quiet)
     last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
     at_rest = still[last][:, None]
+    y: dict[str, Any] = {}
     if aids.zero_velocity:
         y[model.STANDSTILL] = np.where(at_rest, np.zeros((len(epochs), 3)), np.nan)
         y[model.STILL_RATE] = np.where(at_rest, mean_rate[last], np.nan)

@@ -30,11 +30,10 @@ from jaxtyping import Array, ArrayLike
 
 from robins.earth import Geodetic, earth_rate_n, gravity_n
 from robins.filters import Belief, Model, Motion, Sensor
-from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
-from robins.systems.parts import FRD, NED
+from robins.systems.parts import FRD, NED, Block
 from robins.systems.study import SensorAxes, StateBlock
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
@@ -65,13 +64,6 @@ def state_blocks(scale_states: bool) -> tuple[StateBlock, ...]:
         StateBlock("accel_scale", slice(18, 21), "1", "ppm", "FRD", FRD),
     )
     return blocks if scale_states else blocks[:5]
-
-
-class Block(NamedTuple):
-    """Input of one step of the motion."""
-
-    increments: Increments  # (K,), (K, 3), (K, 3)
-    noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
 
 
 class Fix(NamedTuple):

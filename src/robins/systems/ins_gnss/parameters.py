@@ -167,8 +167,8 @@ class Believed(Parameters):
 class Drive(Scenario):
     """A simulated drive; sensor errors are drawn from what the filter is told of them."""
 
-    system: Literal["ins-gnss"] = "ins-gnss"
-    study: Literal["drive"] = "drive"
+    system: str = "ins-gnss"
+    study: str = "drive"
     title: str = "INS/GNSS drive"
     imu_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default(
         "100 Hz"

@@ -30,8 +30,9 @@ from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion
-from robins.systems.ins_gnss.model import POSITION, VELOCITY, Block, Fix, Velocity, start_belief
+from robins.systems.ins_gnss.model import POSITION, VELOCITY, Fix, Velocity, start_belief
 from robins.systems.ins_gnss.parameters import Drive, Imu
+from robins.systems.parts import Block
 from robins.systems.study import Case
 
 
@@ -40,8 +41,7 @@ class Course(NamedTuple):
 
     motion: Motion
     ideal: Increments  # (N,), (N, 3), (N, 3) the samples of an ideal unit
-    compensated: Increments  # the same with coning and sculling in them
-    blocks: Blocks
+    blocks: Blocks  # of the same with coning and sculling in them
     start: Nav
     truth: Nav  # at each epoch, leading axis E
     sample: np.ndarray  # (E,) the one that ends at each epoch
@@ -132,7 +132,6 @@ def lay_out(drive: Drive) -> Course:
     return Course(
         motion=motion,
         ideal=Increments(dt, table.gyro[1:], table.accel[1:]),
-        compensated=compensated,
         blocks=blocks,
         start=start,
         truth=jax.tree_util.tree_map(lambda x: x[index], path),

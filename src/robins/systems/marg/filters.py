@@ -47,7 +47,7 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
 
     def before(memory, prior: Belief, o: Observation):
         memory, reopened, o = inner.before(memory, prior, o)
-        new = memory[o.sensor].recovered
+        new = o.notes["gate.recovered"]
         return memory, select(new, field_forgotten(prior, field_t), Belief(*reopened)), o
 
     return rules.only(MAGNETOMETER, inner._replace(before=before, name="undisturbed"))

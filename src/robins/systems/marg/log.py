@@ -14,8 +14,7 @@ from robins.dataset import Dataset, ImuTable, MagTable
 from robins.filters import Belief
 from robins.ins.alignment import triad
 from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
-from robins.ins.intervals import after_gap, usual_interval
+from robins.ins.increments import Increments, after_gap, from_imu, usual_interval
 from robins.ins.rest import still_samples
 from robins.manifold import Angle
 from robins.rotation import Rotation

@@ -40,12 +40,12 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters import Motion, Sensor
-from robins.ins.extended_pose import left_jacobian
 from robins.manifold import dim
 from robins.rotation import (
     Rotation,
     conjugate,
     from_rotvec,
+    left_jacobian,
     multiply,
     normalise,
     rotate,

@@ -35,7 +35,7 @@ from robins.filters import (
     taylor,
     unscented,
 )
-from robins.filters.fusion import Sharing
+from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.results import array
 from robins.rotation import Rotation
@@ -156,7 +156,7 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
     if chosen.sharing is None:
         return own(*chosen.sensors)
     channels = [channel((sensor,), own(sensor)) for sensor in chosen.sensors]
-    shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)
+    shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)  # pyright: ignore[reportArgumentType] frozen, so hashable
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
         return federated(channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS)

@@ -22,13 +22,13 @@ from robins.rotation import conjugate, from_euler, multiply, rotate, to_euler, t
 from robins.scenario import Span
 from robins.sim.ballistic import ballistic
 from robins.sim.free_body import FreeBody, coning_start, free_body
+from robins.sim.gyro import MemsErrors, MemsGyro, delta_angles, integrate_angles
 from robins.sim.magnetometer import (
     angle_bursts,
     field_bursts,
     observe_field,
     observe_magnetic_attitude,
 )
-from robins.sim.mems_gyro import MemsErrors, MemsGyro, delta_angles, integrate_angles
 from robins.sim.random import Component, stream
 from robins.systems.parts import Three
 from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate

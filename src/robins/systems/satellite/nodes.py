@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from robins import linalg
-from robins.earth.star_index import StarIndex
+from robins.earth.stars import StarIndex
 from robins.filters import Belief, Reading
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
 from robins.sim.attitude_control import Controller, allocate_within, desaturation_dipole, torque

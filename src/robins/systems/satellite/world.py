@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.earth.star_catalogue import hipparcos, synthetic
+from robins.earth.stars import hipparcos, synthetic
 from robins.ins.imu_errors import TriadErrors
 from robins.rotation import from_rotvec, multiply
 from robins.sim.attitude_control import allocation_matrix, controller

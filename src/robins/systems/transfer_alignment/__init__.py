@@ -5,34 +5,18 @@
 - study "product": total state with mounting and flexure, closed loop; also for recorded pairs.
 """
 
-from robins.systems.study import Study
 from robins.systems.system import System
-from robins.systems.transfer_alignment import (
-    matching_claims,
-    matching_parameters,
-    patent,
-    patent_claims,
-    product_claims,
-    product_filters,
-)
-from robins.systems.transfer_alignment.matching import matching_problem
-from robins.systems.transfer_alignment.matching_parameters import Matching
-from robins.systems.transfer_alignment.pair_replay import ALIGNMENT, orientation
-from robins.systems.transfer_alignment.product_problem import Product, product_problem
+from robins.systems.transfer_alignment import attitude_matching, product, velocity_attitude
 
 SYSTEM = System(
     name="transfer-alignment",
     studies={
-        "attitude-matching": Study(
-            Matching, matching_problem, matching_parameters.FILTERS, matching_claims.CLAIMS
-        ),
-        "velocity-attitude": Study(
-            patent.Patent, patent.patent_problem, patent.FILTERS, patent_claims.CLAIMS
-        ),
-        "product": Study(Product, product_problem, product_filters.FILTERS, product_claims.CLAIMS),
+        "attitude-matching": attitude_matching.STUDY,
+        "velocity-attitude": velocity_attitude.STUDY,
+        "product": product.STUDY,
     },
-    orientation=orientation,
-    alignment=ALIGNMENT,
+    orientation=product.orientation,
+    alignment=product.ALIGNMENT,
 )
 
 __all__ = ["SYSTEM"]

@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping
 
 from robins.bench.parts.satellite.computers import acm, adm
 from robins.bench.parts.satellite.kit import Kit
-from robins.bench.parts.satellite.sensors import gyro, star
-from robins.bench.parts.satellite.vehicle import actuators, plant, table
+from robins.bench.parts.satellite.vehicle import actuators, gyro, plant, star, table
 from robins.bench.parts.station import Part
 
 BUILD: Mapping[str, Callable[[Kit], Part]] = {

@@ -1,0 +1,61 @@
+"""How good a filter is and can be: consistency, covariance bound, observability, worst case."""
+
+from robins.filters.analysis.bound import (
+    Bound,
+    bound_along,
+    covariance_bound,
+    linearised,
+    used_sensors,
+)
+from robins.filters.analysis.consistency import (
+    Verdict,
+    anees,
+    block_nees,
+    grand_mean_nis,
+    nees,
+    normalised_sq,
+    whitened_innovations,
+    whiteness,
+)
+from robins.filters.analysis.observability import (
+    bits,
+    gramian,
+    observability,
+    observability_along,
+    spectrum,
+    unobservable,
+    worded,
+)
+from robins.filters.analysis.worst_case import (
+    existence_margin,
+    gamma_min,
+    steady_h_infinity,
+    worst_case_gain,
+)
+
+__all__ = [
+    "Bound",
+    "Verdict",
+    "anees",
+    "bits",
+    "block_nees",
+    "bound_along",
+    "covariance_bound",
+    "existence_margin",
+    "gamma_min",
+    "gramian",
+    "grand_mean_nis",
+    "linearised",
+    "nees",
+    "normalised_sq",
+    "observability",
+    "observability_along",
+    "spectrum",
+    "steady_h_infinity",
+    "unobservable",
+    "used_sensors",
+    "whitened_innovations",
+    "whiteness",
+    "worded",
+    "worst_case_gain",
+]

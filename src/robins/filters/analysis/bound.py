@@ -1,0 +1,211 @@
+"""The covariance bound: how well given sensors can do at best, without any data.
+
+The recursion of the Kalman filter's covariance with the model linearised about the *true* states.
+For Gaussian noise of the stated size it is the posterior Cramer-Rao bound along that trajectory
+(Tichavsky, Muravchik & Nehorai 1998, eq. 34; Van Trees & Bell 2007, part I): no estimator that is
+given the same model has smaller mean square errors. For a linear model the Kalman filter attains
+it.
+
+What was measured never enters, only which components were there. Where process noise depends on the
+state it is that at the true state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief
+from robins.filters.kalman import updated
+from robins.filters.linearise import taylor
+from robins.filters.model import Model
+from robins.filters.observation import Observation, as_measurement
+from robins.manifold import State
+
+
+class Bound(NamedTuple):
+    """Lower-triangular factors of the bound, leading axis E steps."""
+
+    predicted: Array  # (E, n, n) before the measurements of a step
+    factor: Array  # (E, n, n) after them
+
+    covariance = Belief.covariance  # both after the measurements
+    sigma = Belief.sigma
+
+
+class Sight(NamedTuple):
+    """A sensor along a trajectory, leading axis E."""
+
+    H: Array  # (E, m, n)
+    noise: Array  # (E, m, k) factor, R = noise noise'
+    present: Array  # (E, m) bool, the component was measured
+    size: Array  # (E, m) of the numbers that the reading was made of
+
+    def seen_with(self, factor: Array, use: Array) -> Observation:
+        """One step of it (no axis E) as it is seen from an error with this factor."""
+        n = factor.shape[0]
+        belief = Belief(jnp.zeros(n), factor)
+        m = self.H.shape[0]
+        return Observation(
+            sensor="",
+            prior=belief,
+            residual=jnp.zeros(m),
+            present=self.present,
+            accepted=self.present & use,
+            spread=self.H @ factor,
+            excess=linalg.zeros(m, 0),
+            noise=self.noise,
+            size=self.size + jnp.abs(self.H) @ belief.sigma,
+        )
+
+
+class Linearised(NamedTuple):
+    """A model along a trajectory, leading axis E."""
+
+    F: Array  # (E, n, n) transition into each step
+    noise: Array  # (E, n, q) factor, Q = noise noise'
+    sights: tuple[Sight | None, ...]  # of the model's sensors; None for what has no measurements
+
+
+def linearised(
+    model: Model,
+    start: Belief,
+    truth: State,
+    y: Mapping[str, Any],
+    u: Any = None,
+    aux: Mapping[str, Any] | None = None,
+) -> Linearised:
+    """Linearise a model about a true trajectory.
+
+    The transition of step k is taken at the true state before it and with its input, for the first
+    step at the mean of the start; the sensors at ``truth[k]``.
+
+    Args:
+        model: the motion and the sensors.
+        start: belief before the first step.
+        truth: true states at the measurements, leading axis E.
+        y: by sensor name, leading axis E. Only what is NaN matters.
+        u: inputs of the motion, leading axis E.
+        aux: what sensors need besides the state, by sensor name, leading axis E.
+
+    Raises:
+        ValueError: lengths differ.
+    """
+    as_arrays = partial(jax.tree_util.tree_map, jnp.asarray)
+    truth, mean, u, aux = map(as_arrays, (truth, start.mean, u, dict(aux or {})))
+    before = jax.tree_util.tree_map(
+        lambda first, rest: jnp.concatenate([first[None].astype(float), rest[:-1]]), mean, truth
+    )
+    measured = {name: as_measurement(name, values) for name, values in y.items()}
+    rows = (before, truth, u, measured, aux)
+    lengths = {jnp.shape(leaf)[0] for leaf in jax.tree_util.tree_leaves(rows)}
+    if len(lengths) > 1:
+        raise ValueError(
+            f"truth, inputs and measurements must have one length, got {sorted(lengths)}"
+        )
+    way, unit = taylor(), linalg.identity(manifold.dim(start.mean))
+
+    def at(row: Any) -> Linearised:
+        before, now, u, y, aux = row
+        moved = way.transition(Belief(before, unit), model.motion, u)
+        sights = []
+        for sensor in model.sensors:
+            if sensor.name not in y:
+                sights.append(None)
+                continue
+            o = way.observation(Belief(now, unit), sensor, y[sensor.name], aux.get(sensor.name))
+            size = o.size - jnp.sum(jnp.abs(o.spread), axis=1)  # without the unit sigmas
+            sights.append(Sight(o.spread, o.noise, o.present, size))
+        return Linearised(moved.spread, moved.noise, tuple(sights))
+
+    return jax.lax.map(at, rows)
+
+
+def used_sensors(model: Model, without: Sequence[str] = ()) -> np.ndarray:
+    """(S,) which sensors of a model are used when some are left out.
+
+    Raises:
+        KeyError: the model has no such sensor; the message lists those there are.
+    """
+    left_out = {model.sensor(name).name for name in without}
+    return np.array([s.name not in left_out for s in model.sensors], dtype=bool)
+
+
+def covariance_bound(
+    model: Model,
+    start: Belief,
+    truth: State,
+    y: Mapping[str, Any],
+    u: Any = None,
+    aux: Mapping[str, Any] | None = None,
+    use: Any = None,
+    known: Sequence[int] = (),
+) -> Bound:
+    """Covariance that no filter can beat, along a true trajectory; ready for `jax.vmap`.
+
+    Args:
+        model: the motion and the sensors.
+        start: belief before the first step; its factor is the prior.
+        truth: as `linearised` takes it, and so y, u and aux.
+        y: by sensor name.
+        u: inputs of the motion.
+        aux: what sensors need besides the state.
+        use: which sensors to use, as `bound_along` takes it.
+        known: tangent components that are known, as `bound_along` takes them.
+
+    Raises:
+        ValueError: lengths differ, or a component that is known does not exist.
+    """
+    return bound_along(linearised(model, start, truth, y, u, aux), start.factor, use, known)
+
+
+def bound_along(
+    line: Linearised, factor: Array, use: Any = None, known: Sequence[int] = ()
+) -> Bound:
+    """The same of a model that has been linearised; one scan.
+
+    Args:
+        line: from `linearised`.
+        factor: (n, n) of the prior covariance.
+        use: (S,) bool, which sensors of the model to use, in its order, as `used_sensors` makes it;
+            it is data, so a batch of subsets is one `jax.vmap`. All by default.
+        known: numbers of the tangent components that are known exactly, before every prediction and
+            every measurement.
+
+    Raises:
+        ValueError: a component that is known does not exist.
+    """
+    n = factor.shape[0]
+    known = tuple(int(i) for i in known)
+    if any(not 0 <= i < n for i in known):
+        raise ValueError(f"known components {list(known)}: the state has 0 to {n - 1}")
+    use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
+
+    def step(S: Array, row: Linearised):
+        predicted = _given(linalg.tria(row.F @ S, row.noise), known)
+        S = predicted
+        for i, sight in enumerate(row.sights):
+            if sight is not None:
+                seen = sight.seen_with(S, use[i])
+                S = updated(seen.prior, seen, "sqrt")[0].factor
+        return S, Bound(predicted, S)
+
+    return jax.lax.scan(step, _given(factor, known), line)[1]
+
+
+def _given(factor: Array, known: tuple[int, ...]) -> Array:
+    """Factor of what is left once some components of the error are known exactly."""
+    if not known:
+        return factor
+    rows = jnp.eye(factor.shape[0])[np.array(known)]
+    m = len(known)
+    exact = Sight(rows, linalg.zeros(m, 0), jnp.ones(m, bool), jnp.zeros(m))
+    seen = exact.seen_with(factor, jnp.ones((), bool))
+    return updated(seen.prior, seen, "sqrt")[0].factor

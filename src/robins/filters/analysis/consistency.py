@@ -1,0 +1,142 @@
+"""Is a filter as good as it says? Chi-square tests of errors and innovations.
+
+NEES is e' P^-1 e (chi-square with n degrees of freedom if the filter is right), NIS the same for an
+innovation. Sums over independent runs stay chi-square, so an average over N runs has the band of
+chi-square with N n degrees of freedom over N (Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from robins import linalg, manifold
+from robins.errors import require
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.chi_square import chi2_band, chi_square
+from robins.manifold import State
+
+
+def nees(belief: Belief, truth: State) -> Float[Array, ""]:
+    """Normalised estimation error squared of one belief; batch with `jax.vmap`.
+
+    Directions in which nothing is uncertain (a known constant) do not count, whatever their error.
+    """
+    return normalised_sq(manifold.local(belief.mean, truth), belief.factor)
+
+
+def block_nees(belief: Belief, truth: State, block: slice) -> Float[Array, ""]:
+    """NEES of some components alone, from their marginal covariance."""
+    return normalised_sq(manifold.local(belief.mean, truth)[block], belief.factor[block])
+
+
+def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Float[Array, ""]:
+    """Error e' (S S')^-1 e of some components, from the rows of the factor that are theirs.
+
+    Directions without uncertainty do not count.
+    """
+    solid, _ = linalg.guard(factor)
+    return jnp.sum(linalg.solve_lower(solid, error[:, None]) ** 2)
+
+
+class Verdict(NamedTuple):
+    """A statistic beside the band it should be in."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether the value is in its band."""
+        return bool(self.low <= self.value <= self.high)
+
+
+def grand_mean_nis(nis: np.ndarray, dof: np.ndarray, level: float = 0.95) -> Verdict:
+    """Mean of all innovations squared per degree of freedom, over runs and time.
+
+    Innovations of a right filter are white, so their sum over time is chi-square too; this is the
+    sharpest single test of R and Q. Steps with nothing measured (dof = 0) do not count; an infinite
+    NIS, that of a contradiction, does.
+
+    Args:
+        nis: any shape.
+        dof: the same shape, degrees of freedom used.
+        level: of the two-sided band.
+
+    Returns:
+        A verdict about a value that should be near one.
+    """
+    nis, dof = np.asarray(nis, dtype=float), np.asarray(dof)
+    total = float(np.sum(dof))
+    if total == 0.0:
+        return Verdict(float("nan"), float("nan"), float("nan"))
+    low, high = chi2_band(total, 1, level) / total
+    counts = (dof > 0) | np.isinf(nis)
+    return Verdict(float(np.sum(nis[counts]) / total), float(low), float(high))
+
+
+def anees(values: np.ndarray, n: int, level: float = 0.95) -> tuple[np.ndarray, np.ndarray, float]:
+    """Average NEES over runs at each epoch, normalised by n.
+
+    Args:
+        values: (runs, T) NEES.
+        n: state dimension.
+        level: of the two-sided band.
+
+    Returns:
+        (T,) average NEES over n, its band (2,), and the share of epochs inside the band.
+    """
+    values = np.asarray(values, dtype=float)
+    mean = np.mean(values, axis=0) / n
+    band = chi2_band(n, values.shape[0], level) / n
+    inside = (mean >= band[0]) & (mean <= band[1])
+    return mean, band, float(np.mean(inside))
+
+
+def whitened_innovations(info: StepInfo) -> Float[Array, "t m"]:
+    """Innovations in units of their predicted spread, uncorrelated if the filter is right.
+
+    Args:
+        info: of one sensor over a run (leading axis T).
+
+    Returns:
+        (T, m), NaN where not used.
+    """
+
+    def one(residual, factor, used):
+        white = linalg.solve_lower(factor, jnp.where(used, residual, 0.0)[:, None])[:, 0]
+        return jnp.where(used, white, jnp.nan)
+
+    return jax.vmap(one)(info.innovation, info.factor, info.used)
+
+
+def whiteness(series: np.ndarray, lags: int = 20, level: float = 0.95) -> Verdict:
+    """Ljung-Box test that a series has no memory (Ljung & Box 1978).
+
+    Args:
+        series: (T,) whitened innovations of one component; NaN steps are left out of the products.
+        lags: number of autocorrelations looked at.
+        level: of the one-sided bound.
+
+    Raises:
+        ValueError: fewer than three times as many samples as lags, or all of them the same.
+    """
+    x = np.asarray(series, dtype=float)
+    here = np.isfinite(x)
+    count = int(np.sum(here))
+    require(not count < 3 * lags, f"whiteness over {lags} lags wants {3 * lags} samples", count)
+    x = np.where(here, x - np.mean(x[here]), 0.0)
+    power = np.sum(x**2) / count
+    require(power != 0.0, "whiteness of a series that never changes")
+    total = 0.0
+    for lag in range(1, lags + 1):
+        pairs = int(np.sum(here[lag:] & here[:-lag]))
+        if pairs > 0:
+            r = np.sum(x[lag:] * x[:-lag]) / (count * power)
+            total += count * (count + 2) * r**2 / pairs
+    return Verdict(float(total), 0.0, float(chi_square(level, lags)))

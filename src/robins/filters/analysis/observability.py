@@ -1,0 +1,175 @@
+r"""Observability: the information of a window's measurements about the state at its beginning.
+
+The observability Gramian of the linearised system, in units that make it comparable between states
+and between sensors (Ham & Brown 1983; Chen 1999, ch. 6),
+
+    W_k = sum_{j <= k} D Phi_j' H_j' R_j^-1 H_j Phi_j D,
+
+with D the standard deviations of the prior and Phi_j the transition from the beginning to step j.
+An eigenvalue of W says how many times as much is measured of a direction as was known of it before:
+below one the prior knows more.
+
+The Gramian itself is never summed up: Phi may grow without bound, and small eigenvalues would drown
+in the rounding of large ones. The recursion carries two factors, of the error e_0 at the beginning
+and e_k now, given the measurements so far and no process noise,
+
+    e_0 = D L_k z,  e_k = M_k z,  z ~ N(0, I),  L_k L_k' = (I + W_k)^-1.
+
+A measurement multiplies both by the factor T of what it leaves of z, one QR each time, so what is
+seen cannot grow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg
+from robins.errors import require
+from robins.filters.analysis.bound import Linearised, linearised
+from robins.filters.belief import Belief
+from robins.filters.model import Model
+from robins.filters.observation import left_out
+from robins.manifold import State
+
+# An eigenvalue below this counts for nothing: the prior knows the direction a million times better.
+NOTHING = 1e-6
+
+
+def observability(
+    model: Model,
+    start: Belief,
+    truth: State,
+    y: Mapping[str, Any],
+    u: Any = None,
+    aux: Mapping[str, Any] | None = None,
+    use: Any = None,
+    window: int | None = None,
+) -> Array:
+    """Factors L of (I + W)^-1 after every step of a run; ready for `jax.vmap`.
+
+    Args:
+        model: the motion and the sensors.
+        start: belief before the first step; its standard deviations are the units.
+        truth: as `robins.filters.analysis.bound.linearised` takes it, and so y, u and aux.
+        y: by sensor name.
+        u: inputs of the motion.
+        aux: what sensors need besides the state.
+        use: which sensors to use, as `observability_along` takes it.
+        window: after how many steps to begin anew, as `observability_along` takes it.
+
+    Returns:
+        (E, n, n); `bits`, `gramian` and `spectrum` read it.
+
+    Raises:
+        ValueError: lengths differ, or a window is shorter than a step.
+    """
+    line = linearised(model, start, truth, y, u, aux)
+    return observability_along(line, start.sigma, use, window)
+
+
+def observability_along(
+    line: Linearised, sigma: Array, use: Any = None, window: int | None = None
+) -> Array:
+    """The same of a model that has been linearised; one scan.
+
+    Args:
+        line: from `robins.filters.analysis.bound.linearised`.
+        sigma: (n,) units of the states, their prior standard deviations.
+        use: (S,) bool, which sensors of the model to use, in its order; all by default.
+        window: number of steps after which to begin anew, each window with the same units. By
+            default the whole run is one window. A direction that grows and is never seen overflows
+            after 700 of its time constants: give windows then.
+
+    Raises:
+        ValueError: a window is shorter than a step.
+    """
+    require(window is None or window >= 1, f"a window of {window} steps: at least one is wanted")
+    unit, D = linalg.identity(sigma.shape[0]), jnp.diag(sigma)
+    use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
+
+    def step(carry: tuple[Array, Array], item: tuple[Array, Linearised]):
+        fresh, row = item
+        L, M = (jnp.where(fresh, a, b) for a, b in zip((unit, D), carry, strict=True))
+        M = row.F @ M
+        for i, sight in enumerate(row.sights):
+            if sight is not None:
+                spread, excess, noise, _, _ = left_out(sight.seen_with(M, use[i]))
+                T = linalg.block_factor(spread, (excess, noise), unit)[2]
+                L, M = L @ T, M @ T
+        return (L, M), L
+
+    number = jnp.arange(line.F.shape[0])
+    fresh = jnp.zeros(number.shape, bool) if window is None else number % window == 0
+    return jax.lax.scan(step, (unit, D), (fresh, line))[1]
+
+
+def bits(L: Any) -> np.ndarray:
+    """(..., n) information gained of each state [bit]: one bit halves its standard deviation.
+
+    The mutual information between a state at the beginning and the measurements; inf where it was
+    measured exactly.
+    """
+    left = np.sqrt(np.sum(np.asarray(L) ** 2, axis=-1))
+    with np.errstate(divide="ignore"):
+        return np.maximum(-np.log2(left), 0.0)
+
+
+def gramian(L: Any) -> np.ndarray:
+    """(n, n) the Gramian W in units of the prior; not finite after an exact measurement."""
+    values, vectors = spectrum(L)
+    return (vectors * values) @ vectors.T
+
+
+def spectrum(L: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) eigenvalues of W, least first, and (n, n) their unit vectors as columns.
+
+    Values below `NOTHING` belong to directions that are not seen at all; as their vectors are any
+    mixture of these, `unobservable` sorts them out.
+    """
+    vectors, left, _ = np.linalg.svd(np.asarray(L, float))
+    with np.errstate(divide="ignore"):
+        values = np.maximum((1.0 - left) * (1.0 + left) / left**2, 0.0)
+    return values, vectors
+
+
+def unobservable(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(n, d) a basis of what is not seen at all, each vector of as few states as may be.
+
+    Gauss-Jordan on the eigenvectors below `NOTHING`: each keeps one state that no other has.
+    """
+    basis = vectors[:, values < NOTHING].copy()
+    free = np.ones(len(basis), bool)
+    for column in range(basis.shape[1]):
+        row = int(np.argmax(np.where(free, np.max(np.abs(basis[:, column:]), axis=1), -1.0)))
+        pick = column + int(np.argmax(np.abs(basis[row, column:])))
+        basis[:, [column, pick]] = basis[:, [pick, column]]
+        basis[:, column] /= basis[row, column]
+        others = np.arange(basis.shape[1]) != column
+        basis[:, others] -= np.outer(basis[:, column], basis[row, others])
+        free[row] = False
+    return basis / np.linalg.norm(basis, axis=0)
+
+
+def worded(vector: np.ndarray, names: Sequence[str], most: int = 4) -> str:
+    """A direction by the states that make it up: "82 % heading against 17 % gyro bias z".
+
+    The shares are squares of the components, in units of the prior; "with" joins states of one
+    sign, "against" of opposite ones. States that have less than 1 % are left out.
+    """
+    order = np.argsort(-np.round(np.abs(vector), 9), kind="stable")[:most]  # ties keep their order
+    text = ""
+    for i in order:
+        share = 100.0 * vector[i] ** 2 / float(np.sum(vector**2))
+        if share < 1.0 and text:
+            break
+        joint = "with" if vector[i] * vector[order[0]] > 0.0 else "against"
+        text += f" {joint} " if text else ""
+        text += f"{math.floor(share + 0.5)} % {names[i]}"
+    return text

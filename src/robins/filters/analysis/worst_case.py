@@ -1,0 +1,335 @@
+"""The worst case: what gamma a run allows, and how far disturbances can take its error.
+
+The worst-case gain of a filter over a run is
+
+    sup of sqrt( sum_k |L e_k|^2 / (|x0 - x0_hat|^2_{P0^-1} + sum |w_k|^2_{Q^-1} + |v_k|^2_{R^-1}) )
+
+over all initial errors and noises, e_k being the error of the estimate. An H-infinity filter keeps
+it below its gamma. `worst_case_gain` finds it from the gains alone, by no Riccati equation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, ArrayLike, Float
+
+from robins import linalg, manifold
+from robins.errors import require
+from robins.filters.belief import Belief, StepInfo
+from robins.filters.kalman import kalman
+from robins.filters.linearise import Linearisation, taylor
+from robins.filters.model import Model
+from robins.filters.rules._inflation import as_weight
+from robins.filters.rules.h_infinity import (
+    Estimate,
+    first_infeasible,
+    h_infinity,
+    least_gamma,
+    with_gamma,
+)
+from robins.filters.run import Solution, run
+
+
+def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""]:
+    """Least eigenvalue of ``P^-1 - gamma^-2 L'L``: positive where an H-infinity filter exists.
+
+    Args:
+        belief: after the measurement; batch with `jax.vmap`.
+        weight: L as `h_infinity` takes it.
+        gamma: bound; inf leaves the least eigenvalue of the information.
+
+    Returns:
+        In units of P^-1; NaN where P is singular.
+    """
+    L = as_weight(weight, "existence_margin")(belief.mean) / jnp.asarray(gamma, float)
+    root = linalg.solve_lower(belief.factor, linalg.identity(belief.factor.shape[0]))
+    return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
+
+
+def gamma_min(
+    model: Model,
+    start: Belief,
+    y: Any,
+    weight: Any,
+    u: Any = None,
+    aux: Mapping[str, Any] | None = None,
+    linearise: Linearisation | None = None,
+    rtol: float = 1e-4,
+    estimate: Estimate = "a-posteriori",
+    count_missing: bool = False,
+) -> float:
+    """Least gamma for which the H-infinity filter exists over a whole run.
+
+    The largest local bound of the Kalman filter is a lower bound; from there gamma is doubled until
+    the filter exists, then bisected. It grows with the horizon and with outages, and does not
+    depend on the data where the model is linear, but for what is missing.
+
+    Args:
+        model: the motion and the sensors.
+        start: initial belief.
+        y: measurements as `run` takes them.
+        weight: L as `h_infinity` takes it.
+        u: inputs as `run` takes them.
+        aux: what sensors need, as `run` takes it.
+        linearise: `taylor` by default.
+        rtol: by how much the result may be too large; it exists itself.
+        estimate: whose error is bounded, as `h_infinity` takes it.
+        count_missing: as `h_infinity` takes it.
+
+    Raises:
+        ValueError: the Kalman filter itself cannot take every step.
+    """
+    rule = h_infinity(np.inf, weight, estimate=estimate, count_missing=count_missing)
+    filter_ = kalman(linearise, [rule])
+
+    def bounds(step):
+        last = [info.notes["h_infinity.bound"] for info in step.info.values()][-1:]
+        counts = count_missing | _used(step.info)
+        return jnp.where(counts, jnp.max(jnp.array(last), initial=0.0), 0.0)
+
+    @jax.jit  # so that nothing is raised where the filter does not exist
+    def attempt(gamma):
+        state = with_gamma(filter_.init(start, model.dims), gamma)
+        done = run(filter_, model, state, y, u, aux, bounds)
+        return done.final.memory[0], done.log_likelihood, done.steps
+
+    def exists(gamma: float) -> bool:
+        return first_infeasible(attempt(gamma)[0]) is None
+
+    _, log_likelihood, noted = attempt(np.inf)
+    if not np.isfinite(log_likelihood):
+        raise ValueError("gamma_min: a step of the Kalman filter cannot be taken: see its codes")
+    lower = float(np.max(noted, initial=0.0))
+    return least_gamma(exists, lower, rtol) if lower > 0.0 else 0.0
+
+
+def _used(info: Mapping[str, StepInfo]) -> Array:
+    """Whether any sensor used anything, for each step."""
+    some = [jnp.any(one.used, axis=-1) for one in info.values()]
+    return jnp.any(jnp.stack(some), axis=0) if some else jnp.array(False)
+
+
+# ------------------------------------------------------------------------------- worst-case gain
+
+
+class Channel(NamedTuple):
+    """A sensor over a run: e becomes (I - K H) e - K W v at each step, v of unit variance."""
+
+    K: np.ndarray  # (T, n, m) gain, zero columns where nothing was used
+    H: np.ndarray  # (T, m, n)
+    W: np.ndarray  # (T, m, k) noise factor, R = W W'
+
+
+def error_operator(
+    S0: np.ndarray,
+    F: np.ndarray,
+    G: np.ndarray,
+    channels: Sequence[Channel],
+    weight: np.ndarray,
+    gain_on: np.ndarray | None = None,
+) -> np.ndarray:
+    """The matrix from initial error and noises, each of unit weight, to the errors L e of a run.
+
+    Args:
+        S0: (n, p) factor of the initial covariance.
+        F: (T, n, n) transitions into each step.
+        G: (T, n, q) factors of the process noise.
+        channels: sensors in the order in which they update.
+        weight: (T, r, n) rows L of each step; zero rows do not count.
+        gain_on: (T, n, n), for the error *before* the measurement, which is then the one counted:
+            the movement by the measurements, times this, is what the filter predicts from.
+            By default the error after the measurement is counted.
+
+    Returns:
+        (T r, p + T (q + k)), k summed over the channels.
+    """
+    T, n, q = G.shape
+    widths = [q, *(c.W.shape[2] for c in channels)]
+    width = sum(widths)
+    E = np.zeros((n, S0.shape[1] + T * width))
+    E[:, : S0.shape[1]] = S0
+    out = np.zeros((T, weight.shape[1], E.shape[1]))
+    for k in range(T):
+        at = S0.shape[1] + k * width
+        E = F[k] @ E
+        E[:, at : at + q] += G[k]
+        predicted = E.copy()
+        at += q
+        for c in channels:
+            E = E - c.K[k] @ (c.H[k] @ E)
+            E[:, at : at + c.W.shape[2]] -= c.K[k] @ c.W[k]
+            at += c.W.shape[2]
+        if gain_on is None:
+            out[k] = weight[k] @ E
+        else:
+            out[k] = weight[k] @ predicted
+            E = predicted + gain_on[k] @ (E - predicted)
+    return out.reshape(-1, E.shape[1])
+
+
+def spectral_norm(matrix: np.ndarray) -> float:
+    """Largest singular value, by the smaller Gram matrix: exact to rounding for the largest."""
+    gram = matrix @ matrix.T if matrix.shape[0] <= matrix.shape[1] else matrix.T @ matrix
+    last = len(gram) - 1
+    (value,) = scipy.linalg.eigvalsh(gram, subset_by_index=[last, last])
+    return float(np.sqrt(max(value, 0.0)))
+
+
+def worst_case_gain(
+    model: Model,
+    start: Belief,
+    solution: Solution,
+    weight: Any,
+    u: Any = None,
+    aux: Mapping[str, Any] | None = None,
+    estimate: Estimate = "a-posteriori",
+    count_missing: bool = False,
+) -> float:
+    """How far the worst initial error and noises of unit energy can take the error L e of a run.
+
+    The closed-loop recursion of the error, with the gains that the run used, is stacked into one
+    matrix; its 2-norm is the answer (module docstring). The model is linearised about the means of
+    the run, so this is the gain to small disturbances where the model is not linear.
+
+    Args:
+        model: the one that was run.
+        start: the belief it began with.
+        solution: a run that kept its steps.
+        weight: L, as `h_infinity` takes it.
+        u: the inputs of the run.
+        aux: what its sensors were given.
+        estimate: which error counts: "a-posteriori", the one after the measurements of a step, or
+            "a-priori" and "predictor", the one before them.
+        count_missing: whether steps count in which nothing was used.
+
+    Raises:
+        ValueError: the run did not keep its steps.
+    """
+    steps = solution.steps
+    if not hasattr(steps, "prediction"):
+        raise ValueError("worst_case_gain needs a run that kept its steps: leave `keep` alone")
+    S0, F, G, channels, L = _linearised(model, start, steps, weight, u, dict(aux or {}))
+    counts = np.ones(len(F), bool) if count_missing else np.asarray(_used(steps.info))
+    L = np.where(counts[:, None, None], L, 0.0)
+    gain_on = None
+    if estimate != "a-posteriori":
+        gain_on = np.tile(np.eye(F.shape[1]), (len(F), 1, 1))
+        last = [steps.info[s.name].notes for s in model.sensors if s.name in steps.info][-1:]
+        gamma = [notes["h_infinity.gamma"] for notes in last if "h_infinity.gamma" in notes]
+        if steps.prediction.origin is not None and gamma:
+            # P~ L'L / gamma^2 of the settled belief that the next prediction began with
+            scaled = L[:-1] / np.asarray(gamma[0])[:-1, None, None]
+            wide = np.asarray(steps.prediction.origin.covariance)[1:]
+            gain_on[:-1] += wide @ np.swapaxes(scaled, 1, 2) @ scaled
+    return spectral_norm(error_operator(S0, F, G, channels, L, gain_on))
+
+
+def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Any, aux: dict[str, Any]):
+    """Everything the recursion of the error needs, along a run."""
+    n, way, rows = manifold.dim(start.mean), taylor(), as_weight(weight, "worst_case_gain")
+    unit = partial(Belief, factor=linalg.identity(n))  # so that a spread is the Jacobian
+    prediction = steps.prediction
+    if prediction.origin is not None:
+        before = prediction.origin.mean
+    else:
+        before = jax.tree_util.tree_map(
+            lambda a, b: jnp.concatenate([jnp.asarray(a, float)[None], b[:-1]]),
+            start.mean,
+            steps.posterior.mean,
+        )
+
+    @jax.jit
+    @jax.vmap
+    def motion(mean, u):
+        t = way.transition(unit(mean), model.motion, u)
+        return t.spread, t.noise
+
+    F, G = motion(before, u)
+    mean, channels = prediction.belief.mean, []
+    for sensor in model.sensors:
+        if sensor.name not in steps.info:
+            continue
+
+        @jax.jit
+        @jax.vmap
+        def look(mean, info, aux, sensor=sensor):
+            z = sensor.read(mean, aux) if sensor.linear is None else sensor.linear(mean, aux)[0]
+            o = way.observation(unit(mean), sensor, z, aux)
+            residual = jnp.where(info.used, info.innovation, 0.0)
+            return o.spread, o.noise, manifold.retract(mean, info.gain @ residual)
+
+        info = steps.info[sensor.name]
+        H, W, mean = look(mean, info, aux.get(sensor.name))
+        channels.append(Channel(np.asarray(info.gain), np.asarray(H), np.asarray(W)))
+    L = np.asarray(jax.vmap(rows)(steps.posterior.mean))
+    return np.asarray(start.factor), np.asarray(F), np.asarray(G), channels, L
+
+
+# -------------------------------------------------------------------------------------- steady
+
+
+class SteadyHInfinity(NamedTuple):
+    """A time-invariant H-infinity filter."""
+
+    P_pred: np.ndarray  # (n, n) before the measurement
+    P: np.ndarray  # (n, n) after it
+    K: np.ndarray  # (n, m) P H' R^-1, of the estimate after the measurement
+    K_a_priori: np.ndarray  # (n, m) P~ H' R^-1, of the estimate before it; P~ is P inflated
+
+
+def steady_h_infinity(
+    F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, weight: ArrayLike, gamma: float | int
+) -> SteadyHInfinity:
+    """What `h_infinity` converges to on a system that does not change.
+
+    The stabilising solution of the Riccati equation of F' and [H' L'] with weights R and -gamma^2 I
+    (Hassibi, Sayed & Kailath 1999, ch. 4), checked against existence and against the recursion.
+
+    Args:
+        F: (n, n) transition.
+        Q: (n, n) process noise covariance.
+        H: (m, n).
+        R: (m, m) measurement noise covariance.
+        weight: (q, n) L.
+        gamma: bound; inf gives the Kalman filter.
+
+    Raises:
+        ValueError: gamma is not positive, or no such filter exists.
+    """
+    F, Q, H, R, L = (np.asarray(a, dtype=float) for a in (F, Q, H, R, weight))
+    require(gamma > 0.0, f"gamma must be positive, or inf for the Kalman filter; got {gamma}")
+    q = len(L)
+    missing = f"no steady H-infinity filter with gamma = {gamma:g} exists: "
+    C = np.concatenate([H, L / gamma])
+    weights = scipy.linalg.block_diag(R, -np.eye(q))
+    try:
+        P_pred = scipy.linalg.solve_discrete_are(F.T, C.T, Q, weights)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            missing + "its Riccati equation has no stabilising solution; give a larger gamma, and "
+            "see that H sees what F does not let decay"
+        ) from error
+    P_pred = (P_pred + P_pred.T) / 2.0
+    S = H @ P_pred @ H.T + R
+    K = np.linalg.solve(S, H @ P_pred).T
+    A = np.eye(len(F)) - K @ H
+    P = A @ P_pred @ A.T + K @ R @ K.T
+    bound = np.sqrt(max(np.linalg.eigvalsh(L @ P @ L.T)[-1], 0.0))
+    scale = max(np.max(np.abs(P_pred)), np.finfo(float).tiny)
+    if np.linalg.eigvalsh(P_pred)[0] < -1e-9 * scale:
+        raise ValueError(missing + "the solution of its Riccati equation is not a covariance")
+    if not bound < gamma:
+        raise ValueError(missing + f"its local bound sqrt(lambda_max(L P L')) would be {bound:.6g}")
+    inner = gamma**2 * np.eye(q) - L @ P @ L.T if np.isfinite(gamma) else None
+    wide = P if inner is None else P + P @ L.T @ np.linalg.solve(inner, L @ P)
+    residual = F @ wide @ F.T + Q - P_pred
+    if np.max(np.abs(residual)) > 1e-8 * scale:
+        raise ValueError(missing + "the solution of its Riccati equation does not satisfy it")
+    return SteadyHInfinity(P_pred, P, K, np.linalg.solve(R, H @ wide).T)

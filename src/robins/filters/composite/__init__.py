@@ -1,0 +1,31 @@
+"""Filters made of filters: of locals, of modes, of particles; guarded; of late measurements."""
+
+from robins.filters.composite.channels import Channel, at_master, channel
+from robins.filters.composite.delayed import Late, delayed
+from robins.filters.composite.distributed import distributed, intersecting
+from robins.filters.composite.federated import federated, observability_shares
+from robins.filters.composite.fusion import covariance_intersection, fuse, share
+from robins.filters.composite.guarded import guarded
+from robins.filters.composite.imm import Family, imm, mode
+from robins.filters.composite.particle import particle, reseed
+
+__all__ = [
+    "Channel",
+    "Family",
+    "Late",
+    "at_master",
+    "channel",
+    "covariance_intersection",
+    "delayed",
+    "distributed",
+    "federated",
+    "fuse",
+    "guarded",
+    "imm",
+    "intersecting",
+    "mode",
+    "observability_shares",
+    "particle",
+    "reseed",
+    "share",
+]

@@ -1,0 +1,318 @@
+"""Channels: filters side by side, each with sensors of its own, joined into one filter.
+
+What the federated and the distributed filter have in common: who reads which sensor, a measurement
+on its way to its local filter, the belief fused again after it, and steps that cannot be taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import register_static
+from jaxtyping import Array
+
+from robins.errors import require
+from robins.filters.audit import Again, audit
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.checks import sensor_names
+from robins.filters.composite.fusion import is_singular
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step, kalman, not_taken
+from robins.filters.linearise import Transition
+from robins.filters.model import Motion, Sensor, as_noise
+from robins.filters.trees import equal, finite, select
+from robins.manifold import State
+
+
+class Channel(NamedTuple):
+    """A local filter and the sensors it uses; made by `channel`."""
+
+    sensors: tuple[str, ...]
+    filter: Filter
+
+    @property
+    def name(self) -> str:
+        """Its sensors, for messages."""
+        return "+".join(self.sensors)
+
+
+@register_static
+class Names(tuple[str, ...]):
+    """Of the channels, in a state: no number, so no leaf."""
+
+
+class Joined(NamedTuple):
+    """What a filter of channels carries besides the fused belief."""
+
+    members: tuple[FilterState, ...]  # by channel; a master last, where there is one
+    shares: Array  # (members, 1 or n) of the information
+    silent: Array  # (channels,) steps since a measurement was used
+    singular: Array  # (members,) steps not taken because information was infinite
+    names: Names
+
+    def audit(self, start: Joined, again: Again | None, time: Any) -> None:
+        """Ask the members, then raise for steps not taken (`robins.filters.audit`)."""
+        rerun = None if again is None else lambda m: again(start._replace(members=m)).members
+        audit(start.members, self.members, rerun, time)
+        for i, count in enumerate(np.asarray(self.singular).tolist()):
+            name = f"channel '{self.names[i]}'" if i < len(self.names) else "the master"
+            require(
+                count == 0,
+                f"the covariance of {name} was singular in {count} steps, which were not taken: "
+                "infinite information cannot be fused. Give a constraint, a measurement or a state "
+                "without noise some noise, or constrain what is fused",
+            )
+
+
+Fuse = Callable[[Sequence[Belief]], Belief]
+
+
+def channel(sensors: str | Sequence[str], filter: Filter | None = None) -> Channel:
+    """A local filter and the names of the sensors it uses.
+
+    Args:
+        sensors: a name, or several.
+        filter: `kalman(...)` with rules of its own, or any other `Filter`; `kalman()` by default.
+
+    Raises:
+        ValueError: no sensor is named, or one twice.
+    """
+    names = sensor_names("channel", sensors)
+    require(len(set(names)) == len(names), "a channel names each sensor once", list(names))
+    return Channel(names, kalman() if filter is None else filter)
+
+
+def owners(channels: Sequence[Channel]) -> dict[str, int]:
+    """Which channel has which sensor."""
+    require(channels, "no channels: at least one local filter is wanted")
+    owner: dict[str, int] = {}
+    for i, one in enumerate(channels):
+        for name in one.sensors:
+            require(
+                name not in owner,
+                f"sensor '{name}' belongs to two channels: what it measures would be counted twice",
+            )
+            owner[name] = i
+    return owner
+
+
+def local_dims(channels: Sequence[Channel], dims: Mapping[str, int]) -> list[dict[str, int]]:
+    """Sensor dimensions by channel, in the model's order."""
+    owner = owners(channels)
+    if homeless := [name for name in dims if name not in owner]:
+        raise ValueError(
+            f"no channel uses sensor {homeless[0]!r}: name it in one, or take it out of the model"
+        )
+    if unknown := [name for name in owner if name not in dims]:
+        raise ValueError(
+            f"channel '{channels[owner[unknown[0]]].name}' uses sensor {unknown[0]!r}; this model "
+            f"has {sorted(dims)}"
+        )
+    return [{k: v for k, v in dims.items() if owner[k] == i} for i in range(len(channels))]
+
+
+def members_of(filters: Sequence[Filter]):
+    """The `members` of a joined filter: each goes on by its own `reset`."""
+
+    def members(state: FilterState):
+        joined: Joined = state.memory
+
+        def follow(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            each = zip(filters, joined.members, beliefs, strict=True)
+            states = tuple(f.reset(member, own) for f, member, own in each)
+            return FilterState(belief, joined._replace(members=states))
+
+        return tuple(member.belief for member in joined.members), follow
+
+    return members
+
+
+# ----------------------------------------------------------------------------- steps of the whole
+
+
+def updating(channels: Sequence[Channel], fuse: Fuse, name: str):
+    """The `update` of a joined filter: the sensor's local filter updates, then all are fused."""
+    owner = owners(channels)
+
+    def update(
+        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
+    ) -> tuple[FilterState, StepInfo]:
+        if sensor.name not in owner:
+            raise ValueError(f"no channel uses sensor '{sensor.name}'; there are {sorted(owner)}")
+        joined: Joined = state.memory
+        i = owner[sensor.name]
+        before = joined.members[i]
+        after, info = channels[i].filter.update(before, sensor, y, aux)
+        members = (*joined.members[:i], after, *joined.members[i + 1 :])
+        silent = jnp.where(info.dof > 0, joined.silent.at[i].set(0), joined.silent)
+        # What a measurement did not touch stands bit for bit.
+        same = equal(before.belief, after.belief)
+        belief = select(same, state.belief, fuse([m.belief for m in members]))
+        singular = jnp.stack([is_singular(m.belief) for m in members])
+        ok = same | (finite(belief) & ~jnp.any(singular))
+        new = FilterState(belief, joined._replace(members=members, silent=silent))
+        info = not_taken(ok, info, jnp.asarray(int(Code.NOT_FINITE)))
+        info = info.noted(name, share=jnp.mean(joined.shares[i]), silent=silent[i])
+        return select(ok, new, _refused(state, singular)), info
+
+    return update
+
+
+class Moved(NamedTuple):
+    """Members after a prediction, and how it went with each filter that predicted."""
+
+    members: tuple[FilterState, ...]
+    codes: tuple[Any, ...]  # by member
+    belief: Belief  # fused
+    shares: Array
+    transition: Transition | None = None  # of a prediction common to all
+    code: Any = int(Code.DONE)  # of that prediction
+
+
+def concluded(state: FilterState, moved: Moved) -> tuple[FilterState, Prediction]:
+    """The end of the `predict` of a joined filter: taken by all members, or by none.
+
+    A member that cannot take the step keeps its memory of that (`Rule.settle`).
+    """
+    joined: Joined = state.memory
+    joined = joined._replace(silent=joined.silent + 1)
+    done = int(Code.DONE)
+    singular = jnp.stack([is_singular(m.belief) for m in moved.members])
+    sound = finite(moved.belief) & ~jnp.any(singular)
+    code = jnp.where(sound, done, int(Code.NOT_FINITE))
+    for one in (*reversed(moved.codes), moved.code):
+        code = jnp.where(one == done, code, one)
+    ok = code == done
+    kept = tuple(
+        old._replace(memory=select(one == done, old.memory, new.memory))
+        for old, new, one in zip(joined.members, moved.members, moved.codes, strict=True)
+    )
+    stays = state._replace(memory=joined._replace(members=kept))
+    new = FilterState(moved.belief, joined._replace(members=moved.members, shares=moved.shares))
+    new = select(ok, new, _refused(stays, singular))
+    return new, Prediction(moved.transition, new.belief, code)
+
+
+def _refused(state: FilterState, singular: Array) -> FilterState:
+    joined: Joined = state.memory
+    return state._replace(memory=joined._replace(singular=joined.singular + singular.astype(int)))
+
+
+def starting(
+    states: Sequence[FilterState], belief: Belief, shares: Array, channels: Sequence[Channel]
+) -> FilterState:
+    """The state of a joined filter at its start."""
+    silent, singular = (jnp.zeros(len(x), int) for x in (channels, states))
+    names = Names(c.name for c in channels)
+    return FilterState(belief, Joined(tuple(states), shares, silent, singular, names))
+
+
+def followed_by(
+    motion: Motion,
+    noise: Callable[[Array], Array],
+    state: Callable[[State], State] = lambda x: x,
+    slope: Callable[[Array], Array] = lambda F: F,
+) -> Motion:
+    """A motion whose noise factor, new state and slope F are each put through a function."""
+    known = motion.linear
+
+    def linear(x, u):
+        assert known is not None
+        mean, F, given = known(x, u)
+        return state(mean), slope(F), noise(as_noise(given, F.shape[0], "the motion"))
+
+    return Motion(
+        lambda x, u: state(motion.step(x, u)),
+        lambda x, u: noise(motion.noise_factor(x, u)),
+        None if known is None else linear,
+    )
+
+
+class Mastered(NamedTuple):
+    """What a joined filter with sensors at its master carries besides the belief given out."""
+
+    joined: FilterState  # its belief is the one given out
+    master: FilterState
+
+
+def at_master(filter: Filter, sensors: str | Sequence[str], master: Filter | None = None) -> Filter:
+    """A joined filter, some of whose sensors update what was fused and no local filter.
+
+    A hard constraint makes the covariance of a local filter singular, so that it cannot be fused
+    (51 of the airship paper wants its inverse), and one that several locals use is counted several
+    times. Applied to what was fused, it is counted once and may be exact. Whether it lasts depends
+    on what the joined filter makes of the fused belief when it predicts:
+
+        distributed, intersecting   own: locals go on from their own, the constraint is output only
+                                    mean: its mean goes back; full: its mean and covariance
+        federated                   fusion-reset, zero-reset: shared out like all that was fused
+                                    no-reset, rescale: output only
+
+    The sensors must come last in the model: a local measurement after them is fused anew from the
+    locals, which know nothing of them.
+
+    Args:
+        filter: `distributed`, `intersecting` or `federated`, of the other sensors.
+        sensors: those that update what was fused.
+        master: how they do: its way to linearise and what its rules do before and after an update
+            (it never predicts). `kalman()` by default.
+
+    Raises:
+        ValueError: no sensor is named; at `init`, the model has no such sensor or has another one
+            after it, or the filter is not a joined one.
+    """
+    names = sensor_names("at_master", sensors)
+    centre = kalman() if master is None else master
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        if unknown := [name for name in names if name not in dims]:
+            raise ValueError(f"at_master: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
+        last = list(dims)[-len(names) :]
+        if late := [name for name in last if name not in names]:
+            raise ValueError(
+                f"at_master: sensor {late[0]!r} comes after one of the master's: put {list(names)} "
+                "last in the model"
+            )
+        joined = filter.init(belief, {k: m for k, m in dims.items() if k not in names})
+        require(
+            filter.members(joined)[0],
+            "at_master wants a filter of channels: one without locals uses the sensor itself",
+        )
+        own = centre.init(belief, {k: m for k, m in dims.items() if k in names})
+        return FilterState(joined.belief, Mastered(joined, own))
+
+    def predict(
+        state: FilterState, motion: Motion, u: Any = None
+    ) -> tuple[FilterState, Prediction]:
+        mastered: Mastered = state.memory
+        joined, prediction = filter.predict(mastered.joined, motion, u)
+        return FilterState(joined.belief, mastered._replace(joined=joined)), prediction
+
+    def update(
+        state: FilterState, sensor: Sensor, y: Any, aux: Any = None
+    ) -> tuple[FilterState, StepInfo]:
+        mastered: Mastered = state.memory
+        if sensor.name not in names:
+            joined, info = filter.update(mastered.joined, sensor, y, aux)
+            return FilterState(joined.belief, mastered._replace(joined=joined)), info
+        own, info = centre.update(centre.reset(mastered.master, state.belief), sensor, y, aux)
+        joined = mastered.joined._replace(belief=own.belief)
+        return FilterState(own.belief, Mastered(joined, own)), info
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        mastered: Mastered = state.memory
+        joined = filter.reset(mastered.joined, belief)
+        return FilterState(joined.belief, Mastered(joined, centre.reset(mastered.master, belief)))
+
+    def members(state: FilterState):
+        mastered: Mastered = state.memory
+        beliefs, follow = filter.members(mastered.joined)
+
+        def followed(beliefs: Sequence[Belief], belief: Belief) -> FilterState:
+            return FilterState(belief, mastered._replace(joined=follow(beliefs, belief)))
+
+        return beliefs, followed
+
+    return in_step(Filter(init, predict, update, reset, members))

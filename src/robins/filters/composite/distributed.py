@@ -1,0 +1,169 @@
+r"""Distributed filters: locals that each know everything, and what they find, fused.
+
+The airship paper fuses two full filters as if they were independent (its eq. 51):
+
+    P_g = (P_1^-1 + P_2^-1)^-1        x_g = P_g (P_1^-1 x_1 + P_2^-1 x_2)
+
+and feeds x_g back to the navigation state. It does not say what becomes of the local filters then;
+the three readings are ``feedback``:
+
+    own    each goes on from its own mean and covariance: error states shifted by -x_g
+    mean   each takes the fused mean, and keeps its covariance: error states set to zero
+    full   each takes the fused mean and covariance: all information counted again at every step
+
+Locals with the same prior and process noise are not independent, so even the first is somewhat
+overconfident. The federated filter (`federated`) shares both out and is not;
+covariance intersection is safe whatever the correlation.
+
+States that only one local has (the errors of a wind that only its sensors see) cannot be fused:
+with ``common`` the first so many tangent components are, from the marginals of all locals, and the
+rest follows from what the first local makes of it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import jax.numpy as jnp
+
+from robins.errors import require
+from robins.filters.belief import Belief
+from robins.filters.checks import one_of
+from robins.filters.composite.channels import (
+    Channel,
+    Fuse,
+    Joined,
+    Moved,
+    concluded,
+    local_dims,
+    members_of,
+    owners,
+    starting,
+    updating,
+)
+from robins.filters.composite.fusion import (
+    Criterion,
+    check_criterion,
+    common_information_sum,
+    information_sum,
+    intersection_weights,
+)
+from robins.filters.kalman import Filter, FilterState, in_step
+from robins.filters.model import Motion
+
+Feedback = Literal["own", "mean", "full"]
+
+FULL = (
+    "feedback='full' gives every local filter the information of all, to be counted again at the "
+    "next fusion: the covariance shrinks without bound (NEES of 1e7 was measured); use 'own', or "
+    "the federated filter"
+)
+
+
+def distributed(
+    channels: Sequence[Channel], feedback: Feedback = "own", common: int | None = None
+) -> Filter:
+    """Local filters with the whole prior and process noise, fused by an information sum (51).
+
+    The belief of its state is the fused one. Locals have their prior and process noise in common,
+    which (51) takes for independent: expect too small a covariance, and see `federated` for the
+    filter that is right. What an update says of itself is what the sensor's local filter says.
+
+    A local covariance that is singular (a hard constraint, a measurement without noise) has no
+    inverse. The step is not taken, with `Code.NOT_FINITE`, and a run raises a ValueError with what
+    to do at its end; nothing is added to make it regular.
+
+    Args:
+        channels: from `channel`; every sensor of the model belongs to exactly one.
+        feedback: "own", "mean" or "full" (module docstring).
+        common: how many tangent components, from the first on, are fused by (51); all by default.
+            The others belong to the first channel, and follow from its conditional distribution
+            given the common ones (`common_information_sum`). Locals are of one state, so the other
+            channels carry those components as well, but nothing of what they make of them is used.
+
+    Raises:
+        ValueError: a sensor in two channels, an unknown feedback, no common component; at `init`, a
+            sensor without a channel, or a state with fewer components than are common.
+    """
+    one_of("feedback", feedback, Feedback)
+    if feedback == "full":
+        warnings.warn(FULL, UserWarning, stacklevel=2)
+    if common is None:
+        return _side_by_side(channels, information_sum, feedback, "distributed")
+    require(common >= 1, "distributed: at least one component must be common", common)
+    summed = partial(common_information_sum, common=common)
+    return _side_by_side(channels, summed, feedback, "distributed", common)
+
+
+def intersecting(
+    channels: Sequence[Channel],
+    criterion: Criterion | Sequence[float] = "trace",
+    feedback: Feedback = "own",
+) -> Filter:
+    """Local filters with the whole prior and process noise, fused by covariance intersection.
+
+    Consistent whatever the correlation of the locals, at the price of a covariance that is never
+    smaller than that of the best combination of one's own (Julier & Uhlmann 1997).
+
+    Args:
+        channels: from `channel`; every sensor of the model belongs to exactly one.
+        criterion: "trace", "det", or (N,) weights; see `covariance_intersection`.
+        feedback: "own" or "mean"; "full" makes the locals one and the same, which loses information
+            without harm.
+
+    Raises:
+        ValueError: as `distributed`, or the criterion is none of these.
+    """
+    one_of("feedback", feedback, Feedback)
+    check_criterion(criterion, len(channels))
+
+    def intersect(beliefs: Sequence[Belief]) -> Belief:
+        return information_sum(beliefs, intersection_weights(beliefs, criterion))
+
+    return _side_by_side(channels, intersect, feedback, "intersecting")
+
+
+def _side_by_side(
+    channels: Sequence[Channel], fuse: Fuse, feedback: Feedback, name: str, common: int = 1
+) -> Filter:
+    channels = tuple(channels)
+    owners(channels)
+    count = len(channels)
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        each = local_dims(channels, dims)
+        if belief.factor.shape[0] < common:
+            raise ValueError(
+                f"distributed: {common} components are common, the state has "
+                f"{belief.factor.shape[0]}"
+            )
+        states = [c.filter.init(belief, d) for c, d in zip(channels, each, strict=True)]
+        return starting(states, belief, jnp.ones((count, 1)), channels)
+
+    def fed_back(state: FilterState) -> list[FilterState]:
+        joined: Joined = state.memory
+        if feedback == "own":
+            return list(joined.members)
+        fused = state.belief
+        return [
+            c.filter.reset(m, fused if feedback == "full" else Belief(fused.mean, m.belief.factor))
+            for c, m in zip(channels, joined.members, strict=True)
+        ]
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        members, codes = [], []
+        for one, member in zip(channels, fed_back(state), strict=True):
+            member, prediction = one.filter.predict(member, motion, u)
+            members.append(member)
+            codes.append(prediction.code)
+        fused = fuse([m.belief for m in members])
+        return concluded(state, Moved(tuple(members), tuple(codes), fused, state.memory.shares))
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        return members(state)[1]([belief] * count, belief)
+
+    members = members_of([c.filter for c in channels])
+    return in_step(Filter(init, predict, updating(channels, fuse, name), reset, members))

@@ -1,0 +1,364 @@
+"""The federated filter: local filters beside each other, and their information shared and fused.
+
+Each local filter has sensors of its own, and a share of what is known and of the process noise, so
+that what they know is the whole when it is added up (Carlson 1990):
+
+    fuse     Y_g = sum_i Y_i + Y_m,  x_g = Y_g^-1 (sum_i Y_i x_i + Y_m x_m)
+    share    x_i = x_g,  P_i = P_g / b_i,  Q_i = Q / b_i,  sum_i b_i + b_m = 1
+
+    mode          at the start of each step
+    fusion-reset  locals and master take their shares of what was fused
+    no-reset      locals go on from what they have; the master only fuses
+    zero-reset    locals forget all, the master keeps it
+    rescale       locals keep c Y_i, the master takes the (1 - c) Y_i that they give away
+
+A local filter that measures nothing stays in the fusion: it holds a share of what was known, and to
+leave it out would multiply P by 1 / (1 - b_i). With linear models fusion-reset with scalar or root
+sharing, and zero-reset, *are* the centralised filter.
+
+A share a_ij in (0, 1) is what local filter i gets of the information about state j (or about all of
+them, b_i). Four ways to choose them (Zhao, Li & Wang 2016; Xiong et al. 2013):
+
+    equal          b_i  = 1 / N
+    trace          b_i  ~ 1 / tr P_i                        states scaled first
+    diagonal       a_ij ~ 1 / P_i,jj
+    observability  a_ij ~ sigma_ij,  sigma_ij^2 = (O_i' O_i)_jj,
+                   O_i = [R_i^-1/2 H_i; R_i^-1/2 H_i F; ...; R_i^-1/2 H_i F^(k-1)] D
+
+With a reset at every step and linear models shares cannot change the fused accuracy. They matter
+where a local filter judges its measurements by its own covariance, and where it is not reset. In
+terms of O = U S V' the last is sum_l S_l^2 V_jl^2: a singular value belongs to a direction, not to
+the state of the same number. D, the standard deviations of the belief, makes the states unit-free.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from robins import linalg, manifold
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number
+from robins.filters.checks import one_of
+from robins.filters.composite import channels as _channels
+from robins.filters.composite.channels import Channel, Moved, followed_by
+from robins.filters.composite.fusion import Sharing, check_sharing, information_sum, part
+from robins.filters.kalman import Filter, FilterState, in_step, kalman
+from robins.filters.linearise import Linearisation, taylor
+from robins.filters.model import Model, Motion
+
+# Without a floor a share of zero is an infinite covariance.
+FLOOR = 0.05
+
+
+def floored(weights: Array) -> Array:
+    """Shares from weights (N, ...): over N they sum to one, and none is below about `FLOOR`.
+
+    Where no filter has any weight, all get the same. Shares that sum to one and lie above the floor
+    come back unchanged but for rounding.
+    """
+    total = jnp.sum(weights, axis=0, keepdims=True)
+    some = total > 0.0
+    a = jnp.where(some, weights / jnp.where(some, total, 1.0), 1.0 / weights.shape[0])
+    a = jnp.maximum(a, FLOOR)
+    return a / jnp.sum(a, axis=0, keepdims=True)
+
+
+def equal_shares(count: int) -> Array:
+    """(N, 1), all the same."""
+    return jnp.full((count, 1), 1.0 / count)
+
+
+def trace_shares(beliefs: Sequence[Belief], sigma: Array) -> Array:
+    """(N, 1), inverse to the trace of each local covariance.
+
+    Args:
+        beliefs: of the local filters.
+        sigma: (n,) unit of each state, such as its fused standard deviation.
+    """
+    unit = jnp.where(sigma > 0.0, sigma, 1.0)
+    return floored(jnp.stack([1.0 / jnp.sum((b.sigma / unit) ** 2) for b in beliefs])[:, None])
+
+
+def diagonal_shares(beliefs: Sequence[Belief]) -> Array:
+    """(N, n), inverse to the variance of each state in each local filter."""
+    return floored(jnp.stack([1.0 / b.sigma**2 for b in beliefs]))
+
+
+def observability_shares(
+    model: Model,
+    belief: Belief,
+    channels: Sequence[Channel],
+    steps: int | None = None,
+    u: Any = None,
+    aux: dict[str, Any] | None = None,
+) -> np.ndarray:
+    """(N, n) shares by how well each channel sees each state; computed once, before a run.
+
+    A state that no channel sees is shared equally.
+
+    Args:
+        model: its motion and sensors, linearised at the belief.
+        belief: about which to linearise; its standard deviations are the units of the states.
+        channels: from `channel`.
+        steps: number k of blocks in O_i; by default n, the dimension of the state.
+        u: input of the motion for one step.
+        aux: what sensors need besides the state, by sensor name.
+
+    Raises:
+        KeyError: a channel names a sensor that the model has not.
+        ValueError: fewer than one step, or a sensor without noise, which sees infinitely well.
+    """
+    n = manifold.dim(belief.mean)
+    count = n if steps is None else steps
+    require(count >= 1, f"observability over {count} steps: at least one is wanted")
+    way, unit = taylor(), Belief(belief.mean, linalg.identity(n))
+    F = np.asarray(way.transition(unit, model.motion, u).spread)  # F times the identity
+    D = np.asarray(belief.sigma)
+    sees = np.zeros((len(channels), n))
+    for i, one in enumerate(channels):
+        for name in one.sensors:
+            sensor, extra = model.sensor(name), (aux or {}).get(name)
+            seen = way.observation(unit, sensor, sensor.read(belief.mean, extra), extra)
+            root = linalg.tria(seen.noise)
+            if not bool(jnp.all(jnp.diagonal(root) > 0.0)):
+                raise ValueError(f"sensor '{name}' has components without noise: give it some")
+            block = np.asarray(linalg.solve_lower(root, seen.spread))
+            for _ in range(count):
+                sees[i] += np.sum((block * D) ** 2, axis=0)
+                block = block @ F
+    return np.asarray(jax.device_get(floored(jnp.sqrt(jnp.asarray(sees)))))
+
+
+Mode = Literal["fusion-reset", "no-reset", "zero-reset", "rescale"]
+
+HALF = (
+    "sharing='half' is no upper bound where states with different shares are correlated, and adds "
+    "information at every reset (det P falls with no data at all): use 'root', which conserves it"
+)
+
+# Zero-reset: what a local filter is left with of the prior. A filter cannot begin from nothing, so
+# it gets this much of what the master knows, and the master the rest: the sum is exact.
+_TRACE = 1e-8
+
+
+def federated(
+    channels: Sequence[Channel],
+    mode: Mode = "fusion-reset",
+    sharing: Sharing = "root",
+    shares: str | ArrayLike | Sequence[Any] = "equal",
+    master: Number = 0.0,
+    *,
+    keep: Number = 0.5,
+    after_prediction: bool | None = None,
+    linearise: Linearisation | None = None,
+) -> Filter:
+    """A federated Kalman filter (Carlson 1990); runs, streams and batches as any `Filter`.
+
+    The belief of its state is the fused one, after a prediction and after each sensor. What an
+    update says of itself (innovation, gain, NIS, log-likelihood) is what the sensor's local filter
+    says, which knows less than the whole: the log-likelihoods of a run do not sum to that of the
+    data. Notes: ``federated.share``, the mean share of that local filter, and
+    ``federated.silent``, steps since it used a measurement.
+
+    Rules of a local filter work on its share. With sharing after the prediction a local filter with
+    rules predicts for itself, through the map that makes its share of the common prediction; one
+    without rules only corrects.
+
+    Args:
+        channels: from `channel`; every sensor of the model belongs to exactly one.
+        mode: "fusion-reset", "no-reset", "zero-reset" or "rescale" (module docstring).
+            Zero-reset leaves a local filter nothing to judge measurements by, and sigma points of
+            an unknown state reach beyond any model: give it Taylor and no robust rules.
+        sharing: "root", "scalar" or "half"; how, see `robins.filters.composite.fusion`.
+        shares: "equal"; "trace" or "diagonal", from the local covariances at every step; or (N,) or
+            (N, n) numbers that sum to one with the master's, such as `observability_shares`.
+            Shares below 0.05 are raised to it.
+        master: share of a master that measures nothing, from 0 to below 1.
+        keep: c of mode "rescale", what a local filter keeps of its information.
+        after_prediction: fusion-reset: predict what was fused, then share it out (True), or share
+            it out and let all predict (False). By default True with root sharing, which is exact
+            only so, and False else.
+        linearise: how the fused belief and the master's are predicted; `taylor()` by default. Give
+            that of the local filters.
+
+    Raises:
+        ValueError: a sensor in two channels, an unknown mode, sharing or kind of shares, shares
+            that are negative, not finite or do not sum to one, a master that the mode has not; at
+            `init`, a sensor without a channel.
+    """
+    channels = tuple(channels)
+    _channels.owners(channels)
+    one_of("mode", mode, Mode)
+    check_sharing(sharing)
+    _check_master(mode, shares, master, keep)
+    fixed = _fixed_shares(shares, len(channels), master)
+    kind = shares if isinstance(shares, str) else "given"
+    if sharing == "scalar" and (kind == "diagonal" or (fixed is not None and fixed.ndim == 2)):
+        raise ValueError("scalar sharing takes one share a channel: use 'root' for one a state")
+    if after_prediction and mode != "fusion-reset":
+        raise ValueError(f"sharing after the prediction is of mode 'fusion-reset', not {mode!r}")
+    if sharing == "half":
+        warnings.warn(HALF, UserWarning, stacklevel=2)
+
+    count = len(channels)
+    has_master = master > 0.0 or mode == "zero-reset"
+    late = mode == "zero-reset" or (
+        mode == "fusion-reset"
+        and (sharing == "root" if after_prediction is None else after_prediction)
+    )
+    centre = kalman(linearise)
+    filters = [*(c.filter for c in channels), *([centre] if has_master else [])]
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        given = [*_channels.local_dims(channels, dims), *([{}] if has_master else [])]
+        a = initial_shares(belief)
+        parts = parted(belief, a)
+        states = [f.init(p, d) for f, p, d in zip(filters, parts, given, strict=True)]
+        return _channels.starting(states, belief, a, channels)
+
+    def initial_shares(belief: Belief) -> Array:
+        n = belief.factor.shape[0]
+        if mode == "zero-reset":
+            return jnp.array([[_TRACE]] * count + [[1.0 - count * _TRACE]])
+        if fixed is None:
+            a = equal_shares(count)
+            return with_master(a if kind != "diagonal" else jnp.tile(a, (1, n)))
+        if fixed.ndim == 2 and fixed.shape[1] != n:
+            raise ValueError(f"shares are for {fixed.shape[1]} states, the belief has {n}")
+        return with_master(floored(jnp.asarray(fixed.reshape(count, -1))))
+
+    def with_master(a: Array) -> Array:
+        if not has_master:
+            return a
+        own = jnp.full((1, a.shape[1]), master)
+        return jnp.concatenate([(1.0 - master) * a, own])
+
+    def next_shares(state: FilterState) -> Array:
+        locals_ = [m.belief for m in state.memory.members[:count]]
+        if kind == "trace":
+            return with_master(trace_shares(locals_, state.belief.sigma))
+        if kind == "diagonal":
+            return with_master(diagonal_shares(locals_))
+        return state.memory.shares
+
+    def parted(belief: Belief, a: Array) -> list[Belief]:
+        return [Belief(belief.mean, factor) for factor in part(belief.factor, a, sharing)]
+
+    def begun(state: FilterState, a: Array) -> list[FilterState]:
+        """Members as the mode leaves them at the start of a step."""
+        members = state.memory.members
+        if mode == "no-reset":
+            return list(members)
+        beliefs = parted(state.belief, a) if mode == "fusion-reset" else _rescaled(members, keep)
+        return [f.reset(m, b) for f, m, b in zip(filters, members, beliefs, strict=True)]
+
+    def predict_apart(state: FilterState, motion: Motion, u: Any) -> Moved:
+        a = next_shares(state)
+        members, codes = [], []
+        for i, (f, member) in enumerate(zip(filters, begun(state, a), strict=True)):
+            own = followed_by(motion, lambda noise, i=i: part(noise, a, sharing)[i])
+            member, prediction = f.predict(member, own, u)
+            members.append(member)
+            codes.append(prediction.code)
+        return Moved(tuple(members), tuple(codes), information_sum([m.belief for m in members]), a)
+
+    def predict_together(state: FilterState, motion: Motion, u: Any) -> Moved:
+        a = next_shares(state)
+        _, common = centre.predict(centre.init(state.belief, {}), motion, u)
+        members, codes, own = [], [], False
+        beliefs = parted(common.belief, a)
+        for f, member, belief in zip(filters, state.memory.members, beliefs, strict=True):
+            code = int(Code.DONE)
+            if member.memory == ():  # a Kalman filter without rules
+                member = f.reset(member, belief)
+            else:
+                own = True
+                seen = _through(motion, common.belief, belief)
+                member, prediction = f.predict(f.reset(member, state.belief), seen, u)
+                code = prediction.code
+            members.append(member)
+            codes.append(code)
+        # Half sharing does not add up to what was shared, and rules may have changed a share.
+        lossless = not own and (sharing != "half" or a.shape[1] == 1)
+        fused = common.belief if lossless else information_sum([m.belief for m in members])
+        return Moved(tuple(members), tuple(codes), fused, a, common.transition, common.code)
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        moved = (predict_together if late else predict_apart)(state, motion, u)
+        return _channels.concluded(state, moved)
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        return members(state)[1](parted(belief, state.memory.shares), belief)
+
+    update = _channels.updating(channels, information_sum, "federated")
+    members = _channels.members_of(filters)
+    return in_step(Filter(init, predict, update, reset, members))
+
+
+def _rescaled(members: Sequence[FilterState], keep: Number) -> list[Belief]:
+    """Locals with c Y_i; the master with Y_g - c sum Y_i = Y_m + (1 - c) sum Y_i: no difference."""
+    *locals_, master = (m.belief for m in members)
+    kept = [Belief(b.mean, b.factor / jnp.sqrt(keep)) for b in locals_]
+    weights = jnp.array([1.0] + [1.0 - keep] * len(locals_))
+    return [*kept, information_sum([master, *locals_], weights)]
+
+
+def _through(motion: Motion, common: Belief, mine: Belief) -> Motion:
+    """A motion that predicts, from what was fused, a share of the common prediction.
+
+    With S- the factor of the common prediction and S_i that of the share, T = S_i S-^-1 maps one
+    covariance to the other: T (F P F' + Q) T' = P_i. So the motion is followed by T about the
+    predicted mean, and its noise multiplied by T.
+    """
+    solid, _ = linalg.guard(common.factor)
+    T = linalg.solve_lower_transposed(solid, mine.factor.T).T
+
+    def moved(x):
+        return manifold.retract(common.mean, T @ manifold.local(common.mean, x))
+
+    return followed_by(motion, lambda noise: T @ noise, moved, lambda F: T @ F)
+
+
+def _check_master(mode: str, shares: Any, master: Number, keep: Number) -> None:
+    require(0.0 <= master < 1.0, "the master's share must lie from 0 to below 1", master)
+    require(0.0 < keep < 1.0, "keep must lie between 0 and 1", keep)
+    if mode == "rescale" and master == 0.0:
+        raise ValueError(
+            "mode 'rescale' needs a master to take what the locals give away: give it a share"
+        )
+    chosen = master != 0.0 or not isinstance(shares, str) or shares != "equal"
+    if mode == "zero-reset" and chosen:
+        raise ValueError("mode 'zero-reset' leaves everything to the master: shares have no say")
+
+
+def _fixed_shares(shares: Any, count: int, master: Number) -> np.ndarray | None:
+    """Shares of the channels, scaled to sum to one; None where they are not given as numbers."""
+    if isinstance(shares, str):
+        if shares == "observability":
+            raise ValueError(
+                "shares by observability need the model: give observability_shares(model, belief, "
+                "channels) as shares"
+            )
+        if shares not in ("equal", "trace", "diagonal"):
+            raise ValueError(
+                f"shares must be 'equal', 'trace', 'diagonal' or numbers, got {shares!r}"
+            )
+        return None
+    a = np.asarray(shares, dtype=float)
+    if a.ndim not in (1, 2) or a.shape[0] != count:
+        raise ValueError(f"shares have shape {a.shape}: ({count},) or ({count}, n) is wanted")
+    if not np.all(np.isfinite(a)) or np.any(a < 0.0):
+        raise ValueError(f"shares must be finite and not negative, got {a.tolist()}")
+    total = np.sum(a, axis=0)
+    if np.any(np.abs(total + master - 1.0) > 1e-9):
+        raise ValueError(
+            f"shares sum to {total.tolist()}, with the master's {master} they must sum to one"
+        )
+    return a / total

@@ -1,0 +1,280 @@
+r"""Guarded filters: an assumption is used as long as no evidence speaks against it.
+
+A wrong assumption (an exact constraint, air data whose errors are modelled as white) makes the
+covariance of a filter too small, so its own residuals do not show the fault. A *reference* that
+does without the assumption shows it: where the assumption is right, the estimate x_c that uses it
+is efficient, and differs from the reference's x_u by exactly what was gained (Hausman 1978),
+
+    E (x_c - x_u)(x_c - x_u)' = P_u - P_c
+
+Where it is wrong by an error of variance b^2 in some component, the difference has P_u - P_c + b^2,
+and the filter is worse than the reference just where b^2 > P_u - P_c: where the square of the
+difference is on average more than *twice* what it should be. So with
+
+    T_i = (x_c - x_u)_i^2 / P_u,ii        v_i = 1 - P_c,ii / P_u,ii  (not below 0)
+
+the mean of T_i is v_i, or 2 v_i where nothing is gained, and evidence is summed up as Page (1954)
+has it for the quickest detection of a change:
+
+    g_i := max(0, g_i + w_i (T_i - ratio v_i - slack)),   g_i > limit: wrong
+
+The w_i make samples comparable: differences of consecutive steps are nearly the same number. A
+measurement of a *judge*, a sensor that both filters use, renews the share w_i = 1 - P+_u,ii/P-_u,ii
+of what the reference knows; evidence and patience are counted in such renewals, *looks*. Where no
+judge measures nothing is renewed, and the verdict stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number, StepInfo
+from robins.filters.checks import sensor_names
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step
+from robins.filters.model import Motion, Sensor
+from robins.filters.trees import select
+
+Groups = Sequence[Sequence[int]]
+
+# Harm that is not worth a word: a tenth of the reference's variance, 5 % of its deviation.
+SLACK = 0.1
+
+# Patience doubles no more often than this: 64 times the first outlasts most missions.
+_DOUBLINGS = 6
+
+# A group that is renewed this much slower than the fastest is none the judges judge.
+_JUDGED = 0.25
+
+
+class Watch(NamedTuple):
+    """Memory of a guarded filter."""
+
+    filter: FilterState
+    reference: FilterState
+    trusted: Array  # () bool
+    evidence: Array  # (groups,) g
+    looks: Array  # (groups,) renewals since evidence last exceeded half its limit
+    failures: Array  # () how often the patience has doubled
+    trips: Array  # () how often trust was lost
+
+
+def guarded(
+    filter: Filter,
+    reference: Filter,
+    assumption: str | Sequence[str],
+    judges: str | Sequence[str],
+    groups: Groups | None = None,
+    ratio: Number = 2.0,
+    limit: Number = 8.0,
+    patience: Number = 5.0,
+    leap: Number = 6.0,
+    trusted: bool = True,
+) -> Filter:
+    """A filter under an assumption, and beside it one without that takes over where it is wrong.
+
+    The belief is that of ``filter`` while it is trusted, else that of ``reference``, which never
+    sees the sensors of the assumption. Trust is lost when the evidence of a group of states exceeds
+    its limit (module docstring), when a component is further off than ``leap`` deviations of the
+    reference, or when the filter cannot take a step that the reference can. The filter then goes on
+    *unseen* from the reference's belief. It is trusted again after ``patience`` looks of every
+    group the judges see, in none of which the evidence exceeded half its limit. Each loss of trust
+    doubles the patience, up to 64 times, so that what is always wrong costs a vanishing share of
+    the time.
+
+    The test is of harm to the estimate, and relies on the reference's covariance: where that is
+    overconfident (NEES per state above one) a ratio larger by that makes up for it.
+
+    What an update says of itself is what the filter that is in charge says; a sensor of the
+    assumption that is not trusted is refused. Notes: those of the filter, those of the reference as
+    ``reference.`` and their name, ``guarded.trusted``, ``guarded.evidence`` (the greatest, as a
+    share of the limit) and ``guarded.trips``.
+
+    Args:
+        filter: believes the assumption.
+        reference: does without; of the same state. Each may be a filter of filters.
+        assumption: sensors that the reference does not use.
+        judges: sensors that both use and that are beyond question.
+        groups: tangent components that are judged together, by their sum, such as
+            ``[(3, 4), (6, 7)]``; others are not watched. Two axes tell twice as fast as one. By
+            default each component by itself.
+        ratio: how many times what it should be a squared difference may be on average: at 2 a
+            filter that is no better than its reference is still believed.
+        limit: of the evidence. Small: quick; large: rarely wrong.
+        patience: looks with evidence below half its limit before trust is given again.
+        leap: deviations of the reference that no difference exceeds by chance; `inf` to leave out.
+        trusted: whether the filter is in charge at the start.
+
+    Raises:
+        ValueError: a sensor is on both sides, no judge or no assumption is named, a group is empty
+            or a parameter is not of its range; at `init`, the model has no sensor of such a name,
+            or the state no such component.
+    """
+    assumed, judging = (
+        sensor_names("guarded assumption", assumption),
+        sensor_names("guarded judges", judges),
+    )
+    both = sorted(set(assumed) & set(judging))
+    require(not both, f"guarded: {both} cannot judge, it belongs to the assumption")
+    named = groups is None or (len(groups) > 0 and all(len(one) > 0 for one in groups))
+    require(named, "guarded groups must each name a component", groups)
+    require(ratio >= 1.0, "guarded ratio must be at least 1", ratio)
+    for name, value in (("limit", limit), ("patience", patience), ("leap", leap)):
+        require(value > 0.0, f"guarded {name} must be positive", value)
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        if unknown := [name for name in (*assumed, *judging) if name not in dims]:
+            raise ValueError(f"guarded: no sensor {unknown[0]!r}; this model has {sorted(dims)}")
+        count = len(_members(groups, belief.factor.shape[0]))
+        without = {name: m for name, m in dims.items() if name not in assumed}
+        watch = Watch(
+            filter.init(belief, dims),
+            reference.init(belief, without),
+            jnp.asarray(trusted),
+            jnp.zeros(count),
+            jnp.zeros(count),
+            jnp.zeros((), int),
+            jnp.zeros((), int),
+        )
+        return _given_out(watch)
+
+    def taken_over(watch: Watch) -> FilterState:
+        """The filter gone on from what the reference believes.
+
+        Where both are filters of as many locals, local by local: a joined filter that is reset to
+        one belief would have it in every local, and so count it more than once.
+        """
+        mine, follow = filter.members(watch.filter)
+        others, _ = reference.members(watch.reference)
+        if mine and len(mine) == len(others):
+            return follow(others, watch.reference.belief)
+        return filter.reset(watch.filter, watch.reference.belief)
+
+    def judged(watch: Watch, failed: Array, renewed: Array | float) -> Watch:
+        """The verdict after a step: evidence taken, trust lost or given."""
+        square, gained = _difference(watch.filter.belief, watch.reference.belief)
+        renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
+        M = _members(groups, len(square))
+        fresh = M @ (renewed * (square - ratio * gained - SLACK))
+        evidence = jnp.maximum(watch.evidence + fresh, 0.0)
+        looks = watch.looks + M @ renewed / np.sum(M, axis=1)
+        off = jnp.any(np.any(M > 0.0, axis=0) & (square > leap**2))
+        wrong = failed | off | jnp.any(evidence > limit)
+        doubted = wrong | (~watch.trusted & jnp.any(evidence > 0.5 * limit))
+        looks = jnp.where(doubted, 0.0, looks)
+        lost = watch.trusted & wrong
+        failures = jnp.minimum(watch.failures + lost.astype(int), _DOUBLINGS)
+        wait = patience * 2.0 ** failures.astype(float)
+        most = jnp.max(looks)
+        earned = (most >= wait) & jnp.all((looks >= wait) | (looks < _JUDGED * most))
+        return Watch(
+            select(wrong, taken_over(watch), watch.filter),
+            watch.reference,
+            (watch.trusted & ~wrong) | earned,
+            jnp.where(wrong, 0.0, evidence),
+            looks,
+            failures,
+            watch.trips + lost.astype(int),
+        )
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        watch: Watch = state.memory
+        mine, first = filter.predict(watch.filter, motion, u)
+        other, second = reference.predict(watch.reference, motion, u)
+        # Without its reference a filter cannot be judged: they take a step together.
+        together = second.code == int(Code.DONE)
+        moved = watch._replace(filter=select(together, mine, watch.filter), reference=other)
+        new = _given_out(judged(moved, together & (first.code != int(Code.DONE)), 0.0))
+        return new, Prediction(None, new.belief, second.code)
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        watch: Watch = state.memory
+        mine, info = filter.update(watch.filter, sensor, y, aux)
+        notes = dict(info.notes)
+        if sensor.name in assumed:
+            new = judged(watch._replace(filter=mine), _failure(info), 0.0)
+            said = select(watch.trusted, info._replace(notes={}), _not_believed(info))
+        else:
+            other, plain = reference.update(watch.reference, sensor, y, aux)
+            renewed = 0.0
+            if sensor.name in judging:
+                before, after = watch.reference.belief.sigma, other.belief.sigma
+                share = jnp.clip(1.0 - _quotient(after**2, before**2), 0.0, 1.0)
+                renewed = jnp.where((plain.dof > 0) & (before > 0.0), share, 0.0)
+            both = watch._replace(filter=mine, reference=other)
+            new = judged(both, _failure(info) & ~_failure(plain), renewed)
+            notes |= {f"reference.{name}": value for name, value in plain.notes.items()}
+            said = select(watch.trusted, info._replace(notes={}), plain._replace(notes={}))
+        notes["guarded.trusted"] = new.trusted
+        notes["guarded.evidence"] = jnp.max(new.evidence) / limit
+        notes["guarded.trips"] = new.trips
+        return _given_out(new), said._replace(notes=notes)
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        watch: Watch = state.memory
+        return _given_out(
+            watch._replace(
+                filter=filter.reset(watch.filter, belief),
+                reference=reference.reset(watch.reference, belief),
+            )
+        )
+
+    return in_step(Filter(init, predict, update, reset))
+
+
+def _given_out(watch: Watch) -> FilterState:
+    belief = select(watch.trusted, watch.filter.belief, watch.reference.belief)
+    return FilterState(belief, watch)
+
+
+def _quotient(a: Array, b: Array) -> Array:
+    """The ratio, or 0 where b is 0: what the reference knows exactly is not in question."""
+    some = b > 0.0
+    return jnp.where(some, a / jnp.where(some, b, 1.0), 0.0)
+
+
+def _difference(mine: Belief, other: Belief) -> tuple[Array, Array]:
+    """T and v of each tangent component."""
+    variance = other.sigma**2
+    square = _quotient(manifold.local(other.mean, mine.mean) ** 2, variance)
+    gained = jnp.maximum(1.0 - _quotient(mine.sigma**2, variance), 0.0)
+    return square, gained
+
+
+def _members(groups: Groups | None, n: int) -> np.ndarray:
+    """(groups, n) ones where a component belongs to a group."""
+    if groups is None:
+        return np.eye(n)
+    M = np.zeros((len(groups), n))
+    for row, members in zip(M, groups, strict=True):
+        if any(not 0 <= i < n for i in members):
+            raise ValueError(f"guarded: group {list(members)} is not of a state of {n} components")
+        row[list(members)] = 1.0
+    return M
+
+
+def _failure(info: StepInfo) -> Array:
+    """Whether a step was not taken."""
+    lost = (Code.INDEFINITE, Code.NOT_FINITE, Code.INFEASIBLE, Code.CONTRADICTED)
+    return jnp.any(info.code == jnp.array([int(code) for code in lost]))
+
+
+def _not_believed(info: StepInfo) -> StepInfo:
+    """What is said of a measurement that did not touch the belief given out."""
+    missing = info.code == int(Code.MISSING)
+    return info._replace(
+        factor=linalg.identity(len(info.used)),
+        gain=jnp.zeros_like(info.gain),
+        used=jnp.zeros_like(info.used),
+        nis=jnp.zeros_like(info.nis),
+        dof=jnp.zeros_like(info.dof),
+        log_likelihood=jnp.zeros_like(info.log_likelihood),
+        code=jnp.where(missing, info.code, int(Code.REFUSED)),
+        notes={},
+    )

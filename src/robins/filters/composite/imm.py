@@ -1,0 +1,369 @@
+"""Interacting multiple model: several filters of one state, and how likely each is the right one.
+
+Blom & Bar-Shalom, *The interacting multiple model algorithm for systems with Markovian switching
+coefficients*, IEEE Trans. Automatic Control 33 (1988). With p_ij the probability of a change from
+mode i to mode j in a step and mu_i that of mode i, each step
+
+    predicts    c_j = sum_i p_ij mu_i
+    mixes       filter j begins with the moments of the mixture of all, weights p_ij mu_i / c_j
+    updates     mu_j = c_j L_j / sum_k c_k L_k, L_j the likelihood that filter j gives what is seen
+
+and answers with the moments of the mixture under mu. Probabilities are kept as logarithms, and
+moments are taken on the state's manifold and on factors, so that nothing is subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from robins.errors import require
+from robins.filters.audit import Again, audit
+from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.composite.mixture import innovation, log_normalised, matched
+from robins.filters.kalman import Filter, FilterState, Prediction, in_step
+from robins.filters.model import Motion, Sensor
+from robins.filters.trees import equal, select
+
+
+class Mode(NamedTuple):
+    """A filter and what of the model is its own."""
+
+    filter_: Filter
+    motion: Motion | None = None
+    sensors: tuple[Sensor, ...] = ()
+
+    def predict(self, state: FilterState, motion: Motion, u: Any):
+        """State and code of a prediction, by the motion of this mode if it has one."""
+        own = motion if self.motion is None else self.motion
+        state, prediction = self.filter_.predict(state, own, u)
+        return state, prediction.code
+
+    def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
+        """State and information of an update, by the sensor of this mode if it has one."""
+        own = next((s for s in self.sensors if s.name == sensor.name), sensor)
+        return self.filter_.update(state, own, y, aux)
+
+
+class Family(NamedTuple):
+    """Modes that differ in numbers only.
+
+    Filters of different kinds are each a part of the program. Those of a family are one part,
+    batched: seven modes compile in the time of one.
+
+    Attributes:
+        make: makes a filter, or what `mode` makes of one, of one row of the numbers. What depends
+            on a number is computed with it, not decided by it: the numbers are stand-ins then.
+        numbers: pytree of arrays, one row a mode.
+    """
+
+    make: Callable[[Any], Filter | Mode]
+    numbers: Any
+
+    def of(self, row: Any) -> Mode:
+        """The mode of one row."""
+        return _as_mode(self.make(row))
+
+
+class Bank(NamedTuple):
+    """The modes as one: states are kept as the layout likes, beliefs have a leading axis of modes.
+
+    Attributes:
+        size: number of modes.
+        init: ``(belief, dims) -> states``.
+        beliefs: ``states -> Belief``.
+        restart: ``(states, beliefs, alone) -> states``: each goes on from its belief, unless it is
+            alone, (modes,) bool.
+        predict: ``(states, motion, u) -> (states, codes)``.
+        update: ``(states, sensor, y, aux) -> (states, StepInfo, notes)``; notes by mode and name.
+        reset: ``(states, belief) -> states``, all to one belief.
+    """
+
+    size: int
+    init: Callable[[Belief, Mapping[str, int]], Any]
+    beliefs: Callable[[Any], Belief]
+    restart: Callable[[Any, Belief, Array], Any]
+    predict: Callable[[Any, Motion, Any], tuple[Any, Array]]
+    update: Callable[[Any, Sensor, Any, Any], tuple[Any, StepInfo, dict[str, Array]]]
+    reset: Callable[[Any, Belief], Any]
+
+
+def bank(modes: Sequence[Filter | Mode] | Family) -> Bank:
+    """The modes as one."""
+    if isinstance(modes, Family):
+        return _batched(modes)
+    return _each(tuple(map(_as_mode, modes)))
+
+
+def _as_mode(one: Filter | Mode) -> Mode:
+    return one if isinstance(one, Mode) else Mode(one)
+
+
+def _known(modes: Sequence[Mode], dims: Mapping[str, int]) -> None:
+    own = {s.name for m in modes for s in m.sensors}
+    if unknown := own - set(dims):
+        raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
+
+
+def _each(modes: tuple[Mode, ...]) -> Bank:
+    """A tuple of states; each mode is traced by itself."""
+    filters = [m.filter_ for m in modes]
+
+    def init(belief, dims):
+        _known(modes, dims)
+        return tuple(f.init(belief, dims) for f in filters)
+
+    def restart(states, beliefs, alone):
+        begun = []
+        for j, (f, state) in enumerate(zip(filters, states, strict=True)):
+            belief = jax.tree_util.tree_map(lambda a, j=j: a[j], beliefs)
+            begun.append(select(alone[j], state, f.reset(state, belief)))
+        return tuple(begun)
+
+    def predict(states, motion, u):
+        done = [m.predict(s, motion, u) for m, s in zip(modes, states, strict=True)]
+        after, codes = zip(*done, strict=True)
+        return after, jnp.stack(codes)
+
+    def update(states, sensor, y, aux):
+        done = [m.update(s, sensor, y, aux) for m, s in zip(modes, states, strict=True)]
+        after, infos = zip(*done, strict=True)
+        notes = {f"{i}.{k}": v for i, info in enumerate(infos) for k, v in info.notes.items()}
+        return after, _stack([info._replace(notes={}) for info in infos]), notes
+
+    def reset(states, belief):
+        return tuple(f.reset(s, belief) for f, s in zip(filters, states, strict=True))
+
+    def beliefs(states):
+        return _stack([s.belief for s in states])
+
+    return Bank(len(modes), init, beliefs, restart, predict, update, reset)
+
+
+def _batched(family: Family) -> Bank:
+    """States with a leading axis of modes; one mode is traced, for all."""
+    numbers = jax.tree_util.tree_map(jnp.asarray, family.numbers)
+    lengths = {np.shape(x)[:1] for x in jax.tree_util.tree_leaves(numbers)}
+    if len(lengths) != 1 or lengths == {()}:
+        raise ValueError(
+            "the numbers of a family must be arrays with one row a mode; "
+            f"their shapes begin with {sorted(lengths)}"
+        )
+    ((count,),) = lengths
+
+    def rows(of: Callable) -> Callable:
+        """``of(mode, *parts)`` of every mode; parts have a leading axis of modes."""
+        return lambda *parts: jax.vmap(lambda row, *part: of(family.of(row), *part))(
+            numbers, *parts
+        )
+
+    def init(belief, dims):
+        def one(mode: Mode):
+            _known([mode], dims)
+            return mode.filter_.init(belief, dims)
+
+        return rows(one)()
+
+    def restart(states, beliefs, alone):
+        def one(mode: Mode, state, belief, alone):
+            return select(alone, state, mode.filter_.reset(state, belief))
+
+        return rows(one)(states, beliefs, alone)
+
+    def predict(states, motion, u):
+        return rows(lambda mode, state: mode.predict(state, motion, u))(states)
+
+    def update(states, sensor, y, aux):
+        after, info = rows(lambda mode, state: mode.update(state, sensor, y, aux))(states)
+        notes = {f"{i}.{k}": v[i] for i in range(count) for k, v in info.notes.items()}
+        return after, info._replace(notes={}), notes
+
+    def reset(states, belief):
+        return rows(lambda mode, state: mode.filter_.reset(state, belief))(states)
+
+    return Bank(count, init, lambda s: s.belief, restart, predict, update, reset)
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *trees)
+
+
+Rows = ArrayLike | Sequence[Any]  # numbers, or rows of them
+
+_ONE = 1e-9  # how far a sum of probabilities may be off
+
+
+class Interaction(NamedTuple):
+    """Memory of a mixture of filters."""
+
+    states: Any  # of the modes: a tuple, or those of a family with a leading axis
+    log_probability: Array  # (modes,)
+
+    def audit(self, start: Interaction, again: Again | None, time: Any) -> None:
+        """Ask the memories of each mode; of a family each has a row (`robins.filters.audit`)."""
+        if not isinstance(self.states, FilterState):
+            every = None if again is None else lambda s: again(start._replace(states=s)).states
+            audit(start.states, self.states, every, time)
+            return
+        for i in range(len(self.log_probability)):
+
+            def row(states: Any, i: int = i) -> Any:
+                return jax.tree_util.tree_map(lambda x: x[i], states)
+
+            def one(first: Any, i: int = i, row: Any = row) -> Any:
+                put = jax.tree_util.tree_map(
+                    lambda x, new: jnp.asarray(x).at[i].set(new), start.states, first
+                )
+                assert again is not None
+                return row(again(start._replace(states=put)).states)
+
+            audit(row(start.states), row(self.states), None if again is None else one, time)
+
+
+def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor] = ()) -> Mode:
+    """One mode of `imm`.
+
+    Args:
+        filter_: from `kalman` and its kin.
+        motion: of this mode, of the same state; else the run's.
+        sensors: of this mode, each in the place of the run's sensor of its name.
+    """
+    return Mode(filter_, motion, tuple(sensors))
+
+
+def imm(
+    modes: Sequence[Filter | Mode] | Family, transition: Rows, start: Rows | None = None
+) -> Filter:
+    """Interacting multiple model filter over any filters of the same state.
+
+    Modes may differ in rules, in linearisation, and by `mode` in motion and sensors. Each keeps the
+    memory of its rules; only beliefs are mixed. With nothing measured, probabilities only mix.
+
+    The `StepInfo` is that of the mixture: innovation and factor are its moments before the update,
+    the gain is the mean of the modes' gains, and ``imm.probability`` (modes,) is noted. What rules
+    of mode i note is found under ``imm.i.`` and its name.
+
+    Likelihoods only compare where all modes use the same components. Where a rule of one mode
+    refuses what another uses, the measurement leaves the probabilities as they are. A mode whose
+    step fails is out until the next mixing; the code is a failure only where all fail.
+
+    Args:
+        modes: filters, or what `mode` makes of one; a `Family` where they differ in numbers only.
+        transition: (modes, modes), row i the probabilities to change from i in one step.
+        start: (modes,) probabilities before the first prediction; all equal where not given.
+
+    Raises:
+        ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
+            one. When a run begins: a mode brings a sensor that the model does not have.
+    """
+    all_ = bank(modes)
+    require(all_.size, "imm needs at least one mode")
+    count = all_.size
+    even = np.full(count, 1.0 / count)
+    first = _probabilities("start", even if start is None else start, (count,))
+    with np.errstate(divide="ignore"):
+        log_change = np.log(_probabilities("transition", transition, (count, count)))
+        log_first = np.log(first)
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        return FilterState(belief, Interaction(all_.init(belief, dims), jnp.asarray(log_first)))
+
+    def mixed(states: Any, log_now: Array) -> tuple[Any, Array]:
+        """Where each filter begins, and the predicted log-probabilities."""
+        joint = log_now[:, None] + jnp.asarray(log_change)
+        log_weight, log_next = jax.vmap(log_normalised, in_axes=1)(joint)
+        weight = jnp.exp(log_weight)  # (to, from)
+        beliefs = all_.beliefs(states)
+        begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
+        # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
+        alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
+        return all_.restart(states, begun, alone), log_next
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        states, log_now = state.memory
+        begun, log_next = (states, log_now) if count == 1 else mixed(states, log_now)
+        after, code = all_.predict(begun, motion, u)
+        taken = code == int(Code.DONE)
+        log_next = _among(taken, log_next)
+        failed = code[jnp.argmax(log_now)]
+        belief = _mixture(all_.beliefs(after), log_next)
+        outcome = jnp.where(jnp.any(taken), int(Code.DONE), failed)
+        return FilterState(belief, Interaction(after, log_next)), Prediction(None, belief, outcome)
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        states, log_prior = state.memory
+        after, seen, notes = all_.update(states, sensor, y, aux)
+        sound = ~jnp.isneginf(seen.log_likelihood)
+        of_all = jnp.any(seen.used & sound[:, None], axis=0)
+        alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
+        gained = jnp.where(sound & ~alike, 0.0, seen.log_likelihood)
+        log_post, _ = log_normalised(log_prior + gained)
+        log_post = jnp.where(jnp.any(sound), log_post, log_prior)
+        if count == 1:
+            info = jax.tree_util.tree_map(lambda a: a[0], seen)
+        else:
+            info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
+        notes = {f"imm.{k}": v for k, v in notes.items()}
+        notes["imm.probability"] = jnp.exp(log_post)
+        # Where no mode has moved the mixture stands bit for bit.
+        was, now = all_.beliefs(states), all_.beliefs(after)
+        belief = select(equal(now, was), state.belief, _mixture(now, log_post))
+        return FilterState(belief, Interaction(after, log_post)), info._replace(notes=notes)
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        states = all_.reset(state.memory.states, belief)
+        return FilterState(belief, state.memory._replace(states=states))
+
+    return in_step(Filter(init, predict, update, reset))
+
+
+def _probabilities(name: str, given: Rows, shape: tuple[int, ...]) -> np.ndarray:
+    value = np.asarray(given, dtype=float)
+    require(value.shape == shape, f"{name} of imm has shape {value.shape}, its modes need {shape}")
+    total = value.sum(axis=-1)
+    if not (np.all(value >= 0.0) and np.all(np.abs(total - 1.0) <= _ONE)):
+        raise ValueError(
+            f"{name} of imm must hold probabilities, rows that sum to one: got {value.tolist()}"
+        )
+    return value / total[..., None]
+
+
+def _among(taken: Array, log_probability: Array) -> Array:
+    """The same without modes whose step failed, unless all did."""
+    kept = jnp.where(taken | ~jnp.any(taken), log_probability, -jnp.inf)
+    return log_normalised(kept)[0]
+
+
+def _mixture(beliefs: Belief, log_probability: Array) -> Belief:
+    """Moments of all modes; those of one that is certain are its own, bit for bit."""
+    likely = jnp.argmax(log_probability)
+    best = jax.tree_util.tree_map(lambda a: a[likely], beliefs)
+    if len(log_probability) == 1:
+        return best
+    weight = jnp.exp(log_probability)
+    return select(weight[likely] == 1.0, best, matched(beliefs, weight, best.mean))
+
+
+def _seen(seen: StepInfo, log_prior: Array, log_post: Array, used: Array) -> StepInfo:
+    """One `StepInfo` for the mixture of predicted measurements."""
+    _, log_likelihood = log_normalised(log_prior + seen.log_likelihood)
+    lost = jnp.isneginf(log_likelihood)
+    used = used & ~lost
+    expected = innovation(seen, jnp.exp(log_normalised(log_prior)[0]), used)
+    code = seen.code[jnp.argmax(log_post)]
+    return StepInfo(
+        innovation=expected.mean,
+        factor=expected.factor,
+        gain=jnp.einsum("r,rnm->nm", jnp.exp(log_post), seen.gain),
+        used=used,
+        nis=jnp.where(code == int(Code.CONTRADICTED), jnp.inf, expected.nis),
+        dof=expected.dof,
+        log_likelihood=log_likelihood,
+        code=code,
+        notes={},
+    )

@@ -1,0 +1,287 @@
+"""The particle filter, bootstrap and Rao-Blackwellised in one.
+
+Gordon, Salmond & Smith, *Novel approach to nonlinear/non-Gaussian Bayesian state estimation*, IEE
+Proc. F 140 (1993); Schön, Gustafsson & Nordlund, *Marginalized particle filters for mixed
+linear/nonlinear state-space models*, IEEE Trans. Signal Processing 53 (2005).
+
+A particle is a belief: exact in the components that are *sampled*, Gaussian in the rest. Each step
+
+    predicts   a Kalman prediction of every particle, m and S S'. With the sampled components first,
+               S = [[A, 0], [B, C]]: draw xi ~ N(0, I), move the mean by [A; B] xi, and what is left
+               to be uncertain is [[0, 0], [0, C]].
+    updates    a Kalman update of every particle; its likelihood, N(y; z, H S S' H' + R), weighs it.
+
+With all components sampled nothing is left of S: that is the bootstrap filter. With none it would
+be the Kalman filter. The draw conditions the rest on what was sampled, so where the model is linear
+in the rest given the sampled, each particle is exact (Rao-Blackwell).
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.errors import require
+from robins.filters.belief import Belief, Code, Number, StepInfo
+from robins.filters.composite.mixture import innovation, log_normalised, matched
+from robins.filters.kalman import (
+    Filter,
+    FilterState,
+    Prediction,
+    in_step,
+    predicted_factor,
+    updated,
+)
+from robins.filters.linearise import Linearisation, taylor
+from robins.filters.model import Motion, Sensor
+from robins.filters.trees import finite, select
+
+_GENERATOR = "threefry2x32"  # named, so that a key gives the same draws under any setting of JAX
+
+
+class Cloud(NamedTuple):
+    """Memory of a particle filter."""
+
+    particles: Belief  # leading axis; rows of sampled components are zero in the factors
+    log_weight: Array  # (count,), the weights sum to one
+    key: Array  # (2,) uint32, of the draws to come
+
+
+def particle(
+    count: int,
+    key: Any,
+    sampled: Sequence[int] | None = None,
+    linearise: Linearisation | None = None,
+    resample: Number = 0.5,
+    regularise: Number = 0.0,
+) -> Filter:
+    """A particle filter; its belief is the Gaussian with the moments of the weighted cloud.
+
+    The cloud itself is the state's memory, a `Cloud`. The log-likelihood of an update is the
+    logarithm of the mean weight it gives; ``particle.ess`` notes the effective number of particles,
+    1 / sum w^2. Before a prediction the cloud is resampled (systematic: Kitagawa 1996) if that
+    number has fallen below ``resample * count``.
+
+    A particle that leaves the finite numbers gets no weight. A measurement that no particle can
+    explain, not even as the logarithm of a likelihood, is not used (``NOT_FINITE``).
+
+    Runs with the same key draw the same numbers: give each run of a campaign its own, by
+    ``jax.vmap`` over keys or by `reseed`. There are no derivatives through the draws.
+
+    Args:
+        count: number of particles.
+        key: seed or JAX key; may be traced.
+        sampled: tangent components that are sampled; None, all of them. The rest is to be (nearly)
+            linear given these.
+        linearise: how the rest is propagated and measured; `taylor` where not given. Where all is
+            sampled only its noise and readings count.
+        resample: share of ``count``, 0 (never) to 1 (always).
+        regularise: after resampling each sampled component moves at random by this share of the
+            cloud's standard deviation and towards its mean, so that the cloud keeps its moments
+            (Liu & West 2001): for states without process noise, whose particles would become
+            copies. 0 leaves the copies; 0.1 is usual.
+
+    Raises:
+        ValueError: count is not positive, a share is not between 0 and 1, or sampled components
+            are negative or named twice. When a run begins: one is not of the state.
+    """
+    count = operator.index(count)
+    require(count >= 1, "a particle filter needs a positive count of particles", count)
+    for name, share in (("resample", resample), ("regularise", regularise)):
+        require(0.0 <= share <= 1.0, f"{name} of a particle filter must lie in 0..1", share)
+    chosen = None if sampled is None else tuple(operator.index(i) for i in sampled)
+    if chosen is not None and (len(set(chosen)) < len(chosen) or min(chosen, default=0) < 0):
+        raise ValueError(f"sampled components must be different and not negative, got {chosen}")
+    way = taylor() if linearise is None else linearise
+
+    def drawn(key: Array, means: Any, factors: Array) -> Belief:
+        """Particles with the sampled components drawn and the rest conditioned on the draw."""
+        n = factors.shape[1]
+        order, k = _order(chosen, n)
+        back = np.argsort(order)
+        xi = jax.random.normal(key, (count, k))
+
+        def one(xi, mean, S):
+            S = S if np.all(order == np.arange(n)) else linalg.tria(S[order])
+            left = jnp.where((jnp.arange(n) < k)[None], 0.0, S)
+            return Belief(manifold.retract(mean, (S[:, :k] @ xi)[back]), left[back])
+
+        return jax.vmap(one)(xi, means, factors)
+
+    def spread(belief: Belief, key: Array) -> FilterState:
+        """A new cloud from a Gaussian belief."""
+        key, now = _split(key, 1)
+        same = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), belief)
+        even = jnp.full(count, -jnp.log(float(count)))
+        return FilterState(belief, Cloud(drawn(now, *same), even, key))
+
+    def gaussian(cloud: Cloud) -> Belief:
+        return _moments(cloud, _order(chosen, cloud.particles.factor.shape[1])[1])
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        n = belief.factor.shape[0]
+        if chosen is not None and max(chosen, default=0) >= n:
+            raise ValueError(f"sampled components {chosen}: the state has only {n}")
+        return spread(belief, _as_key(key))
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        return spread(belief, state.memory.key)
+
+    def refreshed(state: FilterState, choose: Array, jitter: Array) -> tuple[Belief, Array]:
+        """The cloud, resampled if its weights are too uneven."""
+        cloud = state.memory
+        weight = jnp.exp(cloud.log_weight)
+        due = _effective(weight) < resample * count
+        index = jnp.where(due, _systematic(choose, weight), jnp.arange(count))
+        particles = jax.tree_util.tree_map(lambda x: x[index], cloud.particles)
+        if regularise > 0.0:
+            particles = select(due, jittered(particles, state.belief, jitter), particles)
+        return particles, jnp.where(due, -jnp.log(float(count)), cloud.log_weight)
+
+    def jittered(particles: Belief, cloud: Belief, key: Array) -> Belief:
+        n = cloud.factor.shape[0]
+        order, k = _order(chosen, n)
+        some = order[:k]
+        L = linalg.tria(cloud.factor[some])
+        keep = float(np.sqrt(1.0 - regularise**2))
+
+        def one(x, xi):
+            d = manifold.local(cloud.mean, x)
+            d = d.at[some].set(keep * d[some] + regularise * (L @ xi))
+            return manifold.retract(cloud.mean, d)
+
+        xi = jax.random.normal(key, (count, k))
+        return particles._replace(mean=jax.vmap(one)(particles.mean, xi))
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        key, choose, jitter, draw = _split(state.memory.key, 3)
+        before, log_weight = refreshed(state, choose, jitter)
+
+        def ahead(b: Belief):
+            t = way.transition(b, motion, u)
+            return t.mean, predicted_factor(t, "sqrt")
+
+        after = drawn(draw, *jax.vmap(ahead)(before))
+        sound = jax.vmap(finite)(after)
+        log_weight, total = log_normalised(jnp.where(sound, log_weight, -jnp.inf))
+        taken = jnp.isfinite(total)
+        cloud = Cloud(_each(sound, after, before), log_weight, key)
+        new = FilterState(gaussian(cloud), cloud)
+        new = select(taken, new, state._replace(memory=state.memory._replace(key=key)))
+        code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
+        return new, Prediction(None, new.belief, code)
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        before, log_prior, key = state.memory
+
+        def one(b: Belief):
+            o = way.observation(b, sensor, y, aux)
+            posterior, info = updated(b, o, "sqrt")
+            return posterior, info, b.factor @ jnp.where(info.used[:, None], o.spread, 0.0).T
+
+        after, infos, cross = jax.vmap(one)(before)
+        sound = jax.vmap(finite)((after, infos.log_likelihood))
+        gained = jnp.where(sound, infos.log_likelihood, -jnp.inf)
+        log_post, total = log_normalised(log_prior + gained)
+        lost = ~jnp.isfinite(total)
+        cloud = Cloud(_each(sound, after, before), log_post, key)
+        cloud = select(lost, state.memory, cloud)
+        used = jnp.any(infos.used & sound[:, None], axis=0) & ~lost
+        belief = select(jnp.any(used), gaussian(cloud), state.belief)
+
+        weight = jnp.exp(log_normalised(jnp.where(sound, log_prior, -jnp.inf))[0])
+        expected = innovation(infos, weight, used)
+        gain = _gain(state.belief, before, infos, weight, cross, expected)
+        # Where no particle is left, each may have been contradicted: all sampled and R = 0.
+        best = jnp.argmax(cloud.log_weight)
+        wrong = infos.code[best] == int(Code.CONTRADICTED)
+        code = jnp.where(lost & ~wrong, int(Code.NOT_FINITE), infos.code[best])
+        info = StepInfo(
+            innovation=expected.mean,
+            factor=expected.factor,
+            gain=jnp.where(used[None], gain, 0.0),
+            used=used,
+            nis=jnp.where(wrong, jnp.inf, expected.nis),
+            dof=expected.dof,
+            log_likelihood=total,
+            code=code,
+            notes={"particle.ess": _effective(jnp.exp(cloud.log_weight))},
+        )
+        return FilterState(belief, cloud), info
+
+    return in_step(Filter(init, predict, update, reset))
+
+
+def reseed(state: FilterState, key: Any) -> FilterState:
+    """The same state of a particle filter with other draws to come; `reset` it to draw it anew.
+
+    Args:
+        state: of a `particle` filter.
+        key: seed or JAX key.
+    """
+    return state._replace(memory=state.memory._replace(key=_as_key(key)))
+
+
+def _as_key(key: Any) -> Array:
+    """The numbers of a key, which unlike keys can be saved."""
+    if not jnp.issubdtype(jnp.result_type(key), jax.dtypes.prng_key):
+        if jnp.shape(key) == (2,):
+            return jnp.asarray(key, jnp.uint32)
+        key = jax.random.key(key, impl=_GENERATOR)
+    return jax.random.key_data(key)
+
+
+def _split(key: Array, count: int) -> tuple[Array, ...]:
+    """The numbers of a key to keep, and keys to use."""
+    keys = jax.random.split(jax.random.wrap_key_data(key, impl=_GENERATOR), count + 1)
+    return jax.random.key_data(keys[0]), *keys[1:]
+
+
+def _order(chosen: tuple[int, ...] | None, n: int) -> tuple[np.ndarray, int]:
+    """Tangent components with the sampled ones first, and how many these are."""
+    first = tuple(range(n)) if chosen is None else chosen
+    return np.array([*first, *(i for i in range(n) if i not in first)], dtype=int), len(first)
+
+
+def _systematic(key: Array, weight: Array) -> Array:
+    """Which particles to take over, each about count * weight times (Kitagawa 1996, sec. 3)."""
+    count = weight.shape[0]
+    upto = jnp.cumsum(weight)
+    at = (jnp.arange(count, dtype=float) + jax.random.uniform(key)) / count * upto[-1]
+    index = jnp.searchsorted(upto, at, side="right").astype(int)
+    # Rounding may lead past the end, to a particle without weight.
+    return jnp.minimum(index, jnp.max(jnp.where(weight > 0.0, jnp.arange(count), 0)))
+
+
+def _effective(weight: Array) -> Array:
+    return 1.0 / jnp.sum(weight**2)
+
+
+def _moments(cloud: Cloud, k: int) -> Belief:
+    """The cloud's Gaussian; the first k columns of its factors are zero."""
+    best = jax.tree_util.tree_map(lambda x: x[jnp.argmax(cloud.log_weight)], cloud.particles.mean)
+    slim = cloud.particles._replace(factor=cloud.particles.factor[:, :, k:])
+    return matched(slim, jnp.exp(cloud.log_weight), best)
+
+
+def _gain(prior: Belief, cloud: Belief, infos: StepInfo, weight, cross, expected) -> Array:
+    """Covariance of state and measurement over that of the measurement, in the whole cloud."""
+    d = jax.vmap(lambda x: manifold.local(prior.mean, x))(cloud.mean)
+    apart = jnp.where(jnp.isnan(expected.mean)[None], 0.0, expected.mean[None] - infos.innovation)
+    counts = weight > 0.0
+    d, apart = jnp.where(counts[:, None], d, 0.0), jnp.where(counts[:, None], apart, 0.0)
+    cross = jnp.where(counts[:, None, None], cross, 0.0)
+    covariance = jnp.einsum("i,inm->nm", weight, cross) + (d * weight[:, None]).T @ apart
+    return linalg.solve_spd(expected.factor, covariance.T).T
+
+
+def _each(condition: Array, new: Any, old: Any) -> Any:
+    """Particle by particle."""
+    return jax.vmap(select)(condition, new, old)

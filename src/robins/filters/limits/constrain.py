@@ -1,0 +1,225 @@
+"""Hold a belief to an equality: exact or noisy, linear or not, nearest in any metric.
+
+A constraint g(x) = d is a measurement of g that reads d, without noise if it is exact. So it is
+linearised and used as one, and components that are known already are left out. Only its gain may
+differ: with V = P the constrained state is the most probable one, with V = W^-1 the one nearest
+to the mean in the metric W,
+
+    G = V D' (D V D')^-1,   x* = x - G (g(x) - d),   P* = (I - G D) P (I - G D)' + G R_d G'
+
+(Simon & Chia 2002, sec. II), D the slope of g and R_d the covariance of the constraint's error. No
+covariance is got by subtracting another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from robins import linalg, manifold
+from robins.errors import require
+from robins.filters.belief import Belief
+from robins.filters.iterated import iterated
+from robins.filters.kalman import updated
+from robins.filters.linearise import taylor
+from robins.filters.model import Sensor, as_noise
+from robins.filters.observation import Observation, contradicted, normalised
+from robins.manifold import State
+
+Numbers = ArrayLike | Sequence[Any]
+Function = Numbers | Callable[[State], Any]  # a matrix D, for D x, or a function of the state
+Weight = Literal["covariance", "identity"] | Numbers
+
+ITERATIONS = 4
+
+# Of a row of unit length, what those above must leave; cond(D D') is then below 1e12.
+_INDEPENDENT = 1e-6
+
+
+class Constrained(NamedTuple):
+    """A belief held to a constraint of c components, and how far it was from it."""
+
+    belief: Belief
+    residual: Array  # (c,) d - g(x) before
+    used: Array  # (c,) bool: not known already, and independent of the components above
+    # () residual squared by D P D' + R_d before, chi-square of `dof`; infinite where an exact
+    # component contradicts what is known exactly or the components above it
+    nis: Array
+    dof: Array  # () number of components that were not known already
+
+
+def constrain(
+    belief: Belief,
+    g: Function,
+    d: Any = None,
+    weight: Weight = "covariance",
+    noise: Numbers | None = None,
+    hard: bool = False,
+    iterations: int = ITERATIONS,
+) -> Constrained:
+    """Hold a belief to ``g(x) = d``; may be compiled, with D, d, weight and noise as data.
+
+    Without noise the mean is put on the constraint and nothing is uncertain across it. With noise,
+    constraint and belief are weighed against each other as a measurement would be.
+
+    Args:
+        belief: what to hold.
+        g: (c, n) matrix D, for D x with x the numbers of a state of arrays in tangent order; or a
+            function of the state, with values in an array or in elements such as `Angle`.
+        d: what g(x) must equal, of the form of g(x); zero if left out.
+        weight: metric W in which the constrained state is nearest to the mean: "covariance" for
+            P^-1 (the only one that weighs noise), "identity", or a positive definite (n, n) matrix
+            in tangent coordinates.
+        noise: (c,) standard deviations of the constraint's error, or a (c, k) factor of R_d.
+        hard: put the mean on the constraint although that is noisy, and count its noise in the
+            covariance; weights other than "covariance" always do. Worse than no constraint where
+            R_d exceeds D P D'.
+        iterations: how often a function is linearised, by Gauss-Newton.
+
+    Raises:
+        ValueError: shapes do not fit, a matrix is given for a state that holds elements, or
+            iterations is not positive.
+    """
+    sensor, target = as_sensor(belief.mean, g, d, noise)
+    way = iterated(iterations=iterations if callable(g) else 1)
+    before = taylor().observation(belief, sensor, target, None)
+    judged = normalised(before)
+    metric, root = metric_of(belief, weight)
+
+    if metric is belief and (noise is None or not hard):
+        seen = way.observation(belief, sensor, target, None)
+        posterior, info = updated(belief, seen, "sqrt")
+        used = info.used
+    else:
+        exact = Sensor(sensor.read, linalg.zeros(sensor.dim, 0), sensor.dim, "", sensor.linear)
+        seen = way.observation(metric, exact, target, None)
+        mean, G, used = nearest(metric, seen)
+        S = belief.factor
+        rest = S - G @ (seen.spread if root is None else seen.spread @ (root.T @ S))
+        if noise is None:
+            factor = linalg.tria(rest)
+            factor = jnp.where(linalg.lost_in_rounding(factor, belief.sigma), 0.0, factor)
+        else:
+            factor = linalg.tria(rest, G @ sensor.noise)
+        posterior = Belief(mean, linalg.where(jnp.any(used), factor, S))
+    nis = jnp.where(jnp.any(contradicted(before, judged)), jnp.inf, judged.nis)
+    return Constrained(posterior, before.residual, used, nis, judged.dof)
+
+
+def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array]:
+    """The state nearest to the mean that meets an exact observation, its gain, what was used."""
+    seen = normalised(o)
+    spread = jnp.where(seen.used[:, None], o.spread, 0.0)
+    cross = metric.factor @ linalg.solve_lower(seen.factor, spread).T
+    gain = linalg.solve_lower_transposed(seen.factor, cross.T).T
+    return manifold.retract(metric.mean, cross @ seen.white), gain, seen.used
+
+
+def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[Sensor, Any]:
+    """A constraint as a sensor, and what that sensor reads."""
+    read, linear, value = (g, None, g(mean)) if callable(g) else _by_matrix(mean, g)
+    c = manifold.dim(value)
+    if d is not None:
+        target = jax.tree_util.tree_map(
+            lambda x: jnp.asarray(x, float), d, is_leaf=lambda x: isinstance(x, list)
+        )
+    elif any(manifold.is_element(leaf) for leaf in manifold.leaves(value)):
+        raise ValueError("a constraint on angles or rotations needs d, its value")
+    else:
+        target = jax.tree_util.tree_map(jnp.zeros_like, value)
+    root = linalg.zeros(c, 0) if noise is None else as_noise(noise, c, "the constraint")
+    return Sensor(lambda x, aux: read(x), root, c, "constraint", linear), target
+
+
+def _by_matrix(mean: State, matrix: Numbers) -> tuple[Any, Any, Array]:
+    """D x as a function, the same with its slope, and a value of it."""
+    if any(manifold.is_element(leaf) for leaf in manifold.leaves(mean)):
+        raise ValueError(
+            "a matrix constrains a state of plain arrays, this one holds elements: "
+            "give the constraint as a function of the state"
+        )
+    D = jnp.asarray(matrix, float)
+    if D.ndim != 2 or D.shape[1] != manifold.dim(mean):
+        raise ValueError(
+            f"D is {D.shape}: one column for each of {manifold.dim(mean)} states is wanted"
+        )
+
+    def read(x):
+        return D @ jnp.concatenate([jnp.reshape(leaf, -1) for leaf in manifold.leaves(x)])
+
+    return read, lambda x, aux: (read(x), D), jnp.zeros(len(D))
+
+
+def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
+    """A belief of covariance W^-1, and the factor of W; the belief itself for W = P^-1."""
+    n = belief.factor.shape[0]
+    if isinstance(weight, str):
+        if weight == "covariance":
+            return belief, None
+        if weight != "identity":
+            raise ValueError(f"weight must be 'covariance', 'identity' or a matrix, got {weight!r}")
+        unit = linalg.identity(n)
+        return Belief(belief.mean, unit), unit
+    W = jnp.asarray(weight, float)
+    require(W.shape == (n, n), f"weight is {W.shape}, the state needs ({n}, {n})")
+    root = linalg.cholesky(W)
+    return Belief(belief.mean, linalg.solve_lower_transposed(root, linalg.identity(n))), root
+
+
+def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:
+    """Refuse exact constraints that repeat each other, at the boundary.
+
+    Args:
+        D: (c, n).
+        d: (c,).
+        exact: (c,) bool, the rows to look at: one with noise may say again what is said.
+
+    Raises:
+        ValueError: a row of D is zero, or depends on those above it; it says which row, the rank,
+            and whether the rows can be met at all.
+    """
+    length = np.linalg.norm(D, axis=1)
+    zero = length <= 1e-14 * np.max(length, initial=0.0)
+    unit = D / np.where(zero, 1.0, length)[:, None]
+    basis, kept, fault = np.zeros((0, D.shape[1])), [], None
+    for row in np.flatnonzero(exact):
+        rest = unit[row]
+        for _ in range(2):  # twice, so that the basis stays orthogonal
+            rest = rest - (rest @ basis.T) @ basis
+        left = np.linalg.norm(rest)
+        if left > _INDEPENDENT and not zero[row]:
+            basis = np.concatenate([basis, rest[None] / left])
+            kept.append(row)
+        elif fault is None:
+            fault = row, list(kept)
+    if fault is None:
+        return
+    row, above = fault
+    share = np.linalg.lstsq(D[above].T, D[row])[0] if above else np.zeros(0)
+    scale = np.abs(d[row]) + np.abs(share) @ np.abs(d[above])
+    contradicts = np.abs(d[row] - share @ d[above]) > 1e-9 * scale
+    what = "is zero" if zero[row] else "depends on those above it"
+    mend = "and d contradicts them" if contradicts else "and says nothing new: leave it out"
+    raise ValueError(
+        f"D has rank {len(kept)} for {np.sum(exact)} exact rows: "
+        f"row {row}, counted from 0, {what} {mend}"
+    )
+
+
+def check_weight(rule: str, weight: Weight, n: int | None = None) -> None:
+    """The metric W of a rule; with n, whether it fits a state of that dimension."""
+    if isinstance(weight, str):
+        if weight not in ("covariance", "identity"):
+            raise ValueError(
+                f"{rule} weight must be 'covariance', 'identity' or a matrix, got {weight!r}"
+            )
+    elif n is not None:
+        if np.shape(weight) != (n, n):
+            raise ValueError(f"{rule} weight is {np.shape(weight)}, the state needs ({n}, {n})")
+    elif not np.all(np.diag(linalg.factor(np.asarray(weight, float), f"{rule} weight")) > 0.0):
+        raise ValueError(f"{rule} weight is not positive definite: each state wants a weight")

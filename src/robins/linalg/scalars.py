@@ -1,0 +1,110 @@
+"""Vectors, matrices and quaternions as tuples of scalars: in a compiled loop faster than arrays.
+
+A scan over small arrays spends its time starting kernels; scalars are joined into few. Under `vmap`
+each scalar is an array over the batch. Long chains of them want `settled` in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from robins import _float64  # noqa: F401
+
+Three = Sequence[Any]
+Matrix = Sequence[Sequence[Any]]
+
+
+def scalars(v: Any) -> tuple[Any, ...]:
+    """The components of a vector."""
+    return tuple(v[i] for i in range(v.shape[0]))
+
+
+def matrix(m: Any) -> Matrix:
+    """The rows of a matrix, each a tuple of its components."""
+    return tuple(scalars(m[i]) for i in range(m.shape[0]))
+
+
+def settled(*vectors: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """The same vectors, computed here and once.
+
+    Else XLA would compute what a component needs once more wherever that component is needed.
+    """
+    return [scalars(v) for v in jax.lax.optimization_barrier([jnp.stack(v) for v in vectors])]
+
+
+def plus(a: Three, b: Three, *more: Three) -> Three:
+    """Sum of vectors."""
+    total = tuple(x + y for x, y in zip(a, b, strict=True))
+    return plus(total, *more) if more else total
+
+
+def minus(a: Three, b: Three) -> Three:
+    """Difference."""
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+def times(s: Any, a: Three) -> Three:
+    """A number times a vector."""
+    return tuple(s * x for x in a)
+
+
+def dot(a: Three, b: Three) -> Any:
+    """Scalar product, of any length."""
+    products = [x * y for x, y in zip(a, b, strict=True)]
+    return sum(products[1:], products[0]) if products else 0.0
+
+
+def cross(a: Three, b: Three) -> Three:
+    """Vector product."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def apply(m: Matrix, v: Sequence[Any]) -> Three:
+    """Matrix times vector."""
+    return tuple(dot(row, v) for row in m)
+
+
+def transposed(m: Matrix) -> Matrix:
+    """Rows for columns."""
+    return tuple(zip(*m, strict=True))
+
+
+def dcm(q: Sequence[Any]) -> Matrix:
+    """Direction cosine matrix of a unit quaternion, scalar first."""
+    w, x, y, z = q
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+    """Hamilton product of quaternions, scalar first."""
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+def rotate(q: Sequence[Any], v: Three) -> Three:
+    """Turn a vector of three by a unit quaternion, scalar first."""
+    t = times(2.0, cross(q[1:], v))
+    return plus(v, times(q[0], t), cross(q[1:], t))
+
+
+def symmetric_inverse(m: Matrix) -> Matrix:
+    """Inverse of a symmetric matrix of three by its cofactors."""
+    (a, b, c), (_, d, e), (_, _, f) = m
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    scale = 1.0 / (a * aa + b * bb + c * cc)
+    return tuple(times(scale, row) for row in ((aa, bb, cc), (bb, dd, ee), (cc, ee, ff)))

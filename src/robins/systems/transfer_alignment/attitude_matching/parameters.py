@@ -1,0 +1,106 @@
+"""What a scenario of attitude matching states: manoeuvre, errors, flexure, what filters believe."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Positive, Quantity, default
+from robins.systems.parts import Runs, Three, refuse_too_long, refuse_unsettled
+from robins.systems.study import Scenario
+
+
+class BankTurn(Parameters):
+    """A level bank turn: roll in from the start, turn, roll out, fly on; speed and height stay."""
+
+    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    # horizontal, in the turn, to the right; negative: a left turn
+    acceleration: Annotated[float, Quantity("acceleration", least="-100 g", most="100 g")]
+    roll_time: Annotated[float, Quantity("time", above="0 s")]  # of each roll, at a constant rate
+    turn_time: Annotated[float, Quantity("time", least="0 s")]  # between the rolls
+    duration: Annotated[float, Quantity("time", above="0 s")]  # of the run
+    latitude: Annotated[float, Quantity("angle", least="-85 deg", most="85 deg")]
+    # at the start, clockwise from north
+    heading: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
+class Master(Parameters):
+    """The attitude that the master reports, with white noise at each update."""
+
+    attitude_noise: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
+    # no attitude comes from the first to the second time, as in an outage of the link
+    outage: Annotated[tuple[float, float], Quantity("time", least="0 s")] | None = None
+
+
+class Slave(Parameters):
+    """True errors of the slave: constant drift, noise, and where its attitude begins."""
+
+    gyro_bias: Annotated[Three, Quantity("angle rate")]
+    gyro_noise: Annotated[float, Quantity("angle random walk", least="0 deg/sqrt(h)")]
+    attitude_error: Annotated[Three, Quantity("angle", least="-30 deg", most="30 deg")]  # E, N, U
+
+
+class Mounting(Parameters):
+    """How the slave sits on the master: as drawn, and the true error (slave axes)."""
+
+    nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # rotation vector
+    error: Annotated[Three, Quantity("angle", least="-30 deg", most="30 deg")]
+
+
+class Flexing(Parameters):
+    """How the structure moves between the two, in axes right, forward, up of the master."""
+
+    sigma: Annotated[Three, Quantity("angle", least="0 rad", most="180 deg")]
+    time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
+    damping: Positive = 1.0
+    bending: Annotated[Three, Quantity("angle")] = default("0 rad")  # per g of load above one
+    # white at each update
+    flutter: Annotated[float, Quantity("angle", least="0 rad", most="180 deg")]
+
+
+class Spread(Parameters):
+    """Standard deviations that filters are told of the start, and of flexure over the true ones."""
+
+    attitude: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
+    gyro_bias: Annotated[float, Quantity("angle rate", above="0 rad/s")]
+    mounting: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
+    flexure_sigma_factor: Positive = 1.0
+    flexure_time_factor: Positive = 1.0  # of the correlation time
+
+
+class HInfinity(Parameters):
+    """What is asked of the H-infinity filters."""
+
+    gamma: Positive = 50.0  # of those with R = 1 unit^2, in their unit
+    weighted_over_least: Positive = 1.05  # of the weighted one: gamma over its least
+
+
+class AttitudeMatching(Scenario):
+    """Attitude matching in a bank turn; axes of the paper, ENU and RFU."""
+
+    system: str = "transfer-alignment"
+    study: str = "attitude-matching"
+    title: str = "Attitude matching in a bank turn"
+    runs: Runs = 200
+    claims: tuple[str, ...] | None = ()
+    step: Annotated[float, Quantity("time", above="0 s")] = default("10 ms")  # of the truth
+    period: Annotated[float, Quantity("time", above="0 s")] = default("50 ms")  # of the filters
+    # figures pooled over time count from here
+    settle: Annotated[float, Quantity("time", least="0 s")] = default("15 s")
+    # initial errors as given, or of that size with a sign drawn for each axis and run
+    signs: Literal["fixed", "random"] = "fixed"
+    manoeuvre: BankTurn
+    master: Master
+    slave: Slave
+    mounting: Mounting
+    flexure: Flexing
+    believed: Spread
+    h_infinity: HInfinity = pydantic.Field(default_factory=HInfinity)
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> AttitudeMatching:
+        lasts = self.manoeuvre.duration
+        refuse_too_long("step", lasts, 1.0 / self.step)
+        refuse_unsettled("settle", self.settle, lasts)
+        return self

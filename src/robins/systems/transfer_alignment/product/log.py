@@ -1,0 +1,366 @@
+"""Align a recorded slave to its recorded master, and say what came out and how well.
+
+The tables of a `Dataset` hold the slave's samples (``imu``) and the master's records (``master``).
+The slave begins where the first whole record of the master puts it. What is unknown about that, the
+mounting, the flexure and the noise of the record, is in its attitude too, so the initial covariance
+correlates them. A gap in the slave's samples that is too long to bridge ends a piece; the next one
+is aligned anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import linalg, units
+from robins.dataset import Dataset, Trajectory
+from robins.earth import earth_rate_n, transport_rate_n
+from robins.filters import Belief
+from robins.ins.blocks import cut, epochs_between
+from robins.ins.frames import to_ned_frd
+from robins.ins.increments import Increments, from_imu
+from robins.ins.mechanise import Nav, nav_at, refuse_polar, vector
+from robins.results import Outcome, Progress, silent, variable
+from robins.rotation import Rotation
+from robins.systems.replaying import (
+    Answer,
+    Piece,
+    Reported,
+    epochs_of,
+    gap_counts,
+    navigated,
+    noise_scale,
+    outcome,
+    prepared,
+)
+from robins.systems.study import Case, Contender
+from robins.systems.system import Alignment
+from robins.systems.tables import place_arrays
+from robins.systems.transfer_alignment.product.filters import FILTERS
+from robins.systems.transfer_alignment.product.model import Installation, ProductState
+from robins.systems.transfer_alignment.product.parameters import PairParameters, Replay
+from robins.systems.transfer_alignment.product.study import (
+    BLOCKS,
+    SENSORS,
+    installation_of,
+    product_contender,
+    tracks,
+)
+from robins.systems.transfer_alignment.product.world import PairRun
+
+_ATTITUDE, _MOUNTING, _FLEXURE = slice(0, 3), slice(15, 18), slice(18, 21)
+
+
+# -------------------------------------------------------------------------------- log to pieces
+
+
+class Recorded(NamedTuple):
+    """A recorded pair on one clock, whose zero is the slave's first sample; NED/FRD."""
+
+    increments: Increments  # of the slave: (N,), (N, 3), (N, 3)
+    time_s: np.ndarray  # (N,) end of each
+    master: Trajectory
+    master_s: np.ndarray  # (M,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairPiece(Piece):
+    """A stretch of a recorded pair without a long gap in the slave's samples."""
+
+    world: PairRun
+    record: np.ndarray  # (E,) row of the master's table used there, -1 where there is none
+    first: int  # row that the slave starts from
+
+
+def on_one_clock(dataset: Dataset) -> Recorded:
+    """The tables of a pair that was examined and cleaned (`robins.logs`).
+
+    Raises:
+        ValueError: there is no master, or it has no record within the slave's log.
+    """
+    if dataset.master is None or len(dataset.master) == 0:
+        raise ValueError("a recorded pair needs the records of a master; this log has none")
+    master = to_ned_frd(dataset.master)
+    refuse_polar(master.lat_rad[np.isfinite(master.lat_rad)])
+    increments, end_ns = from_imu(dataset.imu)
+    origin = int(dataset.imu.time_ns[0])
+    time_s, master_s = (end_ns - origin) * 1e-9, (master.time_ns - origin) * 1e-9
+    if not np.any((master_s > 0.0) & (master_s <= time_s[-1])):
+        raise ValueError(
+            f"no record of the master lies within the slave's log: the slave spans 0 to "
+            f"{time_s[-1]:.1f} s, the master {master_s[0]:.1f} to {master_s[-1]:.1f} s; do both "
+            "use the same time scale?"
+        )
+    return Recorded(
+        Increments(*(np.asarray(a, float) for a in increments[:3])), time_s, master, master_s
+    )
+
+
+def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], list[str]]:
+    """The pieces made ready for filters, and a sentence for each stretch that cannot be used.
+
+    Raises:
+        ValueError: no stretch can be used; the sentence says why.
+    """
+    longest = parameters.recording.longest_gap
+    prepare = partial(_prepare, recorded, parameters)
+    return prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
+
+
+def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
+    increments = Increments(*(np.asarray(a)[rows] for a in recorded.increments[:3]))
+    time_s, master_s, delay = recorded.time_s[rows], recorded.master_s, parameters.master.delay
+    begin_s, end_s = float(time_s[0] - increments.dt[0]), float(time_s[-1])
+    reported = nav_at(recorded.master, slice(None))
+    whole = np.isfinite(np.asarray(vector(reported))).all(axis=1)
+    within = (master_s - delay >= begin_s - 1e-9) & (master_s <= end_s + 1e-9)
+    if not np.any(within & whole):
+        late = f" (records are {delay:g} s old)" if delay else ""
+        raise ValueError(
+            "no record of the master with position, velocity and attitude, which the slave could "
+            f"start from, while it was sampled{late}"
+        )
+    k = int(np.flatnonzero(within & whole)[0])
+    start_s = float(np.clip(master_s[k] - delay, begin_s, end_s))
+    used = np.flatnonzero((master_s > master_s[k]) & (master_s <= end_s + 1e-9))
+    if len(used) == 0:
+        raise ValueError(f"the master has no record after the first whole one, {master_s[k]:.1f} s")
+    stamps, recording = np.minimum(master_s[used], end_s), parameters.recording
+    epochs = epochs_between(start_s, end_s, stamps, recording.longest_block)
+    blocks = cut(increments, time_s, start_s, epochs)
+    record = np.full(len(epochs), -1)
+    record[np.searchsorted(epochs, stamps - 1e-9)] = used
+
+    def at_epochs(values: Any, fill: float = np.nan) -> np.ndarray:
+        known = (record >= 0).reshape(-1, *([1] * (np.ndim(values) - 1)))
+        return np.where(known, np.asarray(values)[record], fill)
+
+    at = installation_of(parameters)
+    at_s = np.clip(master_s - delay, begin_s, end_s)
+    of_slave = _gyro_rate(increments, time_s, float(np.median(recorded.increments.dt)), at_s)
+    turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
+    if (told := recorded.master.omega_ib_b) is not None:
+        turn = np.where(np.isfinite(told), told, turn)
+    scale = noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
+    world = PairRun(
+        increments=blocks.increments,
+        noise_scale=scale,
+        start=_slave_of(jax.tree.map(lambda x: x[k], reported), at, jnp.asarray(turn[k])),
+        initial_error=np.zeros(9),
+        master=jax.tree.map(at_epochs, reported),
+        master_omega_b=at_epochs(turn, 0.0),
+        truth=None,
+    )
+    return PairPiece(
+        world=jax.tree.map(jnp.asarray, world),
+        begin_s=start_s,
+        epoch_s=epochs,
+        noise_scale=scale,
+        record=record,
+        first=k,
+    )
+
+
+def _gyro_rate(
+    increments: Increments, time_s: np.ndarray, usual_dt: float, at_s: np.ndarray
+) -> np.ndarray:
+    """Mean of the gyros over 10 ms, or a sample, to either side of times (M,): (M, 3) rad/s.
+
+    Turned by the nominal mounting it stands in for the master's turn rate where that was not
+    recorded: a lever arm of metres does not notice the biases, nor the mounting error.
+    """
+    edge_s = np.concatenate([[time_s[0] - increments.dt[0]], time_s])
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(increments.theta, axis=0)])
+    # towards an end of the samples both sides become shorter, so that the mean stays centred
+    half = np.minimum(max(0.01, usual_dt), np.minimum(at_s - edge_s[0], edge_s[-1] - at_s))
+    half = np.maximum(half, 0.5 * usual_dt)
+
+    def until(t):
+        return np.stack([np.interp(t, edge_s, a) for a in angle.T], -1)
+
+    early, late = (np.clip(at_s + k * half, edge_s[0], edge_s[-1]) for k in (-1.0, 1.0))
+    return (until(late) - until(early)) / (late - early)[:, None]
+
+
+@jax.jit
+def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
+    """Where a record of the master puts the slave: nominal mounting, lever arm, no flexure."""
+    q_nm, v_n, place = master
+    arm_n = q_nm.apply(at.lever_m)
+    omega_in = earth_rate_n(place.lat) + transport_rate_n(place.lat, place.alt, v_n)
+    swing = q_nm.apply(jnp.cross(omega_b, at.lever_m)) - jnp.cross(omega_in, arm_n)
+    return Nav(q_nm @ at.q_ms, v_n + swing, place.retract(arm_n))
+
+
+# ------------------------------------------------------------------------------------ the filters
+
+
+def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
+    """Add to an uncorrelated start that the slave's attitude comes from a record of the master.
+
+    To first order the attitude error is ``C_ns mu + C_nm lambda`` and the noise of the record, all
+    of which come on top of what `belief` doubts by itself; noise of the record is also in velocity
+    and position.
+    """
+    q_ns, q_ms = belief.mean.ins.q_nb, installation_of(parameters).q_ms
+    S, n = jnp.asarray(belief.factor), belief.factor.shape[-1]
+    attitude = S[_ATTITUDE] + q_ns.as_dcm() @ S[_MOUNTING]
+    if n > _FLEXURE.start:
+        attitude = attitude + (q_ns @ q_ms.inverse()).as_dcm() @ S[_FLEXURE]
+    m = parameters.master
+    noise = jnp.asarray([*m.attitude_noise, *m.velocity_noise, *m.position_noise])
+    of_record = jnp.pad(jnp.diag(noise), ((0, n - 9), (0, 0)))
+    return Belief(belief.mean, linalg.tria(S.at[_ATTITUDE].set(attitude), of_record))
+
+
+def contender(parameters: Replay, name: str) -> Contender:
+    """A filter of the product model, for pieces of a recorded recorded.
+
+    Raises:
+        ValueError: no such filter; a noise of the master that is zero.
+    """
+    made = product_contender(parameters, name, parameters.believed)
+
+    def case(run: PairRun) -> Case:
+        given = made.case(run)
+        return given._replace(start=start_belief(given.start, parameters))
+
+    return made._replace(case=case)
+
+
+# ---------------------------------------------------------------------------------- what came out
+
+
+def _estimates(mean: ProductState) -> Mapping[str, Any]:
+    """Blocks that are vectors, and roll, pitch, heading of the slave."""
+    found = {
+        "velocity": mean.ins.v_n,
+        "gyro_bias": mean.ins.gyro_bias,
+        "accel_bias": mean.ins.accel_bias,
+        "mounting": mean.mounting_rad,
+        "euler": jnp.stack(mean.ins.q_nb.as_euler(), -1),
+    }
+    return found if mean.flexure is None else found | {"flexure": mean.flexure[..., :3]}
+
+
+REPORTED = Reported(
+    blocks=BLOCKS,
+    sensors=SENSORS,
+    estimates=_estimates,
+    causes="Likely causes: a delay of the master that is not stated, a sign or frame of its "
+    "velocity or attitude (down for up, heading counterclockwise), a nominal mounting or lever arm "
+    "that is wrong, flexure without states for it, or noise of master and slave told too small.",
+)
+_FOUND = ("gyro_bias", "accel_bias", "mounting")  # what an alignment is for, beside the attitude
+_UNKNOWN = 0.7  # of the sigma at the start; what keeps more of it was hardly seen
+_LARGE_RAD = np.deg2rad(5.0)
+
+
+def metrics_of(answer: Answer) -> dict[str, Any]:
+    """Mounting, biases and attitude at the end with their sigmas."""
+    out: dict[str, Any] = {}
+    found, last = _estimates(answer.mean), np.asarray(answer.sigma)[-1]
+    for block in BLOCKS:
+        name, shown = block.name, (block.units, block.display_unit)
+        ending = units.as_ending(block.display_unit)
+        if name in _FOUND:
+            value = units.convert(np.asarray(found[name])[-1], *shown)
+            out[f"{name}_{ending}"] = value.tolist()
+        if name in ("attitude", *_FOUND):
+            sigma = units.convert(last[block.where], *shown)
+            out[f"{name}_sigma_{ending}"] = sigma.tolist()
+    return out
+
+
+def remarks(name: str, answer: Answer) -> list[str]:
+    """Sentences on what the motion did not show, and on a mounting far from the nominal one."""
+    said = []
+    before, after = np.asarray(answer.start.sigma), np.asarray(answer.sigma)[-1]
+    for block in BLOCKS:
+        hidden = [
+            axis
+            for axis, s, t in zip(block.axes, before[block.where], after[block.where], strict=False)
+            if t > _UNKNOWN * s > 0
+        ]
+        if hidden and block.name in _FOUND:
+            said.append(
+                f"{name}: {block.name.replace('_', ' ')} {', '.join(hidden)} was hardly observed; "
+                "its sigma is near what it was before. Another manoeuvre would show it."
+            )
+    size = float(np.linalg.norm(answer.mean.mounting_rad[-1]))
+    if size > _LARGE_RAD:
+        said.append(
+            f"{name}: the slave sits {np.degrees(size):.1f} deg from its nominal mounting. Models "
+            "of first order do not hold beyond 5 deg; this one keeps whole rotations, but a better "
+            "nominal mounting makes it converge sooner."
+        )
+    return said
+
+
+def _started(piece: PairPiece, recorded: Recorded, delay_s: float) -> str:
+    old = f", which was {delay_s:g} s old" if delay_s else ""
+    return (
+        f"Aligned from {piece.begin_s:.2f} to {piece.epoch_s[-1]:.2f} s, starting from the "
+        f"master's record of {recorded.master_s[piece.first]:.2f} s{old}."
+    )
+
+
+def replay(
+    dataset: Dataset,
+    parameters: Replay,
+    filters: tuple[str, ...] = (),
+    progress: Progress = silent,
+) -> Outcome:
+    """Align the slave of a recorded pair with the filters named.
+
+    Args:
+        dataset: the slave's samples and the master's records, examined and cleaned (`robins.logs`).
+        parameters: what is believed of both units, of the mounting and of the flexure.
+        filters: by default those of the parameters.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        ValueError: no such filter; or the pair cannot be aligned, the sentence says why.
+    """
+    recorded = on_one_clock(dataset)
+    pieces, problems = pieces_of(recorded, parameters)
+    wanted = tuple(filters) or parameters.filters
+    answers = navigated(pieces, wanted, partial(contender, parameters), progress=progress)
+    master = recorded.master
+    notes = [_started(piece, recorded, parameters.master.delay) for piece in pieces]
+    notes += [f"Not aligned, {problem}." for problem in problems]
+    if master.omega_ib_b is None and any(parameters.lever_arm):
+        notes.append("The master's turn rate was not recorded; the slave's gyros stand in for it.")
+    notes += [line for name, answer in answers.items() for line in remarks(name, answer)]
+    time, path = "master_time", (master.lat_rad, master.lon_rad, master.alt_m)
+    variables = {time: variable(time, recorded.master_s, "s", "time of the master's records")}
+    variables |= tracks({name: answer.mean for name, answer in answers.items()})
+    variables |= place_arrays("reference", path, "{} of the master", dims=time)
+    used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
+    return outcome(
+        epochs_of(pieces),
+        answers,
+        REPORTED,
+        metrics=metrics_of,
+        variables=variables,
+        counts=dict(dataset.counts)
+        | gap_counts(pieces, problems)
+        | {"master_records_not_used": len(master) - used - len(pieces)},
+        notes=notes,
+    )
+
+
+def orientation(parameters: Replay) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad] of the master's axes as seen from the slave's."""
+    back = Rotation.from_euler(*parameters.mounting.nominal).inverse()
+    roll, pitch, yaw = (float(angle) for angle in back.as_euler())
+    return roll, pitch, yaw
+
+
+ALIGNMENT = Alignment("product", Replay, FILTERS, replay)

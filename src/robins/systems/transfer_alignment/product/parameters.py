@@ -1,0 +1,242 @@
+"""Parameters of a master and a slave on one vehicle, of the study "product", and of a recording.
+
+A scenario class takes those of the pair by inheriting `PairParameters` beside `Scenario`. Vectors
+along the body are forward, right, down; along the Earth north, east, down.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+import pydantic
+
+from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
+from robins.sim.flexure import Flexure
+from robins.systems.parts import Departure, Leg, Names, Three, refuse_too_long, refuse_unsettled
+from robins.systems.study import Scenario
+
+
+class BankLeg(Parameters):
+    """A bank angle, right wing down positive, and how long the leg lasts."""
+
+    bank: Annotated[float, Quantity("angle", above="-85 deg", below="85 deg")]
+    seconds: Annotated[float, Quantity("time", above="0 s")]
+
+
+class Sway(Parameters):
+    """A sine of an angle."""
+
+    amplitude: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")]
+    period: Annotated[float, Quantity("time", above="0 s")]
+    phase: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
+class Heave(Parameters):
+    """A sine of height."""
+
+    amplitude: Annotated[float, Quantity("length", least="0 m", most="1 km")]
+    period: Annotated[float, Quantity("time", above="0 s")]
+    phase: Annotated[float, Quantity("angle")] = default("0 deg")
+
+
+class Aircraft(Departure):
+    """Level flight at constant speed through commanded banks; see `robins.sim.manoeuvres.fly`."""
+
+    kind: Literal["aircraft"]
+    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    pitch: Annotated[float, Quantity("angle", least="-80 deg", most="80 deg")] = default("0 deg")
+    roll_time: Annotated[float, Quantity("time", above="0 s")] = default("2 s")
+    legs: Annotated[tuple[BankLeg, ...], pydantic.Field(min_length=1)]
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration."""
+        return sum(leg.seconds for leg in self.legs)
+
+
+class Ship(Departure):
+    """A straight course in the sea; without any sway the sea of `MODERATE_SEA`."""
+
+    kind: Literal["ship"]
+    speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")
+    seconds: Annotated[float, Quantity("time", above="0 s")]
+    roll: tuple[Sway, ...] | None = None
+    pitch: tuple[Sway, ...] | None = None
+    yaw: tuple[Sway, ...] | None = None
+    heave: tuple[Heave, ...] | None = None
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration."""
+        return self.seconds
+
+
+class Vehicle(Departure):
+    """A ground vehicle that drives legs, on a road that may be rough."""
+
+    kind: Literal["vehicle"]
+    speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")  # at the start
+    legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
+    roll: tuple[Sway, ...] = ()
+    pitch: tuple[Sway, ...] = ()
+
+    @property
+    def lasts_s(self) -> float:
+        """Duration."""
+        return sum(leg.lasts_s for leg in self.legs)
+
+
+class Slave(Parameters):
+    """The inertial unit to be aligned; biases are constant in a run, drawn with these sigmas."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("50 Hz")
+    gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")]
+    accel_noise: Annotated[Three, Quantity("velocity random walk", least="0 m/s/sqrt(h)")]
+    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")]
+    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
+
+
+class Master(Parameters):
+    """The records of the master; one at each epoch of the filters."""
+
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("10 Hz")
+    # one sigma about north, east, down; flutter of the structure belongs to it
+    attitude_noise: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
+    velocity_noise: Annotated[Three, Quantity("speed", least="0 m/s")]
+    position_noise: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
+    # a record stamped t describes t - delay
+    delay: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+
+
+class Mounting(Parameters):
+    """How the slave sits: ``C_ms = C(nominal) exp(error x)``, the error in slave axes."""
+
+    nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of the slave
+    error: Annotated[Three, Quantity("angle")] = default("0 deg")  # the same in every run
+    # drawn on top
+    sigma: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default("0 deg")
+
+
+class Structure(Parameters):
+    """What bends and swings between master and slave, in master axes: roll, pitch, heading."""
+
+    sigma: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default("0 deg")
+    time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
+    damping: Positive = 1.0
+    # degrees of freedom of the Student-t noise that drives it; without, normal
+    tail_dof: Dof | None = None
+    bending: Annotated[Three, Quantity("angle")] = default("0 deg")  # per g of load factor above 1
+
+    @property
+    def flexure(self) -> Flexure:
+        """The same as simulator and filters take it."""
+        sigma, time, bending = (np.asarray(x) for x in (self.sigma, self.time, self.bending))
+        return Flexure(sigma, time, self.damping, self.tail_dof, bending)
+
+
+class Window(Parameters):
+    """A stretch of time, its end not included."""
+
+    begin: Annotated[float, Quantity("time", least="0 s")]
+    end: Annotated[float, Quantity("time", above="0 s")]
+
+
+class Disturbance(Parameters):
+    """What no filter is told of, unless a scenario says so."""
+
+    # records of the master with attitude and velocity noise that many times as large
+    outlier_share: Share = 0.0
+    outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 10.0
+    # degrees of freedom of Student-t noise of the master, of the stated sigmas; without, normal
+    tail_dof: Dof | None = None
+    gyro_noise_factor: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 1.0  # in the window
+    gyro_noise_window: Window | None = None
+    drift_step: Annotated[Three, Quantity("angle rate")] = default("0 deg/h")  # slave axes
+    drift_step_time: Annotated[float, Quantity("time", least="0 s")] | None = None
+    dropouts: tuple[Window, ...] = ()  # no records of the master
+
+
+class Start(Parameters):
+    """One sigma of the initial errors of the slave's navigation, north, east, down.
+
+    They are drawn from normal distributions; or all +1 sigma; or 1 sigma of random sign.
+    """
+
+    attitude: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
+    velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0 m/s")
+    position: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
+    draw: Literal["normal", "plus-sigma", "random-sign"] = "normal"
+
+
+class PairParameters(Parameters):
+    """A master, a slave, what is between them, and how they move."""
+
+    manoeuvre: Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")]
+    slave: Slave
+    master: Master
+    start: Start
+    mounting: Mounting = pydantic.Field(default_factory=Mounting)
+    # master to slave, master axes
+    lever_arm: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
+    flexure: Structure = pydantic.Field(default_factory=Structure)
+    disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> PairParameters:
+        if self.manoeuvre is not None:  # a recorded pair brings its own
+            lasts = self.manoeuvre.lasts_s
+            refuse_too_long("slave.rate", lasts, self.slave.rate)
+            refuse_too_long("master.rate", lasts, self.master.rate)
+            refuse_unsettled("settle", getattr(self, "settle", 0.0), lasts)
+        return self
+
+
+class Believed(Parameters):
+    """What the filters are told; without a word the stated noise, start and mounting are true."""
+
+    # one sigma of the mounting error
+    mounting: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
+        "0.3 deg"
+    )
+    # flexure states are for what is given here; tails and bending are not modelled
+    flexure: Structure | None = None
+    gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")] = (
+        default("0 deg/h/sqrt(h)")
+    )
+    accel_bias_walk: Annotated[
+        Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")
+    ] = default("0 mg/sqrt(h)")
+    position: bool = False  # match positions too
+
+
+class Product(Scenario, PairParameters):
+    """A pair to be aligned by filters of the product model."""
+
+    system: str = "transfer-alignment"
+    study: str = "product"
+    title: str = "Transfer alignment, closed loop"
+    filters: Names = ("kf", "product")
+    believed: Believed = pydantic.Field(default_factory=Believed)
+    # figures pooled over time count from here, when the manoeuvre has shown what there is to see
+    settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+
+
+class Recording(Parameters):
+    """How a recorded pair is cut into steps of the filter."""
+
+    longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
+    # a gap in the slave's samples that is longer is declared: the alignment begins anew after it
+    longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
+    # process noise factor across one
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
+
+
+class Replay(Product):
+    """What is believed of a recorded pair; the log brings its own motion."""
+
+    manoeuvre: (  # pyright: ignore[reportIncompatibleVariableOverride]
+        Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None
+    ) = None
+    recording: Recording = pydantic.Field(default_factory=Recording)
+    filters: Names = ("product",)

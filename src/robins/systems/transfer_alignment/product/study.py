@@ -1,0 +1,278 @@
+"""The study "product": a slave on an aircraft, a ship or a vehicle, aligned closed loop.
+
+The truth of a run is drawn from what the filter "product" is told: initial errors, biases, noise,
+mounting error and flexure, from the sigmas of the scenario. So a right filter is consistent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from robins import units
+from robins.errors import require_known
+from robins.filters import Belief, Model
+from robins.ins.frames import swap
+from robins.ins.state import InsNoise, InsState
+from robins.rotation import Rotation
+from robins.sim.flexure import Flexure, transition
+from robins.systems.judgement import Claim, consistency, consistency_claims
+from robins.systems.parts import FRD, NED, Block, refuse_unsettled
+from robins.systems.recipes import recipe
+from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View
+from robins.systems.tables import place_arrays
+from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
+from robins.systems.transfer_alignment.product.model import (
+    ATTITUDE,
+    POSITION,
+    RECORDS,
+    VELOCITY,
+    Installation,
+    ProductState,
+    lag_of,
+    product_model,
+)
+from robins.systems.transfer_alignment.product.parameters import Believed, PairParameters, Product
+from robins.systems.transfer_alignment.product.world import (
+    Course,
+    PairRun,
+    lay_out,
+    simulate_pair,
+    start_estimate,
+)
+
+_SLAVE, _MASTER = "FRD of the slave", "FRD of the master"
+BLOCKS = (
+    StateBlock("attitude", slice(0, 3), "rad", "arcmin", "NED", NED),
+    StateBlock("velocity", slice(3, 6), "m/s", "m/s", "NED", NED),
+    StateBlock("position", slice(6, 9), "m", "m", "NED", NED),
+    StateBlock("gyro_bias", slice(9, 12), "rad/s", "deg/h", _SLAVE, FRD),
+    StateBlock("accel_bias", slice(12, 15), "m/s^2", "mg", _SLAVE, FRD),
+    StateBlock("mounting", slice(15, 18), "rad", "arcmin", _SLAVE, FRD),
+    StateBlock("flexure", slice(18, 21), "rad", "arcmin", _MASTER, FRD),
+)
+SENSORS = {name: record.axes for name, record in RECORDS.items()}
+# by every filter, whether or not it has flexure states
+_REPORTED = {block.name: block for block in BLOCKS if block.name != "flexure"}
+_RIGID = 18  # components without flexure states
+# Nothing is known better than this (rad, m/s, m, rad/s, m/s^2, rad), so that covariances that begin
+# with zeros have full rank, as the Joseph form needs.
+_LEAST = np.repeat([1e-9, 1e-6, 1e-3, 1e-12, 1e-8, 1e-9], 3)
+
+
+# ------------------------------------------------------------------------- what a filter believes
+
+
+def installation_of(pair: PairParameters) -> Installation:
+    """Where the slave sits, as far as it is known."""
+    q_ms = Rotation.from_euler(*pair.mounting.nominal)
+    return Installation(q_ms, jnp.asarray(pair.lever_arm, float))
+
+
+def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> Model:
+    """The product model as parameters tell it.
+
+    Raises:
+        ValueError: a noise of the master is zero, so that its records could not be weighed.
+    """
+    matched = (ATTITUDE, VELOCITY, *((POSITION,) if believed.position else ()))
+    sigmas = {}
+    for name in matched:
+        key = RECORDS[name].sigma
+        sigmas[name] = np.asarray(getattr(pair.master, key))
+        if not np.all(sigmas[name] > 0.0):
+            raise ValueError(
+                f"master.{key} is {getattr(pair.master, key)}: what filters match needs a sigma "
+                "above zero on each axis"
+            )
+    noise = InsNoise(
+        gyro_arw=np.asarray(pair.slave.gyro_noise),
+        accel_vrw=np.asarray(pair.slave.accel_noise),
+        gyro_bias_rw=np.asarray(believed.gyro_bias_walk),
+        accel_bias_rw=np.asarray(believed.accel_bias_walk),
+    )
+    return product_model(noise, installation_of(pair), sigmas, flexure)
+
+
+def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> np.ndarray:
+    """(n,) standard deviations of the initial tangent components, uncorrelated."""
+    start, slave = pair.start, pair.slave
+    parts = [start.attitude, start.velocity, start.position]
+    parts += [slave.gyro_bias, slave.accel_bias, believed.mounting]
+    sigma = np.maximum(np.concatenate([np.asarray(p, float) for p in parts]), _LEAST)
+    if flexure is None:
+        return sigma
+    # of the steady state, the factor of whose covariance is that of a very long step
+    three = zip(flexure.sigma_rad, flexure.tau_s, strict=True)
+    steady = [transition(s, t, flexure.damping, 1e3 * t)[1] for s, t in three]
+    return np.concatenate([sigma, *np.sqrt(np.sum(np.asarray(steady) ** 2, axis=2)).T])
+
+
+def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) -> Case:
+    """What a filter is given of a pair, and what it should find.
+
+    Args:
+        matched: records of the master that it uses.
+        start: sigma (n,) at the start, and the delay [s] of the records.
+        run: the pair.
+    """
+    sigma, delay_s = start
+    flexure, truth = jnp.zeros(6), run.truth
+    if len(sigma) == _RIGID:
+        flexure, truth = None, truth and truth._replace(flexure=None)
+    mean = ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
+    lag = lag_of(run.increments, delay_s, run.master_omega_b)
+    return Case(
+        start=Belief(mean, jnp.diag(sigma)),
+        u=Block(run.increments, run.noise_scale),
+        y={name: getattr(run.master, RECORDS[name].field) for name in matched},
+        aux=dict.fromkeys(matched, lag),
+        truth=truth,
+    )
+
+
+def reported(n: int, blocks: Sequence[str] = tuple(_REPORTED), frame: str = "NED") -> np.ndarray:
+    """Rows (3 len(blocks), n) that take some blocks of the tangent error, in the order given.
+
+    Args:
+        n: components of the filter's state, 18 or 24.
+        blocks: of attitude, velocity, position, gyro_bias, accel_bias, mounting.
+        frame: "NED", with body axes forward right down, or "ENU", with right forward up. The error
+            is true minus estimated either way, for the attitude C_true = exp(e x) C_estimate.
+
+    Raises:
+        ValueError: a block or a frame that is not among these.
+    """
+    if frame not in ("NED", "ENU") or any(block not in _REPORTED for block in blocks):
+        raise ValueError(
+            f"blocks are {', '.join(_REPORTED)} in NED or ENU; got {', '.join(blocks)} in {frame}"
+        )
+    turn = np.eye(3) if frame == "NED" else swap(np.eye(3))
+    return np.concatenate([turn @ np.eye(n)[_REPORTED[block].where] for block in blocks])
+
+
+def product_contender(
+    pair: PairParameters,
+    name: str = "product",
+    believed: Believed | None = None,
+    blocks: Sequence[str] = tuple(_REPORTED),
+    frame: str = "NED",
+) -> Contender:
+    """A filter of the product model, for a problem that simulates a `PairRun`.
+
+    Args:
+        pair: what the filter is told of both units, the start and the seat. It knows nothing of
+            `pair.disturbance`, `pair.flexure` and the true mounting error.
+        name: one of `FILTERS`.
+        believed: of mounting and flexure; by default 0.3 deg and none.
+        blocks: what it reports, see `reported`.
+        frame: "NED" or "ENU".
+
+    Raises:
+        ValueError: no such filter, block or frame; a noise of the master that is zero.
+    """
+    require_known("filter", name, FILTERS)
+    told = Believed() if believed is None else believed
+    flexure = VARIANTS[name].flexure(told.flexure)
+    model, sigma = model_of(pair, told, flexure), start_sigma(pair, told, flexure)
+    start = jnp.asarray(sigma), jnp.asarray(pair.master.delay)
+    return Contender(
+        filter=VARIANTS[name].make(),
+        model=model,
+        case=recipe(_case, tuple(model.dims), numbers=start),
+        reported=reported(len(sigma), blocks, frame),
+    )
+
+
+# ------------------------------------------------------------------------------ what is judged
+
+
+FIVE_ARCMIN = "5_arcmin"
+JUDGED = "product"  # the filter whose consistency is claimed
+
+CLAIMS = consistency_claims(
+    {
+        "sigma": "On no state the RMS error of the filter 'product' is proven, at 99 % confidence, "
+        "to differ from its sigma by more than 5 %; value: the largest difference proven",
+        "anees": "ANEES of the filter 'product' is inside its 95 % band at 90 % of the epochs or "
+        "more; value: the share",
+        "nis": "The grand mean NIS of every sensor is inside its 99.9 % band for the filter "
+        "'product'; value: the one farthest from 1",
+    },
+    JUDGED,
+) | {
+    "aligned": Claim(
+        "Once it counts, the attitude RMS of the filter 'product' is at most 1.15 times what its "
+        "covariance allows, pooled over the axes; value: the ratio",
+        (JUDGED,),
+        lambda metrics: metrics[JUDGED]["attitude_over_sigma"],
+        (0.0, 1.15),
+    )
+}
+_ENU = [1, 0, 2]  # of sizes, which have no sign
+
+
+def product_metrics(statistics: Any) -> dict[str, Any]:
+    """Metrics of one filter from its campaign statistics, over the epochs that count.
+
+    Attitudes are listed east, north, up, as in the other studies; the rest as in its block. The
+    last sigmas are those that the filter states at the end.
+    """
+    start = statistics.count_from
+    rms = np.sqrt(np.mean(statistics.rms[start:] ** 2, axis=0))
+    sigma = np.sqrt(np.mean(statistics.sigma[start:] ** 2, axis=0))
+    out: dict[str, Any] = {}
+    for block in statistics.blocks:
+        name, here, shown = block.name, block.where, (block.units, block.display_unit)
+        ending = "mps" if name == "velocity" else units.as_ending(block.display_unit)
+        order = _ENU if name == "attitude" else slice(None)
+        size, last = (units.convert(x[here][order], *shown) for x in (rms, statistics.sigma[-1]))
+        out[f"{name}_rms_{ending}"] = size.tolist()
+        if name == "attitude":
+            ratio = np.sqrt(np.sum(rms[here] ** 2) / np.sum(sigma[here] ** 2))
+            out["attitude_rms_all_arcmin"] = float(np.sqrt(np.mean(size**2)))
+            out["attitude_over_sigma"] = float(ratio)
+        if name in ("attitude", "mounting"):
+            out[f"{name}_last_sigma_{ending}"] = last.tolist()
+    settled = statistics.settled(FIVE_ARCMIN)
+    out["share_below_5_arcmin"] = float(np.mean(settled <= start))
+    return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
+
+
+# ----------------------------------------------------------------------------------- the study
+
+
+def _contender(given: Product, course: Course, name: str) -> Contender:
+    return product_contender(given, name, given.believed)
+
+
+def tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
+    """Where each filter thought the slave was."""
+    places = zip(*(jax.tree.leaves(mean.ins.position) for mean in means.values()), strict=True)
+    return place_arrays("track", map(np.stack, places), "{} of the slave")
+
+
+def _view(given: Product, course: Course) -> View:
+    refuse_unsettled("settle", given.settle, float(course.epoch_s[-1]))
+    path = course.path.position
+    used = (ATTITUDE, VELOCITY, *((POSITION,) if given.believed.position else ()))
+    return View(
+        epoch_s=course.epoch_s,
+        blocks=tuple(_REPORTED.values()),
+        sensors={name: SENSORS[name] for name in used},
+        metrics=product_metrics,
+        context=xr.Dataset(place_arrays("reference", (path.lat, path.lon, path.alt), "true {}")),
+        shown=tracks,
+        count_from=int(np.searchsorted(course.epoch_s, given.settle)),
+        limits=(Limit(FIVE_ARCMIN, "attitude", units.parse("5 arcmin", "angle")),),
+        notes=("The pair is simulated; --master and --slave align a recorded one.",),
+    )
+
+
+STUDY = Study(Product, FILTERS, simulate_pair, _contender, _view, lay_out, CLAIMS)
