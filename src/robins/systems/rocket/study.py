@@ -264,10 +264,19 @@ def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
     return jnp.repeat(jnp.array([given.start.attitude, bias, *scale]), 3)
 
 
-def field_case(scaled: bool, taken: Taken, sigma: Array, world: World) -> Case:
-    """What a filter of "field-vector" takes of a run; pure."""
+def field_case(scaled: bool, taken: Taken, numbers: tuple[Array, Array], world: World) -> Case:
+    """What a filter of "field-vector" takes of a run; pure.
+
+    Args:
+        scaled: scale factors are states.
+        taken: by its sensors.
+        numbers: initial sigma (n,), and the field (E, 3) [T] in n.
+        world: the run.
+    """
+    sigma, field_n = numbers
+    world = world._replace(field_n=field_n)
     start, zero = Rotation(world.start_q_nb), jnp.zeros(3)
-    q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, world.bias.shape)
+    q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, field_n.shape)
     errors = (world.bias, scale) if scaled else (world.bias,)
     state = ScaledState if scaled else FieldState
     seen = {name: take(world) for name, take in taken}
@@ -277,7 +286,7 @@ def field_case(scaled: bool, taken: Taken, sigma: Array, world: World) -> Case:
         y={name: y for name, (y, _) in seen.items()},
         aux={name: aux for name, (_, aux) in seen.items()},
         truth=state(Rotation(q_nb), *errors),
-        rows=field.rows_of(q_nb, world.field_n, len(sigma)),
+        rows=field.rows_of(q_nb, field_n, len(sigma)),
     )
 
 
@@ -285,7 +294,8 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     """A filter of "field-vector" with its model and its data."""
     chosen = FIELD_FILTERS[name]
     _, taken = aboard(given, course, chosen.sensors)
-    case = recipe(field_case, chosen.scaled, taken, numbers=field_sigma(given, chosen))
+    numbers = field_sigma(given, chosen), jnp.asarray(course.field_n)
+    case = recipe(field_case, chosen.scaled, taken, numbers=numbers)
     return Contender(chosen.filter, field_model(given, course, chosen), case)
 
 

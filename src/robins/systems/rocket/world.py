@@ -64,8 +64,8 @@ class World(NamedTuple):
     start_q_nb: Array  # (4,) that filters begin with
     start_omega_b: Array  # (3,)
     theta_b: Array  # (E, 3) what the gyro turned by in each step [rad]
-    field_n: Array  # (E, 3) T, as of the course
     readings: Mapping[str, Any] = {}  # of the instruments of the study, leading axis E
+    field_n: Any = None  # (E, 3) T, the same in all runs: not simulated, but added by a case
 
     @property
     def bias(self) -> Array:
@@ -150,8 +150,7 @@ def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
     theta, errors = delta_angles(key(Component.IMU), q, T, gyro)
     start = wrong_by(q[0], given.start.attitude_error)
     wrong = given.start.rate * jax.random.normal(key(Component.INITIAL_STATE), (3,))
-    felt, field_n = _felt(course, theta), jnp.asarray(course.field_n)
-    world = World(q, omega, errors, start, omega[0] + wrong, felt, field_n)
+    world = World(q, omega, errors, start, omega[0] + wrong, _felt(course, theta))
     it = given, course, key(Component.MAGNETOMETER), world
     return world._replace(
         readings={i.name: i.measure(*it) for i in instruments(given) if i.measure is not None}
@@ -202,12 +201,12 @@ def _magnetic(given: Flight, course: Course, key: Array, world: World) -> tuple[
 
 def _field(given: Flight, course: Course, key: Array, world: World) -> Array:
     """(E, 3) T."""
-    magnet = given.magnetometer
+    magnet, field_n = given.magnetometer, jnp.asarray(course.field_n)
     return observe_field(
         jax.random.fold_in(key, _VECTOR),
         world.q_nb[1:],
-        world.field_n,
-        jnp.sqrt(jnp.sum(world.field_n**2, axis=1)) * math.sin(magnet.noise),
+        field_n,
+        jnp.sqrt(jnp.sum(field_n**2, axis=1)) * math.sin(magnet.noise),
         jnp.asarray(course.seen),
         turn=_burst(field_bursts, given, course, key),
         hard_iron_t=jnp.asarray(magnet.hard_iron),
