@@ -145,11 +145,12 @@ def left_jacobian(
     The right Jacobian, exp((phi + d) x) = exp(phi x) exp((J_r d) x), is J(-phi). To first order in
     phi too, J = I + skew(phi) / 2.
     """
-    if first_order:
-        return jnp.eye(3) + 0.5 * skew(phi)
-    once, twice, _ = (c[..., None, None] for c in turn_coefficients(phi))
     turn = skew(phi)
-    return jnp.eye(3) + once * turn + twice * turn @ turn
+    unit = jnp.broadcast_to(jnp.eye(3), turn.shape)
+    if first_order:
+        return unit + 0.5 * turn
+    once, twice, _ = (c[..., None, None] for c in turn_coefficients(phi))
+    return unit + once * turn + twice * turn @ turn
 
 
 def to_dcm(q: Float[Real, "*b 4"]) -> Float[Real, "*b 3 3"]:

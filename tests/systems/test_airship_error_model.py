@@ -14,7 +14,7 @@ from robins.ins.mechanise import Nav
 from robins.manifold import local, retract
 from robins.rotation import Rotation, to_euler
 from robins.systems.airship import error_model as em
-from robins.systems.airship import instruments as on
+from robins.systems.airship import instruments
 
 MISALIGNMENTS = np.radians(tm.MISALIGNMENTS_DEG)
 CLOSE = (1e-12, 1e-10, 1e-6)  # rad, m/s, m
@@ -254,7 +254,7 @@ def test_the_printed_rows_are_wrong_by_two_towards_east_in_either_reading(counte
     true = numerical_rows_ned(q)
     roll, pitch, heading = to_euler(q.wxyz)
     sense = -1.0 if counterclockwise else 1.0
-    printed = np.asarray(on.printed_attitude_rows(roll, pitch, sense * heading))
+    printed = np.asarray(instruments.printed_attitude_rows(roll, pitch, sense * heading))
     found = -swap(printed * np.array([[1.0], [1.0], [sense]]))  # change of the compass heading
     wrong = np.argwhere(np.abs(found - true) > 1e-6)
     assert len(wrong) == (1 if counterclockwise else 2)
@@ -267,7 +267,7 @@ def test_the_printed_rows_hold_terms_of_neither_sense():
     """At 30 deg of roll towards east the false term of (44) is 2 sin(pitch) sin(roll) cos(roll)."""
     pitch, roll = 0.3, np.radians(30.0)
     right = numerical_rows(pitch, roll, -np.pi / 2) * np.array([[1.0], [1.0], [-1.0]])
-    found = np.asarray(on.printed_attitude_rows(roll, pitch, np.pi / 2))
+    found = np.asarray(instruments.printed_attitude_rows(roll, pitch, np.pi / 2))
     false = 2.0 * np.sin(pitch) * np.sin(roll) * np.cos(roll) / np.cos(pitch)
     assert_allclose(found[1] - right[1], [0.0, false, 0.0], atol=3e-10)
     assert_allclose(found[2, 0], right[2, 0] / np.cos(pitch), atol=3e-10)
@@ -278,12 +278,12 @@ def test_the_printed_rows_hold_terms_of_neither_sense():
 
 @pytest.mark.parametrize("degrees", [90.0, 0.0, 180.0])
 def test_the_printed_constraint_loses_a_row_at_cardinal_headings(degrees):
-    D, _ = on.printed_constraint(np.radians(degrees), 0.3)
+    D, _ = instruments.printed_constraint(np.radians(degrees), 0.3)
     assert_allclose(np.linalg.svd(D, compute_uv=False), [1.0, 0.0], atol=2e-16)
 
 
 def test_the_printed_constraint_is_the_printed_one():
-    D, d = on.printed_constraint(np.radians(89.0), 0.5)
+    D, d = instruments.printed_constraint(np.radians(89.0), 0.5)
     s, c = np.sin(np.radians(89.0)), np.cos(np.radians(89.0))
     assert_allclose(D[:, 3:5], [[s, 0.0], [0.0, c]])
     assert np.count_nonzero(D) == 2
@@ -294,5 +294,5 @@ def test_the_printed_constraint_is_the_printed_one():
 def test_the_air_speed_error_of_the_printed_constraint():
     """What d leaves over, at a heading of 90 deg: (0, dv_a)."""
     x = nav(0.0, 0.0, np.pi / 2)._replace(v_n=jnp.array([4.0, 23.0, 0.0]))
-    left, _ = on.printed_wind(x, (jnp.array([4.5, 0.0, 0.0]), jnp.array([0.0, 20.0])))
+    left, _ = instruments.printed_wind(x, (jnp.array([4.5, 0.0, 0.0]), jnp.array([0.0, 20.0])))
     assert_allclose(left, [0.0, -0.5], atol=1e-15)

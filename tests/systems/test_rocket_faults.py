@@ -80,7 +80,7 @@ def turned_away(world, field_n):
     body = Turn.from_quat(np.array(world.q_nb[1:]), scalar_first=True).inv().apply(field_n)
     across = np.cross(body, [1.0, 0.0, 0.0])
     across *= 40 * DEG / np.linalg.norm(across, axis=1, keepdims=True)
-    z = np.array(world.y[FIELD])
+    z = np.array(world.readings[FIELD])
     z[AT:] = Turn.from_rotvec(across[AT:]).apply(z[AT:])
     return z
 
@@ -98,7 +98,7 @@ IMPOSSIBLE = ("nan", "one axis", "inf", "-inf", "zero", "denormal", "weak", "str
 def of_the_field():
     problem = FIELD_VECTOR.problem(parsed(FieldVector, "b4"), ("gate", "discriminator"), 0)
     world = jax.jit(problem.simulate)(0)
-    good = np.array(world.y[FIELD])
+    good = np.array(world.readings[FIELD])
     field_n = np.array(problem.context["field_n"])
     unit = good[AT] * np.linalg.norm(field_n[AT]) / np.linalg.norm(good[AT])
     one_axis, stopped = good[AT].copy(), good[AT].copy()
@@ -110,7 +110,7 @@ def of_the_field():
         cases[case] = good.copy()
         cases[case][AT] = row
     cases["turned"] = turned_away(world, field_n)
-    worlds = [world._replace(y={FIELD: jnp.asarray(z)}) for z in cases.values()]
+    worlds = [world._replace(readings={FIELD: jnp.asarray(z)}) for z in cases.values()]
     worlds.append(world._replace(theta_b=world.theta_b.at[AT : AT + 10].set(jnp.nan)))
     up, way = direction_of(field_n[0])
     along = (f'body.elevation="{up} deg"', f'body.azimuth="{way} deg"', 'body.cone="0 deg"')
@@ -279,11 +279,11 @@ def of_lost_sensors():
     world = jax.jit(problem.simulate)(0)
 
     def without(*lost):
-        y = dict(world.y)
+        read = dict(world.readings)
         for name, no in zip((GYRO, MAGNETIC), lost, strict=True):
             if no:
-                y[name] = jax.tree.map(lambda x: x.at[TAKEN].set(jnp.nan), y[name])
-        return world._replace(y=y)
+                read[name] = jax.tree.map(lambda x: x.at[TAKEN].set(jnp.nan), read[name])
+        return world._replace(readings=read)
 
     worlds = jax.tree.map(lambda *x: jnp.stack(x), *(without(*one) for one in LOST.values()))
     return {name: found(problem.contenders[name], worlds) for name in names}

@@ -201,8 +201,8 @@ def test_a_flight_has_the_field_of_its_path_the_iron_and_the_limit_of_its_sensor
     np.testing.assert_allclose(course.field_n[0], start, rtol=2e-3, atol=2e-8)
     assert course.alt_m[-1] > 10e3
     one, other = (jax.jit(partial(simulate, p, course, 0))(0) for p in (plain, given))
-    shifted = np.asarray(one.y[FIELD]) + np.array([3e-6, -2e-6, 1e-6])
-    np.testing.assert_allclose(other.y[FIELD], np.clip(shifted, -36e-6, 36e-6), atol=1e-18)
+    shifted = np.asarray(one.readings[FIELD]) + np.array([3e-6, -2e-6, 1e-6])
+    np.testing.assert_allclose(other.readings[FIELD], np.clip(shifted, -36e-6, 36e-6), atol=1e-18)
     assert np.any(np.abs(shifted) > 36e-6)
 
 

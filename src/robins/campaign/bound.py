@@ -13,7 +13,7 @@ import xarray as xr
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.campaign.monte_carlo import contender, solved, worlds
+from robins.campaign.monte_carlo import contender, reported_rows, solved, worlds
 from robins.filters import Belief, Filter, Model
 from robins.filters.analysis.bound import bound_along, linearised, used_sensors
 from robins.filters.analysis.observability import (
@@ -114,7 +114,7 @@ def _case(filter_: Filter, model: Model, case: Partial, world: Any) -> Case:
 def _variances(filter_, model, case: Partial, reported, world) -> Array:
     it = _case(filter_, model, case, world)
     line = linearised(model, _start(it), it.truth, it.y, it.u, it.aux)
-    return _reported(_rows(reported, it), bound_along(line, _start(it).factor).factor)
+    return _reported(reported_rows(reported, it)[0], bound_along(line, _start(it).factor).factor)
 
 
 def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
@@ -128,13 +128,6 @@ def _left(rows: np.ndarray, L: np.ndarray, D: np.ndarray) -> np.ndarray:
 def _start(case: Any) -> Belief:
     """The belief a case begins with, also where it holds the state of a filter."""
     return getattr(case.start, "belief", case.start)
-
-
-def _rows(reported: Any, case: Case) -> Array | None:
-    """What makes of a tangent error what is reported, (r, n) or (E, r, n); None: all of it is."""
-    if case.rows is not None:
-        return case.rows
-    return None if reported is None else jnp.asarray(reported, float)
 
 
 def _reported(rows: Array | None, factor: Array) -> Array:
@@ -161,7 +154,7 @@ def _bound(filter_, model, case: Partial, reported, subsets, world) -> _Found:
     start = _start(it)
     line = linearised(model, start, it.truth, it.y, it.u, it.aux)
 
-    rows = _rows(reported, it)
+    rows, _ = reported_rows(reported, it)
     first = None if rows is None else rows if rows.ndim == 2 else rows[0]
 
     def of(use):

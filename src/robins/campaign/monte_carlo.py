@@ -42,15 +42,14 @@ def _reported(belief: Belief, truth: State, rows: Array | None) -> tuple[Array, 
     return (error, factor) if rows is None else (rows @ error, rows @ factor)
 
 
-def reported_rows(contender: Contender, case: Case) -> tuple[Array | None, int | None]:
+def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
     """Rows that make of a tangent error what is reported, and their axis of time if they have one.
 
-    None: all of the error is reported.
+    (r, n) or (E, r, n); None: all of the error is reported.
     """
     if case.rows is not None:
         return case.rows, 0
-    fixed = contender.reported
-    return (None if fixed is None else jnp.asarray(fixed, float)), None
+    return (None if reported is None else jnp.asarray(reported, float)), None
 
 
 def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any, Case, Tally]:
@@ -72,7 +71,7 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
     """One run of one filter, to what statistics need."""
     steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
-    rows, along = reported_rows(contender, case)
+    rows, along = reported_rows(contender.reported, case)
     error, factor = jax.vmap(_reported, (0, 0, along))(posterior, case.truth, rows)
     # A filter that could not predict is no longer at the time of the truth: it has diverged.
     error = jnp.where((jnp.cumsum(~moved) > 0)[:, None], jnp.nan, error)

@@ -17,7 +17,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from robins.errors import require_known
-from robins.filters import Belief, Filter, Loop, Model, Sensor
+from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
 from robins.scenario import Parameters
 from robins.systems.judgement import Claim, Metrics, judging, standard_metrics
@@ -116,11 +116,11 @@ class Instrument(NamedTuple):
     axes: SensorAxes
     # (parameters, course, key of a component, true motion) -> its reading, leading axis E, NaN
     # where there is none; None: it takes what another instrument has read
-    measure: Callable[..., Any] | None
-    # (parameters, course) -> h(x) and R, as a filter believes; None: it is not aboard
-    believed: Callable[..., Sensor | None]
-    # world -> the measurement, and what h(x) needs besides the state
-    taken: Callable[[Any], tuple[Any, Any]]
+    measure: Any
+    # (parameters, course) -> `Sensor`: h(x) and R, as a filter believes; None: it is not aboard
+    believed: Callable[..., Any]
+    # world -> the measurement, and what h(x) needs besides the state; None: the reading, nothing
+    taken: Any = None
 
 
 @dataclass(frozen=True)

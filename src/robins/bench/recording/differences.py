@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
+from robins.bench.status import aligned
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.records import decode, size_of
 from robins.bench.wire.schema import FIRST_DATA, Field, Message, message
+
+Payloads = dict[tuple[int, int, int], bytes]
+"""Payloads by message, time, and which of those with both alike."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +38,6 @@ class FieldDifference:
     count: int  # of frames that differ
 
 
-class _Both(NamedTuple):
-    """Frames that belong together, by message, time, and which of those with both alike."""
-
-    a: dict[tuple[int, int, int], bytes]
-    b: dict[tuple[int, int, int], bytes]
-    step_ns: int
-
-
 def differences(a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0) -> list[FieldDifference]:
     """Where the frames of two runs differ, the earliest difference first; none: an empty list.
 
@@ -56,15 +51,15 @@ def differences(a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0) -> lis
         b: frames of the other.
         step_ns: length of a step, to tell steps; 0: not known.
     """
-    both = _Both(_by_key(a), _by_key(b), step_ns)
+    of_a, of_b = _by_key(a), _by_key(b)
     found: list[FieldDifference] = []
-    for number in sorted({key[0] for key in (*both.a, *both.b)}):
-        found += _of_message(number, both)
+    for number in sorted({key[0] for key in (*of_a, *of_b)}):
+        found += _of_message(number, of_a, of_b, step_ns)
     return sorted(found, key=lambda d: d.first_time_s)
 
 
-def _by_key(frames: Iterable[Frame]) -> dict[tuple[int, int, int], bytes]:
-    found: dict[tuple[int, int, int], bytes] = {}
+def _by_key(frames: Iterable[Frame]) -> Payloads:
+    found: Payloads = {}
     seen: dict[tuple[int, int], int] = {}
     for frame in frames:
         number, time_ns = frame.header.type, frame.header.time_ns
@@ -76,14 +71,14 @@ def _by_key(frames: Iterable[Frame]) -> dict[tuple[int, int, int], bytes]:
     return found
 
 
-def _of_message(number: int, both: _Both) -> list[FieldDifference]:
+def _of_message(number: int, a: Payloads, b: Payloads, step_ns: int) -> list[FieldDifference]:
     of = _known(number)
     only_a: list[int] = []  # times [ns] of frames that only one has
     only_b: list[int] = []
     as_bytes: list[int] = []  # of frames that both have and no field tells apart
     by_fields: list[tuple[int, bytes, bytes]] = []
-    for key in sorted(key for key in both.a.keys() | both.b.keys() if key[0] == number):
-        x, y, time_ns = both.a.get(key), both.b.get(key), key[1]
+    for key in sorted(key for key in a.keys() | b.keys() if key[0] == number):
+        x, y, time_ns = a.get(key), b.get(key), key[1]
         if y is None:
             only_a.append(time_ns)
         elif x is None:
@@ -92,13 +87,18 @@ def _of_message(number: int, both: _Both) -> list[FieldDifference]:
             by_fields.append((time_ns, x, y))
         elif x != y:
             as_bytes.append(time_ns)
-    found = _of_fields(of, by_fields, both.step_ns) if of and by_fields else []
-    place = _Place(of.name if of else f"message {number}", "", -1, "")
-    for times, a, b in ((only_a, 1.0, 0.0), (only_b, 0.0, 1.0), (as_bytes, 1.0, 1.0)):
-        if count := len(times):
-            values = _Values(0.0, 0.0, a * count, b * count)
-            found.append(_difference(place, values, times[0], count, both.step_ns))
+    found = _of_fields(of, by_fields, step_ns) if of and by_fields else []
+    name = of.name if of else f"message {number}"
+    for times, in_a, in_b in ((only_a, 1.0, 0.0), (only_b, 0.0, 1.0), (as_bytes, 1.0, 1.0)):
+        if n := len(times):
+            when = _when(times[0], step_ns)
+            found.append(FieldDifference(name, "", -1, "", 0.0, 0.0, *when, in_a * n, in_b * n, n))
     return found
+
+
+def _when(time_ns: int, step_ns: int) -> tuple[int, float]:
+    """Step and time [s]; a message has the time of its step's end."""
+    return time_ns // step_ns - 1 if step_ns else -1, time_ns * 1e-9
 
 
 def _known(number: int) -> Message | None:
@@ -106,20 +106,6 @@ def _known(number: int) -> Message | None:
         return message(number)
     except KeyError:
         return None
-
-
-class _Place(NamedTuple):
-    message: str
-    field: str
-    component: int
-    unit: str
-
-
-class _Values(NamedTuple):
-    max_abs: float
-    max_rel: float
-    a: float
-    b: float
 
 
 def _of_fields(
@@ -137,10 +123,10 @@ def _of_fields(
             if not len(where):
                 continue
             first = int(where[0])
-            place = _Place(of.name, f.name, -1 if f.length == 1 else k, f.unit)
-            most = _how_much(x[where, k], y[where, k])
-            values = _Values(*most, float(x[first, k]), float(y[first, k]))
-            found.append(_difference(place, values, frames[first][0], len(where), step_ns))
+            place = of.name, f.name, -1 if f.length == 1 else k, f.unit
+            most, when = _how_much(x[where, k], y[where, k]), _when(frames[first][0], step_ns)
+            values = float(x[first, k]), float(y[first, k])
+            found.append(FieldDifference(*place, *most, *when, *values, len(where)))
     return found
 
 
@@ -161,14 +147,6 @@ def _how_much(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return float(apart.max()), float(relative.max())
 
 
-def _difference(
-    place: _Place, values: _Values, time_ns: int, count: int, step_ns: int
-) -> FieldDifference:
-    step = time_ns // step_ns - 1 if step_ns else -1  # a message has the time of its step's end
-    most, ratio, a, b = values
-    return FieldDifference(*place, most, ratio, step, time_ns * 1e-9, a, b, count)
-
-
 def table(
     found: Sequence[FieldDifference], names: tuple[str, str] = ("recorded", "replayed")
 ) -> str:
@@ -184,7 +162,7 @@ def table(
     lines = []
     if numbers:
         head = ("number", "unit", "frames", "since step", "since s", *names, "most", "relative")
-        lines += _aligned([head, *(_row(d) for d in numbers)])
+        lines += aligned([head, *(_row(d) for d in numbers)])
     lines += [_sentence(d, names) for d in found if not d.field]
     if any(d.max_abs == 0 for d in numbers):
         lines.append(
@@ -203,19 +181,9 @@ def _row(d: FieldDifference) -> tuple[str, ...]:
     a, b = f"{d.a:.9g}", f"{d.b:.9g}"
     if a == b:  # as many digits as it takes
         a, b = repr(d.a), repr(d.b)
-    step = "-" if d.first_step < 0 else str(d.first_step)
-    since = f"{d.first_time_s:.9g}"
-    return (
-        name_of(d),
-        d.unit,
-        str(d.count),
-        step,
-        since,
-        a,
-        b,
-        f"{d.max_abs:.3g}",
-        f"{d.max_rel:.3g}",
-    )
+    when = "-" if d.first_step < 0 else str(d.first_step), f"{d.first_time_s:.9g}"
+    most = f"{d.max_abs:.3g}", f"{d.max_rel:.3g}"
+    return (name_of(d), d.unit, str(d.count), *when, a, b, *most)
 
 
 def _sentence(d: FieldDifference, names: tuple[str, str]) -> str:
@@ -223,10 +191,3 @@ def _sentence(d: FieldDifference, names: tuple[str, str]) -> str:
     if d.a and d.b:
         return f"{d.message}: {d.count} frames of a length that is not that of the message, {when}."
     return f"{d.message}: {d.count} frames only {names[0] if d.a else names[1]}, {when}."
-
-
-def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return [
-        "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]

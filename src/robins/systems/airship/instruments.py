@@ -209,15 +209,10 @@ def steady(world: World) -> tuple[Array, Array]:
 
 
 def along_the_nose(world: World) -> tuple[Array, Array]:
-    """As in the paper: the air speed, forward, and the forecast of the wind."""
+    """The air speed, forward, as the paper takes it, and the forecast of the wind."""
     speed = jnp.linalg.norm(world.readings[WIND], axis=1)
     air_b = speed[:, None] * jnp.array([[1.0, 0.0, 0.0]])
     return _wind(world, world.wind + world.wind_error, air_b)
-
-
-def white_and_lasting(a: AirData) -> float:
-    """One sigma [m/s] of air data and wind, where nothing else stands for the wind's error."""
-    return float(np.hypot(a.noise, a.wind_error))
 
 
 def wind_of(
@@ -237,7 +232,8 @@ def wind_of(
 
 
 AIR_DATA = wind_of(WIND, lambda a: a.noise)
-SOFT = wind_of(WIND, white_and_lasting)
+SOFT = wind_of(WIND, lambda a: float(np.hypot(a.noise, a.wind_error)))
+"""One white noise for air data and wind, where nothing else stands for the error of the wind."""
 
 
 def hard(**given: Any) -> tuple[Instrument, Instrument]:

@@ -20,7 +20,7 @@ from jaxtyping import Array
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
 from robins.manifold import retract
-from robins.systems.airship import instruments as on
+from robins.systems.airship import instruments
 from robins.systems.airship.error_model import ERRORS, feedback
 from robins.systems.airship.instruments import SAR, STAR, WIND, WIND_OF_STAR
 from robins.systems.airship.model import NINE, PRODUCT, WIND_STATES, States
@@ -100,11 +100,14 @@ class Candidate(NamedTuple):
     states: States = NINE
 
 
-PLAIN = (on.RADAR, on.STARS)
-HARD = (*PLAIN, *on.HARD)
-SOFT = (*PLAIN, on.SOFT)
-KNOWN = (*PLAIN, *on.hard(taken=on.steady))
-SIDESLIP = (*PLAIN, *on.hard(taken=on.along_the_nose))
+PLAIN = (instruments.RADAR, instruments.STARS)
+HARD = (*PLAIN, *instruments.HARD)
+SOFT = (*PLAIN, instruments.SOFT)
+WINDY = (*PLAIN, instruments.AIR_DATA)
+KNOWN = (*PLAIN, *instruments.hard(taken=instruments.steady))
+EXACT = (*PLAIN, *instruments.hard(taken=instruments.as_it_is))
+PRINTED = (instruments.PRINTED_RADAR, instruments.PRINTED_STARS)
+SIDESLIP = (*PLAIN, *instruments.hard(taken=instruments.along_the_nose))
 
 CANDIDATES: dict[str, Candidate] = {
     "ekf": Candidate(lambda: _two(ekf), PLAIN),
@@ -113,14 +116,10 @@ CANDIDATES: dict[str, Candidate] = {
     "raukf": Candidate(lambda: _two(robust), PLAIN),
     "cukf-hard": Candidate(lambda: _two(ukf, BOTH), HARD),
     "cukf-soft": Candidate(lambda: _two(ukf, (WIND,)), SOFT),
-    "cukf-wind-states": Candidate(
-        lambda: _two(ukf, (WIND,), common=COMMON), (*PLAIN, on.AIR_DATA), WIND_STATES
-    ),
-    "cukf-exact": Candidate(lambda: _two(ukf, BOTH), (*PLAIN, *on.hard(taken=on.as_it_is))),
-    "cukf-printed": Candidate(lambda: _two(ekf, BOTH), (*PLAIN, *on.PRINTED_WIND)),
-    "cukf-robust": Candidate(
-        lambda: _two(robust, (WIND,), common=COMMON), (*PLAIN, on.AIR_DATA), WIND_STATES
-    ),
+    "cukf-wind-states": Candidate(lambda: _two(ukf, (WIND,), common=COMMON), WINDY, WIND_STATES),
+    "cukf-exact": Candidate(lambda: _two(ukf, BOTH), EXACT),
+    "cukf-printed": Candidate(lambda: _two(ekf, BOTH), (*PLAIN, *instruments.PRINTED_WIND)),
+    "cukf-robust": Candidate(lambda: _two(robust, (WIND,), common=COMMON), WINDY, WIND_STATES),
     "cukf-master": Candidate(lambda: filters.at_master(_two(ukf), (WIND,)), SOFT),
     "cukf-identity": Candidate(
         lambda: _two(lambda: ukf(rules.projection(BOTH, LEVEL)), BOTH), HARD
@@ -134,14 +133,14 @@ CANDIDATES: dict[str, Candidate] = {
     "cukf-soft-gated": Candidate(lambda: _gated(_two(ukf, (WIND,)), (WIND,)), SOFT),
     "cukf-wind-known-gated": Candidate(lambda: _gated(_two(ukf, BOTH), BOTH), KNOWN),
     "cukf-sideslip-gated": Candidate(lambda: _gated(_two(ukf, BOTH), BOTH), SIDESLIP),
-    "ukf-printed-h": Candidate(lambda: _two(ekf), (on.PRINTED_RADAR, on.PRINTED_STARS)),
+    "ukf-printed-h": Candidate(lambda: _two(ekf), PRINTED),
     "centralised": Candidate(ukf, PLAIN),
     "centralised-errors": Candidate(lambda: ukf(feedback()), PLAIN, ERRORS),
     "federated": Candidate(lambda: filters.federated(_locals(ukf), linearise=POINTS), PLAIN),
     "intersection": Candidate(lambda: filters.intersecting(_locals(ukf), "det"), PLAIN),
     "distributed-mean": Candidate(lambda: _two(ukf, feedback="mean"), PLAIN),
     "distributed-full": Candidate(lambda: _two(ukf, feedback="full"), PLAIN),
-    "product": Candidate(_product, on.ABOARD, PRODUCT),
+    "product": Candidate(_product, instruments.ABOARD, PRODUCT),
 }
 """Every filter of the study."""
 
@@ -170,8 +169,8 @@ def as_case(states: States, taken: tuple[tuple[str, Any], ...], sigma: Array, wo
 
 def contender(given: Airship, course: Course, name: str) -> Contender:
     """A filter with its model, its data, and what it reports."""
-    make, instruments, states = CANDIDATES[name]
-    aboard = [(i, s) for i in instruments if (s := i.believed(given, course)) is not None]
+    make, taking, states = CANDIDATES[name]
+    aboard = [(i, s) for i in taking if (s := i.believed(given, course)) is not None]
     sigma = jnp.concatenate([jnp.asarray(s) for s in states.sigma(given, course)])
     taken = tuple((i.name, i.taken) for i, _ in aboard)
     return Contender(
@@ -206,7 +205,7 @@ def view(given: Airship, course: Course) -> View:
     return View(
         epoch_s=course.epoch_s,
         blocks=BLOCKS,
-        sensors={i.name: i.axes for i in on.INSTRUMENTS},
+        sensors={i.name: i.axes for i in instruments.INSTRUMENTS},
         metrics=partial(airship_metrics, course.epoch_s, at_s),
         count_from=first,
         count_to=last,
@@ -339,7 +338,7 @@ CLAIMS: dict[str, Claim] = {
 NAVIGATION = Study(
     parameters=Airship,
     filters=tuple(CANDIDATES),
-    simulate=partial(simulate, on.INSTRUMENTS),
+    simulate=partial(simulate, instruments.INSTRUMENTS),
     contender=contender,
     view=view,
     lay_out=lay_out,

@@ -32,6 +32,7 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay, Start
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
+from robins.systems.parts import Block
 from robins.systems.replaying import Piece, Reported
 from robins.systems.study import Case, Contender
 from robins.systems.tables import place_arrays, track_arrays
@@ -250,7 +251,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     rate = rate_about(increments, log.time_s, epochs)
     y, aux = _fixes(log, used, epochs, rate, parameters.gnss.velocity_window)
     known, about = _known(log, epochs, rate, parameters.aids)
-    belief, u = _belief(log, start, parameters), model.Block(blocks.increments, scale)
+    belief, u = _belief(log, start, parameters), Block(blocks.increments, scale)
     return Stretch(
         world=Case(belief, u, y | known, aux | about, None),
         begin_s=begin_s,

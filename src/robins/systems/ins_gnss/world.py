@@ -30,8 +30,9 @@ from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion
-from robins.systems.ins_gnss.model import POSITION, VELOCITY, Block, Fix, Velocity, start_belief
+from robins.systems.ins_gnss.model import POSITION, VELOCITY, Fix, Velocity, start_belief
 from robins.systems.ins_gnss.parameters import Drive, Imu
+from robins.systems.parts import Block
 from robins.systems.study import Case
 
 

@@ -52,7 +52,8 @@ class Coefficients(NamedTuple):
 
 def angle_state(q_nb: Array, omega_b: Array) -> AngleState:
     """The state, or a run of them, of an attitude and its rates."""
-    return AngleState(*map(Angle, to_euler(q_nb)), omega_b)
+    roll, pitch, yaw = map(Angle, to_euler(q_nb))
+    return AngleState(roll, pitch, yaw, omega_b)
 
 
 # (A1) to (A4)

@@ -40,12 +40,12 @@ from jaxtyping import Array
 from robins import linalg
 from robins.errors import require
 from robins.filters import Motion, Sensor
-from robins.ins.extended_pose import left_jacobian
 from robins.manifold import dim
 from robins.rotation import (
     Rotation,
     conjugate,
     from_rotvec,
+    left_jacobian,
     multiply,
     normalise,
     rotate,
@@ -96,9 +96,9 @@ def field_motion(gyro: GyroNoise) -> Motion:
     return Motion(Partial(propagate, gyro), Partial(noise_of, gyro), Partial(propagated, gyro))
 
 
-def field_sensor(sine: Array) -> Sensor:
+def field_sensor(sine: Array, name: str = FIELD) -> Sensor:
     """The magnetometer, (B4) and (B5); sine of the standard deviation of the field's direction."""
-    return Sensor(read_field, Partial(field_noise, sine), 3, FIELD, observed)
+    return Sensor(read_field, Partial(field_noise, sine), 3, name, observed)
 
 
 # (B1)

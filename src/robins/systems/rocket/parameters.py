@@ -12,7 +12,15 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Span, default
-from robins.systems.parts import Names, Three, refuse_too_long, refuse_unsettled
+from robins.systems.parts import (
+    Duration,
+    Names,
+    Speed,
+    Spread,
+    Three,
+    refuse_too_long,
+    refuse_unsettled,
+)
 from robins.systems.study import Scenario
 
 
@@ -22,7 +30,7 @@ class Launch(Parameters):
     latitude: Annotated[float, Quantity("angle", least="-90 deg", most="90 deg")]
     longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
     height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
-    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    speed: Speed
     elevation: Annotated[float, Quantity("angle", above="0 deg", most="90 deg")]
     azimuth: Annotated[float, Quantity("angle")] = default("0 deg")
     year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2026.0
@@ -37,8 +45,8 @@ class Body(Parameters):
     azimuth: Annotated[float, Quantity("angle")]
     e1: Annotated[float, pydantic.Field(ge=-1.0, lt=1.0)]  # 1 - Ix/It
     # times 1/e2 in which the spin decays, and 1/e3 in which the rates across do; none: never
-    spin_decay: Annotated[float, Quantity("time", above="0 s")] | None = None
-    cone_decay: Annotated[float, Quantity("time", above="0 s")] | None = None
+    spin_decay: Duration | None = None
+    cone_decay: Duration | None = None
     torque: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")]
 
 
@@ -48,12 +56,10 @@ class Gyro(Parameters):
     white: Annotated[float, Quantity("angle rate", above="0 deg/s")]
     bias: Annotated[float, Quantity("angle rate", least="0 deg/h")] = default("5 deg/h")
     drift: Annotated[float, Quantity("angle rate", least="0 deg/h")] = default("5 deg/h")
-    drift_time: Annotated[float, Quantity("time", above="0 s")] = default("300 s")
+    drift_time: Duration = default("300 s")
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")
     # of the attitude that the gyro is integrated to, where that is what is read of it
-    attitude_noise: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
-        "0.5 deg"
-    )
+    attitude_noise: Spread = default("0.5 deg")
     lost: tuple[Span, ...] = ()
 
 
@@ -61,8 +67,8 @@ class Disturbance(Parameters):
     """The magnetometer is wrong by an angle, for a while, again and again."""
 
     angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
-    every: Annotated[float, Quantity("time", above="0 s")] = default("30 s")
-    length: Annotated[float, Quantity("time", above="0 s")] = default("1 s")
+    every: Duration = default("30 s")
+    length: Duration = default("1 s")
 
     @pydantic.model_validator(mode="after")
     def _pauses(self) -> Disturbance:
@@ -81,7 +87,7 @@ class Magnetometer(Parameters):
     scale.
     """
 
-    noise: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
+    noise: Spread = default("1 deg")
     hard_iron: Annotated[Three, Quantity("magnetic field")] = default("0 uT")
     full_scale: Annotated[float, Quantity("magnetic field", above="0 uT")] | None = None
     disturbance: Disturbance | None = None
@@ -92,17 +98,17 @@ class Start(Parameters):
     """How the estimate begins: its error, and what it believes of it, one sigma."""
 
     attitude_error: Annotated[Three, Quantity("angle")] = default("0 deg")
-    attitude: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("2 deg")
+    attitude: Spread = default("2 deg")
     rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("1 deg/s")
 
 
 class Flight(Scenario):
     """What the two studies share."""
 
-    system: Literal["rocket"] = "rocket"
+    system: str = "rocket"
     claims: tuple[str, ...] | None = ()  # the paper's hold only where a scenario states them
-    duration: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
-    step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
+    duration: Duration = default("600 s")
+    step: Duration = default("0.1 s")
     counted_from: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
     quiet_after: Annotated[float, Quantity("time", least="0 s")] = default("10 s")
     launch: Launch
@@ -144,7 +150,7 @@ class Believed(Parameters):
 class MagneticAttitude(Flight):
     """Test-bed A: attitude angles "measured" by the magnetometer, the formulation of the paper."""
 
-    study: Literal["magnetic-attitude"] = "magnetic-attitude"
+    study: str = "magnetic-attitude"
     title: str = "Rocket, magnetic attitude"
     filters: Names = (
         *("gyro", "magnetic-raw", "magnetometer", "ukf", "federated-scalar-ukf"),
@@ -157,7 +163,7 @@ class MagneticAttitude(Flight):
 class FieldVector(Flight):
     """Test-bed B: attitude on SO(3), driven by the gyro, corrected by the measured field."""
 
-    study: Literal["field-vector"] = "field-vector"
+    study: str = "field-vector"
     title: str = "Rocket, field vector"
     filters: Names = (
         *("gyro", "magnetometer", "usque", "huber", "gate", "discriminator"),

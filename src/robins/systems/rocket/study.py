@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
@@ -27,6 +27,7 @@ from robins.filters import (
     Model,
     Motion,
     Rule,
+    Sensor,
     channel,
     federated,
     kalman,
@@ -34,7 +35,7 @@ from robins.filters import (
     taylor,
     unscented,
 )
-from robins.filters.fusion import Sharing
+from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.results import array
 from robins.rotation import Rotation
@@ -48,7 +49,6 @@ from robins.systems.rocket.parameters import FieldVector, Flight, MagneticAttitu
 from robins.systems.rocket.world import (
     BODY,
     EULER,
-    MAGNETOMETER,
     Course,
     World,
     body_of,
@@ -97,6 +97,19 @@ def projected_discriminator(robust: Literal["huber", "gate"]) -> Rule:
     return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust)
 
 
+# name of each sensor of a filter, and what makes its measurement of the world
+Taken = tuple[tuple[str, Callable[[World], Any]], ...]
+
+
+def aboard(
+    given: Flight, course: Course, names: tuple[str, ...]
+) -> tuple[tuple[Sensor, ...], Taken]:
+    """The sensors of these names as a filter believes them, and what it takes of the world."""
+    chosen = [i for i in instruments(given) if i.name in names]
+    believed = (i.believed(given, course) for i in chosen)
+    return tuple(s for s in believed if s is not None), tuple((i.name, i.taken) for i in chosen)
+
+
 # ------------------------------------------------------------------------------- magnetic attitude
 
 
@@ -143,7 +156,7 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
     if chosen.sharing is None:
         return own(*chosen.sensors)
     channels = [channel((sensor,), own(sensor)) for sensor in chosen.sensors]
-    shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)
+    shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)  # pyright: ignore[reportArgumentType] frozen, so hashable
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
         return federated(channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS)
@@ -167,8 +180,7 @@ def angle_sigma(given: MagneticAttitude) -> Array:
 def angle_model(given: MagneticAttitude, course: Course, chosen: AngleFilter) -> Model:
     """Motion and sensors that a filter believes."""
     b, T, white = given.believed, given.step, given.gyro.white
-    found = {i.name: i.believed(given, course) for i in instruments(given)}
-    sensors = tuple(found[name] for name in chosen.sensors)
+    sensors, _ = aboard(given, course, chosen.sensors)
     if not chosen.raw:
         noise = np.array([b.attitude_noise, b.rate_noise]) * np.sqrt(T)
         motion = Motion(Partial(angles.step, coefficients(given)), jnp.repeat(noise, 3))
@@ -188,12 +200,12 @@ def coefficients(given: MagneticAttitude) -> angles.Coefficients:
     return angles.Coefficients(*map(jnp.asarray, (e1, e2, e3, kinematic, given.step)))
 
 
-def angle_case(sensors: tuple[str, ...], sigma: Array, world: World) -> Case:
+def angle_case(taken: Taken, sigma: Array, world: World) -> Case:
     """What a filter of "magnetic-attitude" takes of a run; pure."""
     return Case(
         start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(sigma)),
         u=field.bridged(world.theta_b).theta_b,
-        y={name: world.y[name] for name in sensors},
+        y={name: take(world)[0] for name, take in taken},
         aux={},
         truth=angle_state(world.q_nb[1:], world.omega_b[1:]),
     )
@@ -203,7 +215,8 @@ def angle_contender(given: MagneticAttitude, course: Course, name: str) -> Conte
     """A filter of "magnetic-attitude" with its model and its data."""
     chosen = ANGLE_FILTERS[name]
     model = angle_model(given, course, chosen)
-    case = recipe(angle_case, tuple(model.dims), numbers=angle_sigma(given))
+    _, taken = aboard(given, course, tuple(model.dims))
+    case = recipe(angle_case, taken, numbers=angle_sigma(given))
     return Contender(angle_filter(given, chosen), model, case)
 
 
@@ -214,13 +227,13 @@ class FieldFilter(NamedTuple):
     """A filter of "field-vector"."""
 
     filter: Filter
-    sees: str = FIELD  # or SNAPSHOT, the field taken at its word; or ""
+    sensors: tuple[str, ...] = (FIELD,)  # or SNAPSHOT, the field taken at its word
     scaled: bool = False  # scale factors of the gyro are states
 
 
 FIELD_FILTERS: dict[str, FieldFilter] = {
-    "gyro": FieldFilter(kalman(taylor()), ""),
-    "magnetometer": FieldFilter(kalman(taylor()), SNAPSHOT),
+    "gyro": FieldFilter(kalman(taylor()), ()),
+    "magnetometer": FieldFilter(kalman(taylor()), (SNAPSHOT,)),
     "usque": FieldFilter(ukf()),
     "huber": FieldFilter(ukf(huber(PROBABILITY))),
     "gate": FieldFilter(ukf(patient())),
@@ -238,52 +251,41 @@ def field_model(given: FieldVector, course: Course, chosen: FieldFilter) -> Mode
     g, T = given.gyro, given.step
     # a drift of correlation time tau walks away from where it is by this in a step
     walk = g.drift * math.sqrt(2.0 * T / g.drift_time)
-    angle = FORGETS[0] if chosen.sees == SNAPSHOT else g.white * T
-    sensor = replace(MAGNETOMETER.believed(given, course), name=chosen.sees)
+    angle = FORGETS[0] if SNAPSHOT in chosen.sensors else g.white * T
     motion = field.field_motion(field.GyroNoise(*map(jnp.asarray, (angle, walk, T))))
-    return Model(motion, (sensor,) if chosen.sees else ())
+    sensors, _ = aboard(given, course, chosen.sensors)
+    return Model(motion, sensors)
 
 
 def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
     """(n,) initial, of attitude, bias and scale factors."""
-    bias = 0.0 if chosen.sees == SNAPSHOT else math.hypot(given.gyro.bias, given.gyro.drift)
+    bias = 0.0 if SNAPSHOT in chosen.sensors else math.hypot(given.gyro.bias, given.gyro.drift)
     scale = [given.scale_factor_sigma] if chosen.scaled else []
     return jnp.repeat(jnp.array([given.start.attitude, bias, *scale]), 3)
 
 
-def field_case(
-    scaled: bool, sees: str, full_scale_t: float | None, numbers: tuple[Array, Array], world: World
-) -> Case:
-    """What a filter of "field-vector" takes of a run; pure.
-
-    Args:
-        scaled: scale factors are states.
-        sees: name of its magnetometer, or "".
-        full_scale_t: of the magnetometer, where it is known.
-        numbers: initial sigma (n,), and the field (E, 3) [T] in n.
-        world: the run.
-    """
-    sigma, field_n = numbers
+def field_case(scaled: bool, taken: Taken, sigma: Array, world: World) -> Case:
+    """What a filter of "field-vector" takes of a run; pure."""
     start, zero = Rotation(world.start_q_nb), jnp.zeros(3)
-    q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, field_n.shape)
+    q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, world.bias.shape)
     errors = (world.bias, scale) if scaled else (world.bias,)
-    kind = ScaledState if scaled else FieldState
+    state = ScaledState if scaled else FieldState
+    seen = {name: take(world) for name, take in taken}
     return Case(
-        start=Belief(kind(start, *(zero for _ in errors)), jnp.diag(sigma)),
+        start=Belief(state(start, *(zero for _ in errors)), jnp.diag(sigma)),
         u=field.bridged(world.theta_b),
-        y={sees: field.plausible(world.y[FIELD], field_n, full_scale_t)} if sees else {},
-        aux={sees: field_n} if sees else {},
-        truth=kind(Rotation(q_nb), *errors),
-        rows=field.rows_of(q_nb, field_n, len(sigma)),
+        y={name: y for name, (y, _) in seen.items()},
+        aux={name: aux for name, (_, aux) in seen.items()},
+        truth=state(Rotation(q_nb), *errors),
+        rows=field.rows_of(q_nb, world.field_n, len(sigma)),
     )
 
 
 def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     """A filter of "field-vector" with its model and its data."""
     chosen = FIELD_FILTERS[name]
-    numbers = field_sigma(given, chosen), jnp.asarray(course.field_n)
-    kinds = chosen.scaled, chosen.sees, given.magnetometer.full_scale
-    case = recipe(field_case, *kinds, numbers=numbers)
+    _, taken = aboard(given, course, chosen.sensors)
+    case = recipe(field_case, chosen.scaled, taken, numbers=field_sigma(given, chosen))
     return Contender(chosen.filter, field_model(given, course, chosen), case)
 
 
@@ -304,6 +306,7 @@ def _view(given: Flight, course: Course, **own: Any) -> View:
         context=xr.Dataset(height | block_array("context", block, course.field_n, **about)),
         count_from=int(np.searchsorted(course.time_s, given.counted_from + 1e-9)),
         windows=course.bursts,
+        sensors={i.name: i.axes for i in instruments(given)},
         notes=notes,
         **own,
     )
@@ -318,7 +321,6 @@ def angle_view(given: MagneticAttitude, course: Course) -> View:
             StateBlock("attitude", slice(0, 3), "rad", "deg", "launch NED", EULER),
             StateBlock("rate", slice(3, 6), "rad/s", "deg/s", "FRD", ("p", "q", "r")),
         ),
-        sensors={i.name: i.axes for i in instruments(given)},
         metrics=partial(angle_metrics, course),
     )
 
@@ -334,7 +336,6 @@ def field_view(given: FieldVector, course: Course) -> View:
             StateBlock("field_attitude", slice(3, 6), "rad", "deg", "field", across),
             StateBlock("gyro_bias", slice(6, 9), "rad/s", "deg/h", "FRD", BODY),
         ),
-        sensors=dict.fromkeys((FIELD, SNAPSHOT), MAGNETOMETER.axes),
         metrics=partial(field_metrics, course),
         norms=(Norm("across_field", (4, 5)),),
     )

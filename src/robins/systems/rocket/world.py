@@ -32,7 +32,7 @@ from robins.sim.magnetometer import (
 from robins.sim.random import Component, stream
 from robins.systems.parts import Three
 from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate
-from robins.systems.rocket.field import FIELD, field_sensor
+from robins.systems.rocket.field import FIELD, SNAPSHOT, field_sensor, plausible
 from robins.systems.rocket.parameters import Flight, MagneticAttitude
 from robins.systems.study import Instrument, SensorAxes
 
@@ -64,7 +64,8 @@ class World(NamedTuple):
     start_q_nb: Array  # (4,) that filters begin with
     start_omega_b: Array  # (3,)
     theta_b: Array  # (E, 3) what the gyro turned by in each step [rad]
-    y: Mapping[str, Any] = {}  # what the instruments of the study read, leading axis E
+    field_n: Array  # (E, 3) T, as of the course
+    readings: Mapping[str, Any] = {}  # of the instruments of the study, leading axis E
 
     @property
     def bias(self) -> Array:
@@ -149,9 +150,12 @@ def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
     theta, errors = delta_angles(key(Component.IMU), q, T, gyro)
     start = wrong_by(q[0], given.start.attitude_error)
     wrong = given.start.rate * jax.random.normal(key(Component.INITIAL_STATE), (3,))
-    world = World(q, omega, errors, start, omega[0] + wrong, _felt(course, theta))
+    felt, field_n = _felt(course, theta), jnp.asarray(course.field_n)
+    world = World(q, omega, errors, start, omega[0] + wrong, felt, field_n)
     it = given, course, key(Component.MAGNETOMETER), world
-    return world._replace(y={i.name: i.measure(*it) for i in instruments(given)})
+    return world._replace(
+        readings={i.name: i.measure(*it) for i in instruments(given) if i.measure is not None}
+    )
 
 
 def _felt(course: Course, rows: Array) -> Array:
@@ -165,7 +169,11 @@ def instruments(given: Flight) -> tuple[Instrument, ...]:
     """Those whose readings are measurements; in "field-vector" the gyro drives the motion."""
     if isinstance(given, MagneticAttitude):
         return (RATE_GYRO if given.gyro_reads == "rate" else INTEGRATED_GYRO, MAGNETIC_ATTITUDE)
-    return (MAGNETOMETER,)
+    taken = partial(_taken_field, given.magnetometer.full_scale)
+    return (
+        Instrument(FIELD, _FIELD_AXES, _field, _believed_field, taken),
+        Instrument(SNAPSHOT, _FIELD_AXES, None, partial(_believed_field, name=SNAPSHOT), taken),
+    )
 
 
 def _rate(given: Flight, course: Course, key: Array, world: World) -> Array:
@@ -194,12 +202,12 @@ def _magnetic(given: Flight, course: Course, key: Array, world: World) -> tuple[
 
 def _field(given: Flight, course: Course, key: Array, world: World) -> Array:
     """(E, 3) T."""
-    magnet, field_n = given.magnetometer, jnp.asarray(course.field_n)
+    magnet = given.magnetometer
     return observe_field(
         jax.random.fold_in(key, _VECTOR),
         world.q_nb[1:],
-        field_n,
-        jnp.sqrt(jnp.sum(field_n**2, axis=1)) * math.sin(magnet.noise),
+        world.field_n,
+        jnp.sqrt(jnp.sum(world.field_n**2, axis=1)) * math.sin(magnet.noise),
         jnp.asarray(course.seen),
         turn=_burst(field_bursts, given, course, key),
         hard_iron_t=jnp.asarray(magnet.hard_iron),
@@ -219,28 +227,29 @@ def _as_angles(rows: Array) -> tuple[Angle, ...]:
     return tuple(Angle(rows[:, i]) for i in range(3))
 
 
+def _believed_field(given: Flight, course: Course, name: str = FIELD) -> Sensor:
+    return field_sensor(jnp.asarray(math.sin(given.magnetometer.noise)), name)
+
+
+def _taken_field(full_scale_t: float | None, world: World) -> tuple[Array, Array]:
+    return plausible(world.readings[FIELD], world.field_n, full_scale_t), world.field_n
+
+
+_RATE_AXES = SensorAxes("rad/s", "FRD", ("p", "q", "r"), "deg/s")
 _ANGLE_AXES = SensorAxes("rad", "launch NED", EULER, "deg")
+_FIELD_AXES = SensorAxes("T", "FRD", BODY, "uT")
 RATE_GYRO = Instrument(
-    GYRO,
-    SensorAxes("rad/s", "FRD", ("p", "q", "r"), "deg/s"),
-    _rate,
+    *(GYRO, _RATE_AXES, _rate),
     lambda given, course: Sensor(read_rate, jnp.full(3, given.gyro.white), 3, GYRO),
+    lambda world: (world.readings[GYRO], None),
 )
 INTEGRATED_GYRO = Instrument(
-    GYRO,
-    _ANGLE_AXES,
-    _integrated,
+    *(GYRO, _ANGLE_AXES, _integrated),
     lambda given, course: Sensor(read_angles, jnp.full(3, given.gyro.attitude_noise), 3, GYRO),
+    lambda world: (world.readings[GYRO], None),
 )
 MAGNETIC_ATTITUDE = Instrument(
-    MAGNETIC,
-    _ANGLE_AXES,
-    _magnetic,
+    *(MAGNETIC, _ANGLE_AXES, _magnetic),
     lambda given, course: Sensor(read_angles, jnp.full(3, given.magnetometer.noise), 3, MAGNETIC),
-)
-MAGNETOMETER = Instrument(
-    FIELD,
-    SensorAxes("T", "FRD", BODY, "uT"),
-    _field,
-    lambda given, course: field_sensor(jnp.asarray(math.sin(given.magnetometer.noise))),
+    lambda world: (world.readings[MAGNETIC], None),
 )

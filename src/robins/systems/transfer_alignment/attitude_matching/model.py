@@ -209,7 +209,7 @@ def linear_system(
     swing, drive, swing_sigma = _swing(flexure, T)
     Phi = np.zeros((updates, STATES_FLEXIBLE, STATES_FLEXIBLE))
     Phi[:, :STATES, :STATES], Phi[:, STATES:, STATES:] = rigid.F, swing
-    G = scipy.linalg.block_diag(rigid.G, drive)
+    G = np.asarray(scipy.linalg.block_diag(rigid.G, drive))
     return LinearSystem(Phi, G, H, np.concatenate([rigid.sigma, swing_sigma]))
 
 

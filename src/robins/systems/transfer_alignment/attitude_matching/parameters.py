@@ -79,8 +79,8 @@ class HInfinity(Parameters):
 class AttitudeMatching(Scenario):
     """Attitude matching in a bank turn; axes of the paper, ENU and RFU."""
 
-    system: Literal["transfer-alignment"] = "transfer-alignment"
-    study: Literal["attitude-matching"] = "attitude-matching"
+    system: str = "transfer-alignment"
+    study: str = "attitude-matching"
     title: str = "Attitude matching in a bank turn"
     runs: Runs = 200
     claims: tuple[str, ...] | None = ()

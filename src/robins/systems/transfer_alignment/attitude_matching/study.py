@@ -229,7 +229,7 @@ def view(given: AttitudeMatching, course: Course) -> View:
     )
 
 
-NO_RESULT: Mapping[str, Any] = {
+NO_RESULT: dict[str, Any] = {
     "attitude_rms_arcmin": [np.nan] * 3,
     "attitude_rms_all_arcmin": np.nan,
     "mounting_rms_arcmin": [np.nan] * 3,

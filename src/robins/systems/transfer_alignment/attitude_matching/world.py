@@ -68,9 +68,9 @@ def lay_out(given: AttitudeMatching) -> Course:
     bend = np.abs(given.flexure.bending) * (np.max(load_factor(turn, turn.roll_time)) - 1.0)
     warn_of_large_angles(
         {
-            "slave.attitude_error": np.linalg.norm(given.slave.attitude_error),
-            "mounting.error": np.linalg.norm(given.mounting.error),
-            "flexure": np.linalg.norm(3.0 * np.asarray(given.flexure.sigma) + bend),
+            "slave.attitude_error": float(np.linalg.norm(given.slave.attitude_error)),
+            "mounting.error": float(np.linalg.norm(given.mounting.error)),
+            "flexure": float(np.linalg.norm(3.0 * np.asarray(given.flexure.sigma) + bend)),
         }
     )
     time_s = given.step * np.arange(count * every + 1)

@@ -63,10 +63,9 @@ from robins import _float64, linalg  # noqa: F401
 from robins.earth import Geodetic, earth_rate_n, gravity_n, transport_rate_n
 from robins.filters import Model, Motion, Sensor
 from robins.ins.errors import frame_dynamics
-from robins.ins.extended_pose import left_jacobian
 from robins.ins.increments import Increments
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
-from robins.rotation import Rotation, skew
+from robins.rotation import Rotation, left_jacobian, skew
 from robins.sim.flexure import Flexure, transition
 from robins.systems.parts import NED, Block
 from robins.systems.study import SensorAxes
@@ -79,7 +78,7 @@ class ProductState(NamedTuple):
 
     ins: InsState  # of the slave: 15 components, no scale factors
     mounting_rad: Array  # (3,) mu, slave axes
-    flexure: Array | None = None  # (6,) l [rad], then l' [rad/s], master axes
+    flexure: Any = None  # (6,) l [rad], then l' [rad/s], master axes
 
 
 class Installation(NamedTuple):

@@ -213,8 +213,8 @@ class Believed(Parameters):
 class Product(Scenario, PairParameters):
     """A pair to be aligned by filters of the product model."""
 
-    system: Literal["transfer-alignment"] = "transfer-alignment"
-    study: Literal["product"] = "product"
+    system: str = "transfer-alignment"
+    study: str = "product"
     title: str = "Transfer alignment, closed loop"
     filters: Names = ("kf", "product")
     believed: Believed = pydantic.Field(default_factory=Believed)

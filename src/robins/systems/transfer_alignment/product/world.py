@@ -39,10 +39,9 @@ from robins.sim.disturbance import drift_step, outlier_factor, student_t, window
 from robins.sim.flexure import simulate_flexure
 from robins.sim.ideal_imu import ideal_increments
 from robins.sim.imu_sensor import corrupt
-from robins.sim.lever_arm import at_lever_arm
 from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
-from robins.sim.trajectory import Motion
+from robins.sim.trajectory import Motion, at_lever_arm
 from robins.systems.transfer_alignment.product.model import RECORDS, ProductState, Record
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,8 +86,8 @@ class Informed(Parameters):
 class VelocityAttitude(Scenario, PairParameters):
     """A pair to be aligned open loop, by velocity and Euler angles."""
 
-    system: Literal["transfer-alignment"] = "transfer-alignment"
-    study: Literal["velocity-attitude"] = "velocity-attitude"
+    system: str = "transfer-alignment"
+    study: str = "velocity-attitude"
     title: str = "Transfer alignment by velocity and attitude, open loop"
     runs: Runs = 100
     filters: Names = FILTERS[:-1]
