@@ -18,7 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from robins.dataset import Dataset
@@ -46,7 +45,7 @@ def peer(log: Dataset) -> tuple[float, float]:
     out = []
     causal = vqf.VQF(step).updateBatch(gyro, accel, field)
     for q in (causal, vqf.offlineVQF(gyro, accel, field, step)):
-        ned = np.asarray(multiply(jnp.asarray(ENU_TO_NED), jnp.asarray(q["quat9D"])))
+        ned = multiply(ENU_TO_NED, q["quat9D"])
         out.append(rms_deg(orientation_errors(ned[counts], true[counts]).total))
     return out[0], out[1]
 

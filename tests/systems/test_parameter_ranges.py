@@ -99,7 +99,7 @@ def test_the_walk_finds_what_there_is():
     assert paths >= {
         "Drive.settle", "Imu.gyro_noise", "Start.tilt", "Gnss.sigma_factor.key", "Scenario.runs",
         "Magnetometer.matrix.0.0", "Wheels.axes.0.0", "Wheels.lost.0", "HInfinity.gamma",
-        "Imu.gyro_bias_time", "Place.height", "Span.begin", "Setup.patience", "LinkFault.bits",
+        "Imu.gyro_bias_time", "Departure.height", "Span.begin", "Setup.patience", "LinkFault.bits",
     }  # fmt: skip
     assert len(NUMBERS) > 300
 

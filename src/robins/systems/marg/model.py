@@ -34,7 +34,7 @@ from jaxtyping import Array, ArrayLike, Float
 from robins import rotation
 from robins.filters import Model, Motion, Sensor
 from robins.manifold import Angle
-from robins.rotation import Rotation, skew
+from robins.rotation import Rotation, left_jacobian, skew
 from robins.systems.marg.parameters import Replay
 from robins.systems.parts import NED
 from robins.systems.study import SensorAxes, StateBlock
@@ -187,8 +187,7 @@ def advance_linear(noise: Noise, x: MargState, block: Block):
         [-jnp.asarray(block.samples.turn_time), jnp.asarray(block.samples.turn_rates)], axis=1
     )
     R = x.q_nb.as_dcm()
-    # the left Jacobian of a small rotation, to first order (Sola 2017, eq. 145)
-    turn = R @ (jnp.eye(3) + 0.5 * skew(correction(x, block))) @ rate_map
+    turn = R @ left_jacobian(correction(x, block), first_order=True) @ rate_map
     push = -0.5 * R @ skew(dv) @ rate_map
     tilt = -skew(_velocity_gain(x, block))
     lean = -R @ jnp.asarray(block.samples.turn_time)

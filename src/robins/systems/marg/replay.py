@@ -66,8 +66,7 @@ def orientation_errors(q_estimated: np.ndarray, q_true: np.ndarray) -> Orientati
         q_estimated: (N, 4) q_nb, scalar first, NED.
         q_true: (N, 4) the same.
     """
-    q = rotation.conjugate(jnp.asarray(q_true))
-    e = np.asarray(rotation.multiply(jnp.asarray(q_estimated), q))
+    e = rotation.multiply(q_estimated, rotation.conjugate(q_true))
     w, z = e[:, 0], e[:, 3]
     across = np.hypot(e[:, 1], e[:, 2])
     sign = np.where(w < 0.0, -1.0, 1.0)
@@ -222,8 +221,8 @@ def _errors(attitude: AttitudeTable, log: Prepared, q_nb: np.ndarray) -> Errors:
     q_true, counts = truth_at(attitude, log.time_ns[log.rows])
     q = q_nb[log.rows]
     # how the true vertical leans against the estimated one, along estimated north and east
-    true_down = np.asarray(rotation.to_dcm(jnp.asarray(q_true)))[:, 2]
-    north, east, _ = np.moveaxis(np.asarray(rotation.to_dcm(jnp.asarray(q))), 1, 0)
+    true_down = rotation.to_dcm(q_true)[:, 2]
+    north, east, _ = np.moveaxis(rotation.to_dcm(q), 1, 0)
     tilt = np.stack([np.sum(east * true_down, axis=1), -np.sum(north * true_down, axis=1)], axis=1)
     return Errors(-orientation_errors(q, q_true).heading, tilt, counts)
 
