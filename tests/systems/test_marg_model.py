@@ -12,7 +12,6 @@ from robins.filters import Belief, run
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.marg import Block, Replay, Samples, integrate, model_of
-from robins.systems.marg.filters import marg_filter
 from robins.systems.marg.model import (
     DIM,
     MAGNETOMETER,
@@ -23,6 +22,7 @@ from robins.systems.marg.model import (
     persistence,
     smoothed_attitudes,
 )
+from robins.systems.marg.replay import marg_filter
 
 MODEL = model_of(Replay())
 

@@ -28,14 +28,10 @@ if TYPE_CHECKING:
         SensorAxes,
         StateBlock,
         Study,
+        System,
         View,
     )
-    from robins.systems.system import System
 
-_OF_STUDY = {
-    *("Case", "Contender", "Instrument", "Limit", "Output", "Problem", "Scenario"),
-    *("SensorAxes", "StateBlock", "Study", "View"),
-}
 __all__ = [
     "SYSTEMS",
     "Case",
@@ -77,7 +73,6 @@ SYSTEMS: Mapping[str, System] = _Registry()
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = "study" if name in _OF_STUDY else "system"
-    found = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    found = getattr(importlib.import_module(f"{__name__}.study"), name)
     globals()[name] = found
     return found

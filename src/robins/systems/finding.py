@@ -14,8 +14,7 @@ from typing import Any
 
 from robins.errors import RobinsError, hint
 from robins.systems.catalogue import SUMMARIES, installed, summaries
-from robins.systems.study import Study
-from robins.systems.system import System
+from robins.systems.study import Study, System
 
 
 class UnknownSystem(RobinsError, ValueError):

@@ -10,16 +10,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.errors import require_known
 from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
+from robins.results import Outcome
 from robins.scenario import Parameters
+from robins.systems.catalogue import listed
 from robins.systems.judgement import Claim, Metrics, judging, standard_metrics
 from robins.systems.parts import Names, Runs
 
@@ -80,6 +84,19 @@ class Contender(NamedTuple):
     reported: np.ndarray | None = None  # (r, n) reported = this @ tangent error; None: all of it
     bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
     facts: Mapping[str, Any] = {}  # figures known without a run, put among its metrics
+
+
+def recipe(function: Callable[..., Any], *kinds: Any, numbers: Any) -> Partial:
+    """``function(*kinds, numbers, world)`` as a function of the world alone.
+
+    Kinds (names, flags, None) choose what is compiled; numbers are data. Recipes of one function
+    and equal kinds share what was compiled (`robins.filters.sameness`).
+    """
+
+    def of_kind(numbers: Any, world: Any) -> Any:
+        return function(*kinds, numbers, world)
+
+    return Partial(of_kind, numbers)
 
 
 class Limit(NamedTuple):
@@ -240,3 +257,44 @@ class Study(NamedTuple):
             claims=judging(self.claims, given.claims),
             **vars(self.view(given, course)),
         )
+
+
+class Alignment(NamedTuple):
+    """How a system takes a recorded master and slave in the place of its simulation."""
+
+    study: str  # whose scenarios serve as configurations
+    parameters: type[Parameters]
+    filters: tuple[str, ...]
+    align: Callable[..., Outcome]  # (dataset with a master, parameters, filters, progress)
+
+
+class System(NamedTuple):
+    """One entry of the registry."""
+
+    name: str  # as in the catalogue, which knows its summary and its scenarios
+    studies: Mapping[str, Study]
+    replay_filters: tuple[str, ...] = ()
+    replay_parameters: type[Parameters] | None = None
+    replay_default: Path | None = None  # configuration of a log that comes without one
+    replay: Callable[..., Outcome] | None = None  # (dataset, parameters, filters, progress)
+    # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
+    orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
+    alignment: Alignment | None = None
+
+    @property
+    def scenarios(self) -> dict[str, Path]:
+        """Packaged scenario files by name."""
+        return {name: scenario.path for name, scenario in listed(self.name).items()}
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Names of all filters, each once."""
+        named = [name for study in self.studies.values() for name in study.filters]
+        return tuple(dict.fromkeys([*named, *self.replay_filters]))
+
+    @property
+    def claims(self) -> tuple[Mapping[str, str], ...]:
+        """Ids and texts of what scenarios check, each once: studies may share claims."""
+        every = (item for study in self.studies.values() for item in study.claims.items())
+        told = dict.fromkeys((key, claim.text) for key, claim in every)
+        return tuple({"id": key, "text": text} for key, text in told)

@@ -5,7 +5,7 @@ a product model with states for the biases and for the error of the wind.
 """
 
 from robins.systems.airship.study import NAVIGATION
-from robins.systems.system import System
+from robins.systems.study import System
 
 SYSTEM = System(name="airship", studies={"navigation": NAVIGATION})
 

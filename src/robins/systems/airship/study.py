@@ -28,8 +28,7 @@ from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, lay_out, simulate
 from robins.systems.judgement import Claim, ratio
 from robins.systems.parts import ENU
-from robins.systems.recipes import recipe
-from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, Study, View
+from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, Study, View, recipe
 
 # --------------------------------------------------------------------------------- the filters
 

@@ -7,7 +7,7 @@ from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
 from robins.systems.ins_gnss.study import DRIVE, NAMES
 from robins.systems.ins_gnss.world import drive_dataset
-from robins.systems.system import System
+from robins.systems.study import System
 
 SYSTEM = System(
     name="ins-gnss",

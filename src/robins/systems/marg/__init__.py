@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from robins.systems.marg.filters import FILTERS, filter_of
 from robins.systems.marg.log import first_belief, first_look, prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
 from robins.systems.marg.parameters import Replay
-from robins.systems.marg.replay import replay
-from robins.systems.system import System
+from robins.systems.marg.replay import FILTERS, filter_of, replay
+from robins.systems.study import System
 
 SYSTEM = System(
     name="marg",

@@ -6,7 +6,7 @@ the paper's formulation, and "field-vector" (test-beds B), what a magnetometer c
 """
 
 from robins.systems.rocket.study import FIELD_VECTOR, MAGNETIC_ATTITUDE
-from robins.systems.system import System
+from robins.systems.study import System
 
 SYSTEM = System(
     name="rocket",

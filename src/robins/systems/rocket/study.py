@@ -40,7 +40,6 @@ from robins.filters.rules import discriminator, gate, huber, only, strong_tracki
 from robins.results import array
 from robins.rotation import Rotation
 from robins.systems.parts import NED
-from robins.systems.recipes import recipe
 from robins.systems.rocket import angles, field
 from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
 from robins.systems.rocket.claims import CLAIMS, angle_metrics, field_metrics
@@ -58,7 +57,7 @@ from robins.systems.rocket.world import (
     start_of,
     wrong_by,
 )
-from robins.systems.study import Case, Contender, Norm, StateBlock, Study, View
+from robins.systems.study import Case, Contender, Norm, StateBlock, Study, View, recipe
 from robins.systems.tables import block_array
 
 PROBABILITY = 0.999  # of the chi-square tests

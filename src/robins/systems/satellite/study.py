@@ -22,15 +22,24 @@ from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.results import array
 from robins.systems.judgement import Claim, ratio
-from robins.systems.recipes import recipe
 from robins.systems.satellite import design, model
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.model import ARCSEC, Build, make_filter
 from robins.systems.satellite.nodes import STAR, Given, Row, Step, begin, react
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.world import Course, World, lay_out, simulate
-from robins.systems.study import Case, Contender, Norm, Output, SensorAxes, StateBlock, Study, View
-from robins.systems.system import System
+from robins.systems.study import (
+    Case,
+    Contender,
+    Norm,
+    Output,
+    SensorAxes,
+    StateBlock,
+    Study,
+    System,
+    View,
+    recipe,
+)
 
 AXES = ("x", "y", "z (boresight)")
 BLOCKS = (

@@ -5,7 +5,7 @@
 - study "product": total state with mounting and flexure, closed loop; also for recorded pairs.
 """
 
-from robins.systems.system import System
+from robins.systems.study import System
 from robins.systems.transfer_alignment import attitude_matching, product, velocity_attitude
 
 SYSTEM = System(

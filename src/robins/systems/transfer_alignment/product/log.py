@@ -39,8 +39,7 @@ from robins.systems.replaying import (
     outcome,
     prepared,
 )
-from robins.systems.study import Case, Contender
-from robins.systems.system import Alignment
+from robins.systems.study import Alignment, Case, Contender
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS
 from robins.systems.transfer_alignment.product.model import Installation, ProductState

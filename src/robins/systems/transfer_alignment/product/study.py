@@ -24,8 +24,7 @@ from robins.rotation import Rotation
 from robins.sim.flexure import Flexure, transition
 from robins.systems.judgement import Claim, consistency, consistency_claims
 from robins.systems.parts import FRD, NED, Block, refuse_unsettled
-from robins.systems.recipes import recipe
-from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View
+from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View, recipe
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
 from robins.systems.transfer_alignment.product.model import (
