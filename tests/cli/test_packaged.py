@@ -260,6 +260,7 @@ def folder(tmp_path_factory):
     dataset = pair_dataset(scenario.parse(Replay, pair, ["slave.rate=20 Hz"]), seed=3)
     logs.write_log(here / "master.csv", dataset.master)
     logs.write_log(here / "slave.csv", dataset.imu)
+    (here / "my_system.py").write_bytes((ROOT / "docs/examples/balloon.py").read_bytes())
     problem = ROOT / "src/robins/workbench/problems/baro-height.toml"
     (here / "my-problem.toml").write_text(problem.read_text())
     return here
@@ -274,6 +275,7 @@ STANDS_FOR = {
     "broad_33_disturbed_attached_magnet_2cm.npz": "nine_axes.csv",
     "record.mcap": "results/bench-satellite-s1/record.mcap",
     "other.mcap": "results/bench-satellite-s1/record.mcap",
+    "docs/examples/balloon.py:study": "my_system.py:study",
 }
 # A reader's own devices, and pages that stay open until someone closes them.
 NEEDS_MORE = re.compile(r"/dev/|--live|bench node|> ")
