@@ -432,7 +432,7 @@ def test_the_star_sensor_lies_as_in_one_program():
 
     @jax.jit
     def run(q, says):
-        given = nodes.Given(*[jnp.zeros(())] * 7)
+        given = nodes.Given(*[jnp.zeros(())] * 5)
 
         def step(before, xs):
             one, say = xs

@@ -75,7 +75,7 @@ def test_a_speed_that_is_no_number(pair, speed):
 
 def test_a_path_that_is_not_there_lists_those_there_are(monkeypatch):
     there: list[Listed] = []
-    monkeypatch.setattr(ports.list_ports, "comports", lambda: there)
+    monkeypatch.setattr(ports.system, "comports", lambda: there)
     with pytest.raises(PortError, match=r"'/dev/ttyX9': there is no such path; .*machine: none"):
         address("/dev/ttyX9")
     there += [Listed("/dev/ttyUSB7"), Listed("/dev/ttyACM0")]

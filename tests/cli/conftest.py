@@ -3,13 +3,13 @@
 import sys
 from collections import namedtuple
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from robins import report, results
 from robins.cli import main
-from robins.systems import catalogue
+from robins.systems import Scenario, Study, System, catalogue
+from robins.systems.judgement import Claim
 from robins.workbench import part, publishing
 
 Answer = namedtuple("Answer", "status out err")
@@ -81,9 +81,10 @@ def workbench(monkeypatch):
 @pytest.fixture
 def systems(monkeypatch):
     """Two systems in the registry, and what the catalogue says of them."""
-    claim = {"id": "C1", "text": "it holds"}
-    car = SimpleNamespace(name="car", filters=("ekf", "ukf"), claims=(claim,), replay=print)
-    kite = SimpleNamespace(name="kite", filters=("ekf",), claims=(), replay=None)
+    claims = {"C1": Claim("it holds", (), len, None)}
+    study = Study(Scenario, ("ekf", "ukf"), print, print, print, claims=claims)
+    car = System("car", {"drive": study}, replay=print)
+    kite = System("kite", {"fly": study._replace(filters=("ekf",), claims={})})
     its = {"town": catalogue.Listed(Path("town.toml"), "A car in town", "")}
     its["road"] = catalogue.Listed(Path("road.toml"), "A car on the road", "")
     monkeypatch.setattr("robins.systems.SYSTEMS", {"car": car, "kite": kite})

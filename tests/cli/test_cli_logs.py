@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robins import logs, results, scenario
+from robins import logs, results, scenario, units
 from robins.cli import Status
 from robins.dataset import ImuTable
 from robins.ins import allan
@@ -335,14 +335,14 @@ def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ],
 )
 def test_units_survive_the_name_of_a_metric(unit, ending, shown):
-    assert still.suffix(unit) == ending
-    assert numbers.label(f"x_{still.suffix(unit)}") == ("X", shown)
+    assert units.as_ending(unit) == ending
+    assert numbers.label(f"x_{units.as_ending(unit)}") == ("X", shown)
 
 
 def test_every_unit_of_the_fit_can_be_told():
     for sensor in allan._FIELD_UNITS.values():
         for name, (_, unit) in sensor.items():
-            assert numbers.label(f"{name}_{still.suffix(unit)}").unit != ""
+            assert numbers.label(f"{name}_{units.as_ending(unit)}").unit != ""
 
 
 LOGGER = """

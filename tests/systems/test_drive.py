@@ -5,7 +5,7 @@ import pytest
 from test_replay import DRIVE
 
 from robins import scenario
-from robins.campaign import collect
+from robins.campaign import collect, record, worlds
 from robins.systems.ins_gnss import Drive
 from robins.systems.ins_gnss.study import DRIVE as STUDY
 from robins.systems.ins_gnss.world import lay_out

@@ -14,7 +14,7 @@ import importlib
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from robins.systems.catalogue import summaries
+from robins.systems.catalogue import SUMMARIES, installed, summaries
 
 if TYPE_CHECKING:
     from robins.systems.study import (
@@ -53,9 +53,11 @@ class _Registry(Mapping[str, "System"]):
     """Systems by name; each is imported when it is taken out."""
 
     def __getitem__(self, name: str) -> System:
-        if name not in self:
-            raise KeyError(name)
-        return importlib.import_module(f"{__name__}.finding").find_system(name)
+        if name in SUMMARIES:
+            return importlib.import_module(f"{__name__}.{name.replace('-', '_')}").SYSTEM
+        point = installed()[name]
+        finding = importlib.import_module(f"{__name__}.finding")
+        return finding.as_system(name, point.load(), f"entry point {point.value}")
 
     def __contains__(self, name: object) -> bool:
         return name in summaries()

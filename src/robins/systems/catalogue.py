@@ -40,6 +40,11 @@ def summaries() -> dict[str, str]:
     return SUMMARIES | {name: sentence(point) for name, point in installed().items()}
 
 
+def is_file(name: str) -> bool:
+    """Whether a system is named by a file of Python, such as "my_system.py:study"."""
+    return name.partition(":")[0].endswith(".py")
+
+
 class Listed(NamedTuple):
     """A scenario file and what it is about."""
 

@@ -12,18 +12,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from robins import systems
 from robins.errors import RobinsError, hint
-from robins.systems.catalogue import SUMMARIES, installed, summaries
+from robins.systems.catalogue import is_file
 from robins.systems.study import Study, System
 
 
 class UnknownSystem(RobinsError, ValueError):
     """There is no such system, or what is said to be one is none."""
-
-
-def is_file(name: str) -> bool:
-    """Whether a name means a file of Python, such as "my_system.py:study"."""
-    return name.partition(":")[0].endswith(".py")
 
 
 def find_system(name: str, folder: Path = Path()) -> System:
@@ -38,12 +34,8 @@ def find_system(name: str, folder: Path = Path()) -> System:
     """
     if is_file(name):
         return _of_file(name, folder)
-    if name in SUMMARIES:
-        module = importlib.import_module(f"robins.systems.{name.replace('-', '_')}")
-        return module.SYSTEM
-    if (point := installed().get(name)) is not None:
-        return _as_system(name, point.load(), f"entry point {point.value}")
-    known = summaries()
+    if name in (known := systems.SYSTEMS):
+        return known[name]
     raise UnknownSystem(
         f"no system '{name}'{hint(name, known)} There are {', '.join(known)}",
         fix="for one of your own write file.py:name",
@@ -67,7 +59,7 @@ def _of_file(name: str, folder: Path) -> System:
             path,
             f"write one of {', '.join(f'{where}:{key}' for key in offered)}",
         )
-    return _as_system(f"{path.stem}:{wanted}", getattr(module, wanted), str(path))
+    return as_system(f"{path.stem}:{wanted}", getattr(module, wanted), str(path))
 
 
 def _imported(path: Path) -> ModuleType:
@@ -89,7 +81,12 @@ def _imported(path: Path) -> ModuleType:
     return module
 
 
-def _as_system(name: str, found: Any, where: str) -> System:
+def as_system(name: str, found: Any, where: str) -> System:
+    """A system for what was defined under a name.
+
+    Raises:
+        UnknownSystem: it is neither a system nor a study.
+    """
     if isinstance(found, System):
         return found
     if isinstance(found, Study):

@@ -7,7 +7,6 @@ from importlib.resources import files
 from typing import Any
 
 from robins.systems import catalogue
-from robins.systems.finding import find_system, is_file
 
 
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
@@ -41,11 +40,13 @@ def inventory(system: str | None = None) -> dict[str, Any]:
 
 
 def _told(name: str) -> dict[str, Any]:
+    from robins.systems.finding import find_system  # imports a system, which an overview need not
+
     system = find_system(name)
     return {
         "name": system.name,
         "summary": catalogue.summaries().get(name, ""),
-        "scenarios": [name] if is_file(name) else list(titles(name)),
+        "scenarios": [name] if catalogue.is_file(name) else list(titles(name)),
         "filters": list(system.filters),
         "claims": [{"id": claim["id"], "text": claim["text"]} for claim in system.claims],
         "replays": system.replay is not None,

@@ -11,8 +11,8 @@ import jax
 from robins import scenario, systems
 from robins.errors import hint, require_known
 from robins.systems import Study, System
-from robins.systems.catalogue import configurations, installed, listed
-from robins.systems.finding import find_system, is_file
+from robins.systems.catalogue import configurations, installed, is_file, listed
+from robins.systems.finding import find_system
 from robins.workbench.errors import InputError, refusing
 
 

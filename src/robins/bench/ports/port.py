@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import serial
 from serial.tools import list_ports as system
-from serial.tools.list_ports import comports
 from serial.tools.list_ports_common import ListPortInfo
 
 from robins.errors import RobinsError
@@ -62,7 +61,7 @@ def obstacle(path: str) -> str:
     try:
         kind = os.stat(path).st_mode
     except OSError:
-        there = ", ".join(sorted(p.device for p in comports())) or "none"
+        there = ", ".join(sorted(p.device for p in system.comports())) or "none"
         return f"there is no such path; serial ports of this machine: {there}"
     if not stat.S_ISCHR(kind):
         return "it is no character device; a serial port is one such as /dev/ttyUSB0"
