@@ -2,13 +2,12 @@
 
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
-from robins.campaign.statistics import Statistics, collect, mean_with_bounds, rms_with_bounds
+from robins.campaign.statistics import Statistics, mean_with_bounds, rms_with_bounds
 
 __all__ = [
     "CHUNK",
     "Statistics",
     "campaign_solution",
-    "collect",
     "mean_with_bounds",
     "record",
     "rms_with_bounds",

@@ -29,11 +29,6 @@ def nees(belief: Belief, truth: State) -> Float[Array, ""]:
     return normalised_sq(manifold.local(belief.mean, truth), belief.factor)
 
 
-def block_nees(belief: Belief, truth: State, block: slice) -> Float[Array, ""]:
-    """NEES of some components alone, from their marginal covariance."""
-    return normalised_sq(manifold.local(belief.mean, truth)[block], belief.factor[block])
-
-
 def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Float[Array, ""]:
     """Error e' (S S')^-1 e of some components, from the rows of the factor that are theirs.
 
