@@ -45,7 +45,7 @@ from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import array, variable
 from robins.results.summary import VERDICTS
-from robins.results.writer import ResultWriter, write
+from robins.results.writer import ResultWriter
 
 __all__ = [
     "ROLES",
@@ -65,5 +65,4 @@ __all__ = [
     "silent",
     "variable",
     "versions",
-    "write",
 ]
