@@ -13,10 +13,10 @@ from jaxtyping import ArrayLike
 from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, default
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
+from robins.systems import quantities as q
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
 ENU, RFU = ("east", "north", "up"), ("right", "forward", "up")
-Three = tuple[float, float, float]
 
 MOST_RUNS = 1_000_000
 MOST_SAMPLES = 10_000_000  # of one run: a day at 100 Hz; six axes of them are half a gigabyte
@@ -65,28 +65,22 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
         )
 
 
-Duration = Annotated[float, Quantity("time", above="0 s")]
-Speed = Annotated[float, Quantity("speed", above="0 m/s")]
-Spread = Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
-"""One sigma of an angle."""
-
-
 class Departure(Place):
     """Where a vehicle begins, at what height, and its heading there."""
 
     height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
-    heading: Annotated[float, Quantity("angle")] = default("0 deg")
+    heading: q.Angle = default("0 deg")
 
 
 class Leg(Parameters):
     """One command of a motion over ground; which quantities it takes depends on what it does."""
 
     do: Literal["stop", "straight", "accelerate", "turn", "climb"]
-    seconds: Duration | None = None
-    speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
+    seconds: q.Duration | None = None
+    speed: q.SpeedSize | None = None  # at the end
     # positive to the right
     angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None
-    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
+    rate: q.AngleRate | None = None
     # gained
     height: Annotated[float, Quantity("length", least="-100 km", most="100 km")] | None = None
 

@@ -30,7 +30,7 @@ from robins.sim.magnetometer import (
     observe_magnetic_attitude,
 )
 from robins.sim.random import Component, stream
-from robins.systems.parts import Three
+from robins.systems.quantities import Three
 from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate
 from robins.systems.rocket.field import FIELD, SNAPSHOT, field_sensor, plausible
 from robins.systems.rocket.parameters import Flight, MagneticAttitude
