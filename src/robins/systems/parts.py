@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pydantic
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from robins.ins.increments import Increments
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Parameters, Quantity, Span, default
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
 from robins.systems import quantities as q
 
@@ -63,6 +65,34 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
             "before the end"
         )
+
+
+def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
+    """Which times (N,) lie in none of some spans, (N,) bool."""
+    return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
+
+
+Draw = Literal["plus-sigma", "random-sign", "normal"]
+"""How errors of a stated size are made: as stated, with signs drawn, or with it as sigma."""
+
+
+def signed(key: Array, size: Any, draw: Draw) -> Array:
+    """Errors of a stated size, of any shape."""
+    sigma = jnp.asarray(size, float)
+    normal = jax.random.normal(key, sigma.shape)
+    if draw == "plus-sigma":
+        return sigma
+    return sigma * (jnp.where(normal < 0.0, -1.0, 1.0) if draw == "random-sign" else normal)
+
+
+class Cutting(Parameters):
+    """How a recorded log is cut into steps of a filter."""
+
+    longest_block: q.Duration = default("0.25 s")
+    # a gap of the inertial samples beyond this ends a piece, and the next is aligned anew
+    longest_gap: q.Duration = default("0.5 s")
+    # process noise factor across one that is bridged
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
 class Departure(Place):

@@ -12,10 +12,8 @@ import pydantic
 
 from robins.scenario import Parameters, Quantity, Share, Span, default
 from robins.systems import quantities as q
-from robins.systems.parts import Names, Place, Runs, refuse_too_long
+from robins.systems.parts import Draw, Names, Place, Runs, refuse_too_long
 from robins.systems.study import Scenario
-
-Draw = Literal["plus-sigma", "random-sign", "normal"]
 
 
 class Position(Place):

@@ -9,7 +9,7 @@ import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
 from robins.systems import quantities as q
-from robins.systems.parts import Departure, Leg, Names, refuse_too_long, refuse_unsettled
+from robins.systems.parts import Cutting, Departure, Leg, Names, refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
 
@@ -105,15 +105,11 @@ class Outages(Parameters):
         return inside & (first_s + self.first + begin < last_s - self.last)
 
 
-class Update(Parameters):
+class Update(Cutting):
     """How the filter steps."""
 
-    longest_block: q.Duration = default("0.25 s")
-    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
-    # an IMU gap longer than this is declared instead of bridged
     longest_gap: q.Duration = default("1 s")
-    # process noise factor across one
-    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
+    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
 
 
 class Replay(Parameters):

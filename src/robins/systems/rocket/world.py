@@ -19,7 +19,6 @@ from robins.earth.magnetic import field_along, wmm_for
 from robins.filters import Sensor
 from robins.manifold import Angle, wrap
 from robins.rotation import conjugate, from_euler, multiply, rotate, to_euler, to_rotvec
-from robins.scenario import Span
 from robins.sim.ballistic import ballistic
 from robins.sim.free_body import FreeBody, coning_start, free_body
 from robins.sim.gyro import MemsErrors, MemsGyro, delta_angles, integrate_angles
@@ -30,6 +29,7 @@ from robins.sim.magnetometer import (
     observe_magnetic_attitude,
 )
 from robins.sim.random import Component, stream
+from robins.systems.parts import outside
 from robins.systems.quantities import Three
 from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate
 from robins.systems.rocket.field import FIELD, SNAPSHOT, field_sensor, plausible
@@ -97,8 +97,8 @@ def lay_out(given: Flight) -> Course:
         time_s=time,
         field_n=np.asarray(rotate(path.q_local, jnp.asarray(local))),
         alt_m=np.asarray(path.alt_m),
-        seen=_there(time, given.magnetometer.lost),
-        felt=_there(time, given.gyro.lost),
+        seen=outside(given.magnetometer.lost, time),
+        felt=outside(given.gyro.lost, time),
         bursts=tuple(slice(k, k + width) for k in first if k + width <= count),
         quiet=since > given.quiet_after - 1e-9,
     )
@@ -114,13 +114,6 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
         after = np.maximum(time_s - begin - burst.length, 0.0)
         since = np.where(time_s >= begin - 1e-9, after, since)
     return begun, since
-
-
-def _there(time_s: np.ndarray, lost: tuple[Span, ...]) -> np.ndarray:
-    there = np.ones(len(time_s), dtype=bool)
-    for span in lost:
-        there &= ~span.holds(time_s)
-    return there
 
 
 def body_of(given: Flight) -> FreeBody:

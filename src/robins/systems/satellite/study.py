@@ -57,39 +57,31 @@ class FilterSpec(NamedTuple):
     build: Build
     gain: GainSpec | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
     drift: float | None = None  # variance of the bias' walk over the believed; None: told the truth
-    text: str = ""
 
 
 FILTERS: Mapping[str, FilterSpec] = {
-    "raw": FilterSpec(
-        "fixed", GainSpec("raw"), 1.0, "the star sensor's reading, moved by the gyro"
-    ),
-    "mekf": FilterSpec("mekf", None, 1.0, "multiplicative EKF"),
-    "mekf-gate": FilterSpec("gated", None, 1.0, "the same with a gate that opens again"),
-    "mekf-tuned": FilterSpec("mekf", None, 30.0, "the same, noise of the bias times 30"),
-    "mekf-informed": FilterSpec("mekf", None, None, "the same, told the true drift"),
-    "ekf-quaternion": FilterSpec("quaternion", None, 1.0, "additive EKF of seven states"),
-    "h2": FilterSpec("fixed", GainSpec("h2"), 1.0, "steady Kalman gain"),
-    "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0, "mixed, by LMI, n on the rate"),
-    "mixed-riccati": FilterSpec(
-        "fixed", GainSpec("riccati", 0.5), 1.0, "mixed, by Riccati, n on the rate"
-    ),
-    "mixed-riccati-quarter": FilterSpec(
-        "fixed", GainSpec("riccati", 0.25), 1.0, "the same, gamma halved"
-    ),
-    "mixed-bias-half": FilterSpec(
-        "fixed", GainSpec("riccati", 0.5, "bias"), 1.0, "mixed, by Riccati, n on the bias"
-    ),
-    "mixed-bias": FilterSpec(
-        "fixed", GainSpec("riccati", 0.25, "bias"), 1.0, "the same, gamma halved"
-    ),
-    "mixed-bias-gate": FilterSpec(
-        "fixed-gated", GainSpec("riccati", 0.25, "bias"), 1.0, "the same with the gate"
-    ),
-    "mekf-inflated": FilterSpec(
-        "mekf", GainSpec("riccati", 0.25, "bias"), 1.0, "MEKF with the noise of mixed-bias"
-    ),
-    "hinf": FilterSpec("fixed", GainSpec("riccati", 0.1), 1.0, "worst case first: gamma a tenth"),
+    # the star sensor's reading, moved by the gyro
+    "raw": FilterSpec("fixed", GainSpec("raw"), 1.0),
+    "mekf": FilterSpec("mekf", None, 1.0),  # multiplicative EKF
+    "mekf-gate": FilterSpec("gated", None, 1.0),  # the same with a gate that opens again
+    "mekf-tuned": FilterSpec("mekf", None, 30.0),  # the same, noise of the bias times 30
+    "mekf-informed": FilterSpec("mekf", None, None),  # the same, told the true drift
+    "ekf-quaternion": FilterSpec("quaternion", None, 1.0),  # additive EKF of seven states
+    "h2": FilterSpec("fixed", GainSpec("h2"), 1.0),  # steady Kalman gain
+    "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0),  # mixed, by LMI, n on the rate
+    # mixed, by Riccati, n on the rate
+    "mixed-riccati": FilterSpec("fixed", GainSpec("riccati", 0.5), 1.0),
+    # the same, gamma halved
+    "mixed-riccati-quarter": FilterSpec("fixed", GainSpec("riccati", 0.25), 1.0),
+    # mixed, by Riccati, n on the bias
+    "mixed-bias-half": FilterSpec("fixed", GainSpec("riccati", 0.5, "bias"), 1.0),
+    # the same, gamma halved
+    "mixed-bias": FilterSpec("fixed", GainSpec("riccati", 0.25, "bias"), 1.0),
+    # the same with the gate
+    "mixed-bias-gate": FilterSpec("fixed-gated", GainSpec("riccati", 0.25, "bias"), 1.0),
+    # MEKF with the noise of mixed-bias
+    "mekf-inflated": FilterSpec("mekf", GainSpec("riccati", 0.25, "bias"), 1.0),
+    "hinf": FilterSpec("fixed", GainSpec("riccati", 0.1), 1.0),  # worst case first: gamma a tenth
 }
 
 

@@ -11,10 +11,18 @@ from typing import Annotated, Literal
 import numpy as np
 import pydantic
 
-from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
+from robins.scenario import Dof, Parameters, Positive, Quantity, Share, Span, default
 from robins.sim.flexure import Flexure
 from robins.systems import quantities as q
-from robins.systems.parts import Departure, Leg, Names, refuse_too_long, refuse_unsettled
+from robins.systems.parts import (
+    Cutting,
+    Departure,
+    Draw,
+    Leg,
+    Names,
+    refuse_too_long,
+    refuse_unsettled,
+)
 from robins.systems.study import Scenario
 
 
@@ -134,13 +142,6 @@ class Structure(Parameters):
         return Flexure(sigma, time, self.damping, self.tail_dof, bending)
 
 
-class Window(Parameters):
-    """A stretch of time, its end not included."""
-
-    begin: q.Time
-    end: q.Duration
-
-
 class Disturbance(Parameters):
     """What no filter is told of, unless a scenario says so."""
 
@@ -150,10 +151,10 @@ class Disturbance(Parameters):
     # degrees of freedom of Student-t noise of the master, of the stated sigmas; without, normal
     tail_dof: Dof | None = None
     gyro_noise_factor: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 1.0  # in the window
-    gyro_noise_window: Window | None = None
+    gyro_noise_window: Span | None = None
     drift_step: Annotated[q.Three, Quantity("angle rate")] = default("0 deg/h")  # slave axes
     drift_step_time: q.Time | None = None
-    dropouts: tuple[Window, ...] = ()  # no records of the master
+    dropouts: tuple[Span, ...] = ()  # no records of the master
 
 
 class Start(Parameters):
@@ -165,7 +166,7 @@ class Start(Parameters):
     attitude: q.AngleSizes
     velocity: q.SpeedSizes = default("0 m/s")
     position: q.LengthSizes = default("0 m")
-    draw: Literal["normal", "plus-sigma", "random-sign"] = "normal"
+    draw: Draw = "normal"
 
 
 class PairParameters(Parameters):
@@ -213,21 +214,11 @@ class Product(Scenario, PairParameters):
     settle: q.Time = default("0 s")
 
 
-class Recording(Parameters):
-    """How a recorded pair is cut into steps of the filter."""
-
-    longest_block: q.Duration = default("0.25 s")
-    # a gap in the slave's samples that is longer is declared: the alignment begins anew after it
-    longest_gap: q.Duration = default("0.5 s")
-    # process noise factor across one
-    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
-
-
 class Replay(Product):
     """What is believed of a recorded pair; the log brings its own motion."""
 
     manoeuvre: (  # pyright: ignore[reportIncompatibleVariableOverride]
         Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None
     ) = None
-    recording: Recording = pydantic.Field(default_factory=Recording)
+    recording: Cutting = pydantic.Field(default_factory=Cutting)
     filters: Names = ("product",)
