@@ -36,6 +36,29 @@ def ratio(ours: str, theirs: str, metric: str) -> Callable[[Metrics], float]:
     return lambda metrics: metrics[ours][metric] / metrics[theirs][metric]
 
 
+def ratio_claims(
+    rows: Mapping[str, tuple[str, Sequence[str], Sequence[str], Band, Band]],
+    texts: Mapping[str, str],
+) -> dict[str, Claim]:
+    """Claims that one filter is better than others, by id.
+
+    Args:
+        rows: the filter, the others, of which the best counts, metrics, of which the worst ratio to
+            that counts, and the bands in which the claim is reproduced and partly so.
+        texts: of the claims.
+    """
+
+    def largest(ours: str, theirs: Sequence[str], keys: Sequence[str]) -> Callable[..., float]:
+        return lambda metrics: max(
+            metrics[ours][key] / min(metrics[name][key] for name in theirs) for key in keys
+        )
+
+    return {
+        key: Claim(texts[key], (ours, *theirs), largest(ours, theirs, keys), band, partly)
+        for key, (ours, theirs, keys, band, partly) in rows.items()
+    }
+
+
 def judging(
     claims: Mapping[str, Claim], stated: Sequence[str] | None = None
 ) -> Callable[[Metrics], list[dict[str, Any]]]:

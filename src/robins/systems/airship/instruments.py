@@ -94,7 +94,6 @@ RADAR = Instrument(
     SensorAxes("m or rad", "NED", ("north", "east", "heading", "up")),
     _measure_sar,
     _believed_sar,
-    lambda world: (world.readings[SAR], None),
 )
 
 

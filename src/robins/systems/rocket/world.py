@@ -233,15 +233,12 @@ _FIELD_AXES = SensorAxes("T", "FRD", BODY, "uT")
 RATE_GYRO = Instrument(
     *(GYRO, _RATE_AXES, _rate),
     lambda given, course: Sensor(read_rate, jnp.full(3, given.gyro.white), 3, GYRO),
-    lambda world: (world.readings[GYRO], None),
 )
 INTEGRATED_GYRO = Instrument(
     *(GYRO, _ANGLE_AXES, _integrated),
     lambda given, course: Sensor(read_angles, jnp.full(3, given.gyro.attitude_noise), 3, GYRO),
-    lambda world: (world.readings[GYRO], None),
 )
 MAGNETIC_ATTITUDE = Instrument(
     *(MAGNETIC, _ANGLE_AXES, _magnetic),
     lambda given, course: Sensor(read_angles, jnp.full(3, given.magnetometer.noise), 3, MAGNETIC),
-    lambda world: (world.readings[MAGNETIC], None),
 )

@@ -21,7 +21,7 @@ from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.results import array
-from robins.systems.judgement import Claim, ratio
+from robins.systems.judgement import ratio_claims
 from robins.systems.satellite import design, model
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.model import ARCSEC, Build, make_filter
@@ -190,39 +190,34 @@ RMS, POINTING, SPREAD = "attitude_rms_arcsec", "pointing_rms_arcsec", "attitude_
 BETTER, PARTLY = (0.0, 0.9), (0.0, 1.0)
 
 
-def _against(other: str, words: str) -> Claim:
-    return Claim(
-        f"The mixed filter improves the precision of attitude determination; read against {words}, "
-        f"value: RMS error of mixed-lmi over that of {other}",
-        ("mixed-lmi", other),
-        ratio("mixed-lmi", other, RMS),
-        BETTER,
-        PARTLY,
-    )
-
-
-CLAIMS: dict[str, Claim] = {
-    "improves-on-star": _against("raw", "the star sensor alone"),
-    "improves-on-mekf": _against("mekf", "a Kalman filter that believes the nominal noise"),
-    "improves-on-tuned": _against("mekf-tuned", "a Kalman filter with more noise on the bias"),
-    "improves-on-informed": _against("mekf-informed", "a Kalman filter told the true drift"),
-    "steadier": Claim(
-        "The mixed filter's error varies less from run to run (ours); value: the spread of its "
-        "RMS error over that of the nominal MEKF",
-        ("mixed-bias", "mekf"),
-        ratio("mixed-bias", "mekf", SPREAD),
-        (0.0, 0.5),
-        PARTLY,
-    ),
-    "bias-better": Claim(
-        "The modelling error belongs on the bias, not on the rate (ours); value: pointing error of "
-        "mixed-bias over that of mixed-riccati-quarter, both a quarter of the Kalman filter's gain",
-        ("mixed-bias", "mixed-riccati-quarter"),
-        ratio("mixed-bias", "mixed-riccati-quarter", POINTING),
-        BETTER,
-        PARTLY,
-    ),
+_RATIOS = {
+    "improves-on-star": ("mixed-lmi", ("raw",), (RMS,), BETTER, PARTLY),
+    "improves-on-mekf": ("mixed-lmi", ("mekf",), (RMS,), BETTER, PARTLY),
+    "improves-on-tuned": ("mixed-lmi", ("mekf-tuned",), (RMS,), BETTER, PARTLY),
+    "improves-on-informed": ("mixed-lmi", ("mekf-informed",), (RMS,), BETTER, PARTLY),
+    "steadier": ("mixed-bias", ("mekf",), (SPREAD,), (0.0, 0.5), PARTLY),
+    "bias-better": ("mixed-bias", ("mixed-riccati-quarter",), (POINTING,), BETTER, PARTLY),
 }
+_IMPROVES = (
+    "The mixed filter improves the precision of attitude determination; read against {}, "
+    "value: RMS error of mixed-lmi over that of {}"
+)
+_TEXTS = {
+    "improves-on-star": _IMPROVES.format("the star sensor alone", "raw"),
+    "improves-on-mekf": _IMPROVES.format("a Kalman filter that believes the nominal noise", "mekf"),
+    "improves-on-tuned": _IMPROVES.format(
+        "a Kalman filter with more noise on the bias", "mekf-tuned"
+    ),
+    "improves-on-informed": _IMPROVES.format(
+        "a Kalman filter told the true drift", "mekf-informed"
+    ),
+    "steadier": "The mixed filter's error varies less from run to run (ours); value: the spread of "
+    "its RMS error over that of the nominal MEKF",
+    "bias-better": "The modelling error belongs on the bias, not on the rate (ours); value: "
+    "pointing error of mixed-bias over that of mixed-riccati-quarter, both a quarter of the Kalman "
+    "filter's gain",
+}
+CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 """Every claim that a scenario may state."""
 
 

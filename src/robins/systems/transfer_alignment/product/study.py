@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -22,10 +21,16 @@ from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
 from robins.rotation import Rotation
 from robins.sim.flexure import Flexure, transition
-from robins.systems.judgement import Claim, consistency, consistency_claims
+from robins.systems.judgement import (
+    Claim,
+    consistency,
+    consistency_claims,
+    rms_by_axis,
+    rms_by_component,
+)
 from robins.systems.parts import FRD, NED, Block, refuse_unsettled
 from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View, recipe
-from robins.systems.tables import place_arrays
+from robins.systems.tables import place_arrays, track_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
 from robins.systems.transfer_alignment.product.model import (
     ATTITUDE,
@@ -214,7 +219,6 @@ CLAIMS = consistency_claims(
         (0.0, 1.15),
     )
 }
-_ENU = [1, 0, 2]  # of sizes, which have no sign
 
 
 def product_metrics(statistics: Any) -> dict[str, Any]:
@@ -223,24 +227,21 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
     Attitudes are listed east, north, up, as in the other studies; the rest as in its block. The
     last sigmas are those that the filter states at the end.
     """
-    start = statistics.count_from
-    rms = np.sqrt(np.mean(statistics.rms[start:] ** 2, axis=0))
-    sigma = np.sqrt(np.mean(statistics.sigma[start:] ** 2, axis=0))
-    out: dict[str, Any] = {}
+    out = rms_by_axis(statistics, all_axes=("attitude",))
     for block in statistics.blocks:
-        name, here, shown = block.name, block.where, (block.units, block.display_unit)
-        ending = "mps" if name == "velocity" else units.as_ending(block.display_unit)
-        order = _ENU if name == "attitude" else slice(None)
-        size, last = (units.convert(x[here][order], *shown) for x in (rms, statistics.sigma[-1]))
-        out[f"{name}_rms_{ending}"] = size.tolist()
+        if (name := block.name) not in ("attitude", "mounting"):
+            continue
+        last = units.convert(statistics.sigma[-1][block.where], block.units, block.display_unit)
+        out[f"{name}_last_sigma_arcmin"] = last.tolist()
         if name == "attitude":
-            ratio = np.sqrt(np.sum(rms[here] ** 2) / np.sum(sigma[here] ** 2))
-            out["attitude_rms_all_arcmin"] = float(np.sqrt(np.mean(size**2)))
-            out["attitude_over_sigma"] = float(ratio)
-        if name in ("attitude", "mounting"):
-            out[f"{name}_last_sigma_{ending}"] = last.tolist()
+            sigma = np.sqrt(np.mean(statistics.sigma[statistics.counted, block.where] ** 2, axis=0))
+            rms = rms_by_component(statistics)[block.where]
+            out["attitude_over_sigma"] = float(np.sqrt(np.sum(rms**2) / np.sum(sigma**2)))
+            for key in ("attitude_rms_arcmin", "attitude_last_sigma_arcmin"):
+                north, east, down = out[key]
+                out[key] = [east, north, down]  # sizes, which have no sign
     settled = statistics.settled(FIVE_ARCMIN)
-    out["share_below_5_arcmin"] = float(np.mean(settled <= start))
+    out["share_below_5_arcmin"] = float(np.mean(settled <= statistics.count_from))
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
@@ -253,8 +254,7 @@ def _contender(given: Product, course: Course, name: str) -> Contender:
 
 def tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
     """Where each filter thought the slave was."""
-    places = zip(*(jax.tree.leaves(mean.ins.position) for mean in means.values()), strict=True)
-    return place_arrays("track", map(np.stack, places), "{} of the slave")
+    return track_arrays((mean.ins.position for mean in means.values()), "{} of the slave")
 
 
 def _view(given: Product, course: Course) -> View:
