@@ -62,11 +62,9 @@ def ratio_claims(
 def judging(
     claims: Mapping[str, Claim], stated: Sequence[str] | None = None
 ) -> Callable[[Metrics], list[dict[str, Any]]]:
-    """What gives the verdicts of the claims that a scenario states, where their filters were run.
+    """What gives the verdicts of the claims stated, by id, where their filters were run.
 
-    Args:
-        claims: of the study, by id.
-        stated: ids of those to judge; all where not given.
+    All claims are judged where none are stated.
 
     Raises:
         ValueError: the study has no claim of this id.
@@ -112,9 +110,7 @@ def rms_by_component(statistics: Any) -> np.ndarray:
 def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
     """RMS error of every axis of every block in its display unit, over runs and epochs that count.
 
-    Args:
-        statistics: of a campaign.
-        all_axes: blocks of which the RMS over all axes is told too.
+    Of the blocks in `all_axes` the RMS over all axes is told too.
     """
     rms, out = rms_by_component(statistics), {}
     for block in statistics.blocks:
@@ -151,11 +147,9 @@ def consistency(statistics: Any) -> dict[str, Any]:
 
 
 def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> dict[str, Claim]:
-    """Claims on `consistency`, of one filter, or of the worst of all.
+    """Claims "sigma", "anees" and "nis" on `consistency`, with these texts.
 
-    Args:
-        texts: of the claims "sigma", "anees" and "nis".
-        judged: the filter they are about; all where not given.
+    They are about one filter, `judged`, or about the worst of all where none is given.
     """
     needs = () if judged is None else (judged,)
 

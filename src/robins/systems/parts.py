@@ -38,13 +38,7 @@ class Place(Parameters):
 
 
 def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
-    """Raise a ValueError where the samples of a run would not fit into memory.
-
-    Args:
-        rate: the parameter that says how often.
-        lasts_s: duration of a run.
-        rate_hz: samples a second.
-    """
+    """Raise a ValueError, which names a rate, where a run has more samples than fit into memory."""
     if (samples := lasts_s * rate_hz) > MOST_SAMPLES:
         raise ValueError(
             f"{rate}: at {rate_hz:g} Hz a run of {lasts_s:g} s has {samples:.3g} samples, of which "
@@ -53,13 +47,7 @@ def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
 
 
 def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
-    """Raise a ValueError where figures would begin to count after the end of the run.
-
-    Args:
-        name: the parameter that says from when.
-        from_s: what it says.
-        lasts_s: duration of a run.
-    """
+    """Raise a ValueError, which names a time, where figures would count from after a run's end."""
     if from_s > 0.0 and from_s >= lasts_s:
         raise ValueError(
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
@@ -157,11 +145,7 @@ LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take
 
 
 def warn_of_large_angles(reached_rad: Mapping[str, float]) -> None:
-    """Warn of errors beyond 5 deg, for which linear models do not hold.
-
-    Args:
-        reached_rad: by parameter the size [rad] that its error may reach.
-    """
+    """Warn of errors [rad], by parameter, beyond 5 deg, for which linear models do not hold."""
     large = {name: size for name, size in reached_rad.items() if size > LARGEST_RAD}
     if large:
         told = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())

@@ -79,8 +79,7 @@ def navigation(x: Any) -> Nav:
 def nine_states(noise: InsNoise) -> Motion:
     """Motion of the paper's states, a `Nav`; input of a step: one increment.
 
-    Args:
-        noise: of gyros and accelerometers as believed, one number for the three axes of each.
+    The noise believed is one number for the three axes of gyros and one for accelerometers.
     """
     return Motion(step, Partial(_noise, noise), Partial(_linear, noise))
 

@@ -157,14 +157,7 @@ CANDIDATES: dict[str, Candidate] = {
 
 
 def as_case(states: States, of: Taken, sigma: Array, world: World) -> Case:
-    """What a filter takes of a run; pure.
-
-    Args:
-        states: of the filter.
-        of: its sensors.
-        sigma: (n,) of the error at the start.
-        world: the run.
-    """
+    """What a filter with these sensors takes of a run, errors at the start of sigma (n,); pure."""
     estimate, zero = retract(world.start, -world.initial_error), jnp.zeros(3)
     count = world.wind.shape[0]
     gyro, accel = (jnp.tile(b, (count, 1)) for b in (world.gyro_bias, world.accel_bias))

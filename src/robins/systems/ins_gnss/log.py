@@ -335,13 +335,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Navigate a log with the filters named and say how good they are.
-
-    Args:
-        dataset: IMU and GNSS of a log, examined and cleaned (`robins.logs`).
-        parameters: what the files do not say.
-        filters: names such as "ekf", "ukf", "ekf+rts"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.

@@ -215,15 +215,10 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
 def start_belief(
     nav: Nav, imu: Imu, start: Start, tilt_rad: float, heading_rad: float, gyro_bias: Any = None
 ) -> Belief:
-    """The belief at the start, uncorrelated.
+    """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
 
-    Args:
-        nav: attitude, velocity and position of the IMU.
-        imu: spread of the sensors' errors.
-        start: spread of velocity and position.
-        tilt_rad: spread of roll and pitch.
-        heading_rad: spread of the heading.
-        gyro_bias: (3,) rad/s, where it is known from rest; else zero.
+    Sigmas are of `imu` and `start`, of roll and pitch `tilt_rad`, of the heading `heading_rad`.
+    `gyro_bias` (3,) rad/s is given where it is known from rest; else it is zero.
     """
     sigma = [[tilt_rad, tilt_rad, heading_rad], [start.velocity] * 3, [start.position] * 3]
     sigma += [imu.gyro_bias, imu.accel_bias]

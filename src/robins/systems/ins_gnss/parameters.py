@@ -93,10 +93,7 @@ class Outages(Parameters):
     def mask(self, time_s: np.ndarray, first_s: float, last_s: float) -> np.ndarray:
         """Which times lie in an outage (N,) bool; outages repeat until none may begin any more.
 
-        Args:
-            time_s: (N,) times to judge.
-            first_s: time of the first fix.
-            last_s: time of the last fix.
+        The first and the last fix are at `first_s` and `last_s`.
         """
         period = self.length + self.gap
         since = time_s - (first_s + self.first)

@@ -120,12 +120,9 @@ def calibrated(
 
 
 def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """(N, 3) the last reading within each interval (time[k-1], time[k]]; NaN where none.
+    """(N, 3) the last of readings (M, 3) within each interval (time[k-1], time[k]]; NaN where none.
 
-    Args:
-        time_ns: (N + 1,) ends of intervals, the first one the beginning.
-        field_ns: (M,) ascending.
-        field: (M, 3).
+    Times are (N + 1,), the first one the beginning, and (M,) of the readings, ascending.
     """
     out = np.full((len(time_ns) - 1, 3), np.nan)
     interval = np.searchsorted(time_ns, field_ns, side="left") - 1

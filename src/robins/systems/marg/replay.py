@@ -140,14 +140,10 @@ class OrientationErrors(NamedTuple):
 
 
 def orientation_errors(q_estimated: np.ndarray, q_true: np.ndarray) -> OrientationErrors:
-    """Total, heading and inclination error; NaN where an attitude is missing.
+    """Total, heading and inclination error between q_nb (N, 4), NED; NaN where one is missing.
 
     With q_e = (w, x, y, z): total 2 acos |w|, heading 2 atan(z / w), inclination
     2 acos sqrt(w^2 + z^2); written with the arc tangent, which is exact for small angles too.
-
-    Args:
-        q_estimated: (N, 4) q_nb, scalar first, NED.
-        q_true: (N, 4) the same.
     """
     e = rotation.multiply(q_estimated, rotation.conjugate(q_true))
     w, z = e[:, 0], e[:, 3]
@@ -201,13 +197,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Find the orientation over a log and say how good it is.
-
-    Args:
-        dataset: inertial samples; magnetic field and true attitude where there are.
-        parameters: what the files do not say.
-        filters: "marg" and "marg-smoothed"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Find the orientation over a log, as `System.replay` says, with and without a true attitude.
 
     Raises:
         ValueError: the log cannot be used; the sentence says why.

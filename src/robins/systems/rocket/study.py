@@ -267,13 +267,9 @@ def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
 
 
 def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: World) -> Case:
-    """What a filter of "field-vector" takes of a run; pure.
+    """What a filter of "field-vector" takes of a run, scale factors being states or not; pure.
 
-    Args:
-        scaled: scale factors are states.
-        of: its sensors.
-        numbers: initial sigma (n,), and the field (E, 3) [T] in n.
-        world: the run.
+    Its numbers are the initial sigma (n,) and the field (E, 3) [T] in n.
     """
     sigma, field_n = numbers
     world = world._replace(field_n=field_n)

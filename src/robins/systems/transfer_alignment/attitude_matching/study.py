@@ -152,15 +152,9 @@ def existence(
 ) -> dict[str, Any]:
     """Facts on an H-infinity filter, found by running it over nothing but zeros.
 
-    A filter that does not exist has no result: its figures are there, and empty.
-
-    Args:
-        filter_: with one `h_infinity` rule.
-        system: what it is told of the run.
-        sigma_rad: measurement noise it is told.
-        course: of the run: when there is a measurement.
-        gamma: asked for, in the units of its L x.
-        over_least: in its place, gamma over the least.
+    A filter that does not exist has no result: its figures are there, and empty. The filter has one
+    `h_infinity` rule and is told of the system and a measurement noise [rad]; gamma is asked for in the
+    units of its L x, or as `over_least` times the least.
     """
     model, (u, aux) = system.model(sigma_rad), system.inputs()
     y = np.where(course.heard[:, None], np.zeros((len(course.heard), 3)), np.nan)

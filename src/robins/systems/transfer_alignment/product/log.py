@@ -219,7 +219,7 @@ def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
 
 
 def contender(parameters: Replay, name: str) -> Contender:
-    """A filter of the product model, for pieces of a recorded recorded.
+    """A filter of the product model, for pieces of a recorded pair.
 
     Raises:
         ValueError: no such filter; a noise of the master that is zero.
@@ -316,13 +316,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Align the slave of a recorded pair with the filters named.
-
-    Args:
-        dataset: the slave's samples and the master's records, examined and cleaned (`robins.logs`).
-        parameters: what is believed of both units, of the mounting and of the flexure.
-        filters: by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Align the slave of a recorded pair, examined and cleaned, as `System.replay` says.
 
     Raises:
         ValueError: no such filter; or the pair cannot be aligned, the sentence says why.

@@ -121,10 +121,8 @@ def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | Non
 def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) -> Case:
     """What a filter is given of a pair, and what it should find.
 
-    Args:
-        matched: records of the master that it uses.
-        start: sigma (n,) at the start, and the delay [s] of the records.
-        run: the pair.
+    It uses the records of the master that are `matched`, and starts with a sigma (n,) and the delay
+    [s] of the records.
     """
     sigma, delay_s = start
     flexure, truth = jnp.zeros(6), run.truth

@@ -220,14 +220,7 @@ class PairRun(NamedTuple):
 
 
 def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array) -> PairRun:
-    """One run, from its number, which may be traced; pure.
-
-    Args:
-        pair: the parameters that `course` was laid out from.
-        course: from `lay_out`.
-        seed: of the campaign.
-        index: () number of the run.
-    """
+    """One run of the course of a pair, from its number, which may be traced; pure."""
     initial = stream(seed, index, Component.INITIAL_STATE)
     normal = jax.random.normal(jax.random.fold_in(initial, _MOUNTING), (3,))
     mounting = jnp.asarray(pair.mounting.error) + jnp.asarray(pair.mounting.sigma) * normal
