@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pydantic
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
+from robins.filters import Motion
 from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, Span, default
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
@@ -139,6 +141,17 @@ class Block(NamedTuple):
 
     increments: Increments  # dt (K,), theta (K, 3), dv (K, 3)
     noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
+
+
+def noise_of_linear(linear: Callable[..., Any], x: Any, u: Any) -> Array:
+    """The noise of a step, the third that the linear form of its motion gives."""
+    return linear(x, u)[2]
+
+
+def moved_by(step: Callable[..., Any], linear: Callable[..., Any], *given: Any) -> Motion:
+    """A motion by its step and its linear form, which take `given` before state and input."""
+    slope = Partial(linear, *given)
+    return Motion(Partial(step, *given), Partial(noise_of_linear, slope), slope)
 
 
 LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take

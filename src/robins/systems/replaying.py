@@ -89,8 +89,8 @@ def prepared(
     """The pieces of a log that can be run, and a sentence on each that cannot.
 
     The inertial increments end at `time_s` (N,) and are `dt_s` (N,) long; a longer one than
-    `longest_gap_s` ends a piece and is in none. `prepare` makes a piece of rows of the log, and raises
-    a ValueError where they cannot be run.
+    `longest_gap_s` ends a piece and is in none. `prepare` makes a piece of rows of the log, and
+    raises a ValueError where they cannot be run.
 
     Raises:
         ValueError: no piece can be run; the sentence says why.

@@ -92,8 +92,8 @@ def align(
     """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
 
     What is believed of the two units is a scenario by name, "system/name" or the path of a TOML
-    file. What the master reported and the slave's inertial samples, along the axes of the slave, are
-    paths in any format of `robins.logs`. Other arguments, and what is raised, are as of `replay`.
+    file. What the master reported and the slave's inertial samples, along the axes of the slave,
+    are paths in any format of `robins.logs`. All else, and what is raised, is as of `replay`.
     """
     _float64.require()
     system, label, text = find_scenario(name, recorded=True)

@@ -283,9 +283,6 @@ ERRORS = States(
 )
 
 
-# --------------------------------------------------------------------------------- the small things
-
-
 class Surroundings(NamedTuple):
     """What position and velocity decide; ENU."""
 

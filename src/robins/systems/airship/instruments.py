@@ -241,8 +241,6 @@ def hard(**given: Any) -> tuple[Instrument, Instrument]:
     return one, other
 
 
-# ------------------------------------------------------------------------------------ the table
-
 ABOARD = (EARLY_STARS, RADAR, STARS, AIR_DATA)
 """All that the airship carries, in the order of the updates."""
 

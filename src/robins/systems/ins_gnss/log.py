@@ -79,9 +79,6 @@ class Stretch(Piece):
     withheld: np.ndarray  # (E,) bool
 
 
-# ------------------------------------------------------------------------------------- one clock
-
-
 def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
     """Both tables on the IMU's clock, sigmas as the filter shall believe them.
 
@@ -318,9 +315,6 @@ def _known(
     if aids.non_holonomic:
         y[model.ROAD] = np.where(at_rest, np.nan, np.zeros((len(epochs), 2)))
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
-
-
-# ---------------------------------------------------------------------------------------- replay
 
 
 def contender(parameters: Replay, name: str) -> Contender:

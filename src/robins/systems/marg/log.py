@@ -66,9 +66,6 @@ class Prepared(Piece):
     counts: dict[str, int]
 
 
-# ---------------------------------------------------------------------------------------- samples
-
-
 def whole_samples(
     imu: ImuTable, gyro: Gyro, accelerometer: Accelerometer
 ) -> tuple[ImuTable, np.ndarray, dict[str, int]]:

@@ -47,12 +47,6 @@ _HEADING = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
 _INCLINATION = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("north", "east"))
 
 
-# --------------------------------------------------------------------------------------- accuracy
-
-
-# ------------------------------------------------------------------------------------------ rules
-
-
 def field_forgotten(prior: Belief, field_t: float) -> Belief:
     """Belief that knows nothing of the field any more, and all else as before.
 
@@ -124,9 +118,6 @@ def filter_of(parameters: Replay) -> Filter:
     )
 
 
-# ---------------------------------------------------------------------------------------- replay
-
-
 class OrientationErrors(NamedTuple):
     """Angles [rad] of q_e = q_estimated conj(q_true), both from body to an earth frame.
 
@@ -178,9 +169,6 @@ def truth_at(attitude: AttitudeTable, time_ns: np.ndarray) -> tuple[np.ndarray, 
 def rms_deg(angle_rad: np.ndarray) -> float:
     """Root of the mean square [deg]; NaN of nothing."""
     return float(np.degrees(np.sqrt(np.mean(angle_rad**2)))) if angle_rad.size else float("nan")
-
-
-# ----------------------------------------------------------------------------------------- replay
 
 
 class Errors(NamedTuple):

@@ -295,9 +295,6 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     return Contender(chosen.filter, field_model(given, course, chosen), case)
 
 
-# ------------------------------------------------------------------------------ what both report
-
-
 def _view(given: Flight, course: Course, **own: Any) -> View:
     """What the two studies share: the path and the field for figures, and what is unobserved."""
     height = array("context", course.alt_m, "height", unit="m", display_unit="km")

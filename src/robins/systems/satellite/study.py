@@ -48,9 +48,6 @@ BLOCKS = (
 )
 
 
-# ------------------------------------------------------------------------------------------ filters
-
-
 class FilterSpec(NamedTuple):
     """A filter of the study."""
 
@@ -154,9 +151,6 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     )
 
 
-# ------------------------------------------------------------------------------ metrics and claims
-
-
 def attitude_metrics(statistics: Any) -> dict[str, Any]:
     """Of "attitude-loop": components 0 to 2 are the attitude's, body axes.
 
@@ -219,9 +213,6 @@ _TEXTS = {
 }
 CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 """Every claim that a scenario may state."""
-
-
-# -------------------------------------------------------------------------------------------- study
 
 
 def view(given: AttitudeLoop, course: Course) -> View:

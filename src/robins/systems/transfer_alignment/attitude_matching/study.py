@@ -46,8 +46,6 @@ from robins.systems.transfer_alignment.attitude_matching.world import (
 ARCMIN = units.parse("1 arcmin", "angle")
 FIVE_ARCMIN = Limit("5_arcmin", "attitude", 5.0 * ARCMIN)
 
-# ------------------------------------------------------------------------------------------ filters
-
 # Kalman filters: what R has the variance of. "kf-flexure" has states for what swings.
 TOLD = {
     "kf": ("noise",),
@@ -152,9 +150,9 @@ def existence(
 ) -> dict[str, Any]:
     """Facts on an H-infinity filter, found by running it over nothing but zeros.
 
-    A filter that does not exist has no result: its figures are there, and empty. The filter has one
-    `h_infinity` rule and is told of the system and a measurement noise [rad]; gamma is asked for in the
-    units of its L x, or as `over_least` times the least.
+    A filter that does not exist has no result: its figures are there, and empty. The filter has
+    one `h_infinity` rule and is told of the system and a measurement noise [rad]; gamma is asked
+    for in the units of its L x, or as `over_least` times the least.
     """
     model, (u, aux) = system.model(sigma_rad), system.inputs()
     y = np.where(course.heard[:, None], np.zeros((len(course.heard), 3)), np.nan)
@@ -196,9 +194,6 @@ def _existing(step: Step):
     counts = jnp.any(info.used)
     bound, margin = (info.notes[f"h_infinity.{name}"] for name in ("bound", "margin"))
     return jnp.where(counts, bound, 0.0), jnp.where(counts, margin, 1.0)
-
-
-# -------------------------------------------------------------------------------- what is reported
 
 
 def view(given: AttitudeMatching, course: Course) -> View:

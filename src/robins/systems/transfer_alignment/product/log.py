@@ -197,9 +197,6 @@ def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
     return Nav(q_nm @ at.q_ms, v_n + swing, place.retract(arm_n))
 
 
-# ------------------------------------------------------------------------------------ the filters
-
-
 def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
     """Add to an uncorrelated start that the slave's attitude comes from a record of the master.
 

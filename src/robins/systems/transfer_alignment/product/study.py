@@ -192,9 +192,6 @@ def product_contender(
     )
 
 
-# ------------------------------------------------------------------------------ what is judged
-
-
 FIVE_ARCMIN = "5_arcmin"
 JUDGED = "product"  # the filter whose consistency is claimed
 
@@ -241,9 +238,6 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
     settled = statistics.settled(FIVE_ARCMIN)
     out["share_below_5_arcmin"] = float(np.mean(settled <= statistics.count_from))
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
-
-
-# ----------------------------------------------------------------------------------- the study
 
 
 def _contender(given: Product, course: Course, name: str) -> Contender:

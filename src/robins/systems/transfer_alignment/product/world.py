@@ -204,9 +204,6 @@ def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
         )
 
 
-# --------------------------------------------------------------------------------- one run
-
-
 class PairRun(NamedTuple):
     """One run, simulated or recorded; E epochs, K samples of the slave in each, NED/FRD."""
 

@@ -97,9 +97,6 @@ class VelocityAttitude(Scenario, PairParameters):
     settle: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
 
 
-# ----------------------------------------------------------------------------------- course and run
-
-
 class World(NamedTuple):
     """One run: the pair, and the open-loop errors that the filters of twelve states estimate."""
 
@@ -297,9 +294,6 @@ def of_product(given: VelocityAttitude, name: str) -> Contender:
 
 def _of_pair(case: Callable[[product.PairRun], Case], world: World) -> Case:
     return case(world.pair)
-
-
-# -------------------------------------------------------------------------------- what is reported
 
 
 def view(given: VelocityAttitude, course: Course) -> View:
