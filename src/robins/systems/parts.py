@@ -62,8 +62,8 @@ def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
     return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
 
 
-Draw = Literal["plus-sigma", "random-sign", "normal"]
-"""How errors of a stated size are made: as stated, with signs drawn, or with it as sigma."""
+Draw = Literal["normal", "plus-sigma", "random-sign"]
+"""How errors of a stated size are made: drawn with it as sigma, as stated, or with signs drawn."""
 
 
 def signed(key: Array, size: Any, draw: Draw) -> Array:
