@@ -95,13 +95,6 @@ def _verdicts(claims: Mapping[str, Claim], metrics: Metrics) -> list[dict[str, A
     return out
 
 
-def pooled_rms(statistics: Any, block: Any) -> float:
-    """RMS length of the error of a block in its display unit, over runs and epochs that count."""
-    rms = statistics.rms[statistics.counted, block.where]
-    size = np.sqrt(np.mean(np.sum(rms**2, axis=1)))
-    return float(units.convert(size, block.units, block.display_unit))
-
-
 def rms_by_component(statistics: Any) -> np.ndarray:
     """(r,) RMS error of each component that is reported [SI], over runs and epochs that count."""
     return np.sqrt(np.mean(statistics.rms[statistics.counted] ** 2, axis=0))
@@ -124,10 +117,11 @@ def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]
 
 def standard_metrics(statistics: Any) -> dict[str, Any]:
     """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
-    errors = {
-        f"{block.name}_rms_{units.as_ending(block.display_unit)}": pooled_rms(statistics, block)
-        for block in statistics.blocks
-    }
+    rms, errors = rms_by_component(statistics), {}
+    for block in statistics.blocks:
+        size = float(np.linalg.norm(rms[block.where]))  # pooled over the axes
+        shown = units.convert(size, block.units, block.display_unit)
+        errors[f"{block.name}_rms_{units.as_ending(block.display_unit)}"] = float(shown)
     return errors | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 

@@ -243,8 +243,6 @@ def airship_metrics(epoch_s: np.ndarray, at_s: Sequence[float], statistics: Any)
     return out
 
 
-# ------------------------------------------------------------------------------------ the claims
-
 AEKF, UKF, RAUKF, CUKF = "aekf", "ukf", "raukf", "cukf-wind-states"
 
 # Table 1 of the paper: position and velocity error, mean and standard deviation [m, m/s]

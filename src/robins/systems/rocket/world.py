@@ -154,9 +154,6 @@ def _felt(course: Course, rows: Array) -> Array:
     return jnp.where(jnp.asarray(course.felt)[:, None], rows, jnp.nan)
 
 
-# ------------------------------------------------------------------------------------ instruments
-
-
 def instruments(given: Flight) -> tuple[Instrument, ...]:
     """Those whose readings are measurements; in "field-vector" the gyro drives the motion."""
     if isinstance(given, MagneticAttitude):
