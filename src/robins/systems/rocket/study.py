@@ -20,20 +20,8 @@ import xarray as xr
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import (
-    Belief,
-    Filter,
-    Model,
-    Motion,
-    Rule,
-    Sensor,
-    channel,
-    federated,
-    kalman,
-    observability_shares,
-    taylor,
-    unscented,
-)
+from robins import filters
+from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman
 from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.results import array
@@ -74,7 +62,7 @@ PROBABILITY = 0.999  # of the chi-square tests
 PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a loss of track to be borne
 FORGETS = (10.0, 10.0)  # rad, rad/s: noise of a step that leaves nothing of what was before
 ANGLES_SEEN, RATES_SEEN = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
-_POINTS = unscented(alpha=0.5, beta=2.0, kappa=0.0)
+_POINTS = filters.unscented(alpha=0.5, beta=2.0, kappa=0.0)
 
 # ------------------------------------------------------------------------- what filters are made of
 
@@ -155,14 +143,16 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
         return ukf(*rules, *(() if chosen.rule is None else (chosen.rule,)))
 
     if chosen.raw:
-        return kalman(taylor())
+        return kalman(filters.taylor())
     if chosen.sharing is None:
         return own(*chosen.sensors)
-    channels = [channel((sensor,), own(sensor)) for sensor in chosen.sensors]
+    channels = [filters.channel((sensor,), own(sensor)) for sensor in chosen.sensors]
     shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)  # pyright: ignore[reportArgumentType] frozen, so hashable
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
-        return federated(channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS)
+        return filters.federated(
+            channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS
+        )
 
 
 @cache  # half a second, the same for all filters of a scenario
@@ -170,9 +160,11 @@ def shares_by_state(given: MagneticAttitude) -> np.ndarray:
     """(2, 6) by how well gyro and magnetometer see each state at the start."""
     q, omega = start_of(given)
     start = angle_state(wrong_by(q, given.start.attitude_error), omega)
-    channels = [channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
+    channels = [filters.channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
     model = angle_model(given, lay_out(given), ANGLE_FILTERS["ukf"])
-    return observability_shares(model, Belief(start, jnp.diag(angle_sigma(given))), channels)
+    return filters.observability_shares(
+        model, Belief(start, jnp.diag(angle_sigma(given))), channels
+    )
 
 
 def angle_sigma(given: MagneticAttitude) -> Array:
@@ -234,8 +226,8 @@ class FieldFilter(NamedTuple):
 
 
 FIELD_FILTERS: dict[str, FieldFilter] = {
-    "gyro": FieldFilter(kalman(taylor()), ()),
-    "magnetometer": FieldFilter(kalman(taylor()), (SNAPSHOT,)),
+    "gyro": FieldFilter(kalman(filters.taylor()), ()),
+    "magnetometer": FieldFilter(kalman(filters.taylor()), (SNAPSHOT,)),
     "usque": FieldFilter(ukf()),
     "huber": FieldFilter(ukf(huber(PROBABILITY))),
     "gate": FieldFilter(ukf(patient())),

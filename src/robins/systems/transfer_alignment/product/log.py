@@ -28,17 +28,8 @@ from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, vector
 from robins.results import Outcome, Progress, silent, variable
 from robins.rotation import Rotation
-from robins.systems.replaying import (
-    Answer,
-    Piece,
-    Reported,
-    epochs_of,
-    gap_counts,
-    navigated,
-    noise_scale,
-    outcome,
-    prepared,
-)
+from robins.systems import replaying
+from robins.systems.replaying import Answer, Piece, Reported
 from robins.systems.study import Alignment, Case, Contender
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS
@@ -109,7 +100,7 @@ def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], 
     """
     longest = parameters.recording.longest_gap
     prepare = partial(_prepare, recorded, parameters)
-    return prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
+    return replaying.prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
 
 
 def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
@@ -146,7 +137,7 @@ def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
     turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
     if (told := recorded.master.omega_ib_b) is not None:
         turn = np.where(np.isfinite(told), told, turn)
-    scale = noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
+    scale = replaying.noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
     world = PairRun(
         increments=blocks.increments,
         noise_scale=scale,
@@ -321,7 +312,7 @@ def replay(
     recorded = on_one_clock(dataset)
     pieces, problems = pieces_of(recorded, parameters)
     wanted = tuple(filters) or parameters.filters
-    answers = navigated(pieces, wanted, partial(contender, parameters), progress=progress)
+    answers = replaying.navigated(pieces, wanted, partial(contender, parameters), progress=progress)
     master = recorded.master
     notes = [_started(piece, recorded, parameters.master.delay) for piece in pieces]
     notes += [f"Not aligned, {problem}." for problem in problems]
@@ -333,14 +324,14 @@ def replay(
     variables |= tracks({name: answer.mean for name, answer in answers.items()})
     variables |= place_arrays("reference", path, "{} of the master", dims=time)
     used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
-    return outcome(
-        epochs_of(pieces),
+    return replaying.outcome(
+        replaying.epochs_of(pieces),
         answers,
         REPORTED,
         metrics=metrics_of,
         variables=variables,
         counts=dict(dataset.counts)
-        | gap_counts(pieces, problems)
+        | replaying.gap_counts(pieces, problems)
         | {"master_records_not_used": len(master) - used - len(pieces)},
         notes=notes,
     )

@@ -31,17 +31,8 @@ from robins.systems.judgement import (
 from robins.systems.parts import FRD, NED, Block, refuse_unsettled
 from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View, recipe
 from robins.systems.tables import place_arrays, track_arrays
+from robins.systems.transfer_alignment.product import model as pm
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
-from robins.systems.transfer_alignment.product.model import (
-    ATTITUDE,
-    POSITION,
-    RECORDS,
-    VELOCITY,
-    Installation,
-    ProductState,
-    lag_of,
-    product_model,
-)
 from robins.systems.transfer_alignment.product.parameters import Believed, PairParameters, Product
 from robins.systems.transfer_alignment.product.world import (
     Course,
@@ -61,7 +52,7 @@ BLOCKS = (
     StateBlock("mounting", slice(15, 18), "rad", "arcmin", _SLAVE, FRD),
     StateBlock("flexure", slice(18, 21), "rad", "arcmin", _MASTER, FRD),
 )
-SENSORS = {name: record.axes for name, record in RECORDS.items()}
+SENSORS = {name: record.axes for name, record in pm.RECORDS.items()}
 # by every filter, whether or not it has flexure states
 _REPORTED = {block.name: block for block in BLOCKS if block.name != "flexure"}
 _RIGID = 18  # components without flexure states
@@ -73,10 +64,10 @@ _LEAST = np.repeat([1e-9, 1e-6, 1e-3, 1e-12, 1e-8, 1e-9], 3)
 # ------------------------------------------------------------------------- what a filter believes
 
 
-def installation_of(pair: PairParameters) -> Installation:
+def installation_of(pair: PairParameters) -> pm.Installation:
     """Where the slave sits, as far as it is known."""
     q_ms = Rotation.from_euler(*pair.mounting.nominal)
-    return Installation(q_ms, jnp.asarray(pair.lever_arm, float))
+    return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
 
 def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> Model:
@@ -85,10 +76,10 @@ def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) 
     Raises:
         ValueError: a noise of the master is zero, so that its records could not be weighed.
     """
-    matched = (ATTITUDE, VELOCITY, *((POSITION,) if believed.position else ()))
+    matched = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if believed.position else ()))
     sigmas = {}
     for name in matched:
-        key = RECORDS[name].sigma
+        key = pm.RECORDS[name].sigma
         sigmas[name] = np.asarray(getattr(pair.master, key))
         if not np.all(sigmas[name] > 0.0):
             raise ValueError(
@@ -101,7 +92,7 @@ def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) 
         gyro_bias_rw=np.asarray(believed.gyro_bias_walk),
         accel_bias_rw=np.asarray(believed.accel_bias_walk),
     )
-    return product_model(noise, installation_of(pair), sigmas, flexure)
+    return pm.product_model(noise, installation_of(pair), sigmas, flexure)
 
 
 def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> np.ndarray:
@@ -128,12 +119,12 @@ def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) ->
     flexure, truth = jnp.zeros(6), run.truth
     if len(sigma) == _RIGID:
         flexure, truth = None, truth and truth._replace(flexure=None)
-    mean = ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
-    lag = lag_of(run.increments, delay_s, run.master_omega_b)
+    mean = pm.ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
+    lag = pm.lag_of(run.increments, delay_s, run.master_omega_b)
     return Case(
         start=Belief(mean, jnp.diag(sigma)),
         u=Block(run.increments, run.noise_scale),
-        y={name: getattr(run.master, RECORDS[name].field) for name in matched},
+        y={name: getattr(run.master, pm.RECORDS[name].field) for name in matched},
         aux=dict.fromkeys(matched, lag),
         truth=truth,
     )
@@ -244,7 +235,7 @@ def _contender(given: Product, course: Course, name: str) -> Contender:
     return product_contender(given, name, given.believed)
 
 
-def tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
+def tracks(means: Mapping[str, pm.ProductState]) -> dict[str, Any]:
     """Where each filter thought the slave was."""
     return track_arrays((mean.ins.position for mean in means.values()), "{} of the slave")
 
@@ -252,7 +243,7 @@ def tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
 def _view(given: Product, course: Course) -> View:
     refuse_unsettled("settle", given.settle, float(course.epoch_s[-1]))
     path = course.path.position
-    used = (ATTITUDE, VELOCITY, *((POSITION,) if given.believed.position else ()))
+    used = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if given.believed.position else ()))
     return View(
         epoch_s=course.epoch_s,
         blocks=tuple(_REPORTED.values()),
