@@ -7,7 +7,7 @@ campaign runs any `Problem` and does not know which system it came from.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.errors import require_known
-from robins.filters import Belief, Filter, Loop, Model, Sensor
+from robins.filters import Belief, Filter, Loop, Model
 from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
@@ -138,26 +138,6 @@ class Instrument(NamedTuple):
     believed: Callable[..., Any]
     # world -> the measurement, and what h(x) needs besides the state; None: the reading, nothing
     taken: Any = None
-
-
-Taken = tuple[tuple[str, Any], ...]
-"""Name of each sensor of a filter, and `Instrument.taken`."""
-
-
-def aboard(
-    instruments: Iterable[Instrument], given: Any, course: Any
-) -> tuple[tuple[Sensor, ...], Taken]:
-    """Instruments as a filter believes them, and what it takes of the world, of those it has."""
-    every = [(i, i.believed(given, course)) for i in instruments]
-    there = [(i, sensor) for i, sensor in every if sensor is not None]
-    return tuple(sensor for _, sensor in there), tuple((i.name, i.taken) for i, _ in there)
-
-
-def taken(of: Taken, world: Any) -> dict[str, dict[str, Any]]:
-    """``y`` and ``aux`` of the `Case` of a filter with these sensors; pure."""
-    seen = {name: take(world) if take else (world.readings[name], None) for name, take in of}
-    aux = {name: aux for name, (_, aux) in seen.items() if aux is not None}
-    return {"y": {name: y for name, (y, _) in seen.items()}, "aux": aux}
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from jaxtyping import Array
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
 from robins.manifold import retract
+from robins.systems.aboard import Taken, aboard, taken
 from robins.systems.airship import instruments
 from robins.systems.airship.error_model import ERRORS, feedback
 from robins.systems.airship.instruments import SAR, STAR, WIND, WIND_OF_STAR
@@ -28,19 +29,7 @@ from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, World, lay_out, simulate
 from robins.systems.judgement import Claim, ratio_claims
 from robins.systems.parts import ENU
-from robins.systems.study import (
-    Case,
-    Contender,
-    Instrument,
-    Norm,
-    StateBlock,
-    Study,
-    Taken,
-    View,
-    aboard,
-    recipe,
-    taken,
-)
+from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, Study, View, recipe
 
 # --------------------------------------------------------------------------------- the filters
 

@@ -26,6 +26,7 @@ from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.results import array
 from robins.rotation import Rotation
+from robins.systems.aboard import Taken, aboard, taken
 from robins.systems.parts import NED
 from robins.systems.rocket import angles, field
 from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
@@ -44,18 +45,7 @@ from robins.systems.rocket.world import (
     start_of,
     wrong_by,
 )
-from robins.systems.study import (
-    Case,
-    Contender,
-    Norm,
-    StateBlock,
-    Study,
-    Taken,
-    View,
-    aboard,
-    recipe,
-    taken,
-)
+from robins.systems.study import Case, Contender, Norm, StateBlock, Study, View, recipe
 from robins.systems.tables import block_array
 
 PROBABILITY = 0.999  # of the chi-square tests
