@@ -23,11 +23,7 @@ class UnknownSystem(RobinsError, ValueError):
 
 
 def find_system(name: str, folder: Path = Path()) -> System:
-    """The system of a name.
-
-    Args:
-        name: as `robins list` tells it, or "file.py:name".
-        folder: that a relative path starts from.
+    """The system of a name as `robins list` tells it, or of "file.py:name", relative to a folder.
 
     Raises:
         UnknownSystem: there is none; the message says what there is.

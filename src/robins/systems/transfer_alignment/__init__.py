@@ -6,17 +6,20 @@
 """
 
 from robins.systems.study import System
-from robins.systems.transfer_alignment import attitude_matching, product, velocity_attitude
+from robins.systems.transfer_alignment.attitude_matching.study import STUDY as MATCHING
+from robins.systems.transfer_alignment.product.log import ALIGNMENT, orientation
+from robins.systems.transfer_alignment.product.study import STUDY as PRODUCT
+from robins.systems.transfer_alignment.velocity_attitude.study import STUDY as VELOCITY_ATTITUDE
 
 SYSTEM = System(
     name="transfer-alignment",
     studies={
-        "attitude-matching": attitude_matching.STUDY,
-        "velocity-attitude": velocity_attitude.STUDY,
-        "product": product.STUDY,
+        "attitude-matching": MATCHING,
+        "velocity-attitude": VELOCITY_ATTITUDE,
+        "product": PRODUCT,
     },
-    orientation=product.orientation,
-    alignment=product.ALIGNMENT,
+    orientation=orientation,
+    alignment=ALIGNMENT,
 )
 
 __all__ = ["SYSTEM"]

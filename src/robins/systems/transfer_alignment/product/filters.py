@@ -114,9 +114,6 @@ def adaptive() -> Filter:
     return imm(Family(one, numbers), changes(), start)
 
 
-# ----------------------------------------------------------------------------------- by name
-
-
 OUTLIERS = 0.999  # share of right records that keep their weight in the other filters
 # What a structure may do of which nothing is known. Too short a time is safe, too long is not.
 _TEN_ARCMIN = math.radians(10.0 / 60.0)
