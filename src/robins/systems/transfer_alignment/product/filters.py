@@ -2,8 +2,9 @@
 
 That one, "product-adaptive", is a bank of hypotheses. A single innovation does not say whether the
 record or the gyros are disturbed. The following innovations do, and so does the velocity, which
-neither flexure nor gyro noise affects directly. So several filters of the same 24 states run side by side, each with a
-hypothesis of its own, as an interacting multiple model (`robins.filters.composite.imm`):
+neither flexure nor gyro noise affects directly. So several filters of the same 24 states run side
+by side, each with a hypothesis of its own, as an interacting multiple model
+(`robins.filters.composite.imm`):
 
                 stiff structure           flexing structure
     quiet       the stated noise          and the flexure of the model
