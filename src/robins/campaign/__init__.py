@@ -1,4 +1,4 @@
-"""Campaigns: many runs of a problem, in chunks, with statistics that say how sure they are."""
+"""Campaigns: many runs of a problem, in chunks, with statistics and their confidence."""
 
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate

@@ -1,4 +1,4 @@
-"""What many runs say together, with the confidence they allow.
+"""Statistics of many runs, with their confidence.
 
 Sums are taken chunk by chunk, so a campaign of any size needs the memory of one chunk.
 """

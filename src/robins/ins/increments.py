@@ -1,4 +1,4 @@
-"""IMU samples to increments: how far the body turned and was pushed over each interval.
+"""IMU samples to increments: rotation and velocity increment of the body over each interval.
 
 An `Increments` row describes the motion of the body relative to inertial space between two times,
 in body axes at the earlier one: rotation vector, velocity increment and displacement, with coning,

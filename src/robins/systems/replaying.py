@@ -1,4 +1,4 @@
-"""Recorded logs: pieces that can be run, what filters and smoothers say of them, the outcome.
+"""Recorded logs: pieces that can be run, their estimates by filters and smoothers, the outcome.
 
 A log is cut where a gap is too long to bridge, and every piece is prepared as a world, of which a
 `Contender` makes its case just as it does of a simulated one. What the filters say of the pieces is

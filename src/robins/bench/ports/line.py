@@ -1,4 +1,4 @@
-"""A serial line that takes its time: bytes get through at the baud rate, each at its instant.
+"""A serial line with a baud rate: each byte arrives at its own time.
 
 A pseudo-terminal hands bytes over at once, whatever its baud rate. A line between two of them
 makes them as late as on a wire: a byte is through a byte's time after the one before it, or after

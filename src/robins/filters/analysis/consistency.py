@@ -1,4 +1,4 @@
-"""Is a filter as good as it says? Chi-square tests of errors and innovations.
+"""Consistency of a filter: chi-square tests of errors and innovations.
 
 NEES is e' P^-1 e (chi-square with n degrees of freedom if the filter is right), NIS the same for an
 innovation. Sums over independent runs stay chi-square, so an average over N runs has the band of

@@ -1,4 +1,4 @@
-"""A designed filter, with its true norms: nothing a solver says is believed without them."""
+"""A designed filter with its true norms, which check every answer of a solver."""
 
 from __future__ import annotations
 

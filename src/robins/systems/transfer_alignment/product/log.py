@@ -1,4 +1,4 @@
-"""Align a recorded slave to its recorded master, and say what came out and how well.
+"""Align a recorded slave to its recorded master, with the results and their accuracy.
 
 The tables of a `Dataset` hold the slave's samples (``imu``) and the master's records (``master``).
 The slave begins where the first whole record of the master puts it. What is unknown about that, the
