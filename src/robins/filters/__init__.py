@@ -1,6 +1,5 @@
 """Filters: a way to linearise and a chain of rules; without navigation, sensors or files."""
 
-from robins.filters import composite
 from robins.filters.analysis import (
     Bound,
     bound_along,
@@ -16,7 +15,26 @@ from robins.filters.analysis import (
 )
 from robins.filters.belief import SENTENCES, Belief, Code, StepInfo
 from robins.filters.closed_loop import Closed, Loop, Reading, run_closed
-from robins.filters.composite import *  # noqa: F403
+from robins.filters.composite import (
+    Channel,
+    Family,
+    Late,
+    at_master,
+    channel,
+    covariance_intersection,
+    delayed,
+    distributed,
+    federated,
+    fuse,
+    guarded,
+    imm,
+    intersecting,
+    mode,
+    observability_shares,
+    particle,
+    reseed,
+    share,
+)
 from robins.filters.iterated import iterated
 from robins.filters.kalman import Filter, FilterState, Prediction, kalman
 from robins.filters.linearise import (
@@ -43,10 +61,13 @@ __all__ = [
     "SENTENCES",
     "Belief",
     "Bound",
+    "Channel",
     "Closed",
     "Code",
+    "Family",
     "Filter",
     "FilterState",
+    "Late",
     "Linearisation",
     "Loop",
     "Model",
@@ -66,22 +87,37 @@ __all__ = [
     "StepWarning",
     "Tally",
     "Transition",
+    "at_master",
     "bound_along",
+    "channel",
     "covariance_bound",
+    "covariance_intersection",
     "cubature",
+    "delayed",
+    "distributed",
     "doubts",
     "existence_margin",
+    "federated",
     "filter_step",
+    "fuse",
     "gamma_min",
+    "guarded",
+    "imm",
+    "intersecting",
     "iterated",
     "kalman",
     "linearised",
+    "mode",
     "normalised",
     "observability",
     "observability_along",
+    "observability_shares",
+    "particle",
+    "reseed",
     "rts_smoother",
     "run",
     "run_closed",
+    "share",
     "sigma_points",
     "sigma_weights",
     "steady_h_infinity",
@@ -91,4 +127,3 @@ __all__ = [
     "used_sensors",
     "worst_case_gain",
 ]
-__all__ += composite.__all__
