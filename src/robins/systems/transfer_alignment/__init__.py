@@ -6,20 +6,17 @@
 """
 
 from robins.systems.study import System
-from robins.systems.transfer_alignment.attitude_matching.study import STUDY as MATCHING
-from robins.systems.transfer_alignment.product.log import ALIGNMENT, orientation
-from robins.systems.transfer_alignment.product.study import STUDY as PRODUCT
-from robins.systems.transfer_alignment.velocity_attitude.study import STUDY as VELOCITY_ATTITUDE
+from robins.systems.transfer_alignment import attitude_matching, product, velocity_attitude
 
 SYSTEM = System(
     name="transfer-alignment",
     studies={
-        "attitude-matching": MATCHING,
-        "velocity-attitude": VELOCITY_ATTITUDE,
-        "product": PRODUCT,
+        "attitude-matching": attitude_matching.STUDY,
+        "velocity-attitude": velocity_attitude.STUDY,
+        "product": product.STUDY,
     },
-    orientation=orientation,
-    alignment=ALIGNMENT,
+    orientation=product.orientation,
+    alignment=product.ALIGNMENT,
 )
 
 __all__ = ["SYSTEM"]
