@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -274,6 +274,7 @@ class System(NamedTuple):
     # of a log that was examined and cleaned by `robins.logs`: (dataset, parameters, what the files
     # do not say, names of filters, where there are none those of the parameters, progress)
     replay: Callable[..., Outcome] | None = None
+    reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
     alignment: Alignment | None = None

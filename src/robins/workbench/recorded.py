@@ -65,14 +65,22 @@ def replay(
     parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
     chosen = check_filters(system, chosen_system.replay_filters, filters)
     progress(0.0, "reading")
-    angles = np.degrees(chosen_system.orientation(parameters))
-    formats = logs.formats_of(files, columns)
-    dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
-    _examine(dataset, findings)
-    dataset = logs.clean(dataset)
+    dataset: Any
+    if chosen_system.reads == "ranges":
+        if columns:
+            raise InputError(f"{system} reads text of libRSF: --columns declares other logs")
+        dataset = logs.load_ranges(files)
+        findings(dataset.findings)
+        then = f"robins run {system}/SCENARIO   what such a drive should give"
+    else:
+        angles = np.degrees(chosen_system.orientation(parameters))
+        formats = logs.formats_of(files, columns)
+        dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
+        _examine(dataset, findings)
+        dataset = logs.clean(dataset)
+        then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
     with refusing(dataset.name):
         found = chosen_system.replay(dataset, parameters, chosen, part(progress, 0.1, 1.0))
-    then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
     told = {"scenario": f"{system}/{dataset.name}", "seed": seed, "last_lines": [f"Next:   {then}"]}
     return replace(found, **told, **asked(text, settings))
 
