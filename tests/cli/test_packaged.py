@@ -36,6 +36,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # Of each study the filter that costs least and uses every sensor, and what makes a run short.
 STUDIES = {
     "drive": ("ekf", ()),
+    "city": ("ekf", ()),
     "attitude-matching": ("kf", ()),
     "velocity-attitude": ("kf", ()),
     "product": ("kf", ()),

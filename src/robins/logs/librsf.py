@@ -24,6 +24,7 @@ from robins.logs.findings import LogError, refused, told
 from robins.logs.opening import Source
 from robins.logs.timebase import stamps_to_ns
 
+_STAMP = "S40"  # wider than any stamp, as `stamps_to_ns` wants it
 WIDTH = {"pseudorange3": 10, "odom3": 13, "point3": 4}
 """Numbers in a line of each kind, at least."""
 
@@ -72,7 +73,7 @@ def _times(file: str, lines: _Lines, name: str) -> np.ndarray:
         LogError: a stamp is no number, or time falls.
     """
     rows = np.asarray(lines.rows)
-    stamps = np.array(lines.stamps)
+    stamps = np.array(lines.stamps, dtype=_STAMP)
     time_ns = stamps_to_ns(file, "time", stamps, rows)
     back = np.flatnonzero(np.diff(time_ns) < 0)
     if len(back):
@@ -182,7 +183,9 @@ def load_ranges(
         for kind, table in read_librsf(path, heard).items():
             if kind in held:
                 raise LogError(
-                    path, f"is a second file of the kind of {held[kind].source} ({kind})", "give one"
+                    path,
+                    f"is a second file of the kind of {held[kind].source} ({kind})",
+                    "give one",
                 )
             held[kind] = table
     files = ", ".join(given) or "(no file)"
@@ -190,7 +193,8 @@ def load_ranges(
         if kind not in held:
             raise LogError(files, f"no {word} among the files", f"give a file with {word}")
     ranges, odometry, truth = (held.get(kind) for kind in ("ranges", "odometry", "truth"))
-    assert isinstance(ranges, RangeTable) and isinstance(odometry, OdometryTable)
+    assert isinstance(ranges, RangeTable)
+    assert isinstance(odometry, OdometryTable)
     assert truth is None or isinstance(truth, PlaceTable)
     name = Path(ranges.source).name.split(".")[0]
     return RangeLog(name, ranges, odometry, truth, findings=list(heard))

@@ -97,11 +97,13 @@ class Place(NamedTuple):
 
     def ecef(self, position: Any) -> Array:
         """(..., 3) Earth-fixed, of positions north, east, down."""
-        return self.origin_e + jnp.asarray(position) @ self.C_en.T
+        along = jnp.asarray(position) @ self.C_en.T
+        return along + jnp.broadcast_to(self.origin_e, along.shape)
 
     def local(self, r_e: Any) -> Array:
         """(..., 3) north, east, down, of Earth-fixed positions."""
-        return (jnp.asarray(r_e) - self.origin_e) @ self.C_en
+        r_e = jnp.asarray(r_e)
+        return (r_e - jnp.broadcast_to(self.origin_e, r_e.shape)) @ self.C_en
 
     def geodetic(self, position: Any) -> Geodetic:
         """Latitude, longitude and height of positions north, east, down."""
@@ -115,7 +117,7 @@ class Kind(NamedTuple):
     memory: bool = True  # without it every epoch stands alone: least squares
 
 
-def sagnac_m(satellite_e: Array, receiver_e: Array) -> Array:
+def sagnac_m(satellite_e: Any, receiver_e: Any) -> Any:
     """What the turn of the Earth adds to a range [m], (...) of positions (..., 3)."""
     x, y = satellite_e[..., 0], satellite_e[..., 1]
     return OMEGA_E / LIGHT * (x * receiver_e[..., 1] - y * receiver_e[..., 0])
@@ -187,7 +189,7 @@ def _noise_free(numbers: tuple[Array, Array], x: GnssState, u: Travel) -> Array:
 def pseudoranges(place: Place, member: Array, x: GnssState, sky: Sky) -> Array:
     """(N,) what the receiver reads [m]."""
     q = place.ecef(x.position)
-    r = jnp.sqrt(jnp.sum((sky.satellite_e - q) ** 2, axis=-1))
+    r = jnp.sqrt(jnp.sum((sky.satellite_e - q[None, :]) ** 2, axis=-1))
     rho = r + sagnac_m(sky.satellite_e, q) + x.clock[0] + member @ x.systems
     return rho + x.delay if x.delay.shape[0] else rho
 
@@ -277,7 +279,7 @@ def first_fix(y: Any, sky: Sky, member: Any, system_bias_m: float) -> Array:
     known = jnp.concatenate([jnp.zeros(4), jnp.full(member.shape[1], 1.0 / system_bias_m)])
 
     def predicted(x: Array) -> Array:
-        r = jnp.sqrt(jnp.sum((sky.satellite_e - x[:3]) ** 2, axis=-1))
+        r = jnp.sqrt(jnp.sum((sky.satellite_e - x[None, :3]) ** 2, axis=-1))
         return r + sagnac_m(sky.satellite_e, x[:3]) + x[3] + member @ x[4:]
 
     def better(_, x: Array) -> Array:

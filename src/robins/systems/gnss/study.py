@@ -72,8 +72,8 @@ CLAIMS = {
         (0.0, 1.0),
     ),
     "honest": Claim(
-        "The position of the filter with delay states errs no more than it says: the mean NEES over "
-        "its three components stays below 1.3 of what it should be",
+        "The position of the filter with delay states errs no more than it says: the mean NEES "
+        "over its three components stays below 1.3 of what it should be",
         ("delays",),
         lambda metrics: metrics["delays"]["anees_mean"],
         (0.0, 1.3),

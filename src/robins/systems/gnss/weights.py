@@ -84,7 +84,7 @@ def by_component(
     def before(memory, prior: Belief, o: Observation):
         w, there = weights(o), o.present & o.accepted
         least = jnp.min(jnp.where(there, w, 1.0))
-        mean = jnp.sum(jnp.where(there, w, 0.0)) / jnp.maximum(jnp.sum(there), 1)
+        mean = jnp.sum(jnp.where(there, w, 0.0)) / jnp.maximum(jnp.sum(there.astype(float)), 1.0)
         o = o._replace(noise=o.noise / jnp.sqrt(w)[:, None])
         return memory, prior, o.noted(name, least=least, mean=mean)
 

@@ -73,7 +73,7 @@ def lay_out(city: City) -> Course:
     k = motion.at(time_s)
     place = Place.at(start.as_ecef())
     position = np.asarray(place.local(Geodetic(k.lat, k.lon, k.alt).as_ecef()))
-    heading = np.unwrap(np.asarray(rotation.to_euler(k.q_nb)[2]))
+    heading = np.unwrap(np.asarray(rotation.to_euler(jnp.asarray(k.q_nb))[2]))
     dt = np.diff(time_s)
     way = np.hypot(*np.diff(position[:, :2], axis=0).T)
     azimuth, elevation, r_e = _constellation(city, place)
@@ -163,7 +163,7 @@ def simulate(city: City, course: Course, seed: int, index: Array) -> World:
     # clock: bias and drift, walking
     phase, pace = clock_density(b.clock)
     begin = draw(first, (3,))
-    steps = draw(oscillator, (2, e)) * jnp.sqrt(dt)
+    steps = draw(oscillator, (2, e)) * jnp.sqrt(dt)[None, :]
     drift = b.clock.drift * begin[0] + jnp.cumsum(pace * steps[1])
     clock = 1e4 * begin[1] + jnp.cumsum(drift * dt + phase * steps[0])
     systems = b.clock.system_bias * begin[2:]
@@ -178,7 +178,7 @@ def simulate(city: City, course: Course, seed: int, index: Array) -> World:
     present = jnp.isfinite(arriving.delay)
     delay = jnp.where(present, arriving.delay, 0.0)
     sigma = city.satellites.noise * 10.0 ** ((45.0 - arriving.cn0_dbhz) / 40.0)
-    mean, spread = delay_law(b.delays, course.elevation_rad, arriving.cn0_dbhz)
+    mean, spread = delay_law(b.delays, course.elevation_rad[None, :], arriving.cn0_dbhz)
     c = (1.0 + scale) * jnp.stack(
         [jnp.cos(course.heading_rad), jnp.sin(course.heading_rad)], axis=1
     )
@@ -187,10 +187,10 @@ def simulate(city: City, course: Course, seed: int, index: Array) -> World:
         direction=c,
         yaw_bias=jnp.full(e, bias),
         clock=jnp.stack([clock, drift], axis=1),
-        systems=jnp.broadcast_to(systems, (e, 1)),
+        systems=jnp.broadcast_to(systems[None, :], (e, 1)),
         delay=delay,
     )
-    sky = Sky(jnp.broadcast_to(course.satellite_e, (e, n, 3)), sigma)
+    sky = Sky(jnp.broadcast_to(course.satellite_e[None], (e, n, 3)), sigma)
     exact = jax.vmap(partial(pseudoranges, course.place, jnp.asarray(course.member)))(truth, sky)
     y = jnp.where(present, exact + sigma * draw(white, (e, n)), jnp.nan)
     wanted: dict[str, Any] = {RANGES: y, LENGTH: length_once(city, course.way_m)}
