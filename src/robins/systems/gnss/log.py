@@ -232,6 +232,7 @@ def accuracy(answer: Answer, true: np.ndarray) -> dict[str, Any]:
         "horizontal_rms_m": float(np.sqrt(np.mean(across**2))),
         "horizontal_max_m": float(np.max(across)),
         "vertical_rms_m": float(np.sqrt(np.mean(error[:, 2] ** 2))),
+        "position_rms_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
         "nees": float(np.mean(0.5 * np.sum((error[:, :2] / sigma[:, :2]) ** 2, axis=1))),
         "beyond_3_sigma": float(np.mean(across > 3.0 * np.hypot(sigma[:, 0], sigma[:, 1]))),
         "epochs_compared": int(np.sum(known)),

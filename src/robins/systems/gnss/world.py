@@ -22,6 +22,7 @@ from robins import rotation
 from robins.earth import Geodetic
 from robins.sim.commands import from_commands
 from robins.sim.random import Component, gauss_markov, stream
+from robins.sim.trajectory import Motion
 from robins.systems.gnss.filters import World
 from robins.systems.gnss.model import (
     LENGTH,
@@ -60,18 +61,27 @@ class Course(NamedTuple):
     way_m: np.ndarray  # (E,) along the road
 
 
-def lay_out(city: City) -> Course:
-    """Everything that does not depend on a run.
+def motion_of(city: City) -> Motion:
+    """The motion that the legs describe, from rest.
 
     Raises:
         ValueError: a leg is not complete.
     """
     p = city.place
     start = Geodetic(p.latitude, p.longitude, p.height)
-    motion = from_commands(start, [leg.command() for leg in city.legs], heading_rad=p.heading)
+    return from_commands(start, [leg.command() for leg in city.legs], heading_rad=p.heading)
+
+
+def lay_out(city: City) -> Course:
+    """Everything that does not depend on a run.
+
+    Raises:
+        ValueError: a leg is not complete.
+    """
+    motion = motion_of(city)
     time_s = motion.times_ns(city.rate) * 1e-9
     k = motion.at(time_s)
-    place = Place.at(start.as_ecef())
+    place = Place.at(motion.start.as_ecef())
     position = np.asarray(place.local(Geodetic(k.lat, k.lon, k.alt).as_ecef()))
     heading = np.unwrap(np.asarray(rotation.to_euler(jnp.asarray(k.q_nb))[2]))
     dt = np.diff(time_s)
