@@ -287,7 +287,7 @@ def test_a_fix_is_that_of_gtsam():
 def test_a_log_of_a_city(tmp_path):
     text, truth = gnss_logs.as_text(*gnss_logs.drive())
     (tmp_path / "in.txt").write_text(text)
-    (tmp_path / "gt.txt").write_text(truth + "\n")
+    (tmp_path / "gt.txt").write_text(truth)
     files = [tmp_path / "in.txt", tmp_path / "gt.txt"]
     found = replay(files, system="gnss", filters=["ls", "delays", "delays+rts"])
     metrics = found.metrics

@@ -47,10 +47,10 @@ def as_text(course, run):
             lines.append(
                 f"pseudorange3 {t:.6f} {float(y[k, n])!r} {float(sky.sigma[k, n]) ** 2!r} "
                 f"{x!r} {yy!r} {z!r} {n + 1 + 300 * (n % 2)} {1 + 3 * (n % 2)} "
-                f"{np.degrees(course.elevation_rad[n])!r} {cn0[k, n]!r}"
+                f"{float(np.degrees(course.elevation_rad[n]))!r} {float(cn0[k, n])!r}"
             )
         place = np.asarray(course.place.ecef(course.position[k])).tolist()
         truth.append(f"point3 {t:.6f} " + " ".join(map(repr, place)) + " 0" * 9)
     last = course.epoch_s[-1] + 0.01
     lines.append(f"odom3 {last:.6f} 0 0 0 0 0 0 0.0025 0.0009 0.0009 4e-06 4e-06 4e-06   ")
-    return "\n".join(lines).replace("np.float64(", "").replace(")", "") + "\n", "\n".join(truth)
+    return "\n".join(lines) + "\n", "\n".join(truth) + "\n"
