@@ -71,7 +71,7 @@ def replay(
             raise InputError(f"{system} reads text of libRSF: --columns declares other logs")
         dataset = logs.load_ranges(files)
         findings(dataset.findings)
-        then = f"robins run {system}/SCENARIO   what such a drive should give"
+        then = f"robins list {system}   tells what can be simulated of it"
     else:
         angles = np.degrees(chosen_system.orientation(parameters))
         formats = logs.formats_of(files, columns)

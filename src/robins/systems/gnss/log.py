@@ -151,9 +151,9 @@ def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[Travel, np.nd
     step = np.where(dt > 0.0, dt, 1.0)
     way, turn = integral(odometry.speed_mps), integral(odometry.yaw_rate)
     speed, rate = (np.diff(x, prepend=x[:1]) / step for x in (way, turn))
-    sigma = (np.interp(epoch_s, t, x) for x in (odometry.sigma_speed, odometry.sigma_yaw))
+    slip, sway = (np.interp(epoch_s, t, x) for x in (odometry.sigma_speed, odometry.sigma_yaw))
     none = np.zeros((len(dt), 0))
-    return Travel(dt, np.abs(speed), rate, *sigma, none, none), way - way[0]
+    return Travel(dt, np.abs(speed), rate, slip, sway, none, none), way - way[0]
 
 
 # ---------------------------------------------------------------------------------------- replay

@@ -67,11 +67,11 @@ class GnssState(NamedTuple):
 class Travel(NamedTuple):
     """A step of the motion."""
 
-    dt: ArrayLike  # () s
-    speed: ArrayLike  # () m/s, mean over the step
-    yaw_rate: ArrayLike  # () rad/s, positive to the right
-    speed_sigma: ArrayLike  # () m/s
-    yaw_sigma: ArrayLike  # () rad/s
+    dt: Any  # () s
+    speed: Any  # () m/s, mean over the step
+    yaw_rate: Any  # () rad/s, positive to the right
+    speed_sigma: Any  # () m/s
+    yaw_sigma: Any  # () rad/s
     delay_mean: Any  # (N,) m
     delay_sigma: Any  # (N,) m
 

@@ -121,8 +121,8 @@ def _constellation(city: City, place: Place) -> tuple[np.ndarray, np.ndarray, np
 class Signals(NamedTuple):
     """How the signals arrive in a run, (E, N)."""
 
-    delay: Array  # m, NaN where a signal is lost
-    cn0_dbhz: Array
+    delay: Any  # m, NaN where a signal is lost
+    cn0_dbhz: Any
 
 
 def signals(city: City, course: Course, key: Array) -> Signals:
