@@ -277,6 +277,8 @@ class System(NamedTuple):
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one
     replay: Callable[..., Outcome] | None = None  # (dataset, parameters, filters, progress)
+    # roles of arrays that a replay finds, of which exports are made
+    replay_finds: tuple[str, ...] = ("attitude", "track")
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
     alignment: Alignment | None = None
