@@ -34,8 +34,9 @@ def stamps_ns(solution: xr.Dataset, clock: str) -> np.ndarray | None:
 
 def utc(solution: xr.Dataset, clock: str) -> np.ndarray | None:
     """(E,) datetime64[ns], UTC at the times of a clock; None where the stamps have no date."""
+    known = dated(int(solution.attrs.get("origin_ns", 0)))
     stamps = stamps_ns(solution, clock)
-    return utc_of(stamps) if stamps is not None and dated(solution.attrs["origin_ns"]) else None
+    return utc_of(stamps) if known and stamps is not None else None
 
 
 def to_dataframe(
@@ -93,10 +94,12 @@ def _angles(arrays: Mapping[str, xr.DataArray]) -> dict[str, xr.DataArray]:
     name = "estimate_euler"
     if name in arrays or "q_nb" not in arrays:
         return {}
-    from robins import rotation  # who reads a result need not wait for JAX
+    import jax.numpy as jnp  # who reads a result need not wait for JAX
+
+    from robins import rotation
 
     q = arrays["q_nb"]
-    values = np.stack(rotation.to_euler(np.asarray(q.values)), axis=-1)
+    values = np.stack(rotation.to_euler(jnp.asarray(q.values)), axis=-1)
     about = {"role": "estimate", "units": "rad", "display_unit": "deg"}
     angles = ["roll", "pitch", "heading"]
     return {

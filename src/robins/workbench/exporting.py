@@ -163,7 +163,9 @@ def _remarks(solution: xr.Dataset, formats: Sequence[str]) -> list[str]:
         said.append("The files .tum hold attitudes only: no place was found, x, y and z are zero.")
     maps = [name for name in ("kml", "gpx") if name in formats]
     if maps and ways and ways[0].utc is None:
-        said.append(f"The tracks in {' and '.join(maps)} have no times: the stamps have no date.")
+        said.append(
+            f"The tracks in {' and '.join(maps)} have no times: the stamps of the log have no date."
+        )
     return said
 
 
@@ -225,12 +227,12 @@ def _about(
 
     Both are exact at any distance: north at the other end of a track is not parallel to it.
     """
-    r_e = ecef_from_geodetic(track.lat_rad, track.lon_rad, track.alt_m)
-    C_eo = dcm_en(*origin[:2])
-    away = np.asarray((r_e - ecef_from_geodetic(*origin)) @ C_eo)
-    q_eo, q_en = rotation.from_dcm(C_eo), rotation.from_dcm(dcm_en(track.lat_rad, track.lon_rad))
-    q_on = np.asarray(rotation.multiply(rotation.conjugate(q_eo), q_en))
-    return away[:, [1, 0, 2]] * [1.0, 1.0, -1.0], rotation.multiply(q_on, q_nb)
+    r_e = np.asarray(ecef_from_geodetic(track.lat_rad, track.lon_rad, track.alt_m))
+    C_eo, C_en = dcm_en(*origin[:2]), dcm_en(track.lat_rad, track.lon_rad)
+    north, east, down = ((r_e - np.asarray(ecef_from_geodetic(*origin))) @ np.asarray(C_eo)).T
+    q_eo, q_en = (np.asarray(rotation.from_dcm(C)) for C in (C_eo, C_en))
+    q_on = rotation.multiply(rotation.conjugate(q_eo), q_en)
+    return np.stack([east, north, -down], axis=1), rotation.multiply(q_on, q_nb)
 
 
 def _kml(solution: xr.Dataset, name: str) -> dict[str, bytes]:
@@ -297,7 +299,7 @@ FORMATS = {
 
 
 def _clocks_of_estimates(solution: xr.Dataset) -> list[str]:
-    roles = ("track", "attitude", "estimate")
+    roles = ("track", "attitude", "estimate", "error", "sigma")
     arrays = [array for role in roles for array in find(solution, role).values()]
     return [clock for clock in clocks(solution) if any(clock in a.dims for a in arrays)]
 
