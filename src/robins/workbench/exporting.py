@@ -86,7 +86,7 @@ def tracks(solution: xr.Dataset) -> list[Track]:
         date = utc(solution, clock)
         names = _filters(solution) if "filter" in lat.dims else [name]
         rows = zip(names, *(np.atleast_2d(x.values) for x in (lat, lon, alt)), strict=True)
-        found += [Track(one, text, clock, *row, date) for one, *row in rows]
+        found += [Track(one, text, clock, a, o, h, date) for one, a, o, h in rows]
     return [track for track in found if np.any(track.whole)]
 
 
