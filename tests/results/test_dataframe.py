@@ -3,10 +3,10 @@
 import numpy as np
 import pandas as pd
 import pytest
-from example_folder import a_solution, a_summary
+from example_folder import a_solution, a_summary, write
 from small_replay import ALT_M, GAP, LAT_RAD, NAMES, TIME_S, a_replay, attitudes
 
-from robins.results import ResultError, clocks, read, to_dataframe, write
+from robins.results import ResultError, clocks, read, to_dataframe
 
 LAST = len(TIME_S) - 1
 

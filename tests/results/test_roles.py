@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import role_table
 import xarray as xr
-from example_folder import a_summary
+from example_folder import a_summary, write
 
 from robins import report
-from robins.results import ROLES, array, find, read, roles, write
+from robins.results import ROLES, array, find, read, roles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 # Tables show these, or nothing does.

@@ -1,4 +1,4 @@
-"""Logs: read and write them, have them examined, make them safe.
+"""Logs: read and write them, examine them, clean them.
 
 - `open_log`, `load_dataset`, `load_pair`: any known format, recognised by content, into the tables
   of `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.

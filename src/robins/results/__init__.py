@@ -50,7 +50,7 @@ from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import array, variable
 from robins.results.summary import VERDICTS
-from robins.results.writer import ResultWriter, write
+from robins.results.writer import ResultWriter
 
 __all__ = [
     "ROLES",
@@ -72,5 +72,4 @@ __all__ = [
     "to_dataframe",
     "variable",
     "versions",
-    "write",
 ]

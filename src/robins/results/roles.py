@@ -1,4 +1,4 @@
-"""What the arrays of a solution are to a reader: one table of roles.
+"""The roles of a solution's arrays, in one table.
 
 A row tells how arrays are named, what their dimensions are and what must be known with them. The
 rest follows from it: `robins.results.array` builds one with its name and its attributes ``role``

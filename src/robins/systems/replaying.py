@@ -1,4 +1,4 @@
-"""Recorded logs: pieces that can be run, what filters and smoothers say of them, the outcome.
+"""Recorded logs: pieces that can be run, their estimates by filters and smoothers, the outcome.
 
 A log is cut where a gap is too long to bridge, and every piece is prepared as a world, of which a
 `Contender` makes its case just as it does of a simulated one. What the filters say of the pieces is
@@ -90,11 +90,9 @@ def prepared(
 ) -> tuple[list[PieceT], list[str]]:
     """The pieces of a log that can be run, and a sentence on each that cannot.
 
-    Args:
-        time_s: (N,) end of each increment of the inertial unit.
-        dt_s: (N,) its length.
-        longest_gap_s: a longer increment ends a piece and is in none.
-        prepare: rows of the log -> piece; it raises a ValueError where they cannot be run.
+    The inertial increments end at `time_s` (N,) and are `dt_s` (N,) long; a longer one than
+    `longest_gap_s` ends a piece and is in none. `prepare` makes a piece of rows of the log, and
+    raises a ValueError where they cannot be run.
 
     Raises:
         ValueError: no piece can be run; the sentence says why.
@@ -116,12 +114,9 @@ def prepared(
 
 
 def noise_scale(blocks: Blocks, dt_s: np.ndarray, across_gap: float) -> np.ndarray:
-    """(E,) of the process noise factor: 1, and more in a block in which samples are missing.
+    """(E,) of the process noise factor: 1, or `across_gap` in a block in which samples are missing.
 
-    Args:
-        blocks: cut from the increments.
-        dt_s: (N,) lengths of the increments.
-        across_gap: scale in such a block.
+    The blocks are cut from increments of lengths `dt_s` (N,).
     """
     gap = after_gap(dt_s)
     missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
@@ -157,17 +152,14 @@ def navigated(
     smoothers: Mapping[str, str] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Answer]:
-    """What filters and smoothers say of all pieces; each filter runs over a piece once.
+    """What filters and smoothers, by name, say of all pieces; each filter runs over a piece once.
 
     Args:
         pieces: of a log, in the order of time.
         wanted: names of filters and smoothers.
-        contender: the filter of a name, with its model.
+        contender: the filter of a name, with its model; what it raises for another is raised here.
         smoothers: by the name of a smoother, the filter whose run it smooths.
         progress: called with the share done and what is being done.
-
-    Raises:
-        ValueError: what `contender` raises, for a name that it does not know.
     """
     causal = {name: (smoothers or {}).get(name, name) for name in wanted}
     contenders = {name: contender(name) for name in dict.fromkeys(causal.values())}

@@ -97,20 +97,9 @@ def align(
 ) -> Outcome:
     """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
 
-    Args:
-        name: "system/name" or the path of a TOML file: what is believed of the two units.
-        master: what the master reported, a path in any format of `robins.logs`.
-        slave: inertial samples, along the axes of the slave.
-        filters: names; by default those of the scenario.
-        settings: "path=value" texts that change the scenario.
-        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
-        seed: recorded in the result; nothing is drawn.
-        progress: called with the share done and what is being done.
-        findings: called with what the doctor says.
-
-    Raises:
-        InputError: the pair or what was asked of it cannot be used.
-        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
+    What is believed of the two units is a scenario by name, "system/name" or the path of a TOML
+    file. What the master reported and the slave's inertial samples, along the axes of the slave,
+    are paths in any format of `robins.logs`. All else, and what is raised, is as of `replay`.
     """
     _float64.require()
     system, label, text = find_scenario(name, recorded=True)

@@ -79,9 +79,6 @@ class Stretch(Piece):
     withheld: np.ndarray  # (E,) bool
 
 
-# ------------------------------------------------------------------------------------- one clock
-
-
 def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
     """Both tables on the IMU's clock, sigmas as the filter shall believe them.
 
@@ -320,9 +317,6 @@ def _known(
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
 
 
-# ---------------------------------------------------------------------------------------- replay
-
-
 def contender(parameters: Replay, name: str) -> Contender:
     """A filter with the model it believes in."""
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
@@ -335,13 +329,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Navigate a log with the filters named and say how good they are.
-
-    Args:
-        dataset: IMU and GNSS of a log, examined and cleaned (`robins.logs`).
-        parameters: what the files do not say.
-        filters: names such as "ekf", "ukf", "ekf+rts"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
