@@ -70,7 +70,8 @@ class Reported(NamedTuple):
 
     blocks: Sequence[StateBlock]
     sensors: Mapping[str, SensorAxes]
-    # mean, leading axis E -> (E, k) estimates by block, and "q_nb" (E, 4): attitude, scalar first
+    # mean, leading axis E -> (E, k) estimates by block, and "q_nb" (E, 4), the attitude, scalar
+    # first; or "euler" [rad] along the axes below, where no whole attitude is known
     estimates: Callable[[Any], Mapping[str, Any]]
     causes: str  # the sentence on the likely causes, said where there is a warning
     # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
@@ -287,10 +288,13 @@ def _tables(
                 blank = np.full((len(epoch_s), len(block.axes)), np.nan)
                 values = np.stack([blank if row is None else np.asarray(row) for row in rows])
                 data |= block_array(role, block, values)
-    q_nb = jnp.stack([jnp.asarray(of["q_nb"]) for of in found])
-    euler = np.stack(rotation.to_euler(q_nb), axis=-1)
+    if all("q_nb" in of for of in found):
+        q_nb = jnp.stack([jnp.asarray(of["q_nb"]) for of in found])
+        euler = np.stack(rotation.to_euler(q_nb), axis=-1)
+        data |= attitude_array(q_nb, reported.euler.frame)
+    else:
+        euler = np.stack([np.asarray(of["euler"]) for of in found])
     data |= block_array("estimate", reported.euler, euler, "estimated roll, pitch, heading")
-    data |= attitude_array(q_nb, reported.euler.frame)
     seen = [answer.updates for answer in answers.values()]
     return data | innovation_tables(seen, reported.sensors, epoch_s)
 
