@@ -183,12 +183,20 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
         "robins replay imu.csv gnss.pos --out walk",
         'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
         "robins replay my.csv --columns logger.toml --system marg",
+        "robins replay imu.csv gnss.pos --out walk --export csv,kml",
     ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
 @_RUNS
 @option(
     "--system", default="ins-gnss", show_default=True, help="The system that navigates the log."
+)
+@option(
+    "--export",
+    "exports",
+    callback=as_names,
+    metavar="a,b",
+    help="Write the result for other programs too: csv, tum, kml, gpx.",
 )
 @COLUMNS
 @choices
@@ -198,6 +206,9 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
 
     A file that ends in .toml says what the log does not: noise, mounting, lever arm. The file of
     --columns declares the columns of a log that is in no known format.
+
+    --export writes files into exports/ of the result folder: csv has all estimates, tum is t x y z
+    qx qy qz qw in east, north, up, kml and gpx are tracks with UTC. kml and gpx need positions.
     """
     one_run(runs, "log")
     carry_out("replay", log, out=out or RESULTS / log_name(log), findings=warn, **options)

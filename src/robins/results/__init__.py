@@ -35,8 +35,13 @@ recognised by their place, so any time dimension serves whose coordinate is in s
 start (``time``, ``gnss_time``, ...). Dimension coordinates ``filter`` and ``axis_...`` hold names.
 Bands of consistency figures follow from ``degrees_of_freedom`` and ``runs`` at ``probability``
 (0.95), or are given by ``band_low`` and ``band_high``.
+
+Time counts in seconds since the start. Of a recorded log the attribute ``origin_ns`` of the
+solution is the stamp at its zero: GPS time since 1970-01-01 (UTC and leap seconds), or, before
+1980, the log's own clock. `to_dataframe` makes a table of the arrays on one clock, `Result` too.
 """
 
+from robins.results.dataframe import clocks, to_dataframe
 from robins.results.errors import ResultError
 from robins.results.manifest import SCHEMA_VERSION, versions
 from robins.results.outcome import Outcome, Progress, silent
@@ -58,11 +63,13 @@ __all__ = [
     "ResultError",
     "ResultWriter",
     "array",
+    "clocks",
     "find",
     "keeping",
     "read",
     "rescued",
     "silent",
+    "to_dataframe",
     "variable",
     "versions",
 ]

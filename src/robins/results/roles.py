@@ -76,6 +76,14 @@ ROLES = (
         _FTA,
         "error of {of}; true minus estimated; an error of the vehicle has a caption in `comment`",
     ),
+    Role(
+        "q_nb",
+        f"{_FT} axis_q_nb",
+        "estimated attitude; unit quaternion of Hamilton, scalar first: v_n = q v_b conj(q); at "
+        "the times of the filter or of the samples",
+        "1",
+        named="attitude",
+    ),
     Role("value_{name}", _FTA, "{of}; what the vehicle does besides; caption in `comment`"),
     Role("sigma_{block}", _FTA, "standard deviation of {of}; as the filter states it"),
     Role("innovation_{sensor}", _ATA, "innovation of {of}; NaN where missing"),

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
@@ -28,6 +29,7 @@ from robins.systems.study import Contender, SensorAxes, StateBlock
 from robins.systems.tables import (
     EULER,
     Update,
+    attitude_array,
     block_array,
     innovation_tables,
     updates,
@@ -68,13 +70,14 @@ class Reported(NamedTuple):
 
     blocks: Sequence[StateBlock]
     sensors: Mapping[str, SensorAxes]
-    # mean, leading axis E -> (E, k) estimates by block, and "euler": roll, pitch, heading [rad]
+    # mean, leading axis E -> (E, k) estimates by block, and "q_nb" (E, 4), the attitude, scalar
+    # first; or "euler" [rad] along the axes below, where no whole attitude is known
     estimates: Callable[[Any], Mapping[str, Any]]
     causes: str  # the sentence on the likely causes, said where there is a warning
     # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
     # cautious side, so that small innovations say nothing
     assumed: Collection[str] = ()
-    euler: StateBlock = EULER
+    euler: StateBlock = EULER  # by which the attitude is told; its frame is that of q_nb
 
 
 # -------------------------------------------------------------------------------- log to pieces
@@ -240,6 +243,7 @@ def outcome(
     variables: Mapping[str, Any],
     counts: Mapping[str, int],
     notes: Sequence[str],
+    origin_ns: int | None = None,
 ) -> Outcome:
     """The outcome of a replay: solution, metrics and warnings that all systems have, and its own.
 
@@ -251,6 +255,7 @@ def outcome(
         variables: what else is in the solution, as `robins.results` lists it.
         counts: of samples and pieces.
         notes: sentences for the reader.
+        origin_ns: stamp of the log at which its clock here begins, kept as an attribute.
     """
     doubtful = [
         f"{name}: {sentence}."
@@ -258,8 +263,9 @@ def outcome(
         if answer.updates
         for sentence in doubts(answer.tally, bounds=answer.bounds, assumed=reported.assumed)
     ]
+    origin = {} if origin_ns is None else {"origin_ns": np.int64(origin_ns)}
     return Outcome(
-        solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables)),
+        solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables), attrs=origin),
         metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
         counts=dict(counts),
         notes=list(notes),
@@ -282,7 +288,12 @@ def _tables(
                 blank = np.full((len(epoch_s), len(block.axes)), np.nan)
                 values = np.stack([blank if row is None else np.asarray(row) for row in rows])
                 data |= block_array(role, block, values)
-    euler = np.stack([np.asarray(of["euler"]) for of in found])
+    if all("q_nb" in of for of in found):
+        q_nb = jnp.stack([jnp.asarray(of["q_nb"]) for of in found])
+        euler = np.stack(rotation.to_euler(q_nb), axis=-1)
+        data |= attitude_array(q_nb, reported.euler.frame)
+    else:
+        euler = np.stack([np.asarray(of["euler"]) for of in found])
     data |= block_array("estimate", reported.euler, euler, "estimated roll, pitch, heading")
     seen = [answer.updates for answer in answers.values()]
     return data | innovation_tables(seen, reported.sensors, epoch_s)

@@ -275,6 +275,8 @@ class System(NamedTuple):
     # do not say, names of filters, where there are none those of the parameters, progress)
     replay: Callable[..., Outcome] | None = None
     reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
+    # roles of arrays that a replay finds, of which exports are made
+    replay_finds: tuple[str, ...] = ("attitude", "track")
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
     alignment: Alignment | None = None

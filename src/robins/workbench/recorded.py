@@ -17,6 +17,7 @@ from robins.results import Outcome, Progress, silent
 from robins.systems.finding import find_system
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.examination import parted
+from robins.workbench.exporting import require_formats, with_exports
 from robins.workbench.publication import part
 from robins.workbench.scenarios import asked, check_filters, find_scenario
 
@@ -34,6 +35,7 @@ def replay(
     filters: Sequence[str] = (),
     settings: Sequence[str] = (),
     columns: Sequence[str | os.PathLike[str]] = (),
+    exports: Sequence[str] = (),
     seed: int = 0,
     progress: Progress = silent,
     findings: Findings = unheard,
@@ -46,6 +48,8 @@ def replay(
         filters: names; by default those of the configuration.
         settings: "path=value" texts that change the configuration.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
+        exports: formats of other programs, of `robins.workbench.exporting.FORMATS`; the files are
+            among those of the outcome.
         seed: recorded in the result; a replay draws nothing.
         progress: called with the share done and what is being done.
         findings: called with what the doctor says.
@@ -64,6 +68,7 @@ def replay(
     source = os.fspath(configuration or "the default configuration")
     parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
     chosen = check_filters(system, chosen_system.replay_filters, filters)
+    require_formats(exports, chosen_system.replay_finds, f"a replay with {system}")
     progress(0.0, "reading")
     dataset: Any
     if chosen_system.reads == "ranges":
@@ -81,8 +86,9 @@ def replay(
         then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
     with refusing(dataset.name):
         found = chosen_system.replay(dataset, parameters, chosen, part(progress, 0.1, 1.0))
-    told = {"scenario": f"{system}/{dataset.name}", "seed": seed, "last_lines": [f"Next:   {then}"]}
-    return replace(found, **told, **asked(text, settings))
+    label = f"{system}/{dataset.name}"
+    told = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
+    return with_exports(replace(found, **told, **asked(text, settings)), exports, label)
 
 
 def align(

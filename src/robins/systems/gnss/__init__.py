@@ -17,6 +17,7 @@ SYSTEM = System(
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
     reads="ranges",
+    replay_finds=("track",),
 )
 
 __all__ = ["SYSTEM", "City", "Replay", "gnss_model", "replay"]

@@ -202,6 +202,7 @@ def replay(
             assumed=(LENGTH,),
             euler=HEADING,
         ),
+        origin_ns=int(given.time_ns[0]),
         metrics=lambda answer: {} if true is None else accuracy(answer, true),
         variables=variables,
         counts=dict(log.counts) | counts,

@@ -350,7 +350,7 @@ def replay(
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
     antennas = {name: _antenna(mount, answer.mean, rate) for name, answer in answers.items()}
-    variables = track_arrays(antennas.values()) | _fix_arrays(log)
+    variables = track_arrays(antennas.values(), "{} of the antenna") | _fix_arrays(log)
     variables |= array("outage", withheld.astype(np.int8), long_name="GNSS withheld")
     used = np.any([piece.used for piece in pieces], axis=0)
     counts = replaying.gap_counts(pieces, problems) | {"pieces_not_navigated": len(problems)}
@@ -369,6 +369,7 @@ def replay(
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
         + [f"Not navigated, {problem}." for problem in problems],
+        origin_ns=int(dataset.imu.time_ns[0]),
     )
 
 
@@ -380,7 +381,7 @@ def _antenna(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
 
 def _estimates(mean: InsState) -> Mapping[str, Any]:
     biases_and_scales = {name: getattr(mean, name) for name in InsState._fields[3:]}
-    return {"velocity": mean.v_n, "euler": jnp.stack(mean.q_nb.as_euler(), -1), **biases_and_scales}
+    return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}
 
 
 def _distances(

@@ -20,14 +20,14 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.trees import select
 from robins.ins.frames import to_ned_frd
-from robins.results import Outcome, Progress, array, silent
+from robins.results import Outcome, Progress, array, silent, variable
 from robins.systems import replaying
 from robins.systems.marg import model
 from robins.systems.marg.log import Prepared, prepare
 from robins.systems.marg.parameters import Replay
 from robins.systems.replaying import Answer, Reported
 from robins.systems.study import Contender, StateBlock
-from robins.systems.tables import EULER, block_array
+from robins.systems.tables import EULER, attitude_array, block_array
 
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
 _ESTIMATED = {
@@ -188,7 +188,7 @@ def replay(
     answers = replaying.navigated([log], wanted, contenders.__getitem__, smoothers, progress)
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
     answers = {name: _without_padding(log, answer) for name, answer in answers.items()}
-    variables, errors = _variables(log, answers), {}
+    variables, errors = _variables(log, answers) | _attitudes(log, q_nb), {}
     if dataset.attitude is not None:
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
@@ -217,6 +217,7 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
         notes=notes,
+        origin_ns=int(log.time_ns[0]),
     )
 
 
@@ -242,9 +243,8 @@ def _without_padding(log: Prepared, answer: Answer) -> Answer:
 
 
 def _estimates(mean: model.MargState) -> Mapping[str, Any]:
-    euler = jnp.stack(rotation.to_euler(jnp.asarray(mean.q_nb.wxyz)), axis=-1)
     values = {name: np.asarray(getattr(mean, of)) for name, of in _ESTIMATED.items()}
-    return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"euler": euler}
+    return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"q_nb": mean.q_nb.wxyz}
 
 
 REPORTED = Reported(
@@ -311,6 +311,15 @@ def _variables(log: Prepared, answers: Mapping[str, Answer]) -> dict[str, Any]:
         long_name="magnetometer refused",
         dims="filter time",
     )
+
+
+def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Attitude at every sample, on a clock of its own."""
+    since_s = (log.time_ns - log.time_ns[0]) * 1e-9
+    clock = variable("sample_time", since_s, "s", "time of the inertial samples")
+    words = "estimated attitude at every sample"
+    q = np.stack(list(q_nb.values()))
+    return {"sample_time": clock} | attitude_array(q, "body to NED", "sample_time", words)
 
 
 def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:

@@ -225,13 +225,13 @@ def contender(parameters: Replay, name: str) -> Contender:
 
 
 def _estimates(mean: ProductState) -> Mapping[str, Any]:
-    """Blocks that are vectors, and roll, pitch, heading of the slave."""
+    """Blocks that are vectors, and the attitude of the slave."""
     found = {
         "velocity": mean.ins.v_n,
         "gyro_bias": mean.ins.gyro_bias,
         "accel_bias": mean.ins.accel_bias,
         "mounting": mean.mounting_rad,
-        "euler": jnp.stack(mean.ins.q_nb.as_euler(), -1),
+        "q_nb": mean.ins.q_nb.wxyz,
     }
     return found if mean.flexure is None else found | {"flexure": mean.flexure[..., :3]}
 
@@ -334,6 +334,7 @@ def replay(
         | replaying.gap_counts(pieces, problems)
         | {"master_records_not_used": len(master) - used - len(pieces)},
         notes=notes,
+        origin_ns=int(dataset.imu.time_ns[0]),
     )
 
 
