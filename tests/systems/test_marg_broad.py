@@ -51,7 +51,7 @@ def test_magnets_are_noticed(found, number, least, most):
 
 
 @pytest.mark.parametrize(
-    ("name", "reached", "peer"), [("marg", 2.0, VQF_DEG), ("marg-smoothed", 1.9, VQF_OFFLINE_DEG)]
+    ("name", "reached", "peer"), [("marg", 1.6, VQF_DEG), ("marg-smoothed", 1.4, VQF_OFFLINE_DEG)]
 )
 def test_mean_error_is_below_that_of_vqf(found, name, reached, peer):
     metrics = [found(number).metrics[name] for number in TRIALS]

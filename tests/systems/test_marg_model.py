@@ -164,9 +164,23 @@ def test_the_declination_fades_in_motion_and_stands_at_rest():
     share = float(persistence(noise, moving))
     assert share == pytest.approx(np.exp(-float(moving.samples.dt_s) / 60.0))
     assert float(persistence(noise, still)) == 1.0
-    sigma = MODEL.motion.linear(some_state(), moving)[2]
-    assert float(sigma[24]) == pytest.approx(np.radians(6.0) * np.sqrt(1.0 - share**2))
-    assert float(MODEL.motion.linear(some_state(), still)[2][24]) == 0.0
+    factor = MODEL.motion.linear(some_state(), moving)[2]
+    assert float(factor[24, 24]) == pytest.approx(
+        Replay().magnetometer.declination * np.sqrt(1.0 - share**2)
+    )
+    assert float(MODEL.motion.linear(some_state(), still)[2][24, 24]) == 0.0
+
+
+def test_what_a_gyro_did_not_sample_is_lost_about_its_own_axis():
+    x, lost = some_state(3), np.array([0.2, 0.0, 0.0])
+    bare, block = some_block(), some_block()._replace(lost_turn=lost)
+    Q = [
+        np.asarray(f) @ np.asarray(f).T
+        for f in (MODEL.motion.linear(x, b)[2] for b in (bare, block))
+    ]
+    R = np.asarray(x.q_nb.as_dcm())
+    np.testing.assert_allclose((Q[1] - Q[0])[:3, :3], R @ np.diag(lost**2) @ R.T, atol=1e-12)
+    np.testing.assert_allclose((Q[1] - Q[0])[3:, :], 0.0, atol=1e-15)
 
 
 def test_a_field_along_the_vertical_has_no_azimuth():
@@ -206,7 +220,7 @@ def test_errors_are_as_large_as_the_filter_says():
         def world(x, row):
             block, w, v, b = row
             new, _, q = MODEL.motion.linear(x, block)
-            x = manifold.retract(new, q * w)
+            x = manifold.retract(new, q @ w)
             travel = MODEL.sensor(TRAVEL)
             y = travel.read(x, jnp.zeros(())) + travel.noise_factor(x, jnp.zeros(())) @ v
             strength = x.field + 2.5e-6 * b[:2]

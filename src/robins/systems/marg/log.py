@@ -15,11 +15,12 @@ from robins.filters import Belief
 from robins.ins.alignment import triad
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, after_gap, from_imu, usual_interval
-from robins.ins.rest import still_samples
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.marg import model
 from robins.systems.marg.parameters import Accelerometer, Gyro, Magnetometer, Replay
+from robins.systems.marg.rest import RestFound, at_rest
+from robins.systems.marg.saturation import bridged
 from robins.systems.replaying import Piece
 from robins.systems.study import Case
 
@@ -57,10 +58,18 @@ class Prepared(Piece):
     counts: dict[str, int]
 
 
-def whole_samples(
-    imu: ImuTable, gyro: Gyro, accelerometer: Accelerometer
-) -> tuple[ImuTable, np.ndarray, dict[str, int]]:
-    """The samples that are numbers, which of them touch the end of their range, and counts.
+class Whole(NamedTuple):
+    """The samples that are numbers."""
+
+    imu: ImuTable  # N samples, peaks beyond the range of a gyro put back
+    full: np.ndarray  # (N, 3) bool, a gyro at the end of its range
+    doubt: np.ndarray  # (N, 3) rad/s, spread of what was put back; NaN where nothing
+    accel_full: np.ndarray  # (N,) bool
+    counts: dict[str, int]
+
+
+def whole_samples(imu: ImuTable, gyro: Gyro, accelerometer: Accelerometer) -> Whole:
+    """The samples that are numbers, and which of them touch the end of their range.
 
     Raises:
         ValueError: fewer than two samples are left.
@@ -70,11 +79,21 @@ def whole_samples(
     kept = replace(imu, **{name: getattr(imu, name)[finite] for name in columns})
     if len(kept) < 2:
         raise ValueError(f"orientation needs two whole inertial samples; this log has {len(kept)}")
-    full = np.any(np.abs(kept.gyro) >= 0.99 * gyro.range, axis=1)
-    full |= np.any(np.abs(kept.accel) >= 0.99 * accelerometer.range, axis=1)
-    full &= kept.kind == "rate"  # increments have no range
-    counts = {"imu_missing": int(np.sum(~finite)), "imu_saturated": int(np.sum(full))}
-    return kept, full, counts
+    full = np.zeros(kept.gyro.shape, dtype=bool)
+    doubt, accel_full = np.full(full.shape, np.nan), np.zeros(len(kept), dtype=bool)
+    if kept.kind == "rate":  # increments have no range
+        seconds = (kept.time_ns - kept.time_ns[0]) * 1e-9
+        rate, full, doubt = bridged(seconds, np.asarray(kept.gyro, float), gyro.range)
+        kept = replace(kept, gyro=rate)
+        accel_full = np.any(np.abs(kept.accel) >= 0.99 * accelerometer.range, axis=1)
+    touched = np.any(full, axis=1) | accel_full
+    back = np.any(full & np.isfinite(doubt), axis=1)
+    counts = {
+        "imu_missing": int(np.sum(~finite)),
+        "imu_saturated": int(np.sum(touched)),
+        "imu_bridged": int(np.sum(back)),
+    }
+    return Whole(kept, full, doubt, accel_full, counts)
 
 
 def as_means(imu: ImuTable) -> ImuTable:
@@ -132,7 +151,9 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         ValueError: the log cannot be used; the sentence says why.
     """
     p = parameters
-    imu, full, counts = whole_samples(to_ned_frd(dataset.imu), p.gyro, p.accelerometer)
+    imu, full, doubt, accel_full, counts = whole_samples(
+        to_ned_frd(dataset.imu), p.gyro, p.accelerometer
+    )
     made, _ = from_imu(as_means(imu) if p.update.samples == "means" else imu)
     increments = Increments(*(np.asarray(a, dtype=float) for a in made[:3]))
     dt, theta, dv = increments[:3]
@@ -154,13 +175,20 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         _filled(field, blocks, n, np.nan),
     )
     integrals, block_field = jax.tree.map(np.asarray, model.integrate(samples))
-    quiet = np.zeros(len(dt), bool)
-    if p.rest.detect:
-        quiet = still_samples(increments, *p.rest.quiet)
-    still = np.all(_filled(quiet, blocks, n, True), axis=1)
+    rest = at_rest(
+        integrals.dt_s, _mean_rate(integrals), _mean_force(integrals), block_field, p.rest
+    )
+    still = rest.still
 
     gap = np.where(dt > p.update.gap * usual, dt, 0.0)
-    lost = _filled(gap + dt * (full[1:] | full[:-1]), blocks, n, 0.0).sum(axis=1)
+    known = np.isfinite(doubt)
+    unknown = full & ~known
+    lost = gap + dt * (accel_full[1:] | accel_full[:-1])
+    # what a gyro at its end did not say, about its own axis; what all samples of a gap did not
+    turn = p.update.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
+    turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
+    lost_turn = _filled(turn, blocks, n, 0.0).sum(axis=1)
+    lost = _filled(lost, blocks, n, 0.0).sum(axis=1)
     counts["imu_gaps"] = int(np.sum(gap > 0.0))
     weight = p.accelerometer.gravity * integrals.dt_s
     falling = np.linalg.norm(integrals.dv, axis=1) < _FALLING * weight
@@ -169,16 +197,16 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     u = model.Block(
         integrals,
         still=still.astype(float),
-        lost_turn=np.minimum(p.update.gap_rate * lost, np.pi),
+        lost_turn=np.minimum(lost_turn, np.pi),
         lost_dv=np.hypot(p.update.gap_accel * lost, fall),
     )
     look = first_look(increments, field, parameters)
     ends = np.minimum((np.arange(blocks) + 1) * n, len(dt))
     return Prepared(
         world=Case(
-            first_belief(look, parameters),
+            first_belief(look, parameters, rest),
             u,
-            *_measurements(integrals, block_field, still, parameters),
+            *_measurements(integrals, block_field, rest, parameters),
             None,
         ),
         begin_s=0.0,
@@ -190,9 +218,6 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         still=still[:whole],
         counts=counts,
     )
-
-
-# -------------------------------------------------------------------------------------- the start
 
 
 def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
@@ -263,44 +288,60 @@ def _turned(theta: np.ndarray) -> SciRotation:
     return SciRotation.concatenate(out)
 
 
-def first_belief(look: FirstLook, parameters: Replay) -> Belief:
-    """The belief at the first sample, uncorrelated."""
+def first_belief(look: FirstLook, parameters: Replay, rest: RestFound | None = None) -> Belief:
+    """The belief at the first sample.
+
+    Only heading and declination are correlated: what the field of the start is turned by against
+    the mean of the places to come, the heading is wrong by.
+
+    Args:
+        look: at the first samples.
+        parameters: of the start and of what was not looked at.
+        rest: where the log begins with rest, the mean rate read is the bias.
+    """
     p = parameters
+    begun = rest is not None and rest.first is not None
     mean = model.MargState(
         q_nb=Rotation(jnp.asarray(look.q_nb)),
         v_n=jnp.zeros(3),
         p_n=jnp.zeros(3),
-        gyro_bias=jnp.zeros(3),
+        gyro_bias=jnp.asarray(rest.first) if begun else jnp.zeros(3),
         gyro_gain=jnp.zeros((3, 3)),
         accel_bias=jnp.zeros(3),
         declination=jnp.zeros(()),
         field=jnp.asarray(look.field_t),
     )
     known = bool(np.any(look.field_t != 0.0))
+    # where north is the field of the start, its declination is none but for a first noise
+    bend = p.magnetometer.declination
+    if not known or p.start.north == "start":
+        bend = bend / (20.0 if look.still else 2.0)
     sigma = [
         [look.tilt_rad, look.tilt_rad, look.heading_rad],
         [p.rest.velocity * 10.0 if look.still else 2.0 * p.travel.velocity] * 3,
         [p.travel.place] * 3,
-        [p.gyro.bias] * 3,
+        [rest.first_sigma if begun else p.gyro.bias] * 3,
         [p.gyro.gain] * 9,
         [p.accelerometer.bias] * 3,
-        # North is the field of the start, so its declination is none but for a first noise.
-        [p.magnetometer.declination / (20.0 if look.still else 2.0)],
+        [bend],
         [p.magnetometer.noise if known else p.magnetometer.most] * 2,
     ]
-    return Belief(mean, jnp.diag(jnp.concatenate([jnp.asarray(s) for s in sigma])))
-
-
-# ----------------------------------------------------------------------------------- measurements
+    factor = np.diag(np.concatenate([np.asarray(s, dtype=float) for s in sigma]))
+    if known and p.start.north == "mean":
+        heading = float(np.hypot(look.heading_rad, bend))
+        factor[model.HEADING, model.HEADING] = heading
+        factor[model.DECLINATION, model.HEADING] = bend**2 / heading
+        factor[model.DECLINATION, model.DECLINATION] = bend * look.heading_rad / heading
+    return Belief(mean, jnp.asarray(factor))
 
 
 def _measurements(
-    integrals: model.Integrals, field_b: np.ndarray, still: np.ndarray, parameters: Replay
+    integrals: model.Integrals, field_b: np.ndarray, rest: RestFound, parameters: Replay
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What is known at the end of each block; NaN where nothing is."""
     p, time = parameters, np.asarray(integrals.dt_s)
     blocks, clock = len(time), np.cumsum(time)
-    still = still & (time > 0.0)
+    still = rest.still & (time > 0.0)
     travel = np.full((blocks, 6), np.nan)
     travel[still, :3] = 0.0
     # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
@@ -311,7 +352,7 @@ def _measurements(
     }
     aux: dict[str, Any] = {
         model.TRAVEL: still.astype(float),
-        model.REST_RATE: _mean_rate(integrals),
+        model.REST_RATE: np.concatenate([_mean_rate(integrals), rest.sigma[:, None]], axis=1),
     }
     if p.use_magnetometer != "never":
         there = np.all(np.isfinite(field_b), axis=1)
@@ -329,6 +370,12 @@ def _mean_rate(integrals: model.Integrals) -> np.ndarray:
     q, dt = np.asarray(integrals.turn), np.asarray(integrals.dt_s)[:, None]
     vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])
     return np.where(dt > 0.0, vector / np.where(dt > 0.0, dt, 1.0), 0.0)
+
+
+def _mean_force(integrals: model.Integrals) -> np.ndarray:
+    """(K, 3) m/s^2, mean specific force of each block."""
+    dt = np.asarray(integrals.dt_s)[:, None]
+    return np.asarray(integrals.dv) / np.where(dt > 0.0, dt, 1.0)
 
 
 def every(clock_s: np.ndarray, able: np.ndarray, interval_s: float) -> np.ndarray:

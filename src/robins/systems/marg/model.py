@@ -7,7 +7,7 @@ With q body to NED, C = C(q), f the specific force, w the rate that is read::
     declination' = -declination / T + white while moving,   0 at rest
 
 A step is a block of samples, integrated beforehand (`Block`); F = exp of the linear form of these
-stands in `advance_linear`, Q in `_sigma`. What is peculiar to it:
+stands in `advance_linear`, Q in `_factor`. What is peculiar to it:
 
 - the accelerometer is integrated, not looked at: it carries the velocity, and gravity shows in that
   a velocity and a place which do not run away leave no room for a tilt error. A swing of the hand
@@ -93,7 +93,7 @@ class Block(NamedTuple):
 
     samples: Integrals
     still: ArrayLike  # () 1 where the unit lies still, else 0
-    lost_turn: ArrayLike  # () rad, spread of what was not sampled
+    lost_turn: ArrayLike  # (3,) rad, spread of what was not sampled, body axes; or () of each
     lost_dv: ArrayLike  # () m/s, the same of the velocity
 
 
@@ -118,7 +118,6 @@ class Seen(NamedTuple):
     velocity: ArrayLike  # m/s, moving
     place: ArrayLike  # m, moving
     velocity_still: ArrayLike  # m/s
-    rate_still: ArrayLike  # rad/s
     field: ArrayLike  # T
 
 
@@ -156,19 +155,21 @@ def advance(noise: Noise, x: MargState, block: Block) -> MargState:
     )
 
 
-def _sigma(noise: Noise, x: MargState, block: Block) -> Array:
+def _factor(noise: Noise, x: MargState, block: Block) -> Array:
+    """(27, 27) of the process noise: diagonal, but that a turn is lost about body axes."""
     dt, moving = jnp.asarray(block.samples.dt_s), 1.0 - jnp.asarray(block.still)
     root = jnp.sqrt(dt)
     kept = persistence(noise, block)
     angle = noise.turn_error * jnp.asarray(block.samples.angle)
     turn = jnp.sqrt((noise.gyro * root) ** 2 + angle**2 + jnp.asarray(block.lost_turn) ** 2)
+    turn = jnp.broadcast_to(turn, (3,))
     push = jnp.sqrt((noise.accel * root) ** 2 + jnp.asarray(block.lost_dv) ** 2)
     walk = jnp.where(moving > 0.0, noise.gyro_bias_moving, noise.gyro_bias_still) * root
     # sqrt(1 - kept^2), with a finite derivative where nothing is lost
     lost = -jnp.expm1(2.0 * jnp.log(kept))
     drift = jnp.where(lost > 0.0, jnp.sqrt(jnp.where(lost > 0.0, lost, 1.0)), 0.0)
     parts = [
-        jnp.broadcast_to(turn, (3,)),
+        jnp.zeros(3),
         jnp.broadcast_to(push, (3,)),
         jnp.zeros(3),
         jnp.broadcast_to(walk, (3,)),
@@ -177,11 +178,11 @@ def _sigma(noise: Noise, x: MargState, block: Block) -> Array:
         (noise.declination * drift)[None],
         jnp.broadcast_to(noise.field * root, (2,)),
     ]
-    return jnp.concatenate(parts)
+    return jnp.diag(jnp.concatenate(parts)).at[0:3, 0:3].set(x.q_nb.as_dcm() * turn[None, :])
 
 
 def advance_linear(noise: Noise, x: MargState, block: Block):
-    """`advance`, its Jacobian (27, 27) between tangent spaces, and the noise (27,)."""
+    """`advance`, its Jacobian (27, 27) between tangent spaces, and the noise factor."""
     dt, dv = jnp.asarray(block.samples.dt_s), jnp.asarray(block.samples.dv)
     rate_map = jnp.concatenate(
         [-jnp.asarray(block.samples.turn_time), jnp.asarray(block.samples.turn_rates)], axis=1
@@ -199,7 +200,7 @@ def advance_linear(noise: Noise, x: MargState, block: Block):
         F = F.at[rows, 21:24].set(share * lean)
     F = F.at[6:9, 3:6].set(dt * jnp.eye(3))
     F = F.at[DECLINATION, DECLINATION].set(persistence(noise, block))
-    return advance(noise, x, block), F, _sigma(noise, x, block)
+    return advance(noise, x, block), F, _factor(noise, x, block)
 
 
 def _read_travel(x: MargState, still: Any):
@@ -216,19 +217,20 @@ def _travel_sigma(seen: Seen, x: MargState, still: Any):
     return jnp.concatenate([jnp.broadcast_to(velocity, (3,)), jnp.broadcast_to(place, (3,))])
 
 
-def _read_rest_rate(x: MargState, rate_b: Any):
+def _read_rest_rate(x: MargState, seen_b: Any):
     """What the unit, lying still, would seem to turn by."""
+    rate_b = seen_b[:3]
     return rate_b + x.gyro_gain @ rate_b - x.gyro_bias
 
 
-def _rest_rate_linear(x: MargState, rate_b: Any):
-    gain = jnp.kron(jnp.eye(3), rate_b[None, :])
+def _rest_rate_linear(x: MargState, seen_b: Any):
+    gain = jnp.kron(jnp.eye(3), seen_b[None, :3])
     H = jnp.zeros((3, DIM)).at[:, 9:12].set(-jnp.eye(3)).at[:, 12:21].set(gain)
-    return _read_rest_rate(x, rate_b), H
+    return _read_rest_rate(x, seen_b), H
 
 
-def _rest_rate_sigma(seen: Seen, x: MargState, rate_b: Any):
-    return jnp.broadcast_to(jnp.asarray(seen.rate_still), (3,))
+def _rest_rate_sigma(x: MargState, seen_b: Any):
+    return jnp.broadcast_to(jnp.asarray(seen_b)[3], (3,))
 
 
 def _level(x: MargState, field_b: Any):
@@ -265,10 +267,10 @@ def model_of(parameters: Replay) -> Model:
 
     Returns:
         A model with sensors, in order: "travel" ((6,) zeros; NaN where nothing is claimed; aux 1
-        at rest, else 0), "rest_rate" ((3,) zeros at rest, else NaN; aux (3,) mean rate read) and,
-        where it is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in body axes
-        [T]). The measurement is zero and the reading what the state makes of aux: the innovation is
-        minus the reading.
+        at rest, else 0), "rest_rate" ((3,) zeros at rest, else NaN; aux (4,) mean rate read and its
+        spread) and, where it is used, "magnetometer" ((`Angle(0)`, (2,) zeros); aux (3,) field in
+        body axes [T]). The measurement is zero and the reading what the state makes of aux: the
+        innovation is minus the reading.
     """
     gyro, accelerometer = parameters.gyro, parameters.accelerometer
     magnetometer, travel, rest = parameters.magnetometer, parameters.travel, parameters.rest
@@ -284,18 +286,18 @@ def model_of(parameters: Replay) -> Model:
         field=magnetometer.field_walk,
         gravity=accelerometer.gravity,
     )
-    seen = Seen(travel.velocity, travel.place, rest.velocity, rest.rate, magnetometer.noise)
+    seen = Seen(travel.velocity, travel.place, rest.velocity, magnetometer.noise)
     noise, seen = jax.tree_util.tree_map(lambda x: jnp.asarray(x, float), (noise, seen))
     sensors = [
         Sensor(_read_travel, Partial(_travel_sigma, seen), 6, TRAVEL, _travel_linear),
-        Sensor(_read_rest_rate, Partial(_rest_rate_sigma, seen), 3, REST_RATE, _rest_rate_linear),
+        Sensor(_read_rest_rate, _rest_rate_sigma, 3, REST_RATE, _rest_rate_linear),
     ]
     if parameters.use_magnetometer != "never":
         sigma = Partial(_magnetometer_sigma, seen)
         sensors.append(Sensor(_read_magnetometer, sigma, 3, MAGNETOMETER, _magnetometer_linear))
     motion = Motion(
         step=Partial(advance, noise),
-        noise=Partial(_sigma, noise),
+        noise=Partial(_factor, noise),
         linear=Partial(advance_linear, noise),
     )
     return Model(motion, tuple(sensors))

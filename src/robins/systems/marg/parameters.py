@@ -25,7 +25,7 @@ class Gyro(Parameters):
     """The gyros: true rate = (I + gain) (what is read) - bias."""
 
     noise: q.AngleWalk = default("0.01 deg/s/sqrt(Hz)")
-    bias: q.RateSize = default("1 deg/s")
+    bias: q.RateSize = default("3 deg/s")
     bias_walk: q.RateWalkSize = default("0.0006 deg/s/sqrt(s)")
     # vibration and warmth of the hand move a bias faster than rest does
     bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
@@ -61,7 +61,7 @@ class Magnetometer(Parameters):
     offset: Field = default("0 uT")
     matrix: Matrix = IDENTITY
     noise: q.FieldStrength = default("2.5 uT")
-    declination: q.Spread = default("6 deg")
+    declination: q.Spread = default("2.5 deg")
     declination_time: q.Duration = default("60 s")
     # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
@@ -80,8 +80,8 @@ class Travel(Parameters):
     speed, and a large place.
     """
 
-    velocity: q.Speed = default("0.5 m/s")
-    place: q.Length = default("0.3 m")
+    velocity: q.Speed = default("1 m/s")
+    place: q.Length = default("0.6 m")
     every: q.Duration = default("1 s")
     weight: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.9999  # Huber's; 1: never less
 
@@ -93,14 +93,15 @@ class Rest(Parameters):
     after: q.Duration = default("1.5 s")
     quiet_rate: q.AngleRate = default("2 deg/s")
     quiet_accel: q.Acceleration = default("0.5 m/s^2")
-    most_rate: q.AngleRate = default("4 deg/s")  # a mean rate above this is no bias but a turn
+    # a mean rate further than this from the bias that rest has shown last is no bias but a turn,
+    most_rate: q.AngleRate = default("4 deg/s")
+    # unless the log begins with it or it lasts, and then up to
+    new_bias: q.Duration = default("5 s")
+    most_bias: q.AngleRate = default("10 deg/s")
+    # share of the field, which turns with the Earth where the unit turns
+    quiet_field: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.05
     rate: q.AngleRate = default("0.03 deg/s")
     velocity: q.Speed = default("0.01 m/s")
-
-    @property
-    def quiet(self) -> tuple[float, float, float, float]:
-        """Thresholds of `robins.ins.rest.still_samples`: s, rad/s, m/s^2, rad/s."""
-        return self.after, self.quiet_rate, self.quiet_accel, self.most_rate
 
 
 class Start(Parameters):
@@ -112,6 +113,21 @@ class Start(Parameters):
     heading: q.Spread = default("1 deg")
     tilt_moving: q.Spread = default("5 deg")
     heading_moving: q.Spread = default("30 deg")
+    # north is the field where the log begins, or its mean over the places where the unit will be:
+    # then the heading of the start is no better than the declination there
+    north: Literal["start", "mean"] = "start"
+
+
+class Stated(Parameters):
+    """What no state carries and the stated standard deviations of attitude must hold.
+
+    Axes of a housing, gyros that do not respond at once, and stamps that are late cannot be told
+    from attitude. They do not average out, so they are added to what is stated, not to a noise.
+    """
+
+    tilt: q.Spread = default("0.3 deg")
+    heading: q.Spread = default("1 deg")
+    delay: q.Time = default("0.002 s")
 
 
 class Update(Parameters):
@@ -139,5 +155,6 @@ class Replay(Parameters):
     travel: Travel = pydantic.Field(default_factory=Travel)
     rest: Rest = pydantic.Field(default_factory=Rest)
     start: Start = pydantic.Field(default_factory=Start)
+    stated: Stated = pydantic.Field(default_factory=Stated)
     update: Update = pydantic.Field(default_factory=Update)
     filters: Names = ("marg", "marg-smoothed")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 
 from robins import linalg, rotation
 from robins.dataset import AttitudeTable, Dataset
+from robins.earth.magnetic import MagneticModelError, decimal_year, elements, field_n, wmm_for
 from robins.filters import Belief, Code, Filter, kalman, rules
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -22,7 +24,7 @@ from robins.filters.trees import select
 from robins.ins.frames import to_ned_frd
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.systems import replaying
-from robins.systems.marg import model
+from robins.systems.marg import model, monitor
 from robins.systems.marg.log import Prepared, prepare
 from robins.systems.marg.parameters import Replay
 from robins.systems.replaying import Answer, Reported
@@ -185,10 +187,21 @@ def replay(
     believed = Contender(filter_of(parameters), model.model_of(parameters))
     wanted = filters or parameters.filters
     contenders, smoothers = {CAUSAL: believed}, {SMOOTHED: CAUSAL}
-    answers = replaying.navigated([log], wanted, contenders.__getitem__, smoothers, progress)
+    # the run that is smoothed is told too: its innovations are what the smoother can be doubted by
+    told = tuple(dict.fromkeys([*wanted, CAUSAL]))
+    answers = replaying.navigated([log], told, contenders.__getitem__, smoothers, progress)
+    seen = _without_padding(log, answers[CAUSAL], parameters).updates
+    answers = {name: answers[name] for name in wanted}
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
-    answers = {name: _without_padding(log, answer) for name, answer in answers.items()}
-    variables, errors = _variables(log, answers) | _attitudes(log, q_nb), {}
+    answers = {name: _without_padding(log, a, parameters) for name, a in answers.items()}
+    north = None if parameters.use_magnetometer == "never" else true_north(dataset)
+    if north is not None:
+        q_nb = {name: _turned_north(q, north) for name, q in q_nb.items()}
+        answers = {name: _turned_answer(answer, north) for name, answer in answers.items()}
+    doubt = {
+        name: monitor.doubts_of(answer.mean, seen, parameters) for name, answer in answers.items()
+    }
+    variables, errors = _variables(log, answers, doubt) | _attitudes(log, q_nb), {}
     if dataset.attitude is not None:
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
@@ -207,9 +220,18 @@ def replay(
     notes = _sentences(log, answers)
     if dataset.mag is None:
         notes.append("There is no magnetometer in this log: the heading is that of the gyros.")
+    if north is not None:
+        notes.append(
+            f"North is true north: the field of the Earth is turned by {math.degrees(north):.1f} "
+            "deg at the first fix (World Magnetic Model)."
+        )
+    lasted = np.asarray(log.world.u.samples.dt_s)[: len(log.rows)]
+    warned = monitor.of_samples(log.counts, len(log.time_ns))
+    for name, answer in answers.items():
+        warned += monitor.sentences(name, doubt[name], answer.mean, lasted)
     predictions = next(iter(answers.values())).tally.counts()
     lost = sum(number for code, number in predictions.items() if code != Code.DONE)
-    return replaying.outcome(
+    outcome = replaying.outcome(
         log.epoch_s[: len(log.rows)],
         answers,
         REPORTED,
@@ -219,6 +241,43 @@ def replay(
         notes=notes,
         origin_ns=int(log.time_ns[0]),
     )
+    return replace(outcome, warnings=[*warned, *outcome.warnings])
+
+
+def true_north(dataset: Dataset) -> float | None:
+    """Declination [rad] of the Earth's field by the WMM at the first fix; None where none is.
+
+    None too where the log has no date: a stamp that counts from the start of a recording is
+    outside the life of every model.
+    """
+    gnss = dataset.gnss
+    if gnss is None or dataset.mag is None:
+        return None
+    place = np.stack([gnss.lat_rad, gnss.lon_rad, gnss.alt_m], axis=1)
+    known = np.flatnonzero(np.all(np.isfinite(place), axis=1))
+    if not known.size:
+        return None
+    lat, lon, height = place[known[0]]
+    try:
+        year = decimal_year(np.datetime64(int(gnss.time_ns[known[0]]), "ns"))
+        field = field_n(wmm_for(year), lat, lon, height, year)
+    except MagneticModelError:
+        return None
+    return float(elements(field).declination_rad)
+
+
+def _turned_north(q_nb: np.ndarray, declination: float) -> np.ndarray:
+    """Attitudes counted from the north of the field, counted from true north."""
+    turn = np.array([math.cos(declination / 2.0), 0.0, 0.0, math.sin(declination / 2.0)])
+    return np.asarray(rotation.multiply(turn, q_nb))
+
+
+def _turned_answer(answer: Answer, declination: float) -> Answer:
+    turn = rotation.from_rotvec(jnp.array([0.0, 0.0, declination]))
+    mean = answer.mean
+    q_nb = mean.q_nb.__class__(jnp.asarray(_turned_north(mean.q_nb.wxyz, declination)))
+    turned = [np.asarray(rotation.rotate(turn, jnp.asarray(v))) for v in (mean.v_n, mean.p_n)]
+    return answer._replace(mean=mean._replace(q_nb=q_nb, v_n=turned[0], p_n=turned[1]))
 
 
 def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
@@ -234,11 +293,16 @@ def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
     return np.concatenate([np.asarray(first)[None], rows])
 
 
-def _without_padding(log: Prepared, answer: Answer) -> Answer:
-    """The answer at the blocks that are not padding, as NumPy."""
+def _without_padding(log: Prepared, answer: Answer, parameters: Replay) -> Answer:
+    """The answer at the blocks that are not padding, as NumPy; attitude as sure as is stated."""
     mean, sigma, seen = jax.tree_util.tree_map(
         lambda x: np.asarray(x)[: len(log.rows)], (answer.mean, answer.sigma, answer.updates)
     )
+    stated, samples = parameters.stated, log.world.u.samples
+    turned, lasted = (np.asarray(a)[: len(log.rows)] for a in (samples.angle, samples.dt_s))
+    late = stated.delay * turned / lasted
+    floor = np.stack([np.hypot(x, late) for x in [stated.tilt] * 2 + [stated.heading]], axis=1)
+    sigma = np.concatenate([np.hypot(sigma[:, :3], floor), sigma[:, 3:]], axis=1)
     return answer._replace(mean=mean, sigma=sigma, updates=seen)
 
 
@@ -254,7 +318,7 @@ REPORTED = Reported(
     causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
     "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
     "small.",
-    assumed=(model.TRAVEL, model.REST_RATE),
+    assumed=(model.TRAVEL, model.REST_RATE, model.MAGNETOMETER),
     euler=EULER._replace(frame="body to NED"),
 )
 
@@ -300,9 +364,19 @@ def _refused(log: Prepared, answer: Answer) -> np.ndarray:
     return none if update is None else update.code == int(Code.REFUSED)
 
 
-def _variables(log: Prepared, answers: Mapping[str, Answer]) -> dict[str, Any]:
+def _variables(
+    log: Prepared, answers: Mapping[str, Answer], doubt: Mapping[str, monitor.Doubt]
+) -> dict[str, Any]:
     still = log.still.astype(np.int8)
     data = array("context", still, "rest", unit="1", long_name="unit lies still")
+    data |= array(
+        "context",
+        np.stack([doubt[name].any.astype(np.int8) for name in answers]),
+        "doubtful",
+        unit="1",
+        long_name="states or innovations beyond what was assumed",
+        dims="filter time",
+    )
     return data | array(
         "context",
         np.stack([_refused(log, answer).astype(np.int8) for answer in answers.values()]),
@@ -329,7 +403,8 @@ def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
         log.look.sentence,
         f"At rest for {100.0 * float(np.mean(log.still)):.0f} % of the log; "
         f"{c['imu_missing']} inertial samples missing, {c['imu_saturated']} at the end of their "
-        f"range, {c['imu_gaps']} gaps; {c['field_missing']} field readings missing, "
+        f"range ({c['imu_bridged']} put back from their flanks), {c['imu_gaps']} gaps; "
+        f"{c['field_missing']} field readings missing, "
         f"{c['field_implausible']} no field of the Earth; {c['blocks_in_free_fall']} blocks in "
         f"free fall.",
     ]

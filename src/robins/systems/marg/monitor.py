@@ -1,0 +1,144 @@
+"""What a replay says against itself: states and innovations that its own assumptions forbid.
+
+A filter whose model is wrong goes on with a small sigma. Its states show it: a declination that the
+field of no room has, gains that no gyro is sold with, and a velocity or place that must be refused
+again and again, which is a tilt that does not fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from robins.filters import Code
+from robins.systems.marg.model import MAGNETOMETER, TRAVEL, MargState
+from robins.systems.marg.parameters import Replay
+from robins.systems.tables import Update
+
+_SIGMAS = 3.0
+_LOOKS = 20  # of travel, in the mean of its NIS
+_NIS = 1.5  # of a degree of freedom, in that mean
+_LASTING_S = 5.0
+_GAP_SHARE = 0.002  # of samples at the end of their range that nothing could be put back for
+
+
+class Doubt(NamedTuple):
+    """Of B blocks."""
+
+    declination: np.ndarray  # (B,) bool
+    gain: np.ndarray  # (B,) bool
+    tilt: np.ndarray  # (B,) bool
+    refused: np.ndarray  # (B,) bool
+
+    @property
+    def any(self) -> np.ndarray:
+        """(B,) bool: some doubt."""
+        return self.declination | self.gain | self.tilt | self.refused
+
+
+def doubts_of(mean: MargState, updates: Mapping[str, Update], parameters: Replay) -> Doubt:
+    """Where the states of a filter or a smoother, or its innovations, contradict the parameters.
+
+    - declination: further from zero than three of its standard deviations;
+    - gain: one of nine beyond three standard deviations;
+    - tilt: the NIS of velocity and place, in the mean over the last 20 looks, above 1.5;
+    - refused: the magnetometer at ten looks in a row or more.
+
+    Args:
+        mean: leading axis B.
+        updates: by sensor, of the filter or of the run that was smoothed.
+        parameters: what was assumed.
+    """
+    declination = np.abs(np.asarray(mean.declination))
+    gain = np.max(np.abs(np.asarray(mean.gyro_gain).reshape(len(declination), -1)), axis=1)
+    none = np.zeros(len(declination), dtype=bool)
+    tilt, refused = none, none
+    if TRAVEL in updates:
+        tilt = _too_large(updates[TRAVEL])
+    if MAGNETOMETER in updates:
+        refused = _in_a_row(updates[MAGNETOMETER], 10)
+    return Doubt(
+        declination > _SIGMAS * parameters.magnetometer.declination,
+        gain > _SIGMAS * parameters.gyro.gain,
+        tilt,
+        refused,
+    )
+
+
+def _too_large(update: Update) -> np.ndarray:
+    nis, dof = np.asarray(update.nis), np.asarray(update.dof)
+    looks = np.flatnonzero(dof == np.max(dof, initial=0))
+    out = np.zeros(len(nis), dtype=bool)
+    if len(looks) < _LOOKS or dof[looks[0]] == 0:
+        return out
+    sums = np.cumsum(np.concatenate([[0.0], nis[looks] / dof[looks]]))
+    over = (sums[_LOOKS:] - sums[:-_LOOKS]) / _LOOKS > _NIS
+    for last in np.flatnonzero(over) + _LOOKS - 1:
+        out[looks[last - _LOOKS + 1] : looks[last] + 1] = True
+    return out
+
+
+def _in_a_row(update: Update, least: int) -> np.ndarray:
+    code, dof = np.asarray(update.code), np.asarray(update.dof)
+    refused = code == int(Code.REFUSED)
+    out, run = np.zeros(len(code), dtype=bool), []
+    for k in np.flatnonzero(refused | (dof > 0)):
+        run = [*run, k] if refused[k] else []
+        if len(run) >= least:
+            out[run[0] : k + 1] = True
+    return out
+
+
+def sentences(name: str, doubt: Doubt, mean: MargState, dt_s: np.ndarray) -> list[str]:
+    """Warnings of a filter: what was doubtful for more than 5 s, and what follows.
+
+    Args:
+        name: of the filter.
+        doubt: of its states.
+        mean: leading axis B.
+        dt_s: (B,) lengths of the blocks.
+    """
+    out = []
+    most = float(np.degrees(np.max(np.abs(np.asarray(mean.declination)), initial=0.0)))
+    largest = 100.0 * float(np.max(np.abs(np.asarray(mean.gyro_gain)), initial=0.0))
+    for where, what in (
+        (
+            doubt.declination,
+            f"the field is turned by up to {most:.0f} deg against its mean, beyond three of its "
+            "standard deviations (magnetometer.declination): either the field here bends that "
+            "much, or the heading is wrong by as much",
+        ),
+        (
+            doubt.gain,
+            f"a gain of the gyros is {largest:.1f} %, beyond three of its standard deviations "
+            "(gyro.gain): the gyros are worse than was said, or the gains take up another error, "
+            "and the heading with them",
+        ),
+        (
+            doubt.tilt,
+            "velocity and place do not stay as small as was said (travel.velocity, travel.place), "
+            "or the tilt is wrong: its stated sigma is too small",
+        ),
+        (
+            doubt.refused,
+            "the field was refused ten times in a row or more: the heading came from the gyros "
+            "alone, and may be off by more than is stated",
+        ),
+    ):
+        seconds = float(np.sum(np.asarray(dt_s)[where]))
+        if seconds > _LASTING_S:
+            out.append(f"{name}: for {seconds:.0f} s {what}.")
+    return out
+
+
+def of_samples(counts: Mapping[str, int], samples: int) -> list[str]:
+    """A warning where gyros or accelerometers were at the end of their range too often."""
+    lost = counts["imu_saturated"] - counts["imu_bridged"]
+    if lost <= _GAP_SHARE * samples:
+        return []
+    return [
+        f"{lost} samples are at the end of their range and could not be put back: the attitude may "
+        "be off by more than is stated after them."
+    ]

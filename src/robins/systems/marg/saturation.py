@@ -1,0 +1,97 @@
+"""Gyros at the end of their range: found where nobody told the range, and bridged.
+
+A signal that is cut off jumps to a level, stays, and leaves it by a jump. A smooth peak that fills
+two samples within 0.5 % of its height has its next sample within 4.5 % of it (of a sine: half an
+interval is at most 0.1 rad, and cos 0.3 is 0.955); so a level that is reached or left by a jump of
+more, twice, is the end of the range.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+_LEVEL = 0.005  # share of the level that its samples lie within
+_JUMP = 0.05  # share of the level, more than a smooth peak can fall by
+_LEAST_RATE = 1.0  # rad/s; no gyro ends below
+_OFTEN = 2  # jumps to or from the level
+_LONGEST_S = 0.2  # s, of a peak that is bridged
+_MISSED = 0.3  # of what a bridge adds: the share that it may err by
+
+
+class Bridged(NamedTuple):
+    """Rates with their peaks put back."""
+
+    rate: np.ndarray  # (N, 3) rad/s
+    full: np.ndarray  # (N, 3) bool, at the end of the range
+    doubt: np.ndarray  # (N, 3) rad/s, standard deviation of what was put back; NaN where nothing
+
+
+def levels(rate: np.ndarray) -> np.ndarray:
+    """(3, 2) rad/s: largest negative and positive rate that an axis can read; infinite where
+    none shows.
+
+    Args:
+        rate: (N, 3) rad/s.
+    """
+    out = np.full((3, 2), np.inf)
+    for axis in range(3):
+        for side, sign in enumerate((-1.0, 1.0)):
+            x = sign * rate[:, axis]
+            top = float(np.max(x, initial=0.0))
+            if top < _LEAST_RATE:
+                continue
+            at = x > (1.0 - _LEVEL) * top
+            pair = at[1:-2] & at[2:-1]
+            low = (1.0 - _JUMP) * top
+            jumps = np.sum(pair & (x[:-3] < low)) + np.sum(pair & (x[3:] < low))
+            if jumps >= _OFTEN:
+                out[axis, side] = (1.0 - _LEVEL) * top
+    return out
+
+
+def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
+    """Put back the peaks that the range cut off.
+
+    A peak is the cubic that leaves the last good sample and meets the next good one with the slopes
+    of its flanks. A longer one is left at its level.
+
+    Args:
+        time_s: (N,).
+        rate: (N, 3) rad/s.
+        most: rad/s, the end of the range where it is told.
+    """
+    limit = np.minimum(levels(rate), 0.99 * most)
+    full = (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
+    out, doubt = rate.copy(), np.full(rate.shape, np.nan)
+    for axis in range(3):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], full[:, axis], [False]])))
+        for begin, end in edges.reshape(-1, 2):
+            if begin < 3 or end + 3 > len(rate) or np.any(full[begin - 3 : begin, axis]):
+                continue
+            if np.any(full[end : end + 3, axis]):
+                continue
+            t0, t1 = time_s[begin - 1], time_s[end]
+            if t1 - t0 > _LONGEST_S:
+                continue
+            x, sign = rate[:, axis], np.sign(rate[begin, axis])
+            rise = _slope(time_s[begin - 3 : begin], x[begin - 3 : begin])
+            fall = _slope(time_s[end : end + 3][::-1], x[end : end + 3][::-1])
+            h, u = t1 - t0, (time_s[begin:end] - t0) / (t1 - t0)
+            cubic = (
+                (2.0 * u**3 - 3.0 * u**2 + 1.0) * x[begin - 1]
+                + (3.0 * u**2 - 2.0 * u**3) * x[end]
+                + (u**3 - 2.0 * u**2 + u) * h * rise
+                + (u**3 - u**2) * h * fall
+            )
+            added = np.maximum(sign * (cubic - x[begin:end]), 0.0)
+            out[begin:end, axis] += sign * added
+            doubt[begin:end, axis] = _MISSED * added
+    return Bridged(out, full, doubt)
+
+
+def _slope(t: np.ndarray, x: np.ndarray) -> float:
+    """Slope at the last of three samples, of the parabola through them."""
+    late, early = (x[2] - x[1]) / (t[2] - t[1]), (x[1] - x[0]) / (t[1] - t[0])
+    return float(late + (late - early) * (t[2] - t[1]) / (t[2] - t[0]))

@@ -1,0 +1,56 @@
+"""The end of a gyro's range, found and bridged: against peaks that are known."""
+
+import numpy as np
+import pytest
+
+from robins.systems.marg.saturation import bridged, levels
+
+TIME = np.arange(3000) / 100.0
+
+
+def shakes(hertz=4.0, size=10.0, seed=0):
+    """(N, 3) rad/s: shaking about x whose strength swells, small motion about the others."""
+    rng = np.random.default_rng(seed)
+    swell = 0.6 + 0.4 * np.sin(2.0 * np.pi * 0.13 * TIME)
+    out = 0.2 * rng.standard_normal((len(TIME), 3))
+    out[:, 0] = size * swell * np.sin(2.0 * np.pi * hertz * TIME)
+    return out
+
+
+def test_a_range_that_cuts_is_found_on_its_axis_and_no_other():
+    cut = np.clip(shakes(), -7.37, 7.25)
+    cut[:, 0] += 0.005 * np.random.default_rng(1).standard_normal(len(TIME))
+    found = levels(cut)
+    np.testing.assert_allclose(found[0], [7.37, 7.25], rtol=0.01)
+    assert np.all(np.isinf(found[1:]))
+
+
+@pytest.mark.parametrize("hertz", [0.2, 1.0, 2.3, 5.0, 11.0])
+def test_no_smooth_motion_has_a_range(hertz):
+    """Sines of one height, whose peaks all fill the same level."""
+    rate = np.stack([9.0 * np.sin(2.0 * np.pi * hertz * TIME + p) for p in (0.0, 0.3, 1.0)], axis=1)
+    assert np.all(np.isinf(levels(rate)))
+
+
+def test_peaks_are_put_back_to_within_what_is_stated():
+    true = shakes(hertz=3.0)
+    cut = np.clip(true, -7.3, 7.3)
+    found = bridged(TIME, cut, np.inf)
+    assert found.full[:, 0].sum() > 100
+    assert not found.full[:, 1:].any()
+    there = np.isfinite(found.doubt[:, 0])
+    assert there.sum() > 0.9 * found.full[:, 0].sum()
+    lost, left = (np.abs(a - true)[there, 0].sum() for a in (cut, found.rate))
+    assert left < 0.25 * lost
+    # areas of peaks, which is what turns the unit, against the stated spread
+    assert np.mean(np.abs(found.rate - true)[there, 0] < 3.0 * found.doubt[there, 0]) > 0.9
+    np.testing.assert_array_equal(found.rate[~found.full], cut[~found.full])
+
+
+def test_a_range_that_is_told_is_used_and_a_long_stay_is_not_bridged():
+    rate = np.zeros((500, 3))
+    rate[100:300, 2] = 34.9
+    found = bridged(TIME[:500], rate, 34.9)
+    assert found.full[:, 2].sum() == 200
+    assert np.isnan(found.doubt).all()
+    np.testing.assert_array_equal(found.rate, rate)
