@@ -1,4 +1,4 @@
-"""Orientation on BROAD, trial by trial, beside VQF: the tables of the page on MARG.
+"""Orientation on BROAD beside VQF, trial by trial, as they are and changed on purpose.
 
     python docs/studies/marg_broad.py [FOLDER] [--made]
 
