@@ -6,8 +6,10 @@ is too long to bridge ends a piece of the log; the next piece is aligned anew.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,19 +20,22 @@ import numpy as np
 from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.earth import Geodetic, gravity
-from robins.filters import Belief
+from robins.errors import require_known
+from robins.filters import Belief, StepWarning, run
 from robins.ins.alignment import level
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav
-from robins.ins.rest import moving_statistics, standstill
+from robins.ins.rest import confirmed, moving_statistics, standstill, unrest
 from robins.ins.state import InsState
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay, Start
+from robins.systems.ins_gnss.robust import robust, supposing_mean, weighed
+from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
 from robins.systems.replaying import Piece, Reported
@@ -43,6 +48,11 @@ CAUSES = (
     "mean over the receiver's interval, or a vehicle that was taken for still; `robins doctor` "
     "tells some of them."
 )
+ROBUST, WEIGHED = "robust", "weighed"
+SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
+NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
+"""Filters and smoothers of recorded logs; the first is what a log gets that nobody tuned it for."""
+
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
@@ -188,7 +198,7 @@ def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
                 f"start.known_heading"
             )
         fast = usable[0]
-    still, mean_rate = standstill(log.increments, *aids.quiet)
+    still, mean_rate = _at_rest(log, aids)
     width = max(2, round(2.0 * aids.window / float(np.median(dt))))
     mean_force, spread = moving_statistics(dv / dt[:, None], width)
     last = len(dt) - 1 if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
@@ -284,7 +294,7 @@ def _belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
 
 
 def _fixes(
-    log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float
+    log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """GNSS measurements by epoch; NaN where there is no fix or it is withheld."""
     given, g = used & ~log.withheld, log.gnss
@@ -298,17 +308,50 @@ def _fixes(
     y: dict[str, Any] = {model.POSITION: Geodetic(*map(sorted_in, (g.lat_rad, g.lon_rad, g.alt_m)))}
     aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m, 1.0), rate)}
     if log.v_n is not None and log.sigma_v is not None:
+        if window_s is None:
+            window_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 0.0
         gained = gained_in_window(log.increments, log.time_s, epochs, window_s)
         y[model.VELOCITY] = sorted_in(log.v_n)
         aux[model.VELOCITY] = model.Velocity(sorted_in(log.sigma_v, 1.0), rate, *gained)
     return y, aux
 
 
+def _at_rest(log: Log, aids: Aids) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) whether the vehicle stands still at each increment, by samples and fixes; mean rate."""
+    still, mean_rate = standstill(log.increments, *aids.quiet)
+    fix_s, moves = _moving_fixes(log, aids.moving_speed)
+    wait_s = 1.5 * max(1.0, float(np.median(np.diff(fix_s)))) if len(fix_s) > 1 else 1.5
+    quiet = unrest(log.increments, *aids.quiet)
+    return confirmed(still, quiet, log.time_s, fix_s, moves, wait_s), mean_rate
+
+
+def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the fixes that tell whether the vehicle moves, and what they tell.
+
+    By the velocity, or by the way since the fix a second before where the receiver gives none.
+    """
+    g, given = log.gnss, ~log.withheld
+    if g.v_n is not None and g.sigma_v is not None:
+        size = np.hypot(g.v_n[:, 0], g.v_n[:, 1])
+        noise = np.max(g.sigma_v[:, :2], axis=1)
+        known = given & np.isfinite(size)
+        return log.gnss_s[known], size[known] > np.maximum(speed, 4.0 * noise[known])
+    known = given & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
+    time_s, noise = log.gnss_s[known], np.max(g.sigma_m[known, :2], axis=1)
+    before = np.maximum(np.searchsorted(time_s, time_s - 1.0 + 1e-6, side="right") - 1, 0)
+    place = Geodetic(*map(jnp.asarray, (g.lat_rad[known], g.lon_rad[known], 0.0 * time_s)))
+    there = Geodetic(place.lat[before], place.lon[before], place.alt[before])
+    way = np.hypot(*np.asarray(there.local(place)).T[:2]) if len(time_s) else np.zeros(0)
+    limit = np.maximum(speed * (time_s - time_s[before]), 4.0 * np.hypot(noise, noise[before]))
+    told = time_s[before] < time_s
+    return time_s[told], way[told] > limit[told]
+
+
 def _known(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    still, mean_rate = standstill(log.increments, *aids.quiet)
+    still, mean_rate = _at_rest(log, aids)
     last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
     at_rest = still[last][:, None]
     y: dict[str, Any] = {}
@@ -323,10 +366,81 @@ def _known(
 # ---------------------------------------------------------------------------------------- replay
 
 
-def contender(parameters: Replay, name: str) -> Contender:
+class Unsaid(NamedTuple):
+    """What a log says of its receiver that its configuration does not."""
+
+    patience: int  # positions in a row, `find_back`
+    mean: float  # 1 where velocities are means over the window, 0 where they are of the fix
+
+
+def contender(parameters: Replay, unsaid: Unsaid, name: str) -> Contender:
     """A filter with the model it believes in."""
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
-    return Contender(make_filter(name, parameters.update.gate), believed)
+    asked = parameters.gnss.velocity_window is None
+    if name == ROBUST:
+        return Contender(robust(believed, asked, unsaid.patience), believed)
+    if name == WEIGHED:
+        return Contender(weighed(unsaid.patience), supposing_mean(believed, unsaid.mean))
+    told = supposing_mean(believed, 0.0) if asked else believed
+    return Contender(make_filter(name, parameters.update.gate), told)
+
+
+def _unsaid(
+    log: Log, pieces: Sequence[Stretch], parameters: Replay, wanted: Sequence[str]
+) -> tuple[Unsaid, list[str]]:
+    """What the log says, and a sentence for the reader where a smoother needed to know it.
+
+    Whether velocities are means over the time since the last fix is decided by the likelihood of
+    the whole log; a causal filter has that as a hypothesis of its own.
+    """
+    step = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
+    unsaid = Unsaid(max(2, math.ceil(parameters.update.patience / max(step, 1e-3))), 1.0)
+    smooths = any(SMOOTHED.get(name) == WEIGHED for name in wanted)
+    if parameters.gnss.velocity_window is not None or log.v_n is None or not smooths:
+        return unsaid, []
+    likely = [_likelihood(pieces, parameters, unsaid._replace(mean=f)) for f in (0.0, 1.0)]
+    means = likely[1] > likely[0]
+    what = f"means over the {step:.3g} s since the last fix" if means else "those of the fix"
+    sentence = (
+        f"For the smoother the velocities are taken as {what}, which makes the log-likelihood "
+        f"higher by {abs(likely[1] - likely[0]):.0f}."
+    )
+    return unsaid._replace(mean=float(means)), [sentence]
+
+
+def _likelihood(pieces: Sequence[Stretch], parameters: Replay, unsaid: Unsaid) -> float:
+    total = 0.0
+    for piece in pieces:
+        one = contender(parameters, unsaid, WEIGHED)
+        case = one.case(piece.world)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", StepWarning)
+            found = run(
+                one.filter, one.model, case.start, case.y, case.u, case.aux, keep=replaying.kept
+            )
+        total += float(found.log_likelihood)
+    return total
+
+
+def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
+    """The samples along the vehicle's axes, unless the log was loaded with a mounting.
+
+    Args:
+        dataset: a log.
+        orientation: roll, pitch, yaw [rad] of forward-right-down as seen from the sensor.
+    """
+    if dataset.mounted or not any(orientation):
+        return dataset
+    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*orientation))).T
+    whole = np.round(C_bs)  # right angles exchange axes and mix nothing
+    C_bs = np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
+    imu = to_ned_frd(dataset.imu)
+    imu = replace(imu, gyro=imu.gyro @ C_bs.T, accel=imu.accel @ C_bs.T)
+    mag = dataset.mag
+    if mag is not None:
+        mag = to_ned_frd(mag)
+        mag = replace(mag, field_t=mag.field_t @ C_bs.T)
+    return replace(dataset, imu=imu, mag=mag, mounted=True)
 
 
 def replay(
@@ -338,16 +452,17 @@ def replay(
     """Navigate a log with the filters named and say how good they are.
 
     Args:
-        dataset: IMU and GNSS of a log, examined and cleaned (`robins.logs`).
-        parameters: what the files do not say.
-        filters: names such as "ekf", "ukf", "ekf+rts"; by default those of the parameters.
+        dataset: IMU and GNSS of a log, examined and cleaned (`robins.logs`). Samples that were
+            loaded without a mounting are turned as the parameters say.
+        parameters: what the files do not say; `Replay()` is what the command takes without a file.
+        filters: names such as "robust", "ukf", "ekf+rts"; by default those of the parameters.
         progress: called with the share done and what is being done.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
     parameters = with_lever_arm(parameters, dataset.lever_arm_b_m)
-    log = on_one_clock(dataset, parameters)
+    log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
     pieces, problems = replaying.prepared(
         log.time_s,
         log.increments.dt,
@@ -355,8 +470,11 @@ def replay(
         partial(prepare, log, parameters),
     )
     wanted = filters or parameters.filters
+    for name in wanted:
+        require_known("filter", name, NAMES, "this system")
+    unsaid, found = _unsaid(log, pieces, parameters, wanted)
     answers = replaying.navigated(
-        pieces, wanted, partial(contender, parameters), SMOOTHERS, progress
+        pieces, wanted, partial(contender, parameters, unsaid), SMOOTHED, progress
     )
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
@@ -380,6 +498,7 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
+        + found
         + [f"Not navigated, {problem}." for problem in problems],
     )
 

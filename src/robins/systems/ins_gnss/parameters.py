@@ -50,8 +50,9 @@ class Gnss(Parameters):
     lever_arm: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
     latency: Annotated[float, Quantity("time", least="-10 s", most="10 s")] = default("0 s")
     use_velocity: bool = True
-    # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix
-    velocity_window: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix; not
+    # given: `robust` finds out, the others take it for 0
+    velocity_window: Annotated[float, Quantity("time", least="0 s")] | None = None
     # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
@@ -82,6 +83,8 @@ class Aids(Parameters):
     window: Duration = default("0.5 s")
     quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.15 m/s^2")
     quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.5 deg/s")
+    # a fix that is faster, and by four of its sigmas faster than nothing, says that it moves
+    moving_speed: Speed = default("0.2 m/s")
     non_holonomic: bool = False
     # IMU to rear axle, body
     axle: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
@@ -122,25 +125,59 @@ class Update(Parameters):
     """How the filter steps."""
 
     longest_block: Duration = default("0.25 s")
-    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
+    # of the other filters than `robust`; 0: no gate
+    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999
+    # `robust` follows positions that stay away for longer than this
+    patience: Duration = default("10 s")
     # an IMU gap longer than this is declared instead of bridged
     longest_gap: Duration = default("1 s")
     # process noise factor across one
     gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
+class Unit(Imu):
+    """A unit of which nothing is told: a consumer-grade MEMS."""
+
+    gyro_noise: Annotated[Three, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
+        "0.01 deg/s/sqrt(Hz)"
+    )
+    accel_noise: Annotated[Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")] = (
+        default("200 ug/sqrt(Hz)")
+    )
+    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")] = default("0.5 deg/s")
+    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")] = default("20 mg")
+    gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")] = (
+        default("0.002 deg/s/sqrt(s)")
+    )
+    accel_bias_walk: Annotated[
+        Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")
+    ] = default("20 ug/sqrt(s)")
+
+
+class Rover(Gnss):
+    """A receiver of which nothing is told."""
+
+    sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=lambda: {"2": 3.0, "5": 3.0})
+
+
+class FirstLook(Start):
+    """A start of which nothing is told."""
+
+    tilt: Spread = default("3 deg")
+
+
 class Replay(Parameters):
-    """A recorded log: what cannot be read from the files themselves."""
+    """A recorded log: what cannot be read from the files themselves; each part may be left out."""
 
     system: Literal["ins-gnss"] = "ins-gnss"
-    title: str = "INS/GNSS replay"
-    imu: Imu
-    gnss: Gnss = pydantic.Field(default_factory=Gnss)
-    start: Start = pydantic.Field(default_factory=Start)
+    title: str = "INS/GNSS replay, consumer MEMS"
+    imu: Unit = pydantic.Field(default_factory=Unit)
+    gnss: Rover = pydantic.Field(default_factory=Rover)
+    start: FirstLook = pydantic.Field(default_factory=FirstLook)
     aids: Aids = pydantic.Field(default_factory=Aids)
     update: Update = pydantic.Field(default_factory=Update)
     outages: Outages | None = None
-    filters: Names = ("ekf",)
+    filters: Names = ("robust", "robust+rts")
 
     def withheld(self, time_s: np.ndarray, fix_s: np.ndarray) -> np.ndarray:
         """Which times (N,) lie in an outage, of a log with fixes at some times (M,)."""
