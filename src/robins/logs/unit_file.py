@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from robins import rotation
@@ -18,7 +19,7 @@ from robins.logs.gnss_motion import lateness, track_of
 from robins.logs.motion import travel_in_body, unexplained_but_for_biases
 from robins.logs.quiet import signal_of, windows_of
 
-_STRAIGHT = 0.9  # mean of the directions of travel, below which there is no forward
+_STRAIGHT = 0.85  # mean of the directions of travel, below which there is no forward
 _LEAST = 20  # directions of travel
 _RIGHT_DEG = 3.0  # angles this near to right angles are right angles
 _RESTS = 5  # pairs of seconds at rest, for the noise
@@ -53,6 +54,7 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
     if pair is None:
         return Found(**_noise(imu, gnss, None))
     late, lag = lateness(track), small_offset(pair)
+    shift = np.array([lag or 0.0])
     window = 2.0 * late if late is not None and late > _LATE_S else None
     if window is not None and abs(window - epoch) < 0.4 * epoch:
         window = epoch
@@ -63,9 +65,8 @@ def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
     plain = pair_in_time(imu, gnss, signal, track, late_s=0.0)
     left = None
     if plain is not None:
-        shifts = np.array([lag or 0.0])
         before = float(np.mean(unexplained_but_for_biases(plain, np.zeros(1))))
-        with_it = float(np.mean(unexplained_but_for_biases(pair, shifts)))
+        with_it = float(np.mean(unexplained_but_for_biases(pair, shift)))
         left = before, with_it
     return Found(
         orientation_deg=orientation,
@@ -98,7 +99,7 @@ def _orientation(
     turned = np.rad2deg(np.arccos(np.clip((np.trace(C_bs @ whole.T) - 1.0) / 2.0, -1.0, 1.0)))
     if abs(np.linalg.det(whole) - 1.0) < 1e-9 and turned < _RIGHT_DEG:
         C_bs = whole
-    angles = rotation.to_euler(rotation.from_dcm(C_bs.T))
+    angles = rotation.to_euler(rotation.from_dcm(jnp.asarray(C_bs.T)))
     roll, pitch, yaw = (float(np.round(np.rad2deg(float(a)), 1)) + 0.0 for a in angles)
     return (roll, pitch, yaw), C_bs
 

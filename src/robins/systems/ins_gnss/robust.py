@@ -4,7 +4,7 @@ Every measurement has a weight of its own, that of noise with Student's t (`rule
 the estimate follows positions that stay away from it (`find_back`). What the files of a log do not
 say is asked as hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
 
-    s   how much larger the process noise is than told, 1, 8 or 64
+    s   how much larger the covariance of the process noise is than told, 1, 8 or 64
     f   what the receiver's velocity is: that of the fix (0), or the mean since the last one (1)
 
 A measurement that is off is weighed down in all modes alike and moves no probability; a motion that
@@ -81,10 +81,10 @@ def find_back(patience: int) -> Rule:
 
 
 def supposing(scale: Any) -> Rule:
-    """Process noise that is larger than told, by a factor on its standard deviations."""
+    """Process noise whose covariance is larger than told, by this factor."""
 
     def process(memory, transition):
-        return memory, transition._replace(noise=scale * transition.noise)
+        return memory, transition._replace(noise=jnp.sqrt(scale) * transition.noise)
 
     return Rule(process=process, name="supposing")
 
