@@ -206,7 +206,7 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
     epilog=examples(
         "robins doctor imu.csv gnss.pos",
         "robins doctor imu.csv unit.toml --json",
-        "robins doctor imu.csv gnss.pos --write unit.toml",
+        "robins doctor imu.csv gnss.pos --write found.toml",
     ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
