@@ -12,9 +12,10 @@ from robins.filters.rules import student_t
 from robins.ins.rest import confirmed, standstill
 from robins.logs.mounting import Mounting, turned
 from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
-from robins.systems.ins_gnss.log import _at_rest, in_body_axes, on_one_clock
 from robins.systems.ins_gnss.model import POSITION
+from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
 from robins.systems.ins_gnss.robust import SCALES, changes, find_back, hypotheses
+from robins.systems.ins_gnss.start import at_rest
 
 SMOOTH = """
 imu_rate = "50 Hz"
@@ -120,7 +121,7 @@ def test_standstill_uses_nothing_of_the_future():
 def test_a_smooth_road_is_not_taken_for_rest(log, velocities):
     given = log if velocities else replace(log, gnss=replace(log.gnss, v_n=None, sigma_v=None))
     whole, aids = on_one_clock(given, Replay()), Replay().aids
-    found, _ = _at_rest(whole, aids)
+    found, _ = at_rest(whole, aids)
     speed = np.interp(whole.time_s, log.truth.time_ns * 1e-9, np.linalg.norm(log.truth.v_n, axis=1))
     by_spread, _ = standstill(whole.increments, *aids.quiet)
     assert np.sum(by_spread & (speed > 5.0)) > 300, "the spread alone takes it for rest"

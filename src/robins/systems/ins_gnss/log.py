@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,24 +17,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins import rotation
-from robins.dataset import Dataset, GnssTable
-from robins.earth import Geodetic, gravity
+from robins.dataset import Dataset
+from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief, StepWarning, run
-from robins.ins.alignment import level
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
-from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
+from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
-from robins.ins.rest import confirmed, moving_statistics, standstill, unrest
 from robins.ins.state import InsState
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.ins_gnss import model
-from robins.systems.ins_gnss.parameters import Aids, Replay, Start
+from robins.systems.ins_gnss.parameters import Aids, Replay
+from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
 from robins.systems.ins_gnss.robust import robust, supposing_mean, weighed
+from robins.systems.ins_gnss.start import StartPoint, at_rest, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
@@ -56,29 +54,6 @@ NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
 
 
-class Log(NamedTuple):
-    """A log or a piece of it, NED/FRD, in seconds since the first IMU sample."""
-
-    increments: Increments  # dt (N,), theta (N, 3), dv (N, 3)
-    time_s: np.ndarray  # (N,) end of each increment
-    gnss: GnssTable  # M fixes, of the whole log
-    gnss_s: np.ndarray  # (M,)
-    sigma_m: np.ndarray  # (M, 3) believed by the filter
-    v_n: np.ndarray | None  # (M, 3), None where velocities are not used
-    sigma_v: np.ndarray | None
-    withheld: np.ndarray  # (M,) bool
-
-
-class StartPoint(NamedTuple):
-    """Where and how the filter begins."""
-
-    fix: int  # row of the whole fix that it begins at
-    q_nb: np.ndarray  # (4,)
-    tilt_sigma_rad: float
-    gyro_bias: np.ndarray  # (3,) rad/s, mean rate of a standstill, else zero
-    sentence: str  # how it was found, for the reader
-
-
 @dataclass(frozen=True, kw_only=True)
 class Stretch(Piece):
     """A piece of a log that is navigated; its world is a `Case`."""
@@ -87,156 +62,6 @@ class Stretch(Piece):
     rate_b: np.ndarray  # (E, 3) rad/s mean raw gyro rate about each epoch
     used: np.ndarray  # (M,) bool, fixes of the log that fall on an epoch of the piece
     withheld: np.ndarray  # (E,) bool
-
-
-# ------------------------------------------------------------------------------------- one clock
-
-
-def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
-    """Both tables on the IMU's clock, sigmas as the filter shall believe them.
-
-    Raises:
-        ValueError: there is no GNSS, or no fix lies within the IMU's time.
-    """
-    if dataset.gnss is None or len(dataset.gnss) == 0:
-        raise ValueError("a replay of INS/GNSS needs GNSS fixes; this log has none")
-    gnss, g = to_ned_frd(dataset.gnss), parameters.gnss
-    increments, end_ns = from_imu(dataset.imu)
-    origin = int(dataset.imu.time_ns[0])
-    time_s, gnss_s = (end_ns - origin) * 1e-9, (gnss.time_ns - origin) * 1e-9
-    if not np.any((gnss_s > 0.0) & (gnss_s <= time_s[-1])):
-        raise ValueError(
-            f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
-            f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
-        )
-    factor = np.ones(len(gnss))
-    if gnss.quality is not None:
-        for quality, value in g.sigma_factor.items():
-            factor[gnss.quality == int(quality)] = value
-    v_n, sigma_v = (gnss.v_n, gnss.sigma_v) if g.use_velocity else (None, None)
-    if sigma_v is not None:
-        sigma_v = np.maximum(sigma_v * factor[:, None], g.least_velocity_sigma)
-    return Log(
-        Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
-        time_s,
-        gnss,
-        gnss_s,
-        np.maximum(gnss.sigma_m * factor[:, None], g.least_sigma),
-        v_n if sigma_v is not None else None,
-        sigma_v,
-        parameters.withheld(gnss_s, gnss_s),
-    )
-
-
-def with_lever_arm(parameters: Replay, arm: tuple[float, float, float] | None) -> Replay:
-    """The parameters with the lever arm that the log was loaded with, if it was with one.
-
-    Raises:
-        ValueError: the parameters have another.
-    """
-    other = parameters.gnss.lever_arm
-    if arm is None:
-        return parameters
-    if any(other) and not np.allclose(arm, other, rtol=0.0, atol=1e-6):
-        raise ValueError(
-            f"the log was loaded with a lever arm of {arm} m, and gnss.lever_arm is {other} m; "
-            "give one of the two"
-        )
-    gnss = parameters.gnss.model_copy(update={"lever_arm": arm})
-    return parameters.model_copy(update={"gnss": gnss})
-
-
-# ------------------------------------------------------------------------------------- the start
-
-
-@jax.jit
-def _turned(q, theta):
-    def step(q, t):
-        return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(t))), None
-
-    return jax.lax.scan(step, q, theta)[0]
-
-
-def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
-    """The same tilt with another heading."""
-    _, _, now = rotation.to_euler(jnp.asarray(q_nb))
-    turn = rotation.from_rotvec(jnp.array([0.0, 0.0, 1.0]) * (heading_rad - now))
-    return np.asarray(rotation.multiply(turn, jnp.asarray(q_nb)))
-
-
-def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
-    """Level on the quietest early window; take the heading as given or from the GNSS course.
-
-    The gyros carry the tilt from that window to the moment the course is known (first fix faster
-    than ``start.course_speed``); body forward is then taken along the course. The filter begins at
-    the first whole fix from there on.
-
-    Raises:
-        ValueError: no heading is known: none was given, and no fix is fast enough; there is no
-            whole fix, or none after that moment; or the mean specific force is not gravity's.
-    """
-    (dt, theta, dv), time_s, gnss_s = log.increments[:3], log.time_s, log.gnss_s
-    g, v_n, begin_s = log.gnss, log.gnss.v_n, time_s[0] - dt[0]
-    whole = np.all(np.isfinite([g.lat_rad, g.lon_rad, g.alt_m]), axis=0)
-    whole &= (gnss_s > begin_s) & (gnss_s <= time_s[-1])
-    if not np.any(whole):
-        raise ValueError(f"no whole GNSS fix between {begin_s:.1f} and {time_s[-1]:.1f} s")
-    fast = None
-    if start.known_heading is None:
-        if v_n is None:
-            raise ValueError(
-                "the heading at the start is not known: the log has no GNSS velocity to take a "
-                "course from; give start.known_heading"
-            )
-        speed = np.hypot(v_n[:, 0], v_n[:, 1])
-        usable = np.flatnonzero((speed >= start.course_speed) & (gnss_s > time_s[0]))
-        if len(usable) == 0:
-            raise ValueError(
-                f"the heading at the start is not known: the fastest fix moves at "
-                f"{np.nanmax(speed):.2f} m/s and a course is taken from "
-                f"{start.course_speed:.2f} m/s on; lower start.course_speed or give "
-                f"start.known_heading"
-            )
-        fast = usable[0]
-    still, mean_rate = _at_rest(log, aids)
-    width = max(2, round(2.0 * aids.window / float(np.median(dt))))
-    mean_force, spread = moving_statistics(dv / dt[:, None], width)
-    last = len(dt) - 1 if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
-    quiet_enough = np.flatnonzero(still[: last + 1])
-    if len(quiet_enough):
-        at = int(quiet_enough[min(len(quiet_enough) - 1, width)])
-        tilt, how, bias = start.tilt, "at rest", np.mean(mean_rate[quiet_enough], axis=0)
-    else:
-        first = min(width - 1, last)
-        at = first + int(np.argmin(np.sum(spread[first : last + 1] ** 2, axis=1)))
-        tilt, how, bias = 3.0 * start.tilt, "on the quietest second, moving", np.zeros(3)
-    force, some = mean_force[at], np.flatnonzero(whole)[0]
-    here = float(gravity(*(jnp.asarray(float(x[some])) for x in (g.lat_rad, g.alt_m))))
-    if not 0.5 * here < np.linalg.norm(force) < 1.5 * here:
-        raise ValueError(
-            f"cannot level: the mean specific force at {time_s[at]:.2f} s is "
-            f"{np.linalg.norm(force):.2f} m/s^2, gravity is {here:.2f}"
-        )
-    sentence = f"levelled {how} at {time_s[at]:.1f} s"
-    heading = start.known_heading or 0.0
-    q_nb = np.asarray(level(force, 0.0, heading).q_nb.wxyz)
-    begin_s = float(time_s[at])
-    if fast is None:
-        sentence += f", heading given as {np.degrees(heading):.1f} deg"
-    else:
-        assert v_n is not None
-        carried = jnp.asarray(theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None])
-        heading = float(np.arctan2(v_n[fast, 1], v_n[fast, 0]))
-        q_nb = with_heading(np.asarray(_turned(jnp.asarray(q_nb), carried)), heading)
-        begin_s = float(gnss_s[fast])
-        sentence += (
-            f"; heading {np.degrees(heading) % 360:.1f} deg from the course at {begin_s:.1f} s, "
-            f"when the speed reached {np.hypot(*v_n[fast, :2]):.2f} m/s"
-        )
-    later = np.flatnonzero(whole & (gnss_s >= begin_s - 1e-6))
-    if len(later) == 0:
-        raise ValueError(f"no whole GNSS fix after the attitude is known, at {begin_s:.1f} s")
-    return StartPoint(int(later[0]), q_nb, tilt, bias, sentence)
 
 
 # ------------------------------------------------------------------------------ piece to a case
@@ -316,50 +141,19 @@ def _fixes(
     return y, aux
 
 
-def _at_rest(log: Log, aids: Aids) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) whether the vehicle stands still at each increment, by samples and fixes; mean rate."""
-    still, mean_rate = standstill(log.increments, *aids.quiet)
-    fix_s, moves = _moving_fixes(log, aids.moving_speed)
-    wait_s = 1.5 * max(1.0, float(np.median(np.diff(fix_s)))) if len(fix_s) > 1 else 1.5
-    quiet = unrest(log.increments, *aids.quiet)
-    return confirmed(still, quiet, log.time_s, fix_s, moves, wait_s), mean_rate
-
-
-def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times of the fixes that tell whether the vehicle moves, and what they tell.
-
-    By the velocity, or by the way since the fix a second before where the receiver gives none.
-    """
-    g, given = log.gnss, ~log.withheld
-    if g.v_n is not None and g.sigma_v is not None:
-        size = np.hypot(g.v_n[:, 0], g.v_n[:, 1])
-        noise = np.max(g.sigma_v[:, :2], axis=1)
-        known = given & np.isfinite(size)
-        return log.gnss_s[known], size[known] > np.maximum(speed, 4.0 * noise[known])
-    known = given & np.isfinite(g.lat_rad) & np.isfinite(g.lon_rad)
-    time_s, noise = log.gnss_s[known], np.max(g.sigma_m[known, :2], axis=1)
-    before = np.maximum(np.searchsorted(time_s, time_s - 1.0 + 1e-6, side="right") - 1, 0)
-    place = Geodetic(*map(jnp.asarray, (g.lat_rad[known], g.lon_rad[known], 0.0 * time_s)))
-    there = Geodetic(place.lat[before], place.lon[before], place.alt[before])
-    way = np.hypot(*np.asarray(there.local(place)).T[:2]) if len(time_s) else np.zeros(0)
-    limit = np.maximum(speed * (time_s - time_s[before]), 4.0 * np.hypot(noise, noise[before]))
-    told = time_s[before] < time_s
-    return time_s[told], way[told] > limit[told]
-
-
 def _known(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    still, mean_rate = _at_rest(log, aids)
+    still, mean_rate = at_rest(log, aids)
     last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
-    at_rest = still[last][:, None]
+    stands = still[last][:, None]
     y: dict[str, Any] = {}
     if aids.zero_velocity:
-        y[model.STANDSTILL] = np.where(at_rest, np.zeros((len(epochs), 3)), np.nan)
-        y[model.STILL_RATE] = np.where(at_rest, mean_rate[last], np.nan)
+        y[model.STANDSTILL] = np.where(stands, np.zeros((len(epochs), 3)), np.nan)
+        y[model.STILL_RATE] = np.where(stands, mean_rate[last], np.nan)
     if aids.non_holonomic:
-        y[model.ROAD] = np.where(at_rest, np.nan, np.zeros((len(epochs), 2)))
+        y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
 
 
@@ -420,27 +214,6 @@ def _likelihood(pieces: Sequence[Stretch], parameters: Replay, unsaid: Unsaid) -
             )
         total += float(found.log_likelihood)
     return total
-
-
-def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
-    """The samples along the vehicle's axes, unless the log was loaded with a mounting.
-
-    Args:
-        dataset: a log.
-        orientation: roll, pitch, yaw [rad] of forward-right-down as seen from the sensor.
-    """
-    if dataset.mounted or not any(orientation):
-        return dataset
-    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*orientation))).T
-    whole = np.round(C_bs)  # right angles exchange axes and mix nothing
-    C_bs = np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
-    imu = to_ned_frd(dataset.imu)
-    imu = replace(imu, gyro=imu.gyro @ C_bs.T, accel=imu.accel @ C_bs.T)
-    mag = dataset.mag
-    if mag is not None:
-        mag = to_ned_frd(mag)
-        mag = replace(mag, field_t=mag.field_t @ C_bs.T)
-    return replace(dataset, imu=imu, mag=mag, mounted=True)
 
 
 def replay(
