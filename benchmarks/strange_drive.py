@@ -180,7 +180,7 @@ def judged(drive: Drive, log: Dataset, told: Told, outcome: Any, name: str) -> d
     after = np.any([(t > b + 3.0) & (t < b + 8.0) for _, b in OUTAGES_S], axis=0) & ~deceived
     free = settled & ~out & ~deceived
     heading = np.interp(t, time, np.unwrap(_heading(truth.q_nb)))
-    turned = np.angle(np.exp(1j * (s["euler"].values[:, 2] - heading))) if "euler" in s else 0 * t
+    turned = np.angle(np.exp(1j * (s["estimate_euler"].values[:, 2] - heading)))
     spoke = s["gnss_position_time"].values if "gnss_position_time" in s else np.zeros(0)
     figures = {
         "rms_m": _rms(across[free]),

@@ -64,9 +64,6 @@ class Stretch(Piece):
     withheld: np.ndarray  # (E,) bool
 
 
-# ------------------------------------------------------------------------------ piece to a case
-
-
 def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     """Align on a piece of a log, place the epochs and sort the measurements to them.
 
@@ -157,9 +154,6 @@ def _known(
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
 
 
-# ---------------------------------------------------------------------------------------- replay
-
-
 class Unsaid(NamedTuple):
     """What a log says of its receiver that its configuration does not."""
 
@@ -222,14 +216,10 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Navigate a log with the filters named and say how good they are.
+    """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
 
-    Args:
-        dataset: IMU and GNSS of a log, examined and cleaned (`robins.logs`). Samples that were
-            loaded without a mounting are turned as the parameters say.
-        parameters: what the files do not say; `Replay()` is what the command takes without a file.
-        filters: names such as "robust", "ukf", "ekf+rts"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+    Samples that were loaded without a mounting are turned as the parameters say; `Replay()` is what
+    the command takes without a file.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
@@ -253,7 +243,7 @@ def replay(
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
     antennas = {name: _antenna(mount, answer.mean, rate) for name, answer in answers.items()}
-    variables = track_arrays(antennas.values()) | _fix_arrays(log)
+    variables = track_arrays(antennas.values(), "{} of the antenna") | _fix_arrays(log)
     variables |= array("outage", withheld.astype(np.int8), long_name="GNSS withheld")
     used = np.any([piece.used for piece in pieces], axis=0)
     counts = replaying.gap_counts(pieces, problems) | {"pieces_not_navigated": len(problems)}
@@ -273,6 +263,7 @@ def replay(
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
         + found
         + [f"Not navigated, {problem}." for problem in problems],
+        origin_ns=int(dataset.imu.time_ns[0]),
     )
 
 
@@ -284,7 +275,7 @@ def _antenna(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
 
 def _estimates(mean: InsState) -> Mapping[str, Any]:
     biases_and_scales = {name: getattr(mean, name) for name in InsState._fields[3:]}
-    return {"velocity": mean.v_n, "euler": jnp.stack(mean.q_nb.as_euler(), -1), **biases_and_scales}
+    return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}
 
 
 def _distances(
