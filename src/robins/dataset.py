@@ -143,6 +143,7 @@ class Dataset:
     master_delay_s: float = 0.0  # by how much records of the master are older than their stamps
     # from the IMU to the GNSS antenna, forward, right, down; None where nobody told it
     lever_arm_b_m: tuple[float, float, float] | None = None
+    mounted: bool = False  # the sensor's axes were turned to the vehicle's when it was loaded
 
 
 @dataclass(frozen=True)

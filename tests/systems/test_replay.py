@@ -19,8 +19,8 @@ from robins.rotation import Rotation as Attitude
 from robins.systems import ins_gnss
 from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset
 from robins.systems.ins_gnss import replay as replay_log
-from robins.systems.ins_gnss.log import on_one_clock
 from robins.systems.ins_gnss.model import Mount, read_position
+from robins.systems.ins_gnss.recording import on_one_clock
 from robins.workbench import replay as replay_files
 
 DRIVE = """

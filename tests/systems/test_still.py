@@ -8,10 +8,12 @@ import pytest
 
 from robins import rotation
 from robins.dataset import GnssTable
+from robins.earth.magnetic import elements, field_n, wmm
 from robins.ins.increments import Increments
 from robins.ins.rest import moving_statistics, standstill
-from robins.systems.ins_gnss.log import Log, find_start, with_heading
 from robins.systems.ins_gnss.parameters import Aids, Start
+from robins.systems.ins_gnss.recording import Log
+from robins.systems.ins_gnss.start import find_start, with_heading
 
 G = 9.80
 DT = 0.01
@@ -94,3 +96,24 @@ def test_start_says_why_it_cannot():
         find_start(log._replace(gnss=lost), Start(), Aids())
     found = find_start(with_velocity(None), Start(known_heading=1.25), Aids())
     assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(1.25, abs=1e-12)
+
+
+def test_a_magnetometer_tells_the_heading_where_no_course_does():
+    """Of a field made at a known attitude; true north, so with the declination of the place."""
+    log = _walk(4.0, 2.0, 0.1, -0.05, 0.0, 1.0)
+    slow = log._replace(gnss=replace(log.gnss, v_n=0.0 * log.gnss.v_n))
+    roll, pitch, heading = 0.1, -0.05, 2.2
+    north, east, down = 21e-6, 0.0, 43e-6  # along magnetic north
+    declination = float(elements(field_n(wmm(2025), 0.7, 0.2, 100.0, 2025.0)).declination_rad)
+    along = np.array([np.cos(declination) * north, np.sin(declination) * north + east, down])
+    C = np.asarray(rotation.to_dcm(rotation.from_euler(roll, pitch, heading)))
+    field = np.tile(C.T @ along, (60, 1))
+    seen = slow._replace(field_s=np.arange(60) * 0.1, field_b=field)
+    found = find_start(seen, Start(), Aids())
+    assert float(rotation.to_euler(jnp.asarray(found.q_nb))[2]) == pytest.approx(heading, abs=2e-3)
+    assert "from the magnetometer" in found.sentence
+    # a course is better than a magnetometer in a vehicle of steel
+    moving = log._replace(field_s=seen.field_s, field_b=field)
+    assert "from the course" in find_start(moving, Start(), Aids()).sentence
+    with pytest.raises(ValueError, match=r"reads 0\.1 of the Earth's field"):
+        find_start(seen._replace(field_b=0.1 * field), Start(), Aids())

@@ -216,18 +216,28 @@ def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options:
 
 @app.command(
     short_help="Examine a log before it is navigated.",
-    epilog=examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
+    epilog=examples(
+        "robins doctor imu.csv gnss.pos",
+        "robins doctor imu.csv unit.toml --json",
+        "robins doctor imu.csv gnss.pos --write found.toml",
+    ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
+@option("--write", type=click.Path(path_type=Path), metavar="FILE", help="Write what it found.")
 @COLUMNS
 @answers
-def doctor(log: tuple[Path, ...], columns: tuple[Path, ...], as_json: bool) -> int:
+def doctor(
+    log: tuple[Path, ...], write: Path | None, columns: tuple[Path, ...], as_json: bool
+) -> int:
     """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
     The exit status is 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... says
     how the sensor is mounted, as for `robins replay`.
+
+    With --write, what the log tells of the unit and the receiver (mounting, latency, window of the
+    velocities, noise at rest) becomes a configuration for `robins replay`.
     """
-    return judge(log, columns, as_json)
+    return judge(log, columns, as_json, write)
 
 
 @app.command(

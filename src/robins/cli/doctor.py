@@ -22,12 +22,21 @@ _KINDS = {
 }
 
 
-def judge(log: Sequence[Path], columns: Sequence[Path], as_json: bool) -> Status:
-    """Print what there is and the findings; bad input if a run on this log would be wrong."""
+def judge(
+    log: Sequence[Path], columns: Sequence[Path], as_json: bool, write: Path | None = None
+) -> Status:
+    """Print what there is and the findings; bad input if a run on this log would be wrong.
+
+    What the log tells of its unit is written to a file where one is named.
+    """
     with only_json(as_json):
         from robins.workbench import examine
+        from robins.workbench.examination import unit_file
 
+        text = None if write is None else unit_file(log, columns)
         found = examine(log, columns)
+        if write is not None and text is not None:
+            write.write_text(text)
     say(found.data if as_json else None, _text(found, log, columns), as_json)
     return Status.BAD_INPUT if found.counts["error"] else Status.DONE
 

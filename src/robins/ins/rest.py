@@ -3,7 +3,7 @@
 `standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops;
 `still_samples` at their distance from running means, and for how long it has been small, as suits a
 unit in a hand. `robins.ins.alignment.is_static` judges a whole record instead. None of them tells a
-smooth motion at constant speed from rest.
+smooth motion at constant speed from rest; `confirmed` asks fixes of it, too.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from robins.ins.increments import Increments
 
 _MEMORY_S = 0.5  # time constant of the running means
 _FEWEST = 5  # samples in the memory, below which nothing can be told
+_CALMER = 0.5  # at rest without fixes: this share of the least unrest seen in motion, or less
 
 
 def moving_statistics(values: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -64,6 +65,69 @@ def standstill(
     still &= np.all(np.abs(mean_rate) < 4.0 * quiet_rate, axis=1)
     still[: width - 1] = False
     return still, mean_rate
+
+
+def unrest(
+    increments: Increments, window_s: float, quiet_rate: float, quiet_force: float
+) -> np.ndarray:
+    """(N,) spread over the window up to each increment, in thresholds of `standstill`; the axis
+    that is the farthest from still.
+    """
+    dt, theta, dv = increments[:3]
+    width = max(2, round(window_s / float(np.median(dt))))
+    _, spread_rate = moving_statistics(theta / dt[:, None], width)
+    _, spread_force = moving_statistics(dv / dt[:, None], width)
+    each = np.concatenate([spread_rate / quiet_rate, spread_force / quiet_force], axis=1)
+    return np.max(each, axis=1)
+
+
+def confirmed(
+    still: np.ndarray,
+    unrest: np.ndarray,
+    time_s: np.ndarray,
+    fix_s: np.ndarray,
+    moves: np.ndarray,
+    wait_s: float,
+) -> np.ndarray:
+    """Which samples that look still are: a vehicle on a smooth road looks like one at rest.
+
+    While fixes come, the last one decides. Without them a sample counts as still only if it is
+    plainly calmer than the unit was in any interval before, between two fixes that said, as did
+    the next, that it moves; if there was none, spread alone tells nothing. Nothing of the future
+    is used.
+
+    Args:
+        still: (N,) bool, by the spread of the samples.
+        unrest: (N,) the spread itself, in any unit.
+        time_s: (N,) increasing times of the samples.
+        fix_s: (M,) increasing times of fixes that tell whether the vehicle moves.
+        moves: (M,) bool, what they tell.
+        wait_s: how long a fix tells it.
+
+    Returns:
+        (N,) bool.
+    """
+    if len(fix_s) == 0:
+        return np.zeros(len(time_s), dtype=bool)
+    last = np.searchsorted(fix_s, time_s + 1e-9, side="right") - 1
+    known = (last >= 0) & (time_s - fix_s[np.maximum(last, 0)] <= wait_s)
+    moving = known & moves[np.maximum(last, 0)]
+    calm = unrest < _CALMER * _calmest_in_motion(unrest, time_s, fix_s, moves, wait_s)[last + 1]
+    return still & np.where(known, ~moving, calm)
+
+
+def _calmest_in_motion(
+    unrest: np.ndarray, time_s: np.ndarray, fix_s: np.ndarray, moves: np.ndarray, wait_s: float
+) -> np.ndarray:
+    """(M + 1,) least unrest in motion as it is known after so many fixes; 0 where it is not."""
+    edges = np.searchsorted(time_s, fix_s)
+    least = np.full(len(fix_s) + 1, np.inf)
+    for k in range(1, len(fix_s) - 1):
+        begin, end = edges[k - 1], edges[k]
+        if begin < end and np.all(moves[k - 1 : k + 2]) and fix_s[k] - fix_s[k - 1] <= wait_s:
+            least[k + 2] = np.min(unrest[begin:end])
+    least = np.minimum.accumulate(least)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def still_samples(

@@ -55,7 +55,7 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
     signal, track = signal_of(imu), track_of(gnss)
     if signal is None or track is None:
         return
-    pair = _pair(imu, gnss, signal, track)
+    pair = pair_in_time(imu, gnss, signal, track)
     if pair is None:
         yield note(imu, "motion_not_checked", 0)(
             "gyro unit, axes and time offset could not be checked against GNSS: there are no "
@@ -74,8 +74,18 @@ def check_motion(imu: ImuTable, gnss: GnssTable) -> Iterator[Finding]:
         yield from _forward(imu, gnss, pair)
 
 
-def _pair(imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track) -> Pair | None:
-    """Both on one time, specific force scaled to gravity, velocities without their delay."""
+def pair_in_time(
+    imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track, late_s: float | None = None
+) -> Pair | None:
+    """Both on one time, specific force scaled to gravity, velocities without their delay.
+
+    Args:
+        imu: the table of the signal.
+        gnss: the table of the track.
+        signal: usable samples.
+        track: complete fixes.
+        late_s: how much older velocities are than their stamps; by default as the positions say.
+    """
     windows = windows_of(signal)
     size = usual_force(windows)
     if not size > 0.0:
@@ -88,24 +98,31 @@ def _pair(imu: ImuTable, gnss: GnssTable, signal: Signal, track: Track) -> Pair 
     scaled = signal._replace(accel=accel, gyro=gyro)
     v_n, noise = velocity_of(track)
     start = int(imu.time_ns[signal.rows[0]]) - int(gnss.time_ns[0])
-    when = track.time_s - start * 1e-9 - (lateness(track) or 0.0)
+    late_s = lateness(track) if late_s is None else late_s
+    when = track.time_s - start * 1e-9 - (late_s or 0.0)
     return pair_of(scaled, when, v_n, noise)
 
 
-def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
+def small_offset(pair: Pair) -> float | None:
+    """What is to be added to the stamps of GNSS for the motion to fit best [s]; None if it fits."""
     lags = np.arange(-_SMALL_LAG_S, _SMALL_LAG_S + 0.05, 0.1)
     left = _mean(unexplained(pair, np.eye(3)[None], lags))[0]
     lags = lags[np.nanargmin(left)] + np.arange(-2, 3) * 0.1
     each = [lowest(lags, left) for left in unexplained_but_for_biases(pair, lags)]
     clear = np.array([lag for lag in each if lag is not None])
     if len(clear) < max(1, len(each) // 2):
-        return
+        return None
     lag = float(np.median(clear))
-    if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())):
+    return lag if abs(lag) > max(_OFFSET_S, 2.0 * float(clear.std())) else None
+
+
+def _small_offset(imu: ImuTable, gnss: GnssTable, pair: Pair) -> Iterator[Finding]:
+    lag = small_offset(pair)
+    if lag is not None:
         yield finding("error" if abs(lag) > 1.0 else "warning", gnss, "time_offset", lag)(
             f"the motion fits {name_of(imu)} best if {lag:+.2f} s is added to the stamps of this "
-            f"file (from {len(clear)} stretches of 30 s). A buffer or a filter delays one of them; "
-            "give the run that time offset."
+            "file. A buffer or a filter delays one of them; give the run that time offset, or have "
+            "`robins doctor --write unit.toml` write it."
         )
 
 

@@ -14,6 +14,7 @@ from robins.logs.ordering import increasing
 
 _BASE_S = 1.0
 _SPEED = 0.3  # m/s; below it a receiver at rest
+_KEPT = 0.9  # share of the steps that tell how late velocities are, those that fit best
 
 
 class Track(NamedTuple):
@@ -119,7 +120,9 @@ def lateness(track: Track) -> float | None:
         steps = steps_of(track, float(lag))
         if steps is None:
             return None
-        left.append(np.mean((steps.of_position - steps.of_velocity)[:, :2] ** 2))
+        apart = np.sum((steps.of_position - steps.of_velocity)[:, :2] ** 2, axis=1)
+        # steps onto a reflected signal and off it say nothing of time
+        left.append(np.mean(np.sort(apart)[: max(1, round(_KEPT * len(apart)))]))
     late = lowest(lags, np.array(left))
     clear = late is not None and min(left) < 0.5 * left[len(lags) // 2]
     return late if clear else None

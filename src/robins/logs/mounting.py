@@ -170,7 +170,8 @@ def turned(opened: Any, mounting: Mounting | None) -> Any:
         return opened
     if isinstance(opened, Dataset):
         on_board = {k: turned(getattr(opened, k), mounting) for k in ("imu", "mag", "attitude")}
-        return dataclasses.replace(opened, **on_board, lever_arm_b_m=_lever_arm(opened, mounting))
+        told = {"lever_arm_b_m": _lever_arm(opened, mounting), "mounted": True}
+        return dataclasses.replace(opened, **on_board, **told)
     if isinstance(opened, ImuTable | MagTable | AttitudeTable):
         return mounting.turn(opened)
     return opened

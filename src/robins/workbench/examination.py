@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins import logs, scenario, systems
+from robins.ins.frames import to_ned_frd
 from robins.logs.findings import by_severity
 from robins.logs.mounting import turned
 from robins.logs.quiet import usual_step_s
 from robins.logs.tables import kind_of, tables_of
+from robins.logs.unit_file import find_unit, toml_of
 from robins.workbench.errors import InputError
 
 SEVERITIES = ("error", "warning", "note")
@@ -72,6 +74,35 @@ def examine(
     )
 
 
+def unit_file(
+    paths: Sequence[str | os.PathLike[str]], columns: Sequence[str | os.PathLike[str]] = ()
+) -> str:
+    """A configuration with what a log tells of its unit and its receiver, for `robins replay`.
+
+    Args:
+        paths: the files of the log, without a configuration: what is written is found anew.
+        columns: as of `examine`.
+
+    Raises:
+        InputError: there is a configuration among them, or nothing was found.
+        robins.logs.LogError: a file cannot be read.
+    """
+    files, configuration = parted(paths)
+    if configuration is not None:
+        raise InputError(
+            "a configuration is written from the log alone", configuration, "omit this file."
+        )
+    dataset = logs.load_dataset(files, formats=logs.formats_of(files, columns))
+    found = find_unit(to_ned_frd(dataset.imu), dataset.gnss)
+    if not any(value is not None for value in found):
+        raise InputError(
+            "the log tells nothing of its unit: there is too little motion, and no rest",
+            dataset.name,
+            "drive a figure of eight and stand for ten seconds.",
+        )
+    return toml_of(found, dataset.name)
+
+
 def _described(table: Any) -> dict[str, Any]:
     step_s = usual_step_s(table.time_ns)
     return {
@@ -113,7 +144,7 @@ def mounting_of(configuration: Path | None) -> logs.Mounting | None:
     if configuration is None:
         return None
     text = scenario.read_text(configuration)
-    name = str(scenario.mapping_of(text).get("system"))
+    name = str(scenario.mapping_of(text).get("system", "ins-gnss"))
     system = systems.SYSTEMS.get(name)
     if system is None or system.replay_parameters is None:
         known = ", ".join(systems.SYSTEMS)

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from robins.systems.ins_gnss.log import replay
+from robins.systems.ins_gnss.log import NAMES, replay
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
-from robins.systems.ins_gnss.study import DRIVE, NAMES
+from robins.systems.ins_gnss.study import DRIVE
 from robins.systems.ins_gnss.world import drive_dataset
 from robins.systems.study import System
 

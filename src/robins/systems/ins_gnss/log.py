@@ -6,7 +6,9 @@ is too long to bridge ends a piece of the log; the next piece is aligned anew.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,22 +17,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins import rotation
-from robins.dataset import Dataset, GnssTable
-from robins.earth import Geodetic, gravity
-from robins.filters import Belief
-from robins.ins.alignment import level
+from robins.dataset import Dataset
+from robins.earth import Geodetic
+from robins.errors import require_known
+from robins.filters import Belief, StepWarning, run
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
-from robins.ins.frames import to_ned_frd
-from robins.ins.increments import Increments, from_imu
+from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
-from robins.ins.rest import moving_statistics, standstill
 from robins.ins.state import InsState
 from robins.results import Outcome, Progress, array, silent, variable
 from robins.rotation import Rotation
 from robins.systems import replaying
 from robins.systems.ins_gnss import model
-from robins.systems.ins_gnss.parameters import Aids, Replay, Start
+from robins.systems.ins_gnss.parameters import Aids, Replay
+from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
+from robins.systems.ins_gnss.robust import robust, supposing_mean, weighed
+from robins.systems.ins_gnss.start import StartPoint, at_rest, find_start
+from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
 from robins.systems.replaying import Piece, Reported
@@ -43,30 +46,12 @@ CAUSES = (
     "mean over the receiver's interval, or a vehicle that was taken for still; `robins doctor` "
     "tells some of them."
 )
+ROBUST, WEIGHED = "robust", "weighed"
+SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
+NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
+"""Filters and smoothers of recorded logs; the first is what a log gets that nobody tuned it for."""
+
 RTK_QUALITY = {1: "fix", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp"}
-
-
-class Log(NamedTuple):
-    """A log or a piece of it, NED/FRD, in seconds since the first IMU sample."""
-
-    increments: Increments  # dt (N,), theta (N, 3), dv (N, 3)
-    time_s: np.ndarray  # (N,) end of each increment
-    gnss: GnssTable  # M fixes, of the whole log
-    gnss_s: np.ndarray  # (M,)
-    sigma_m: np.ndarray  # (M, 3) believed by the filter
-    v_n: np.ndarray | None  # (M, 3), None where velocities are not used
-    sigma_v: np.ndarray | None
-    withheld: np.ndarray  # (M,) bool
-
-
-class StartPoint(NamedTuple):
-    """Where and how the filter begins."""
-
-    fix: int  # row of the whole fix that it begins at
-    q_nb: np.ndarray  # (4,)
-    tilt_sigma_rad: float
-    gyro_bias: np.ndarray  # (3,) rad/s, mean rate of a standstill, else zero
-    sentence: str  # how it was found, for the reader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,156 +62,6 @@ class Stretch(Piece):
     rate_b: np.ndarray  # (E, 3) rad/s mean raw gyro rate about each epoch
     used: np.ndarray  # (M,) bool, fixes of the log that fall on an epoch of the piece
     withheld: np.ndarray  # (E,) bool
-
-
-def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
-    """Both tables on the IMU's clock, sigmas as the filter shall believe them.
-
-    Raises:
-        ValueError: there is no GNSS, or no fix lies within the IMU's time.
-    """
-    if dataset.gnss is None or len(dataset.gnss) == 0:
-        raise ValueError("a replay of INS/GNSS needs GNSS fixes; this log has none")
-    gnss, g = to_ned_frd(dataset.gnss), parameters.gnss
-    increments, end_ns = from_imu(dataset.imu)
-    origin = int(dataset.imu.time_ns[0])
-    time_s, gnss_s = (end_ns - origin) * 1e-9, (gnss.time_ns - origin) * 1e-9
-    if not np.any((gnss_s > 0.0) & (gnss_s <= time_s[-1])):
-        raise ValueError(
-            f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
-            f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
-        )
-    factor = np.ones(len(gnss))
-    if gnss.quality is not None:
-        for quality, value in g.sigma_factor.items():
-            factor[gnss.quality == int(quality)] = value
-    v_n, sigma_v = (gnss.v_n, gnss.sigma_v) if g.use_velocity else (None, None)
-    if sigma_v is not None:
-        sigma_v = np.maximum(sigma_v * factor[:, None], g.least_velocity_sigma)
-    return Log(
-        Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
-        time_s,
-        gnss,
-        gnss_s,
-        np.maximum(gnss.sigma_m * factor[:, None], g.least_sigma),
-        v_n if sigma_v is not None else None,
-        sigma_v,
-        parameters.withheld(gnss_s, gnss_s),
-    )
-
-
-def with_lever_arm(parameters: Replay, arm: tuple[float, float, float] | None) -> Replay:
-    """The parameters with the lever arm that the log was loaded with, if it was with one.
-
-    Raises:
-        ValueError: the parameters have another.
-    """
-    other = parameters.gnss.lever_arm
-    if arm is None:
-        return parameters
-    if any(other) and not np.allclose(arm, other, rtol=0.0, atol=1e-6):
-        raise ValueError(
-            f"the log was loaded with a lever arm of {arm} m, and gnss.lever_arm is {other} m; "
-            "give one of the two"
-        )
-    gnss = parameters.gnss.model_copy(update={"lever_arm": arm})
-    return parameters.model_copy(update={"gnss": gnss})
-
-
-# ------------------------------------------------------------------------------------- the start
-
-
-@jax.jit
-def _turned(q, theta):
-    def step(q, t):
-        return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(t))), None
-
-    return jax.lax.scan(step, q, theta)[0]
-
-
-def with_heading(q_nb: np.ndarray, heading_rad: float) -> np.ndarray:
-    """The same tilt with another heading."""
-    _, _, now = rotation.to_euler(jnp.asarray(q_nb))
-    turn = rotation.from_rotvec(jnp.array([0.0, 0.0, 1.0]) * (heading_rad - now))
-    return np.asarray(rotation.multiply(turn, jnp.asarray(q_nb)))
-
-
-def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
-    """Level on the quietest early window; take the heading as given or from the GNSS course.
-
-    The gyros carry the tilt from that window to the moment the course is known (first fix faster
-    than ``start.course_speed``); body forward is then taken along the course. The filter begins at
-    the first whole fix from there on.
-
-    Raises:
-        ValueError: no heading is known: none was given, and no fix is fast enough; there is no
-            whole fix, or none after that moment; or the mean specific force is not gravity's.
-    """
-    (dt, theta, dv), time_s, gnss_s = log.increments[:3], log.time_s, log.gnss_s
-    g, v_n, begin_s = log.gnss, log.gnss.v_n, time_s[0] - dt[0]
-    whole = np.all(np.isfinite([g.lat_rad, g.lon_rad, g.alt_m]), axis=0)
-    whole &= (gnss_s > begin_s) & (gnss_s <= time_s[-1])
-    if not np.any(whole):
-        raise ValueError(f"no whole GNSS fix between {begin_s:.1f} and {time_s[-1]:.1f} s")
-    fast = None
-    if start.known_heading is None:
-        if v_n is None:
-            raise ValueError(
-                "the heading at the start is not known: the log has no GNSS velocity to take a "
-                "course from; give start.known_heading"
-            )
-        speed = np.hypot(v_n[:, 0], v_n[:, 1])
-        usable = np.flatnonzero((speed >= start.course_speed) & (gnss_s > time_s[0]))
-        if len(usable) == 0:
-            raise ValueError(
-                f"the heading at the start is not known: the fastest fix moves at "
-                f"{np.nanmax(speed):.2f} m/s and a course is taken from "
-                f"{start.course_speed:.2f} m/s on; lower start.course_speed or give "
-                f"start.known_heading"
-            )
-        fast = usable[0]
-    still, mean_rate = standstill(log.increments, *aids.quiet)
-    width = max(2, round(2.0 * aids.window / float(np.median(dt))))
-    mean_force, spread = moving_statistics(dv / dt[:, None], width)
-    last = len(dt) - 1 if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
-    quiet_enough = np.flatnonzero(still[: last + 1])
-    if len(quiet_enough):
-        at = int(quiet_enough[min(len(quiet_enough) - 1, width)])
-        tilt, how, bias = start.tilt, "at rest", np.mean(mean_rate[quiet_enough], axis=0)
-    else:
-        first = min(width - 1, last)
-        at = first + int(np.argmin(np.sum(spread[first : last + 1] ** 2, axis=1)))
-        tilt, how, bias = 3.0 * start.tilt, "on the quietest second, moving", np.zeros(3)
-    force, some = mean_force[at], np.flatnonzero(whole)[0]
-    here = float(gravity(*(jnp.asarray(float(x[some])) for x in (g.lat_rad, g.alt_m))))
-    if not 0.5 * here < np.linalg.norm(force) < 1.5 * here:
-        raise ValueError(
-            f"cannot level: the mean specific force at {time_s[at]:.2f} s is "
-            f"{np.linalg.norm(force):.2f} m/s^2, gravity is {here:.2f}"
-        )
-    sentence = f"levelled {how} at {time_s[at]:.1f} s"
-    heading = start.known_heading or 0.0
-    q_nb = np.asarray(level(force, 0.0, heading).q_nb.wxyz)
-    begin_s = float(time_s[at])
-    if fast is None:
-        sentence += f", heading given as {np.degrees(heading):.1f} deg"
-    else:
-        assert v_n is not None
-        carried = jnp.asarray(theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None])
-        heading = float(np.arctan2(v_n[fast, 1], v_n[fast, 0]))
-        q_nb = with_heading(np.asarray(_turned(jnp.asarray(q_nb), carried)), heading)
-        begin_s = float(gnss_s[fast])
-        sentence += (
-            f"; heading {np.degrees(heading) % 360:.1f} deg from the course at {begin_s:.1f} s, "
-            f"when the speed reached {np.hypot(*v_n[fast, :2]):.2f} m/s"
-        )
-    later = np.flatnonzero(whole & (gnss_s >= begin_s - 1e-6))
-    if len(later) == 0:
-        raise ValueError(f"no whole GNSS fix after the attitude is known, at {begin_s:.1f} s")
-    return StartPoint(int(later[0]), q_nb, tilt, bias, sentence)
-
-
-# ------------------------------------------------------------------------------ piece to a case
 
 
 def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
@@ -281,7 +116,7 @@ def _belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
 
 
 def _fixes(
-    log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float
+    log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """GNSS measurements by epoch; NaN where there is no fix or it is withheld."""
     given, g = used & ~log.withheld, log.gnss
@@ -295,6 +130,8 @@ def _fixes(
     y: dict[str, Any] = {model.POSITION: Geodetic(*map(sorted_in, (g.lat_rad, g.lon_rad, g.alt_m)))}
     aux: dict[str, Any] = {model.POSITION: model.Fix(sorted_in(log.sigma_m, 1.0), rate)}
     if log.v_n is not None and log.sigma_v is not None:
+        if window_s is None:
+            window_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 0.0
         gained = gained_in_window(log.increments, log.time_s, epochs, window_s)
         y[model.VELOCITY] = sorted_in(log.v_n)
         aux[model.VELOCITY] = model.Velocity(sorted_in(log.sigma_v, 1.0), rate, *gained)
@@ -305,22 +142,72 @@ def _known(
     log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    still, mean_rate = standstill(log.increments, *aids.quiet)
+    still, mean_rate = at_rest(log, aids)
     last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
-    at_rest = still[last][:, None]
+    stands = still[last][:, None]
     y: dict[str, Any] = {}
     if aids.zero_velocity:
-        y[model.STANDSTILL] = np.where(at_rest, np.zeros((len(epochs), 3)), np.nan)
-        y[model.STILL_RATE] = np.where(at_rest, mean_rate[last], np.nan)
+        y[model.STANDSTILL] = np.where(stands, np.zeros((len(epochs), 3)), np.nan)
+        y[model.STILL_RATE] = np.where(stands, mean_rate[last], np.nan)
     if aids.non_holonomic:
-        y[model.ROAD] = np.where(at_rest, np.nan, np.zeros((len(epochs), 2)))
+        y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
 
 
-def contender(parameters: Replay, name: str) -> Contender:
+class Unsaid(NamedTuple):
+    """What a log says of its receiver that its configuration does not."""
+
+    patience: int  # positions in a row, `find_back`
+    mean: float  # 1 where velocities are means over the window, 0 where they are of the fix
+
+
+def contender(parameters: Replay, unsaid: Unsaid, name: str) -> Contender:
     """A filter with the model it believes in."""
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
-    return Contender(make_filter(name, parameters.update.gate), believed)
+    asked = parameters.gnss.velocity_window is None
+    if name == ROBUST:
+        return Contender(robust(believed, asked, unsaid.patience), believed)
+    if name == WEIGHED:
+        return Contender(weighed(unsaid.patience), supposing_mean(believed, unsaid.mean))
+    told = supposing_mean(believed, 0.0) if asked else believed
+    return Contender(make_filter(name, parameters.update.gate), told)
+
+
+def _unsaid(
+    log: Log, pieces: Sequence[Stretch], parameters: Replay, wanted: Sequence[str]
+) -> tuple[Unsaid, list[str]]:
+    """What the log says, and a sentence for the reader where a smoother needed to know it.
+
+    Whether velocities are means over the time since the last fix is decided by the likelihood of
+    the whole log; a causal filter has that as a hypothesis of its own.
+    """
+    step = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
+    unsaid = Unsaid(max(2, math.ceil(parameters.update.patience / max(step, 1e-3))), 1.0)
+    smooths = any(SMOOTHED.get(name) == WEIGHED for name in wanted)
+    if parameters.gnss.velocity_window is not None or log.v_n is None or not smooths:
+        return unsaid, []
+    likely = [_likelihood(pieces, parameters, unsaid._replace(mean=f)) for f in (0.0, 1.0)]
+    means = likely[1] > likely[0]
+    what = f"means over the {step:.3g} s since the last fix" if means else "those of the fix"
+    sentence = (
+        f"For the smoother the velocities are taken as {what}, which makes the log-likelihood "
+        f"higher by {abs(likely[1] - likely[0]):.0f}."
+    )
+    return unsaid._replace(mean=float(means)), [sentence]
+
+
+def _likelihood(pieces: Sequence[Stretch], parameters: Replay, unsaid: Unsaid) -> float:
+    total = 0.0
+    for piece in pieces:
+        one = contender(parameters, unsaid, WEIGHED)
+        case = one.case(piece.world)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", StepWarning)
+            found = run(
+                one.filter, one.model, case.start, case.y, case.u, case.aux, keep=replaying.kept
+            )
+        total += float(found.log_likelihood)
+    return total
 
 
 def replay(
@@ -331,11 +218,14 @@ def replay(
 ) -> Outcome:
     """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
 
+    Samples that were loaded without a mounting are turned as the parameters say; `Replay()` is what
+    the command takes without a file.
+
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
     parameters = with_lever_arm(parameters, dataset.lever_arm_b_m)
-    log = on_one_clock(dataset, parameters)
+    log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
     pieces, problems = replaying.prepared(
         log.time_s,
         log.increments.dt,
@@ -343,8 +233,11 @@ def replay(
         partial(prepare, log, parameters),
     )
     wanted = filters or parameters.filters
+    for name in wanted:
+        require_known("filter", name, NAMES, "this system")
+    unsaid, found = _unsaid(log, pieces, parameters, wanted)
     answers = replaying.navigated(
-        pieces, wanted, partial(contender, parameters), SMOOTHERS, progress
+        pieces, wanted, partial(contender, parameters, unsaid), SMOOTHED, progress
     )
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
@@ -368,6 +261,7 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
+        + found
         + [f"Not navigated, {problem}." for problem in problems],
         origin_ns=int(dataset.imu.time_ns[0]),
     )

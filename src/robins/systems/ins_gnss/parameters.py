@@ -40,8 +40,9 @@ class Gnss(Parameters):
     lever_arm: q.Arm = default("0 m")  # IMU to antenna, body
     latency: Annotated[float, Quantity("time", least="-10 s", most="10 s")] = default("0 s")
     use_velocity: bool = True
-    # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix
-    velocity_window: q.Time = default("0 s")
+    # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix; not
+    # given: `robust` finds out, the others take it for 0
+    velocity_window: q.Time | None = None
     # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
@@ -70,6 +71,8 @@ class Aids(Parameters):
     window: q.Duration = default("0.5 s")
     quiet_accel: q.Acceleration = default("0.15 m/s^2")
     quiet_rate: q.AngleRate = default("0.5 deg/s")
+    # a fix that is faster, and by four of its sigmas faster than nothing, says that it moves
+    moving_speed: q.Speed = default("0.2 m/s")
     non_holonomic: bool = False
     axle: q.Arm = default("0 m")  # IMU to rear axle, body
     road_velocity: Annotated[tuple[float, float], Quantity("speed", above="0 m/s")] = default(
@@ -106,21 +109,51 @@ class Update(Cutting):
     """How the filter steps."""
 
     longest_gap: q.Duration = default("1 s")
-    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
+    # of the other filters than `robust`; 0: no gate
+    gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999
+    # `robust` follows positions that stay away for longer than this
+    patience: q.Duration = default("10 s")
+
+
+class Unit(Imu):
+    """A unit of which nothing is told: a consumer-grade MEMS."""
+
+    gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
+        "0.01 deg/s/sqrt(Hz)"
+    )
+    accel_noise: Annotated[q.Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")] = (
+        default("200 ug/sqrt(Hz)")
+    )
+    gyro_bias: q.RateSizes = default("0.5 deg/s")
+    accel_bias: q.AccelSizes = default("20 mg")
+    gyro_bias_walk: q.RateWalkSizes = default("0.002 deg/s/sqrt(s)")
+    accel_bias_walk: q.AccelRateWalkSizes = default("20 ug/sqrt(s)")
+
+
+class Rover(Gnss):
+    """A receiver of which nothing is told."""
+
+    sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=lambda: {"2": 3.0, "5": 3.0})
+
+
+class FirstLook(Start):
+    """A start of which nothing is told."""
+
+    tilt: q.Spread = default("3 deg")
 
 
 class Replay(Parameters):
-    """A recorded log: what cannot be read from the files themselves."""
+    """A recorded log: what cannot be read from the files themselves; each part may be left out."""
 
     system: Literal["ins-gnss"] = "ins-gnss"
-    title: str = "INS/GNSS replay"
-    imu: Imu
-    gnss: Gnss = pydantic.Field(default_factory=Gnss)
-    start: Start = pydantic.Field(default_factory=Start)
+    title: str = "INS/GNSS replay, consumer MEMS"
+    imu: Unit = pydantic.Field(default_factory=Unit)
+    gnss: Rover = pydantic.Field(default_factory=Rover)
+    start: FirstLook = pydantic.Field(default_factory=FirstLook)
     aids: Aids = pydantic.Field(default_factory=Aids)
     update: Update = pydantic.Field(default_factory=Update)
     outages: Outages | None = None
-    filters: Names = ("ekf",)
+    filters: Names = ("robust", "robust+rts")
 
     def withheld(self, time_s: np.ndarray, fix_s: np.ndarray) -> np.ndarray:
         """Which times (N,) lie in an outage, of a log with fixes at some times (M,)."""

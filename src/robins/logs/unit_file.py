@@ -1,0 +1,163 @@
+"""What the doctor can find of a unit and its receiver, as a configuration for a replay.
+
+The clock offset and the window of the velocities are found together: a velocity that is a mean over
+the last epoch and a receiver whose stamps are late look alike to the IMU, and only the positions
+tell them apart. Where they cannot, the window alone is taken, for it is the more common.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from robins import rotation
+from robins.dataset import GnssTable, ImuTable
+from robins.logs.checks_motion import pair_in_time, small_offset
+from robins.logs.gnss_motion import lateness, track_of
+from robins.logs.motion import travel_in_body, unexplained_but_for_biases
+from robins.logs.quiet import signal_of, windows_of
+
+_STRAIGHT = 0.85  # mean of the directions of travel, below which there is no forward
+_LEAST = 20  # directions of travel
+_RIGHT_DEG = 3.0  # angles this near to right angles are right angles
+_RESTS = 5  # pairs of seconds at rest, for the noise
+_LATE_S = 0.03
+
+
+class Found(NamedTuple):
+    """What was found; None where the log does not tell it."""
+
+    orientation_deg: tuple[float, float, float] | None = None  # roll, pitch, yaw of the mounting
+    latency_s: float | None = None  # a fix stamped t is of t - latency
+    velocity_window_s: float | None = None
+    gyro_noise: tuple[float, float, float] | None = None  # rad/sqrt(s), vehicle's axes
+    accel_noise: tuple[float, float, float] | None = None  # m/s/sqrt(s)
+    left: tuple[float, float] | None = None  # unexplained share of the motion, before and with it
+
+
+def find_unit(imu: ImuTable, gnss: GnssTable | None) -> Found:
+    """Mounting, latency, velocity window and noise, as far as a log tells them.
+
+    Args:
+        imu: forward-right-down as far as is known: along the sensor's axes.
+        gnss: of the same log.
+    """
+    signal, track = signal_of(imu), None if gnss is None else track_of(gnss)
+    if signal is None:
+        return Found()
+    if gnss is None or track is None or track.v_n is None:
+        return Found(**_noise(imu, None, None))
+    epoch = float(np.median(np.diff(track.time_s)))
+    pair = pair_in_time(imu, gnss, signal, track)
+    if pair is None:
+        return Found(**_noise(imu, gnss, None))
+    late, lag = lateness(track), small_offset(pair)
+    shift = np.array([lag or 0.0])
+    window = 2.0 * late if late is not None and late > _LATE_S else None
+    if window is not None and abs(window - epoch) < 0.4 * epoch:
+        window = epoch
+    # The positions did not tell how old velocities are: half an epoch is no offset of a clock.
+    if late is None and lag is not None and 0.3 * epoch < -lag < 0.7 * epoch:
+        window, lag = epoch, None
+    orientation, C_bs = _orientation(imu, pair)
+    plain = pair_in_time(imu, gnss, signal, track, late_s=0.0)
+    left = None
+    if plain is not None:
+        before = float(np.mean(unexplained_but_for_biases(plain, np.zeros(1))))
+        with_it = float(np.mean(unexplained_but_for_biases(pair, shift)))
+        left = before, with_it
+    return Found(
+        orientation_deg=orientation,
+        latency_s=None if lag is None else -lag,
+        velocity_window_s=window,
+        left=left,
+        **_noise(imu, gnss, C_bs),
+    )
+
+
+def _orientation(
+    imu: ImuTable, pair
+) -> tuple[tuple[float, float, float] | None, np.ndarray | None]:
+    """Roll, pitch, yaw [deg] of the vehicle seen from the sensor, and C_bs."""
+    signal = signal_of(imu)
+    v_b = travel_in_body(pair)
+    if signal is None or len(v_b) < _LEAST:
+        return None, None
+    windows = windows_of(signal)
+    down = -np.mean(windows.accel[windows.calm], axis=0)
+    down /= np.linalg.norm(down)
+    ahead = v_b / np.linalg.norm(v_b, axis=1, keepdims=True)
+    if np.linalg.norm(np.mean(ahead, axis=0)) < _STRAIGHT:
+        return None, None
+    forward = np.mean(ahead, axis=0)
+    forward -= down * (down @ forward)
+    forward /= np.linalg.norm(forward)
+    C_bs = np.stack([forward, np.cross(down, forward), down])
+    whole = np.round(C_bs)
+    turned = np.rad2deg(np.arccos(np.clip((np.trace(C_bs @ whole.T) - 1.0) / 2.0, -1.0, 1.0)))
+    if abs(np.linalg.det(whole) - 1.0) < 1e-9 and turned < _RIGHT_DEG:
+        C_bs = whole
+    angles = rotation.to_euler(rotation.from_dcm(jnp.asarray(C_bs.T)))
+    roll, pitch, yaw = (float(np.round(np.rad2deg(float(a)), 1)) + 0.0 for a in angles)
+    return (roll, pitch, yaw), C_bs
+
+
+def _noise(imu: ImuTable, gnss: GnssTable | None, C_bs: np.ndarray | None) -> dict:
+    """Random walks by means over a second at rest: half the mean square of their differences."""
+    signal = signal_of(imu)
+    if signal is None:
+        return {}
+    windows = windows_of(signal)
+    begin_s = signal.time_s[windows.first]
+    rest = windows.at_rest.copy()
+    if gnss is not None and gnss.v_n is not None:
+        fix_s = (gnss.time_ns - imu.time_ns[signal.rows[0]]) * 1e-9
+        size = np.hypot(gnss.v_n[:, 0], gnss.v_n[:, 1])
+        good = np.isfinite(size)
+        rest &= np.interp(begin_s + 0.5, fix_s[good], size[good], left=np.inf, right=np.inf) < 0.2
+    both = rest[1:] & rest[:-1]
+    if np.sum(both) < _RESTS:
+        return {}
+    length = float(np.median(np.diff(begin_s)))
+    out = {}
+    for name, means in (("gyro_noise", windows.gyro), ("accel_noise", windows.accel)):
+        means = means if C_bs is None else means @ C_bs.T
+        spread = np.sqrt(0.5 * np.mean(np.diff(means, axis=0)[both] ** 2, axis=0) * length)
+        out[name] = tuple(float(x) for x in spread)
+    return out
+
+
+def toml_of(found: Found, log: str) -> str:
+    """A configuration of `robins replay` with what was found; the rest is the default.
+
+    Args:
+        found: by `find_unit`.
+        log: name of the log, for the first line.
+    """
+    lines = [f"# Found by `robins doctor` in {log}; what is not here is the default.", ""]
+    if found.left is not None:
+        before, after = found.left
+        lines[1:1] = [f"# Motion left unexplained: {before:.1%} without it, {after:.1%} with it."]
+    lines += ['system = "ins-gnss"', ""]
+    unit, receiver = [], []
+    if found.orientation_deg is not None:
+        unit.append(f"orientation = {_list(found.orientation_deg, 'deg', '.1f')}")
+    if found.gyro_noise is not None:
+        noise = np.rad2deg(found.gyro_noise)
+        unit.append(f"gyro_noise = {_list(noise, 'deg/s/sqrt(Hz)', '.3g')}")
+    if found.accel_noise is not None:
+        unit.append(f"accel_noise = {_list(found.accel_noise, 'm/s^2/sqrt(Hz)', '.3g')}")
+    if found.latency_s is not None:
+        receiver.append(f'latency = "{found.latency_s:.3f} s"')
+    if found.velocity_window_s is not None:
+        receiver.append(f'velocity_window = "{found.velocity_window_s:.3g} s"')
+    receiver.append('# lever_arm = ["0 m", "0 m", "0 m"]  # IMU to antenna; a log does not tell it')
+    for name, rows in (("imu", unit), ("gnss", receiver)):
+        lines += [f"[{name}]", *rows, ""] if rows else []
+    return "\n".join(lines)
+
+
+def _list(values, unit: str, form: str) -> str:
+    return "[" + ", ".join(f'"{value:{form}} {unit}"' for value in values) + "]"

@@ -1,0 +1,115 @@
+"""A recorded log on one clock, along the vehicle's axes, with the sigmas that a filter believes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from robins import rotation
+from robins.dataset import Dataset, GnssTable
+from robins.ins.frames import to_ned_frd
+from robins.ins.increments import Increments, from_imu
+from robins.systems.ins_gnss.parameters import Replay
+
+
+class Log(NamedTuple):
+    """A log or a piece of it, NED/FRD, in seconds since the first IMU sample."""
+
+    increments: Increments  # dt (N,), theta (N, 3), dv (N, 3)
+    time_s: np.ndarray  # (N,) end of each increment
+    gnss: GnssTable  # M fixes, of the whole log
+    gnss_s: np.ndarray  # (M,)
+    sigma_m: np.ndarray  # (M, 3) believed by the filter
+    v_n: np.ndarray | None  # (M, 3), None where velocities are not used
+    sigma_v: np.ndarray | None
+    withheld: np.ndarray  # (M,) bool
+    field_s: np.ndarray | None = None  # (K,) of a magnetometer, where there is one
+    field_b: np.ndarray | None = None  # (K, 3) T, body axes
+
+
+def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
+    """The samples along the vehicle's axes, unless the log was loaded with a mounting.
+
+    Args:
+        dataset: a log.
+        orientation: roll, pitch, yaw [rad] of forward-right-down as seen from the sensor.
+    """
+    if dataset.mounted or not any(orientation):
+        return dataset
+    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*orientation))).T
+    whole = np.round(C_bs)  # right angles exchange axes and mix nothing
+    C_bs = np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
+    imu = to_ned_frd(dataset.imu)
+    imu = replace(imu, gyro=imu.gyro @ C_bs.T, accel=imu.accel @ C_bs.T)
+    mag = dataset.mag
+    if mag is not None:
+        mag = to_ned_frd(mag)
+        mag = replace(mag, field_t=mag.field_t @ C_bs.T)
+    return replace(dataset, imu=imu, mag=mag, mounted=True)
+
+
+def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
+    """Both tables on the IMU's clock, sigmas as the filter shall believe them.
+
+    Raises:
+        ValueError: there is no GNSS, or no fix lies within the IMU's time.
+    """
+    if dataset.gnss is None or len(dataset.gnss) == 0:
+        raise ValueError("a replay of INS/GNSS needs GNSS fixes; this log has none")
+    gnss, g = to_ned_frd(dataset.gnss), parameters.gnss
+    increments, end_ns = from_imu(dataset.imu)
+    origin = int(dataset.imu.time_ns[0])
+    time_s, gnss_s = (end_ns - origin) * 1e-9, (gnss.time_ns - origin) * 1e-9
+    if not np.any((gnss_s > 0.0) & (gnss_s <= time_s[-1])):
+        raise ValueError(
+            f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
+            f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
+        )
+    factor = np.ones(len(gnss))
+    if gnss.quality is not None:
+        for quality, value in g.sigma_factor.items():
+            factor[gnss.quality == int(quality)] = value
+    v_n, sigma_v = (gnss.v_n, gnss.sigma_v) if g.use_velocity else (None, None)
+    if sigma_v is not None:
+        sigma_v = np.maximum(sigma_v * factor[:, None], g.least_velocity_sigma)
+    return Log(
+        Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
+        time_s,
+        gnss,
+        gnss_s,
+        np.maximum(gnss.sigma_m * factor[:, None], g.least_sigma),
+        v_n if sigma_v is not None else None,
+        sigma_v,
+        parameters.withheld(gnss_s, gnss_s),
+        *_field(dataset, origin),
+    )
+
+
+def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Times and whole readings of the magnetometer; None of both without one."""
+    if dataset.mag is None:
+        return None, None
+    mag = to_ned_frd(dataset.mag)
+    whole = np.all(np.isfinite(mag.field_t), axis=1)
+    return (mag.time_ns[whole] - origin_ns) * 1e-9, mag.field_t[whole]
+
+
+def with_lever_arm(parameters: Replay, arm: tuple[float, float, float] | None) -> Replay:
+    """The parameters with the lever arm that the log was loaded with, if it was with one.
+
+    Raises:
+        ValueError: the parameters have another.
+    """
+    other = parameters.gnss.lever_arm
+    if arm is None:
+        return parameters
+    if any(other) and not np.allclose(arm, other, rtol=0.0, atol=1e-6):
+        raise ValueError(
+            f"the log was loaded with a lever arm of {arm} m, and gnss.lever_arm is {other} m; "
+            "give one of the two"
+        )
+    gnss = parameters.gnss.model_copy(update={"lever_arm": arm})
+    return parameters.model_copy(update={"gnss": gnss})

@@ -1,0 +1,93 @@
+"""What the doctor finds of a unit and its receiver, on logs whose unit and receiver are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robins import scenario
+from robins.logs.mounting import Mounting
+from robins.logs.unit_file import Found, find_unit, toml_of
+from robins.systems.ins_gnss import Drive, Replay, drive_dataset
+
+TURNS = "".join(
+    f'[[legs]]\ndo = "turn"\nangle = "{angle} deg"\nrate = "15 deg/s"\n'
+    f'[[legs]]\ndo = "accelerate"\nseconds = "5 s"\nspeed = "{speed} m/s"\n'
+    for angle, speed in ((70, 14), (-90, 8), (60, 13), (-120, 9), (80, 15), (45, 10))
+)
+DRIVE = f"""
+imu_rate = "50 Hz"
+[place]
+latitude = "46 deg"
+longitude = "9 deg"
+height = "300 m"
+heading = "20 deg"
+[imu]
+gyro_noise = "0.006 deg/s/sqrt(Hz)"
+accel_noise = "200 ug/sqrt(Hz)"
+gyro_bias = "0.1 deg/s"
+accel_bias = "5 mg"
+gyro_bias_walk = "0.0005 deg/s/sqrt(s)"
+accel_bias_walk = "5 ug/sqrt(s)"
+[gnss]
+rate = "4 Hz"
+sigma = "0.02 m"
+velocity_sigma = "0.03 m/s"
+[[legs]]
+do = "stop"
+seconds = "20 s"
+[[legs]]
+do = "accelerate"
+seconds = "6 s"
+speed = "10 m/s"
+{TURNS}
+"""
+EPOCH_S = 0.25
+
+
+@pytest.fixture(scope="module")
+def log():
+    return drive_dataset(scenario.parse(Drive, DRIVE), seed=2)
+
+
+def _means(log):
+    """The fixes with velocities that are means since the last one."""
+    t, at = log.truth.time_ns * 1e-9, log.gnss.time_ns * 1e-9
+    ways = np.cumsum(log.truth.v_n, axis=0) * 0.02
+    way = [np.stack([np.interp(at - a, t, x) for x in ways.T], -1) for a in (0.0, EPOCH_S)]
+    noise = 0.03 * np.random.default_rng(1).normal(size=log.gnss.v_n.shape)
+    return replace(log.gnss, v_n=(way[0] - way[1]) / EPOCH_S + noise)
+
+
+@pytest.mark.parametrize("means", [False, True])
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_an_offset_of_the_clock_and_a_window_of_the_velocities_are_told_apart(log, late_s, means):
+    gnss = _means(log) if means else log.gnss
+    found = find_unit(log.imu, replace(gnss, time_ns=gnss.time_ns + round(late_s * 1e9)))
+    assert (found.latency_s or 0.0) == pytest.approx(late_s, abs=0.04)
+    assert found.velocity_window_s == (EPOCH_S if means else None)
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (180.0, 0.0, -90.0), (10.0, -20.0, 35.0)])
+def test_the_mounting_is_that_of_a_turned_unit(log, angles):
+    C_bs = Mounting(*angles).dcm_bs()
+    imu = replace(log.imu, gyro=log.imu.gyro @ C_bs, accel=log.imu.accel @ C_bs)
+    found = find_unit(imu, log.gnss)
+    there = Mounting(*found.orientation_deg).dcm_bs()
+    apart = np.degrees(np.arccos(np.clip((np.trace(there @ C_bs.T) - 1.0) / 2.0, -1.0, 1.0)))
+    assert apart < (1e-3 if 10.0 not in angles else 4.0)
+    # 20 s of rest: half a dozen means or more, each of a second
+    np.testing.assert_allclose(np.degrees(found.gyro_noise), 0.006, rtol=0.6)
+    np.testing.assert_allclose(found.accel_noise, 200e-6 * 9.80665, rtol=0.6)
+
+
+def test_what_is_written_is_a_whole_configuration():
+    found = Found((180.0, 0.0, -90.0), 0.15, 0.25, (1e-4, 2e-4, 3e-4), None, (0.5, 0.02))
+    parameters = scenario.parse(Replay, toml_of(found, "drive"))
+    assert np.degrees(parameters.imu.orientation) == pytest.approx((180.0, 0.0, -90.0))
+    assert parameters.imu.gyro_noise == pytest.approx((1e-4, 2e-4, 3e-4), rel=5e-3)
+    assert parameters.imu.accel_noise == Replay().imu.accel_noise
+    assert parameters.gnss.latency == pytest.approx(0.15)
+    assert parameters.gnss.velocity_window == pytest.approx(0.25)
+    nothing = scenario.parse(Replay, toml_of(Found(), "drive"))
+    assert nothing == Replay()
