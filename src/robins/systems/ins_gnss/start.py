@@ -94,7 +94,7 @@ def _compass(
     log: Log,
     q_nb: np.ndarray,
     when_s: float,
-    place: tuple[float, ...],
+    place: tuple[float, float, float],
     time_ns: int,
     otherwise: str,
 ) -> tuple[float, str]:
@@ -183,7 +183,7 @@ def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
     q_nb = np.asarray(level(force, 0.0, heading).q_nb.wxyz)
     begin_s = float(time_s[at])
     if unknown:
-        place = tuple(float(x[some]) for x in (g.lat_rad, g.lon_rad, g.alt_m))
+        place = float(g.lat_rad[some]), float(g.lon_rad[some]), float(g.alt_m[some])
         heading, told = _compass(log, q_nb, begin_s, place, int(g.time_ns[some]), unknown)
         q_nb = with_heading(q_nb, heading)
         sentence += f", {told}"

@@ -300,12 +300,14 @@ def first_belief(look: FirstLook, parameters: Replay, rest: RestFound | None = N
         rest: where the log begins with rest, the mean rate read is the bias.
     """
     p = parameters
-    begun = rest is not None and rest.first is not None
+    bias, bias_sigma = jnp.zeros(3), p.gyro.bias
+    if rest is not None and rest.first is not None:
+        bias, bias_sigma = jnp.asarray(rest.first), rest.first_sigma
     mean = model.MargState(
         q_nb=Rotation(jnp.asarray(look.q_nb)),
         v_n=jnp.zeros(3),
         p_n=jnp.zeros(3),
-        gyro_bias=jnp.asarray(rest.first) if begun else jnp.zeros(3),
+        gyro_bias=bias,
         gyro_gain=jnp.zeros((3, 3)),
         accel_bias=jnp.zeros(3),
         declination=jnp.zeros(()),
@@ -320,7 +322,7 @@ def first_belief(look: FirstLook, parameters: Replay, rest: RestFound | None = N
         [look.tilt_rad, look.tilt_rad, look.heading_rad],
         [p.rest.velocity * 10.0 if look.still else 2.0 * p.travel.velocity] * 3,
         [p.travel.place] * 3,
-        [rest.first_sigma if begun else p.gyro.bias] * 3,
+        [bias_sigma] * 3,
         [p.gyro.gain] * 9,
         [p.accelerometer.bias] * 3,
         [bend],
