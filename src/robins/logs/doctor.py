@@ -82,6 +82,7 @@ OF_READERS = (
     Code("several_instances", "note", "a flight log holds several sensors of one kind"),
     Code("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
     Code("quaternion_length", "warning", "single quaternions of another length; likewise"),
+    Code("other_kinds", "note", "a file holds lines of kinds that are not read"),
 )
 
 _OF_VELOCITY = (
