@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation as SciRotation
 
-from robins.campaign.statistics import collect
+from robins.campaign.statistics import Statistics
 from robins.earth import Geodetic
 from robins.filters import Code, kalman, run
 from robins.ins.increments import Increments
@@ -428,7 +428,9 @@ def statistics(scale, runs=60, epochs=40, seed=0):
         },
     }
     problem = STUDY.problem(load(Product, *SHIP), (), 0)
-    return collect([record], problem.blocks, 0, problem.limits)
+    statistics = Statistics(problem.blocks, 0, problem.limits)
+    statistics.add(record)
+    return statistics
 
 
 def test_metrics_are_in_their_units_and_order():

@@ -82,3 +82,18 @@ class Line:
         if not self._bursts:
             return None
         return -(-(self._bursts[0][0] + self._byte) // self._baud)
+
+
+def load(
+    bytes_count: float | int, seconds: float | int, baud: int, bits_per_byte: int = BITS_PER_BYTE
+) -> float:
+    """Share of what a line can carry that so many bytes in so many seconds are.
+
+    Above 1 the backlog grows for ever.
+
+    Raises:
+        ValueError: no time, or no baud.
+    """
+    if not (seconds > 0.0 and baud > 0):
+        raise ValueError(f"seconds and baud must be above 0, got {seconds} and {baud}")
+    return bytes_count * bits_per_byte / (seconds * baud)
