@@ -8,8 +8,8 @@ scale of the process noise,
 
     Q_s = s^2 Q + s^2 back C,     s of the scales,  C = diag of the initial variance of constants
 
-so a motion that is wrong for long makes a mode of more noise likely, and a bad record, which is gone
-at the next step, does not. There is no gate: nothing is refused, so nothing is locked out.
+so a motion that is wrong for long makes a mode of more noise likely, and a bad record, which is
+gone at the next step, does not. There is no gate: nothing is refused, so nothing is locked out.
 
 States that the model holds for constant (biases, misalignments) have no noise of their own to be
 scaled. A mode lasts 1 / back steps once it has begun, and over these lets a constant wander by s
@@ -40,21 +40,28 @@ UP, BACK = 1e-4, 1e-2
 OTHER = 1e-5  # that an alternative gives way to another in a step
 
 
-def excited(scale: ArrayLike, constants: Sequence[int] = (), wander: ArrayLike = 0.0) -> Rule:
+def excited(
+    scale: ArrayLike,
+    constants: Sequence[int] = (),
+    wander: ArrayLike = 0.0,
+    only: Sequence[int] | None = None,
+) -> Rule:
     """Process noise of another scale; constants wander.
 
     Args:
         scale: s, of the standard deviations of the process noise.
         constants: tangent components that the model holds for constant.
         wander: standard deviation of what is added to each in a step, over its initial sigma.
+        only: tangent components whose process noise is scaled; None: all.
     """
     which = np.asarray(constants, int)
+    moved = slice(None) if only is None else np.asarray(only, int)
 
     def init(belief: Belief, dims: Any) -> Array:
         return jnp.sqrt(jnp.sum(belief.factor[which] ** 2, axis=1))
 
     def process(first: Array, t: Transition):
-        noise = jnp.asarray(scale) * t.noise
+        noise = t.noise.at[moved].multiply(scale)
         if len(which):
             columns = jnp.zeros((len(noise), len(which)))
             columns = columns.at[which, np.arange(len(which))].set(wander * first)
@@ -96,6 +103,7 @@ def adaptive(
     up: float = UP,
     back: float = BACK,
     constants: Sequence[int] = (),
+    only: Sequence[int] | None = None,
     motions: Callable[[Any], Motion] | None = None,
     alternatives: Any = None,
     linearise: Linearisation | None = None,
@@ -112,6 +120,8 @@ def adaptive(
         up: probability of a change to one louder scale in a step.
         back: of a change to one quieter scale.
         constants: tangent components that the model holds for constant.
+        only: components whose process noise is scaled, where others are driven by something else,
+            such as the error of a wind; all where not given.
         motions: makes the motion of one row of the alternatives.
         alternatives: pytree of arrays, one row an alternative of the motion that holds for good.
             Each is combined with every scale.
@@ -132,7 +142,7 @@ def adaptive(
 
     def one(row: Any) -> Filter | Mode:
         scale, wandering, *other = row
-        rules = (excited(scale, constants, wandering), huber(robust))
+        rules = (excited(scale, constants, wandering, only), huber(robust))
         made = kalman(by, rules, form)
         return made if motions is None else Mode(made, motions(other[0]))
 

@@ -37,6 +37,7 @@ from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, 
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 COMMON = 9  # states that all local filters have
+BIASES = tuple(range(9, 15))  # of gyros and accelerometers, of filters that have states for them
 BOTH = (WIND, WIND_OF_STAR)
 
 
@@ -91,6 +92,11 @@ def _product() -> Filter:
     return ekf(rules.only((SAR,), rules.huber(0.999)), rules.only((WIND,), patient))
 
 
+def _adaptive() -> Filter:
+    """As "product", but for a motion of which nobody knows when it is wrong."""
+    return filters.adaptive(constants=BIASES)
+
+
 class Candidate(NamedTuple):
     """A filter of the study, its instruments as it takes them, its states."""
 
@@ -140,6 +146,7 @@ CANDIDATES: dict[str, Candidate] = {
     "distributed-mean": Candidate(lambda: _two(ukf, feedback="mean"), PLAIN),
     "distributed-full": Candidate(lambda: _two(ukf, feedback="full"), PLAIN),
     "product": Candidate(_product, instruments.ABOARD, PRODUCT),
+    "adaptive": Candidate(_adaptive, instruments.ABOARD, PRODUCT),
 }
 """Every filter of the study."""
 

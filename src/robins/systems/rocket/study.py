@@ -28,6 +28,7 @@ from robins.filters import (
     Motion,
     Rule,
     Sensor,
+    adaptive,
     channel,
     federated,
     kalman,
@@ -109,6 +110,11 @@ def aboard(
     return tuple(s for s in believed if s is not None), tuple((i.name, i.taken) for i in chosen)
 
 
+def bank() -> Filter:
+    """A bank over the scale of the process noise, with the sigma points of the studies."""
+    return adaptive(linearise=_POINTS)
+
+
 # ------------------------------------------------------------------------------- magnetic attitude
 
 
@@ -120,6 +126,7 @@ class AngleFilter(NamedTuple):
     sensors: tuple[str, ...] = (GYRO, MAGNETIC)
     raw: bool = False  # its sensor is taken at its word, without a model of the motion
     discriminates: bool = False  # outliers from model errors, of each sensor
+    adapts: bool = False  # a bank over the process noise
 
 
 ANGLE_FILTERS: dict[str, AngleFilter] = {
@@ -139,6 +146,7 @@ ANGLE_FILTERS: dict[str, AngleFilter] = {
     "huber": AngleFilter(None, huber(PROBABILITY)),
     "gate": AngleFilter(None, patient()),
     "discriminator": AngleFilter(discriminates=True),
+    "adaptive": AngleFilter(adapts=True),
     "federated-root-discriminator": AngleFilter("root", discriminates=True),
 }
 
@@ -152,6 +160,8 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
 
     if chosen.raw:
         return kalman(taylor())
+    if chosen.adapts:
+        return bank()
     if chosen.sharing is None:
         return own(*chosen.sensors)
     channels = [channel((sensor,), own(sensor)) for sensor in chosen.sensors]
@@ -238,6 +248,7 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
     "gate": FieldFilter(ukf(patient())),
     "discriminator": FieldFilter(ukf(projected_discriminator("huber"))),
     "discriminator-gate": FieldFilter(ukf(projected_discriminator("gate"))),
+    "adaptive": FieldFilter(bank()),
     "strong-tracking": FieldFilter(ukf(fading())),
     "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
     "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),

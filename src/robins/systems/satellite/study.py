@@ -66,6 +66,9 @@ FILTERS: Mapping[str, FilterSpec] = {
     ),
     "mekf": FilterSpec("mekf", None, 1.0, "multiplicative EKF"),
     "mekf-gate": FilterSpec("gated", None, 1.0, "the same with a gate that opens again"),
+    "adaptive": FilterSpec(
+        "adaptive", None, 1.0, "a bank of them, over the scale of the process noise"
+    ),
     "mekf-tuned": FilterSpec("mekf", None, 30.0, "the same, noise of the bias times 30"),
     "mekf-informed": FilterSpec("mekf", None, None, "the same, told the true drift"),
     "ekf-quaternion": FilterSpec("quaternion", None, 1.0, "additive EKF of seven states"),
