@@ -6,7 +6,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
-from robins.filters.composite.adaptive import changes, lasting
+from robins.filters.composite.adaptive import Part, changes, excited, lasting
+from robins.filters.linearise import Transition
 from robins.filters.rules import huber
 
 F = np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # the third is held constant
@@ -64,7 +65,7 @@ def track(rng, steps=60):
 def test_it_is_the_dense_recursion():
     scales, up, back = (1.0, 5.0, 40.0), 0.02, 0.1
     y = track(np.random.default_rng(3))
-    found = run(adaptive(scales, 1.0, up, back, constants=[2]), MODEL, START, y)
+    found = run(adaptive(scales, 1.0, up, back, parts=[Part(constants=[2])]), MODEL, START, y)
     mean, covariance, mu = dense(y, scales, up, back)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8, atol=1e-10)
@@ -80,12 +81,18 @@ def test_one_scale_is_a_filter_with_hubers_rule():
     np.testing.assert_allclose(bank.mean, alone.mean, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(("count", "up", "back"), [(2, 0.1, 0.3), (3, 1e-4, 1e-2), (4, 0.2, 0.01)])
-def test_scales_change_as_stated_and_begin_where_they_last(count, up, back):
-    change = changes(count, up, back)
+@pytest.mark.parametrize(
+    ("scales", "up", "back"),
+    [((1, 8), 0.1, 0.3), ((1, 8, 64), 1e-4, 1e-2), ((1, 8, 64, 8, 64), 0.1, 0.01)],
+)
+def test_scales_change_as_stated_and_begin_where_they_last(scales, up, back):
+    change = changes(scales, up, back)
     np.testing.assert_allclose(change.sum(axis=1), 1.0, rtol=1e-14)
     assert change[0, -1] == up
     assert change[-1, 0] == back
+    if len(scales) == 5:
+        assert change[2, 4] == up  # as loud, of the other part
+        assert change[4, 1] == back
     far = np.linalg.matrix_power(change, 10**6)
     np.testing.assert_allclose(lasting(change), far[0], rtol=1e-6)
 
@@ -102,6 +109,18 @@ def test_it_follows_what_lasts_and_ignores_what_does_not():
     assert error["bank"][10] < 5.0  # the wild record
     assert np.max(error["bank"][26:]) < 6.0  # four sigma of a record, of six times the noise
     assert np.max(error["huber"][26:]) > 4.0 * np.max(error["bank"][26:])
+
+
+def test_a_part_has_its_own_noise_and_its_own_constants():
+    rng = np.random.default_rng(8)
+    N, none = rng.normal(size=(4, 2)), np.zeros((4, 0))
+    t = Transition(jnp.zeros(4), jnp.eye(4), jnp.asarray(none), jnp.asarray(N))
+    rule = excited([Part([0], [2]), Part([1], [3])], np.array([5.0, 1.0]), np.array([0.3, 0.0]))
+    first = rule.init(Belief.of(jnp.zeros(4), np.diag([1.0, 1.0, 4.0, 9.0])), {"y": 1})
+    _, found = rule.process(first, t)
+    grown = np.diag([5.0, 1.0, 1.0, 1.0]) @ N
+    expected = grown @ grown.T + np.diag([0.0, 0.0, (0.3 * 2.0) ** 2, 0.0])
+    np.testing.assert_allclose(found.noise @ found.noise.T, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_of_alternatives_the_right_one_is_found():

@@ -14,12 +14,16 @@ gone at the next step, does not. There is no gate: nothing is refused, so nothin
 States that the model holds for constant (biases, misalignments) have no noise of their own to be
 scaled. A mode lasts 1 / back steps once it has begun, and over these lets a constant wander by s
 times the sigma that it began with. The first scale is that of the model as it is: constants stay.
+
+Where several instruments drive the motion, one goes wrong at a time. So a mode scales one `Part` of
+the noise, and the part that is sound still tells the error of the other: a gyro that drifts must
+not make an accelerometer doubtful by which the tilt is known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,48 +44,58 @@ UP, BACK = 1e-4, 1e-2
 OTHER = 1e-5  # that an alternative gives way to another in a step
 
 
-def excited(
-    scale: ArrayLike,
-    constants: Sequence[int] = (),
-    wander: ArrayLike = 0.0,
-    only: Sequence[int] | None = None,
-) -> Rule:
-    """Process noise of another scale; constants wander.
+class Part(NamedTuple):
+    """What goes wrong together, such as all that one instrument drives.
+
+    Attributes:
+        moves: tangent components whose process noise is scaled; None: all.
+        constants: tangent components that the model holds for constant.
+    """
+
+    moves: Sequence[int] | None = None
+    constants: Sequence[int] = ()
+
+
+def excited(parts: Sequence[Part], scales: ArrayLike, wanders: ArrayLike) -> Rule:
+    """Process noise of another scale, part by part; constants wander.
 
     Args:
-        scale: s, of the standard deviations of the process noise.
-        constants: tangent components that the model holds for constant.
-        wander: standard deviation of what is added to each in a step, over its initial sigma.
-        only: tangent components whose process noise is scaled; None: all.
+        parts: of the process noise.
+        scales: (parts,) of the standard deviations of the noise.
+        wanders: (parts,) standard deviation of what is added to each constant in a step, over its
+            initial sigma.
     """
-    which = np.asarray(constants, int)
-    moved = slice(None) if only is None else np.asarray(only, int)
+    of = np.array([i for i, part in enumerate(parts) for _ in part.constants], int)
+    which = np.array([c for part in parts for c in part.constants], int)
 
     def init(belief: Belief, dims: Any) -> Array:
         return jnp.sqrt(jnp.sum(belief.factor[which] ** 2, axis=1))
 
     def process(first: Array, t: Transition):
-        noise = t.noise.at[moved].multiply(scale)
+        noise = t.noise
+        for i, part in enumerate(parts):
+            rows = slice(None) if part.moves is None else np.asarray(part.moves, int)
+            noise = noise.at[rows].multiply(jnp.asarray(scales)[i])
         if len(which):
             columns = jnp.zeros((len(noise), len(which)))
-            columns = columns.at[which, np.arange(len(which))].set(wander * first)
+            columns = columns.at[which, np.arange(len(which))].set(jnp.asarray(wanders)[of] * first)
             noise = jnp.concatenate([noise, columns], axis=1)
         return first, t._replace(noise=noise)
 
     return Rule(init=init, process=process, name="excited")
 
 
-def changes(count: int, up: float = UP, back: float = BACK) -> np.ndarray:
-    """(count, count) probabilities of a change in one step between scales in rising order.
+def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
+    """(n, n) probabilities of a change in one step between modes of these scales.
 
-    From any to one that is louder up each, to one that is quieter back each.
+    From any to each that is not quieter up, to each that is quieter back.
 
     Raises:
         ValueError: they are no probabilities.
     """
-    louder = np.triu(np.full((count, count), up), 1)
-    quieter = np.tril(np.full((count, count), back), -1)
-    change = louder + quieter
+    s = np.asarray(scales, float)
+    change = np.where(s[None] < s[:, None], back, up)
+    np.fill_diagonal(change, 0.0)
     stay = 1.0 - change.sum(axis=1)
     good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(stay > 0.0))
     require(good, "up and back of adaptive must leave a mode a chance to stay", (up, back))
@@ -98,12 +112,11 @@ def lasting(change: np.ndarray) -> np.ndarray:
 
 
 def adaptive(
-    scales: Sequence[float] = SCALES,
+    scales: Sequence[float | int] = SCALES,
     robust: float = 0.99,
     up: float = UP,
     back: float = BACK,
-    constants: Sequence[int] = (),
-    only: Sequence[int] | None = None,
+    parts: Sequence[Part] = (Part(),),
     motions: Callable[[Any], Motion] | None = None,
     alternatives: Any = None,
     linearise: Linearisation | None = None,
@@ -119,9 +132,7 @@ def adaptive(
         robust: share of right records that keep their weight (`huber`).
         up: probability of a change to one louder scale in a step.
         back: of a change to one quieter scale.
-        constants: tangent components that the model holds for constant.
-        only: components whose process noise is scaled, where others are driven by something else,
-            such as the error of a wind; all where not given.
+        parts: of the process noise; a mode makes one of them louder.
         motions: makes the motion of one row of the alternatives.
         alternatives: pytree of arrays, one row an alternative of the motion that holds for good.
             Each is combined with every scale.
@@ -137,22 +148,27 @@ def adaptive(
     require(rising, "scales of adaptive must rise, from above zero", scales)
     if (motions is None) != (alternatives is None):
         raise ValueError("adaptive needs both motions and alternatives, or neither")
-    wander = np.where(np.arange(len(s)) > 0, s * np.sqrt(back), 0.0)
+    # The quiet mode, then each louder scale of each part.
+    louder = np.tile(s[1:], len(parts))
+    own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
+    gains = s[0] * np.ones((1 + len(louder), len(parts)))
+    gains[1:] = np.where(own > 0.0, louder[:, None], gains[1:])
+    wanders = np.zeros_like(gains)
+    wanders[1:] = np.sqrt(back) * own * louder[:, None]
     by = taylor() if linearise is None else linearise
 
     def one(row: Any) -> Filter | Mode:
-        scale, wandering, *other = row
-        rules = (excited(scale, constants, wandering, only), huber(robust))
-        made = kalman(by, rules, form)
+        gain, wander, *other = row
+        made = kalman(by, (excited(parts, gain, wander), huber(robust)), form)
         return made if motions is None else Mode(made, motions(other[0]))
 
-    change = changes(len(s), up, back)
-    start = lasting(change)
+    change = changes([s[0], *louder], up, back)
+    start, modes = lasting(change), len(change)
     if motions is None:
-        return imm(Family(one, (s, wander)), change, start)
+        return imm(Family(one, (gains, wanders)), change, start)
     (count,) = {np.shape(x)[0] for x in jax.tree_util.tree_leaves(alternatives)}
-    here = np.repeat(np.arange(count), len(s))
+    here = np.repeat(np.arange(count), modes)
     rows = jax.tree_util.tree_map(lambda x: np.asarray(x)[here], alternatives)
     between = np.full((count, count), OTHER) + np.diag(np.full(count, 1.0 - count * OTHER))
-    numbers = (np.tile(s, count), np.tile(wander, count), rows)
+    numbers = (np.tile(gains, (count, 1)), np.tile(wanders, (count, 1)), rows)
     return imm(Family(one, numbers), np.kron(between, change), np.tile(start, count) / count)

@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
+from robins.filters.composite.adaptive import Part
 from robins.manifold import retract
 from robins.systems.airship import instruments
 from robins.systems.airship.error_model import ERRORS, feedback
@@ -37,7 +38,9 @@ from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, 
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 COMMON = 9  # states that all local filters have
-BIASES = tuple(range(9, 15))  # of gyros and accelerometers, of filters that have states for them
+# What each of them drives, and their biases, of filters that have states for these
+GYROS = Part(range(0, 3), range(9, 12))
+ACCELEROMETERS = Part(range(3, 9), range(12, 15))
 BOTH = (WIND, WIND_OF_STAR)
 
 
@@ -94,7 +97,7 @@ def _product() -> Filter:
 
 def _adaptive() -> Filter:
     """As "product", but for a motion of which nobody knows when it is wrong."""
-    return filters.adaptive(constants=BIASES)
+    return filters.adaptive(parts=(GYROS, ACCELEROMETERS))
 
 
 class Candidate(NamedTuple):

@@ -33,6 +33,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from robins.filters import Family, Filter, Motion, adaptive, imm, kalman, taylor, unscented
+from robins.filters.composite.adaptive import Part
 from robins.filters.linearise import Transition
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -129,7 +130,8 @@ STRUCTURES = (
     _TEN_ARCMIN * np.array([_STIFF, 1.0, 1.0, 1.0]),
     np.array([_DECADES_S[0], *_DECADES_S]),
 )
-CONSTANTS = tuple(range(9, 15))  # biases of gyros and accelerometers
+GYROS = Part(range(0, 3), range(9, 12))  # attitude, and the biases
+ACCELEROMETERS = Part(range(3, 9), range(12, 15))
 
 
 def blind(moving: Moving) -> Filter:
@@ -139,7 +141,8 @@ def blind(moving: Moving) -> Filter:
         sigma, time = (jnp.broadcast_to(jnp.asarray(x), 3) for x in row)
         return moving(Flexure(sigma, time))
 
-    return adaptive(constants=CONSTANTS, motions=motion, alternatives=STRUCTURES, form="joseph")
+    units = (GYROS, ACCELEROMETERS)
+    return adaptive(parts=units, motions=motion, alternatives=STRUCTURES, form="joseph")
 
 
 # ----------------------------------------------------------------------------------- by name

@@ -73,7 +73,7 @@ ADAPTIVE: dict[str, dict[str, Any]] = {
     "hinf-patent-weights": {"weight": np.ones(va.STATES)},  # L = I, and R = I below
 }
 # Of the product model: closed loop, with states for the mounting. Run by default is the first; the
-# others are banks of seven and of twelve filters.
+# others are banks of seven and of twenty filters.
 PRODUCT = ("product", "product-adaptive", "adaptive")
 FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
