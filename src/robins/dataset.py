@@ -143,3 +143,58 @@ class Dataset:
     master_delay_s: float = 0.0  # by how much records of the master are older than their stamps
     # from the IMU to the GNSS antenna, forward, right, down; None where nobody told it
     lever_arm_b_m: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class RangeTable(_Rows):
+    """Pseudoranges of a GNSS receiver, one a row; satellites of one time stand together.
+
+    Corrected for the atmosphere and the clocks of the satellites. A satellite's position is where
+    it sent, Earth-fixed at that time, so that a receiver's model must turn the Earth (Sagnac).
+    """
+
+    time_ns: np.ndarray  # (N,) int64, does not fall
+    range_m: np.ndarray  # (N,)
+    sigma_m: np.ndarray  # (N,)
+    satellite_e: np.ndarray  # (N, 3) m
+    satellite: np.ndarray  # (N,) int, one number for each satellite of any system
+    system: np.ndarray  # (N,) int
+    elevation_rad: np.ndarray  # (N,)
+    cn0_dbhz: np.ndarray  # (N,)
+    source: str = ""
+    rows: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class OdometryTable(_Rows):
+    """Speed of the wheels and rate of a yaw gyro."""
+
+    time_ns: np.ndarray  # (M,) int64
+    speed_mps: np.ndarray  # (M,) forward
+    yaw_rate: np.ndarray  # (M,) rad/s, positive to the right
+    sigma_speed: np.ndarray  # (M,) of the noise of a row
+    sigma_yaw: np.ndarray  # (M,)
+    source: str = ""
+    rows: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class PlaceTable(_Rows):
+    """True places, Earth-fixed."""
+
+    time_ns: np.ndarray  # (K,) int64
+    r_e: np.ndarray  # (K, 3) m
+    source: str = ""
+    rows: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class RangeLog:
+    """What a run of tight GNSS starts from."""
+
+    name: str
+    ranges: RangeTable
+    odometry: OdometryTable
+    truth: PlaceTable | None = None
+    counts: dict[str, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from robins.bench import wire
 from robins.bench.broker.faults import ROUTES
-from robins.bench.ports.line import load
+from robins.bench.ports.line import BITS_PER_BYTE
 from robins.bench.ports.port import open_pair
 from robins.bench.wire import Frame, Header, Receiver, Sequence
 from robins.bench.wire.c_header import firmware, schema_number
@@ -325,9 +325,9 @@ def test_the_page_has_the_budget():
         there, here = on_the_line((*to, "tick")), on_the_line((*back, "done"))
         cells = [line, str(there), str(here)]
         for baud in BAUDS:
-            full = [round(100 * load(max(there, here), 1 / hz, baud)) for hz in RATES_HZ]
+            full = [round(100 * max(there, here) * hz * BITS_PER_BYTE / baud) for hz in RATES_HZ]
             cells.append(", ".join(f"{share} %" for share in full))
-        cells.append(f"{1e3 * load(there + here, 1.0, 460800):.1f}")
+        cells.append(f"{1e3 * (there + here) * BITS_PER_BYTE / 460800:.1f}")
         rows.append(f"| {' | '.join(cells)} |")
     page = (DOCS / "board.md").read_text("utf-8").splitlines()
     first = page.index(rows[0])

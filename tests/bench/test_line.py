@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robins.bench.ports.line import Line, load
+from robins.bench.ports.line import Line
 
 BAUDS = st.sampled_from([300, 9600, 115_200, 460_800, 921_600, 999_983])
 
@@ -89,11 +89,3 @@ def test_what_does_not_fit_is_dropped_and_counted():
 def test_lines_that_cannot_be(wrong):
     with pytest.raises(ValueError, match="must be at least 1, got"):
         Line(**({"baud": 9600} | wrong))
-
-
-def test_load():
-    """A frame of the gyro at 100 Hz, as the page of the wire says."""
-    assert load(49 * 100, 1.0, 49_000) == pytest.approx(1.0, rel=1e-15)
-    assert load(1152, 0.1, 115_200, 11) == pytest.approx(1.1, rel=1e-15)
-    with pytest.raises(ValueError, match="seconds and baud must be above 0, got 0"):
-        load(1, 0, 9600)

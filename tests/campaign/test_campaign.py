@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from robins.campaign import collect, monte_carlo, record, rms_with_bounds, simulate, worlds
+from robins.campaign import Statistics, monte_carlo, record, rms_with_bounds, simulate, worlds
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
 from robins.filters.rules import h_infinity
 from robins.sim.random import Component, stream
@@ -18,6 +18,14 @@ from robins.systems.study import Case, Contender, Limit, Problem, SensorAxes, St
 STEPS = 60
 F = jnp.array([[1.0, 0.5], [0.0, 1.0]])
 Q_FACTOR = jnp.array([[0.02, 0.0], [0.05, 0.03]])
+
+
+def collect(records, blocks, **settings):
+    """Statistics of all chunks."""
+    statistics = Statistics(blocks, **settings)
+    for one in records:
+        statistics.add(one)
+    return statistics
 
 
 def _move(x, u):

@@ -99,6 +99,14 @@ def test_a_log_is_replayed_and_the_doctor_is_heard(robins, workbench):
     assert "degrees" not in answer.err  # an error ends the command and is told there
 
 
+def test_exports_are_asked_for_by_name(robins, workbench):
+    assert robins("replay", "imu.csv", "--export", "csv, kml").status == 0
+    assert workbench.asked["exports"] == ("csv", "kml")
+    assert robins("replay", "imu.csv").status == 0
+    assert workbench.asked["exports"] == ()
+    assert robins("replay", "imu.csv", "--export", "csv,").status == Status.BAD_INPUT
+
+
 def test_a_log_is_one_run(robins, workbench):
     assert robins("replay", "imu.csv", "--runs", 1).status == 0
     answer = robins("replay", "imu.csv", "--runs", 5)

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import click
+import gnss_logs
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # Of each study the filter that costs least and uses every sensor, and what makes a run short.
 STUDIES = {
     "drive": ("ekf", ()),
+    "city": ("ekf", ()),
     "attitude-matching": ("kf", ()),
     "velocity-attitude": ("kf", ()),
     "product": ("kf", ()),
@@ -251,6 +253,8 @@ def folder(tmp_path_factory):
     (here / "logger.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     turned = logs.open_log(here / "turned.csv")
     logs.write_log(here / "my.csv", turned, logs.columns_from(here / "logger.toml"))
+    for name, text in zip(("ranges", "places"), gnss_logs.as_text(*gnss_logs.drive()), strict=True):
+        (here / f"{name}.txt").write_text(text)
     rng = np.random.default_rng(2)
     still = rng.normal(size=(2, 3000, 3)) * [[[1e-3]], [[5e-3]]] + [[[0, 0, 0]], [[0, 0, -9.81]]]
     stamps = np.arange(3000) * 10_000_000
@@ -320,6 +324,8 @@ def as_short_as_can_be(words):
             return [*words, "--runs", "1"]
         case ["design", *_] if "--methods" not in words:
             return [*words, "--methods", "riccati"]
+        case ["replay", *_] if "gnss" in words:
+            return [*words, "--filters", "ls"]
         case ["replay", *_]:
             return [*words, "--filters", "marg" if "--system" in words else "ekf"]
         case ["bench", "up", *_]:

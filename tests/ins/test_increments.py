@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from composed import composed
 from numpy.polynomial.legendre import leggauss
 from pyins import strapdown
 from scipy.spatial.transform import Rotation
 
 from robins.dataset import ImuTable
 from robins.ins.frames import to_enu_rfu
-from robins.ins.increments import Increments, displacement, from_imu, thin
+from robins.ins.increments import Increments, displacement, from_imu
 
 rng = np.random.default_rng(3)
 NODES, WEIGHTS = leggauss(8)
@@ -61,11 +62,11 @@ class Coning:
 def joined_error(body, t, kind):
     """Errors in attitude, velocity and displacement of all increments, joined."""
     imu = body.imu(t, kind)
-    total, _ = thin(*from_imu(imu), len(t) - 1)
+    total = composed(from_imu(imu)[0])
     theta, dv, dr = body.motion(t[0], t[-1])
-    miss = Rotation.from_rotvec(theta).inv() * Rotation.from_rotvec(total.theta[0])
+    miss = Rotation.from_rotvec(theta).inv() * Rotation.from_rotvec(total.theta)
     return np.array(
-        [miss.magnitude(), np.linalg.norm(total.dv[0] - dv), np.linalg.norm(total.dr[0] - dr)]
+        [miss.magnitude(), np.linalg.norm(total.dv - dv), np.linalg.norm(total.dr - dr)]
     )
 
 
@@ -148,9 +149,10 @@ def test_coning_drift_stays_at_its_bound(hz, samples):
     body = Coning(half_angle, rate)
     seconds = 4.0
     t = np.arange(int(seconds * samples) + 1) / samples
-    inc, end_ns = from_imu(body.imu(t, "increment"))
-    total, _ = thin(inc, end_ns, len(t) - 1)  # whole turns of the cone, so all of it is drift
-    drift = abs(total.theta[0, 2]) / seconds
+    total = composed(
+        from_imu(body.imu(t, "increment"))[0]
+    )  # whole turns of the cone, so all of it is drift
+    drift = abs(total.theta[2]) / seconds
     bound = coning_drift(half_angle, rate, 1.0 / samples)
     # terms in the fourth power of the half angle, and rounding of 4e3 joins
     assert drift == pytest.approx(bound, rel=2.0 * half_angle**2, abs=1e-13)
@@ -172,23 +174,6 @@ def test_rfu_tables_give_the_same_increments():
     imu = Coning(0.1, 3.0).imu(np.arange(50) / 50.0, "increment")
     for ours, theirs in zip(from_imu(imu)[0], from_imu(to_enu_rfu(imu))[0], strict=True):
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_thinned_increments_are_compositions():
-    inc, end_ns = from_imu(Coning(0.2, 4.0).imu(np.arange(24) / 50.0, "increment"))
-    joined, joined_ns = thin(inc, end_ns, 5)
-    np.testing.assert_array_equal(joined_ns, end_ns[[4, 9, 14, 19, 22]])
-    np.testing.assert_allclose(joined.dt, [0.1] * 4 + [0.06], atol=1e-15)
-    turned, v, r = Rotation.identity(), np.zeros(3), np.zeros(3)
-    for k in range(20, 23):  # the short run at the end, one by one
-        r = r + v * inc.dt[k] + turned.apply(inc.dr[k])
-        v = v + turned.apply(inc.dv[k])
-        turned = turned * Rotation.from_rotvec(inc.theta[k])
-    np.testing.assert_allclose(joined.theta[4], turned.as_rotvec(), atol=1e-16)
-    np.testing.assert_allclose(joined.dv[4], v, atol=1e-15)
-    np.testing.assert_allclose(joined.dr[4], r, atol=1e-15)
-    with pytest.raises(ValueError, match="every = 0"):
-        thin(inc, end_ns, 0)
 
 
 def at_row(k, value):
@@ -227,15 +212,15 @@ def without(imu, lost):
 def test_lost_increments_are_bridged_by_a_straight_line(lost):
     """The error of the path is that of one line over each gap, times what the turn makes of it."""
     body, t = Coning(0.3, 2.0), np.arange(401) / 40.0
-    total, _ = thin(*from_imu(without(body.imu(t, "increment"), lost)), len(t))
+    total = composed(from_imu(without(body.imu(t, "increment"), lost))[0])
     theta, dv, _ = body.motion(t[0], t[-1])
     kept = np.delete(t, lost)
     gaps = np.diff(kept)[np.diff(kept) > 0.03]
     # |w''| = 0.3 x 2^3 rad/s^3, |f''| < 9.5 m/s^4; a line between means overshoots it by h/40
     off = (gaps**3 / 12.0 + gaps**2 / 40.0 / 6.0).sum()
-    turned = (Rotation.from_rotvec(theta).inv() * Rotation.from_rotvec(total.theta[0])).magnitude()
+    turned = (Rotation.from_rotvec(theta).inv() * Rotation.from_rotvec(total.theta)).magnitude()
     assert turned < 2.4 * off
-    assert np.linalg.norm(total.dv[0] - dv) < (9.5 + 9.8 * 2.4 * 10.0) * off
+    assert np.linalg.norm(total.dv - dv) < (9.5 + 9.8 * 2.4 * 10.0) * off
 
 
 def burst(t):

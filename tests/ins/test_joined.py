@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from composed import composed
 
 from robins.earth import Geodetic
-from robins.ins.increments import Increments, joined, thin
+from robins.ins.increments import Increments, joined
 from robins.ins.mechanise import Nav, mechanise
 from robins.rotation import Rotation, from_euler
 
@@ -37,24 +38,24 @@ join = jax.jit(joined)
 @pytest.mark.parametrize("shifts", [True, False], ids=["with dr", "without dr"])
 def test_joined_is_what_numpy_composes(shifts):
     given = ONE_S if shifts else ONE_S._replace(dr=None)
-    want, _ = thin(given, np.arange(RATE_HZ), RATE_HZ)
+    want = composed(given)
     got = join(given)
-    assert float(got.dt) == pytest.approx(float(want.dt[0]), rel=1e-14)
+    assert float(got.dt) == pytest.approx(float(want.dt), rel=1e-14)
     for name in ("theta", "dv", "dr"):
-        mine, theirs = getattr(got, name), getattr(want, name)[0]
+        mine, theirs = getattr(got, name), getattr(want, name)
         np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-14, err_msg=name)
 
 
 def test_many_intervals_are_mapped():
     blocks = Increments(*(a.reshape(SPANS, RATE_HZ, *a.shape[1:]) for a in SAMPLES))
     got = jax.vmap(join)(blocks)
-    want, _ = thin(SAMPLES, np.arange(len(SAMPLES.dt)), RATE_HZ)
+    each = [composed(Increments(*(a[k] for a in blocks))) for k in range(SPANS)]
+    want = Increments(*map(np.stack, zip(*each, strict=True)))
     for a, b in zip(got, want, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
     # and joining what was joined joins all of it: the intervals lie one after the other
-    whole, _ = thin(SAMPLES, np.arange(len(SAMPLES.dt)), len(SAMPLES.dt))
-    for a, b in zip(join(got), whole, strict=True):
-        np.testing.assert_allclose(a, b[0], rtol=1e-12, atol=1e-13)
+    for a, b in zip(join(got), composed(SAMPLES), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
 
 
 def test_one_step_over_a_second_leads_where_its_samples_lead():
@@ -76,8 +77,8 @@ def test_one_step_over_a_second_leads_where_its_samples_lead():
     assert np.linalg.norm(turn) < 1e-9
     assert np.linalg.norm(push) < 1e-5
     assert np.linalg.norm(shift) < 1e-4
-    lost, _ = thin(ONE_S, np.arange(RATE_HZ), RATE_HZ)
-    plain = mechanise(start, Increments(lost.dt, lost.theta, lost.dv))
+    lost = composed(ONE_S)
+    plain = mechanise(start, Increments(*(a[None] for a in lost[:3])))
     off = ends[0].position.local(jax.tree.map(lambda a: a[-1], plain.position))
     assert np.linalg.norm(off) > 100 * np.linalg.norm(shift)
 

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from rich.console import Console
 
 from robins import report
 from robins.report import numbers
@@ -102,8 +103,16 @@ def test_the_verdict_counts_the_claims(verdicts, text):
     assert report.verdict([{"verdict": v} for v in verdicts]) == text
 
 
+def plain(summary, width=100):
+    """The tables of a terminal as plain text."""
+    console = Console(width=width, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(report.table(summary, width))
+    return capture.get()
+
+
 def test_the_table_of_a_terminal_holds_every_metric_claim_and_refusal(town):
-    text = report.plain(town)
+    text = plain(town)
     for expected in (
         *("Horizontal RMS [m]", "0.0213", "kalman", "robust", "reproduced"),
         *("Smoothed error in 15 s outages", "at most 0.29", "1 of 2 claims reproduced, 1 partly."),
@@ -113,18 +122,18 @@ def test_the_table_of_a_terminal_holds_every_metric_claim_and_refusal(town):
 
 
 def test_markup_in_names_is_printed_as_it_is(town):
-    text = report.plain(town | {"filters": {"[red]x": {"a[/]b_m": 1.0}}})
+    text = plain(town | {"filters": {"[red]x": {"a[/]b_m": 1.0}}})
     assert "[red]x" in text
     assert "A[/]b [m]" in text
 
 
 def test_an_empty_summary_prints_nothing(town):
-    assert report.plain(town | {"filters": {}, "claims": [], "counts": {}}) == ""
+    assert plain(town | {"filters": {}, "claims": [], "counts": {}}) == ""
 
 
 def test_filters_without_room_come_in_tables_of_their_own(town):
     filters = {f"filter-{i}": {"a_m": 1.0, **({"b_m": 2.0} if i > 6 else {})} for i in range(9)}
-    text = report.plain(town | {"filters": filters, "claims": [], "counts": {}}, 60)
+    text = plain(town | {"filters": filters, "claims": [], "counts": {}}, 60)
     assert max(map(len, text.splitlines())) <= 60
     heads = [line.split()[1:] for line in text.splitlines() if line.startswith("metric")]
     assert len(heads) > 1

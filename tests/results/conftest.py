@@ -1,9 +1,7 @@
 """Results to damage and to replace."""
 
 import pytest
-from example_folder import a_solution, a_summary
-
-from robins.results import write
+from example_folder import a_solution, a_summary, write
 
 
 @pytest.fixture

@@ -2,9 +2,8 @@
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 
-from robins.results import array, variable
+from robins.results import ResultWriter, array, variable
 
 
 def a_summary(**changes):
@@ -35,10 +34,14 @@ def a_solution(scale=1.0):
     )
 
 
-def a_figure():
-    figure = Figure()
-    figure.subplots().plot([1, 2, 3])
-    return figure
+def write(path, values, dataset=None, files=None):
+    """Write a whole result at once; files by name."""
+    with ResultWriter(path) as writer:
+        writer.save_summary(values)
+        if dataset is not None:
+            writer.save_solution(dataset)
+        for name, content in (files or {}).items():
+            writer.save_file(name, content)
 
 
 def names(path):

@@ -9,10 +9,10 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from example_folder import a_figure, a_solution, a_summary, names
+from example_folder import a_solution, a_summary, names, write
 
 from robins import results
-from robins.results import ResultError, ResultWriter, folder, read, write
+from robins.results import ResultError, ResultWriter, folder, read
 
 # ------------------------------------------------------------------- nothing of the user is lost
 
@@ -157,7 +157,7 @@ def test_a_full_disk_leaves_the_earlier_result(earlier, monkeypatch, what):
     if what == "sync":
         monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(ResultError, match="No space left on device; free some space"):
-        write(earlier, a_summary(seed=2), a_solution(), figures={"x": a_figure()})
+        write(earlier, a_summary(seed=2), a_solution(), files={"figures/x.png": b"png"})
     monkeypatch.undo()
     still_there(earlier)
 
@@ -236,8 +236,8 @@ PROLOGUE = """
     import os, resource, sys
     from pathlib import Path
     sys.path[:0] = [{tests!r}]
-    from example_folder import a_solution, a_summary, names
-    from robins.results import ResultError, ResultWriter, read, write
+    from example_folder import a_solution, a_summary, names, write
+    from robins.results import ResultError, ResultWriter, read
     out = Path({out!r})
 """
 

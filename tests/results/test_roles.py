@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import role_table
 import xarray as xr
-from example_folder import a_summary
+from example_folder import a_summary, write
 
 from robins import report
-from robins.results import ROLES, array, find, read, roles, write
+from robins.results import ROLES, array, find, read, roles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 # Tables show these, or nothing does.
-NOT_DRAWN = {"bound_left", "gramian", "trade_off_bound", "context"}
+NOT_DRAWN = {"attitude", "bound_left", "gramian", "trade_off_bound", "context"}
 
 
 def examples():

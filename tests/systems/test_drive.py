@@ -5,7 +5,7 @@ import pytest
 from test_replay import DRIVE
 
 from robins import scenario
-from robins.campaign import collect, record, worlds
+from robins.campaign import Statistics, record, worlds
 from robins.systems.ins_gnss import Drive
 from robins.systems.ins_gnss.study import DRIVE as STUDY
 from robins.systems.ins_gnss.world import lay_out
@@ -22,7 +22,8 @@ def campaign(*settings):
     small = ("start.tilt=0.5 deg", "start.heading=2 deg", "update.gate=0")
     problem = STUDY.problem(parsed(*small, *settings), ("ekf",), 1)
     (runs,) = worlds(problem, RUNS, RUNS)
-    statistics = collect([record(problem, "ekf", *runs)], problem.blocks)
+    statistics = Statistics(problem.blocks)
+    statistics.add(record(problem, "ekf", *runs))
     metrics = problem.metrics(statistics)
     return metrics, {c["id"]: c["verdict"] for c in problem.claims({"ekf": metrics})}
 

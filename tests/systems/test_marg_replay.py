@@ -298,3 +298,23 @@ def test_lost_means_are_bridged_by_a_straight_line():
     log = ImuTable(np.round(end * 1e9).astype(np.int64), ramp, ramp - [0.0, 0.0, 9.8], "rate")
     inc, _ = from_imu(as_means(log))
     np.testing.assert_allclose(inc.theta.sum(0)[2], end[-1] ** 2 - end[0] ** 2, rtol=1e-9)
+
+
+def test_the_attitude_stands_at_every_sample(moved):
+    """And at the ends of blocks it is the one that the angles tell."""
+    log, outcome = moved
+    solution = outcome.solution
+    assert solution.attrs["origin_ns"] == log.imu.time_ns[0]
+    q_nb, at_s = solution["q_nb"], solution["sample_time"].values
+    assert q_nb.dims == ("filter", "sample_time", "axis_q_nb")
+    np.testing.assert_allclose(at_s, (log.imu.time_ns - log.imu.time_ns[0]) * 1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(q_nb.values, axis=-1), 1.0, atol=1e-12)
+    ends = np.searchsorted(at_s, solution["time"].values - 1e-6)
+    for name in ("marg", "marg-smoothed"):
+        q = Rotation.from_quat(q_nb.sel(filter=name).values, scalar_first=True)
+        angles = solution["estimate_euler"].sel(filter=name).values[:, ::-1]
+        turned = (q[ends].inv() * Rotation.from_euler("ZYX", angles)).magnitude()
+        assert turned.max() < 1e-9
+        # between them it goes on as smoothly as the hand
+        away = (q[:-1].inv() * q[1:]).magnitude()
+        assert away.max() < 0.1

@@ -119,6 +119,25 @@ def test_a_file_that_is_no_system_says_what_it_lacks(tmp_path, text, name, wante
     assert "wrong.py" in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("x = 1\n\nraise ZeroDivisionError('here')\n", 3),
+        ("import json\n\ndef read():\n    json.loads('{')\n\nread()\n", 4),
+        ("x = 1\ny = )\n", 2),
+        ("x = 1\nimport beside_it\n", 2),
+        ("x = 1\n\ncompile('x =', 'elsewhere.py', 'exec')\n", 3),
+    ],
+    ids=["raised", "called", "syntax", "syntax-beside-it", "syntax-in-a-string"],
+)
+def test_a_file_that_cannot_be_imported_is_named_with_its_line(tmp_path, text, line):
+    (tmp_path / "beside_it.py").write_text("x = 1\n\n\n\ndef\n")
+    (tmp_path / "wrong.py").write_text(text)
+    with pytest.raises(UnknownSystem) as refused:
+        find_system("wrong.py:study", tmp_path)
+    assert refused.value.where == f"{tmp_path / 'wrong.py'}, line {line}"
+
+
 def test_a_file_with_the_name_of_a_loaded_module_is_refused(tmp_path):
     (tmp_path / "json.py").write_text(EXAMPLE.read_text())
     with pytest.raises(UnknownSystem, match="give the file another name"):

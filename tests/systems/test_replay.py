@@ -126,6 +126,16 @@ def test_the_filter_is_far_better_than_the_fixes_and_the_smoother_better_still(c
     assert np.all(smoothed <= heading * (1 + 1e-9))
 
 
+def test_the_attitude_is_told_as_angles_and_as_a_quaternion(clean_outcome, log):
+    solution = clean_outcome.solution
+    assert solution.attrs["origin_ns"] == log.imu.time_ns[0]
+    assert solution["q_nb"].attrs["frame"] == "FRD to NED"
+    for name in ("ekf", "ekf+rts"):
+        q = Rotation.from_quat(solution["q_nb"].sel(filter=name).values, scalar_first=True)
+        angles = solution["estimate_euler"].sel(filter=name).values[:, ::-1]
+        assert (q.inv() * Rotation.from_euler("ZYX", angles)).magnitude().max() < 1e-9
+
+
 def test_a_lever_arm_told_with_the_log_is_that_of_the_configuration(log, clean_outcome):
     told = replace(logs.clean(log), lever_arm_b_m=(0.5, -0.2, -1.0))
     for settings in ((), ('gnss.lever_arm="0 m"',)):

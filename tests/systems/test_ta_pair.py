@@ -369,7 +369,7 @@ def test_a_scenario_class_takes_the_pieces_by_inheritance():
         ),
         (
             'disturbance.dropouts=[{begin="9 s", end="9 s"}]',
-            r"dropouts\[0\] from 9 s to 9 s .* begin before it ends",
+            r"dropouts.0 .* end \(9 s\) must come after begin \(9 s\)",
         ),
         ("disturbance.gyro_noise_factor=3.0", "without a gyro_noise_window"),
         ('disturbance.drift_step="9 deg/h"', "drift_step and drift_step_time belong together"),

@@ -382,6 +382,13 @@ def files(runs, tmp_path_factory):
     return folder
 
 
+def test_the_attitude_of_the_slave_is_told_as_angles_and_as_a_quaternion(clean, pairs):
+    assert clean.solution.attrs["origin_ns"] == pairs[0].imu.time_ns[0]
+    q = SciRotation.from_quat(clean.solution["q_nb"].values[0], scalar_first=True)
+    angles = clean.solution["estimate_euler"].values[0, :, ::-1]
+    assert (q.inv() * SciRotation.from_euler("ZYX", angles)).magnitude().max() < 1e-9
+
+
 def test_two_files_become_a_result_with_figures_and_a_page(files, clean):
     heard, pair = [], (files / "master.csv", files / "slave.csv")
     mine, settings = str(files / "mine.toml"), ('title="Mine"',)

@@ -1,4 +1,4 @@
-"""The test bench: a vehicle part by part, each a process or a board, each on a serial line.
+"""The test bench: each part of a vehicle is a process or a board on its own serial line.
 
 From the ground up:
 

@@ -1,4 +1,4 @@
-"""Benches that run on this machine tell each second how they are, for `robins bench status`."""
+"""Running benches of this machine report their state every second, for `robins bench status`."""
 
 from __future__ import annotations
 

@@ -1,14 +1,13 @@
-"""Campaigns: many runs of a problem, in chunks, with statistics that say how sure they are."""
+"""Campaigns: many runs of a problem, in chunks, with statistics and their confidence."""
 
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
-from robins.campaign.statistics import Statistics, collect, mean_with_bounds, rms_with_bounds
+from robins.campaign.statistics import Statistics, mean_with_bounds, rms_with_bounds
 
 __all__ = [
     "CHUNK",
     "Statistics",
     "campaign_solution",
-    "collect",
     "mean_with_bounds",
     "record",
     "rms_with_bounds",

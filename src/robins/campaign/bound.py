@@ -1,4 +1,4 @@
-"""The covariance bound of a problem: what its sensors allow, without any filter and any data."""
+"""The covariance bound of a problem: what its sensors allow, without a filter or data."""
 
 from __future__ import annotations
 

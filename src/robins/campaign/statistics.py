@@ -1,11 +1,11 @@
-"""What many runs say together, with the confidence they allow.
+"""Statistics of many runs, with their confidence.
 
 Sums are taken chunk by chunk, so a campaign of any size needs the memory of one chunk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -219,19 +219,6 @@ class Statistics:
     def sensors(self) -> list[str]:
         """Sensors that were used at all."""
         return [k for k, v in self._dof.items() if np.sum(v) > 0]
-
-
-def collect(
-    records: Iterable[dict[str, Any]],
-    blocks: Sequence[StateBlock],
-    count_from: int = 0,
-    limits: Sequence[Limit] = (),
-) -> Statistics:
-    """Statistics of all chunks."""
-    out = Statistics(blocks, count_from, limits)
-    for record in records:
-        out.add(record)
-    return out
 
 
 def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[float, float, float]:

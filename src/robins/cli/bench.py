@@ -35,7 +35,7 @@ from robins.cli.tell import carry_out, say
     ),
 )
 def bench() -> None:
-    """The test bench: each part of a vehicle a process or a board, each on a serial line."""
+    """The test bench: each part of a vehicle is a process or a board on a serial line."""
 
 
 def _ports(
@@ -50,8 +50,8 @@ def _ports(
     return found
 
 
-_SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of all noise. [default: 0]")
-_FILTER = option("--filter", "filter_", metavar="NAME", help="Of the attitude determination.")
+_SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of all noise. [default: 0]")
+_FILTER = option("--filter", "filter_", metavar="NAME", help="Filter for the attitude.")
 
 
 @bench.command(
@@ -66,19 +66,19 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Of the attitude de
 )
 @click.argument("scenario")
 @_FILTER
-@option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Of the run. [default: all]")
+@option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Length. [default: all]")
 @option("--clock", type=click.Choice(["lockstep", "realtime"]), help="[default: lockstep]")
-@option("--rate", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="In real time.")
-@option("--overrun", type=click.Choice(["continue", "skip", "abort"]), help="Of a deadline.")
-@option("--on-death", type=click.Choice(["fail", "restart"]), help="Of a process.")
-@option("--restarts", type=click.IntRange(1, 100_000), help="At most, of processes. [default: 10]")
+@option("--rate", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Real-time rate.")
+@option("--overrun", type=click.Choice(["continue", "skip", "abort"]), help="For a late step.")
+@option("--on-death", type=click.Choice(["fail", "restart"]), help="If a part dies.")
+@option("--restarts", type=click.IntRange(1, 100_000), help="Upper limit. [default: 10]")
 @option("--node", "ports", multiple=True, callback=_ports, metavar="PART=PORT", help="A board.")
-@option("--baud", type=click.IntRange(300), help="Slow the virtual lines down to this.")
+@option("--baud", type=click.IntRange(300), help="Speed of the virtual lines.")
 @option("--fifo", is_flag=True, help="Ask for the real-time scheduler SCHED_FIFO.")
-@option("--live", is_flag=True, help="Serve a page that shows it.")
+@option("--live", is_flag=True, help="Serve a page that shows the run.")
 @option("--paused", is_flag=True, help="With --live: wait for Start on the page.")
-@option("--host", default="127.0.0.1", show_default=True, help="Of the page.")
-@option("--port", type=click.IntRange(0, 65535), default=8321, show_default=True, help="Same.")
+@option("--host", default="127.0.0.1", show_default=True, help="Page address.")
+@option("--port", type=click.IntRange(0, 65535), default=8321, show_default=True, help="Page port.")
 @SETTINGS
 @_SEED
 @publishes
@@ -86,9 +86,9 @@ def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> 
     """Run SCENARIO on the bench: one of the satellite, one of the bench, or a file of either.
 
     Plant, rate table, gyro, star sensor, attitude determination, control and actuators are
-    processes, each on a serial line of its own, which the bench joins, records and disturbs. With
-    --node a board takes the place of a process. In lock-step (the default) the run equals
-    `robins run` bit for bit; real time is that of an ordinary kernel, soft.
+    processes, each on its own serial line; the bench connects, records and disturbs the lines. With
+    --node a board replaces a process. In lock-step (the default) the run equals `robins run` bit
+    for bit; real time is soft, as on any ordinary kernel.
 
     Scenarios of the bench: killed-adm, lost-star, lost-wheel, noisy-line, sign-star, stuck-star,
     wrong-star.
@@ -106,10 +106,10 @@ def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> 
     return Status.FAILED if outcome.failure else Status.DONE
 
 
-@bench.command(short_help="How the benches of this machine are.")
+@bench.command(short_help="Show the benches that run on this machine.")
 @answers
 def status(as_json: bool) -> None:
-    """Tell the benches that run on this machine: step, processes, links."""
+    """Show the benches that run on this machine: step, processes, links."""
     from robins.bench.status import running, table
 
     found = running()
@@ -117,7 +117,7 @@ def status(as_json: bool) -> None:
 
 
 @bench.command(
-    short_help="Let a part hear a record again, and compare what it says.",
+    short_help="Send a record to a part again and compare its answers.",
     epilog=examples(
         "robins bench replay results/bench-satellite-s1/record.mcap --node adm",
         "robins bench replay record.mcap --node adm --filter ekf-quaternion",
@@ -127,14 +127,14 @@ def status(as_json: bool) -> None:
 @click.argument("record", type=LOGS)
 @option("--node", required=True, metavar="PART", help="Which part.")
 @_FILTER
-@option("--diff", type=LOGS, metavar="RECORD", help="Compare with what the part says in another.")
+@option("--diff", type=LOGS, metavar="RECORD", help="Compare with another record.")
 @answers
 def replay(record: Path, as_json: bool, **options: Any) -> int:
-    """Start a part alone and let it hear RECORD, the record.mcap of a run, again.
+    """Start a part alone and send it RECORD, the record.mcap of a run, again.
 
-    The same part says the same bytes; exit status 1 if it does not. With --filter another filter
-    hears the same, and with --diff the part of two records is compared, field by field; then
-    differences are what was asked for, and no failure.
+    The exit status is 1 if the part does not answer with the same bytes. With --filter another
+    filter gets the same input, and with --diff the part of two records is compared, field by
+    field; then differences are expected and are not a failure.
     """
     cache.enable()
     with only_json(as_json), Progress() as progress:
@@ -148,10 +148,10 @@ def replay(record: Path, as_json: bool, **options: Any) -> int:
     return Status.DONE if (found.same or asked) and found.whole else Status.FAILED
 
 
-@bench.command(short_help="The serial ports of this machine.")
+@bench.command(short_help="List the serial ports of this machine.")
 @answers
 def ports(as_json: bool) -> None:
-    """Name the serial ports of this machine, and whether we may use them."""
+    """List the serial ports of this machine, and whether you may use them."""
     from robins.bench.ports.port import list_ports, table
 
     found = list_ports()
@@ -159,7 +159,7 @@ def ports(as_json: bool) -> None:
 
 
 @bench.command(
-    short_help="Be one part at a port, by hand.",
+    short_help="Run one part at a port, by hand.",
     epilog=examples("robins bench node gyro /dev/ttyUSB0,460800 satellite/s1 --seed 3"),
 )
 @click.argument("part")
@@ -169,10 +169,10 @@ def ports(as_json: bool) -> None:
 @_SEED
 @DEBUG
 def node(part: str, port: str, scenario: str, **options: Any) -> None:
-    """Be PART of SCENARIO at PORT until the bench says stop, as its process would be.
+    """Run PART of SCENARIO at PORT until the bench says stop, as its process would.
 
-    For a part on another machine, at the other end of a serial cable: there `robins bench up
-    SCENARIO --node PART=PORT` runs with the same seed.
+    Use it for a part on another machine, at the other end of a serial cable: there `robins bench
+    up SCENARIO --node PART=PORT` runs with the same seed.
     """
     cache.enable()
     from robins.workbench import bench_node
@@ -183,7 +183,7 @@ def node(part: str, port: str, scenario: str, **options: Any) -> None:
 
 
 @bench.command(
-    short_help="The wire as a C header, for firmware.",
+    short_help="Print the wire as a C header, for firmware.",
     epilog=examples("robins bench header > robins_wire.h"),
 )
 @DEBUG

@@ -1,4 +1,4 @@
-"""Less waiting for the compiler: it does what pays, and what it made is kept between commands."""
+"""Saves compile time: faster compiler settings, and a cache that is kept between commands."""
 
 from __future__ import annotations
 

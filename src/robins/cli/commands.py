@@ -38,8 +38,8 @@ Examples:
   robins list                                    what there is to run
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
-  robins bound ins-gnss/drive                    what can these sensors do at best?
-  robins doctor imu.csv gnss.pos                 is my log fit to navigate?
+  robins bound ins-gnss/drive                    how accurate can these sensors be at best?
+  robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it
   robins allan still.csv                         noise parameters of my IMU
   robins calibrate turned.csv                    hard and soft iron of my magnetometer
@@ -65,7 +65,7 @@ class _Group(click.Group):
 @click.version_option(__version__, prog_name="robins")
 @click.option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
 def app() -> None:
-    """Robust inertial navigation: simulate, navigate real logs, compare filters, show how good."""
+    """Robust inertial navigation: simulate, navigate real logs, compare filters, check claims."""
 
 
 def warn(findings: Sequence[Any]) -> None:
@@ -128,11 +128,11 @@ def run(
 ) -> None:
     """Simulate SCENARIO with several filters.
 
-    SCENARIO is a name that `robins list` tells, a TOML file, or FILE.py:STUDY of your own.
+    SCENARIO is a name from `robins list`, a TOML file, or FILE.py:STUDY of your own.
 
     All filters get the same random numbers; run k of seed S is the same whatever N is.
 
-    With --master and --slave a recorded pair takes the place of the simulation.
+    With --master and --slave a recorded pair replaces the simulation.
     """
     if master is None and slave is None:
         if columns:
@@ -149,7 +149,7 @@ def run(
 
 
 @app.command(
-    short_help="What the sensors of a scenario allow at best.",
+    short_help="Compute the best accuracy that the sensors of a scenario allow.",
     epilog=examples(
         "robins bound ins-gnss/drive",
         'robins bound ins-gnss/drive --without gnss_velocity --at "60 s" --at "200 s"',
@@ -159,15 +159,15 @@ def run(
 @click.argument("scenario")
 @option("--runs", type=click.IntRange(min=1), default=1, help="Trajectories to average over.")
 @option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
-@option("--at", multiple=True, metavar="TIME", help='Tell that time, "200 s"; may be repeated.')
+@option("--at", multiple=True, metavar="TIME", help='Print that time, "200 s"; may be repeated.')
 @choices
 @publishes
 def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: Any) -> None:
-    """Covariance bound and observability of SCENARIO: no filter with this model can do better.
+    """Compute the covariance bound and observability of SCENARIO; no filter can do better.
 
-    Needs no data: the model of a filter, by default the first of the scenario, is linearised about
-    the simulated truth. Tells the best sigma of each state over time, which states the sensors
-    see, what each sensor buys, and which directions are least observable.
+    It needs no data: the model of a filter, by default the first of the scenario, is linearised
+    about the simulated truth. It shows the best sigma of each state over time, which states the
+    sensors observe, what each sensor contributes, and which directions are least observable.
     """
     if len(filters) > 1:
         raise InputError(
@@ -183,42 +183,55 @@ def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: 
         "robins replay imu.csv gnss.pos --out walk",
         'robins replay imu.csv gnss.pos unit.toml --set gnss.latency="-50 ms" --json',
         "robins replay my.csv --columns logger.toml --system marg",
+        "robins replay imu.csv gnss.pos --out walk --export csv,kml",
     ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
 @_RUNS
-@option("--system", default="ins-gnss", show_default=True, help="What navigates the log.")
+@option(
+    "--system", default="ins-gnss", show_default=True, help="The system that navigates the log."
+)
+@option(
+    "--export",
+    "exports",
+    callback=as_names,
+    metavar="a,b",
+    help="Write the result for other programs too: csv, tum, kml, gpx.",
+)
 @COLUMNS
 @choices
 @publishes
 def replay(log: tuple[Path, ...], runs: int | None, out: Path | None, **options: Any) -> None:
     """Navigate a recorded log: LOG... are its files, inertial samples and GNSS fixes.
 
-    A file that ends in .toml says what the log does not: noise, mounting, lever arm. That of
+    A file that ends in .toml says what the log does not: noise, mounting, lever arm. The file of
     --columns declares the columns of a log that is in no known format.
+
+    --export writes files into exports/ of the result folder: csv has all estimates, tum is t x y z
+    qx qy qz qw in east, north, up, kml and gpx are tracks with UTC. kml and gpx need positions.
     """
     one_run(runs, "log")
     carry_out("replay", log, out=out or RESULTS / log_name(log), findings=warn, **options)
 
 
 @app.command(
-    short_help="Judge a log before anyone navigates it.",
+    short_help="Examine a log before it is navigated.",
     epilog=examples("robins doctor imu.csv gnss.pos", "robins doctor imu.csv unit.toml --json"),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
 @COLUMNS
 @answers
 def doctor(log: tuple[Path, ...], columns: tuple[Path, ...], as_json: bool) -> int:
-    """Judge a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
+    """Examine a log as an engineer would: units, axes, gravity, rates, gaps, time, sigmas.
 
-    Exit status 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... tells how
-    the sensor is mounted, as for `robins replay`.
+    The exit status is 2 if a run on it would be wrong, 0 otherwise. A .toml file among LOG... says
+    how the sensor is mounted, as for `robins replay`.
     """
     return judge(log, columns, as_json)
 
 
 @app.command(
-    short_help="Noise parameters of a resting IMU.",
+    short_help="Estimate the noise parameters of a resting IMU.",
     epilog=examples("robins allan still.csv", "robins allan still.csv --terms N --json"),
 )
 @click.argument("log", type=LOGS)
@@ -226,7 +239,7 @@ def doctor(log: tuple[Path, ...], columns: tuple[Path, ...], as_json: bool) -> i
 @COLUMNS
 @publishes
 def allan(log: Path, out: Path | None, **options: Any) -> None:
-    """Allan deviation of a resting IMU, with bounds, and the noise parameters of its data sheet.
+    """Compute the Allan deviation of a resting IMU, and the noise parameters of its data sheet.
 
     Q quantisation, N random walk, B bias instability, K rate random walk, R rate ramp.
     """
@@ -235,23 +248,23 @@ def allan(log: Path, out: Path | None, **options: Any) -> None:
 
 
 @app.command(
-    short_help="Hard and soft iron of a turned magnetometer.",
+    short_help="Calibrate hard and soft iron of a magnetometer.",
     epilog=examples(
         "robins calibrate turned.csv",
         'robins calibrate turned.ulg --field "48.5 uT" --begin "20 s" --end "80 s" --json',
     ),
 )
 @click.argument("log", nargs=-1, required=True, type=LOGS)
-@option("--field", metavar="FIELD", help='Its size at the place, "48.5 uT"; sets the scale.')
+@option("--field", metavar="FIELD", help='Its strength at the place, "48.5 uT"; sets the scale.')
 @option("--begin", metavar="TIME", help='Use samples from "20 s" after the first one on.')
 @option("--end", metavar="TIME", help='Use samples up to "80 s" after the first one.')
 @COLUMNS
 @publishes
 def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
-    """Hard and soft iron of a magnetometer from a log in which it is turned about all its axes.
+    """Calibrate hard and soft iron from a log in which the sensor is turned about all its axes.
 
-    Finds the offset and the matrix of ``matrix (measured - offset)``, whose size is that of the
-    Earth's field wherever the sensor points. A .toml file among LOG... tells how the sensor is
+    It finds the offset and the matrix of ``matrix (measured - offset)``, whose size is that of the
+    Earth's field wherever the sensor points. A .toml file among LOG... says how the sensor is
     mounted, as for `robins replay`, which takes the calibration.toml of the result.
     """
     out = out or RESULTS / f"calibrate-{log_name(log)}"
@@ -259,7 +272,7 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
 
 
 @app.command(
-    short_help="Gains that bound the worst case, and what that costs.",
+    short_help="Design gains that bound the worst case, and show their cost.",
     epilog=examples(
         "robins design attitude-axis",
         'robins design my.toml --gamma "1, 0.8" --methods riccati,retuned-slack --json',
@@ -270,10 +283,10 @@ def calibrate(log: tuple[Path, ...], out: Path | None, **options: Any) -> None:
 @option("--methods", callback=as_names, metavar="a,b", help="Which methods to compare.")
 @publishes
 def design(problem: str, out: Path | None, **options: Any) -> None:
-    """Constant-gain filters for PROBLEM, a TOML file with the matrices of a plant or an example.
+    """Design constant gains for PROBLEM, a TOML file with the matrices of a plant or an example.
 
-    Compares methods that keep the gain from a modelling error to the estimate below gamma: how much
-    noise each lets through, by true norms. Examples: attitude-axis, attitude-axis-drift,
+    It compares methods that keep the gain from a modelling error to the estimate below gamma, by
+    the true norm from noise to the estimate. Examples: attitude-axis, attitude-axis-drift,
     baro-height, two-states.
     """
     out = out or RESULTS / f"design-{Path(problem).name.removesuffix('.toml')}"
@@ -285,14 +298,14 @@ app.add_command(bench)
 
 @app.command(
     "list",
-    short_help="Name the systems and scenarios; of a system its filters and claims.",
+    short_help="List the systems and scenarios, or the filters and claims of a system.",
     epilog=examples("robins list", "robins list ins-gnss", "robins list --json"),
 )
 @click.argument("system", required=False)
 @answers
 def list_(system: str | None, as_json: bool) -> None:
-    """Name the systems and their scenarios, or tell the filters and claims of SYSTEM.
+    """List the systems and their scenarios, or the filters and claims of SYSTEM.
 
-    With --json everything there is, or SYSTEM alone.
+    With --json it prints everything, or SYSTEM alone.
     """
     listing(system, as_json)

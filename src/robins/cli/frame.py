@@ -1,4 +1,4 @@
-"""What every command stands on: exit status, errors of the user, which stream gets what."""
+"""What every command needs: exit status, errors of the user, which stream gets what."""
 
 from __future__ import annotations
 

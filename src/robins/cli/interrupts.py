@@ -1,4 +1,4 @@
-"""Ctrl-C that is heard: an interrupt must not get lost in a compiler or a garbage collector.
+"""Handles Ctrl-C: an interrupt must not get lost in a compiler or a garbage collector.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be. After a long call into
 compiled code that is often a callback of the garbage collector, from which nothing can be raised:

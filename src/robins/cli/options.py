@@ -27,7 +27,7 @@ COLUMNS = option(
     type=LOGS,
     multiple=True,
     metavar="TOML",
-    help="Says what the columns of a log are that is in no known format; may be repeated.",
+    help="Declares the columns of a log that is in no known format; may be repeated.",
 )
 
 
@@ -77,7 +77,7 @@ def choices(command: Callable) -> Callable:
     for one in (
         option("--filters", callback=as_names, metavar="a,b", help="Which filters to compare."),
         SETTINGS,
-        option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of all noise."),
+        option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise."),
     ):
         command = one(command)
     return command

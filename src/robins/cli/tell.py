@@ -1,4 +1,4 @@
-"""What every command ends with: what came out, where it is, and what to do next."""
+"""The last lines of every command: the result, where it is, and what to do next."""
 
 from __future__ import annotations
 

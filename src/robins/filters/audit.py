@@ -1,4 +1,4 @@
-"""What memories have to report of a run, found by walking the state that it ended with.
+"""Reports of the memories in the last state of a run.
 
 Nothing can be raised in compiled code. A memory whose type has a method ``audit(start, again,
 time)`` is asked when the numbers are there, wherever in a state it lies; the filters around it need

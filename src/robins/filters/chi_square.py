@@ -1,4 +1,4 @@
-"""Quantiles of the chi-square distribution, which decide what is too far off to be true.
+"""Quantiles of the chi-square distribution, the limits of gates and consistency tests.
 
 By the inverse of the incomplete gamma function alone: the statistics package takes half a second
 to import, which every process of a test bench would wait for.

@@ -1,4 +1,4 @@
-"""A filter in the loop that its own estimate closes: the vehicle moves as the estimate tells it.
+"""A filter in closed loop: its estimate controls the vehicle.
 
 `run` goes over measurements that are there beforehand. Where a controller acts on the estimate,
 what is measured next depends on the filter, so vehicle, controller, sensors and filter step

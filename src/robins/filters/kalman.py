@@ -1,4 +1,4 @@
-"""The Kalman filter: predict and update atoms, and the filter that strings rules around them.
+"""The Kalman filter: predict and update atoms, and the filter that applies rules around them.
 
 The atoms know no time, no sensor by name and no rule. Both come in two forms with the same inputs
 and outputs: *square root*, one QR of a block matrix, no covariance ever formed (Kaminski, Bryson &

@@ -1,4 +1,4 @@
-"""A measurement as a belief sees it, and how surprising it is."""
+"""A measurement relative to a belief: residual, spread and NIS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same filter, one sample at a time, for benches and programs that live."""
+"""The same filter, one sample at a time, for benches and live programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outcomes of the steps of a run, counted, and what they say against its results."""
+"""Counts of the outcomes of a run's steps, and the warnings that follow from them."""
 
 from __future__ import annotations
 

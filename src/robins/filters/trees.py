@@ -1,4 +1,4 @@
-"""Small questions asked of pytrees inside compiled code."""
+"""Small functions of pytrees inside compiled code."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from robins.ins.errors import error_dynamics
 from robins.ins.extended_pose import ExtendedPose
 from robins.ins.frames import swap, swap_q, to_enu_rfu, to_ned_frd
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors, grade
-from robins.ins.increments import Increments, from_imu, thin
+from robins.ins.increments import Increments, from_imu
 from robins.ins.invariant import (
     InvariantState,
     direction_sensor,
@@ -68,7 +68,6 @@ __all__ = [
     "refuse_polar",
     "swap",
     "swap_q",
-    "thin",
     "to_enu_rfu",
     "to_ned_frd",
     "velocity_sensor",

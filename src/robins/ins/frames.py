@@ -1,4 +1,4 @@
-"""The two frame conventions of the house, and the way between them.
+"""The two frame conventions of robins, and the conversion between them.
 
 Native are north-east-down for navigation and forward-right-down for the body (NED/FRD). East-north-
 up and right-forward-up (ENU/RFU) is the same thing relabelled: with T the half turn about (1, 1, 0)

@@ -1,4 +1,4 @@
-"""IMU samples to increments: how far the body turned and was pushed over each interval.
+"""IMU samples to increments: rotation and velocity increment of the body over each interval.
 
 An `Increments` row describes the motion of the body relative to inertial space between two times,
 in body axes at the earlier one: rotation vector, velocity increment and displacement, with coning,
@@ -35,7 +35,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.spatial.transform import Rotation as _Rotation
 
 from robins import _float64  # noqa: F401
 from robins.dataset import ImuTable
@@ -183,36 +182,6 @@ def _turned(phi, v):
     p = np.sqrt(sq) / np.pi
     turn = _cross(phi, v)
     return v + np.sinc(p) * turn + 0.5 * np.sinc(0.5 * p) ** 2 * _cross(phi, turn)
-
-
-def thin(increments: Increments, time_ns: np.ndarray, every: int) -> tuple[Increments, np.ndarray]:
-    """Join runs of `every` increments into one each, and the times these end at.
-
-    Exact: the joined increment is the composition of the motions. A shorter run may be left at the
-    end. `time_ns` holds the end of each interval.
-
-    Raises:
-        ValueError: `every` is less than one.
-    """
-    require(every >= 1, f"every = {every}: at least one increment goes into each new one")
-    n = len(increments.dt)
-    groups = -(-n // every)
-    dt, theta, dv, dr = (
-        np.zeros((groups * every, *np.shape(a)[1:])) for a in (*increments[:3], increments.dv)
-    )
-    dt[:n], theta[:n], dv[:n] = (np.asarray(a) for a in increments[:3])
-    dr[:n] = displacement(increments)
-    total = Increments(np.zeros(groups), None, np.zeros((groups, 3)), np.zeros((groups, 3)))
-    turned = _Rotation.identity(groups)
-    t, v, r = total.dt, total.dv, total.dr
-    for k in range(every):
-        at = slice(k, None, every)
-        r = r + v * dt[at, None] + turned.apply(dr[at])
-        v = v + turned.apply(dv[at])
-        turned = turned * _Rotation.from_rotvec(theta[at])
-        t = t + dt[at]
-    ends = np.minimum(np.arange(1, groups + 1) * every, n) - 1
-    return Increments(t, turned.as_rotvec(), v, r), np.asarray(time_ns)[ends]
 
 
 def displacement(increments: Increments) -> Any:

@@ -26,7 +26,7 @@ from robins.earth import A_M, E2, OMEGA_E, Geodetic
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, displacement
 from robins.ins.kernel import one_kernel, pack
-from robins.ins.zonal_gravity import gravity_nd
+from robins.ins.zonal_gravity import gravity_nd, horner
 from robins.linalg.scalars import cross, product, rotate
 from robins.rotation import Rotation
 
@@ -155,15 +155,8 @@ def rows(inc: Increments) -> Float[Array, "*b 11"]:
     half = 0.5 * inc.theta
     sq = jnp.sum(half * half, -1, keepdims=True)
     # As `rotation.from_rotvec`, for turns of at most two pi, by the cheaper series.
-    q_bb = [_horner(_COS, sq), half * _horner(_SIN, sq)]
+    q_bb = [horner(_COS, sq), half * horner(_SIN, sq)]
     return jnp.concatenate([inc.dt[..., None], *q_bb, inc.dv, displacement(inc)], -1)
-
-
-def _horner(coefficients, x):
-    total = coefficients[-1]
-    for c in reversed(coefficients[:-1]):
-        total = c + x * total
-    return total
 
 
 def _sin_cos(x):
@@ -172,7 +165,7 @@ def _sin_cos(x):
     A library call would keep the runs of a batch from being computed side by side.
     """
     sq = x * x
-    return x * _horner(_SIN, sq), _horner(_COS, sq)
+    return x * horner(_SIN, sq), horner(_COS, sq)
 
 
 def _wrap(lon):

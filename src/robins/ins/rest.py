@@ -1,4 +1,4 @@
-"""When a unit stands still, told sample by sample from what came up to now.
+"""Detects causally, sample by sample, when a unit stands still.
 
 `standstill` looks at the scatter of the samples over a window, as suits a vehicle that stops;
 `still_samples` at their distance from running means, and for how long it has been small, as suits a

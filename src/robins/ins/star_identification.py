@@ -1,4 +1,4 @@
-"""Which stars are seen, when nothing is known: lost in space.
+"""Identification of stars without a prior attitude (lost in space).
 
 The angle between two stars is the same in all axes, so it can be looked up. `index_pairs` makes the
 table of all pairs of a catalogue that fit into a field of view, sorted by angle, with the k-vector

@@ -56,7 +56,8 @@ def _polynomials(j: list[float]) -> tuple[list[np.ndarray], list[np.ndarray]]:
 _ACROSS, _ALONG = _polynomials(_zonal_harmonics())
 
 
-def _horner(coefficients, x):
+def horner(coefficients, x):
+    """The polynomial with these coefficients, the constant first."""
     total = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         total = c + x * total
@@ -80,6 +81,6 @@ def gravity_nd(
     x = z * z * per_r_sq
     k = A_M**2 * per_r_sq
     pull = GM * per_r_sq * jnp.sqrt(per_r_sq)
-    across = OMEGA_E**2 * p - pull * p * (1.0 + k * _horner([_horner(c, x) for c in _ACROSS], k))
-    along = -pull * z * (1.0 + k * _horner([_horner(c, x) for c in _ALONG], k))
+    across = OMEGA_E**2 * p - pull * p * (1.0 + k * horner([horner(c, x) for c in _ACROSS], k))
+    along = -pull * z * (1.0 + k * horner([horner(c, x) for c in _ALONG], k))
     return along * cos_lat - across * sin_lat, -along * sin_lat - across * cos_lat

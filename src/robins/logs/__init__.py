@@ -1,7 +1,8 @@
-"""Logs: read and write them, have them examined, make them safe.
+"""Logs: read and write them, examine them, clean them.
 
 - `open_log`, `load_dataset`, `load_pair`: any known format, recognised by content, into the tables
   of `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.
+- `load_ranges`: pseudoranges and odometry of a car, text of libRSF, into a `RangeLog`.
 - `write_log`: the same formats as text, by default those with units in their header.
 - `TextFormat` and `Column`: a row for a format of your own, `columns_from` reads it from TOML.
 - `Mounting`: how the IMU sits in the vehicle.
@@ -13,6 +14,7 @@ from robins.logs.clean import clean
 from robins.logs.declared import columns_from, formats_of
 from robins.logs.doctor import examine
 from robins.logs.findings import Finding, LogError, LogWarning
+from robins.logs.librsf import load_ranges
 from robins.logs.loading import load_dataset, load_pair
 from robins.logs.mounting import Mounting, Origin
 from robins.logs.registry import FORMATS, Format, open_log, write_log
@@ -34,6 +36,7 @@ __all__ = [
     "formats_of",
     "load_dataset",
     "load_pair",
+    "load_ranges",
     "open_log",
     "write_log",
 ]

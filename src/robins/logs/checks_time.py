@@ -10,11 +10,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from robins.dataset import AttitudeTable, GnssTable, ImuTable, MagTable, Trajectory
+from robins.gps_time import GPS_EPOCH_S
 from robins.logs.findings import Finding
 from robins.logs.ordering import increasing
 from robins.logs.quiet import error, finding, name_of, place, usual_step_s, warning
 from robins.logs.tables import Table
-from robins.logs.timebase import GPS_EPOCH_S, WEEK_S
+from robins.logs.timebase import WEEK_S
 
 # Steps a clock makes, in seconds, and what makes them.
 _WRAPS = {

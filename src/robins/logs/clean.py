@@ -1,4 +1,4 @@
-"""The boundary behind which a run is safe: bad samples are refused, counted, and then absent.
+"""Cleans a log for a run: bad samples are refused, counted and removed.
 
 What is refused here leaves the tables exactly as if its rows had never been recorded; nothing is
 repaired, interpolated or smoothed. Time is put in order by refusing the fewest samples, see

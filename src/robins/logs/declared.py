@@ -1,4 +1,4 @@
-"""A format of one's own in TOML: the row of a log that nobody else writes.
+"""A log format of your own, declared in TOML.
 
     separator = ";"                              # "," unless stated; " " is any number of blanks
     body = "FLU"                                 # where x, y, z point: forward, left, up

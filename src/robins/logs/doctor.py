@@ -66,6 +66,11 @@ class Check:
         return set(self.proves.split()) & found | set(judged.split())
 
 
+def _check(topic: str, find: Callable[..., Iterable[Finding]], needs: str, **when: str):
+    """A row: what it is asked about and when, and then what it can say."""
+    return lambda *codes: Check(topic, find, needs, codes, **when)
+
+
 # What readers leave out or doubt while they read.
 OF_READERS = (
     Code("ends_early", "warning", "the recording or the copy was interrupted"),
@@ -90,102 +95,71 @@ _NO_PLACE = "position_unit no_fix_as_zero"
 
 # Asked about each table by itself; only findings on that table silence.
 ALONE = (
-    Check(
-        "In time",
-        check_time,
-        "stamps unit_known",
-        (
-            Code("too_short", "error", "fewer than two samples; nothing can be run on that"),
-            Code("time_stands", "error", "a time column that is constant, or another one"),
-            Code("time_unit", "error", "the rate tells that time is in ms, us or ns"),
-            Code("time_slow", "warning", "inertial samples too far apart to navigate by"),
-            Code("time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"),
-            Code("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
-            Code("time_backward", "warning", "samples that step back; `clean` refuses them"),
-            Code("time_jump", "error or warning", "a leap second, a time zone, a counter"),
-            Code("gap_short", "warning or note", "samples are missing, for less than a second"),
-            Code("gap_long", "warning or note", "samples are missing, for a second or more"),
-            Code("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
-        ),
+    _check("In time", check_time, "stamps unit_known")(
+        Code("too_short", "error", "fewer than two samples; nothing can be run on that"),
+        Code("time_stands", "error", "a time column that is constant, or another one"),
+        Code("time_unit", "error", "the rate tells that time is in ms, us or ns"),
+        Code("time_slow", "warning", "inertial samples too far apart to navigate by"),
+        Code("time_duplicate", "warning", "samples that repeat a time; `clean` refuses them"),
+        Code("clock_set_back", "error", "a counter ran over, a time zone, a restart"),
+        Code("time_backward", "warning", "samples that step back; `clean` refuses them"),
+        Code("time_jump", "error or warning", "a leap second, a time zone, a counter"),
+        Code("gap_short", "warning or note", "samples are missing, for less than a second"),
+        Code("gap_long", "warning or note", "samples are missing, for a second or more"),
+        Code("time_jitter", "warning or note", "stamps taken on arrival, not by the sensor"),
     ),
-    Check(
-        "In the numbers of any table",
-        check_limits,
-        "table",
-        (Code("absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"),),
+    _check("In the numbers of any table", check_limits, "table")(
+        Code("absurd", "warning", "single numbers no vehicle has: a bit or a digit was lost"),
     ),
-    Check(
-        "In the inertial samples",
-        check_columns,
-        "imu",
-        (
-            Code("column_missing", "error", "a column without a number"),
-            Code("not_finite", "warning", "single samples without a number"),
-            Code("axis_stuck", "error", "a value that never changes"),
-            Code("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
-            Code("saturated", "warning", "the range was too small"),
-            Code("coarse", "warning", "the bits or the decimals were too few"),
-        ),
+    _check("In the inertial samples", check_columns, "imu")(
+        Code("column_missing", "error", "a column without a number"),
+        Code("not_finite", "warning", "single samples without a number"),
+        Code("axis_stuck", "error", "a value that never changes"),
+        Code("axis_stuck_for_a_while", "warning", "a value that hung for a while"),
+        Code("saturated", "warning", "the range was too small"),
+        Code("coarse", "warning", "the bits or the decimals were too few"),
     ),
-    Check(
-        "In the inertial samples",
-        check_imu,
-        "imu in_vehicle",
-        (
-            Code("no_samples", "error", "fewer than ten samples have all six numbers"),
-            Code("gravity_bias", "note", "the unit is right, the accelerometers are a little off"),
-            Code("rates_as_increments", "error", "gravity tells that rates are read as increments"),
-            Code("increments_as_rates", "error", "gravity tells that increments are read as rates"),
-            Code("gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"),
-            Code("gravity_missing", "error", "gravity was taken off"),
-            Code("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
-            Code("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
-            Code("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
-            Code("z_axis_reversed", "error", "gravity points the wrong way"),
-            Code("not_level", "warning", "gravity points along another axis"),
-            Code("gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"),
-        ),
+    _check("In the inertial samples", check_imu, "imu in_vehicle")(
+        Code("no_samples", "error", "fewer than ten samples have all six numbers"),
+        Code("gravity_bias", "note", "the unit is right, the accelerometers are a little off"),
+        Code("rates_as_increments", "error", "gravity tells that rates are read as increments"),
+        Code("increments_as_rates", "error", "gravity tells that increments are read as rates"),
+        Code("gravity_unit", "error", "gravity tells that the unit is g, mg, cm/s^2, ft/s^2"),
+        Code("gravity_missing", "error", "gravity was taken off"),
+        Code("gravity_unknown", "error", "gravity is not there, and no usual unit makes it"),
+        Code("gravity_not_seen", "warning", "the same, in a log without a second at rest"),
+        Code("sensor_axes", "note", "gravity is not along z: attitude will be the sensor's"),
+        Code("z_axis_reversed", "error", "gravity points the wrong way"),
+        Code("not_level", "warning", "gravity points along another axis"),
+        Code("gyro_unit", "error or warning", "too fast, or the Earth's rate in deg/h, deg/s"),
     ),
-    Check(
-        "In the GNSS fixes",
-        check_gnss,
-        "gnss",
-        (
-            Code("gnss_missing", "error, warning or note", "components; the others are used"),
-            Code("position_unit", "error", "degrees for radians, longitude for latitude"),
-            Code("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
-            Code("position_in_radians", "warning", "radians were read as degrees"),
-            Code("height", "error or warning", "nobody drives, sails or flies by air there"),
-            Code("sigma_not_positive", "error", "zero, which means unknown, not exact"),
-            Code("sigma_missing", "error", "there is none in any fix"),
-            Code("sigma_absurd", "warning", "they are in another unit, or variances"),
-            Code("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
-            Code("position_resolution", "note", "too few decimals for so good a fix"),
-        ),
+    _check("In the GNSS fixes", check_gnss, "gnss")(
+        Code("gnss_missing", "error, warning or note", "components; the others are used"),
+        Code("position_unit", "error", "degrees for radians, longitude for latitude"),
+        Code("no_fix_as_zero", "error", '"no fix" was written as latitude 0, longitude 0'),
+        Code("position_in_radians", "warning", "radians were read as degrees"),
+        Code("height", "error or warning", "nobody drives, sails or flies by air there"),
+        Code("sigma_not_positive", "error", "zero, which means unknown, not exact"),
+        Code("sigma_missing", "error", "there is none in any fix"),
+        Code("sigma_absurd", "warning", "they are in another unit, or variances"),
+        Code("float_sigma", "warning", "float solutions claim to be as good as fixed ones"),
+        Code("position_resolution", "note", "too few decimals for so good a fix"),
     ),
-    Check(
-        "In the GNSS fixes",
-        check_velocity,
-        "gnss",
-        (*_OF_VELOCITY, Code("velocity_sign", "error", "a vertical velocity of the other sign")),
-        silenced_by=_NO_PLACE,
+    _check("In the GNSS fixes", check_velocity, "gnss", silenced_by=_NO_PLACE)(
+        *_OF_VELOCITY,
+        Code("velocity_sign", "error", "a vertical velocity of the other sign"),
     ),
-    Check(
-        "In the magnetic field",
-        check_mag,
-        "mag",
-        (
-            Code("field_missing", "warning", "samples without a number"),
-            Code("field_zero", "error or warning", "0 0 0 where there was no measurement"),
-            Code("field_stuck", "error", "an axis that never changes"),
-            Code("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
-            Code("field_stuck_for_a_while", "warning", "the sensor hung"),
-            Code("field_repeated", "note", "more rows than the sensor took measurements"),
-            Code("field_saturated", "warning", "a magnet drove it to its stop"),
-            Code("field_offset", "warning", "hard iron: run `robins calibrate`"),
-            Code("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
-            Code("field_disturbed", "note", "single stretches of another field than the Earth's"),
-        ),
+    _check("In the magnetic field", check_mag, "mag")(
+        Code("field_missing", "warning", "samples without a number"),
+        Code("field_zero", "error or warning", "0 0 0 where there was no measurement"),
+        Code("field_stuck", "error", "an axis that never changes"),
+        Code("field_unit", "error or warning", "the Earth's field of 20 to 70 uT tells it"),
+        Code("field_stuck_for_a_while", "warning", "the sensor hung"),
+        Code("field_repeated", "note", "more rows than the sensor took measurements"),
+        Code("field_saturated", "warning", "a magnet drove it to its stop"),
+        Code("field_offset", "warning", "hard iron: run `robins calibrate`"),
+        Code("field_varies", "warning", "hard or soft iron, or steel and magnets around"),
+        Code("field_disturbed", "note", "single stretches of another field than the Earth's"),
     ),
 )
 
@@ -199,99 +173,91 @@ _GYROS_WRONG = "gyro_unit gyro_axes gyro_reversed left_handed"
 
 # Asked about all tables of a log together.
 TOGETHER = (
-    Check(
-        "In time",
-        check_span,
-        "imu others",
-        (
-            Code("no_overlap", "error", "the files share no time; names the offset that would fit"),
-            Code("leap_seconds", "warning", "one file is in UTC, one in GPS time"),
-            Code("little_overlap", "warning", "the files share little of their time"),
-        ),
+    _check("In time", check_span, "imu others")(
+        Code("no_overlap", "error", "the files share no time; names the offset that would fit"),
+        Code("leap_seconds", "warning", "one file is in UTC, one in GPS time"),
+        Code("little_overlap", "warning", "the files share little of their time"),
     ),
-    Check(
+    # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
+    _check(
         "In a master and the IMU to be aligned to it",
         check_master,
         "imu master delay_s",
-        (
-            Code("master_missing", "error or warning", "position, velocity or attitude"),
-            *_OF_VELOCITY,
-            Code("velocity_sign", "error", "it changes against positions or specific forces"),
-            Code("turning_not_checked", "note", "the vehicle hardly turns"),
-            Code("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
-            Code("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
-            Code("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
-            Code("turning_disagrees", "error", "gyros and attitudes show two turnings"),
-            Code("master_late", "error or warning", "attitudes older or younger than stated"),
-            Code("force_not_checked", "note", "too few seconds of both"),
-            Code("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
-            Code("rates_as_increments", "error", "likewise"),
-            Code("increments_as_rates", "error", "likewise"),
-            Code("accel_reversed", "error", "they fit with the opposite sign"),
-            Code("accel_axes", "error", "they fit with axes exchanged or reversed"),
-            Code("force_disagrees", "error", "they feel something else than the velocities ask"),
-        ),
-        # An IMU alone is judged at rest or nearly so; a master tells more, in any motion.
         overrules="gravity_unit gravity_unknown gravity_bias gravity_not_seen gravity_missing "
         "z_axis_reversed not_level rates_as_increments increments_as_rates",
         undecided="force_not_checked",
+    )(
+        Code("master_missing", "error or warning", "position, velocity or attitude"),
+        *_OF_VELOCITY,
+        Code("velocity_sign", "error", "it changes against positions or specific forces"),
+        Code("turning_not_checked", "note", "the vehicle hardly turns"),
+        Code("attitude_sign", "error", "heading, pitch or roll reversed, or all inverted"),
+        Code("gyro_axes", "error", "the gyros turn as the attitudes with other axes"),
+        Code("gyro_unit", "error", "the gyros turn as the attitudes in another unit"),
+        Code("turning_disagrees", "error", "gyros and attitudes show two turnings"),
+        Code("master_late", "error or warning", "attitudes older or younger than stated"),
+        Code("force_not_checked", "note", "too few seconds of both"),
+        Code("gravity_unit", "error", "accelerometers fit the velocities in another unit"),
+        Code("rates_as_increments", "error", "likewise"),
+        Code("increments_as_rates", "error", "likewise"),
+        Code("accel_reversed", "error", "they fit with the opposite sign"),
+        Code("accel_axes", "error", "they fit with axes exchanged or reversed"),
+        Code("force_disagrees", "error", "they feel something else than the velocities ask"),
     ),
-    Check(
+    _check(
         "In IMU and GNSS together",
         check_motion,
         "imu gnss",
-        (
-            Code("motion_not_checked", "note", "too little motion to compare them"),
-            Code("motion_disagrees", "warning", "they do not describe one motion in any way"),
-            Code("time_offset", "error or warning", "they fit only if one file is shifted"),
-            Code("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
-            Code("gyro_unit", "error", "turns fit those of the velocities in another unit"),
-            Code("left_handed", "error", "axes or signs of both triads"),
-            Code("accel_reversed", "error", "the accelerometers have the opposite sign"),
-            Code("accel_axes", "error", "axes or signs of the accelerometers"),
-            Code("gyro_reversed", "error", "the gyros have the opposite sense"),
-            Code("gyro_axes", "error", "axes or signs of the gyros"),
-            Code("forward_axis", "warning", "the vehicle does not travel along its forward axis"),
-        ),
         silenced_by=_SPOILT,
         unless="master",
         proves="gyro_unit",
+    )(
+        Code("motion_not_checked", "note", "too little motion to compare them"),
+        Code("motion_disagrees", "warning", "they do not describe one motion in any way"),
+        Code("time_offset", "error or warning", "they fit only if one file is shifted"),
+        Code("leap_seconds", "error", "likewise, by the 18 s between UTC and GPS time"),
+        Code("gyro_unit", "error", "turns fit those of the velocities in another unit"),
+        Code("left_handed", "error", "axes or signs of both triads"),
+        Code("accel_reversed", "error", "the accelerometers have the opposite sign"),
+        Code("accel_axes", "error", "axes or signs of the accelerometers"),
+        Code("gyro_reversed", "error", "the gyros have the opposite sense"),
+        Code("gyro_axes", "error", "axes or signs of the gyros"),
+        Code("forward_axis", "warning", "the vehicle does not travel along its forward axis"),
     ),
-    Check(
+    _check(
         "In an IMU that was turned about",
         check_turning,
         "imu",
-        (
-            Code("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit"),
-            Code("left_handed", "error", "they do with the opposite sense, or triads reflected"),
-            Code("gyro_axes", "error", "they do with axes exchanged or reversed"),
-        ),
         silenced_by=_SPOILT,
         unless="master gnss",
         but_after="motion_not_checked",
         proves="gyro_unit",
+    )(
+        Code("gyro_unit", "error", "the gyros turn gravity as it was seen in another unit"),
+        Code("left_handed", "error", "they do with the opposite sense, or triads reflected"),
+        Code("gyro_axes", "error", "they do with axes exchanged or reversed"),
     ),
-    Check(
+    _check(
         "In the magnetic field",
         check_mag_axes,
         "imu mag",
-        (Code("field_axes", "error", "it turns as the gyros say only with other columns"),),
         silenced_by=f"{_SPOILT} {_GYROS_WRONG} field_unit field_stuck",
         unless="master",
+    )(
+        Code("field_axes", "error", "it turns as the gyros say only with other columns"),
     ),
-    Check(
+    _check(
         "In the attitudes",
         check_attitude,
         "imu attitude",
-        (
-            Code("attitude_missing", "warning", "there is none"),
-            Code("attitude_order", "error", "they are scalar last, or navigation to body"),
-            Code("attitude_axes", "error", "they are of a body with other axes"),
-            Code("attitude_disagrees", "warning", "they are of another body or another time"),
-            Code("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
-        ),
         silenced_by=f"{_SPOILT} {_GYROS_WRONG}",
         unless="master",
+    )(
+        Code("attitude_missing", "warning", "there is none"),
+        Code("attitude_order", "error", "they are scalar last, or navigation to body"),
+        Code("attitude_axes", "error", "they are of a body with other axes"),
+        Code("attitude_disagrees", "warning", "they are of another body or another time"),
+        Code("attitude_frame", "error", "they are to NED where ENU is said, or not upright"),
     ),
 )
 

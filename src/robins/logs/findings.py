@@ -1,4 +1,4 @@
-"""What is said about a log: findings, which are counted and read on, and errors, which stop.
+"""Messages about a log: findings, which are counted, and errors, which stop the reading.
 
 Both name the file, the line or time, the value, the likely cause and the mend, in one sentence.
 """

@@ -1,4 +1,4 @@
-"""Magnitudes far beyond any vehicle: only nonsense is larger; the doctor tells, `clean` refuses."""
+"""Magnitudes far beyond any vehicle: the doctor reports larger values, `clean` refuses them."""
 
 from __future__ import annotations
 

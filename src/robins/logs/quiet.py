@@ -1,4 +1,4 @@
-"""What the doctor looks at: a table without its bad rows, its usual step, its quiet stretches."""
+"""What the doctor examines: a table without its bad rows, its usual step, its quiet stretches."""
 
 from __future__ import annotations
 

@@ -7,8 +7,10 @@ numbers has a reader of its own, see `robins.logs.registry`.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
+from typing import Any
 
-from robins.logs.text_format import ANY, Column, TextFormat
+from robins.logs.text_format import ANY, Column, Looks, TextFormat
 
 _CLOCKS = ("s", "ms", "us", "ns")
 _RATE, _FORCE, _TURN, _ANGLE = ("rad/s", "deg/s"), ("m/s^2", "g"), ("rad", "deg"), ("deg", "rad")
@@ -24,9 +26,16 @@ def _columns(names: str, holds: str, *units: str) -> tuple[Column, ...]:
     return tuple(Column(quantity, name, units) for name, quantity in pairs)
 
 
-def _placed(*columns: Column) -> tuple[Column, ...]:
-    """The same columns, found by their order."""
-    return tuple(column._replace(place=k) for k, column in enumerate(columns, start=1))
+def _format(name: str, about: str, looks: Looks | None = None, **how: Any):
+    """A row: what `TextFormat` takes, then groups of columns; with `looks` by their order."""
+
+    def of(*groups: Iterable[Column]) -> TextFormat:
+        columns = itertools.chain.from_iterable(groups)
+        if looks is not None:
+            columns = (column._replace(place=k) for k, column in enumerate(columns, start=1))
+        return TextFormat(name, about, tuple(columns), looks=looks, **how)
+
+    return of
 
 
 # ------------------------------------------------------- how rows of numbers without names look
@@ -78,167 +87,141 @@ _SECOND = _columns("time of week [s]", "time_of_week", "s")
 _NAMED = _columns("time_{unit_}", "time", *_CLOCKS)
 
 TEXT_FORMATS: tuple[TextFormat, ...] = (
-    TextFormat(
+    _format(
         "gnss-imu",
         "GNSS_IMU: CSV without header; seconds since 1970 in GPS time, axes of the sensor",
-        _placed(
-            *_columns("time [s]", "time", "s"),
-            *_columns("acc_@ [g]", "accel_@", "g"),
-            *_columns("gyro_@ [rad/s]", "gyro_@", "rad/s"),
-        ),
         looks=_gnss_imu,
+    )(
+        _columns("time [s]", "time", "s"),
+        _columns("acc_@ [g]", "accel_@", "g"),
+        _columns("gyro_@ [rad/s]", "gyro_@", "rad/s"),
     ),
-    TextFormat(
-        "kfgins-imu",
-        "KF-GINS: increments, forward-right-down",
-        _placed(
-            *_SECOND,
-            *_columns("dtheta_@ [rad]", "dtheta_@", "rad"),
-            *_columns("dv_@ [m/s]", "dv_@", "m/s"),
-        ),
-        separator=" ",
-        looks=_kfgins_imu,
+    _format(
+        "kfgins-imu", "KF-GINS: increments, forward-right-down", separator=" ", looks=_kfgins_imu
+    )(
+        _SECOND,
+        _columns("dtheta_@ [rad]", "dtheta_@", "rad"),
+        _columns("dv_@ [m/s]", "dv_@", "m/s"),
     ),
-    TextFormat(
+    _format(
         "kfgins-gnss",
         "KF-GINS: fixes, which lack no component",
-        _placed(
-            *_SECOND,
-            *_PLACE,
-            *_columns(
-                "sigma_N [m], sigma_E [m], sigma_D [m]", "sigma_north sigma_east sigma_down", "m"
-            ),
-        ),
         separator=" ",
         whole=True,
         looks=_kfgins_gnss,
+    )(
+        _SECOND,
+        _PLACE,
+        _columns("sigma_N [m], sigma_E [m], sigma_D [m]", "sigma_north sigma_east sigma_down", "m"),
     ),
-    TextFormat(
+    _format(
         "kfgins-nav",
         "KF-GINS: navigation result; counted from the week of the first line",
-        _placed(
-            *_columns("week", "week"),
-            *_SECOND,
-            *_PLACE,
-            *_columns("vN [m/s], vE [m/s], vD [m/s]", "v_north v_east v_down", "m/s"),
-            *_columns("roll [deg], pitch [deg], yaw [deg]", _EULER, "deg"),
-        ),
         separator=" ",
         looks=_kfgins_nav,
+    )(
+        _columns("week", "week"),
+        _SECOND,
+        _PLACE,
+        _columns("vN [m/s], vE [m/s], vD [m/s]", "v_north v_east v_down", "m/s"),
+        _columns("roll [deg], pitch [deg], yaw [deg]", _EULER, "deg"),
     ),
-    TextFormat(
+    _format(
         "pyins-imu",
         "pyins: CSV of Imu or Increments, a DataFrame whose index is the time",
-        (
-            *_columns(f"time | {ANY}", "time", "s"),
-            *_columns("gyro_@", "gyro_@", "rad/s"),
-            *_columns("accel_@", "accel_@", "m/s^2"),
-            *_columns("dt", "dt", "s"),
-            *_columns("theta_@", "dtheta_@", "rad"),
-            *_columns("dv_@", "dv_@", "m/s"),
-        ),
         choice=True,
+    )(
+        _columns(f"time | {ANY}", "time", "s"),
+        _columns("gyro_@", "gyro_@", "rad/s"),
+        _columns("accel_@", "accel_@", "m/s^2"),
+        _columns("dt", "dt", "s"),
+        _columns("theta_@", "dtheta_@", "rad"),
+        _columns("dv_@", "dv_@", "m/s"),
     ),
-    TextFormat(
-        "pyins-trajectory",
-        "pyins: CSV of Trajectory, a DataFrame whose index is the time",
-        (
-            *_columns(f"time | {ANY}", "time", "s"),
-            *_columns("lat, lon", "lat lon", "deg"),
-            *_columns("alt", "height", "m"),
-            *_columns("VN, VE, VD", "v_north v_east v_down", "m/s"),
-            *_columns("roll, pitch, heading", _EULER, "deg"),
-        ),
+    _format("pyins-trajectory", "pyins: CSV of Trajectory, a DataFrame whose index is the time")(
+        _columns(f"time | {ANY}", "time", "s"),
+        _columns("lat, lon", "lat lon", "deg"),
+        _columns("alt", "height", "m"),
+        _columns("VN, VE, VD", "v_north v_east v_down", "m/s"),
+        _columns("roll, pitch, heading", _EULER, "deg"),
     ),
-    TextFormat(
-        "euroc-imu",
-        "EuRoC and ASL: imu0/data.csv, axes of the sensor",
-        (
-            *_columns("timestamp [ns] | timestamp", "time", "ns"),
-            *_columns("w_RS_S_@ [rad s^-1] | w_RS_S_@", "gyro_@", "rad/s"),
-            *_columns("a_RS_S_@ [m s^-2] | a_RS_S_@", "accel_@", "m/s^2"),
-        ),
-        commented=True,
+    _format("euroc-imu", "EuRoC and ASL: imu0/data.csv, axes of the sensor", commented=True)(
+        _columns("timestamp [ns] | timestamp", "time", "ns"),
+        _columns("w_RS_S_@ [rad s^-1] | w_RS_S_@", "gyro_@", "rad/s"),
+        _columns("a_RS_S_@ [m s^-2] | a_RS_S_@", "accel_@", "m/s^2"),
     ),
-    TextFormat(
+    _format(
         "euroc-truth",
         "EuRoC and ASL: ground truth in local metres, taken as east, north, up",
-        (
-            *_columns("timestamp [ns] | timestamp", "time", "ns"),
-            *_columns(
-                "p_RS_R_x [m] | p_RS_R_x, p_RS_R_y [m] | p_RS_R_y, p_RS_R_z [m] | p_RS_R_z",
-                "east north up",
-                "m",
-            ),
-            *_columns(
-                "q_RS_w [] | q_RS_w, q_RS_x [] | q_RS_x, q_RS_y [] | q_RS_y, q_RS_z [] | q_RS_z",
-                "q_w q_x q_y q_z",
-            ),
-            Column("v_east", "v_RS_R_x [m s^-1] | v_RS_R_x"),
-            Column("v_north", "v_RS_R_y [m s^-1] | v_RS_R_y"),
-            Column("v_down", "v_RS_R_z [m s^-1] | v_RS_R_z", scale=-1.0),
-        ),
         nav="ENU",
         commented=True,
+    )(
+        _columns("timestamp [ns] | timestamp", "time", "ns"),
+        _columns(
+            "p_RS_R_x [m] | p_RS_R_x, p_RS_R_y [m] | p_RS_R_y, p_RS_R_z [m] | p_RS_R_z",
+            "east north up",
+            "m",
+        ),
+        _columns(
+            "q_RS_w [] | q_RS_w, q_RS_x [] | q_RS_x, q_RS_y [] | q_RS_y, q_RS_z [] | q_RS_z",
+            "q_w q_x q_y q_z",
+        ),
+        (Column("v_east", "v_RS_R_x [m s^-1] | v_RS_R_x"),),
+        (Column("v_north", "v_RS_R_y [m s^-1] | v_RS_R_y"),),
+        (Column("v_down", "v_RS_R_z [m s^-1] | v_RS_R_z", scale=-1.0),),
     ),
-    TextFormat(
+    _format(
         "tum",
         "TUM, for evo: metres east, north, up of an origin, rotation with the scalar last",
-        (
-            *_columns("timestamp", "time", "s"),
-            *_columns("tx, ty, tz", "east north up", "m"),
-            *_columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
-        ),
         separator=" ",
         nav="ENU",
         commented=True,
+    )(
+        _columns("timestamp", "time", "s"),
+        _columns("tx, ty, tz", "east north up", "m"),
+        _columns("qx, qy, qz, qw", "q_x q_y q_z q_w"),
     ),
-    TextFormat(
+    _format(
         "named-imu",
         "anyone: CSV with units in its header; rates, or increments since the line before",
-        (
-            *_NAMED,
-            *_columns("gyro_@_{unit_}", "gyro_@", *_RATE),
-            *_columns("accel_@_{unit_}", "accel_@", *_FORCE),
-            *_columns("dtheta_@_{unit_}", "dtheta_@", *_TURN),
-            *_columns("dv_@_{unit_}", "dv_@", "m/s"),
-        ),
         says_frames=True,
         choice=True,
+    )(
+        _NAMED,
+        _columns("gyro_@_{unit_}", "gyro_@", *_RATE),
+        _columns("accel_@_{unit_}", "accel_@", *_FORCE),
+        _columns("dtheta_@_{unit_}", "dtheta_@", *_TURN),
+        _columns("dv_@_{unit_}", "dv_@", "m/s"),
     ),
-    TextFormat(
+    _format(
         "named-path",
         "anyone: CSV with units in its header; with angles or quaternions, maybe turn rates",
-        (
-            *_NAMED,
-            *_columns("lat_{unit_}, lon_{unit_}", "lat lon", *_ANGLE),
-            *_columns("height_{unit_}", "height", "m"),
-            *_columns(
-                "v_north_{unit_}, v_east_{unit_}, v_down_{unit_}", "v_north v_east v_down", "m/s"
-            ),
-            *_columns("roll_{unit_}, pitch_{unit_}, heading_{unit_}", _EULER, *_ANGLE),
-            *_columns("q_w, q_x, q_y, q_z", "q_w q_x q_y q_z"),
-            *_columns("omega_@_{unit_}", "omega_@", *_RATE),
-        ),
         says_frames=True,
         choice=True,
+    )(
+        _NAMED,
+        _columns("lat_{unit_}, lon_{unit_}", "lat lon", *_ANGLE),
+        _columns("height_{unit_}", "height", "m"),
+        _columns("v_north_{unit_}, v_east_{unit_}, v_down_{unit_}", "v_north v_east v_down", "m/s"),
+        _columns("roll_{unit_}, pitch_{unit_}, heading_{unit_}", _EULER, *_ANGLE),
+        _columns("q_w, q_x, q_y, q_z", "q_w q_x q_y q_z"),
+        _columns("omega_@_{unit_}", "omega_@", *_RATE),
     ),
-    TextFormat(
+    _format(
         "xio-csv",
         "x-io sensors and Fusion: CSV with any units in its header, axes of the sensor",
-        (
-            *_columns("Time ({unit}) | Timestamp ({unit})", "time", *_CLOCKS),
-            *(
-                Column(f"{stem}_{axis}", f"{sensor} {axis.upper()} ({{unit}})", (symbol, ANY))
-                for sensor, stem, symbol in (
-                    ("Gyroscope", "gyro", "deg/s"),
-                    ("Accelerometer", "accel", "g"),
-                    ("Magnetometer", "mag", "uT"),
-                )
-                for axis in "xyz"
-            ),
-        ),
         choice=True,
+    )(
+        _columns("Time ({unit}) | Timestamp ({unit})", "time", *_CLOCKS),
+        (
+            Column(f"{stem}_{axis}", f"{sensor} {axis.upper()} ({{unit}})", (symbol, ANY))
+            for sensor, stem, symbol in (
+                ("Gyroscope", "gyro", "deg/s"),
+                ("Accelerometer", "accel", "g"),
+                ("Magnetometer", "mag", "uT"),
+            )
+            for axis in "xyz"
+        ),
     ),
 )
 """All of them."""

@@ -14,9 +14,9 @@ from decimal import Decimal
 
 import numpy as np
 
+from robins.gps_time import GPS_EPOCH_S, leap_seconds
 from robins.logs.findings import refused
 
-GPS_EPOCH_S = 315_964_800  # 1980-01-06 on a count from 1970-01-01 without leap seconds
 WEEK_S = 604_800
 _NS = 1_000_000_000
 GPS_EPOCH_NS, WEEK_NS = GPS_EPOCH_S * _NS, WEEK_S * _NS
@@ -26,16 +26,6 @@ _HOUR_NS = 3600 * _NS
 _DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})", re.ASCII)
 _CLOCK = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)", re.ASCII)
 _EPOCH_DAY = datetime.date(1970, 1, 1).toordinal()
-
-# UTC dates from which GPS time - UTC has grown by one more second (IERS Bulletin C).
-_LEAPS = [
-    datetime.date(*day)
-    for day in [
-        (1981, 7, 1), (1982, 7, 1), (1983, 7, 1), (1985, 7, 1), (1988, 1, 1), (1990, 1, 1),
-        (1991, 1, 1), (1992, 7, 1), (1993, 7, 1), (1994, 7, 1), (1996, 1, 1), (1997, 7, 1),
-        (1999, 1, 1), (2006, 1, 1), (2009, 1, 1), (2012, 7, 1), (2015, 7, 1), (2017, 1, 1),
-    ]
-]  # fmt: skip
 
 
 def decimals_to_ns(text: np.ndarray, exponent: int = 9) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +137,7 @@ def calendar_to_ns(date: str, clock: str, *, utc: bool = False) -> int:
     days = today.toordinal() - _EPOCH_DAY
     whole = (days * 24 + hour) * 3600 + minute * 60
     if utc:
-        whole += sum(today >= leap for leap in _LEAPS)
+        whole += leap_seconds(today)
     if abs(whole) * _NS >= LIMIT_NS - _NS:
         raise ValueError(f"the year {today.year} is not one from which anyone has a log")
     return whole * _NS + int((seconds * _NS).to_integral_value())

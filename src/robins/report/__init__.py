@@ -18,7 +18,7 @@ from robins.report.embed import Drawn, draw
 from robins.report.figures import FIGURES, drawings
 from robins.report.numbers import verdict
 from robins.report.style import Picture
-from robins.report.terminal import plain, table
+from robins.report.terminal import table
 
 __all__ = [
     "FIGURES",
@@ -30,7 +30,6 @@ __all__ = [
     "draw",
     "page",
     "pictures",
-    "plain",
     "table",
     "verdict",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -65,14 +65,6 @@ def _groups(cells: Mapping[str, Sequence[str]], room: int) -> list[list[str]]:
         groups[-1].append(name)
         left -= wanted
     return groups
-
-
-def plain(summary: Mapping[str, Any], width: int = 100) -> str:
-    """The same as plain text."""
-    console = Console(width=width, color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(table(summary, width))
-    return capture.get()
 
 
 def _new(*columns: str) -> Table:

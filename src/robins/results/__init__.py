@@ -35,8 +35,13 @@ recognised by their place, so any time dimension serves whose coordinate is in s
 start (``time``, ``gnss_time``, ...). Dimension coordinates ``filter`` and ``axis_...`` hold names.
 Bands of consistency figures follow from ``degrees_of_freedom`` and ``runs`` at ``probability``
 (0.95), or are given by ``band_low`` and ``band_high``.
+
+Time counts in seconds since the start. Of a recorded log the attribute ``origin_ns`` of the
+solution is the stamp at its zero: GPS time since 1970-01-01 (UTC and leap seconds), or, before
+1980, the log's own clock. `to_dataframe` makes a table of the arrays on one clock, `Result` too.
 """
 
+from robins.results.dataframe import clocks, to_dataframe
 from robins.results.errors import ResultError
 from robins.results.manifest import SCHEMA_VERSION, versions
 from robins.results.outcome import Outcome, Progress, silent
@@ -45,7 +50,7 @@ from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import array, variable
 from robins.results.summary import VERDICTS
-from robins.results.writer import ResultWriter, write
+from robins.results.writer import ResultWriter
 
 __all__ = [
     "ROLES",
@@ -58,12 +63,13 @@ __all__ = [
     "ResultError",
     "ResultWriter",
     "array",
+    "clocks",
     "find",
     "keeping",
     "read",
     "rescued",
     "silent",
+    "to_dataframe",
     "variable",
     "versions",
-    "write",
 ]

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
 import xarray as xr
 
-from robins.results import folder, manifest, solution, summary
+from robins.results import dataframe, folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
 
 
@@ -30,6 +31,19 @@ class Result(NamedTuple):
         """The page, if there is one."""
         name = self.summary["files"].get("report")
         return self.path / name if name else None
+
+    def to_dataframe(
+        self, filter: str | None = None, clock: str = "time", *, si: bool = False
+    ) -> pd.DataFrame:
+        """The time series on one clock as a table; see `robins.results.to_dataframe`.
+
+        Raises:
+            ResultError: the result has no time series.
+            ValueError: there is no such filter or clock.
+        """
+        if self.solution is None:
+            raise ResultError(self.path, "has no time series", "name the result of a run")
+        return dataframe.to_dataframe(self.solution, filter, clock, si=si)
 
 
 def read(path: str | os.PathLike[str]) -> Result:

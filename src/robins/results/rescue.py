@@ -1,4 +1,4 @@
-"""What was computed is kept where it cannot be written as a result: hours of work may be in it."""
+"""Keeps computed numbers that cannot be written as a result; they may have taken hours."""
 
 from __future__ import annotations
 

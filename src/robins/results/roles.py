@@ -1,4 +1,4 @@
-"""What the arrays of a solution are to a reader: one table of roles.
+"""The roles of a solution's arrays, in one table.
 
 A row tells how arrays are named, what their dimensions are and what must be known with them. The
 rest follows from it: `robins.results.array` builds one with its name and its attributes ``role``
@@ -75,6 +75,14 @@ ROLES = (
         "error_{block}",
         _FTA,
         "error of {of}; true minus estimated; an error of the vehicle has a caption in `comment`",
+    ),
+    Role(
+        "q_nb",
+        f"{_FT} axis_q_nb",
+        "estimated attitude; unit quaternion of Hamilton, scalar first: v_n = q v_b conj(q); at "
+        "the times of the filter or of the samples",
+        "1",
+        named="attitude",
     ),
     Role("value_{name}", _FTA, "{of}; what the vehicle does besides; caption in `comment`"),
     Role("sigma_{block}", _FTA, "standard deviation of {of}; as the filter states it"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping
 from contextlib import suppress
@@ -11,7 +10,6 @@ from time import monotonic
 from typing import Any
 
 import xarray as xr
-from matplotlib.figure import Figure
 
 from robins.results import folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
@@ -89,13 +87,6 @@ class ResultWriter:
     def seconds(self) -> float:
         """Time since the writer was made."""
         return round(monotonic() - self._began, 3)
-
-    def figure(self, name: str, figure: Figure, dpi: int = 150) -> None:
-        """Store a figure as `figures/NAME.png`."""
-        picture = io.BytesIO()
-        # No software and date tags: the same figure is then the same file.
-        figure.savefig(picture, format="png", dpi=dpi, metadata={"Software": None})
-        self.save_file(f"{FIGURES}/{name}.png", picture.getvalue())
 
     def save_report(self, html: str) -> None:
         """Store the page as `report.html`."""
@@ -183,34 +174,6 @@ class ResultWriter:
                 self.commit()
         finally:
             self.discard()  # nothing is left to do after a commit
-
-
-def write(
-    path: str | os.PathLike[str],
-    values: Mapping[str, Any],
-    dataset: xr.Dataset | None = None,
-    *,
-    figures: Mapping[str, Figure] | None = None,
-    report: str | None = None,
-    scenario_text: str = "",
-    device: str = "cpu",
-    command: str = "",
-) -> Path:
-    """Write a whole result at once: summary, solution, figures by name, page; see `ResultWriter`.
-
-    Raises:
-        ResultError: the path cannot or must not be written to.
-        TypeError, ValueError: the summary or the solution is not as documented.
-    """
-    with ResultWriter(path, scenario_text=scenario_text, device=device, command=command) as writer:
-        writer.save_summary(values)
-        if dataset is not None:
-            writer.save_solution(dataset)
-        for name, figure in (figures or {}).items():
-            writer.figure(name, figure)
-        if report is not None:
-            writer.save_report(report)
-    return Path(path)
 
 
 def _check_replaceable(path: Path) -> None:

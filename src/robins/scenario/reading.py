@@ -1,4 +1,4 @@
-"""A scenario's text into parameters, and what the user is told where that fails.
+"""Reads a scenario's text into parameters, with a message where that fails.
 
 pydantic's findings become one line a fault, with path, value and mend.
 """

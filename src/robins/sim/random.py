@@ -1,4 +1,4 @@
-"""Random streams that depend on their name, not on who draws when.
+"""Random streams that depend on their name only, not on the order of draws.
 
 A stream is named by three numbers: the seed of the campaign, the run, and the component that
 draws. Both generators below are counter-based (Threefry and Philox; Salmon et al., "Parallel

@@ -1,4 +1,4 @@
-"""A three-axis rate table: it carries a gyro and turns as it is told, a little late.
+"""A three-axis rate table: it carries a gyro and follows commands with a lag.
 
 Each axis follows its commanded rate c with a first-order lag, and with limits of its rate and of
 its acceleration:

@@ -20,6 +20,7 @@ SUMMARIES = {
     "airship": "a stratospheric airship in the wind: SINS, stars, radar, barometer and air data",
     "rocket": "a spinning sounding rocket: attitude from MEMS gyro and magnetometer, federated",
     "satellite": "a satellite's attitude in closed loop: gyro, star sensor, mixed H2/H-infinity",
+    "gnss": "tight GNSS of a car: robust pseudoranges, wheels, yaw gyro; a city, recorded logs",
     "marg": "orientation from gyro, accelerometer and magnetometer, of recorded logs",
 }
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,11 +24,7 @@ class UnknownSystem(RobinsError, ValueError):
 
 
 def find_system(name: str, folder: Path = Path()) -> System:
-    """The system of a name.
-
-    Args:
-        name: as `robins list` tells it, or "file.py:name".
-        folder: that a relative path starts from.
+    """The system of a name as `robins list` tells it, or of "file.py:name", relative to a folder.
 
     Raises:
         UnknownSystem: there is none; the message says what there is.
@@ -70,7 +67,7 @@ def _imported(path: Path) -> ModuleType:
         module = importlib.import_module(path.stem)
     except Exception as error:
         raise UnknownSystem(
-            f"importing it failed: {type(error).__name__}: {error}", path
+            f"importing it failed: {type(error).__name__}: {error}", _place(path, error)
         ) from error
     if Path(str(module.__file__)).resolve() != path:
         raise UnknownSystem(
@@ -79,6 +76,15 @@ def _imported(path: Path) -> ModuleType:
             "give the file another name",
         )
     return module
+
+
+def _place(path: Path, error: Exception) -> str:
+    """The file, and the line of it that the error names: of the syntax, or the last called."""
+    if isinstance(error, SyntaxError) and error.filename and Path(error.filename).resolve() == path:
+        return f"{path}, line {error.lineno}"
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path]
+    return f"{path}, line {lines[-1]}" if lines else str(path)
 
 
 def as_system(name: str, found: Any, where: str) -> System:

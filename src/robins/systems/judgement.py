@@ -36,14 +36,35 @@ def ratio(ours: str, theirs: str, metric: str) -> Callable[[Metrics], float]:
     return lambda metrics: metrics[ours][metric] / metrics[theirs][metric]
 
 
+def ratio_claims(
+    rows: Mapping[str, tuple[str, Sequence[str], Sequence[str], Band, Band]],
+    texts: Mapping[str, str],
+) -> dict[str, Claim]:
+    """Claims that one filter is better than others, by id.
+
+    Args:
+        rows: the filter, the others, of which the best counts, metrics, of which the worst ratio to
+            that counts, and the bands in which the claim is reproduced and partly so.
+        texts: of the claims.
+    """
+
+    def largest(ours: str, theirs: Sequence[str], keys: Sequence[str]) -> Callable[..., float]:
+        return lambda metrics: max(
+            metrics[ours][key] / min(metrics[name][key] for name in theirs) for key in keys
+        )
+
+    return {
+        key: Claim(texts[key], (ours, *theirs), largest(ours, theirs, keys), band, partly)
+        for key, (ours, theirs, keys, band, partly) in rows.items()
+    }
+
+
 def judging(
     claims: Mapping[str, Claim], stated: Sequence[str] | None = None
 ) -> Callable[[Metrics], list[dict[str, Any]]]:
-    """What gives the verdicts of the claims that a scenario states, where their filters were run.
+    """What gives the verdicts of the claims stated, by id, where their filters were run.
 
-    Args:
-        claims: of the study, by id.
-        stated: ids of those to judge; all where not given.
+    All claims are judged where none are stated.
 
     Raises:
         ValueError: the study has no claim of this id.
@@ -74,13 +95,6 @@ def _verdicts(claims: Mapping[str, Claim], metrics: Metrics) -> list[dict[str, A
     return out
 
 
-def pooled_rms(statistics: Any, block: Any) -> float:
-    """RMS length of the error of a block in its display unit, over runs and epochs that count."""
-    rms = statistics.rms[statistics.counted, block.where]
-    size = np.sqrt(np.mean(np.sum(rms**2, axis=1)))
-    return float(units.convert(size, block.units, block.display_unit))
-
-
 def rms_by_component(statistics: Any) -> np.ndarray:
     """(r,) RMS error of each component that is reported [SI], over runs and epochs that count."""
     return np.sqrt(np.mean(statistics.rms[statistics.counted] ** 2, axis=0))
@@ -89,9 +103,7 @@ def rms_by_component(statistics: Any) -> np.ndarray:
 def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
     """RMS error of every axis of every block in its display unit, over runs and epochs that count.
 
-    Args:
-        statistics: of a campaign.
-        all_axes: blocks of which the RMS over all axes is told too.
+    Of the blocks in `all_axes` the RMS over all axes is told too.
     """
     rms, out = rms_by_component(statistics), {}
     for block in statistics.blocks:
@@ -105,10 +117,11 @@ def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]
 
 def standard_metrics(statistics: Any) -> dict[str, Any]:
     """RMS error of every block, whether the filter errs as much as it says, runs that diverged."""
-    errors = {
-        f"{block.name}_rms_{units.as_ending(block.display_unit)}": pooled_rms(statistics, block)
-        for block in statistics.blocks
-    }
+    rms, errors = rms_by_component(statistics), {}
+    for block in statistics.blocks:
+        size = float(np.linalg.norm(rms[block.where]))  # pooled over the axes
+        shown = units.convert(size, block.units, block.display_unit)
+        errors[f"{block.name}_rms_{units.as_ending(block.display_unit)}"] = float(shown)
     return errors | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 
@@ -128,11 +141,9 @@ def consistency(statistics: Any) -> dict[str, Any]:
 
 
 def consistency_claims(texts: Mapping[str, str], judged: str | None = None) -> dict[str, Claim]:
-    """Claims on `consistency`, of one filter, or of the worst of all.
+    """Claims "sigma", "anees" and "nis" on `consistency`, with these texts.
 
-    Args:
-        texts: of the claims "sigma", "anees" and "nis".
-        judged: the filter they are about; all where not given.
+    They are about one filter, `judged`, or about the worst of all where none is given.
     """
     needs = () if judged is None else (judged,)
 

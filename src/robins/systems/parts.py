@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pydantic
-from jaxtyping import ArrayLike
+from jax.tree_util import Partial
+from jaxtyping import Array, ArrayLike
 
+from robins.filters import Motion
 from robins.ins.increments import Increments
-from robins.scenario import Parameters, Quantity, default
+from robins.scenario import Parameters, Quantity, Span, default
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
+from robins.systems import quantities as q
 
 NED, FRD = ("north", "east", "down"), ("forward", "right", "down")
 ENU, RFU = ("east", "north", "up"), ("right", "forward", "up")
-Three = tuple[float, float, float]
 
 MOST_RUNS = 1_000_000
 MOST_SAMPLES = 10_000_000  # of one run: a day at 100 Hz; six axes of them are half a gigabyte
@@ -36,13 +40,7 @@ class Place(Parameters):
 
 
 def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
-    """Raise a ValueError where the samples of a run would not fit into memory.
-
-    Args:
-        rate: the parameter that says how often.
-        lasts_s: duration of a run.
-        rate_hz: samples a second.
-    """
+    """Raise a ValueError, which names a rate, where a run has more samples than fit into memory."""
     if (samples := lasts_s * rate_hz) > MOST_SAMPLES:
         raise ValueError(
             f"{rate}: at {rate_hz:g} Hz a run of {lasts_s:g} s has {samples:.3g} samples, of which "
@@ -51,13 +49,7 @@ def refuse_too_long(rate: str, lasts_s: float, rate_hz: float) -> None:
 
 
 def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
-    """Raise a ValueError where figures would begin to count after the end of the run.
-
-    Args:
-        name: the parameter that says from when.
-        from_s: what it says.
-        lasts_s: duration of a run.
-    """
+    """Raise a ValueError, which names a time, where figures would count from after a run's end."""
     if from_s > 0.0 and from_s >= lasts_s:
         raise ValueError(
             f"{name} = {from_s:g} s leaves nothing to count of a run of {lasts_s:g} s: it must be "
@@ -65,28 +57,50 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
         )
 
 
-Duration = Annotated[float, Quantity("time", above="0 s")]
-Speed = Annotated[float, Quantity("speed", above="0 m/s")]
-Spread = Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
-"""One sigma of an angle."""
+def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
+    """Which times (N,) lie in none of some spans, (N,) bool."""
+    return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
+
+
+Draw = Literal["normal", "plus-sigma", "random-sign"]
+"""How errors of a stated size are made: drawn with it as sigma, as stated, or with signs drawn."""
+
+
+def signed(key: Array, size: Any, draw: Draw) -> Array:
+    """Errors of a stated size, of any shape."""
+    sigma = jnp.asarray(size, float)
+    normal = jax.random.normal(key, sigma.shape)
+    if draw == "plus-sigma":
+        return sigma
+    return sigma * (jnp.where(normal < 0.0, -1.0, 1.0) if draw == "random-sign" else normal)
+
+
+class Cutting(Parameters):
+    """How a recorded log is cut into steps of a filter."""
+
+    longest_block: q.Duration = default("0.25 s")
+    # a gap of the inertial samples beyond this ends a piece, and the next is aligned anew
+    longest_gap: q.Duration = default("0.5 s")
+    # process noise factor across one that is bridged
+    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
 class Departure(Place):
     """Where a vehicle begins, at what height, and its heading there."""
 
     height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
-    heading: Annotated[float, Quantity("angle")] = default("0 deg")
+    heading: q.Angle = default("0 deg")
 
 
 class Leg(Parameters):
     """One command of a motion over ground; which quantities it takes depends on what it does."""
 
     do: Literal["stop", "straight", "accelerate", "turn", "climb"]
-    seconds: Duration | None = None
-    speed: Annotated[float, Quantity("speed", least="0 m/s")] | None = None  # at the end
+    seconds: q.Duration | None = None
+    speed: q.SpeedSize | None = None  # at the end
     # positive to the right
     angle: Annotated[float, Quantity("angle", least="-36000 deg", most="36000 deg")] | None = None
-    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] | None = None
+    rate: q.AngleRate | None = None
     # gained
     height: Annotated[float, Quantity("length", least="-100 km", most="100 km")] | None = None
 
@@ -129,15 +143,22 @@ class Block(NamedTuple):
     noise_scale: ArrayLike  # () multiplies the process noise factor: 1, more across an IMU gap
 
 
+def noise_of_linear(linear: Callable[..., Any], x: Any, u: Any) -> Array:
+    """The noise of a step, the third that the linear form of its motion gives."""
+    return linear(x, u)[2]
+
+
+def moved_by(step: Callable[..., Any], linear: Callable[..., Any], *given: Any) -> Motion:
+    """A motion by its step and its linear form, which take `given` before state and input."""
+    slope = Partial(linear, *given)
+    return Motion(Partial(step, *given), Partial(noise_of_linear, slope), slope)
+
+
 LARGEST_RAD = np.radians(5.0)  # of an error that a linear model may take
 
 
 def warn_of_large_angles(reached_rad: Mapping[str, float]) -> None:
-    """Warn of errors beyond 5 deg, for which linear models do not hold.
-
-    Args:
-        reached_rad: by parameter the size [rad] that its error may reach.
-    """
+    """Warn of errors [rad], by parameter, beyond 5 deg, for which linear models do not hold."""
     large = {name: size for name, size in reached_rad.items() if size > LARGEST_RAD}
     if large:
         told = ", ".join(f"{name} may reach {np.degrees(x):.1f} deg" for name, x in large.items())

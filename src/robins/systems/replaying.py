@@ -1,4 +1,4 @@
-"""Recorded logs: pieces that can be run, what filters and smoothers say of them, the outcome.
+"""Recorded logs: pieces that can be run, their estimates by filters and smoothers, the outcome.
 
 A log is cut where a gap is too long to bridge, and every piece is prepared as a world, of which a
 `Contender` makes its case just as it does of a simulated one. What the filters say of the pieces is
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from robins import rotation
 from robins.filters import Belief, Code, StepWarning, Tally, doubts, rts_smoother, run
 from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.run import Step
@@ -28,6 +29,7 @@ from robins.systems.study import Contender, SensorAxes, StateBlock
 from robins.systems.tables import (
     EULER,
     Update,
+    attitude_array,
     block_array,
     innovation_tables,
     updates,
@@ -68,13 +70,14 @@ class Reported(NamedTuple):
 
     blocks: Sequence[StateBlock]
     sensors: Mapping[str, SensorAxes]
-    # mean, leading axis E -> (E, k) estimates by block, and "euler": roll, pitch, heading [rad]
+    # mean, leading axis E -> (E, k) estimates by block, and "q_nb" (E, 4), the attitude, scalar
+    # first; or "euler" [rad] along the axes below, where no whole attitude is known
     estimates: Callable[[Any], Mapping[str, Any]]
     causes: str  # the sentence on the likely causes, said where there is a warning
     # sensors that nobody built, such as "the wheels do not slip": their noise is a guess on the
     # cautious side, so that small innovations say nothing
     assumed: Collection[str] = ()
-    euler: StateBlock = EULER
+    euler: StateBlock = EULER  # by which the attitude is told; its frame is that of q_nb
 
 
 # -------------------------------------------------------------------------------- log to pieces
@@ -88,11 +91,9 @@ def prepared(
 ) -> tuple[list[PieceT], list[str]]:
     """The pieces of a log that can be run, and a sentence on each that cannot.
 
-    Args:
-        time_s: (N,) end of each increment of the inertial unit.
-        dt_s: (N,) its length.
-        longest_gap_s: a longer increment ends a piece and is in none.
-        prepare: rows of the log -> piece; it raises a ValueError where they cannot be run.
+    The inertial increments end at `time_s` (N,) and are `dt_s` (N,) long; a longer one than
+    `longest_gap_s` ends a piece and is in none. `prepare` makes a piece of rows of the log, and
+    raises a ValueError where they cannot be run.
 
     Raises:
         ValueError: no piece can be run; the sentence says why.
@@ -114,12 +115,9 @@ def prepared(
 
 
 def noise_scale(blocks: Blocks, dt_s: np.ndarray, across_gap: float) -> np.ndarray:
-    """(E,) of the process noise factor: 1, and more in a block in which samples are missing.
+    """(E,) of the process noise factor: 1, or `across_gap` in a block in which samples are missing.
 
-    Args:
-        blocks: cut from the increments.
-        dt_s: (N,) lengths of the increments.
-        across_gap: scale in such a block.
+    The blocks are cut from increments of lengths `dt_s` (N,).
     """
     gap = after_gap(dt_s)
     missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
@@ -155,17 +153,14 @@ def navigated(
     smoothers: Mapping[str, str] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Answer]:
-    """What filters and smoothers say of all pieces; each filter runs over a piece once.
+    """What filters and smoothers, by name, say of all pieces; each filter runs over a piece once.
 
     Args:
         pieces: of a log, in the order of time.
         wanted: names of filters and smoothers.
-        contender: the filter of a name, with its model.
+        contender: the filter of a name, with its model; what it raises for another is raised here.
         smoothers: by the name of a smoother, the filter whose run it smooths.
         progress: called with the share done and what is being done.
-
-    Raises:
-        ValueError: what `contender` raises, for a name that it does not know.
     """
     causal = {name: (smoothers or {}).get(name, name) for name in wanted}
     contenders = {name: contender(name) for name in dict.fromkeys(causal.values())}
@@ -248,6 +243,7 @@ def outcome(
     variables: Mapping[str, Any],
     counts: Mapping[str, int],
     notes: Sequence[str],
+    origin_ns: int | None = None,
 ) -> Outcome:
     """The outcome of a replay: solution, metrics and warnings that all systems have, and its own.
 
@@ -259,6 +255,7 @@ def outcome(
         variables: what else is in the solution, as `robins.results` lists it.
         counts: of samples and pieces.
         notes: sentences for the reader.
+        origin_ns: stamp of the log at which its clock here begins, kept as an attribute.
     """
     doubtful = [
         f"{name}: {sentence}."
@@ -266,8 +263,9 @@ def outcome(
         if answer.updates
         for sentence in doubts(answer.tally, bounds=answer.bounds, assumed=reported.assumed)
     ]
+    origin = {} if origin_ns is None else {"origin_ns": np.int64(origin_ns)}
     return Outcome(
-        solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables)),
+        solution=xr.Dataset(_tables(epoch_s, answers, reported) | dict(variables), attrs=origin),
         metrics={name: metrics(answer) | _innovations(answer) for name, answer in answers.items()},
         counts=dict(counts),
         notes=list(notes),
@@ -290,7 +288,12 @@ def _tables(
                 blank = np.full((len(epoch_s), len(block.axes)), np.nan)
                 values = np.stack([blank if row is None else np.asarray(row) for row in rows])
                 data |= block_array(role, block, values)
-    euler = np.stack([np.asarray(of["euler"]) for of in found])
+    if all("q_nb" in of for of in found):
+        q_nb = jnp.stack([jnp.asarray(of["q_nb"]) for of in found])
+        euler = np.stack(rotation.to_euler(q_nb), axis=-1)
+        data |= attitude_array(q_nb, reported.euler.frame)
+    else:
+        euler = np.stack([np.asarray(of["euler"]) for of in found])
     data |= block_array("estimate", reported.euler, euler, "estimated roll, pitch, heading")
     seen = [answer.updates for answer in answers.values()]
     return data | innovation_tables(seen, reported.sensors, epoch_s)

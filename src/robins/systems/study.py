@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -238,12 +238,7 @@ class Study(NamedTuple):
     claims: Mapping[str, Claim] = {}  # by id, what its scenarios check
 
     def problem(self, given: Any, filters: Sequence[str], seed: int) -> Problem:
-        """The scenario with these filters, ready for a campaign.
-
-        Args:
-            given: parameters of this study.
-            filters: names.
-            seed: of the random streams.
+        """The scenario of these parameters with these filters, by name, ready for a campaign.
 
         Raises:
             ValueError: the parameters do not fit together, or a filter or claim is not known.
@@ -276,7 +271,12 @@ class System(NamedTuple):
     replay_filters: tuple[str, ...] = ()
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one
-    replay: Callable[..., Outcome] | None = None  # (dataset, parameters, filters, progress)
+    # of a log that was examined and cleaned by `robins.logs`: (dataset, parameters, what the files
+    # do not say, names of filters, where there are none those of the parameters, progress)
+    replay: Callable[..., Outcome] | None = None
+    reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
+    # roles of arrays that a replay finds, of which exports are made
+    replay_finds: tuple[str, ...] = ("attitude", "track")
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
     alignment: Alignment | None = None

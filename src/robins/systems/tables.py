@@ -51,7 +51,8 @@ def place_arrays(
     which = (("lat_rad", "latitude"), ("lon_rad", "longitude"), ("alt_m", "height"))
     for (of, words), values in zip(which, places, strict=True):
         about = {"unit": of.rpartition("_")[2], "long_name": name.format(words), "dims": dims}
-        made |= array(role, values, of, **about)
+        shown = {"display_unit": "deg"} if about["unit"] == "rad" else {}
+        made |= array(role, values, of, **about, **shown)
     return made
 
 
@@ -59,6 +60,20 @@ def track_arrays(places: Iterable[Any], name: str = "{}") -> dict[str, Any]:
     """Where each filter thought something was: a `Geodetic` of each, leading axis E epochs."""
     rows = zip(*((place.lat, place.lon, place.alt) for place in places), strict=True)
     return place_arrays("track", map(np.stack, rows), name)
+
+
+def attitude_array(q_nb: Any, frame: str, time: str = "time", words: str = "") -> dict[str, Any]:
+    """Attitude of each filter (F, E, 4) as q_nb, at the times of a clock; see `results.ROLES`.
+
+    Args:
+        q_nb: unit quaternions of Hamilton, scalar first.
+        frame: from which axes to which, such as "FRD to NED".
+        time: name of the clock.
+        words: its long name, if it is not that of the role.
+    """
+    about: dict[str, Any] = {"frame": frame, "axes": ("w", "x", "y", "z"), "long_name": words}
+    about["convention"] = "Hamilton, scalar first: v_n = q v_b conj(q)"
+    return array("attitude", q_nb, dims=f"filter {time} axis_q_nb", **about)
 
 
 def innovation_tables(

@@ -28,6 +28,7 @@ _WHERE = {
     "calibrate": "magnetometer",
     "design": "gains",
     "examine": "examination",
+    "export": "exporting",
     "inventory": "contents",
     "overview": "contents",
     "part": "publication",

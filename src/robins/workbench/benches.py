@@ -1,4 +1,4 @@
-"""The commands of the test bench: a run part by part, a part heard again, a part by hand."""
+"""The commands of the test bench: a run part by part, the replay of a part, a part by hand."""
 
 from __future__ import annotations
 

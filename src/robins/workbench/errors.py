@@ -1,4 +1,4 @@
-"""What the user gave and cannot be used."""
+"""Errors about input that cannot be used."""
 
 from __future__ import annotations
 

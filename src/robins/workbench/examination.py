@@ -1,4 +1,4 @@
-"""The command `doctor`: a log judged before anyone navigates it."""
+"""The command `doctor`: a log examined before it is navigated."""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from robins.results import Outcome, Progress, silent
 from robins.systems.finding import find_system
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.examination import parted
+from robins.workbench.exporting import require_formats, with_exports
 from robins.workbench.publication import part
 from robins.workbench.scenarios import asked, check_filters, find_scenario
 
@@ -34,6 +35,7 @@ def replay(
     filters: Sequence[str] = (),
     settings: Sequence[str] = (),
     columns: Sequence[str | os.PathLike[str]] = (),
+    exports: Sequence[str] = (),
     seed: int = 0,
     progress: Progress = silent,
     findings: Findings = unheard,
@@ -46,6 +48,8 @@ def replay(
         filters: names; by default those of the configuration.
         settings: "path=value" texts that change the configuration.
         columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
+        exports: formats of other programs, of `robins.workbench.exporting.FORMATS`; the files are
+            among those of the outcome.
         seed: recorded in the result; a replay draws nothing.
         progress: called with the share done and what is being done.
         findings: called with what the doctor says.
@@ -64,17 +68,27 @@ def replay(
     source = os.fspath(configuration or "the default configuration")
     parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
     chosen = check_filters(system, chosen_system.replay_filters, filters)
+    require_formats(exports, chosen_system.replay_finds, f"a replay with {system}")
     progress(0.0, "reading")
-    angles = np.degrees(chosen_system.orientation(parameters))
-    formats = logs.formats_of(files, columns)
-    dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
-    _examine(dataset, findings)
-    dataset = logs.clean(dataset)
+    dataset: Any
+    if chosen_system.reads == "ranges":
+        if columns:
+            raise InputError(f"{system} reads text of libRSF: --columns declares other logs")
+        dataset = logs.load_ranges(files)
+        findings(dataset.findings)
+        then = f"robins list {system}   tells what can be simulated of it"
+    else:
+        angles = np.degrees(chosen_system.orientation(parameters))
+        formats = logs.formats_of(files, columns)
+        dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
+        _examine(dataset, findings)
+        dataset = logs.clean(dataset)
+        then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
     with refusing(dataset.name):
         found = chosen_system.replay(dataset, parameters, chosen, part(progress, 0.1, 1.0))
-    then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
-    told = {"scenario": f"{system}/{dataset.name}", "seed": seed, "last_lines": [f"Next:   {then}"]}
-    return replace(found, **told, **asked(text, settings))
+    label = f"{system}/{dataset.name}"
+    told = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
+    return with_exports(replace(found, **told, **asked(text, settings)), exports, label)
 
 
 def align(
@@ -91,20 +105,9 @@ def align(
 ) -> Outcome:
     """Align a recorded slave to its recorded master: doctor, clean, filter, measure.
 
-    Args:
-        name: "system/name" or the path of a TOML file: what is believed of the two units.
-        master: what the master reported, a path in any format of `robins.logs`.
-        slave: inertial samples, along the axes of the slave.
-        filters: names; by default those of the scenario.
-        settings: "path=value" texts that change the scenario.
-        columns: TOML files that declare formats of the files, see `robins.logs.columns_from`.
-        seed: recorded in the result; nothing is drawn.
-        progress: called with the share done and what is being done.
-        findings: called with what the doctor says.
-
-    Raises:
-        InputError: the pair or what was asked of it cannot be used.
-        robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
+    What is believed of the two units is a scenario by name, "system/name" or the path of a TOML
+    file. What the master reported and the slave's inertial samples, along the axes of the slave,
+    are paths in any format of `robins.logs`. All else, and what is raised, is as of `replay`.
     """
     _float64.require()
     system, label, text = find_scenario(name, recorded=True)

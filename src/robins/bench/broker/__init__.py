@@ -1,4 +1,4 @@
-"""The middle of the bench: it holds the far ends of all lines and passes on what is said.
+"""The broker of the bench: it holds the far ends of all lines and passes messages on.
 
 - `broker`: who says what to whom, step by step. `link`: one far end; what is wrong with its frames.
 - `faults`: what may go wrong on purpose, as parameters; `injector` does it.

@@ -1,4 +1,4 @@
-"""What may go wrong on a link, on purpose, as parameters of a scenario."""
+"""Faults that a scenario can inject into a link, as parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes wrong on the links, on purpose, done at the bench.
+"""Injects faults into the links, at the bench.
 
 A fault of the line acts on bytes: bit errors (the check is then wrong), loss, duplication,
 disorder, delay, silence. A fault of a sensor or an actuator acts on what is said: the payload

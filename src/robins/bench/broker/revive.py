@@ -1,4 +1,4 @@
-"""A part that died is started anew and told what the old one was told since its last memory.
+"""Restarts a part that died and sends it the messages since its last saved memory.
 
 The same part with the same frames has the same state to the last bit, so a run goes on as if
 nothing had happened. It costs the time to start, and to compute some hundred steps.

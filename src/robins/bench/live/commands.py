@@ -1,4 +1,4 @@
-"""What the page may ask of the bench: nothing but what it was offered."""
+"""The commands that the page may send to the bench: only those that it was offered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes between the bench and the server of its page, over a pair of sockets.
+"""Messages between the bench and the server of its page, over a pair of sockets.
 
 To the server: `length u32 | kind u8 | body`, little endian; a body is a sample as the browser gets
 it, or JSON. Back: JSON, one object a line.

@@ -1,9 +1,9 @@
-"""Who may talk to the server: pages of this server only.
+"""Access to the server: only its own pages may connect.
 
-A browser runs pages of strangers on the machine of the bench, and lets them open a websocket to any
-address. Two headers, which a page cannot forge, tell them: `Origin`, where a page came from, must
-be this server, and `Host`, whom it thinks it talks to, must be an address or a name of this
-machine, since a stranger's name can be made to point here (DNS rebinding).
+A browser on the machine of the bench also runs pages of other sites, which may open a websocket to
+any address. Two headers, which a page cannot forge, identify them: `Origin`, the site of the page,
+must be this server, and `Host`, the address that it asked for, must be an address or a name of this
+machine, since a foreign name can be made to point here (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def same_origin(origin: str | None, host: str) -> bool:
 
 
 class Guard:
-    """Answers strangers with 403, and tells browsers to load nothing from elsewhere."""
+    """Answers pages of other sites with 403, and tells browsers to load nothing from elsewhere."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

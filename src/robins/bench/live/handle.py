@@ -1,4 +1,4 @@
-"""The bench's hold on its page: feeds the server process, and never waits for it."""
+"""The bench's handle of its page: it feeds the server process and never waits for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the server knows of the bench, and the pages that watch it.
+"""The server's data on the bench, and the pages that show them.
 
 Each page has queues of its own, with a bound: one that is slow loses its oldest samples, which are
 counted, and slows nobody.

@@ -1,4 +1,4 @@
-"""Serial ports, and what takes their place where there is no hardware.
+"""Serial ports, and their replacements without hardware.
 
 - `port`: what people write for one; a real one opened; a pseudo-terminal. `listing`: what there is.
 - `line`: bytes that get through at the baud rate. `cable`: two paths, joined; also a program.

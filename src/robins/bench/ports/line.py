@@ -1,4 +1,4 @@
-"""A serial line that takes its time: bytes get through at the baud rate, each at its instant.
+"""A serial line with a baud rate: each byte arrives at its own time.
 
 A pseudo-terminal hands bytes over at once, whatever its baud rate. A line between two of them
 makes them as late as on a wire: a byte is through a byte's time after the one before it, or after
@@ -82,18 +82,3 @@ class Line:
         if not self._bursts:
             return None
         return -(-(self._bursts[0][0] + self._byte) // self._baud)
-
-
-def load(
-    bytes_count: float | int, seconds: float | int, baud: int, bits_per_byte: int = BITS_PER_BYTE
-) -> float:
-    """Share of what a line can carry that so many bytes in so many seconds are.
-
-    Above 1 the backlog grows for ever.
-
-    Raises:
-        ValueError: no time, or no baud.
-    """
-    if not (seconds > 0.0 and baud > 0):
-        raise ValueError(f"seconds and baud must be above 0, got {seconds} and {baud}")
-    return bytes_count * bits_per_byte / (seconds * baud)

@@ -1,4 +1,4 @@
-"""What went over the lines: written down, read, heard again by a part, compared.
+"""Records of the lines: written, read, replayed to a part, compared.
 
 - `layout`: how entries lie in an MCAP file. `writer`, `reader`: to the disk and back.
 - `replay`: a part hears a record again. `differences`: two runs, field by field.

@@ -1,4 +1,4 @@
-"""What a part said in two runs, field by field: where it differs, by how much, and since when."""
+"""A part's messages in two runs, field by field: where they differ, by how much, since when."""
 
 from __future__ import annotations
 

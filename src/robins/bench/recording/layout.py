@@ -1,4 +1,4 @@
-"""What a record is made of: its entries, and how they lie in an MCAP file.
+"""The layout of a record: its entries, and how an MCAP file holds them.
 
 MCAP (mcap.dev) is a container of time-stamped messages that other tools open too. Ours has a topic
 for each link and direction, ``/gyro/from`` or ``/adm/to``, whose messages are the bytes as they

@@ -1,4 +1,4 @@
-"""Reads what was written down of a run, to the last frame that is whole."""
+"""Reads the record of a run, up to the last whole frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A part of a recorded run, run again alone: it hears what it heard then; does it say the same?
+"""Runs a part of a recorded run again alone, on its recorded input, and compares its answers.
 
 The part gets every byte that it got, in that order, wrong ones included, and as in lock-step the
 next tick waits until it is done with the one before. So a part whose output depends on its input

@@ -1,4 +1,4 @@
-"""What went over the links, written down: raw frames with the time they came, in an MCAP file.
+"""Writes the record of a run: raw frames with their times of arrival, in an MCAP file.
 
 Messages go to the disk in chunks of 512 messages, of 64 KiB or of a quarter of a second, whichever
 comes first, each in one write. So a file that was cut anywhere lacks what came in the last quarter

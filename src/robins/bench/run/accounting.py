@@ -1,4 +1,4 @@
-"""How late, how long: times of the parts and of whole cycles, over days in little memory.
+"""Lateness and durations of the parts and of whole cycles, over days in little memory.
 
 A histogram keeps each number to one part in 256 (the leading eight bits, as HdrHistogram by G. Tene
 does), so a run of any length needs a few thousand counters, and a number costs the same whenever

@@ -1,4 +1,4 @@
-"""The run of a bench inside one program, without any wire, to hold the bench to."""
+"""The run of a bench inside one program, without any wire, as the reference for the bench."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run on the bench comes to: figures for scripts, sentences for people, arrays to draw."""
+"""The outcome of a run on the bench: figures for scripts, sentences for people, arrays to draw."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run on the bench may be told, as parameters with units: a scenario of the bench.
+"""The parameters of a run on the bench, with units: a scenario of the bench.
 
 flies = "satellite/s1"        # what flies: a scenario of the satellite, or a file of one
 filter = "mekf-gate"

@@ -1,4 +1,4 @@
-"""Who looks on while a bench runs: its live page, and the file that `robins bench status` reads."""
+"""Views of a running bench: its live page, and the file that `robins bench status` reads."""
 
 from __future__ import annotations
 

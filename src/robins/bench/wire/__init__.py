@@ -1,4 +1,4 @@
-"""The wire: what the parts of a vehicle say to each other over serial lines.
+"""The wire: the messages between the parts of a vehicle over serial lines.
 
 - `schema`: every message, field by field; encoder, decoder, documentation and C header follow it.
 - `records`: payloads, from values to bytes and back, and the gate that each of them passes.

@@ -1,4 +1,4 @@
-"""Frames out of a stream of bytes, however it is cut up and whatever is wrong with it."""
+"""Extracts frames from a stream of bytes, however it is cut and whatever is damaged."""
 
 from __future__ import annotations
 

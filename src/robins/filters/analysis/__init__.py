@@ -10,7 +10,6 @@ from robins.filters.analysis.bound import (
 from robins.filters.analysis.consistency import (
     Verdict,
     anees,
-    block_nees,
     grand_mean_nis,
     nees,
     normalised_sq,
@@ -38,7 +37,6 @@ __all__ = [
     "Verdict",
     "anees",
     "bits",
-    "block_nees",
     "bound_along",
     "covariance_bound",
     "existence_margin",

@@ -150,15 +150,8 @@ def covariance_bound(
 ) -> Bound:
     """Covariance that no filter can beat, along a true trajectory; ready for `jax.vmap`.
 
-    Args:
-        model: the motion and the sensors.
-        start: belief before the first step; its factor is the prior.
-        truth: as `linearised` takes it, and so y, u and aux.
-        y: by sensor name.
-        u: inputs of the motion.
-        aux: what sensors need besides the state.
-        use: which sensors to use, as `bound_along` takes it.
-        known: tangent components that are known, as `bound_along` takes them.
+    Arguments are those of `linearised`, the factor of ``start`` being the prior, and of
+    `bound_along`.
 
     Raises:
         ValueError: lengths differ, or a component that is known does not exist.

@@ -1,4 +1,4 @@
-"""Is a filter as good as it says? Chi-square tests of errors and innovations.
+"""Consistency of a filter: chi-square tests of errors and innovations.
 
 NEES is e' P^-1 e (chi-square with n degrees of freedom if the filter is right), NIS the same for an
 innovation. Sums over independent runs stay chi-square, so an average over N runs has the band of
@@ -27,11 +27,6 @@ def nees(belief: Belief, truth: State) -> Float[Array, ""]:
     Directions in which nothing is uncertain (a known constant) do not count, whatever their error.
     """
     return normalised_sq(manifold.local(belief.mean, truth), belief.factor)
-
-
-def block_nees(belief: Belief, truth: State, block: slice) -> Float[Array, ""]:
-    """NEES of some components alone, from their marginal covariance."""
-    return normalised_sq(manifold.local(belief.mean, truth)[block], belief.factor[block])
 
 
 def normalised_sq(error: Float[Array, "r"], factor: Float[Array, "r n"]) -> Float[Array, ""]:

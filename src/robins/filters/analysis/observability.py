@@ -54,15 +54,8 @@ def observability(
 ) -> Array:
     """Factors L of (I + W)^-1 after every step of a run; ready for `jax.vmap`.
 
-    Args:
-        model: the motion and the sensors.
-        start: belief before the first step; its standard deviations are the units.
-        truth: as `robins.filters.analysis.bound.linearised` takes it, and so y, u and aux.
-        y: by sensor name.
-        u: inputs of the motion.
-        aux: what sensors need besides the state.
-        use: which sensors to use, as `observability_along` takes it.
-        window: after how many steps to begin anew, as `observability_along` takes it.
+    Arguments are those of `robins.filters.analysis.bound.linearised`, the standard deviations of
+    ``start`` being the units, and of `observability_along`.
 
     Returns:
         (E, n, n); `bits`, `gramian` and `spectrum` read it.

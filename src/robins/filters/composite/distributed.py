@@ -1,4 +1,4 @@
-r"""Distributed filters: locals that each know everything, and what they find, fused.
+r"""Distributed filters: locals that each have the whole prior, and the fusion of their estimates.
 
 The airship paper fuses two full filters as if they were independent (its eq. 51):
 

@@ -1,4 +1,4 @@
-r"""Guarded filters: an assumption is used as long as no evidence speaks against it.
+r"""Guarded filters: an assumption is used as long as there is no evidence against it.
 
 A wrong assumption (an exact constraint, air data whose errors are modelled as white) makes the
 covariance of a filter too small, so its own residuals do not show the fault. A *reference* that

@@ -39,15 +39,16 @@ class Mode(NamedTuple):
     sensors: tuple[Sensor, ...] = ()
 
     def predict(self, state: FilterState, motion: Motion, u: Any):
-        """State and code of a prediction, by the motion of this mode if it has one."""
+        """State, code and no notes of a prediction, by the motion of this mode if it has one."""
         own = motion if self.motion is None else self.motion
         state, prediction = self.filter_.predict(state, own, u)
-        return state, prediction.code
+        return state, prediction.code, {}
 
     def update(self, state: FilterState, sensor: Sensor, y: Any, aux: Any):
-        """State and information of an update, by the sensor of this mode if it has one."""
+        """State, information and notes of an update, by its own sensor of that name if any."""
         own = next((s for s in self.sensors if s.name == sensor.name), sensor)
-        return self.filter_.update(state, own, y, aux)
+        state, info = self.filter_.update(state, own, y, aux)
+        return state, info._replace(notes={}), info.notes
 
 
 class Family(NamedTuple):
@@ -75,22 +76,15 @@ class Bank(NamedTuple):
 
     Attributes:
         size: number of modes.
-        init: ``(belief, dims) -> states``.
+        every: ``(of, states, *rows) -> (states, found, notes)``, what ``of(mode, state, *row)``
+            makes of every mode: states, what was found with a leading axis of modes, as ``rows``
+            have, and a dict of notes for each.
         beliefs: ``states -> Belief``.
-        restart: ``(states, beliefs, alone) -> states``: each goes on from its belief, unless it is
-            alone, (modes,) bool.
-        predict: ``(states, motion, u) -> (states, codes)``.
-        update: ``(states, sensor, y, aux) -> (states, StepInfo, notes)``; notes by mode and name.
-        reset: ``(states, belief) -> states``, all to one belief.
     """
 
     size: int
-    init: Callable[[Belief, Mapping[str, int]], Any]
+    every: Callable[..., tuple[Any, Any, Sequence[dict[str, Array]]]]
     beliefs: Callable[[Any], Belief]
-    restart: Callable[[Any, Belief, Array], Any]
-    predict: Callable[[Any, Motion, Any], tuple[Any, Array]]
-    update: Callable[[Any, Sensor, Any, Any], tuple[Any, StepInfo, dict[str, Array]]]
-    reset: Callable[[Any, Belief], Any]
 
 
 def bank(modes: Sequence[Filter | Mode] | Family) -> Bank:
@@ -104,45 +98,18 @@ def _as_mode(one: Filter | Mode) -> Mode:
     return one if isinstance(one, Mode) else Mode(one)
 
 
-def _known(modes: Sequence[Mode], dims: Mapping[str, int]) -> None:
-    own = {s.name for m in modes for s in m.sensors}
-    if unknown := own - set(dims):
-        raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
-
-
 def _each(modes: tuple[Mode, ...]) -> Bank:
     """A tuple of states; each mode is traced by itself."""
-    filters = [m.filter_ for m in modes]
 
-    def init(belief, dims):
-        _known(modes, dims)
-        return tuple(f.init(belief, dims) for f in filters)
+    def every(of, states, *rows):
+        done = []
+        for j, (mode, state) in enumerate(zip(modes, states, strict=True)):
+            row = jax.tree_util.tree_map(lambda a, j=j: a[j], rows)
+            done.append(of(mode, state, *row))
+        after, found, notes = zip(*done, strict=True)
+        return after, _stack(found), notes
 
-    def restart(states, beliefs, alone):
-        begun = []
-        for j, (f, state) in enumerate(zip(filters, states, strict=True)):
-            belief = jax.tree_util.tree_map(lambda a, j=j: a[j], beliefs)
-            begun.append(select(alone[j], state, f.reset(state, belief)))
-        return tuple(begun)
-
-    def predict(states, motion, u):
-        done = [m.predict(s, motion, u) for m, s in zip(modes, states, strict=True)]
-        after, codes = zip(*done, strict=True)
-        return after, jnp.stack(codes)
-
-    def update(states, sensor, y, aux):
-        done = [m.update(s, sensor, y, aux) for m, s in zip(modes, states, strict=True)]
-        after, infos = zip(*done, strict=True)
-        notes = {f"{i}.{k}": v for i, info in enumerate(infos) for k, v in info.notes.items()}
-        return after, _stack([info._replace(notes={}) for info in infos]), notes
-
-    def reset(states, belief):
-        return tuple(f.reset(s, belief) for f, s in zip(filters, states, strict=True))
-
-    def beliefs(states):
-        return _stack([s.belief for s in states])
-
-    return Bank(len(modes), init, beliefs, restart, predict, update, reset)
+    return Bank(len(modes), every, lambda states: _stack([s.belief for s in states]))
 
 
 def _batched(family: Family) -> Bank:
@@ -156,37 +123,12 @@ def _batched(family: Family) -> Bank:
         )
     ((count,),) = lengths
 
-    def rows(of: Callable) -> Callable:
-        """``of(mode, *parts)`` of every mode; parts have a leading axis of modes."""
-        return lambda *parts: jax.vmap(lambda row, *part: of(family.of(row), *part))(
-            numbers, *parts
-        )
+    def every(of, *parts):
+        one = jax.vmap(lambda row, *part: of(family.of(row), *part))
+        after, found, notes = one(numbers, *parts)
+        return after, found, [{k: v[i] for k, v in notes.items()} for i in range(count)]
 
-    def init(belief, dims):
-        def one(mode: Mode):
-            _known([mode], dims)
-            return mode.filter_.init(belief, dims)
-
-        return rows(one)()
-
-    def restart(states, beliefs, alone):
-        def one(mode: Mode, state, belief, alone):
-            return select(alone, state, mode.filter_.reset(state, belief))
-
-        return rows(one)(states, beliefs, alone)
-
-    def predict(states, motion, u):
-        return rows(lambda mode, state: mode.predict(state, motion, u))(states)
-
-    def update(states, sensor, y, aux):
-        after, info = rows(lambda mode, state: mode.update(state, sensor, y, aux))(states)
-        notes = {f"{i}.{k}": v[i] for i in range(count) for k, v in info.notes.items()}
-        return after, info._replace(notes={}), notes
-
-    def reset(states, belief):
-        return rows(lambda mode, state: mode.filter_.reset(state, belief))(states)
-
-    return Bank(count, init, lambda s: s.belief, restart, predict, update, reset)
+    return Bank(count, every, lambda states: states.belief)
 
 
 def _stack(trees: Sequence[Any]) -> Any:
@@ -271,7 +213,16 @@ def imm(
         log_first = np.log(first)
 
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
-        return FilterState(belief, Interaction(all_.init(belief, dims), jnp.asarray(log_first)))
+        own = set()
+
+        def begin(mode: Mode, _):
+            own.update(s.name for s in mode.sensors)
+            return mode.filter_.init(belief, dims), None, {}
+
+        states, *_ = all_.every(begin, (None,) * count)
+        if unknown := own - set(dims):
+            raise ValueError(f"modes of imm bring {sorted(unknown)}; the model has {list(dims)}")
+        return FilterState(belief, Interaction(states, jnp.asarray(log_first)))
 
     def mixed(states: Any, log_now: Array) -> tuple[Any, Array]:
         """Where each filter begins, and the predicted log-probabilities."""
@@ -282,12 +233,16 @@ def imm(
         begun = jax.vmap(matched, in_axes=(None, 0, 0))(beliefs, weight, beliefs.mean)
         # A mode that receives nothing goes on alone, as does one that mixes with none, bit for bit.
         alone = ~jnp.isfinite(log_next) | (jnp.diagonal(weight) == 1.0)
-        return all_.restart(states, begun, alone), log_next
+
+        def restart(mode: Mode, state: FilterState, belief: Belief, alone: Array):
+            return select(alone, state, mode.filter_.reset(state, belief)), None, {}
+
+        return all_.every(restart, states, begun, alone)[0], log_next
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
         states, log_now = state.memory
         begun, log_next = (states, log_now) if count == 1 else mixed(states, log_now)
-        after, code = all_.predict(begun, motion, u)
+        after, code, _ = all_.every(lambda m, s: m.predict(s, motion, u), begun)
         taken = code == int(Code.DONE)
         log_next = _among(taken, log_next)
         failed = code[jnp.argmax(log_now)]
@@ -297,7 +252,7 @@ def imm(
 
     def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
         states, log_prior = state.memory
-        after, seen, notes = all_.update(states, sensor, y, aux)
+        after, seen, each = all_.every(lambda m, s: m.update(s, sensor, y, aux), states)
         sound = ~jnp.isneginf(seen.log_likelihood)
         of_all = jnp.any(seen.used & sound[:, None], axis=0)
         alike = jnp.all((seen.used == of_all[None]) | ~sound[:, None])
@@ -308,7 +263,7 @@ def imm(
             info = jax.tree_util.tree_map(lambda a: a[0], seen)
         else:
             info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
-        notes = {f"imm.{k}": v for k, v in notes.items()}
+        notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
         notes["imm.probability"] = jnp.exp(log_post)
         # Where no mode has moved the mixture stands bit for bit.
         was, now = all_.beliefs(states), all_.beliefs(after)
@@ -316,8 +271,9 @@ def imm(
         return FilterState(belief, Interaction(after, log_post)), info._replace(notes=notes)
 
     def reset(state: FilterState, belief: Belief) -> FilterState:
-        states = all_.reset(state.memory.states, belief)
-        return FilterState(belief, state.memory._replace(states=states))
+        inner = state.memory
+        states, *_ = all_.every(lambda m, s: (m.filter_.reset(s, belief), None, {}), inner.states)
+        return FilterState(belief, inner._replace(states=states))
 
     return in_step(Filter(init, predict, update, reset))
 

@@ -1,4 +1,4 @@
-"""Choose the bound of an H-infinity filter step by step, from how surprising measurements are."""
+"""Choose the bound of an H-infinity filter step by step, from the size of the innovations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A designed filter, with its true norms: nothing a solver says is believed without them."""
+"""A designed filter with its true norms, which check every answer of a solver."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from robins.errors import RobinsError
 from robins.filters.synthesis import norms
-from robins.filters.synthesis.plant import Plant, error_system
+from robins.filters.synthesis.plant import ErrorSystem, Plant, error_system
 
 _BOUND = 1e-3  # by how much, relatively, a solver's bound may lie below the true H2 norm
 _GAMMA = 1e-6  # by how much the true H-infinity norm may exceed gamma
@@ -52,54 +52,26 @@ class Design(NamedTuple):
     seconds: float  # time the design took; nan where it was not measured
 
 
-def certify(
-    plant: Plant,
-    K: Any,
-    *,
-    method: str,
-    gamma: norms.Number = np.inf,
-    bound: norms.Number = np.nan,
-    lambda_: norms.Number = np.nan,
-    status: str = "",
-    seconds: norms.Number = np.nan,
-) -> Design:
+def certify(plant: Plant, K: Any, *, method: str, **told: Any) -> Design:
     """The design of an observer gain, if its true norms are what was asked and promised.
 
     Args:
         plant: what it was designed for.
         K: (n, m) gain.
-        method: as in `Design`; so the rest.
-        gamma: as in `Design`.
-        bound: as in `Design`.
-        lambda_: as in `Design`.
-        status: as in `Design`.
-        seconds: as in `Design`.
+        method: as in `Design`.
+        told: ``gamma``, ``bound``, ``lambda_``, ``status`` and ``seconds``, as in `Design`, of
+            those that there are.
 
     Raises:
         NotCertified: the error does not decay, H2 > bound (1 + 1e-3), Hinf > gamma (1 + 1e-6), or
             the two computations of Hinf differ by more than 1e-6.
         ValueError: K is not (n, m) or not finite.
     """
-    error = error_system(plant, K)
-    design = Design(
-        method, float(gamma), np.array(K, float), "observer", None, float(bound),
-        norms.h2_norm(error.A, error.Bw, error.L),
-        norms.hinf_norm(error.A, error.Bn, error.L),
-        norms.peak_gain(error.A, error.Bn, error.L),
-        norms.spectral_radius(error.A), float(lambda_), status, float(seconds),
-    )  # fmt: skip
-    return _checked(design)
+    return _certified(error_system(plant, K), np.array(K, float), None, method, **told)
 
 
 def certify_full(
-    plant: Plant,
-    filter_: tuple[Any, Any, Any],
-    *,
-    method: str,
-    gamma: norms.Number = np.inf,
-    bound: norms.Number = np.nan,
-    status: str = "",
-    seconds: norms.Number = np.nan,
+    plant: Plant, filter_: tuple[Any, Any, Any], *, method: str, **told: Any
 ) -> Design:
     """The same for a full-order filter x^(k+1) = Ah x^ + Bh y, z^ = Gh x^.
 
@@ -108,48 +80,60 @@ def certify_full(
     Args:
         plant: what it was designed for.
         filter_: Ah (n, n), Bh (n, m), Gh (r, n).
-        method: as in `Design`; so the rest.
-        gamma: as in `Design`.
-        bound: as in `Design`.
-        status: as in `Design`.
-        seconds: as in `Design`.
+        method: as in `Design`.
+        told: as `certify` takes it.
 
     Raises:
         NotCertified: as `certify`.
     """
     Ah, Bh, Gh = (np.array(matrix, float) for matrix in filter_)
     zero = np.zeros((len(plant.A), len(Ah)))
-    A = np.block([[plant.A, zero], [Bh @ plant.C, Ah]])
-    Bw = np.vstack([plant.Bw, Bh @ plant.Dw])
-    Bn = np.vstack([plant.Bn, Bh @ plant.Dn])
-    C = np.hstack([plant.L, -Gh])
+    error = ErrorSystem(
+        np.block([[plant.A, zero], [Bh @ plant.C, Ah]]),
+        np.vstack([plant.Bw, Bh @ plant.Dw]),
+        np.vstack([plant.Bn, Bh @ plant.Dn]),
+        np.hstack([plant.L, -Gh]),
+    )
+    return _certified(error, Bh, (Ah, Bh, Gh), method, **told)
+
+
+def _certified(
+    error: ErrorSystem,
+    gain: np.ndarray,
+    filter_: tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    method: str,
+    gamma: norms.Number = np.inf,
+    bound: norms.Number = np.nan,
+    lambda_: norms.Number = np.nan,
+    status: str = "",
+    seconds: norms.Number = np.nan,
+) -> Design:
+    """The design, if no promise is broken; else the error names which."""
     design = Design(
-        method, float(gamma), Bh, "full", (Ah, Bh, Gh), float(bound),
-        norms.h2_norm(A, Bw, C), norms.hinf_norm(A, Bn, C), norms.peak_gain(A, Bn, C),
-        norms.spectral_radius(A), np.nan, status, float(seconds),
+        method, float(gamma), gain, "full" if filter_ else "observer", filter_, float(bound),
+        norms.h2_norm(error.A, error.Bw, error.L),
+        norms.hinf_norm(error.A, error.Bn, error.L),
+        norms.peak_gain(error.A, error.Bn, error.L),
+        norms.spectral_radius(error.A), float(lambda_), status, float(seconds),
     )  # fmt: skip
-    return _checked(design)
-
-
-def _checked(design: Design) -> Design:
-    """Raise if a promise is broken, naming which."""
-    told = f"{design.method}: the answer is not certified"
-    said = f" (the solver said {design.status!r})" if design.status else ""
-    if not design.radius < 1.0:
-        raise NotCertified(
-            f"{told}: its error does not decay, spectral radius {design.radius:.9g}{said}"
-        )
-    if design.h2 > design.bound * (1.0 + _BOUND):
-        raise NotCertified(
-            f"{told}: true H2 norm {design.h2:.6g} above the promised {design.bound:.6g}{said}"
-        )
-    if design.hinf > design.gamma * (1.0 + _GAMMA):
-        raise NotCertified(
-            f"{told}: true H-infinity norm {design.hinf:.9g} above gamma {design.gamma:.9g}{said}"
-        )
-    if abs(design.hinf - design.hinf_sweep) > _AGREE * design.hinf:
-        raise NotCertified(
-            f"{told}: H-infinity norm {design.hinf:.9g} by levels but {design.hinf_sweep:.9g} "
-            f"by a sweep of the frequency{said}"
-        )
+    said = f" (the solver said {status!r})" if status else ""
+    promises = (
+        (design.radius < 1.0, f"its error does not decay, spectral radius {design.radius:.9g}"),
+        (
+            not design.h2 > design.bound * (1.0 + _BOUND),
+            f"true H2 norm {design.h2:.6g} above the promised {design.bound:.6g}",
+        ),
+        (
+            not design.hinf > design.gamma * (1.0 + _GAMMA),
+            f"true H-infinity norm {design.hinf:.9g} above gamma {design.gamma:.9g}",
+        ),
+        (
+            not abs(design.hinf - design.hinf_sweep) > _AGREE * design.hinf,
+            f"H-infinity norm {design.hinf:.9g} by levels but {design.hinf_sweep:.9g} by a sweep "
+            "of the frequency",
+        ),
+    )
+    for kept, why in promises:
+        if not kept:
+            raise NotCertified(f"{method}: the answer is not certified: {why}{said}")
     return design

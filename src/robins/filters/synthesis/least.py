@@ -1,4 +1,4 @@
-"""The least gain from n to the error: below it no filter can get, and a gain that gets there.
+"""The least gain from n to the error of any filter, and a gain that reaches it.
 
 Both come from the Riccati recursion of the game in which n is played against the estimate (Hassibi,
 Sayed & Kailath, *Indefinite-Quadratic Estimation and Control*, SIAM 1999, ch. 4), from P = 0:

@@ -255,8 +255,7 @@ class EveryStep:
             return False
         if np.isinf(self.gamma):
             return True
-        levels = Levels.of(e.A, e.Bn, e.L, np.zeros((len(e.L), e.Bn.shape[1])))
-        return not levels.reached(self.gamma * (1.0 + _GAMMA))
+        return not Levels.of(e.A, e.Bn, e.L).reached(self.gamma * (1.0 + _GAMMA))
 
 
 def full(plant: Plant, gamma: Number) -> Design:

@@ -74,7 +74,6 @@ def hinf_norm(
     """
     if spectral_radius(A) >= 1.0:
         return np.inf
-    D = np.zeros((len(C), B.shape[1])) if D is None else D
     levels = Levels.of(A, B, C, D)
     lower = levels.lower
     while lower > 0.0 and lower < levels.upper:
@@ -96,8 +95,9 @@ class Levels(NamedTuple):
     upper: float  # gain that is not exceeded
 
     @classmethod
-    def of(cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Levels:
+    def of(cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray | None = None) -> Levels:
         """Scale the states so that both Gramians agree on the diagonal, and bound the norm."""
+        D = np.zeros((len(C), B.shape[1])) if D is None else D
         Wc, Wo = gramian(A, B), gramian(A.T, C.T)
         control, observe = np.diagonal(Wc), np.diagonal(Wo)
         both = (control > 0.0) & (observe > 0.0)

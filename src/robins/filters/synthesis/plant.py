@@ -66,22 +66,17 @@ def plant(A: Any, Bw: Any, Bn: Any, C: Any, Dw: Any = None, Dn: Any = None, L: A
     n, m = A.shape[0], C.shape[0]
     require(A.shape[1] == n and n != 0, f"A is {A.shape}: the transition of a state must be square")
     require(m != 0, f"C is {C.shape}: nothing is measured")
-    if C.shape[1] != n:
-        raise ValueError(f"C is {C.shape}, must be ({m}, {n}): A says that x has {n} components")
-    for block, name in ((Bw, "Bw"), (Bn, "Bn")):
-        if block.shape[0] != n:
-            shape = f"({n}, {block.shape[1]})"
-            raise ValueError(
-                f"{name} is {block.shape}, must be {shape}: A says that x has {n} components"
-            )
+    why = f"A says that x has {n} components"
+    _require_shape("C", C, (m, n), why)
+    _require_shape("Bw", Bw, (n, Bw.shape[1]), why)
+    _require_shape("Bn", Bn, (n, Bn.shape[1]), why)
     Dw = _feedthrough(Dw, "Dw", m, Bw, "w")
     Dn = _feedthrough(Dn, "Dn", m, Bn, "n")
     L = np.eye(n) if L is None else _matrix(L, "L")
-    if L.shape[1] != n or L.shape[0] == 0:
-        raise ValueError(
-            f"L is {L.shape}, must have one row for each number to be estimated and {n} columns: "
-            f"A says that x has {n} components"
-        )
+    require(
+        L.shape[1] == n and L.shape[0] != 0,
+        f"L is {L.shape}, must have one row for each number to be estimated and {n} columns: {why}",
+    )
     _refuse_undetectable(A, C)
     return Plant(A, Bw, Bn, C, Dw, Dn, L)
 
@@ -110,10 +105,7 @@ def current_form(A: Any, Bw: Any, Bn: Any, C: Any, Dv: Any, L: Any = None, Dn: A
     given = plant(A, Bw, Bn, C, None, Dn, L)
     Dv = _matrix(Dv, "Dv")
     n, m = len(given.A), len(given.C)
-    if Dv.shape[0] != m:
-        raise ValueError(
-            f"Dv is {Dv.shape}, must be ({m}, {Dv.shape[1]}): C says that y has {m} components"
-        )
+    _require_shape("Dv", Dv, (m, Dv.shape[1]), f"C says that y has {m} components")
     return Plant(
         given.A,
         np.hstack([given.Bw, np.zeros((n, Dv.shape[1]))]),
@@ -134,11 +126,14 @@ def error_system(plant: Plant, K: Any) -> ErrorSystem:
     """
     K = _matrix(K, "K")
     n, m = len(plant.A), len(plant.C)
-    if K.shape != (n, m):
-        raise ValueError(f"K is {K.shape}, must be ({n}, {m}): x has {n} components and y has {m}")
+    _require_shape("K", K, (n, m), f"x has {n} components and y has {m}")
     return ErrorSystem(
         plant.A - K @ plant.C, plant.Bw - K @ plant.Dw, plant.Bn - K @ plant.Dn, plant.L
     )
+
+
+def _require_shape(name: str, block: np.ndarray, shape: tuple[int, int], why: str) -> None:
+    require(block.shape == shape, f"{name} is {block.shape}, must be {shape}: {why}")
 
 
 def _matrix(value: Any, name: str) -> np.ndarray:

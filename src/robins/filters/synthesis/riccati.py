@@ -102,9 +102,7 @@ def _search(plant: Plant, gamma: float) -> tuple[np.ndarray, float]:
         e = error_system(plant, K)
         if norms.spectral_radius(e.A) >= 1.0:
             return False
-        return not norms.Levels.of(e.A, e.Bn, e.L, np.zeros((len(e.L), e.Bn.shape[1]))).reached(
-            gamma
-        )
+        return not norms.Levels.of(e.A, e.Bn, e.L).reached(gamma)
 
     K = _gain(plant, 0.0)
     if np.isinf(gamma) or meets(K):

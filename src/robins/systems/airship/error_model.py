@@ -147,16 +147,10 @@ def error_rate(
 def step(
     x: Float[Array, "9"], over: Sins, dt_s: ArrayLike, errors: SensorErrors = NO_ERRORS
 ) -> Float[Array, "9"]:
-    """Move over one filter period by the midpoint rule: x + f(x + f(x) T/2) T.
+    """Move errors x by the midpoint rule over a filter period T: x + f(x + f(x) T/2) T.
 
-    The paper uses f, a derivative, as if it were this map.
-
-    Args:
-        x: error state at the begin.
-        over: the SINS on average over the period, or in the middle of it; f_c is then the velocity
-            gained over the length of the period.
-        dt_s: length of the period.
-        errors: as in `error_rate`.
+    The paper uses f, a derivative, as if it were this map. `over` is the SINS on average over the
+    period, or in the middle of it; f_c is then the velocity gained over the length of the period.
     """
     dt = jnp.asarray(dt_s, float)
     middle = x + 0.5 * dt * error_rate(x, over, errors)
@@ -287,9 +281,6 @@ ERRORS = States(
     _start_sigma,
     _reported,
 )
-
-
-# --------------------------------------------------------------------------------- the small things
 
 
 class Surroundings(NamedTuple):

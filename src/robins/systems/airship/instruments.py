@@ -94,7 +94,6 @@ RADAR = Instrument(
     SensorAxes("m or rad", "NED", ("north", "east", "heading", "up")),
     _measure_sar,
     _believed_sar,
-    lambda world: (world.readings[SAR], None),
 )
 
 
@@ -242,8 +241,6 @@ def hard(**given: Any) -> tuple[Instrument, Instrument]:
     return one, other
 
 
-# ------------------------------------------------------------------------------------ the table
-
 ABOARD = (EARLY_STARS, RADAR, STARS, AIR_DATA)
 """All that the airship carries, in the order of the updates."""
 
@@ -283,11 +280,8 @@ def printed_constraint(
     """D and d of (49), (50) to the letter, but for the error of the wind in d, which nobody knows.
 
     dv_E and dv_N are components already, and yet are multiplied by sine and cosine of the heading;
-    d has these two the other way round. D loses a row wherever the heading is cardinal.
-
-    Args:
-        heading_rad: SINS's.
-        air_speed_error: () m/s, the dv_a of (50), see `printed_wind`.
+    d has these two the other way round. D loses a row wherever the heading is cardinal. The air
+    speed error () [m/s] is the dv_a of (50), see `printed_wind`.
     """
     s, c = _sin_cos(heading_rad)
     D = jnp.zeros((2, 9)).at[0, 3].set(s).at[1, 4].set(c)
@@ -314,12 +308,9 @@ def _turned(x: Nav) -> Array:
 def printed_wind(x: Any, air: tuple[ArrayLike, Array]):
     """(49), (50): D x = d with x computed minus true; what d leaves over should be zero.
 
-    The air speed error dv_a is taken as it can be had: |v - wind| of the SINS less the measured air
-    speed.
-
-    Args:
-        x: a `Nav`.
-        air: (3,) m/s, measured velocity through the air; (2,) m/s, wind north east, as thought.
+    Of a `Nav`, the measured velocity through the air (3,) and the wind as thought (2,), north east,
+    [m/s]. The air speed error dv_a is taken as it can be had: |v - wind| of the SINS less the
+    measured air speed.
     """
     speed = jnp.linalg.norm(jnp.asarray(air[0]))
     wind = jnp.concatenate([jnp.asarray(air[1])[::-1], jnp.zeros(1)])  # east north up

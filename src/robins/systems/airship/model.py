@@ -47,6 +47,7 @@ from robins.ins.mechanise import Nav, step
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import Course, start_sigma
+from robins.systems.parts import noise_of_linear
 
 
 class WithWind(NamedTuple):
@@ -73,14 +74,10 @@ def navigation(x: Any) -> Nav:
     return x if isinstance(x, Nav) else x.nav
 
 
-# ------------------------------------------------------------------------------ nine states
-
-
 def nine_states(noise: InsNoise) -> Motion:
     """Motion of the paper's states, a `Nav`; input of a step: one increment.
 
-    Args:
-        noise: of gyros and accelerometers as believed, one number for the three axes of each.
+    The noise believed is one number for the three axes of gyros and one for accelerometers.
     """
     return Motion(step, Partial(_noise, noise), Partial(_linear, noise))
 
@@ -109,24 +106,14 @@ def _linear(noise: InsNoise, x: Nav, block: Increments):
     return new.nav, Phi[:9, :9], walk(noise, block.dt)
 
 
-# --------------------------------------------------------------------------- fifteen states
-
-
 def with_biases(noise: InsNoise) -> Motion:
     """Motion of an `InsState`; input of a step: K increments."""
-    moved = Partial(propagate, noise=noise)
-    return Motion(moved, Partial(_noise_ins, noise), Partial(_linear_ins, noise))
+    linear = Partial(_linear_ins, noise)
+    return Motion(Partial(propagate, noise=noise), Partial(noise_of_linear, linear), linear)
 
 
 def _linear_ins(noise: InsNoise, x: InsState, block: Increments):
     return propagate_linear(x, block, noise, segments=1)
-
-
-def _noise_ins(noise: InsNoise, x: InsState, block: Increments) -> Array:
-    return _linear_ins(noise, x, block)[2]
-
-
-# ---------------------------------------------------------------------- the error of the wind
 
 
 def with_wind(base: Motion, wind: WindNoise) -> Motion:

@@ -11,16 +11,9 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Share, Span, default
-from robins.systems.parts import Names, Place, Runs, Three, refuse_too_long
+from robins.systems import quantities as q
+from robins.systems.parts import Draw, Names, Place, Runs, refuse_too_long
 from robins.systems.study import Scenario
-
-Draw = Literal["plus-sigma", "random-sign", "normal"]
-Rate = Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")]
-Time = Annotated[float, Quantity("time", above="0 s")]
-Speed = Annotated[float, Quantity("speed", least="0 m/s")]
-SpeedSigma = Annotated[float, Quantity("speed", above="0 m/s")]
-Length = Annotated[float, Quantity("length", above="0 m")]
-Angles = Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
 
 
 class Position(Place):
@@ -32,21 +25,21 @@ class Position(Place):
 class Hull(Parameters):
     """How the airship moves: a velocity through the air, and how fast it is carried along."""
 
-    air_speed: Speed = default("10 m/s")
-    course: Annotated[float, Quantity("angle")] = default("90 deg")
-    response: Time = default("20 s")
+    air_speed: q.SpeedSize = default("10 m/s")
+    course: q.Angle = default("90 deg")
+    response: q.Duration = default("20 s")
     # amplitudes of roll, pitch and heading, and the periods of their sines
-    sway_calm: Angles = default("0.3 deg")
-    sway_gust: Angles = default("2.3 deg")
-    sway_period: Annotated[Three, Quantity("time", above="0 s")] = default("60 s")
+    sway_calm: q.AngleSizes = default("0.3 deg")
+    sway_gust: q.AngleSizes = default("2.3 deg")
+    sway_period: q.Durations = default("60 s")
 
 
 class Gusts(Parameters):
     """Gusts drawn anew every so often, each held until the next."""
 
     speed: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
-    spread: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default("45 deg")
-    every: Time = default("10 s")
+    spread: q.AngleSize = default("45 deg")
+    every: q.Duration = default("10 s")
 
 
 class Turbulence(Parameters):
@@ -55,14 +48,14 @@ class Turbulence(Parameters):
     spectrum: Literal["dryden", "von-karman"]
     sigma: Annotated[tuple[float, float], Quantity("speed", least="0 m/s")]
     length: Annotated[tuple[float, float], Quantity("length", above="0 m")] = default("533 m")
-    step: Time = default("0.1 s")
+    step: q.Duration = default("0.1 s")
 
 
 class Wind(Parameters):
     """Wind that always blows, and what comes on top within `span`."""
 
-    constant: Speed = default("10 m/s")
-    towards: Annotated[float, Quantity("angle")] = default("90 deg")
+    constant: q.SpeedSize = default("10 m/s")
+    towards: q.Angle = default("90 deg")
     span: Span = Span(begin=200.0, end=800.0)
     gusts: Gusts | None = None
     turbulence: Turbulence | None = None
@@ -86,32 +79,27 @@ class Wind(Parameters):
 class Imu(Parameters):
     """The inertial unit; biases are constant in a run."""
 
-    rate: Rate = default("100 Hz")
-    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")] = default("0.1 deg/h")
-    gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
-        "0.01 deg/sqrt(h)"
-    )
-    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")] = default("1 mg")
-    accel_noise: Annotated[Three, Quantity("velocity random walk", least="0 m/s/sqrt(s)")] = (
-        default("4.903325e-3 m/s/sqrt(s)")
-    )
+    rate: q.Frequency = default("100 Hz")
+    gyro_bias: q.RateSizes = default("0.1 deg/h")
+    gyro_noise: q.AngleWalkSizes = default("0.01 deg/sqrt(h)")
+    accel_bias: q.AccelSizes = default("1 mg")
+    accel_noise: q.AccelWalkSizes = default("4.903325e-3 m/s/sqrt(s)")
     draw: Draw = "random-sign"  # of the biases
-    # share of the acceleration by gusts that the accelerometers do not feel
-    unsensed: Share = 0.0
+    unsensed: Share = 0.0  # share of the acceleration by gusts that the accelerometers do not feel
 
 
 class Readings(Parameters):
     """What every instrument but the inertial unit has: how often it reads, when it is lost."""
 
-    rate: Rate = default("1 Hz")
+    rate: q.Frequency = default("1 Hz")
     lost: tuple[Span, ...] = ()
 
 
 class Sar(Readings):
     """Horizontal position and heading from a radar image matched with a map."""
 
-    position: Length = default("25 m")  # each axis
-    heading: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("1 deg")
+    position: q.Length = default("25 m")  # each axis
+    heading: q.Spread = default("1 deg")
     outlier_share: Share = 0.0
     outlier_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 5.0
 
@@ -119,32 +107,30 @@ class Sar(Readings):
 class Barometer(Readings):
     """Height from static pressure."""
 
-    height: Length = default("20 m")
+    height: q.Length = default("20 m")
 
 
 class Star(Readings):
     """Pitch, roll and heading from stars, once an epoch or several times."""
 
-    rate: Rate = default("2 Hz")
-    attitude: Annotated[float, Quantity("angle", above="0 arcsec", most="180 deg")] = default(
-        "20 arcsec"
-    )
+    rate: q.Frequency = default("2 Hz")
+    attitude: q.Spread = default("20 arcsec")
 
 
 class AirData(Readings):
     """Velocity through the air, and what is thought to be the wind: both err."""
 
-    noise: SpeedSigma = default("0.3 m/s")  # each axis
-    wind_error: SpeedSigma = default("0.3 m/s")
-    wind_time: Time = default("50 s")
+    noise: q.Speed = default("0.3 m/s")  # each axis
+    wind_error: q.Speed = default("0.3 m/s")
+    wind_time: q.Duration = default("50 s")
 
 
 class Start(Parameters):
     """What is not known at the start, in north, east, down; one standard deviation."""
 
-    attitude: Angles
-    velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0.1 m/s")
-    position: Annotated[Three, Quantity("length", least="0 m")]
+    attitude: q.AngleSizes
+    velocity: q.SpeedSizes = default("0.1 m/s")
+    position: q.LengthSizes
     draw: Draw = "plus-sigma"
 
 
@@ -155,12 +141,8 @@ class BelievedNoise(Parameters):
     bends or the unit sits off the centre.
     """
 
-    gyro_noise: Annotated[float, Quantity("angle random walk", least="0 deg/sqrt(h)")] = default(
-        "0.01 deg/sqrt(h)"
-    )
-    accel_noise: Annotated[float, Quantity("velocity random walk", above="0 m/s/sqrt(s)")] = (
-        default("0.07 m/s/sqrt(s)")
-    )
+    gyro_noise: q.AngleWalkSize = default("0.01 deg/sqrt(h)")
+    accel_noise: q.AccelWalk = default("0.07 m/s/sqrt(s)")
     accel_noise_factor: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 1.0
 
 
@@ -176,8 +158,8 @@ class Airship(Scenario):
     runs: Runs = 20
     filters: Names = COMPARED
     claims: tuple[str, ...] | None = ()  # ids of those the scenario checks
-    duration: Time = default("1000 s")
-    epoch: Time = default("1 s")  # step of the filters
+    duration: q.Duration = default("1000 s")
+    epoch: q.Duration = default("1 s")  # step of the filters
     counted: Span = Span(begin=200.0, end=800.0)  # figures pooled over time are of this span
     place: Position
     hull: Hull = pydantic.Field(default_factory=Hull)

@@ -33,7 +33,8 @@ from robins.sim.ideal_imu import increments_between
 from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.wind import Carried, carried_at, carry, dryden, gusts, von_karman, wind_at
-from robins.systems.airship.parameters import Airship, Draw, Readings
+from robins.systems.airship.parameters import Airship, Readings
+from robins.systems.parts import outside, signed
 from robins.systems.study import Instrument
 
 PARTS = 2  # increments between two star sights that a filter with states for biases takes
@@ -131,10 +132,7 @@ def _towards(direction: float) -> np.ndarray:
 def present(time_s: np.ndarray, instrument: Readings) -> np.ndarray:
     """Whether an instrument reads at times: at its own rate, and not where it is lost."""
     every = round(1.0 / (time_s[0] * instrument.rate))  # the first step is as long as all
-    there = (np.arange(1, len(time_s) + 1) % every) == 0
-    for span in instrument.lost:
-        there &= ~span.holds(time_s)
-    return there
+    return (np.arange(1, len(time_s) + 1) % every == 0) & outside(instrument.lost, time_s)
 
 
 def _attitude(given: Airship, time_s: Any):
@@ -178,15 +176,6 @@ def blow(given: Airship, key: Array) -> tuple[Array, float]:
 
 def _steps(given: Airship, step_s: float) -> int:
     return math.ceil(given.duration / step_s - 1e-9)
-
-
-def signed(key: Array, size: Any, draw: Draw) -> Array:
-    """Errors of a stated size: as stated, with signs drawn, or drawn with it as sigma."""
-    sigma = jnp.asarray(size, float)
-    normal = jax.random.normal(key, sigma.shape)
-    if draw == "plus-sigma":
-        return sigma
-    return sigma * (jnp.where(normal < 0.0, -1.0, 1.0) if draw == "random-sign" else normal)
 
 
 def _desired(given: Airship, course: Course, carried: Carried, time_s: Float[Array, "n"]) -> Nav:

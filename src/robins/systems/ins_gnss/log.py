@@ -79,9 +79,6 @@ class Stretch(Piece):
     withheld: np.ndarray  # (E,) bool
 
 
-# ------------------------------------------------------------------------------------- one clock
-
-
 def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
     """Both tables on the IMU's clock, sigmas as the filter shall believe them.
 
@@ -320,9 +317,6 @@ def _known(
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
 
 
-# ---------------------------------------------------------------------------------------- replay
-
-
 def contender(parameters: Replay, name: str) -> Contender:
     """A filter with the model it believes in."""
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
@@ -335,13 +329,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Navigate a log with the filters named and say how good they are.
-
-    Args:
-        dataset: IMU and GNSS of a log, examined and cleaned (`robins.logs`).
-        parameters: what the files do not say.
-        filters: names such as "ekf", "ukf", "ekf+rts"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Navigate a log of IMU and GNSS, examined and cleaned, as `System.replay` says.
 
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
@@ -362,7 +350,7 @@ def replay(
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
     antennas = {name: _antenna(mount, answer.mean, rate) for name, answer in answers.items()}
-    variables = track_arrays(antennas.values()) | _fix_arrays(log)
+    variables = track_arrays(antennas.values(), "{} of the antenna") | _fix_arrays(log)
     variables |= array("outage", withheld.astype(np.int8), long_name="GNSS withheld")
     used = np.any([piece.used for piece in pieces], axis=0)
     counts = replaying.gap_counts(pieces, problems) | {"pieces_not_navigated": len(problems)}
@@ -381,6 +369,7 @@ def replay(
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
         + [f"Not navigated, {problem}." for problem in problems],
+        origin_ns=int(dataset.imu.time_ns[0]),
     )
 
 
@@ -392,7 +381,7 @@ def _antenna(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
 
 def _estimates(mean: InsState) -> Mapping[str, Any]:
     biases_and_scales = {name: getattr(mean, name) for name in InsState._fields[3:]}
-    return {"velocity": mean.v_n, "euler": jnp.stack(mean.q_nb.as_euler(), -1), **biases_and_scales}
+    return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}
 
 
 def _distances(

@@ -29,11 +29,11 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
 from robins.earth import Geodetic, earth_rate_n, gravity_n
-from robins.filters import Belief, Model, Motion, Sensor
+from robins.filters import Belief, Model, Sensor
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
-from robins.systems.parts import FRD, NED, Block
+from robins.systems.parts import FRD, NED, Block, moved_by
 from robins.systems.study import SensorAxes, StateBlock
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
@@ -101,10 +101,6 @@ def _step(noise: InsNoise, x: InsState, block: Block) -> InsState:
 def _step_linear(noise: InsNoise, x: InsState, block: Block):
     new, Phi, factor = propagate_linear(x, block.increments, noise)
     return new, Phi, factor * block.noise_scale
-
-
-def _process_noise(noise: InsNoise, x: InsState, block: Block):
-    return _step_linear(noise, x, block)[2]
 
 
 def turn_rate_b(x: InsState, omega_b: Array) -> Array:
@@ -194,14 +190,9 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
         it.
     """
     noise, mount = noise_of(imu), mount_of(gnss, aids)
-    motion = Motion(
-        step=Partial(_step, noise),
-        noise=Partial(_process_noise, noise),
-        linear=Partial(_step_linear, noise),
-    )
     still, still_rate = aids.standstill_velocity, aids.standstill_rate
     return Model(
-        motion,
+        moved_by(_step, _step_linear, noise),
         (
             Sensor(Partial(_read_position, mount), _fix_sigma, 3, POSITION),
             Sensor(Partial(_read_velocity, mount), _fix_sigma, 3, VELOCITY),
@@ -215,15 +206,10 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
 def start_belief(
     nav: Nav, imu: Imu, start: Start, tilt_rad: float, heading_rad: float, gyro_bias: Any = None
 ) -> Belief:
-    """The belief at the start, uncorrelated.
+    """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
 
-    Args:
-        nav: attitude, velocity and position of the IMU.
-        imu: spread of the sensors' errors.
-        start: spread of velocity and position.
-        tilt_rad: spread of roll and pitch.
-        heading_rad: spread of the heading.
-        gyro_bias: (3,) rad/s, where it is known from rest; else zero.
+    Sigmas are of `imu` and `start`, of roll and pitch `tilt_rad`, of the heading `heading_rad`.
+    `gyro_bias` (3,) rad/s is given where it is known from rest; else it is zero.
     """
     sigma = [[tilt_rad, tilt_rad, heading_rad], [start.velocity] * 3, [start.position] * 3]
     sigma += [imu.gyro_bias, imu.accel_bias]

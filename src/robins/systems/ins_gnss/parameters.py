@@ -8,17 +8,8 @@ import numpy as np
 import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
-from robins.systems.parts import (
-    Departure,
-    Duration,
-    Leg,
-    Names,
-    Speed,
-    Spread,
-    Three,
-    refuse_too_long,
-    refuse_unsettled,
-)
+from robins.systems import quantities as q
+from robins.systems.parts import Cutting, Departure, Leg, Names, refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
 
@@ -29,62 +20,58 @@ class Imu(Parameters):
     where a correlation time is given.
     """
 
-    gyro_noise: Annotated[Three, Quantity("angle random walk", above="0 deg/sqrt(h)")]
-    accel_noise: Annotated[Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")]
-    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")]
-    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
-    gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")]
-    accel_bias_walk: Annotated[Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")]
-    gyro_bias_time: Duration | None = None
-    accel_bias_time: Duration | None = None
+    gyro_noise: Annotated[q.Three, Quantity("angle random walk", above="0 deg/sqrt(h)")]
+    accel_noise: Annotated[q.Three, Quantity("velocity random walk", above="0 m/s/sqrt(h)")]
+    gyro_bias: q.RateSizes
+    accel_bias: q.AccelSizes
+    gyro_bias_walk: q.RateWalkSizes
+    accel_bias_walk: q.AccelRateWalkSizes
+    gyro_bias_time: q.Duration | None = None
+    accel_bias_time: q.Duration | None = None
     scale_states: bool = False
-    gyro_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
-    accel_scale: Annotated[Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
-    orientation: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of mount
+    gyro_scale: Annotated[q.Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
+    accel_scale: Annotated[q.Three, Quantity("scale factor", least="0 ppm")] = default("1000 ppm")
+    orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of mount
 
 
 class Gnss(Parameters):
     """The receiver, its antenna and how far its stated sigmas are believed."""
 
-    # IMU to antenna, body
-    lever_arm: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
+    lever_arm: q.Arm = default("0 m")  # IMU to antenna, body
     latency: Annotated[float, Quantity("time", least="-10 s", most="10 s")] = default("0 s")
     use_velocity: bool = True
     # many receivers state the mean velocity since the last fix; 0 s: the velocity at the fix
-    velocity_window: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    velocity_window: q.Time = default("0 s")
     # by RTKLIB quality: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
     sigma_factor: dict[str, Positive] = pydantic.Field(default_factory=dict)
     least_sigma: Annotated[float, Quantity("length", least="0 m")] = default("0 m")
-    least_velocity_sigma: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")
+    least_velocity_sigma: q.SpeedSize = default("0 m/s")
 
 
 class Start(Parameters):
     """How well the start is known, and how the heading is found."""
 
-    tilt: Spread = default("2 deg")
-    heading: Spread = default("20 deg")
-    velocity: Speed = default("0.2 m/s")
-    position: Annotated[float, Quantity("length", above="0 m")] = default("0.1 m")
+    tilt: q.Spread = default("2 deg")
+    heading: q.Spread = default("20 deg")
+    velocity: q.Speed = default("0.2 m/s")
+    position: q.Length = default("0.1 m")
     # heading of the body at the start; without it, the course once above the speed
-    known_heading: Annotated[float, Quantity("angle")] | None = None
-    course_speed: Speed = default("1 m/s")
+    known_heading: q.Angle | None = None
+    course_speed: q.Speed = default("1 m/s")
 
 
 class Aids(Parameters):
     """Knowledge about the motion, used as measurements."""
 
     zero_velocity: bool = True
-    standstill_velocity: Speed = default("0.01 m/s")
-    standstill_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default(
-        "0.05 deg/s"
-    )
+    standstill_velocity: q.Speed = default("0.01 m/s")
+    standstill_rate: q.AngleRate = default("0.05 deg/s")
     # at rest: spread of the samples over the window stays below these
-    window: Duration = default("0.5 s")
-    quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.15 m/s^2")
-    quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.5 deg/s")
+    window: q.Duration = default("0.5 s")
+    quiet_accel: q.Acceleration = default("0.15 m/s^2")
+    quiet_rate: q.AngleRate = default("0.5 deg/s")
     non_holonomic: bool = False
-    # IMU to rear axle, body
-    axle: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
+    axle: q.Arm = default("0 m")  # IMU to rear axle, body
     road_velocity: Annotated[tuple[float, float], Quantity("speed", above="0 m/s")] = default(
         "0.1 m/s"
     )
@@ -98,18 +85,15 @@ class Aids(Parameters):
 class Outages(Parameters):
     """Times at which the GNSS is withheld, to see how long the inertial solution holds."""
 
-    length: Duration
-    first: Annotated[float, Quantity("time", least="0 s")]  # after the first fix
-    gap: Duration  # between two outages
-    last: Annotated[float, Quantity("time", least="0 s")]  # before the last fix none begins
+    length: q.Duration
+    first: q.Time  # after the first fix
+    gap: q.Duration  # between two outages
+    last: q.Time  # before the last fix none begins
 
     def mask(self, time_s: np.ndarray, first_s: float, last_s: float) -> np.ndarray:
         """Which times lie in an outage (N,) bool; outages repeat until none may begin any more.
 
-        Args:
-            time_s: (N,) times to judge.
-            first_s: time of the first fix.
-            last_s: time of the last fix.
+        The first and the last fix are at `first_s` and `last_s`.
         """
         period = self.length + self.gap
         since = time_s - (first_s + self.first)
@@ -118,15 +102,11 @@ class Outages(Parameters):
         return inside & (first_s + self.first + begin < last_s - self.last)
 
 
-class Update(Parameters):
+class Update(Cutting):
     """How the filter steps."""
 
-    longest_block: Duration = default("0.25 s")
+    longest_gap: q.Duration = default("1 s")
     gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999  # 0: no gate
-    # an IMU gap longer than this is declared instead of bridged
-    longest_gap: Duration = default("1 s")
-    # process noise factor across one
-    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
 
 
 class Replay(Parameters):
@@ -153,8 +133,8 @@ class Receiver(Gnss):
     """A simulated receiver; its sigmas are true, and what it states."""
 
     rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
-    sigma: Annotated[Three, Quantity("length", above="0 m")]
-    velocity_sigma: Annotated[Three, Quantity("speed", above="0 m/s")]
+    sigma: Annotated[q.Three, Quantity("length", above="0 m")]
+    velocity_sigma: Annotated[q.Three, Quantity("speed", above="0 m/s")]
 
 
 class Believed(Parameters):
@@ -170,9 +150,7 @@ class Drive(Scenario):
     system: str = "ins-gnss"
     study: str = "drive"
     title: str = "INS/GNSS drive"
-    imu_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default(
-        "100 Hz"
-    )
+    imu_rate: q.Frequency = default("100 Hz")
     place: Departure
     legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     imu: Imu
@@ -183,7 +161,7 @@ class Drive(Scenario):
     outages: Outages | None = None
     believed: Believed = pydantic.Field(default_factory=Believed)
     # figures pooled over time leave out what comes before, while heading errors are large
-    settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    settle: q.Time = default("0 s")
     filters: Names = ("ekf",)
 
     @pydantic.model_validator(mode="after")

@@ -61,8 +61,6 @@ def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
 
 def believed_imu(drive: Drive) -> Imu:
     """The inertial sensors as the filters believe in them: their noise by `believed.q_factor`."""
-    if drive.believed.q_factor == 1.0:
-        return drive.imu
     factor = float(np.sqrt(drive.believed.q_factor))
     scaled = ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")
     return drive.imu.model_copy(

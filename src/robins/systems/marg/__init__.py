@@ -15,6 +15,7 @@ SYSTEM = System(
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
+    replay_finds=("attitude",),
     orientation=lambda parameters: parameters.orientation,
 )
 

@@ -18,16 +18,7 @@ from robins.ins.increments import Increments, after_gap, from_imu, usual_interva
 from robins.ins.rest import still_samples
 from robins.manifold import Angle
 from robins.rotation import Rotation
-from robins.systems.marg.model import (
-    MAGNETOMETER,
-    REST_RATE,
-    TRAVEL,
-    Block,
-    Integrals,
-    MargState,
-    Samples,
-    integrate,
-)
+from robins.systems.marg import model
 from robins.systems.marg.parameters import Accelerometer, Gyro, Magnetometer, Replay
 from robins.systems.replaying import Piece
 from robins.systems.study import Case
@@ -59,14 +50,11 @@ class Prepared(Piece):
     """
 
     time_ns: np.ndarray  # (N,) int64, of each sample, from the first one on
-    samples: Samples
+    samples: model.Samples
     rows: np.ndarray  # (B,) the sample that each block ends with
     look: FirstLook
     still: np.ndarray  # (B,) bool
     counts: dict[str, int]
-
-
-# ---------------------------------------------------------------------------------------- samples
 
 
 def whole_samples(
@@ -120,12 +108,9 @@ def calibrated(
 
 
 def at_samples(time_ns: np.ndarray, field_ns: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """(N, 3) the last reading within each interval (time[k-1], time[k]]; NaN where none.
+    """(N, 3) the last of readings (M, 3) within each interval (time[k-1], time[k]]; NaN where none.
 
-    Args:
-        time_ns: (N + 1,) ends of intervals, the first one the beginning.
-        field_ns: (M,) ascending.
-        field: (M, 3).
+    Times are (N + 1,), the first one the beginning, and (M,) of the readings, ascending.
     """
     out = np.full((len(time_ns) - 1, 3), np.nan)
     interval = np.searchsorted(time_ns, field_ns, side="left") - 1
@@ -162,13 +147,13 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     n = max(1, round(p.update.block / usual))
     whole = -(-len(dt) // n)
     blocks = -(-whole // _PACK) * _PACK
-    samples = Samples(
+    samples = model.Samples(
         _filled(dt, blocks, n, 0.0),
         _filled(theta, blocks, n, 0.0),
         _filled(dv, blocks, n, 0.0),
         _filled(field, blocks, n, np.nan),
     )
-    integrals, block_field = jax.tree.map(np.asarray, integrate(samples))
+    integrals, block_field = jax.tree.map(np.asarray, model.integrate(samples))
     quiet = np.zeros(len(dt), bool)
     if p.rest.detect:
         quiet = still_samples(increments, *p.rest.quiet)
@@ -181,7 +166,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
     falling = np.linalg.norm(integrals.dv, axis=1) < _FALLING * weight
     counts["blocks_in_free_fall"] = int(np.sum(falling))
     fall = np.where(falling, weight, 0.0)
-    u = Block(
+    u = model.Block(
         integrals,
         still=still.astype(float),
         lost_turn=np.minimum(p.update.gap_rate * lost, np.pi),
@@ -281,7 +266,7 @@ def _turned(theta: np.ndarray) -> SciRotation:
 def first_belief(look: FirstLook, parameters: Replay) -> Belief:
     """The belief at the first sample, uncorrelated."""
     p = parameters
-    mean = MargState(
+    mean = model.MargState(
         q_nb=Rotation(jnp.asarray(look.q_nb)),
         v_n=jnp.zeros(3),
         p_n=jnp.zeros(3),
@@ -310,7 +295,7 @@ def first_belief(look: FirstLook, parameters: Replay) -> Belief:
 
 
 def _measurements(
-    integrals: Integrals, field_b: np.ndarray, still: np.ndarray, parameters: Replay
+    integrals: model.Integrals, field_b: np.ndarray, still: np.ndarray, parameters: Replay
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What is known at the end of each block; NaN where nothing is."""
     p, time = parameters, np.asarray(integrals.dt_s)
@@ -321,22 +306,25 @@ def _measurements(
     # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
     travel[every(clock, time > 0.0, p.travel.every)] = 0.0
     y: dict[str, Any] = {
-        TRAVEL: travel,
-        REST_RATE: np.where(still[:, None], np.zeros((blocks, 3)), np.nan),
+        model.TRAVEL: travel,
+        model.REST_RATE: np.where(still[:, None], np.zeros((blocks, 3)), np.nan),
     }
-    aux: dict[str, Any] = {TRAVEL: still.astype(float), REST_RATE: _mean_rate(integrals)}
+    aux: dict[str, Any] = {
+        model.TRAVEL: still.astype(float),
+        model.REST_RATE: _mean_rate(integrals),
+    }
     if p.use_magnetometer != "never":
         there = np.all(np.isfinite(field_b), axis=1)
         look = every(clock, there & ~still, p.travel.every)
-        y[MAGNETOMETER] = (
+        y[model.MAGNETOMETER] = (
             Angle(np.where(look, 0.0, np.nan)),
             np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
         )
-        aux[MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
+        aux[model.MAGNETOMETER] = np.where(there[:, None], field_b, np.array([1e-5, 0.0, 0.0]))
     return y, aux
 
 
-def _mean_rate(integrals: Integrals) -> np.ndarray:
+def _mean_rate(integrals: model.Integrals) -> np.ndarray:
     """(K, 3) rad/s, mean over each block, from its rotation; meant for rest."""
     q, dt = np.asarray(integrals.turn), np.asarray(integrals.dt_s)[:, None]
     vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])

@@ -364,11 +364,7 @@ def causal_attitudes(
     """Attitude at every sample from what was known by then.
 
     Inside a block the last posterior is carried on by the gyro; at its end stands the new one.
-
-    Args:
-        start: the state before the first block.
-        posterior: states at the ends of the blocks, leading axis K.
-        samples: of the blocks.
+    `start` is the state before the first block, `posterior` has those at the ends, leading axis K.
     """
     before = jax.tree_util.tree_map(
         lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b[:-1]]), start, posterior

@@ -11,11 +11,12 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Entry, Parameters, Quantity, default
-from robins.systems.parts import Duration, Names, Speed, Spread, Three
+from robins.systems import quantities as q
+from robins.systems.parts import Names
 
 Row = tuple[Entry, Entry, Entry]
 Matrix = tuple[Row, Row, Row]
-Field = Annotated[Three, Quantity("magnetic field")]
+Field = Annotated[q.Three, Quantity("magnetic field")]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -23,35 +24,27 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 class Gyro(Parameters):
     """The gyros: true rate = (I + gain) (what is read) - bias."""
 
-    noise: Annotated[float, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
-        "0.01 deg/s/sqrt(Hz)"
-    )
-    bias: Annotated[float, Quantity("angle rate", least="0 deg/s")] = default("1 deg/s")
-    bias_walk: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")] = default(
-        "0.0006 deg/s/sqrt(s)"
-    )
+    noise: q.AngleWalk = default("0.01 deg/s/sqrt(Hz)")
+    bias: q.RateSize = default("1 deg/s")
+    bias_walk: q.RateWalkSize = default("0.0006 deg/s/sqrt(s)")
     # vibration and warmth of the hand move a bias faster than rest does
-    bias_walk_moving: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")] = (
-        default("0.01 deg/s/sqrt(s)")
-    )
+    bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
     gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("5000 ppm")
     # what nine numbers do not explain, as a share of the angle turned
     turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
-    range: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2000 deg/s")
+    range: q.AngleRate = default("2000 deg/s")
 
 
 class Accelerometer(Parameters):
     """The accelerometers."""
 
-    noise: Annotated[float, Quantity("velocity random walk", above="0 m/s/sqrt(h)")] = default(
-        "0.02 m/s/sqrt(s)"
-    )
+    noise: q.AccelWalk = default("0.02 m/s/sqrt(s)")
     bias: Annotated[float, Quantity("acceleration", least="0 mg")] = default("0.05 m/s^2")
     bias_walk: Annotated[float, Quantity("acceleration random walk", least="0 mg/sqrt(s)")] = (
         default("0.0001 m/s^2/sqrt(s)")
     )
-    range: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("157 m/s^2")
+    range: q.Acceleration = default("157 m/s^2")
     gravity: Annotated[float, Quantity("acceleration", above="0 m/s^2", most="100 m/s^2")] = (
         default("9.81 m/s^2")
     )
@@ -67,17 +60,17 @@ class Magnetometer(Parameters):
 
     offset: Field = default("0 uT")
     matrix: Matrix = IDENTITY
-    noise: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("2.5 uT")
-    declination: Spread = default("6 deg")
-    declination_time: Duration = default("60 s")
+    noise: q.FieldStrength = default("2.5 uT")
+    declination: q.Spread = default("6 deg")
+    declination_time: q.Duration = default("60 s")
     # random walk of strength and dip of the field that counts as undisturbed: spread after 1 s
     field_walk: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("0.01 uT")
     # magnitudes outside are no field of the Earth: not used, counted
     least: Annotated[float, Quantity("magnetic field", least="0 uT")] = default("8 uT")
-    most: Annotated[float, Quantity("magnetic field", above="0 uT")] = default("200 uT")
+    most: q.FieldStrength = default("200 uT")
     gate: Annotated[float, pydantic.Field(gt=0.0, lt=1.0)] = 0.95
     # so many seconds of motion in one and the same other field make that field the reference
-    patience: Duration = default("20 s")
+    patience: q.Duration = default("20 s")
 
 
 class Travel(Parameters):
@@ -87,9 +80,9 @@ class Travel(Parameters):
     speed, and a large place.
     """
 
-    velocity: Speed = default("0.5 m/s")
-    place: Annotated[float, Quantity("length", above="0 m")] = default("0.3 m")
-    every: Duration = default("1 s")
+    velocity: q.Speed = default("0.5 m/s")
+    place: q.Length = default("0.3 m")
+    every: q.Duration = default("1 s")
     weight: Annotated[float, pydantic.Field(gt=0.0, le=1.0)] = 0.9999  # Huber's; 1: never less
 
 
@@ -97,13 +90,12 @@ class Rest(Parameters):
     """When the unit lies still, and what that says."""
 
     detect: bool = True
-    after: Duration = default("1.5 s")
-    quiet_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("2 deg/s")
-    quiet_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("0.5 m/s^2")
-    # a mean rate above this is no bias but a turn
-    most_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("4 deg/s")
-    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("0.03 deg/s")
-    velocity: Speed = default("0.01 m/s")
+    after: q.Duration = default("1.5 s")
+    quiet_rate: q.AngleRate = default("2 deg/s")
+    quiet_accel: q.Acceleration = default("0.5 m/s^2")
+    most_rate: q.AngleRate = default("4 deg/s")  # a mean rate above this is no bias but a turn
+    rate: q.AngleRate = default("0.03 deg/s")
+    velocity: q.Speed = default("0.01 m/s")
 
     @property
     def quiet(self) -> tuple[float, float, float, float]:
@@ -114,12 +106,12 @@ class Rest(Parameters):
 class Start(Parameters):
     """How well the first attitude is known, when it is found at rest and when not."""
 
-    still: Duration = default("0.5 s")
-    moving: Duration = default("3 s")
-    tilt: Spread = default("1 deg")
-    heading: Spread = default("1 deg")
-    tilt_moving: Spread = default("5 deg")
-    heading_moving: Spread = default("30 deg")
+    still: q.Duration = default("0.5 s")
+    moving: q.Duration = default("3 s")
+    tilt: q.Spread = default("1 deg")
+    heading: q.Spread = default("1 deg")
+    tilt_moving: q.Spread = default("5 deg")
+    heading_moving: q.Spread = default("30 deg")
 
 
 class Update(Parameters):
@@ -127,11 +119,11 @@ class Update(Parameters):
 
     # a sample is the mean over the interval it ends, or the value at an instant
     samples: Literal["means", "instants"] = "means"
-    block: Duration = default("0.1 s")
+    block: q.Duration = default("0.1 s")
     # an interval between samples longer than this many usual ones is a gap
     gap: Annotated[float, pydantic.Field(gt=1.0, le=1e6)] = 3.0
-    gap_rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("60 deg/s")
-    gap_accel: Annotated[float, Quantity("acceleration", above="0 m/s^2")] = default("3 m/s^2")
+    gap_rate: q.AngleRate = default("60 deg/s")
+    gap_accel: q.Acceleration = default("3 m/s^2")
 
 
 class Replay(Parameters):
@@ -140,7 +132,7 @@ class Replay(Parameters):
     system: Literal["marg"] = "marg"
     title: str = "Orientation from gyro, accelerometer and magnetometer"
     use_magnetometer: Literal["always", "undisturbed", "never"] = "undisturbed"
-    orientation: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of mount
+    orientation: q.Angles = default("0 deg")  # roll, pitch, yaw of mount
     gyro: Gyro = pydantic.Field(default_factory=Gyro)
     accelerometer: Accelerometer = pydantic.Field(default_factory=Accelerometer)
     magnetometer: Magnetometer = pydantic.Field(default_factory=Magnetometer)

@@ -20,37 +20,21 @@ from robins.filters.observation import Observation
 from robins.filters.rule import Rule
 from robins.filters.trees import select
 from robins.ins.frames import to_ned_frd
-from robins.results import Outcome, Progress, array, silent
+from robins.results import Outcome, Progress, array, silent, variable
 from robins.systems import replaying
+from robins.systems.marg import model
 from robins.systems.marg.log import Prepared, prepare
-from robins.systems.marg.model import (
-    BLOCKS,
-    DECLINATION,
-    FIELD,
-    MAGNETOMETER,
-    REST_RATE,
-    SENSORS,
-    TRAVEL,
-    MargState,
-    causal_attitudes,
-    model_of,
-    smoothed_attitudes,
-)
 from robins.systems.marg.parameters import Replay
 from robins.systems.replaying import Answer, Reported
 from robins.systems.study import Contender, StateBlock
-from robins.systems.tables import EULER, block_array
+from robins.systems.tables import EULER, attitude_array, block_array
 
 CAUSAL, SMOOTHED = FILTERS = ("marg", "marg-smoothed")
-_ESTIMATED = {block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in BLOCKS[1:]}
+_ESTIMATED = {
+    block.name: {"velocity": "v_n"}.get(block.name, block.name) for block in model.BLOCKS[1:]
+}
 _HEADING = StateBlock("heading", slice(2, 3), "rad", "deg", "NED", ("heading",))
 _INCLINATION = StateBlock("inclination", slice(0, 2), "rad", "deg", "NED", ("north", "east"))
-
-
-# --------------------------------------------------------------------------------------- accuracy
-
-
-# ------------------------------------------------------------------------------------------ rules
 
 
 def field_forgotten(prior: Belief, field_t: float) -> Belief:
@@ -59,8 +43,8 @@ def field_forgotten(prior: Belief, field_t: float) -> Belief:
     The heading too: the gyros know it better than a field that has changed. That the declination of
     a place is small on the long run then leads the heading to the new field in some minutes.
     """
-    forgotten = jnp.zeros(prior.factor.shape[0]).at[DECLINATION].set(math.pi)
-    forgotten = forgotten.at[FIELD].set(field_t)
+    forgotten = jnp.zeros(prior.factor.shape[0]).at[model.DECLINATION].set(math.pi)
+    forgotten = forgotten.at[model.FIELD].set(field_t)
     S = jnp.where(forgotten[:, None] > 0.0, 0.0, prior.factor)
     mean = prior.mean._replace(declination=jnp.zeros_like(prior.mean.declination))
     return Belief(mean, linalg.tria(S, jnp.diag(forgotten)))
@@ -86,7 +70,7 @@ def undisturbed(probability: float, patience: int, field_t: float) -> Rule:
         new = o.notes["gate.recovered"]
         return memory, select(new, field_forgotten(prior, field_t), Belief(*reopened)), o
 
-    return rules.only(MAGNETOMETER, inner._replace(before=before, name="undisturbed"))
+    return rules.only(model.MAGNETOMETER, inner._replace(before=before, name="undisturbed"))
 
 
 def marg_filter(
@@ -105,8 +89,8 @@ def marg_filter(
         field_t: T, spread of strength and vertical component of a new field.
     """
     chain = [
-        rules.only(TRAVEL, rules.huber(weight)),
-        rules.only(REST_RATE, rules.gate(0.9999, 100)),
+        rules.only(model.TRAVEL, rules.huber(weight)),
+        rules.only(model.REST_RATE, rules.gate(0.9999, 100)),
     ]
     if gate is not None:
         chain.append(undisturbed(gate, patience, field_t))
@@ -124,9 +108,6 @@ def filter_of(parameters: Replay) -> Filter:
     )
 
 
-# ---------------------------------------------------------------------------------------- replay
-
-
 class OrientationErrors(NamedTuple):
     """Angles [rad] of q_e = q_estimated conj(q_true), both from body to an earth frame.
 
@@ -140,14 +121,10 @@ class OrientationErrors(NamedTuple):
 
 
 def orientation_errors(q_estimated: np.ndarray, q_true: np.ndarray) -> OrientationErrors:
-    """Total, heading and inclination error; NaN where an attitude is missing.
+    """Total, heading and inclination error between q_nb (N, 4), NED; NaN where one is missing.
 
     With q_e = (w, x, y, z): total 2 acos |w|, heading 2 atan(z / w), inclination
     2 acos sqrt(w^2 + z^2); written with the arc tangent, which is exact for small angles too.
-
-    Args:
-        q_estimated: (N, 4) q_nb, scalar first, NED.
-        q_true: (N, 4) the same.
     """
     e = rotation.multiply(q_estimated, rotation.conjugate(q_true))
     w, z = e[:, 0], e[:, 3]
@@ -184,9 +161,6 @@ def rms_deg(angle_rad: np.ndarray) -> float:
     return float(np.degrees(np.sqrt(np.mean(angle_rad**2)))) if angle_rad.size else float("nan")
 
 
-# ----------------------------------------------------------------------------------------- replay
-
-
 class Errors(NamedTuple):
     """True minus estimated at the ends of blocks."""
 
@@ -201,26 +175,20 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Find the orientation over a log and say how good it is.
-
-    Args:
-        dataset: inertial samples; magnetic field and true attitude where there are.
-        parameters: what the files do not say.
-        filters: "marg" and "marg-smoothed"; by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Find the orientation over a log, as `System.replay` says, with and without a true attitude.
 
     Raises:
         ValueError: the log cannot be used; the sentence says why.
     """
     progress(0.0, "integrating blocks")
     log = prepare(dataset, parameters)
-    believed = Contender(filter_of(parameters), model_of(parameters))
+    believed = Contender(filter_of(parameters), model.model_of(parameters))
     wanted = filters or parameters.filters
     contenders, smoothers = {CAUSAL: believed}, {SMOOTHED: CAUSAL}
     answers = replaying.navigated([log], wanted, contenders.__getitem__, smoothers, progress)
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}
     answers = {name: _without_padding(log, answer) for name, answer in answers.items()}
-    variables, errors = _variables(log, answers), {}
+    variables, errors = _variables(log, answers) | _attitudes(log, q_nb), {}
     if dataset.attitude is not None:
         errors = {name: _errors(dataset.attitude, log, q) for name, q in q_nb.items()}
         variables |= _error_arrays(answers, errors)
@@ -249,15 +217,19 @@ def replay(
         variables=variables,
         counts=dict(dataset.counts) | log.counts | {"steps_not_taken": lost},
         notes=notes,
+        origin_ns=int(log.time_ns[0]),
     )
 
 
 def _by_sample(log: Prepared, answer: Answer) -> np.ndarray:
     """(N, 4) attitude at every sample."""
     if answer.name == SMOOTHED:
-        q, first = smoothed_attitudes(answer.mean, log.samples)
+        q, first = model.smoothed_attitudes(answer.mean, log.samples)
     else:
-        q, first = causal_attitudes(answer.start.mean, answer.mean, log.samples), log.look.q_nb
+        q, first = (
+            model.causal_attitudes(answer.start.mean, answer.mean, log.samples),
+            log.look.q_nb,
+        )
     rows = np.asarray(q).reshape(-1, 4)[: len(log.time_ns) - 1]
     return np.concatenate([np.asarray(first)[None], rows])
 
@@ -270,20 +242,19 @@ def _without_padding(log: Prepared, answer: Answer) -> Answer:
     return answer._replace(mean=mean, sigma=sigma, updates=seen)
 
 
-def _estimates(mean: MargState) -> Mapping[str, Any]:
-    euler = jnp.stack(rotation.to_euler(jnp.asarray(mean.q_nb.wxyz)), axis=-1)
+def _estimates(mean: model.MargState) -> Mapping[str, Any]:
     values = {name: np.asarray(getattr(mean, of)) for name, of in _ESTIMATED.items()}
-    return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"euler": euler}
+    return {name: x.reshape(len(x), -1) for name, x in values.items()} | {"q_nb": mean.q_nb.wxyz}
 
 
 REPORTED = Reported(
-    blocks=BLOCKS,
-    sensors=SENSORS,
+    blocks=model.BLOCKS,
+    sensors=model.SENSORS,
     estimates=_estimates,
     causes="Likely causes: a magnetometer without calibration (`robins calibrate`) or beside iron, "
     "axes or units of a sensor that differ from what the log says, or noise of the gyro told too "
     "small.",
-    assumed=(TRAVEL, REST_RATE),
+    assumed=(model.TRAVEL, model.REST_RATE),
     euler=EULER._replace(frame="body to NED"),
 )
 
@@ -324,7 +295,7 @@ def _error_arrays(answers: Mapping[str, Answer], errors: Mapping[str, Errors]) -
 
 def _refused(log: Prepared, answer: Answer) -> np.ndarray:
     """(B,) bool: the magnetometer was refused."""
-    update = answer.updates.get(MAGNETOMETER)
+    update = answer.updates.get(model.MAGNETOMETER)
     none = np.zeros(len(log.rows), dtype=bool)
     return none if update is None else update.code == int(Code.REFUSED)
 
@@ -342,6 +313,15 @@ def _variables(log: Prepared, answers: Mapping[str, Answer]) -> dict[str, Any]:
     )
 
 
+def _attitudes(log: Prepared, q_nb: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Attitude at every sample, on a clock of its own."""
+    since_s = (log.time_ns - log.time_ns[0]) * 1e-9
+    clock = variable("sample_time", since_s, "s", "time of the inertial samples")
+    words = "estimated attitude at every sample"
+    q = np.stack(list(q_nb.values()))
+    return {"sample_time": clock} | attitude_array(q, "body to NED", "sample_time", words)
+
+
 def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
     """What a reader of the report should know."""
     c = log.counts
@@ -355,7 +335,7 @@ def _sentences(log: Prepared, answers: Mapping[str, Answer]) -> list[str]:
     ]
     for name, answer in answers.items():
         refused = _refused(log, answer)
-        update = answer.updates.get(MAGNETOMETER)
+        update = answer.updates.get(model.MAGNETOMETER)
         asked = 0 if update is None else int(np.sum((update.dof > 0) | refused))
         if asked:
             out.append(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from robins.systems.judgement import Band, Claim, rms_by_component
+from robins.systems.judgement import Band, ratio_claims, rms_by_component
 from robins.systems.rocket.world import BODY, EULER, Course
 
 PAPER, SCALAR, UKF = "federated-vector-stukf", "federated-scalar-ukf", "ukf"
@@ -73,11 +72,9 @@ def field_metrics(course: Course, statistics: Any) -> dict[str, Any]:
     return out
 
 
-# By id: ours, over the best of these, in these metrics of which the worst counts, the bands in
-# which it is reproduced and partly so.
 _BETTER: tuple[Band, Band] = ((0.0, 0.98), (0.0, 1.0))
 _AXES = tuple(f"{angle}_rms_deg" for angle in EULER)
-_RATIOS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...], Band, Band]] = {
+_RATIOS = {
     "better-than-sensors": (PAPER, ("gyro", "magnetic-raw"), _AXES, *_BETTER),
     "better-than-magnetometer": (PAPER, ("magnetometer",), (RMS,), *_BETTER),
     "better-than-scalar": (PAPER, (SCALAR,), (RMS,), *_BETTER),
@@ -118,14 +115,5 @@ _TEXTS = {
 }
 
 
-def _largest(ours: str, theirs: tuple[str, ...], keys: tuple[str, ...]) -> Callable[..., float]:
-    return lambda metrics: max(
-        metrics[ours][key] / min(metrics[name][key] for name in theirs) for key in keys
-    )
-
-
-CLAIMS = {
-    key: Claim(_TEXTS[key], (ours, *theirs), _largest(ours, theirs, keys), band, partly)
-    for key, (ours, theirs, keys, band, partly) in _RATIOS.items()
-}
+CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 """Every claim that a scenario may state."""

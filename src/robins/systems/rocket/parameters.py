@@ -12,15 +12,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Quantity, Span, default
-from robins.systems.parts import (
-    Duration,
-    Names,
-    Speed,
-    Spread,
-    Three,
-    refuse_too_long,
-    refuse_unsettled,
-)
+from robins.systems import quantities as q
+from robins.systems.parts import Names, refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
 
@@ -30,45 +23,45 @@ class Launch(Parameters):
     latitude: Annotated[float, Quantity("angle", least="-90 deg", most="90 deg")]
     longitude: Annotated[float, Quantity("angle", least="-180 deg", most="180 deg")]
     height: Annotated[float, Quantity("length", least="-1 km", most="100 km")] = default("0 m")
-    speed: Speed
+    speed: q.Speed
     elevation: Annotated[float, Quantity("angle", above="0 deg", most="90 deg")]
-    azimuth: Annotated[float, Quantity("angle")] = default("0 deg")
+    azimuth: q.Angle = default("0 deg")
     year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2026.0
 
 
 class Body(Parameters):
     """A body symmetric about its x axis, that spins and cones; white torque over inertia."""
 
-    spin: Annotated[float, Quantity("angle rate", above="0 deg/s")]
+    spin: q.AngleRate
     cone: Annotated[float, Quantity("angle", least="0 deg", below="80 deg")]  # half angle
     elevation: Annotated[float, Quantity("angle", least="-90 deg", most="90 deg")]  # of momentum
-    azimuth: Annotated[float, Quantity("angle")]
+    azimuth: q.Angle
     e1: Annotated[float, pydantic.Field(ge=-1.0, lt=1.0)]  # 1 - Ix/It
     # times 1/e2 in which the spin decays, and 1/e3 in which the rates across do; none: never
-    spin_decay: Duration | None = None
-    cone_decay: Duration | None = None
-    torque: Annotated[float, Quantity("rate random walk", least="0 deg/s/sqrt(s)")]
+    spin_decay: q.Duration | None = None
+    cone_decay: q.Duration | None = None
+    torque: q.RateWalkSize
 
 
 class Gyro(Parameters):
     """A MEMS triad: constant, slow and white errors; sigma of the white one is of a sample."""
 
-    white: Annotated[float, Quantity("angle rate", above="0 deg/s")]
-    bias: Annotated[float, Quantity("angle rate", least="0 deg/h")] = default("5 deg/h")
-    drift: Annotated[float, Quantity("angle rate", least="0 deg/h")] = default("5 deg/h")
-    drift_time: Duration = default("300 s")
+    white: q.AngleRate
+    bias: q.RateSize = default("5 deg/h")
+    drift: q.RateSize = default("5 deg/h")
+    drift_time: q.Duration = default("300 s")
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")
     # of the attitude that the gyro is integrated to, where that is what is read of it
-    attitude_noise: Spread = default("0.5 deg")
+    attitude_noise: q.Spread = default("0.5 deg")
     lost: tuple[Span, ...] = ()
 
 
 class Disturbance(Parameters):
     """The magnetometer is wrong by an angle, for a while, again and again."""
 
-    angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")]
-    every: Duration = default("30 s")
-    length: Duration = default("1 s")
+    angle: q.Spread
+    every: q.Duration = default("30 s")
+    length: q.Duration = default("1 s")
 
     @pydantic.model_validator(mode="after")
     def _pauses(self) -> Disturbance:
@@ -87,9 +80,9 @@ class Magnetometer(Parameters):
     scale.
     """
 
-    noise: Spread = default("1 deg")
-    hard_iron: Annotated[Three, Quantity("magnetic field")] = default("0 uT")
-    full_scale: Annotated[float, Quantity("magnetic field", above="0 uT")] | None = None
+    noise: q.Spread = default("1 deg")
+    hard_iron: Annotated[q.Three, Quantity("magnetic field")] = default("0 uT")
+    full_scale: q.FieldStrength | None = None
     disturbance: Disturbance | None = None
     lost: tuple[Span, ...] = ()
 
@@ -97,9 +90,9 @@ class Magnetometer(Parameters):
 class Start(Parameters):
     """How the estimate begins: its error, and what it believes of it, one sigma."""
 
-    attitude_error: Annotated[Three, Quantity("angle")] = default("0 deg")
-    attitude: Spread = default("2 deg")
-    rate: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("1 deg/s")
+    attitude_error: q.Angles = default("0 deg")
+    attitude: q.Spread = default("2 deg")
+    rate: q.AngleRate = default("1 deg/s")
 
 
 class Flight(Scenario):
@@ -107,10 +100,10 @@ class Flight(Scenario):
 
     system: str = "rocket"
     claims: tuple[str, ...] | None = ()  # the paper's hold only where a scenario states them
-    duration: Duration = default("600 s")
-    step: Duration = default("0.1 s")
-    counted_from: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
-    quiet_after: Annotated[float, Quantity("time", least="0 s")] = default("10 s")
+    duration: q.Duration = default("600 s")
+    step: q.Duration = default("0.1 s")
+    counted_from: q.Time = default("30 s")
+    quiet_after: q.Time = default("10 s")
     launch: Launch
     body: Body
     gyro: Gyro
@@ -139,9 +132,7 @@ class Believed(Parameters):
 
     error: Annotated[float, Quantity("ratio")] = default("0 %")  # of the coefficients
     wrong: Literal["rates", "all"] = "all"  # only e1, e2, e3, or the kinematic rows too
-    attitude_noise: Annotated[float, Quantity("angle random walk", above="0 deg/sqrt(s)")] = (
-        default("3.16227766e-5 rad/sqrt(s)")
-    )
+    attitude_noise: q.AngleWalk = default("3.16227766e-5 rad/sqrt(s)")
     rate_noise: Annotated[float, Quantity("rate random walk", above="0 deg/s/sqrt(s)")] = default(
         "0.02 deg/s/sqrt(s)"
     )

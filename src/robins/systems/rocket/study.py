@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
@@ -21,25 +20,13 @@ import xarray as xr
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import (
-    Belief,
-    Filter,
-    Model,
-    Motion,
-    Rule,
-    Sensor,
-    adaptive,
-    channel,
-    federated,
-    kalman,
-    observability_shares,
-    taylor,
-    unscented,
-)
+from robins import filters
+from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman
 from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
 from robins.results import array
 from robins.rotation import Rotation
+from robins.systems.aboard import Taken, aboard, taken
 from robins.systems.parts import NED
 from robins.systems.rocket import angles, field
 from robins.systems.rocket.angles import GYRO, MAGNETIC, angle_state
@@ -65,7 +52,7 @@ PROBABILITY = 0.999  # of the chi-square tests
 PATIENCE = 30  # samples: 3 s, longer than a burst, shorter than a loss of track to be borne
 FORGETS = (10.0, 10.0)  # rad, rad/s: noise of a step that leaves nothing of what was before
 ANGLES_SEEN, RATES_SEEN = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
-_POINTS = unscented(alpha=0.5, beta=2.0, kappa=0.0)
+_POINTS = filters.unscented(alpha=0.5, beta=2.0, kappa=0.0)
 
 # ------------------------------------------------------------------------- what filters are made of
 
@@ -97,22 +84,16 @@ def projected_discriminator(robust: Literal["huber", "gate"]) -> Rule:
     return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust)
 
 
-# name of each sensor of a filter, and what makes its measurement of the world
-Taken = tuple[tuple[str, Callable[[World], Any]], ...]
-
-
-def aboard(
+def sensors_of(
     given: Flight, course: Course, names: tuple[str, ...]
 ) -> tuple[tuple[Sensor, ...], Taken]:
-    """The sensors of these names as a filter believes them, and what it takes of the world."""
-    chosen = [i for i in instruments(given) if i.name in names]
-    believed = (i.believed(given, course) for i in chosen)
-    return tuple(s for s in believed if s is not None), tuple((i.name, i.taken) for i in chosen)
+    """`aboard`, of the instruments of these names."""
+    return aboard([i for i in instruments(given) if i.name in names], given, course)
 
 
 def bank() -> Filter:
     """A bank over the scale of the process noise, with the sigma points of the studies."""
-    return adaptive(linearise=_POINTS)
+    return filters.adaptive(linearise=_POINTS)
 
 
 # ------------------------------------------------------------------------------- magnetic attitude
@@ -159,16 +140,18 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
         return ukf(*rules, *(() if chosen.rule is None else (chosen.rule,)))
 
     if chosen.raw:
-        return kalman(taylor())
+        return kalman(filters.taylor())
     if chosen.adapts:
         return bank()
     if chosen.sharing is None:
         return own(*chosen.sensors)
-    channels = [channel((sensor,), own(sensor)) for sensor in chosen.sensors]
+    channels = [filters.channel((sensor,), own(sensor)) for sensor in chosen.sensors]
     shares = "equal" if chosen.sharing == "scalar" else shares_by_state(given)  # pyright: ignore[reportArgumentType] frozen, so hashable
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "sharing='half'", UserWarning)
-        return federated(channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS)
+        return filters.federated(
+            channels, "fusion-reset", chosen.sharing, shares, linearise=_POINTS
+        )
 
 
 @cache  # half a second, the same for all filters of a scenario
@@ -176,9 +159,11 @@ def shares_by_state(given: MagneticAttitude) -> np.ndarray:
     """(2, 6) by how well gyro and magnetometer see each state at the start."""
     q, omega = start_of(given)
     start = angle_state(wrong_by(q, given.start.attitude_error), omega)
-    channels = [channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
+    channels = [filters.channel((sensor,), kalman()) for sensor in (GYRO, MAGNETIC)]
     model = angle_model(given, lay_out(given), ANGLE_FILTERS["ukf"])
-    return observability_shares(model, Belief(start, jnp.diag(angle_sigma(given))), channels)
+    return filters.observability_shares(
+        model, Belief(start, jnp.diag(angle_sigma(given))), channels
+    )
 
 
 def angle_sigma(given: MagneticAttitude) -> Array:
@@ -189,7 +174,7 @@ def angle_sigma(given: MagneticAttitude) -> Array:
 def angle_model(given: MagneticAttitude, course: Course, chosen: AngleFilter) -> Model:
     """Motion and sensors that a filter believes."""
     b, T, white = given.believed, given.step, given.gyro.white
-    sensors, _ = aboard(given, course, chosen.sensors)
+    sensors, _ = sensors_of(given, course, chosen.sensors)
     if not chosen.raw:
         noise = np.array([b.attitude_noise, b.rate_noise]) * np.sqrt(T)
         motion = Motion(Partial(angles.step, coefficients(given)), jnp.repeat(noise, 3))
@@ -209,14 +194,13 @@ def coefficients(given: MagneticAttitude) -> angles.Coefficients:
     return angles.Coefficients(*map(jnp.asarray, (e1, e2, e3, kinematic, given.step)))
 
 
-def angle_case(taken: Taken, sigma: Array, world: World) -> Case:
+def angle_case(of: Taken, sigma: Array, world: World) -> Case:
     """What a filter of "magnetic-attitude" takes of a run; pure."""
     return Case(
         start=Belief(angle_state(world.start_q_nb, world.start_omega_b), jnp.diag(sigma)),
         u=field.bridged(world.theta_b).theta_b,
-        y={name: take(world)[0] for name, take in taken},
-        aux={},
         truth=angle_state(world.q_nb[1:], world.omega_b[1:]),
+        **taken(of, world),
     )
 
 
@@ -224,8 +208,8 @@ def angle_contender(given: MagneticAttitude, course: Course, name: str) -> Conte
     """A filter of "magnetic-attitude" with its model and its data."""
     chosen = ANGLE_FILTERS[name]
     model = angle_model(given, course, chosen)
-    _, taken = aboard(given, course, tuple(model.dims))
-    case = recipe(angle_case, taken, numbers=angle_sigma(given))
+    _, of = sensors_of(given, course, tuple(model.dims))
+    case = recipe(angle_case, of, numbers=angle_sigma(given))
     return Contender(angle_filter(given, chosen), model, case)
 
 
@@ -241,8 +225,8 @@ class FieldFilter(NamedTuple):
 
 
 FIELD_FILTERS: dict[str, FieldFilter] = {
-    "gyro": FieldFilter(kalman(taylor()), ()),
-    "magnetometer": FieldFilter(kalman(taylor()), (SNAPSHOT,)),
+    "gyro": FieldFilter(kalman(filters.taylor()), ()),
+    "magnetometer": FieldFilter(kalman(filters.taylor()), (SNAPSHOT,)),
     "usque": FieldFilter(ukf()),
     "huber": FieldFilter(ukf(huber(PROBABILITY))),
     "gate": FieldFilter(ukf(patient())),
@@ -263,7 +247,7 @@ def field_model(given: FieldVector, course: Course, chosen: FieldFilter) -> Mode
     walk = g.drift * math.sqrt(2.0 * T / g.drift_time)
     angle = FORGETS[0] if SNAPSHOT in chosen.sensors else g.white * T
     motion = field.field_motion(field.GyroNoise(*map(jnp.asarray, (angle, walk, T))))
-    sensors, _ = aboard(given, course, chosen.sensors)
+    sensors, _ = sensors_of(given, course, chosen.sensors)
     return Model(motion, sensors)
 
 
@@ -274,14 +258,10 @@ def field_sigma(given: FieldVector, chosen: FieldFilter) -> Array:
     return jnp.repeat(jnp.array([given.start.attitude, bias, *scale]), 3)
 
 
-def field_case(scaled: bool, taken: Taken, numbers: tuple[Array, Array], world: World) -> Case:
-    """What a filter of "field-vector" takes of a run; pure.
+def field_case(scaled: bool, of: Taken, numbers: tuple[Array, Array], world: World) -> Case:
+    """What a filter of "field-vector" takes of a run, scale factors being states or not; pure.
 
-    Args:
-        scaled: scale factors are states.
-        taken: by its sensors.
-        numbers: initial sigma (n,), and the field (E, 3) [T] in n.
-        world: the run.
+    Its numbers are the initial sigma (n,) and the field (E, 3) [T] in n.
     """
     sigma, field_n = numbers
     world = world._replace(field_n=field_n)
@@ -289,27 +269,22 @@ def field_case(scaled: bool, taken: Taken, numbers: tuple[Array, Array], world: 
     q_nb, scale = world.q_nb[1:], jnp.broadcast_to(world.errors.scale_factor, field_n.shape)
     errors = (world.bias, scale) if scaled else (world.bias,)
     state = ScaledState if scaled else FieldState
-    seen = {name: take(world) for name, take in taken}
     return Case(
         start=Belief(state(start, *(zero for _ in errors)), jnp.diag(sigma)),
         u=field.bridged(world.theta_b),
-        y={name: y for name, (y, _) in seen.items()},
-        aux={name: aux for name, (_, aux) in seen.items()},
         truth=state(Rotation(q_nb), *errors),
         rows=field.rows_of(q_nb, field_n, len(sigma)),
+        **taken(of, world),
     )
 
 
 def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     """A filter of "field-vector" with its model and its data."""
     chosen = FIELD_FILTERS[name]
-    _, taken = aboard(given, course, chosen.sensors)
+    _, of = sensors_of(given, course, chosen.sensors)
     numbers = field_sigma(given, chosen), jnp.asarray(course.field_n)
-    case = recipe(field_case, chosen.scaled, taken, numbers=numbers)
+    case = recipe(field_case, chosen.scaled, of, numbers=numbers)
     return Contender(chosen.filter, field_model(given, course, chosen), case)
-
-
-# ------------------------------------------------------------------------------ what both report
 
 
 def _view(given: Flight, course: Course, **own: Any) -> View:

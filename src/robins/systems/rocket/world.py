@@ -19,7 +19,6 @@ from robins.earth.magnetic import field_along, wmm_for
 from robins.filters import Sensor
 from robins.manifold import Angle, wrap
 from robins.rotation import conjugate, from_euler, multiply, rotate, to_euler, to_rotvec
-from robins.scenario import Span
 from robins.sim.ballistic import ballistic
 from robins.sim.free_body import FreeBody, coning_start, free_body
 from robins.sim.gyro import MemsErrors, MemsGyro, delta_angles, integrate_angles
@@ -30,7 +29,8 @@ from robins.sim.magnetometer import (
     observe_magnetic_attitude,
 )
 from robins.sim.random import Component, stream
-from robins.systems.parts import Three
+from robins.systems.parts import outside
+from robins.systems.quantities import Three
 from robins.systems.rocket.angles import GYRO, MAGNETIC, read_angles, read_rate
 from robins.systems.rocket.field import FIELD, SNAPSHOT, field_sensor, plausible
 from robins.systems.rocket.parameters import Flight, MagneticAttitude
@@ -97,8 +97,8 @@ def lay_out(given: Flight) -> Course:
         time_s=time,
         field_n=np.asarray(rotate(path.q_local, jnp.asarray(local))),
         alt_m=np.asarray(path.alt_m),
-        seen=_there(time, given.magnetometer.lost),
-        felt=_there(time, given.gyro.lost),
+        seen=outside(given.magnetometer.lost, time),
+        felt=outside(given.gyro.lost, time),
         bursts=tuple(slice(k, k + width) for k in first if k + width <= count),
         quiet=since > given.quiet_after - 1e-9,
     )
@@ -114,13 +114,6 @@ def _disturbed(given: Flight, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarra
         after = np.maximum(time_s - begin - burst.length, 0.0)
         since = np.where(time_s >= begin - 1e-9, after, since)
     return begun, since
-
-
-def _there(time_s: np.ndarray, lost: tuple[Span, ...]) -> np.ndarray:
-    there = np.ones(len(time_s), dtype=bool)
-    for span in lost:
-        there &= ~span.holds(time_s)
-    return there
 
 
 def body_of(given: Flight) -> FreeBody:
@@ -159,9 +152,6 @@ def simulate(given: Flight, course: Course, seed: int, index: Array) -> World:
 
 def _felt(course: Course, rows: Array) -> Array:
     return jnp.where(jnp.asarray(course.felt)[:, None], rows, jnp.nan)
-
-
-# ------------------------------------------------------------------------------------ instruments
 
 
 def instruments(given: Flight) -> tuple[Instrument, ...]:
@@ -240,15 +230,12 @@ _FIELD_AXES = SensorAxes("T", "FRD", BODY, "uT")
 RATE_GYRO = Instrument(
     *(GYRO, _RATE_AXES, _rate),
     lambda given, course: Sensor(read_rate, jnp.full(3, given.gyro.white), 3, GYRO),
-    lambda world: (world.readings[GYRO], None),
 )
 INTEGRATED_GYRO = Instrument(
     *(GYRO, _ANGLE_AXES, _integrated),
     lambda given, course: Sensor(read_angles, jnp.full(3, given.gyro.attitude_noise), 3, GYRO),
-    lambda world: (world.readings[GYRO], None),
 )
 MAGNETIC_ATTITUDE = Instrument(
     *(MAGNETIC, _ANGLE_AXES, _magnetic),
     lambda given, course: Sensor(read_angles, jnp.full(3, given.magnetometer.noise), 3, MAGNETIC),
-    lambda world: (world.readings[MAGNETIC], None),
 )

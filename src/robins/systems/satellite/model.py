@@ -131,10 +131,6 @@ def _read_additive(x: QuaternionState, aux: Any) -> BodyRotation:
     return BodyRotation(normalise(x.q_ib))
 
 
-def _none(q_ib: Array) -> None:
-    return None
-
-
 def _rows_additive(q_ib: Array) -> Array:
     """(6, 7) attitude error in body axes and error of the bias, from those of the components."""
     rows = jnp.zeros((6, 7))
@@ -145,7 +141,7 @@ MULTIPLICATIVE = StateForm(
     attitude=lambda x: x.attitude.wxyz,
     bias=lambda x: x.gyro_bias,
     state=lambda q, b: AttitudeState(BodyRotation(q), b),
-    rows=_none,
+    rows=lambda q: None,
 )
 ADDITIVE = StateForm(
     attitude=lambda x: normalise(x.q_ib),

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Entry, Parameters, Positive, Quantity, Span, default
-from robins.systems.parts import Three, refuse_too_long, refuse_unsettled
+from robins.systems import quantities as q
+from robins.systems.parts import refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
 _TILTED = (3.0**-0.5, 3.0**-0.5, 3.0**-0.5)
@@ -17,11 +18,9 @@ class Orbit(Parameters):
     """A circular orbit, and the model of the magnetic field along it."""
 
     altitude: Annotated[float, Quantity("length", least="100 km")] = default("500 km")
-    inclination: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "97.4 deg"
-    )
-    node: Annotated[float, Quantity("angle")] = default("0 deg")
-    latitude_argument: Annotated[float, Quantity("angle")] = default("0 deg")
+    inclination: q.AngleSize = default("97.4 deg")
+    node: q.Angle = default("0 deg")
+    latitude_argument: q.Angle = default("0 deg")
     field: Literal["dipole", "wmm"] = "dipole"
     year: Annotated[float, pydantic.Field(ge=2020.0, lt=2030.0)] = 2025.0
 
@@ -29,13 +28,13 @@ class Orbit(Parameters):
 class Craft(Parameters):
     """Inertia and what disturbs it; products are the elements xy, xz, yz of the matrix."""
 
-    moments: Annotated[Three, Quantity("moment of inertia", above="0 kg m^2")] = default(
+    moments: Annotated[q.Three, Quantity("moment of inertia", above="0 kg m^2")] = default(
         "1.9 kg m^2", "2.1 kg m^2", "2.4 kg m^2"
     )
-    products: Annotated[Three, Quantity("moment of inertia")] = default(
+    products: Annotated[q.Three, Quantity("moment of inertia")] = default(
         "0.02 kg m^2", "-0.03 kg m^2", "0.01 kg m^2"
     )
-    dipole: Annotated[Three, Quantity("magnetic moment")] = default(
+    dipole: Annotated[q.Three, Quantity("magnetic moment")] = default(
         "0.05 A m^2", "-0.03 A m^2", "0.04 A m^2"
     )
     # amplitude of a torque on each axis that goes with the orbit, a third of a turn apart
@@ -55,7 +54,7 @@ class Wheels(Parameters):
     momentum: Annotated[float, Quantity("angular momentum", above="0 N m s")] = default("0.1 N m s")
     start: Annotated[float, Quantity("angular momentum")] = default("0 N m s")  # each of them
     lost: tuple[Annotated[int, pydantic.Field(ge=0, le=99)], ...] = ()
-    lost_at: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    lost_at: q.Time = default("0 s")
     loss_known: bool = True  # from the start; then torques are shared out among the others
 
     @pydantic.model_validator(mode="after")
@@ -76,7 +75,7 @@ class Wheels(Parameters):
 class Control(Parameters):
     """Attitude control by wheels, their unloading by magnetorquers."""
 
-    frequency: Annotated[float, Quantity("angle rate", above="0 rad/s")] = default("0.12 rad/s")
+    frequency: q.AngleRate = default("0.12 rad/s")
     damping: Positive = 0.9
     dipole: Annotated[float, Quantity("magnetic moment", least="0 A m^2")] = default("5 A m^2")
     unloading: Annotated[float, Quantity("inverse time", least="0 1/s")] = default("0.002 1/s")
@@ -85,34 +84,25 @@ class Control(Parameters):
 class Slew(Parameters):
     """Sinusoidal turns about the body axes on top of the reference, growing from rest."""
 
-    angle: Annotated[Three, Quantity("angle", most="90 deg")]
-    period: Annotated[Three, Quantity("time", above="0 s")]
-    grows: Annotated[float, Quantity("time", least="0 s")] = default("100 s")
+    angle: Annotated[q.Three, Quantity("angle", most="90 deg")]
+    period: q.Durations
+    grows: q.Time = default("100 s")
 
 
 class Gyro(Parameters):
     """A gyro triad whose noise has several sources; each is drawn anew in each run."""
 
-    random_walk: Annotated[float, Quantity("angle random walk", above="0 deg/sqrt(h)")] = default(
-        "1.2 arcsec/sqrt(s)"
-    )
-    rate_walk: Annotated[float, Quantity("rate random walk", least="0 arcsec/s/sqrt(s)")] = default(
-        "0.005 arcsec/s/sqrt(s)"
-    )
-    markov: Annotated[float, Quantity("angle rate", least="0 arcsec/s")] = default("0.3 arcsec/s")
-    markov_time: Annotated[float, Quantity("time", above="0 s")] = default("300 s")
-    bias: Annotated[float, Quantity("angle rate", least="0 arcsec/s")] = default("3 arcsec/s")
+    random_walk: q.AngleWalk = default("1.2 arcsec/sqrt(s)")
+    rate_walk: q.RateWalkSize = default("0.005 arcsec/s/sqrt(s)")
+    markov: q.RateSize = default("0.3 arcsec/s")
+    markov_time: q.Duration = default("300 s")
+    bias: q.RateSize = default("3 arcsec/s")
     ramp: Annotated[float, Quantity("angular acceleration", least="0 rad/s^2")] = default(
         "9.6962736e-10 rad/s^2"  # 2e-4 arcsec/s^2
     )
     scale_factor: Annotated[float, Quantity("ratio", least="0")] = default("0 ppm")  # one sigma
-    # one sigma
-    misalignment: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "0 arcsec"
-    )
-    quantum: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "0.05 arcsec"
-    )
+    misalignment: q.AngleSize = default("0 arcsec")  # one sigma
+    quantum: q.AngleSize = default("0.05 arcsec")
 
 
 class StarFault(Span):
@@ -124,7 +114,7 @@ class StarFault(Span):
     """
 
     kind: Literal["stuck", "turned", "sign", "short"]
-    angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("10 deg")
+    angle: q.Spread = default("10 deg")
 
 
 class Camera(Parameters):
@@ -137,29 +127,21 @@ class Camera(Parameters):
     catalogue: Literal["synthetic", "hipparcos"] = "synthetic"
     field: Annotated[float, Quantity("angle", above="1 deg", most="60 deg")] = default("20 deg")
     magnitude: Annotated[float, pydantic.Field(ge=3.0, le=6.5)] = 5.5
-    # of a star
-    noise: Annotated[float, Quantity("angle", above="0 arcsec", most="180 deg")] = default(
-        "20 arcsec"
-    )
+    noise: q.Spread = default("20 arcsec")  # of a star
     missed: Annotated[float, Quantity("ratio", least="0", below="1")] = default("0 %")
     false_stars: Annotated[int, pydantic.Field(ge=0, le=20)] = 0
-    # of a match
-    tolerance: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
-        "0.1 deg"
-    )
+    tolerance: q.Spread = default("0.1 deg")  # of a match
 
 
 class Star(Parameters):
     """A star sensor, its boresight z; the low-frequency error is a sine of drawn phase."""
 
-    period: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
-    noise: Annotated[Three, Quantity("angle", above="0 deg")] = default(
+    period: q.Duration = default("0.5 s")
+    noise: Annotated[q.Three, Quantity("angle", above="0 deg")] = default(
         "10 arcsec", "10 arcsec", "40 arcsec"
     )
-    low_frequency: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "0 arcsec"
-    )
-    low_frequency_period: Annotated[float, Quantity("time", above="0 s")] = default("600 s")
+    low_frequency: q.AngleSize = default("0 arcsec")
+    low_frequency_period: q.Duration = default("600 s")
     lost: tuple[Span, ...] = ()
     faults: tuple[StarFault, ...] = ()
     camera: Camera | None = None
@@ -172,10 +154,8 @@ class Believed(Parameters):
     """
 
     drift: Annotated[float, Quantity("rate random walk", above="0 rad/s/sqrt(s)")] | None = None
-    attitude: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default(
-        "60 arcsec"
-    )
-    bias: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("3 arcsec/s")
+    attitude: q.Spread = default("60 arcsec")
+    bias: q.AngleRate = default("3 arcsec/s")
 
 
 class AttitudeLoop(Scenario, Parameters):
@@ -185,9 +165,9 @@ class AttitudeLoop(Scenario, Parameters):
     study: str = "attitude-loop"
     title: str = "Satellite attitude"
     claims: tuple[str, ...] | None = ()
-    duration: Annotated[float, Quantity("time", above="0 s")] = default("1500 s")
-    step: Annotated[float, Quantity("time", above="0 s")] = default("0.1 s")
-    counted_from: Annotated[float, Quantity("time", least="0 s")] = default("500 s")
+    duration: q.Duration = default("1500 s")
+    step: q.Duration = default("0.1 s")
+    counted_from: q.Time = default("500 s")
     points: Literal["nadir", "inertial"] = "nadir"
     slew: Slew | None = None
     orbit: Orbit = pydantic.Field(default_factory=Orbit)

@@ -21,7 +21,7 @@ from robins.filters import Loop
 from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.results import array
-from robins.systems.judgement import Claim, ratio
+from robins.systems.judgement import ratio_claims
 from robins.systems.satellite import design, model
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.model import ARCSEC, Build, make_filter
@@ -48,51 +48,39 @@ BLOCKS = (
 )
 
 
-# ------------------------------------------------------------------------------------------ filters
-
-
 class FilterSpec(NamedTuple):
     """A filter of the study."""
 
     build: Build
     gain: GainSpec | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
     drift: float | None = None  # variance of the bias' walk over the believed; None: told the truth
-    text: str = ""
 
 
 FILTERS: Mapping[str, FilterSpec] = {
-    "raw": FilterSpec(
-        "fixed", GainSpec("raw"), 1.0, "the star sensor's reading, moved by the gyro"
-    ),
-    "mekf": FilterSpec("mekf", None, 1.0, "multiplicative EKF"),
-    "mekf-gate": FilterSpec("gated", None, 1.0, "the same with a gate that opens again"),
-    "adaptive": FilterSpec(
-        "adaptive", None, 1.0, "a bank of them, over the scale of the process noise"
-    ),
-    "mekf-tuned": FilterSpec("mekf", None, 30.0, "the same, noise of the bias times 30"),
-    "mekf-informed": FilterSpec("mekf", None, None, "the same, told the true drift"),
-    "ekf-quaternion": FilterSpec("quaternion", None, 1.0, "additive EKF of seven states"),
-    "h2": FilterSpec("fixed", GainSpec("h2"), 1.0, "steady Kalman gain"),
-    "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0, "mixed, by LMI, n on the rate"),
-    "mixed-riccati": FilterSpec(
-        "fixed", GainSpec("riccati", 0.5), 1.0, "mixed, by Riccati, n on the rate"
-    ),
-    "mixed-riccati-quarter": FilterSpec(
-        "fixed", GainSpec("riccati", 0.25), 1.0, "the same, gamma halved"
-    ),
-    "mixed-bias-half": FilterSpec(
-        "fixed", GainSpec("riccati", 0.5, "bias"), 1.0, "mixed, by Riccati, n on the bias"
-    ),
-    "mixed-bias": FilterSpec(
-        "fixed", GainSpec("riccati", 0.25, "bias"), 1.0, "the same, gamma halved"
-    ),
-    "mixed-bias-gate": FilterSpec(
-        "fixed-gated", GainSpec("riccati", 0.25, "bias"), 1.0, "the same with the gate"
-    ),
-    "mekf-inflated": FilterSpec(
-        "mekf", GainSpec("riccati", 0.25, "bias"), 1.0, "MEKF with the noise of mixed-bias"
-    ),
-    "hinf": FilterSpec("fixed", GainSpec("riccati", 0.1), 1.0, "worst case first: gamma a tenth"),
+    # the star sensor's reading, moved by the gyro
+    "raw": FilterSpec("fixed", GainSpec("raw"), 1.0),
+    "mekf": FilterSpec("mekf", None, 1.0),  # multiplicative EKF
+    "mekf-gate": FilterSpec("gated", None, 1.0),  # the same with a gate that opens again
+    # a bank of them over the scale of the process noise
+    "adaptive": FilterSpec("adaptive", None, 1.0),
+    "mekf-tuned": FilterSpec("mekf", None, 30.0),  # the same, noise of the bias times 30
+    "mekf-informed": FilterSpec("mekf", None, None),  # the same, told the true drift
+    "ekf-quaternion": FilterSpec("quaternion", None, 1.0),  # additive EKF of seven states
+    "h2": FilterSpec("fixed", GainSpec("h2"), 1.0),  # steady Kalman gain
+    "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0),  # mixed, by LMI, n on the rate
+    # mixed, by Riccati, n on the rate
+    "mixed-riccati": FilterSpec("fixed", GainSpec("riccati", 0.5), 1.0),
+    # the same, gamma halved
+    "mixed-riccati-quarter": FilterSpec("fixed", GainSpec("riccati", 0.25), 1.0),
+    # mixed, by Riccati, n on the bias
+    "mixed-bias-half": FilterSpec("fixed", GainSpec("riccati", 0.5, "bias"), 1.0),
+    # the same, gamma halved
+    "mixed-bias": FilterSpec("fixed", GainSpec("riccati", 0.25, "bias"), 1.0),
+    # the same with the gate
+    "mixed-bias-gate": FilterSpec("fixed-gated", GainSpec("riccati", 0.25, "bias"), 1.0),
+    # MEKF with the noise of mixed-bias
+    "mekf-inflated": FilterSpec("mekf", GainSpec("riccati", 0.25, "bias"), 1.0),
+    "hinf": FilterSpec("fixed", GainSpec("riccati", 0.1), 1.0),  # worst case first: gamma a tenth
 }
 
 
@@ -165,9 +153,6 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     )
 
 
-# ------------------------------------------------------------------------------ metrics and claims
-
-
 def attitude_metrics(statistics: Any) -> dict[str, Any]:
     """Of "attitude-loop": components 0 to 2 are the attitude's, body axes.
 
@@ -201,43 +186,35 @@ RMS, POINTING, SPREAD = "attitude_rms_arcsec", "pointing_rms_arcsec", "attitude_
 BETTER, PARTLY = (0.0, 0.9), (0.0, 1.0)
 
 
-def _against(other: str, words: str) -> Claim:
-    return Claim(
-        f"The mixed filter improves the precision of attitude determination; read against {words}, "
-        f"value: RMS error of mixed-lmi over that of {other}",
-        ("mixed-lmi", other),
-        ratio("mixed-lmi", other, RMS),
-        BETTER,
-        PARTLY,
-    )
-
-
-CLAIMS: dict[str, Claim] = {
-    "improves-on-star": _against("raw", "the star sensor alone"),
-    "improves-on-mekf": _against("mekf", "a Kalman filter that believes the nominal noise"),
-    "improves-on-tuned": _against("mekf-tuned", "a Kalman filter with more noise on the bias"),
-    "improves-on-informed": _against("mekf-informed", "a Kalman filter told the true drift"),
-    "steadier": Claim(
-        "The mixed filter's error varies less from run to run (ours); value: the spread of its "
-        "RMS error over that of the nominal MEKF",
-        ("mixed-bias", "mekf"),
-        ratio("mixed-bias", "mekf", SPREAD),
-        (0.0, 0.5),
-        PARTLY,
-    ),
-    "bias-better": Claim(
-        "The modelling error belongs on the bias, not on the rate (ours); value: pointing error of "
-        "mixed-bias over that of mixed-riccati-quarter, both a quarter of the Kalman filter's gain",
-        ("mixed-bias", "mixed-riccati-quarter"),
-        ratio("mixed-bias", "mixed-riccati-quarter", POINTING),
-        BETTER,
-        PARTLY,
-    ),
+_RATIOS = {
+    "improves-on-star": ("mixed-lmi", ("raw",), (RMS,), BETTER, PARTLY),
+    "improves-on-mekf": ("mixed-lmi", ("mekf",), (RMS,), BETTER, PARTLY),
+    "improves-on-tuned": ("mixed-lmi", ("mekf-tuned",), (RMS,), BETTER, PARTLY),
+    "improves-on-informed": ("mixed-lmi", ("mekf-informed",), (RMS,), BETTER, PARTLY),
+    "steadier": ("mixed-bias", ("mekf",), (SPREAD,), (0.0, 0.5), PARTLY),
+    "bias-better": ("mixed-bias", ("mixed-riccati-quarter",), (POINTING,), BETTER, PARTLY),
 }
+_IMPROVES = (
+    "The mixed filter improves the precision of attitude determination; read against {}, "
+    "value: RMS error of mixed-lmi over that of {}"
+)
+_TEXTS = {
+    "improves-on-star": _IMPROVES.format("the star sensor alone", "raw"),
+    "improves-on-mekf": _IMPROVES.format("a Kalman filter that believes the nominal noise", "mekf"),
+    "improves-on-tuned": _IMPROVES.format(
+        "a Kalman filter with more noise on the bias", "mekf-tuned"
+    ),
+    "improves-on-informed": _IMPROVES.format(
+        "a Kalman filter told the true drift", "mekf-informed"
+    ),
+    "steadier": "The mixed filter's error varies less from run to run (ours); value: the spread of "
+    "its RMS error over that of the nominal MEKF",
+    "bias-better": "The modelling error belongs on the bias, not on the rate (ours); value: "
+    "pointing error of mixed-bias over that of mixed-riccati-quarter, both a quarter of the Kalman "
+    "filter's gain",
+}
+CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 """Every claim that a scenario may state."""
-
-
-# -------------------------------------------------------------------------------------------- study
 
 
 def view(given: AttitudeLoop, course: Course) -> View:

@@ -21,6 +21,7 @@ from robins.sim.orbit import circular_orbit, field_along_orbit
 from robins.sim.random import Component, stream
 from robins.sim.spacecraft import CraftState, craft_state, spacecraft
 from robins.sim.star_sensor import StarCamera, index_for, star_errors
+from robins.systems.parts import outside
 from robins.systems.satellite.nodes import Given, Lens, StarSays, Step
 from robins.systems.satellite.parameters import AttitudeLoop, Craft, Gyro, Star, Wheels
 
@@ -126,10 +127,8 @@ def _lens(star: Star) -> Lens | None:
 
 
 def _star_says(star: Star, due: np.ndarray, time_s: np.ndarray) -> StarSays:
-    seen, stuck = due.copy(), np.zeros(len(due), dtype=bool)
+    seen, stuck = due & outside(star.lost, time_s), np.zeros(len(due), dtype=bool)
     turn, factor = np.zeros((len(due), 3)), np.ones(len(due))
-    for span in star.lost:
-        seen &= ~span.holds(time_s)
     for fault in star.faults:
         here = fault.holds(time_s)
         if fault.kind == "stuck":

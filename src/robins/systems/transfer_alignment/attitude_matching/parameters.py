@@ -7,28 +7,28 @@ from typing import Annotated, Literal
 import pydantic
 
 from robins.scenario import Parameters, Positive, Quantity, default
-from robins.systems.parts import Runs, Three, refuse_too_long, refuse_unsettled
+from robins.systems import quantities as q
+from robins.systems.parts import Runs, refuse_too_long, refuse_unsettled
 from robins.systems.study import Scenario
 
 
 class BankTurn(Parameters):
     """A level bank turn: roll in from the start, turn, roll out, fly on; speed and height stay."""
 
-    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    speed: q.Speed
     # horizontal, in the turn, to the right; negative: a left turn
     acceleration: Annotated[float, Quantity("acceleration", least="-100 g", most="100 g")]
-    roll_time: Annotated[float, Quantity("time", above="0 s")]  # of each roll, at a constant rate
-    turn_time: Annotated[float, Quantity("time", least="0 s")]  # between the rolls
-    duration: Annotated[float, Quantity("time", above="0 s")]  # of the run
+    roll_time: q.Duration  # of each roll, at a constant rate
+    turn_time: q.Time  # between the rolls
+    duration: q.Duration  # of the run
     latitude: Annotated[float, Quantity("angle", least="-85 deg", most="85 deg")]
-    # at the start, clockwise from north
-    heading: Annotated[float, Quantity("angle")] = default("0 deg")
+    heading: q.Angle = default("0 deg")  # at the start, clockwise from north
 
 
 class Master(Parameters):
     """The attitude that the master reports, with white noise at each update."""
 
-    attitude_noise: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
+    attitude_noise: q.Spread
     # no attitude comes from the first to the second time, as in an outage of the link
     outage: Annotated[tuple[float, float], Quantity("time", least="0 s")] | None = None
 
@@ -36,35 +36,34 @@ class Master(Parameters):
 class Slave(Parameters):
     """True errors of the slave: constant drift, noise, and where its attitude begins."""
 
-    gyro_bias: Annotated[Three, Quantity("angle rate")]
-    gyro_noise: Annotated[float, Quantity("angle random walk", least="0 deg/sqrt(h)")]
-    attitude_error: Annotated[Three, Quantity("angle", least="-30 deg", most="30 deg")]  # E, N, U
+    gyro_bias: Annotated[q.Three, Quantity("angle rate")]
+    gyro_noise: q.AngleWalkSize
+    attitude_error: Annotated[q.Three, Quantity("angle", least="-30 deg", most="30 deg")]  # E, N, U
 
 
 class Mounting(Parameters):
     """How the slave sits on the master: as drawn, and the true error (slave axes)."""
 
-    nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # rotation vector
-    error: Annotated[Three, Quantity("angle", least="-30 deg", most="30 deg")]
+    nominal: q.Angles = default("0 deg")  # rotation vector
+    error: Annotated[q.Three, Quantity("angle", least="-30 deg", most="30 deg")]
 
 
 class Flexing(Parameters):
     """How the structure moves between the two, in axes right, forward, up of the master."""
 
-    sigma: Annotated[Three, Quantity("angle", least="0 rad", most="180 deg")]
-    time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
+    sigma: q.AngleSizes
+    time: q.Durations = default("1 s")
     damping: Positive = 1.0
-    bending: Annotated[Three, Quantity("angle")] = default("0 rad")  # per g of load above one
-    # white at each update
-    flutter: Annotated[float, Quantity("angle", least="0 rad", most="180 deg")]
+    bending: q.Angles = default("0 rad")  # per g of load above one
+    flutter: q.AngleSize  # white at each update
 
 
-class Spread(Parameters):
+class BelievedSpread(Parameters):
     """Standard deviations that filters are told of the start, and of flexure over the true ones."""
 
-    attitude: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
-    gyro_bias: Annotated[float, Quantity("angle rate", above="0 rad/s")]
-    mounting: Annotated[float, Quantity("angle", above="0 rad", most="180 deg")]
+    attitude: q.Spread
+    gyro_bias: q.AngleRate
+    mounting: q.Spread
     flexure_sigma_factor: Positive = 1.0
     flexure_time_factor: Positive = 1.0  # of the correlation time
 
@@ -84,10 +83,9 @@ class AttitudeMatching(Scenario):
     title: str = "Attitude matching in a bank turn"
     runs: Runs = 200
     claims: tuple[str, ...] | None = ()
-    step: Annotated[float, Quantity("time", above="0 s")] = default("10 ms")  # of the truth
-    period: Annotated[float, Quantity("time", above="0 s")] = default("50 ms")  # of the filters
-    # figures pooled over time count from here
-    settle: Annotated[float, Quantity("time", least="0 s")] = default("15 s")
+    step: q.Duration = default("10 ms")  # of the truth
+    period: q.Duration = default("50 ms")  # of the filters
+    settle: q.Time = default("15 s")  # figures pooled over time count from here
     # initial errors as given, or of that size with a sign drawn for each axis and run
     signs: Literal["fixed", "random"] = "fixed"
     manoeuvre: BankTurn
@@ -95,7 +93,7 @@ class AttitudeMatching(Scenario):
     slave: Slave
     mounting: Mounting
     flexure: Flexing
-    believed: Spread
+    believed: BelievedSpread
     h_infinity: HInfinity = pydantic.Field(default_factory=HInfinity)
 
     @pydantic.model_validator(mode="after")

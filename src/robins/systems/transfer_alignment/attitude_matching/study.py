@@ -25,16 +25,7 @@ from robins.sim.flexure import Flexure
 from robins.systems.judgement import Claim, Metrics, graded, ratio, rms_by_axis
 from robins.systems.parts import ENU, RFU
 from robins.systems.study import Case, Contender, Limit, SensorAxes, StateBlock, Study, View
-from robins.systems.transfer_alignment.attitude_matching.model import (
-    ATTITUDE,
-    EPS,
-    MU,
-    PHI,
-    STATES,
-    LinearSystem,
-    linear_system,
-    roll_rad,
-)
+from robins.systems.transfer_alignment.attitude_matching import model as am
 from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
 from robins.systems.transfer_alignment.attitude_matching.world import (
     Course,
@@ -45,8 +36,6 @@ from robins.systems.transfer_alignment.attitude_matching.world import (
 
 ARCMIN = units.parse("1 arcmin", "angle")
 FIVE_ARCMIN = Limit("5_arcmin", "attitude", 5.0 * ARCMIN)
-
-# ------------------------------------------------------------------------------------------ filters
 
 # Kalman filters: what R has the variance of. "kf-flexure" has states for what swings.
 TOLD = {
@@ -77,12 +66,12 @@ FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted")
 
 def central_filter() -> Filter:
     """H-infinity with L = I [rad]; gamma is data."""
-    return kalman(rules=[h_infinity(np.inf, np.eye(STATES))])
+    return kalman(rules=[h_infinity(np.inf, np.eye(am.STATES))])
 
 
 def weighted_filter() -> Filter:
     """H-infinity on the attitude alone, in arcminutes; gamma is data."""
-    return kalman(rules=[h_infinity(np.inf, np.eye(STATES)[PHI] / ARCMIN)])
+    return kalman(rules=[h_infinity(np.inf, np.eye(am.STATES)[am.PHI] / ARCMIN)])
 
 
 def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
@@ -100,8 +89,8 @@ def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
             given.believed.flexure_time_factor * np.asarray(flexure.time),
             flexure.damping,
         )
-        return _contender(kalman(), linear_system(given, updates, believed), sigma)
-    system = linear_system(given, updates)
+        return _contender(kalman(), am.linear_system(given, updates, believed), sigma)
+    system = am.linear_system(given, updates)
     if name in TOLD:
         return _contender(kalman(), system, sigma)
     if name == "hinf-weighted":
@@ -111,7 +100,7 @@ def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
     paper = IN_UNIT[name]
     one = units.parse(f"1 {paper.unit}", "angle")
     if paper.identity:
-        system = system._replace(sigma=np.full(STATES, one))
+        system = system._replace(sigma=np.full(am.STATES, one))
     gamma = given.h_infinity.gamma * one if paper.bounded else np.inf
     facts = existence(central_filter(), system, one, course, gamma)
     return _contender(central_filter(), system, one, facts, one)
@@ -119,32 +108,32 @@ def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
 
 def _contender(
     filter_: Filter,
-    system: LinearSystem,
+    system: am.LinearSystem,
     sigma: float,
     facts: Mapping[str, Any] | None = None,
     unit: float = 1.0,
 ) -> Contender:
     """A filter of a system; with facts, an H-infinity filter whose gamma has a unit."""
     model, start, (F, aux) = system.model(sigma), system.start(), system.inputs()
-    rows = np.eye(STATES, F.shape[-1]) if F.shape[-1] > STATES else None
+    rows = np.eye(am.STATES, F.shape[-1]) if F.shape[-1] > am.STATES else None
     known: dict[str, Any] = dict(facts or {})
     gamma = known.get("gamma", np.inf)
     if facts:
         start = with_gamma(filter_.init(start, model.dims), gamma)
         known |= {key: known[key] / unit for key in ("gamma", "gamma_min")}
-    case = Partial(_case, start, F, aux[ATTITUDE])
+    case = Partial(_case, start, F, aux[am.ATTITUDE])
     return Contender(filter_, model, case, rows, bounds=bool(np.isfinite(gamma)), facts=known)
 
 
 def _case(start: Any, F: Any, H: Any, world: World) -> Case:
     """What a filter of n states takes of a run; F is (E, n, n) and H (E, 3, n)."""
     truth = world.state[:, : F.shape[-1]]
-    return Case(start, F, {ATTITUDE: world.measured}, {ATTITUDE: H}, truth)
+    return Case(start, F, {am.ATTITUDE: world.measured}, {am.ATTITUDE: H}, truth)
 
 
 def existence(
     filter_: Filter,
-    system: LinearSystem,
+    system: am.LinearSystem,
     sigma_rad: float,
     course: Course,
     gamma: float = np.nan,
@@ -152,15 +141,9 @@ def existence(
 ) -> dict[str, Any]:
     """Facts on an H-infinity filter, found by running it over nothing but zeros.
 
-    A filter that does not exist has no result: its figures are there, and empty.
-
-    Args:
-        filter_: with one `h_infinity` rule.
-        system: what it is told of the run.
-        sigma_rad: measurement noise it is told.
-        course: of the run: when there is a measurement.
-        gamma: asked for, in the units of its L x.
-        over_least: in its place, gamma over the least.
+    A filter that does not exist has no result: its figures are there, and empty. The filter has
+    one `h_infinity` rule and is told of the system and a measurement noise [rad]; gamma is asked
+    for in the units of its L x, or as `over_least` times the least.
     """
     model, (u, aux) = system.model(sigma_rad), system.inputs()
     y = np.where(course.heard[:, None], np.zeros((len(course.heard), 3)), np.nan)
@@ -198,26 +181,23 @@ def existence(
 
 def _existing(step: Step):
     """Local bound and margin of a step, where it counts."""
-    info = step.info[ATTITUDE]
+    info = step.info[am.ATTITUDE]
     counts = jnp.any(info.used)
     bound, margin = (info.notes[f"h_infinity.{name}"] for name in ("bound", "margin"))
     return jnp.where(counts, bound, 0.0), jnp.where(counts, margin, 1.0)
 
 
-# -------------------------------------------------------------------------------- what is reported
-
-
 def view(given: AttitudeMatching, course: Course) -> View:
     """What is reported of every filter."""
-    roll = roll_rad(given.manoeuvre, course.epoch_s)
+    roll = am.roll_rad(given.manoeuvre, course.epoch_s)
     return View(
         epoch_s=course.epoch_s,
         blocks=(
-            StateBlock("attitude", PHI, "rad", "arcmin", "ENU", ENU),
-            StateBlock("gyro_bias", EPS, "rad/s", "deg/h", "RFU", RFU),
-            StateBlock("mounting", MU, "rad", "arcmin", "RFU", RFU),
+            StateBlock("attitude", am.PHI, "rad", "arcmin", "ENU", ENU),
+            StateBlock("gyro_bias", am.EPS, "rad/s", "deg/h", "RFU", RFU),
+            StateBlock("mounting", am.MU, "rad", "arcmin", "RFU", RFU),
         ),
-        sensors={ATTITUDE: SensorAxes("rad", "ENU", ENU)},
+        sensors={am.ATTITUDE: SensorAxes("rad", "ENU", ENU)},
         metrics=metrics_of,
         context=xr.Dataset(
             array("context", roll, "roll", unit="rad")

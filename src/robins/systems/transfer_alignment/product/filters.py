@@ -1,10 +1,10 @@
-"""The filters of the product model; one of them is told neither what shakes nor since when.
+"""The filters of the product model; one of them has no information on the disturbance.
 
-That one, "product-adaptive", is a bank of hypotheses. A disturbed record is no reason to doubt the
-gyros, and a disturbed gyro none to doubt the records; an innovation alone does not say which it
-was. What tells them apart is how it goes on, and what the velocity says, which neither flexure nor
-gyro noise reach directly. So several filters of the same 24 states run side by side, each with a
-hypothesis of its own, as an interacting multiple model (`robins.filters.composite.imm`):
+That one, "product-adaptive", is a bank of hypotheses. A single innovation does not say whether the
+record or the gyros are disturbed. The following innovations do, and so does the velocity, which
+neither flexure nor gyro noise affects directly. So several filters of the same 24 states run side
+by side, each with a hypothesis of its own, as an interacting multiple model
+(`robins.filters.composite.imm`):
 
                 stiff structure           flexing structure
     quiet       the stated noise          and the flexure of the model

@@ -1,4 +1,4 @@
-"""Align a recorded slave to its recorded master, and say what came out and how well.
+"""Align a recorded slave to its recorded master, with the results and their accuracy.
 
 The tables of a `Dataset` hold the slave's samples (``imu``) and the master's records (``master``).
 The slave begins where the first whole record of the master puts it. What is unknown about that, the
@@ -28,17 +28,8 @@ from robins.ins.increments import Increments, from_imu
 from robins.ins.mechanise import Nav, nav_at, refuse_polar, vector
 from robins.results import Outcome, Progress, silent, variable
 from robins.rotation import Rotation
-from robins.systems.replaying import (
-    Answer,
-    Piece,
-    Reported,
-    epochs_of,
-    gap_counts,
-    navigated,
-    noise_scale,
-    outcome,
-    prepared,
-)
+from robins.systems import replaying
+from robins.systems.replaying import Answer, Piece, Reported
 from robins.systems.study import Alignment, Case, Contender
 from robins.systems.tables import place_arrays
 from robins.systems.transfer_alignment.product.filters import FILTERS
@@ -109,7 +100,7 @@ def pieces_of(recorded: Recorded, parameters: Replay) -> tuple[list[PairPiece], 
     """
     longest = parameters.recording.longest_gap
     prepare = partial(_prepare, recorded, parameters)
-    return prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
+    return replaying.prepared(recorded.time_s, np.asarray(recorded.increments.dt), longest, prepare)
 
 
 def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
@@ -146,7 +137,7 @@ def _prepare(recorded: Recorded, parameters: Replay, rows: slice) -> PairPiece:
     turn = np.asarray(at.q_ms.apply(jnp.asarray(of_slave)))
     if (told := recorded.master.omega_ib_b) is not None:
         turn = np.where(np.isfinite(told), told, turn)
-    scale = noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
+    scale = replaying.noise_scale(blocks, np.asarray(increments.dt), recording.gap_noise)
     world = PairRun(
         increments=blocks.increments,
         noise_scale=scale,
@@ -197,9 +188,6 @@ def _slave_of(master: Nav, at: Installation, omega_b) -> Nav:
     return Nav(q_nm @ at.q_ms, v_n + swing, place.retract(arm_n))
 
 
-# ------------------------------------------------------------------------------------ the filters
-
-
 def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
     """Add to an uncorrelated start that the slave's attitude comes from a record of the master.
 
@@ -219,7 +207,7 @@ def start_belief(belief: Belief, parameters: PairParameters) -> Belief:
 
 
 def contender(parameters: Replay, name: str) -> Contender:
-    """A filter of the product model, for pieces of a recorded recorded.
+    """A filter of the product model, for pieces of a recorded pair.
 
     Raises:
         ValueError: no such filter; a noise of the master that is zero.
@@ -237,13 +225,13 @@ def contender(parameters: Replay, name: str) -> Contender:
 
 
 def _estimates(mean: ProductState) -> Mapping[str, Any]:
-    """Blocks that are vectors, and roll, pitch, heading of the slave."""
+    """Blocks that are vectors, and the attitude of the slave."""
     found = {
         "velocity": mean.ins.v_n,
         "gyro_bias": mean.ins.gyro_bias,
         "accel_bias": mean.ins.accel_bias,
         "mounting": mean.mounting_rad,
-        "euler": jnp.stack(mean.ins.q_nb.as_euler(), -1),
+        "q_nb": mean.ins.q_nb.wxyz,
     }
     return found if mean.flexure is None else found | {"flexure": mean.flexure[..., :3]}
 
@@ -316,13 +304,7 @@ def replay(
     filters: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> Outcome:
-    """Align the slave of a recorded pair with the filters named.
-
-    Args:
-        dataset: the slave's samples and the master's records, examined and cleaned (`robins.logs`).
-        parameters: what is believed of both units, of the mounting and of the flexure.
-        filters: by default those of the parameters.
-        progress: called with the share done and what is being done.
+    """Align the slave of a recorded pair, examined and cleaned, as `System.replay` says.
 
     Raises:
         ValueError: no such filter; or the pair cannot be aligned, the sentence says why.
@@ -330,7 +312,7 @@ def replay(
     recorded = on_one_clock(dataset)
     pieces, problems = pieces_of(recorded, parameters)
     wanted = tuple(filters) or parameters.filters
-    answers = navigated(pieces, wanted, partial(contender, parameters), progress=progress)
+    answers = replaying.navigated(pieces, wanted, partial(contender, parameters), progress=progress)
     master = recorded.master
     notes = [_started(piece, recorded, parameters.master.delay) for piece in pieces]
     notes += [f"Not aligned, {problem}." for problem in problems]
@@ -342,16 +324,17 @@ def replay(
     variables |= tracks({name: answer.mean for name, answer in answers.items()})
     variables |= place_arrays("reference", path, "{} of the master", dims=time)
     used = sum(int(np.sum(piece.record >= 0)) for piece in pieces)
-    return outcome(
-        epochs_of(pieces),
+    return replaying.outcome(
+        replaying.epochs_of(pieces),
         answers,
         REPORTED,
         metrics=metrics_of,
         variables=variables,
         counts=dict(dataset.counts)
-        | gap_counts(pieces, problems)
+        | replaying.gap_counts(pieces, problems)
         | {"master_records_not_used": len(master) - used - len(pieces)},
         notes=notes,
+        origin_ns=int(dataset.imu.time_ns[0]),
     )
 
 

@@ -61,13 +61,13 @@ from jaxtyping import Array, ArrayLike
 
 from robins import _float64, linalg  # noqa: F401
 from robins.earth import Geodetic, earth_rate_n, gravity_n, transport_rate_n
-from robins.filters import Model, Motion, Sensor
+from robins.filters import Model, Sensor
 from robins.ins.errors import frame_dynamics
 from robins.ins.increments import Increments
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.rotation import Rotation, left_jacobian, skew
 from robins.sim.flexure import Flexure, transition
-from robins.systems.parts import NED, Block
+from robins.systems.parts import NED, Block, moved_by
 from robins.systems.study import SensorAxes
 
 ATTITUDE, VELOCITY, POSITION = "master_attitude", "master_velocity", "master_position"
@@ -98,9 +98,6 @@ class Lag(NamedTuple):
     theta: ArrayLike  # (3,) rad, turn of the slave over dt, body axes
     dv: ArrayLike  # (3,) m/s, velocity gained over dt, body axes now
     omega_m: ArrayLike  # (3,) rad/s, omega_im of the master when the record was true
-
-
-# ---------------------------------------------------------------------------------- the motion
 
 
 class _Drive(NamedTuple):
@@ -137,10 +134,6 @@ def _step_linear(drive: _Drive, x: ProductState, block: Block):
         new = new._replace(flexure=Phi @ x.flexure)
         Phis, Ls = [*Phis, Phi], [*Ls, L]
     return new, block_diag(*Phis), block_diag(*Ls) * block.noise_scale
-
-
-def _noise(drive: _Drive, x: ProductState, block: Block):
-    return _step_linear(drive, x, block)[2]
 
 
 # ---------------------------------------------------------------------------------- the master
@@ -262,9 +255,6 @@ RECORDS = {
 }
 
 
-# ---------------------------------------------------------------------------------- the model
-
-
 def product_model(
     noise: InsNoise,
     installation: Installation,
@@ -287,12 +277,7 @@ def product_model(
         sensors bear the names of `sigmas`; an attitude is a `Rotation`, a velocity (3,) NED, a
         position a `Geodetic`; the aux of each is a `Lag`.
     """
-    drive = _Drive(noise, flexure)
-    motion = Motion(
-        step=Partial(_step, drive),
-        noise=Partial(_noise, drive),
-        linear=Partial(_step_linear, drive),
-    )
+    motion = moved_by(_step, _step_linear, _Drive(noise, flexure))
 
     def sensor(name: str, sigma: ArrayLike) -> Sensor:
         record, noisy = RECORDS[name], jnp.broadcast_to(jnp.asarray(sigma, float), 3)

@@ -11,9 +11,18 @@ from typing import Annotated, Literal
 import numpy as np
 import pydantic
 
-from robins.scenario import Dof, Parameters, Positive, Quantity, Share, default
+from robins.scenario import Dof, Parameters, Positive, Quantity, Share, Span, default
 from robins.sim.flexure import Flexure
-from robins.systems.parts import Departure, Leg, Names, Three, refuse_too_long, refuse_unsettled
+from robins.systems import quantities as q
+from robins.systems.parts import (
+    Cutting,
+    Departure,
+    Draw,
+    Leg,
+    Names,
+    refuse_too_long,
+    refuse_unsettled,
+)
 from robins.systems.study import Scenario
 
 
@@ -21,32 +30,32 @@ class BankLeg(Parameters):
     """A bank angle, right wing down positive, and how long the leg lasts."""
 
     bank: Annotated[float, Quantity("angle", above="-85 deg", below="85 deg")]
-    seconds: Annotated[float, Quantity("time", above="0 s")]
+    seconds: q.Duration
 
 
 class Sway(Parameters):
     """A sine of an angle."""
 
-    amplitude: Annotated[float, Quantity("angle", least="0 deg", most="180 deg")]
-    period: Annotated[float, Quantity("time", above="0 s")]
-    phase: Annotated[float, Quantity("angle")] = default("0 deg")
+    amplitude: q.AngleSize
+    period: q.Duration
+    phase: q.Angle = default("0 deg")
 
 
 class Heave(Parameters):
     """A sine of height."""
 
     amplitude: Annotated[float, Quantity("length", least="0 m", most="1 km")]
-    period: Annotated[float, Quantity("time", above="0 s")]
-    phase: Annotated[float, Quantity("angle")] = default("0 deg")
+    period: q.Duration
+    phase: q.Angle = default("0 deg")
 
 
 class Aircraft(Departure):
     """Level flight at constant speed through commanded banks; see `robins.sim.manoeuvres.fly`."""
 
     kind: Literal["aircraft"]
-    speed: Annotated[float, Quantity("speed", above="0 m/s")]
+    speed: q.Speed
     pitch: Annotated[float, Quantity("angle", least="-80 deg", most="80 deg")] = default("0 deg")
-    roll_time: Annotated[float, Quantity("time", above="0 s")] = default("2 s")
+    roll_time: q.Duration = default("2 s")
     legs: Annotated[tuple[BankLeg, ...], pydantic.Field(min_length=1)]
 
     @property
@@ -59,8 +68,8 @@ class Ship(Departure):
     """A straight course in the sea; without any sway the sea of `MODERATE_SEA`."""
 
     kind: Literal["ship"]
-    speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")
-    seconds: Annotated[float, Quantity("time", above="0 s")]
+    speed: q.SpeedSize = default("0 m/s")
+    seconds: q.Duration
     roll: tuple[Sway, ...] | None = None
     pitch: tuple[Sway, ...] | None = None
     yaw: tuple[Sway, ...] | None = None
@@ -76,7 +85,7 @@ class Vehicle(Departure):
     """A ground vehicle that drives legs, on a road that may be rough."""
 
     kind: Literal["vehicle"]
-    speed: Annotated[float, Quantity("speed", least="0 m/s")] = default("0 m/s")  # at the start
+    speed: q.SpeedSize = default("0 m/s")  # at the start
     legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
     roll: tuple[Sway, ...] = ()
     pitch: tuple[Sway, ...] = ()
@@ -90,56 +99,47 @@ class Vehicle(Departure):
 class Slave(Parameters):
     """The inertial unit to be aligned; biases are constant in a run, drawn with these sigmas."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("50 Hz")
-    gyro_noise: Annotated[Three, Quantity("angle random walk", least="0 deg/sqrt(h)")]
-    accel_noise: Annotated[Three, Quantity("velocity random walk", least="0 m/s/sqrt(h)")]
-    gyro_bias: Annotated[Three, Quantity("angle rate", least="0 deg/h")]
-    accel_bias: Annotated[Three, Quantity("acceleration", least="0 mg")]
+    rate: q.Frequency = default("50 Hz")
+    gyro_noise: q.AngleWalkSizes
+    accel_noise: q.AccelWalkSizes
+    gyro_bias: q.RateSizes
+    accel_bias: q.AccelSizes
 
 
 class Master(Parameters):
     """The records of the master; one at each epoch of the filters."""
 
-    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 kHz")] = default("10 Hz")
+    rate: q.Frequency = default("10 Hz")
     # one sigma about north, east, down; flutter of the structure belongs to it
-    attitude_noise: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
-    velocity_noise: Annotated[Three, Quantity("speed", least="0 m/s")]
-    position_noise: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
-    # a record stamped t describes t - delay
-    delay: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
+    attitude_noise: q.AngleSizes
+    velocity_noise: q.SpeedSizes
+    position_noise: q.LengthSizes = default("0 m")
+    delay: q.Time = default("0 s")  # a record stamped t describes t - delay
 
 
 class Mounting(Parameters):
     """How the slave sits: ``C_ms = C(nominal) exp(error x)``, the error in slave axes."""
 
-    nominal: Annotated[Three, Quantity("angle")] = default("0 deg")  # roll, pitch, yaw of the slave
-    error: Annotated[Three, Quantity("angle")] = default("0 deg")  # the same in every run
-    # drawn on top
-    sigma: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default("0 deg")
+    nominal: q.Angles = default("0 deg")  # roll, pitch, yaw of the slave
+    error: q.Angles = default("0 deg")  # the same in every run
+    sigma: q.AngleSizes = default("0 deg")  # drawn on top
 
 
 class Structure(Parameters):
     """What bends and swings between master and slave, in master axes: roll, pitch, heading."""
 
-    sigma: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default("0 deg")
-    time: Annotated[Three, Quantity("time", above="0 s")] = default("1 s")
+    sigma: q.AngleSizes = default("0 deg")
+    time: q.Durations = default("1 s")
     damping: Positive = 1.0
     # degrees of freedom of the Student-t noise that drives it; without, normal
     tail_dof: Dof | None = None
-    bending: Annotated[Three, Quantity("angle")] = default("0 deg")  # per g of load factor above 1
+    bending: q.Angles = default("0 deg")  # per g of load factor above 1
 
     @property
     def flexure(self) -> Flexure:
         """The same as simulator and filters take it."""
         sigma, time, bending = (np.asarray(x) for x in (self.sigma, self.time, self.bending))
         return Flexure(sigma, time, self.damping, self.tail_dof, bending)
-
-
-class Window(Parameters):
-    """A stretch of time, its end not included."""
-
-    begin: Annotated[float, Quantity("time", least="0 s")]
-    end: Annotated[float, Quantity("time", above="0 s")]
 
 
 class Disturbance(Parameters):
@@ -151,10 +151,10 @@ class Disturbance(Parameters):
     # degrees of freedom of Student-t noise of the master, of the stated sigmas; without, normal
     tail_dof: Dof | None = None
     gyro_noise_factor: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 1.0  # in the window
-    gyro_noise_window: Window | None = None
-    drift_step: Annotated[Three, Quantity("angle rate")] = default("0 deg/h")  # slave axes
-    drift_step_time: Annotated[float, Quantity("time", least="0 s")] | None = None
-    dropouts: tuple[Window, ...] = ()  # no records of the master
+    gyro_noise_window: Span | None = None
+    drift_step: Annotated[q.Three, Quantity("angle rate")] = default("0 deg/h")  # slave axes
+    drift_step_time: q.Time | None = None
+    dropouts: tuple[Span, ...] = ()  # no records of the master
 
 
 class Start(Parameters):
@@ -163,10 +163,10 @@ class Start(Parameters):
     They are drawn from normal distributions; or all +1 sigma; or 1 sigma of random sign.
     """
 
-    attitude: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")]
-    velocity: Annotated[Three, Quantity("speed", least="0 m/s")] = default("0 m/s")
-    position: Annotated[Three, Quantity("length", least="0 m")] = default("0 m")
-    draw: Literal["normal", "plus-sigma", "random-sign"] = "normal"
+    attitude: q.AngleSizes
+    velocity: q.SpeedSizes = default("0 m/s")
+    position: q.LengthSizes = default("0 m")
+    draw: Draw = "normal"
 
 
 class PairParameters(Parameters):
@@ -177,8 +177,7 @@ class PairParameters(Parameters):
     master: Master
     start: Start
     mounting: Mounting = pydantic.Field(default_factory=Mounting)
-    # master to slave, master axes
-    lever_arm: Annotated[Three, Quantity("length", least="-1 km", most="1 km")] = default("0 m")
+    lever_arm: q.Arm = default("0 m")  # master to slave, master axes
     flexure: Structure = pydantic.Field(default_factory=Structure)
     disturbance: Disturbance = pydantic.Field(default_factory=Disturbance)
 
@@ -195,18 +194,11 @@ class PairParameters(Parameters):
 class Believed(Parameters):
     """What the filters are told; without a word the stated noise, start and mounting are true."""
 
-    # one sigma of the mounting error
-    mounting: Annotated[Three, Quantity("angle", least="0 deg", most="180 deg")] = default(
-        "0.3 deg"
-    )
+    mounting: q.AngleSizes = default("0.3 deg")  # one sigma of the mounting error
     # flexure states are for what is given here; tails and bending are not modelled
     flexure: Structure | None = None
-    gyro_bias_walk: Annotated[Three, Quantity("rate random walk", least="0 deg/h/sqrt(h)")] = (
-        default("0 deg/h/sqrt(h)")
-    )
-    accel_bias_walk: Annotated[
-        Three, Quantity("acceleration random walk", least="0 mg/sqrt(h)")
-    ] = default("0 mg/sqrt(h)")
+    gyro_bias_walk: q.RateWalkSizes = default("0 deg/h/sqrt(h)")
+    accel_bias_walk: q.AccelRateWalkSizes = default("0 mg/sqrt(h)")
     position: bool = False  # match positions too
 
 
@@ -219,17 +211,7 @@ class Product(Scenario, PairParameters):
     filters: Names = ("kf", "product")
     believed: Believed = pydantic.Field(default_factory=Believed)
     # figures pooled over time count from here, when the manoeuvre has shown what there is to see
-    settle: Annotated[float, Quantity("time", least="0 s")] = default("0 s")
-
-
-class Recording(Parameters):
-    """How a recorded pair is cut into steps of the filter."""
-
-    longest_block: Annotated[float, Quantity("time", above="0 s")] = default("0.25 s")
-    # a gap in the slave's samples that is longer is declared: the alignment begins anew after it
-    longest_gap: Annotated[float, Quantity("time", above="0 s")] = default("0.5 s")
-    # process noise factor across one
-    gap_noise: Annotated[float, pydantic.Field(ge=1.0, le=1e6)] = 30.0
+    settle: q.Time = default("0 s")
 
 
 class Replay(Product):
@@ -238,5 +220,5 @@ class Replay(Product):
     manoeuvre: (  # pyright: ignore[reportIncompatibleVariableOverride]
         Annotated[Aircraft | Ship | Vehicle, pydantic.Field(discriminator="kind")] | None
     ) = None
-    recording: Recording = pydantic.Field(default_factory=Recording)
+    recording: Cutting = pydantic.Field(default_factory=Cutting)
     filters: Names = ("product",)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -22,21 +21,18 @@ from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
 from robins.rotation import Rotation
 from robins.sim.flexure import Flexure, transition
-from robins.systems.judgement import Claim, consistency, consistency_claims
+from robins.systems.judgement import (
+    Claim,
+    consistency,
+    consistency_claims,
+    rms_by_axis,
+    rms_by_component,
+)
 from robins.systems.parts import FRD, NED, Block, refuse_unsettled
 from robins.systems.study import Case, Contender, Limit, StateBlock, Study, View, recipe
-from robins.systems.tables import place_arrays
+from robins.systems.tables import place_arrays, track_arrays
+from robins.systems.transfer_alignment.product import model as pm
 from robins.systems.transfer_alignment.product.filters import FILTERS, VARIANTS
-from robins.systems.transfer_alignment.product.model import (
-    ATTITUDE,
-    POSITION,
-    RECORDS,
-    VELOCITY,
-    Installation,
-    ProductState,
-    lag_of,
-    product_model,
-)
 from robins.systems.transfer_alignment.product.parameters import Believed, PairParameters, Product
 from robins.systems.transfer_alignment.product.world import (
     Course,
@@ -56,7 +52,7 @@ BLOCKS = (
     StateBlock("mounting", slice(15, 18), "rad", "arcmin", _SLAVE, FRD),
     StateBlock("flexure", slice(18, 21), "rad", "arcmin", _MASTER, FRD),
 )
-SENSORS = {name: record.axes for name, record in RECORDS.items()}
+SENSORS = {name: record.axes for name, record in pm.RECORDS.items()}
 # by every filter, whether or not it has flexure states
 _REPORTED = {block.name: block for block in BLOCKS if block.name != "flexure"}
 _RIGID = 18  # components without flexure states
@@ -68,10 +64,10 @@ _LEAST = np.repeat([1e-9, 1e-6, 1e-3, 1e-12, 1e-8, 1e-9], 3)
 # ------------------------------------------------------------------------- what a filter believes
 
 
-def installation_of(pair: PairParameters) -> Installation:
+def installation_of(pair: PairParameters) -> pm.Installation:
     """Where the slave sits, as far as it is known."""
     q_ms = Rotation.from_euler(*pair.mounting.nominal)
-    return Installation(q_ms, jnp.asarray(pair.lever_arm, float))
+    return pm.Installation(q_ms, jnp.asarray(pair.lever_arm, float))
 
 
 def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> Model:
@@ -80,10 +76,10 @@ def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) 
     Raises:
         ValueError: a noise of the master is zero, so that its records could not be weighed.
     """
-    matched = (ATTITUDE, VELOCITY, *((POSITION,) if believed.position else ()))
+    matched = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if believed.position else ()))
     sigmas = {}
     for name in matched:
-        key = RECORDS[name].sigma
+        key = pm.RECORDS[name].sigma
         sigmas[name] = np.asarray(getattr(pair.master, key))
         if not np.all(sigmas[name] > 0.0):
             raise ValueError(
@@ -96,7 +92,7 @@ def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) 
         gyro_bias_rw=np.asarray(believed.gyro_bias_walk),
         accel_bias_rw=np.asarray(believed.accel_bias_walk),
     )
-    return product_model(noise, installation_of(pair), sigmas, flexure)
+    return pm.product_model(noise, installation_of(pair), sigmas, flexure)
 
 
 def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | None) -> np.ndarray:
@@ -116,21 +112,19 @@ def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | Non
 def _case(matched: tuple[str, ...], start: tuple[Array, Array], run: PairRun) -> Case:
     """What a filter is given of a pair, and what it should find.
 
-    Args:
-        matched: records of the master that it uses.
-        start: sigma (n,) at the start, and the delay [s] of the records.
-        run: the pair.
+    It uses the records of the master that are `matched`, and starts with a sigma (n,) and the delay
+    [s] of the records.
     """
     sigma, delay_s = start
     flexure, truth = jnp.zeros(6), run.truth
     if len(sigma) == _RIGID:
         flexure, truth = None, truth and truth._replace(flexure=None)
-    mean = ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
-    lag = lag_of(run.increments, delay_s, run.master_omega_b)
+    mean = pm.ProductState(InsState.start(start_estimate(run)), jnp.zeros(3), flexure)
+    lag = pm.lag_of(run.increments, delay_s, run.master_omega_b)
     return Case(
         start=Belief(mean, jnp.diag(sigma)),
         u=Block(run.increments, run.noise_scale),
-        y={name: getattr(run.master, RECORDS[name].field) for name in matched},
+        y={name: getattr(run.master, pm.RECORDS[name].field) for name in matched},
         aux=dict.fromkeys(matched, lag),
         truth=truth,
     )
@@ -193,9 +187,6 @@ def product_contender(
     )
 
 
-# ------------------------------------------------------------------------------ what is judged
-
-
 FIVE_ARCMIN = "5_arcmin"
 JUDGED = "product"  # the filter whose consistency is claimed
 
@@ -218,7 +209,6 @@ CLAIMS = consistency_claims(
         (0.0, 1.15),
     )
 }
-_ENU = [1, 0, 2]  # of sizes, which have no sign
 
 
 def product_metrics(statistics: Any) -> dict[str, Any]:
@@ -227,44 +217,37 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
     Attitudes are listed east, north, up, as in the other studies; the rest as in its block. The
     last sigmas are those that the filter states at the end.
     """
-    start = statistics.count_from
-    rms = np.sqrt(np.mean(statistics.rms[start:] ** 2, axis=0))
-    sigma = np.sqrt(np.mean(statistics.sigma[start:] ** 2, axis=0))
-    out: dict[str, Any] = {}
+    out = rms_by_axis(statistics, all_axes=("attitude",))
     for block in statistics.blocks:
-        name, here, shown = block.name, block.where, (block.units, block.display_unit)
-        ending = "mps" if name == "velocity" else units.as_ending(block.display_unit)
-        order = _ENU if name == "attitude" else slice(None)
-        size, last = (units.convert(x[here][order], *shown) for x in (rms, statistics.sigma[-1]))
-        out[f"{name}_rms_{ending}"] = size.tolist()
+        if (name := block.name) not in ("attitude", "mounting"):
+            continue
+        last = units.convert(statistics.sigma[-1][block.where], block.units, block.display_unit)
+        out[f"{name}_last_sigma_arcmin"] = last.tolist()
         if name == "attitude":
-            ratio = np.sqrt(np.sum(rms[here] ** 2) / np.sum(sigma[here] ** 2))
-            out["attitude_rms_all_arcmin"] = float(np.sqrt(np.mean(size**2)))
-            out["attitude_over_sigma"] = float(ratio)
-        if name in ("attitude", "mounting"):
-            out[f"{name}_last_sigma_{ending}"] = last.tolist()
+            sigma = np.sqrt(np.mean(statistics.sigma[statistics.counted, block.where] ** 2, axis=0))
+            rms = rms_by_component(statistics)[block.where]
+            out["attitude_over_sigma"] = float(np.sqrt(np.sum(rms**2) / np.sum(sigma**2)))
+            for key in ("attitude_rms_arcmin", "attitude_last_sigma_arcmin"):
+                north, east, down = out[key]
+                out[key] = [east, north, down]  # sizes, which have no sign
     settled = statistics.settled(FIVE_ARCMIN)
-    out["share_below_5_arcmin"] = float(np.mean(settled <= start))
+    out["share_below_5_arcmin"] = float(np.mean(settled <= statistics.count_from))
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
-
-
-# ----------------------------------------------------------------------------------- the study
 
 
 def _contender(given: Product, course: Course, name: str) -> Contender:
     return product_contender(given, name, given.believed)
 
 
-def tracks(means: Mapping[str, ProductState]) -> dict[str, Any]:
+def tracks(means: Mapping[str, pm.ProductState]) -> dict[str, Any]:
     """Where each filter thought the slave was."""
-    places = zip(*(jax.tree.leaves(mean.ins.position) for mean in means.values()), strict=True)
-    return place_arrays("track", map(np.stack, places), "{} of the slave")
+    return track_arrays((mean.ins.position for mean in means.values()), "{} of the slave")
 
 
 def _view(given: Product, course: Course) -> View:
     refuse_unsettled("settle", given.settle, float(course.epoch_s[-1]))
     path = course.path.position
-    used = (ATTITUDE, VELOCITY, *((POSITION,) if given.believed.position else ()))
+    used = (pm.ATTITUDE, pm.VELOCITY, *((pm.POSITION,) if given.believed.position else ()))
     return View(
         epoch_s=course.epoch_s,
         blocks=tuple(_REPORTED.values()),

@@ -34,6 +34,7 @@ from robins.ins.mechanise import Nav, mechanise, nav_at
 from robins.ins.state import InsState
 from robins.manifold import retract
 from robins.rotation import Rotation, conjugate, from_rotvec, multiply, rotate, to_rotvec
+from robins.scenario import Span
 from robins.sim.commands import from_commands
 from robins.sim.disturbance import drift_step, outlier_factor, student_t, window_factor
 from robins.sim.flexure import simulate_flexure
@@ -42,15 +43,14 @@ from robins.sim.imu_sensor import corrupt
 from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
 from robins.sim.trajectory import Motion, at_lever_arm
+from robins.systems.parts import outside, signed
 from robins.systems.transfer_alignment.product.model import RECORDS, ProductState, Record
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,
     Disturbance,
     PairParameters,
     Ship,
-    Start,
     Vehicle,
-    Window,
 )
 
 SLACK_S = 1e-8  # times are rounded to nanoseconds
@@ -142,9 +142,7 @@ def lay_out(pair: PairParameters) -> Course:
     g = np.asarray(_compiled_gravity(truth.lat_rad, truth.alt_m))
     described_s = epoch_s - pair.master.delay
     described_ns = np.round(np.maximum(described_s, 0.0) * 1e9).astype(np.int64)
-    there = described_s >= -SLACK_S
-    for window in pair.disturbance.dropouts:
-        there &= (epoch_s < window.begin - SLACK_S) | (epoch_s >= window.end - SLACK_S)
+    there = (described_s >= -SLACK_S) & outside(pair.disturbance.dropouts, epoch_s)
     return Course(
         motion=motion,
         epoch_s=epoch_s,
@@ -180,11 +178,11 @@ def _samples_an_epoch(slave_hz: float, master_hz: float) -> int:
 def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
     d = disturbance
 
-    def inside(name: str, window: Window) -> None:
-        if not window.begin < window.end <= end_s + SLACK_S:
+    def inside(name: str, window: Span) -> None:
+        if window.end > end_s + SLACK_S:
             raise ValueError(
                 f"disturbance.{name} from {window.begin:g} s to {window.end:g} s must lie within "
-                f"the run, 0 s to {end_s:g} s, and begin before it ends"
+                f"the run, 0 s to {end_s:g} s"
             )
 
     if d.gyro_noise_window is not None:
@@ -206,9 +204,6 @@ def _check_disturbance(disturbance: Disturbance, end_s: float) -> None:
         )
 
 
-# --------------------------------------------------------------------------------- one run
-
-
 class PairRun(NamedTuple):
     """One run, simulated or recorded; E epochs, K samples of the slave in each, NED/FRD."""
 
@@ -222,14 +217,7 @@ class PairRun(NamedTuple):
 
 
 def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array) -> PairRun:
-    """One run, from its number, which may be traced; pure.
-
-    Args:
-        pair: the parameters that `course` was laid out from.
-        course: from `lay_out`.
-        seed: of the campaign.
-        index: () number of the run.
-    """
+    """One run of the course of a pair, from its number, which may be traced; pure."""
     initial = stream(seed, index, Component.INITIAL_STATE)
     normal = jax.random.normal(jax.random.fold_in(initial, _MOUNTING), (3,))
     mounting = jnp.asarray(pair.mounting.error) + jnp.asarray(pair.mounting.sigma) * normal
@@ -240,6 +228,7 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
     theta, dv = _felt(course, d)
     q_nb = multiply(jnp.asarray(course.q_nb), d)
     theta_error, dv_error, *biases = _slave_errors(pair, course, stream(seed, index, Component.IMU))
+    begin = [*pair.start.attitude, *pair.start.velocity, *pair.start.position]
     shape = (len(course.epoch_s), course.each)
 
     def at_epochs(x: Array) -> Array:
@@ -254,7 +243,7 @@ def simulate_pair(pair: PairParameters, course: Course, seed: int, index: Array)
         ),
         noise_scale=jnp.ones(shape[0]),
         start=jax.tree.map(jnp.asarray, course.start)._replace(q_nb=Rotation(q_nb[0])),
-        initial_error=_initial_error(pair.start, jax.random.fold_in(initial, _NAVIGATION)),
+        initial_error=signed(jax.random.fold_in(initial, _NAVIGATION), begin, pair.start.draw),
         master=_records(pair, course, seed, index),
         master_omega_b=jnp.asarray(course.master_omega_b),
         truth=ProductState(
@@ -311,14 +300,6 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Arr
         step, turned = drift_step(jnp.asarray(course.begin_s), dt, at, jnp.asarray(d.drift_step))
         theta, bias = theta + turned, bias + step
     return theta, dv, bias, seen.accel.bias
-
-
-def _initial_error(start: Start, key: Array) -> Float[Array, "9"]:
-    sigma = jnp.asarray([*start.attitude, *start.velocity, *start.position])
-    normal = jax.random.normal(key, (9,))
-    if start.draw == "plus-sigma":
-        return sigma
-    return sigma * (jnp.where(normal < 0.0, -1.0, 1.0) if start.draw == "random-sign" else normal)
 
 
 def _records(pair: PairParameters, course: Course, seed: int, index: Array) -> Nav:

@@ -108,12 +108,9 @@ def transition(interval: Interval) -> Float[Array, "12 12"]:
 
 
 def process_sigma(gyro_noise: float, accel_noise: float, dt_s: float) -> np.ndarray:
-    """(12,) roots of the diagonal of Q; noise is alike on all axes, so no rotation changes it.
+    """(12,) roots of the diagonal of Q over an interval; noise is alike on all axes: none turns it.
 
-    Args:
-        gyro_noise: angle random walk [rad/sqrt(s)].
-        accel_noise: velocity random walk [m/s/sqrt(s)].
-        dt_s: duration of the interval.
+    The noises are an angle random walk [rad/sqrt(s)] and a velocity random walk [m/s/sqrt(s)].
     """
     sigma, root = np.zeros(STATES), math.sqrt(dt_s)
     sigma[VELOCITY], sigma[PHI] = accel_noise * root, gyro_noise * root
@@ -174,23 +171,19 @@ its (3,) standard deviations [rad]."""
 def euler_difference(slave_q_enu: ArrayLike, master_q_enu: ArrayLike) -> Float[Array, "*b 3"]:
     """Heading, pitch and roll of the slave minus those of the master [rad], in [-pi, pi).
 
-    Args:
-        slave_q_enu: (..., 4) attitude, body RFU to ENU.
-        master_q_enu: (..., 4), of boxes that are aligned; NaN where missing.
+    Of attitudes (..., 4), body RFU to ENU, of boxes that are aligned; NaN where one is missing.
     """
     slave, master = (euler_enu_rfu(jnp.asarray(q, float)) for q in (slave_q_enu, master_q_enu))
     return wrap(jnp.stack([a - b for a, b in zip(slave[::-1], master[::-1], strict=True)], -1))
 
 
 def refuse_steep(time_s: np.ndarray, q_nb: ArrayLike) -> None:
-    """Refuse attitudes at which roll and heading cannot be told apart; outside compiled code.
+    """Refuse attitudes (N, 4), NED/FRD, at which roll and heading are hard to tell apart.
 
-    Args:
-        time_s: (N,) s.
-        q_nb: (N, 4) attitude, NED/FRD.
+    Outside compiled code.
 
     Raises:
-        ValueError: the nose points more than 85 deg up or down at some time.
+        ValueError: the nose points more than 85 deg up or down at some time [s] of `time_s` (N,).
     """
     pitch = np.asarray(to_euler(jnp.asarray(q_nb, float))[1])
     steep = np.flatnonzero(np.abs(pitch) > STEEPEST_RAD)

@@ -37,7 +37,7 @@ from robins.ins.increments import Increments
 from robins.results import array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
-from robins.systems.judgement import Claim, ratio, rms_by_axis
+from robins.systems.judgement import ratio_claims, rms_by_axis
 from robins.systems.parts import ENU, RFU, Names, Runs, refuse_unsettled, warn_of_large_angles
 from robins.systems.study import (
     Case,
@@ -97,9 +97,6 @@ class VelocityAttitude(Scenario, PairParameters):
     told: Informed = pydantic.Field(default_factory=Informed)
     # figures pooled over time count from here
     settle: Annotated[float, Quantity("time", least="0 s")] = default("30 s")
-
-
-# ----------------------------------------------------------------------------------- course and run
 
 
 class World(NamedTuple):
@@ -304,9 +301,6 @@ def _of_pair(case: Callable[[product.PairRun], Case], world: World) -> Case:
     return case(world.pair)
 
 
-# -------------------------------------------------------------------------------- what is reported
-
-
 def view(given: VelocityAttitude, course: Course) -> View:
     """What is reported of every filter, errors being true minus estimated."""
     epoch_s, path = course.pair.epoch_s, course.pair.path
@@ -362,43 +356,26 @@ def metrics_of(epoch_s: np.ndarray, statistics: Any) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ claims
 
 RMS = "attitude_rms_all_arcmin"
-_BETTER = 0.95  # ratio up to which one filter is better than the other
-_FAIRLY = 0.98  # and up to which it is so in part; beyond, the two are as good
-
-
-def _better(text: str, ours: str, theirs: str) -> Claim:
-    value = ratio(ours, theirs, RMS)
-    return Claim(text, (ours, theirs), value, (0.0, _BETTER), (0.0, _FAIRLY))
-
-
-CLAIMS: dict[str, Claim] = {
-    "beats-kf": _better(
-        "Under noise that is unknown and not Gaussian the adaptive H-infinity filter aligns more "
-        "accurately than a Kalman filter that is told of the stated noise alone (the patent); "
-        "value: ratio of their attitude RMS over all axes",
-        "adaptive-hinf",
-        "kf",
-    ),
-    "kf-suffers": Claim(
-        "Not told of the noise that is there, a Kalman filter loses accuracy (the patent); value: "
-        "its attitude RMS over that of one told of it",
-        ("kf", "kf-told-both"),
-        ratio("kf", "kf-told-both", RMS),
-        (1.0 / _BETTER, None),
-        (1.0 / _FAIRLY, None),
-    ),
-    "beats-fixed": _better(
-        "A bound that adapts to the environment serves better than a fixed one (the patent), here "
-        "1.05 times the least there is; value: ratio of attitude RMS",
-        "adaptive-hinf",
-        "hinf-fixed",
-    ),
-    "compensation": _better(
-        "Compensating P where the bound does not hold raises the accuracy (the patent); value: "
-        "attitude RMS with compensation over that without",
-        "adaptive-hinf-compensated",
-        "adaptive-hinf",
-    ),
+# ratio up to which one filter is better than the other, and is so in part; beyond, both are as good
+_BETTER, _FAIRLY = (0.0, 0.95), (0.0, 0.98)
+_ADAPTIVE = "adaptive-hinf"
+_RATIOS = {
+    "beats-kf": (_ADAPTIVE, ("kf",), (RMS,), _BETTER, _FAIRLY),
+    "kf-suffers": ("kf", ("kf-told-both",), (RMS,), (1.0 / 0.95, None), (1.0 / 0.98, None)),
+    "beats-fixed": (_ADAPTIVE, ("hinf-fixed",), (RMS,), _BETTER, _FAIRLY),
+    "compensation": (f"{_ADAPTIVE}-compensated", (_ADAPTIVE,), (RMS,), _BETTER, _FAIRLY),
 }
+_TEXTS = {
+    "beats-kf": "Under noise that is unknown and not Gaussian the adaptive H-infinity filter "
+    "aligns more accurately than a Kalman filter that is told of the stated noise alone (the "
+    "patent); value: ratio of their attitude RMS over all axes",
+    "kf-suffers": "Not told of the noise that is there, a Kalman filter loses accuracy (the "
+    "patent); value: its attitude RMS over that of one told of it",
+    "beats-fixed": "A bound that adapts to the environment serves better than a fixed one (the "
+    "patent), here 1.05 times the least there is; value: ratio of attitude RMS",
+    "compensation": "Compensating P where the bound does not hold raises the accuracy (the "
+    "patent); value: attitude RMS with compensation over that without",
+}
+CLAIMS = ratio_claims(_RATIOS, _TEXTS)
 
 STUDY = Study(VelocityAttitude, FILTERS, simulate, contender, view, lay_out, CLAIMS)

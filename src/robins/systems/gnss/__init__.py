@@ -1,0 +1,23 @@
+"""Tight GNSS: pseudoranges, wheels and a yaw gyro; a simulated city and recorded logs."""
+
+from pathlib import Path
+
+from robins.systems.gnss.filters import NAMES
+from robins.systems.gnss.log import replay
+from robins.systems.gnss.model import gnss_model
+from robins.systems.gnss.parameters import City, Replay
+from robins.systems.gnss.study import CITY
+from robins.systems.study import System
+
+SYSTEM = System(
+    name="gnss",
+    studies={"city": CITY},
+    replay_filters=NAMES,
+    replay_parameters=Replay,
+    replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
+    replay=replay,
+    reads="ranges",
+    replay_finds=("track",),
+)
+
+__all__ = ["SYSTEM", "City", "Replay", "gnss_model", "replay"]

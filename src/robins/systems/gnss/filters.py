@@ -1,0 +1,97 @@
+"""The filters by name, what each believes, and the case that it makes of a world."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins.errors import require_known
+from robins.filters import kalman, rules
+from robins.filters.rule import Rule
+from robins.systems.gnss.model import (
+    RANGES,
+    GnssState,
+    Kind,
+    Place,
+    Travel,
+    gnss_model,
+    start_belief,
+)
+from robins.systems.gnss.parameters import Believed, Weights
+from robins.systems.gnss.weights import by_component, huber_weight, student_weight, switch_weight
+from robins.systems.study import Case, Contender, recipe
+
+KINDS = {
+    "ls": Kind(memory=False),
+    "ekf": Kind(),
+    "huber": Kind(),
+    "student-t": Kind(),
+    "switchable": Kind(),
+    "delays": Kind(delays=True),
+}
+"""What each filter takes the pseudoranges for; "delays" is the default of a replay."""
+
+SMOOTHERS = {f"{name}+rts": name for name, kind in KINDS.items() if kind.memory}
+"""Of recorded logs, by name: the filter whose run each smooths."""
+
+NAMES = (*KINDS, *SMOOTHERS)
+
+
+class World(NamedTuple):
+    """A drive as a filter is given it; leading axis E but for the fix."""
+
+    fix: Any  # (4 + K,) of `first_fix`, of the first epoch
+    u: Travel
+    y: Any  # measurements by sensor
+    sky: Any  # `Sky`
+    truth: GnssState | None = None
+
+
+def weighing(name: str, weights: Weights) -> tuple[Rule, ...]:
+    """The rules of a filter."""
+    chosen = {
+        "huber": huber_weight(weights.huber),
+        "student-t": student_weight(weights.dof),
+        "switchable": switch_weight(weights.switch),
+        "delays": student_weight(weights.dof),
+    }
+    if name not in chosen:
+        return ()
+    return (rules.only(RANGES, by_component(chosen[name], name.replace("-", "_"))),)
+
+
+def _case(kind: Kind, believed: Believed, numbers: tuple[Place, Any], world: World) -> Case:
+    place, member = numbers
+    systems = np.shape(member)[1]
+    first = Travel(*(a[0] for a in world.u))
+    start = start_belief(believed, kind, world.fix, place, systems, first)
+    truth = world.truth
+    if truth is not None and not kind.delays:
+        truth = truth._replace(delay=truth.delay[:, :0])
+    return Case(start, world.u, world.y, {RANGES: world.sky}, truth)
+
+
+def contender(believed: Believed, place: Place, member: np.ndarray, name: str) -> Contender:
+    """A filter with the model it believes in.
+
+    Args:
+        believed: of clock, wheels, delays and weights.
+        place: origin of the state.
+        member: (N, K) as of `gnss_model`.
+        name: of the filter.
+
+    Raises:
+        ValueError: there is no filter of this name, or it is a smoother.
+    """
+    if name in SMOOTHERS:
+        raise ValueError(f"{name}: campaigns compare causal filters; `robins replay` smooths a log")
+    require_known("filter", name, KINDS, "this system, where all but ls may end in +rts")
+    kind = KINDS[name]
+    n = 8 + member.shape[1] + len(member) * kind.delays
+    return Contender(
+        kalman(rules=weighing(name, believed.weights)),
+        gnss_model(believed, kind, place, member),
+        recipe(_case, kind, believed, numbers=(place, np.asarray(member, float))),
+        reported=np.eye(3, n),
+    )

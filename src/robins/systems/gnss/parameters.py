@@ -1,0 +1,132 @@
+"""Parameters of tight GNSS, of a replayed log and of a simulated city, with units.
+
+What a filter believes follows from physics and published figures, not from a log: the oscillator is
+that of Brown & Hwang (2012, table 9.3, a temperature-compensated crystal), wheels and yaw gyro are
+those of a car, delays follow from the width of streets.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from robins.scenario import Parameters, Positive, Quantity, default
+from robins.systems import quantities as q
+from robins.systems.parts import Departure, Leg, Names, refuse_too_long
+from robins.systems.study import Scenario
+
+Decibels = Annotated[float, pydantic.Field(ge=0.0, le=70.0)]
+
+
+class Clock(Parameters):
+    """The receiver's oscillator, by the coefficients h0 [s] and h_-2 [Hz] of its Allan variance."""
+
+    h0: Positive = 2e-19
+    h2: Positive = 2e-20
+    drift: q.Speed = default("300 m/s")  # at the start: 1 ppm
+    system_bias: q.Length = default("10 m")  # of a system's clock against the first
+
+
+class Wheels(Parameters):
+    """Odometer and yaw gyro; the log states the white noise of each sample."""
+
+    scale: Annotated[float, Quantity("ratio", above="0 ppm")] = default("2 %")
+    yaw_bias: q.AngleRate = default("0.2 deg/s")
+    # change of height along the road, as a random walk over the distance: after 1 m
+    rise: q.Length = default("0.1 m")
+    # until then the heading may be unknown, and the length of a metre is not used
+    aligned_after: q.Length = default("100 m")
+
+
+class Delays(Parameters):
+    """Delays of signals that come round a corner or off a wall, one state a satellite.
+
+    A signal reflected by a wall at the distance a from the receiver comes late by 2 a cos(e), e
+    being the elevation (Hsu 2018). The distance to the walls is exponential with the mean
+    `reflector`; the probability that a signal is blocked falls from one to zero between two C/N0.
+    """
+
+    reflector: q.Length = default("20 m")
+    blocked_dbhz: Decibels = 25.0
+    clear_dbhz: Decibels = 45.0
+    multipath: q.Length = default("3 m")  # spread of the delay of a signal in direct sight
+    # a delay is forgotten along the road, and more slowly at rest
+    distance: q.Length = default("30 m")
+    time: q.Duration = default("100 s")
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self) -> Delays:
+        if not self.blocked_dbhz < self.clear_dbhz:
+            raise ValueError("blocked_dbhz must be less than clear_dbhz")
+        return self
+
+
+class Weights(Parameters):
+    """Robust weights by satellite; the usual constants of their authors."""
+
+    huber: Positive = 1.345
+    dof: Positive = 5.0
+    switch: Positive = 1.0
+
+
+class Believed(Parameters):
+    """What every filter believes."""
+
+    clock: Clock = pydantic.Field(default_factory=Clock)
+    wheels: Wheels = pydantic.Field(default_factory=Wheels)
+    delays: Delays = pydantic.Field(default_factory=Delays)
+    weights: Weights = pydantic.Field(default_factory=Weights)
+
+
+class Replay(Believed):
+    """A recorded log: what its file does not say."""
+
+    system: Literal["gnss"] = "gnss"
+    title: str = "Tight GNSS replay"
+    filters: Names = ("delays", "delays+rts")
+
+
+class Satellites(Parameters):
+    """The sky over the city: systems alternate, azimuths spread by the golden angle."""
+
+    count: Annotated[int, pydantic.Field(ge=6, le=64)] = 16
+    lowest: Annotated[float, Quantity("angle", least="5 deg", most="60 deg")] = default("12 deg")
+    noise: q.Length = default("3 m")  # white, at 45 dBHz
+
+
+class Streets(Parameters):
+    """Walls on both sides, in blocks whose height and distance are drawn anew."""
+
+    block: q.Length = default("40 m")
+    gap: Annotated[float, pydantic.Field(ge=0.0, le=1.0)] = 0.25  # share of blocks without a wall
+    least_height: q.Length = default("8 m")
+    mean_height: q.Length = default("20 m")
+    nearest: q.Length = default("8 m")  # wall to the middle of the street, log-uniform
+    farthest: q.Length = default("40 m")
+    loss_db: Positive = 12.0  # of a reflected signal
+
+
+class City(Scenario, Believed):
+    """A simulated drive through streets that block and reflect."""
+
+    system: str = "gnss"
+    study: str = "city"
+    title: str = "Drive through a city"
+    rate: Annotated[float, Quantity("frequency", above="0 Hz", most="100 Hz")] = default("5 Hz")
+    place: Departure
+    legs: Annotated[tuple[Leg, ...], pydantic.Field(min_length=1)]
+    satellites: Satellites = pydantic.Field(default_factory=Satellites)
+    streets: Streets = pydantic.Field(default_factory=Streets)
+    speed_noise: q.Speed = default("0.05 m/s")
+    yaw_noise: q.AngleRate = default("0.1 deg/s")
+    settle: q.Time = default("0 s")
+    filters: Names = ("ls", "ekf", "huber", "student-t", "switchable", "delays")
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> City:
+        lasts = sum(leg.lasts_s for leg in self.legs)
+        refuse_too_long("rate", lasts, self.rate)
+        if self.settle >= lasts:
+            raise ValueError(f"settle: the drive lasts {lasts:g} s; let it begin to count before")
+        return self

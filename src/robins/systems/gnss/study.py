@@ -1,0 +1,84 @@
+"""The study "city": what is reported of the filters and what is claimed of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from robins.systems.gnss import filters, world
+from robins.systems.gnss.model import POSITION, sensor_axes
+from robins.systems.gnss.parameters import City
+from robins.systems.gnss.world import Course
+from robins.systems.judgement import Claim, Metrics, consistency, ratio
+from robins.systems.study import Contender, Norm, Study, View
+from robins.systems.tables import place_arrays, track_arrays
+
+HORIZONTAL = "horizontal"
+
+
+def contender(city: City, course: Course, name: str) -> Contender:
+    """A filter with the model it believes in."""
+    return filters.contender(city, course.place, course.member, name)
+
+
+def view(city: City, course: Course) -> View:
+    """What is reported: the position, the true path, the track of each filter in the first run."""
+    place = course.place
+    p = place.geodetic(course.position)
+    return View(
+        epoch_s=course.epoch_s,
+        blocks=(POSITION,),
+        sensors=sensor_axes(course.satellites),
+        metrics=_metrics,
+        context=xr.Dataset(place_arrays("reference", (p.lat, p.lon, p.alt), "true {}")),
+        shown=lambda means: track_arrays(place.geodetic(m.position) for m in means.values()),
+        count_from=int(np.searchsorted(course.epoch_s, city.settle)),
+        norms=(Norm(HORIZONTAL, (0, 1)),),
+    )
+
+
+def _metrics(statistics: Any) -> dict[str, Any]:
+    """Horizontal mean and RMS over runs and epochs, vertical RMS, consistency."""
+    square = np.mean(statistics.rms[statistics.counted] ** 2, axis=0)
+    return {
+        "horizontal_mean_m": float(np.mean(statistics.norm(HORIZONTAL)[:, 0])),
+        "horizontal_rms_m": float(np.sqrt(square[0] + square[1])),
+        "vertical_rms_m": float(np.sqrt(square[2])),
+        **consistency(statistics),
+        "diverged_runs": statistics.diverged,
+    }
+
+
+def _best_other(metrics: Metrics) -> float:
+    others = [m["horizontal_mean_m"] for name, m in metrics.items() if name != "delays"]
+    return metrics["delays"]["horizontal_mean_m"] / min(others)
+
+
+CLAIMS = {
+    "halves": Claim(
+        "A delay state for each satellite makes the mean horizontal error at most half of that of "
+        "least squares; value: their ratio",
+        ("delays", "ls"),
+        ratio("delays", "ls", "horizontal_mean_m"),
+        (0.0, 0.5),
+    ),
+    "best": Claim(
+        "Delay states err less than robust weights on white noise; value: their mean horizontal "
+        "error over that of the best other filter",
+        ("delays", "huber", "student-t", "switchable"),
+        _best_other,
+        (0.0, 1.0),
+    ),
+    "honest": Claim(
+        "The position of the filter with delay states errs no more than it says: the mean NEES "
+        "over its three components stays below 1.3 of what it should be",
+        ("delays",),
+        lambda metrics: metrics["delays"]["anees_mean"],
+        (0.0, 1.3),
+    ),
+}
+
+# smoothers are named so that a campaign asked for one is told where it belongs
+CITY = Study(City, filters.NAMES, world.simulate, contender, view, world.lay_out, CLAIMS)
