@@ -1,5 +1,6 @@
 """Filters made of filters: of locals, of modes, of particles; guarded; of late measurements."""
 
+from robins.filters.composite.adaptive import adaptive
 from robins.filters.composite.channels import Channel, at_master, channel
 from robins.filters.composite.delayed import Late, delayed
 from robins.filters.composite.distributed import distributed, intersecting
@@ -13,6 +14,7 @@ __all__ = [
     "Channel",
     "Family",
     "Late",
+    "adaptive",
     "at_master",
     "channel",
     "covariance_intersection",

@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
+from robins.filters.composite.adaptive import Part
 from robins.manifold import retract
 from robins.systems.aboard import Taken, aboard, taken
 from robins.systems.airship import instruments
@@ -38,6 +39,9 @@ from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, 
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 COMMON = 9  # states that all local filters have
+# What each of them drives, and their biases, of filters that have states for these
+GYROS = Part(range(0, 3), range(9, 12))
+ACCELEROMETERS = Part(range(3, 9), range(12, 15))
 BOTH = (WIND, WIND_OF_STAR)
 
 
@@ -92,6 +96,11 @@ def _product() -> Filter:
     return ekf(rules.only((SAR,), rules.huber(0.999)), rules.only((WIND,), patient))
 
 
+def _adaptive() -> Filter:
+    """As "product", but for a motion of which nobody knows when it is wrong."""
+    return filters.adaptive(parts=(GYROS, ACCELEROMETERS))
+
+
 class Candidate(NamedTuple):
     """A filter of the study, its instruments as it takes them, its states."""
 
@@ -141,6 +150,7 @@ CANDIDATES: dict[str, Candidate] = {
     "distributed-mean": Candidate(lambda: _two(ukf, feedback="mean"), PLAIN),
     "distributed-full": Candidate(lambda: _two(ukf, feedback="full"), PLAIN),
     "product": Candidate(_product, instruments.ABOARD, PRODUCT),
+    "adaptive": Candidate(_adaptive, instruments.ABOARD, PRODUCT),
 }
 """Every filter of the study."""
 

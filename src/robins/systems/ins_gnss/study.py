@@ -11,7 +11,7 @@ import xarray as xr
 
 from robins import units
 from robins.errors import require_known
-from robins.filters import Filter, cubature, kalman, taylor, unscented
+from robins.filters import Filter, adaptive, cubature, kalman, taylor, unscented
 from robins.filters.rules import gate
 from robins.results import array
 from robins.systems.ins_gnss.model import SENSORS, ins_gnss_model, state_blocks
@@ -31,7 +31,10 @@ FILTERS = {
 SMOOTHERS = {f"{name}+rts": name for name in FILTERS}
 """Of recorded logs, by name: the filter whose run each smooths."""
 
-NAMES = (*FILTERS, *SMOOTHERS)
+ADAPTIVE = (
+    "adaptive"  # a bank over the process noise; nothing is gated, and nothing can be smoothed
+)
+NAMES = (*FILTERS, ADAPTIVE, *SMOOTHERS)
 
 CLAIMS = consistency_claims(
     {
@@ -45,11 +48,13 @@ CLAIMS = consistency_claims(
 
 
 def make_filter(name: str, gate_probability: float = 0.0) -> Filter:
-    """The filter of a name, gated where the probability is not zero.
+    """The filter of a name, gated where the probability is not zero; "adaptive" never is.
 
     Raises:
         ValueError: there is no filter of this name.
     """
+    if name == ADAPTIVE:
+        return adaptive()
     require_known("filter", name, FILTERS, "this system, where each may end in +rts")
     return FILTERS[name]((gate(gate_probability),) if gate_probability > 0.0 else ())
 

@@ -91,6 +91,11 @@ def sensors_of(
     return aboard([i for i in instruments(given) if i.name in names], given, course)
 
 
+def bank() -> Filter:
+    """A bank over the scale of the process noise, with the sigma points of the studies."""
+    return filters.adaptive(linearise=_POINTS)
+
+
 # ------------------------------------------------------------------------------- magnetic attitude
 
 
@@ -102,6 +107,7 @@ class AngleFilter(NamedTuple):
     sensors: tuple[str, ...] = (GYRO, MAGNETIC)
     raw: bool = False  # its sensor is taken at its word, without a model of the motion
     discriminates: bool = False  # outliers from model errors, of each sensor
+    adapts: bool = False  # a bank over the process noise
 
 
 ANGLE_FILTERS: dict[str, AngleFilter] = {
@@ -121,6 +127,7 @@ ANGLE_FILTERS: dict[str, AngleFilter] = {
     "huber": AngleFilter(None, huber(PROBABILITY)),
     "gate": AngleFilter(None, patient()),
     "discriminator": AngleFilter(discriminates=True),
+    "adaptive": AngleFilter(adapts=True),
     "federated-root-discriminator": AngleFilter("root", discriminates=True),
 }
 
@@ -134,6 +141,8 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
 
     if chosen.raw:
         return kalman(filters.taylor())
+    if chosen.adapts:
+        return bank()
     if chosen.sharing is None:
         return own(*chosen.sensors)
     channels = [filters.channel((sensor,), own(sensor)) for sensor in chosen.sensors]
@@ -223,6 +232,7 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
     "gate": FieldFilter(ukf(patient())),
     "discriminator": FieldFilter(ukf(projected_discriminator("huber"))),
     "discriminator-gate": FieldFilter(ukf(projected_discriminator("gate"))),
+    "adaptive": FieldFilter(bank()),
     "strong-tracking": FieldFilter(ukf(fading())),
     "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
     "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),

@@ -25,7 +25,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins import linalg
-from robins.filters import Belief, Filter, Model, Motion, Sensor, kalman, taylor
+from robins.filters import Belief, Filter, Model, Motion, Sensor, adaptive, kalman, taylor
 from robins.filters.rules import constant_gain, gate
 from robins.rotation import BodyRotation, conjugate, from_rotvec, multiply, normalise, skew, to_dcm
 from robins.systems.satellite.nodes import STAR, StateForm
@@ -33,7 +33,7 @@ from robins.systems.satellite.nodes import STAR, StateForm
 ARCSEC = math.pi / 648000.0
 GATE = 0.9999962  # chi-square of 3 at 27.9
 PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
-Build = Literal["mekf", "quaternion", "gated", "fixed", "fixed-gated"]
+Build = Literal["mekf", "quaternion", "gated", "adaptive", "fixed", "fixed-gated"]
 
 
 class AttitudeState(NamedTuple):
@@ -179,6 +179,8 @@ def start(q_ib: Array, attitude_rad: Any, bias_rad_s: Any, additive: bool = Fals
 @cache  # made before a run is traced: a rule checks its gain, which a trace cannot
 def make_filter(build: Build) -> Filter:
     """The filter of a build; those that differ in their gains share it, for a gain is data."""
+    if build == "adaptive":
+        return adaptive()
     reopened = gate(GATE, PATIENCE, "reinitialise")
     held = constant_gain({STAR: np.zeros((6, 3))})
     rules = {"gated": [reopened], "fixed": [held], "fixed-gated": [reopened, held]}

@@ -61,6 +61,8 @@ FILTERS: Mapping[str, FilterSpec] = {
     "raw": FilterSpec("fixed", GainSpec("raw"), 1.0),
     "mekf": FilterSpec("mekf", None, 1.0),  # multiplicative EKF
     "mekf-gate": FilterSpec("gated", None, 1.0),  # the same with a gate that opens again
+    # a bank of them over the scale of the process noise
+    "adaptive": FilterSpec("adaptive", None, 1.0),
     "mekf-tuned": FilterSpec("mekf", None, 30.0),  # the same, noise of the bias times 30
     "mekf-informed": FilterSpec("mekf", None, None),  # the same, told the true drift
     "ekf-quaternion": FilterSpec("quaternion", None, 1.0),  # additive EKF of seven states

@@ -1,0 +1,308 @@
+"""The filter "adaptive" of every system against the best of those that were told.
+
+    python benchmarks/defaults.py [SYSTEM/SCENARIO ...] [--runs 50] [--seeds 0] [--troubles]
+        [--out table.md]
+
+Without a name, every simulated scenario whose study has a filter of that name. A row says the RMS
+error of what the scenario is about (attitude, or position), over epochs and runs that count, of the
+filter "adaptive" over that of the best other filter, and the NEES of that block for a component:
+one where the filter knows how wrong it is. Others are all that the scenario names itself, and
+
+    told       the model of "adaptive" as it stands, in one Kalman filter, with the scale of its
+               process noise that turned out best on these very runs; of transfer alignment also
+               one that is told the flexure it meets
+
+With --troubles a table more, of what no scenario has: each is done to the simulated world from the
+middle of the run on, here and not in robins.
+
+    bias step     the gyros' bias moves by ten times its stated sigma
+    scale error   what the gyros report is 0.3 % too much
+    loud          records have 30 times their noise, for 20 s
+    lost axis     one component of each record is missing
+    soft, fast    a structure flexes by 20' in 6 s, or by 3' in 0.4 s (transfer alignment)
+
+It takes hours for all; nothing is fetched. A name, few runs and a small --chunk make it short.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins import manifold, scenario, units
+from robins.campaign.monte_carlo import record, worlds
+from robins.filters import Model, Motion, kalman
+from robins.filters.rules import huber
+from robins.rotation import Rotation
+from robins.systems import catalogue
+from robins.systems.finding import find_system
+from robins.systems.study import Case, Contender, Problem
+from robins.systems.transfer_alignment.product.parameters import Believed
+from robins.systems.transfer_alignment.product.study import product_contender
+from robins.systems.transfer_alignment.velocity_attitude.study import of_product
+
+DEFAULT = "adaptive"
+ABOUT = {"airship": "position", "ins-gnss": "position"}  # else attitude
+SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
+
+
+class Score(NamedTuple):
+    """Of a filter on the runs of a scenario."""
+
+    error: float  # RMS length, display unit
+    nees: float  # of a component
+
+
+# --------------------------------------------------------------------------------- who is told
+
+
+def _scaled_step(motion: Motion, scale: Array, x: Any, u: Any):
+    return motion.step(x, u)
+
+
+def _scaled_noise(motion: Motion, scale: Array, x: Any, u: Any):
+    return scale * motion.noise_factor(x, u)
+
+
+def _scaled_linear(motion: Motion, scale: Array, x: Any, u: Any):
+    assert motion.linear is not None
+    new, F, noise = motion.linear(x, u)
+    return new, F, scale * noise
+
+
+def told(base: Contender, scale: float) -> Contender:
+    """One Kalman filter with Huber's rule, on a model whose process noise is scaled."""
+    motion, s = base.model.motion, jnp.asarray(scale)
+    linear = None if motion.linear is None else Partial(_scaled_linear, motion, s)
+    louder = Motion(Partial(_scaled_step, motion, s), Partial(_scaled_noise, motion, s), linear)
+    return base._replace(filter=TOLD, model=Model(louder, base.model.sensors))
+
+
+TOLD = kalman(rules=[huber(0.999)])
+
+
+def told_structure(given: Any) -> Contender:
+    """The product filter that believes in the flexure that is there, or in none."""
+    structure = given.flexure if any(given.flexure.sigma) else None
+    if given.study == "velocity-attitude":
+        return of_product(given, "product", Believed(flexure=structure))
+    believed = given.believed.model_copy(update={"flexure": structure})
+    return product_contender(given, "product", believed)
+
+
+# ----------------------------------------------------------------------------------- troubles
+
+
+def _late(count: int) -> Array:
+    return jnp.arange(count) >= count // 2
+
+
+def _turned(u: Any, change: Callable[[Array, Array], Array]) -> Any:
+    """The input of a motion with other turns: ``change(theta, dt)`` from the middle on."""
+    if hasattr(u, "increments"):
+        return u._replace(increments=_turned(u.increments, change))
+    late = _late(u.theta.shape[0]).reshape(-1, *([1] * (u.theta.ndim - 1)))
+    dt = jnp.broadcast_to(jnp.asarray(u.dt)[..., None], u.theta.shape)
+    return u._replace(theta=jnp.where(late, change(u.theta, dt), u.theta))
+
+
+def bias_step(case: Case, base: Contender, dt_s: float) -> Case:
+    """Ten sigma of the stated bias of the gyros."""
+    step = 10.0 * jnp.sqrt(jnp.sum(case.start.factor[9:12] ** 2, axis=1))
+    return case._replace(u=_turned(case.u, lambda theta, dt: theta + step * dt))
+
+
+def scale_error(case: Case, base: Contender, dt_s: float) -> Case:
+    """0.3 %."""
+    return case._replace(u=_turned(case.u, lambda theta, dt: 1.003 * theta))
+
+
+def loud(case: Case, base: Contender, dt_s: float) -> Case:
+    """30 times the noise on top of what is there, for 20 s."""
+    out, key = {}, jax.random.key(20)
+    for k, (name, y) in enumerate(case.y.items()):
+        sensor, aux, truth = base.model.sensor(name), case.aux.get(name), case.truth
+        count = jax.tree_util.tree_leaves(y)[0].shape[0]
+        index = jnp.arange(count)
+        inside = (index >= count // 2) & (index < count // 2 + round(20.0 / dt_s))
+        # a run has its own: its initial error is as good as a number
+        own = jax.random.fold_in(jax.random.fold_in(key, k), _number_of(case))
+        white = 30.0 * inside[:, None] * jax.random.normal(own, (count, sensor.dim))
+
+        def one(y, x, a, w, sensor=sensor):
+            return manifold.retract(y, sensor.noise_factor(x, a) @ w)
+
+        axes = (0, 0, None if aux is None else 0, 0)
+        out[name] = jax.vmap(one, axes)(y, truth, aux, white)
+    return case._replace(y=out)
+
+
+def _number_of(case: Case) -> Array:
+    """A number that differs from run to run."""
+    first = jax.tree_util.tree_leaves(case.u)[1]
+    bits = jax.lax.bitcast_convert_type(jnp.sum(jnp.asarray(first, float)), jnp.int64)
+    return jnp.abs(bits) % (2**31 - 1)
+
+
+def lost_axis(case: Case, base: Contender, dt_s: float) -> Case:
+    """The first component of each record that is a vector; whole attitudes stay."""
+    return case._replace(y={name: _without_axis(y) for name, y in case.y.items()})
+
+
+def _without_axis(y: Any) -> Any:
+    if isinstance(y, Rotation):
+        return y
+    leaves, shape = jax.tree_util.tree_flatten(y)
+    late = _late(leaves[0].shape[0])
+    if leaves[0].ndim > 1:
+        leaves[0] = leaves[0].at[:, 0].set(jnp.where(late, jnp.nan, leaves[0][:, 0]))
+    else:
+        leaves[0] = jnp.where(late, jnp.nan, leaves[0])
+    return shape.unflatten(leaves)
+
+
+TROUBLES = {
+    "bias step": bias_step,
+    "scale error": scale_error,
+    "loud": loud,
+    "lost axis": lost_axis,
+}
+STRUCTURES = {
+    "soft": ("flexure.sigma=20 arcmin", "flexure.time=6 s"),
+    "fast": ("flexure.sigma=3 arcmin", "flexure.time=0.4 s"),
+}
+# of each system, a scenario without trouble of its own
+TROUBLED = ("airship/s1", "ins-gnss/drive", "transfer-alignment/aircraft")
+
+
+def _spoilt(trouble: Callable[..., Case], dt_s: float, base: Contender, world: Any) -> Case:
+    return trouble(base.case(world), base, dt_s)
+
+
+def spoilt(problem: Problem, trouble: Callable[..., Case]) -> Problem:
+    """The same problem with trouble in what all its filters are given."""
+    dt_s = float(problem.epoch_s[1] - problem.epoch_s[0])
+    cases = {
+        name: c._replace(case=Partial(lambda world, c=c: _spoilt(trouble, dt_s, c, world)))
+        for name, c in problem.contenders.items()
+    }
+    return replace(problem, contenders=cases)
+
+
+# -------------------------------------------------------------------------------------- tables
+
+
+def every() -> Iterator[str]:
+    """Scenarios whose study has the filter."""
+    for system in catalogue.summaries():
+        found = find_system(system)
+        for name, path in found.scenarios.items():
+            study = tomllib.loads(path.read_text()).get("study") or next(iter(found.studies), "")
+            has = study in found.studies and DEFAULT in found.studies[study].filters
+            if has and name not in ("replay", "walk"):
+                yield f"{system}/{name}"
+
+
+def problem_of(where: str, seed: int, changes: tuple[str, ...] = ()) -> Problem:
+    """A scenario with the filters it names, the default and those that are told."""
+    system, name = where.split("/")
+    found = find_system(system)
+    text = found.scenarios[name].read_text()
+    study = found.studies[tomllib.loads(text).get("study") or next(iter(found.studies))]
+    given = scenario.parse(study.parameters, text, list(changes), source=name)
+    names = tuple(dict.fromkeys([*given.filters, *_kin(system), DEFAULT]))
+    problem = study.problem(given, names, seed)
+    more = {}
+    if system != "satellite":  # whose filters in the loop are told by their names
+        aligns = system == "transfer-alignment"
+        base = told_structure(given) if aligns else problem.contenders[DEFAULT]
+        more = {f"told, noise times {s:g}": told(base, s) for s in SCALES}
+    return replace(problem, contenders={**problem.contenders, **more})
+
+
+def _kin(system: str) -> tuple[str, ...]:
+    return ("product",) if system == "transfer-alignment" else ()
+
+
+def scores(problem: Problem, block: str, runs: int, chunk: int) -> dict[str, Score]:
+    """Of every filter, on the same worlds."""
+    where = next(b for b in problem.blocks if b.name == block)
+    at = slice(problem.count_from, problem.count_to)
+    square: dict[str, list[float]] = {}
+    nees: dict[str, list[float]] = {}
+    for batch, count in worlds(problem, runs, chunk):
+        for name in problem.contenders:
+            found = record(problem, name, batch, count)
+            error = found["error"][:, at, where.where]
+            square.setdefault(name, []).extend(np.mean(np.sum(error**2, axis=2), axis=1))
+            mean = np.mean(found["block_nees"][block][:, at], axis=1) / len(where.axes)
+            nees.setdefault(name, []).extend(mean)
+    return {
+        name: Score(
+            float(units.convert(np.sqrt(np.mean(square[name])), where.units, where.display_unit)),
+            float(np.mean(nees[name])),
+        )
+        for name in square
+    }
+
+
+def row(where: str, trouble: str, problem: Problem, runs: int, chunk: int, seed: int) -> str:
+    """A line of the table."""
+    block = ABOUT.get(where.split("/")[0], "attitude")
+    unit = next(b.display_unit for b in problem.blocks if b.name == block)
+    found = scores(problem, block, runs, chunk)
+    ours = found.pop(DEFAULT)
+    best = min(found, key=lambda name: np.nan_to_num(found[name].error, nan=np.inf))
+    over = ours.error / found[best].error
+    cells = [where, trouble, str(seed), f"{ours.error:.3g} {unit}", best]
+    cells += [f"{found[best].error:.3g}", f"{over:.2f}", f"{ours.nees:.2f}"]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The default filter against the best told one.")
+    parser.add_argument("scenarios", nargs="*", help="system/scenario; all where none is named")
+    parser.add_argument("--runs", type=int, default=50, help="of each scenario")
+    parser.add_argument("--chunk", type=int, default=25, help="runs at a time")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the random numbers")
+    parser.add_argument("--troubles", action="store_true", help="what no scenario has")
+    parser.add_argument("--out", type=Path, help="file for the table")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore", UserWarning)
+    head = "| scenario | trouble | seed | adaptive | best told | its error | ratio | NEES |"
+    lines = [head, "|" + "---|" * 8]
+    print("\n".join(lines), flush=True)
+
+    def say(*which: Any) -> None:
+        lines.append(row(*which))
+        print(lines[-1], flush=True)
+
+    size = arguments.runs, arguments.chunk
+    for seed in arguments.seeds:
+        for where in arguments.scenarios or (TROUBLED if arguments.troubles else every()):
+            problem = problem_of(where, seed)
+            if not arguments.troubles:
+                say(where, "", problem, *size, seed)
+                continue
+            for name, trouble in TROUBLES.items():
+                say(where, name, spoilt(problem, trouble), *size, seed)
+            if where.startswith("transfer-alignment"):
+                for name, changes in STRUCTURES.items():
+                    say(where, name, problem_of(where, seed, changes), *size, seed)
+    if arguments.out is not None:
+        arguments.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

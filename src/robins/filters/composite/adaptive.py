@@ -1,0 +1,174 @@
+"""One filter for a model of which nobody knows when it is wrong: a bank over the process noise.
+
+An innovation that is too large is a bad record or a motion that was not foreseen. A robust weight
+alone takes it for the first, and once the motion is wrong it refuses the truth; a fading factor
+takes it for the second, and follows outliers. The bank (`robins.filters.composite.imm`) holds both:
+each mode weighs its records by Huber's rule (`robins.filters.rules.huber`) and believes in another
+scale of the process noise,
+
+    Q_s = s^2 Q + s^2 back C,     s of the scales,  C = diag of the initial variance of constants
+
+so a motion that is wrong for long makes a mode of more noise likely, and a bad record, which is
+gone at the next step, does not. There is no gate: nothing is refused, so nothing is locked out.
+
+States that the model holds for constant (biases, misalignments) have no noise of their own to be
+scaled. A mode lasts 1 / back steps once it has begun, and over these lets a constant wander by s
+times the sigma that it began with. The first scale is that of the model as it is: constants stay.
+
+Where several instruments drive the motion, one goes wrong at a time. So a mode scales one `Part` of
+the noise, and the part that is sound still tells the error of the other: a gyro that drifts must
+not make an accelerometer doubtful by which the tilt is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from robins.errors import require
+from robins.filters.belief import Belief
+from robins.filters.composite.imm import Family, Mode, imm
+from robins.filters.kalman import Filter, Form, kalman
+from robins.filters.linearise import Linearisation, Transition, taylor
+from robins.filters.model import Motion
+from robins.filters.rule import Rule
+from robins.filters.rules import huber
+
+SCALES = (1.0, 8.0, 64.0)
+UP, BACK = 1e-4, 1e-2
+OTHER = 1e-5  # that an alternative gives way to another in a step
+
+
+class Part(NamedTuple):
+    """What goes wrong together, such as all that one instrument drives.
+
+    Attributes:
+        moves: tangent components whose process noise is scaled; None: all.
+        constants: tangent components that the model holds for constant.
+    """
+
+    moves: Sequence[int] | None = None
+    constants: Sequence[int] = ()
+
+
+def excited(parts: Sequence[Part], scales: ArrayLike, wanders: ArrayLike) -> Rule:
+    """Process noise of another scale, part by part; constants wander.
+
+    Args:
+        parts: of the process noise.
+        scales: (parts,) of the standard deviations of the noise.
+        wanders: (parts,) standard deviation of what is added to each constant in a step, over its
+            initial sigma.
+    """
+    of = np.array([i for i, part in enumerate(parts) for _ in part.constants], int)
+    which = np.array([c for part in parts for c in part.constants], int)
+
+    def init(belief: Belief, dims: Any) -> Array:
+        return jnp.sqrt(jnp.sum(belief.factor[which] ** 2, axis=1))
+
+    def process(first: Array, t: Transition):
+        noise = t.noise
+        for i, part in enumerate(parts):
+            rows = slice(None) if part.moves is None else np.asarray(part.moves, int)
+            noise = noise.at[rows].multiply(jnp.asarray(scales)[i])
+        if len(which):
+            columns = jnp.zeros((len(noise), len(which)))
+            columns = columns.at[which, np.arange(len(which))].set(jnp.asarray(wanders)[of] * first)
+            noise = jnp.concatenate([noise, columns], axis=1)
+        return first, t._replace(noise=noise)
+
+    return Rule(init=init, process=process, name="excited")
+
+
+def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
+    """(n, n) probabilities of a change in one step between modes of these scales.
+
+    From any to each that is not quieter up, to each that is quieter back.
+
+    Raises:
+        ValueError: they are no probabilities.
+    """
+    s = np.asarray(scales, float)
+    change = np.where(s[None] < s[:, None], back, up)
+    np.fill_diagonal(change, 0.0)
+    stay = 1.0 - change.sum(axis=1)
+    good = 0.0 < up < 1.0 and 0.0 < back < 1.0 and bool(np.all(stay > 0.0))
+    require(good, "up and back of adaptive must leave a mode a chance to stay", (up, back))
+    return change + np.diag(stay)
+
+
+def lasting(change: np.ndarray) -> np.ndarray:
+    """(count,) probabilities that stay as they are under a change of each step."""
+    count = len(change)
+    A = np.vstack([change.T - np.eye(count), np.ones(count)])
+    found, *_ = np.linalg.lstsq(A, np.append(np.zeros(count), 1.0))
+    found = np.maximum(found, 0.0)
+    return found / found.sum()
+
+
+def adaptive(
+    scales: Sequence[float | int] = SCALES,
+    robust: float = 0.99,
+    up: float = UP,
+    back: float = BACK,
+    parts: Sequence[Part] = (Part(),),
+    motions: Callable[[Any], Motion] | None = None,
+    alternatives: Any = None,
+    linearise: Linearisation | None = None,
+    form: Form = "sqrt",
+) -> Filter:
+    """A bank of Kalman filters over the scale of the process noise, with Huber's rule in each.
+
+    Nothing in it belongs to a scenario: the numbers are decades of what a motion may do, and the
+    same for every system.
+
+    Args:
+        scales: of the standard deviations of the process noise, rising; the first is the model's.
+        robust: share of right records that keep their weight (`huber`).
+        up: probability of a change to one louder scale in a step.
+        back: of a change to one quieter scale.
+        parts: of the process noise; a mode makes one of them louder.
+        motions: makes the motion of one row of the alternatives.
+        alternatives: pytree of arrays, one row an alternative of the motion that holds for good.
+            Each is combined with every scale.
+        linearise: of each mode; by Taylor where not given.
+        form: of the update, "sqrt" or "joseph".
+
+    Raises:
+        ValueError: scales that do not rise from above zero; probabilities that are none; of motions
+            and alternatives one without the other.
+    """
+    s = np.asarray(scales, float)
+    rising = s.ndim == 1 and len(s) > 0 and s[0] > 0.0 and bool(np.all(np.diff(s) > 0.0))
+    require(rising, "scales of adaptive must rise, from above zero", scales)
+    if (motions is None) != (alternatives is None):
+        raise ValueError("adaptive needs both motions and alternatives, or neither")
+    # The quiet mode, then each louder scale of each part.
+    louder = np.tile(s[1:], len(parts))
+    own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
+    gains = s[0] * np.ones((1 + len(louder), len(parts)))
+    gains[1:] = np.where(own > 0.0, louder[:, None], gains[1:])
+    wanders = np.zeros_like(gains)
+    wanders[1:] = np.sqrt(back) * own * louder[:, None]
+    by = taylor() if linearise is None else linearise
+
+    def one(row: Any) -> Filter | Mode:
+        gain, wander, *other = row
+        made = kalman(by, (excited(parts, gain, wander), huber(robust)), form)
+        return made if motions is None else Mode(made, motions(other[0]))
+
+    change = changes([s[0], *louder], up, back)
+    start, modes = lasting(change), len(change)
+    if motions is None:
+        return imm(Family(one, (gains, wanders)), change, start)
+    (count,) = {np.shape(x)[0] for x in jax.tree_util.tree_leaves(alternatives)}
+    here = np.repeat(np.arange(count), modes)
+    rows = jax.tree_util.tree_map(lambda x: np.asarray(x)[here], alternatives)
+    between = np.full((count, count), OTHER) + np.diag(np.full(count, 1.0 - count * OTHER))
+    numbers = (np.tile(gains, (count, 1)), np.tile(wanders, (count, 1)), rows)
+    return imm(Family(one, numbers), np.kron(between, change), np.tile(start, count) / count)

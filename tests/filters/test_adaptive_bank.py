@@ -1,0 +1,153 @@
+"""The bank over the process noise against one written down plainly in NumPy, and what it is for."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
+from robins.filters.composite.adaptive import Part, changes, excited, lasting
+from robins.filters.linearise import Transition
+from robins.filters.rules import huber
+
+F = np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # the third is held constant
+G = np.array([[0.1, 0.0], [0.2, 0.1], [0.0, 0.0]])
+H = np.array([[1.0, 0.0, 0.0]])
+P0 = np.array([[4.0, 0.5, 0.0], [0.5, 1.0, 0.1], [0.0, 0.1, 0.04]])
+MODEL = Model(
+    Motion(lambda x, u: jnp.asarray(F) @ x, G), (Sensor(lambda x, aux: x[:1], np.ones(1), 1),)
+)
+START = Belief.of(jnp.zeros(3), P0)
+PROBABILITY = "imm.probability"
+
+
+def dense(y, scales, up, back):
+    """Mean, covariance and probabilities of Blom & Bar-Shalom's recursion, as they are printed."""
+    count = len(scales)
+    change = np.array([[up if j > i else back for j in range(count)] for i in range(count)])
+    for i in range(count):
+        change[i, i] = 1.0 - sum(change[i, j] for j in range(count) if j != i)
+    mu = np.linalg.matrix_power(change, 100000)[0]
+    m, P, out = [np.zeros(3)] * count, [P0] * count, []
+    for row in y:
+        c = change.T @ mu
+        begun, likelihood = [], np.ones(count)
+        for j in range(count):
+            w = change[:, j] * mu / c[j]
+            a = sum(w[i] * m[i] for i in range(count))
+            spread = [P[i] + np.outer(m[i] - a, m[i] - a) for i in range(count)]
+            begun.append((a, sum(w[i] * spread[i] for i in range(count))))
+        for j, (a, A) in enumerate(begun):
+            Q = scales[j] ** 2 * G @ G.T
+            if j > 0:
+                Q = Q + np.diag([0.0, 0.0, scales[j] ** 2 * back * P0[2, 2]])
+            a, A = F @ a, F @ A @ F.T + Q
+            S = H @ A @ H.T + 1.0
+            likelihood[j] = multivariate_normal(cov=S).pdf(row - H @ a)
+            K = A @ H.T / S
+            m[j], P[j] = a + K @ (row - H @ a), A - K @ H @ A
+        mu = c * likelihood / (c @ likelihood)
+        mean = sum(p * x for p, x in zip(mu, m, strict=True))
+        parts = [V + np.outer(x - mean, x - mean) for x, V in zip(m, P, strict=True)]
+        out.append((mean, sum(p * V for p, V in zip(mu, parts, strict=True)), mu))
+    return [np.array(x) for x in zip(*out, strict=True)]
+
+
+def track(rng, steps=60):
+    """Positions with noise, of a motion that is pushed away in its middle."""
+    x, y = np.array([0.0, 0.5, 0.0]), []
+    for k in range(steps):
+        x = F @ x + G @ rng.normal(size=2) + (np.array([0.0, 4.0, 0.0]) if 20 <= k < 24 else 0.0)
+        y.append(x[:1] + rng.normal(size=1))
+    return np.array(y)
+
+
+def test_it_is_the_dense_recursion():
+    scales, up, back = (1.0, 5.0, 40.0), 0.02, 0.1
+    y = track(np.random.default_rng(3))
+    found = run(adaptive(scales, 1.0, up, back, parts=[Part(constants=[2])]), MODEL, START, y)
+    mean, covariance, mu = dense(y, scales, up, back)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(found.steps.info["y"].notes[PROBABILITY], mu, rtol=1e-7, atol=1e-12)
+    assert np.max(mu[20:26, 1:].sum(axis=1)) > 0.9  # the push is seen
+    assert np.max(mu[:15, 1:].sum(axis=1)) < 0.5
+
+
+def test_one_scale_is_a_filter_with_hubers_rule():
+    y = track(np.random.default_rng(4))
+    bank = run(adaptive((1.0,), 0.99), MODEL, START, y)
+    alone = run(kalman(rules=[huber(0.99)]), MODEL, START, y)
+    np.testing.assert_allclose(bank.mean, alone.mean, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scales", "up", "back"),
+    [((1, 8), 0.1, 0.3), ((1, 8, 64), 1e-4, 1e-2), ((1, 8, 64, 8, 64), 0.1, 0.01)],
+)
+def test_scales_change_as_stated_and_begin_where_they_last(scales, up, back):
+    change = changes(scales, up, back)
+    np.testing.assert_allclose(change.sum(axis=1), 1.0, rtol=1e-14)
+    assert change[0, -1] == up
+    assert change[-1, 0] == back
+    if len(scales) == 5:
+        assert change[2, 4] == up  # as loud, of the other part
+        assert change[4, 1] == back
+    far = np.linalg.matrix_power(change, 10**6)
+    np.testing.assert_allclose(lasting(change), far[0], rtol=1e-6)
+
+
+def test_it_follows_what_lasts_and_ignores_what_does_not():
+    """A wild record among right ones, then a push that no noise of the model explains."""
+    rng = np.random.default_rng(5)
+    clean, y = track(rng), None
+    y = clean.copy()
+    y[10] += 1e4
+    error = {}
+    for name, one in {"bank": adaptive(), "huber": kalman(rules=[huber(0.99)])}.items():
+        error[name] = np.abs(run(one, MODEL, START, y).mean[:, 0] - clean[:, 0])
+    assert error["bank"][10] < 5.0  # the wild record
+    assert np.max(error["bank"][26:]) < 6.0  # four sigma of a record, of six times the noise
+    assert np.max(error["huber"][26:]) > 4.0 * np.max(error["bank"][26:])
+
+
+def test_a_part_has_its_own_noise_and_its_own_constants():
+    rng = np.random.default_rng(8)
+    N, none = rng.normal(size=(4, 2)), np.zeros((4, 0))
+    t = Transition(jnp.zeros(4), jnp.eye(4), jnp.asarray(none), jnp.asarray(N))
+    rule = excited([Part([0], [2]), Part([1], [3])], np.array([5.0, 1.0]), np.array([0.3, 0.0]))
+    first = rule.init(Belief.of(jnp.zeros(4), np.diag([1.0, 1.0, 4.0, 9.0])), {"y": 1})
+    _, found = rule.process(first, t)
+    grown = np.diag([5.0, 1.0, 1.0, 1.0]) @ N
+    expected = grown @ grown.T + np.diag([0.0, 0.0, (0.3 * 2.0) ** 2, 0.0])
+    np.testing.assert_allclose(found.noise @ found.noise.T, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_of_alternatives_the_right_one_is_found():
+    """A motion that decays at one of three rates for good."""
+    rates = np.array([0.2, 0.7, 0.98])
+
+    def decaying(rate):
+        return Motion(lambda x, u: jnp.reshape(rate, (1,)) * x, np.ones(1))
+
+    rng, x, y = np.random.default_rng(6), np.zeros(1), []
+    for _ in range(300):
+        x = 0.7 * x + rng.normal(size=1)
+        y.append(x + 0.1 * rng.normal(size=1))
+    model = Model(decaying(0.98), (Sensor(lambda x, aux: x, 0.1 * np.ones(1), 1),))
+    bank = adaptive((1.0, 8.0), motions=decaying, alternatives=rates)
+    found = run(bank, model, Belief.of(np.zeros(1), np.eye(1)), np.array(y))
+    last = np.asarray(found.steps.info["y"].notes[PROBABILITY])[-1]
+    assert last.shape == (6,)
+    assert last[2] > 0.9  # the second rate, the first scale
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="rise"):
+        adaptive((1.0, 1.0))
+    with pytest.raises(ValueError, match="rise"):
+        adaptive((0.0, 8.0))
+    with pytest.raises(ValueError, match="chance to stay"):
+        adaptive(back=0.6)
+    with pytest.raises(ValueError, match="both motions and alternatives"):
+        adaptive(alternatives=np.ones(2))
