@@ -17,6 +17,7 @@ import robins.logs
 from robins.logs import clean, examine, open_log
 from robins.logs.doctor import ALONE, OF_READERS, REFUSALS, TOGETHER
 from robins.logs.findings import SEVERITIES
+from robins.logs.librsf import read_librsf
 
 CHECKS = (*ALONE, *TOGETHER)
 
@@ -85,6 +86,11 @@ FILES = (
         f"{PATH}q_w,q_x,q_y,q_z\n"
         + "".join(f"{t},48,11,0,1,2,3,{7 if t == 1 else 0.8},0,0.6,0\n" for t in range(4)),
     ),
+    (
+        "other_kinds",
+        "note: lines of other kinds were left out: 1 of 'imu3'",
+        "point3 0 3785108 899901 5037234\nimu3 1 2 3\n",
+    ),
 )
 
 
@@ -139,7 +145,7 @@ def test_what_a_reader_leaves_out_is_found(tmp_path, code, says, content):
     path = tmp_path / "log.txt"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     found = []
-    open_log(path, findings=found)
+    (read_librsf if code == "other_kinds" else open_log)(path, findings=found)
     (f,) = found
     kind, _, words = says.partition(": ")
     assert (f.code, f"{f.severity} {f.where}".strip()) == (code, kind)
