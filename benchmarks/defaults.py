@@ -1,12 +1,12 @@
-"""The filter "adaptive" of every system against the best of those that were told.
+"""The default filter of every system against the best of those that were told.
 
     python benchmarks/defaults.py [SYSTEM/SCENARIO ...] [--runs 50] [--seeds 0] [--troubles]
-        [--out table.md]
+        [--keep scores.json] [--out table.md]
 
-Without a name, every simulated scenario whose study has a filter of that name. A row says the RMS
-error of what the scenario is about (attitude, or position), over epochs and runs that count, of the
-filter "adaptive" over that of the best other filter, and the NEES of that block for a component:
-one where the filter knows how wrong it is. Others are all that the scenario names itself, and
+Without a name, every simulated scenario. A row says the RMS error of what the scenario is about
+(attitude, or position), over epochs and runs that count, of the default filter over that of the
+best other filter, and the NEES of that block for a component: one where the filter knows how wrong
+it is. Others are all that the scenario names itself, and
 
     told       the model of "adaptive" as it stands, in one Kalman filter, with the scale of its
                process noise that turned out best on these very runs; of transfer alignment also
@@ -21,18 +21,28 @@ middle of the run on, here and not in robins.
     lost axis     one component of each record is missing
     soft, fast    a structure flexes by 20' in 6 s, or by 3' in 0.4 s (transfer alignment)
 
-It takes hours for all; nothing is fetched. A name, few runs and a small --chunk make it short.
+It takes hours for all; nothing is fetched. What is found is kept in a file, filter by filter, so
+that an interrupted table goes on where it was, and a filter that has changed is computed again
+where its lines are deleted there. A name, few runs and a small --chunk make it short.
 """
+
+# ruff: noqa: E402
 
 from __future__ import annotations
 
 import argparse
+import json
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from robins.cli.cache import enable
+
+enable()  # programs are kept between calls; before JAX is imported
 
 import jax
 import jax.numpy as jnp
@@ -52,8 +62,7 @@ from robins.systems.transfer_alignment.product.parameters import Believed
 from robins.systems.transfer_alignment.product.study import product_contender
 from robins.systems.transfer_alignment.velocity_attitude.study import of_product
 
-DEFAULT = "adaptive"
-ABOUT = {"airship": "position", "ins-gnss": "position"}  # else attitude
+ABOUT = {"airship": "position", "ins-gnss": "position", "gnss": "position"}  # else attitude
 SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 
 
@@ -204,14 +213,9 @@ def spoilt(problem: Problem, trouble: Callable[..., Case]) -> Problem:
 
 
 def every() -> Iterator[str]:
-    """Scenarios whose study has the filter."""
+    """All simulated scenarios."""
     for system in catalogue.summaries():
-        found = find_system(system)
-        for name, path in found.scenarios.items():
-            study = tomllib.loads(path.read_text()).get("study") or next(iter(found.studies), "")
-            has = study in found.studies and DEFAULT in found.studies[study].filters
-            if has and name not in ("replay", "walk"):
-                yield f"{system}/{name}"
+        yield from (f"{system}/{name}" for name in catalogue.listed(system))
 
 
 def problem_of(where: str, seed: int, changes: tuple[str, ...] = ()) -> Problem:
@@ -221,48 +225,69 @@ def problem_of(where: str, seed: int, changes: tuple[str, ...] = ()) -> Problem:
     text = found.scenarios[name].read_text()
     study = found.studies[tomllib.loads(text).get("study") or next(iter(found.studies))]
     given = scenario.parse(study.parameters, text, list(changes), source=name)
-    names = tuple(dict.fromkeys([*given.filters, *_kin(system), DEFAULT]))
+    kin = [name for name in KIN if name in study.filters]
+    names = tuple(dict.fromkeys([*given.filters, *kin, found.default]))
     problem = study.problem(given, names, seed)
     more = {}
-    if system != "satellite":  # whose filters in the loop are told by their names
-        aligns = system == "transfer-alignment"
-        base = told_structure(given) if aligns else problem.contenders[DEFAULT]
+    if system not in ("satellite", "gnss"):  # whose filters are told by their names
+        aligns = "product" in study.filters and system == "transfer-alignment"
+        base = told_structure(given) if aligns else problem.contenders[found.default]
         more = {f"told, noise times {s:g}": told(base, s) for s in SCALES}
     return replace(problem, contenders={**problem.contenders, **more})
 
 
-def _kin(system: str) -> tuple[str, ...]:
-    return ("product",) if system == "transfer-alignment" else ()
+KIN = ("product", "kf-flexure")  # told filters that not every scenario of their study names
 
 
-def scores(problem: Problem, block: str, runs: int, chunk: int) -> dict[str, Score]:
-    """Of every filter, on the same worlds."""
+class Kept:
+    """Scores in a JSON file, by what they are of."""
+
+    def __init__(self, path: Path | None) -> None:
+        self.path, self.scores = path, {}
+        if path is not None and path.is_file():
+            self.scores = {k: Score(*v) for k, v in json.loads(path.read_text()).items()}
+
+    def get(self, key: str, compute: Callable[[], Score]) -> Score:
+        """A score, computed where it is not known yet."""
+        if key not in self.scores:
+            self.scores[key] = compute()
+            if self.path is not None:
+                lines = json.dumps(self.scores, indent=0, sort_keys=True)
+                part = self.path.with_suffix(".part")
+                part.write_text(lines, encoding="utf-8")
+                part.replace(self.path)
+        return self.scores[key]
+
+
+def score(problem: Problem, name: str, block: str, batches: list[tuple[Any, int]]) -> Score:
+    """Of one filter on worlds that all filters share."""
     where = next(b for b in problem.blocks if b.name == block)
     at = slice(problem.count_from, problem.count_to)
-    square: dict[str, list[float]] = {}
-    nees: dict[str, list[float]] = {}
-    for batch, count in worlds(problem, runs, chunk):
-        for name in problem.contenders:
-            found = record(problem, name, batch, count)
-            error = found["error"][:, at, where.where]
-            square.setdefault(name, []).extend(np.mean(np.sum(error**2, axis=2), axis=1))
-            mean = np.mean(found["block_nees"][block][:, at], axis=1) / len(where.axes)
-            nees.setdefault(name, []).extend(mean)
-    return {
-        name: Score(
-            float(units.convert(np.sqrt(np.mean(square[name])), where.units, where.display_unit)),
-            float(np.mean(nees[name])),
-        )
-        for name in square
-    }
+    square: list[float] = []
+    nees: list[float] = []
+    for batch, count in batches:
+        found = record(problem, name, batch, count)
+        error = found["error"][:, at, where.where]
+        square.extend(np.mean(np.sum(error**2, axis=2), axis=1))
+        nees.extend(np.mean(found["block_nees"][block][:, at], axis=1) / len(where.axes))
+    rms = np.sqrt(np.mean(square))
+    return Score(float(units.convert(rms, where.units, where.display_unit)), float(np.mean(nees)))
 
 
-def row(where: str, trouble: str, problem: Problem, runs: int, chunk: int, seed: int) -> str:
+def row(where: str, trouble: str, problem: Problem, size: tuple[int, int], seed: int, kept: Kept):
     """A line of the table."""
-    block = ABOUT.get(where.split("/")[0], "attitude")
+    system, (runs, chunk) = where.split("/")[0], size
+    block, default = ABOUT.get(system, "attitude"), find_system(system).default
     unit = next(b.display_unit for b in problem.blocks if b.name == block)
-    found = scores(problem, block, runs, chunk)
-    ours = found.pop(DEFAULT)
+    batches = cache(lambda: list(worlds(problem, runs, chunk)))
+    found = {
+        name: kept.get(
+            f"{where} | {trouble} | seed {seed} | {runs} runs | {name}",
+            lambda name=name: score(problem, name, block, batches()),
+        )
+        for name in problem.contenders
+    }
+    ours = found.pop(default)
     best = min(found, key=lambda name: np.nan_to_num(found[name].error, nan=np.inf))
     over = ours.error / found[best].error
     cells = [where, trouble, str(seed), f"{ours.error:.3g} {unit}", best]
@@ -277,29 +302,32 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=25, help="runs at a time")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the random numbers")
     parser.add_argument("--troubles", action="store_true", help="what no scenario has")
+    parser.add_argument("--keep", type=Path, help="file of what is found, to go on from")
     parser.add_argument("--out", type=Path, help="file for the table")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)
-    head = "| scenario | trouble | seed | adaptive | best told | its error | ratio | NEES |"
+    kept = Kept(arguments.keep)
+    head = "| scenario | trouble | seed | default | best told | its error | ratio | NEES |"
     lines = [head, "|" + "---|" * 8]
     print("\n".join(lines), flush=True)
 
-    def say(*which: Any) -> None:
-        lines.append(row(*which))
+    size = arguments.runs, arguments.chunk
+
+    def say(where: str, trouble: str, problem: Problem, seed: int) -> None:
+        lines.append(row(where, trouble, problem, size, seed, kept))
         print(lines[-1], flush=True)
 
-    size = arguments.runs, arguments.chunk
     for seed in arguments.seeds:
         for where in arguments.scenarios or (TROUBLED if arguments.troubles else every()):
             problem = problem_of(where, seed)
             if not arguments.troubles:
-                say(where, "", problem, *size, seed)
+                say(where, "", problem, seed)
                 continue
             for name, trouble in TROUBLES.items():
-                say(where, name, spoilt(problem, trouble), *size, seed)
+                say(where, name, spoilt(problem, trouble), seed)
             if where.startswith("transfer-alignment"):
                 for name, changes in STRUCTURES.items():
-                    say(where, name, problem_of(where, seed, changes), *size, seed)
+                    say(where, name, problem_of(where, seed, changes), seed)
     if arguments.out is not None:
         arguments.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

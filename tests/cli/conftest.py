@@ -83,7 +83,7 @@ def systems(monkeypatch):
     """Two systems in the registry, and what the catalogue says of them."""
     claims = {"C1": Claim("it holds", (), len, None)}
     study = Study(Scenario, ("ekf", "ukf"), print, print, print, claims=claims)
-    car = System("car", {"drive": study}, replay=print)
+    car = System("car", {"drive": study}, default="ukf", replay=print)
     kite = System("kite", {"fly": study._replace(filters=("ekf",), claims={})})
     its = {"town": catalogue.Listed(Path("town.toml"), "A car in town", "")}
     its["road"] = catalogue.Listed(Path("road.toml"), "A car on the road", "")

@@ -257,9 +257,9 @@ def test_the_list_names_everything(robins, systems):
     scenarios, filters = ["car/town", "car/road"], ["ekf", "ukf"]
     claim = {"id": "C1", "text": "it holds"}
     car = {"name": "car", "summary": "a car", "scenarios": scenarios, "filters": filters}
-    car |= {"claims": [claim], "replays": True}
+    car |= {"default": "ukf", "claims": [claim], "replays": True}
     kite = {"name": "kite", "summary": "a kite", "scenarios": [], "filters": ["ekf"]}
-    kite |= {"claims": [], "replays": False}
+    kite |= {"default": None, "claims": [], "replays": False}
     assert json.loads(answer.out) == {
         "scenarios": scenarios,
         "systems": [car, kite],
@@ -284,7 +284,14 @@ def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, system
     assert "robins run car/town" in lines[-1]
     assert "C1" not in "\n".join(lines)
     car = robins("list", "car").out
-    for expected in ("car  a car", "A car in town", "ekf, ukf", "C1: it holds", "logs     yes"):
+    for expected in (
+        "car  a car",
+        "A car in town",
+        "ekf, ukf",
+        "C1: it holds",
+        "logs     yes",
+        "default  ukf",
+    ):
         assert expected in car
     assert "robins replay LOG --system kite" in robins("list", "kite").out
     refused = robins("list", "boat")

@@ -31,6 +31,7 @@ from robins.systems import SYSTEMS
 from robins.systems.catalogue import configurations
 from robins.systems.ins_gnss import Drive, drive_dataset
 from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.workbench.scenarios import unasked
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -96,6 +97,17 @@ def filters_of(name):
 
 def test_every_study_is_in_the_table():
     assert set(STUDIES) == {study for s in SYSTEMS.values() for study in s.studies} == set(WHOLE)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_has_a_default_that_runs_beside_what_a_scenario_names(name):
+    system = SYSTEMS[name]
+    assert system.default in system.filters
+    for one in (one for one in PACKAGED if one.startswith(f"{name}/")):
+        _, study, _ = study_of(one)
+        given = scenario.parse(study.parameters, system.scenarios[one.split("/")[1]].read_text())
+        default = {system.default} & set(study.filters)
+        assert set(unasked(system, study, given)) == {*(given.filters or study.filters), *default}
 
 
 def test_a_configuration_of_what_is_recorded_is_not_simulated(robins):

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from robins.filters import Belief, Model, Motion, Sensor, adaptive, kalman, run
-from robins.filters.composite.adaptive import Part, changes, excited, lasting
+from robins.filters.composite.adaptive import changes, excited, lasting
 from robins.filters.linearise import Transition
 from robins.filters.rules import huber
 
@@ -39,8 +39,6 @@ def dense(y, scales, up, back):
             begun.append((a, sum(w[i] * spread[i] for i in range(count))))
         for j, (a, A) in enumerate(begun):
             Q = scales[j] ** 2 * G @ G.T
-            if j > 0:
-                Q = Q + np.diag([0.0, 0.0, scales[j] ** 2 * back * P0[2, 2]])
             a, A = F @ a, F @ A @ F.T + Q
             S = H @ A @ H.T + 1.0
             likelihood[j] = multivariate_normal(cov=S).pdf(row - H @ a)
@@ -65,7 +63,7 @@ def track(rng, steps=60):
 def test_it_is_the_dense_recursion():
     scales, up, back = (1.0, 5.0, 40.0), 0.02, 0.1
     y = track(np.random.default_rng(3))
-    found = run(adaptive(scales, 1.0, up, back, parts=[Part(constants=[2])]), MODEL, START, y)
+    found = run(adaptive(scales, 1.0, up, back), MODEL, START, y)
     mean, covariance, mu = dense(y, scales, up, back)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8, atol=1e-10)
@@ -111,16 +109,12 @@ def test_it_follows_what_lasts_and_ignores_what_does_not():
     assert np.max(error["huber"][26:]) > 4.0 * np.max(error["bank"][26:])
 
 
-def test_a_part_has_its_own_noise_and_its_own_constants():
+def test_a_part_has_its_own_noise():
     rng = np.random.default_rng(8)
     N, none = rng.normal(size=(4, 2)), np.zeros((4, 0))
     t = Transition(jnp.zeros(4), jnp.eye(4), jnp.asarray(none), jnp.asarray(N))
-    rule = excited([Part([0], [2]), Part([1], [3])], np.array([5.0, 1.0]), np.array([0.3, 0.0]))
-    first = rule.init(Belief.of(jnp.zeros(4), np.diag([1.0, 1.0, 4.0, 9.0])), {"y": 1})
-    _, found = rule.process(first, t)
-    grown = np.diag([5.0, 1.0, 1.0, 1.0]) @ N
-    expected = grown @ grown.T + np.diag([0.0, 0.0, (0.3 * 2.0) ** 2, 0.0])
-    np.testing.assert_allclose(found.noise @ found.noise.T, expected, rtol=1e-12, atol=1e-14)
+    _, found = excited([[0], slice(1, 3)], np.array([5.0, 2.0])).process((), t)
+    np.testing.assert_allclose(found.noise, np.diag([5.0, 2.0, 2.0, 1.0]) @ N, rtol=1e-15)
 
 
 def test_of_alternatives_the_right_one_is_found():

@@ -43,6 +43,7 @@ def _details(system: Mapping[str, Any], summary: str, titles: Mapping[str, str])
         [
             f"{_section(system['name'], summary, titles)}\n",
             f"filters  {', '.join(system['filters'])}",
+            f"default  {system['default'] or 'none'}",
             f"logs     {'yes, with `robins replay`' if system['replays'] else 'no'}",
             *(f"claim    {claim['id']}: {claim['text']}" for claim in system["claims"]),
             f"\nNext:   robins {next_}",

@@ -268,6 +268,8 @@ class System(NamedTuple):
 
     name: str  # as in the catalogue, which knows its summary and its scenarios
     studies: Mapping[str, Study]
+    # the filter to use where nothing is known of what may go wrong; a run has it beside its own
+    default: str = ""
     replay_filters: tuple[str, ...] = ()
     replay_parameters: type[Parameters] | None = None
     replay_default: Path | None = None  # configuration of a log that comes without one

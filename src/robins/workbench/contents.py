@@ -48,6 +48,7 @@ def _told(name: str) -> dict[str, Any]:
         "summary": catalogue.summaries().get(name, ""),
         "scenarios": [name] if catalogue.is_file(name) else list(titles(name)),
         "filters": list(system.filters),
+        "default": system.default or None,
         "claims": [{"id": claim["id"], "text": claim["text"]} for claim in system.claims],
         "replays": system.replay is not None,
     }

@@ -91,6 +91,14 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
     return tuple(dict.fromkeys(wanted))
 
 
+def unasked(system: System, study: Study, parameters: Any) -> tuple[str, ...]:
+    """The filters that run where none is named: the scenario's, and the default of the system."""
+    return (
+        *(parameters.filters or study.filters),
+        *(name for name in (system.default,) if name in study.filters),
+    )
+
+
 def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:
     """Fields of an outcome: the scenario as it was run, and what ran it."""
     effective = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))

@@ -6,16 +6,16 @@ takes it for the second, and follows outliers. The bank (`robins.filters.composi
 each mode weighs its records by Huber's rule (`robins.filters.rules.huber`) and believes in another
 scale of the process noise,
 
-    Q_s = s^2 Q + s^2 back C,     s of the scales,  C = diag of the initial variance of constants
+    Q_s = s^2 Q,     s of the scales
 
 so a motion that is wrong for long makes a mode of more noise likely, and a bad record, which is
 gone at the next step, does not. There is no gate: nothing is refused, so nothing is locked out.
 
-States that the model holds for constant (biases, misalignments) have no noise of their own to be
-scaled. A mode lasts 1 / back steps once it has begun, and over these lets a constant wander by s
-times the sigma that it began with. The first scale is that of the model as it is: constants stay.
+States that the model holds for constant (biases, misalignments) stay constant in every mode: a
+bias that may wander explains what was something else, and what the quiet mode has learnt of it is
+lost when the modes are mixed.
 
-Where several instruments drive the motion, one goes wrong at a time. So a mode scales one `Part` of
+Where several instruments drive the motion, one goes wrong at a time. So a mode scales one part of
 the noise, and the part that is sound still tells the error of the other: a gyro that drifts must
 not make an accelerometer doubtful by which the tilt is known.
 """
@@ -23,15 +23,14 @@ not make an accelerometer doubtful by which the tilt is known.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from robins.errors import require
-from robins.filters.belief import Belief
 from robins.filters.composite.imm import Family, Mode, imm
 from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
@@ -40,49 +39,33 @@ from robins.filters.rule import Rule
 from robins.filters.rules import huber
 
 SCALES = (1.0, 8.0, 64.0)
-UP, BACK = 1e-4, 1e-2
+UP, BACK = 1e-5, 1e-2
 OTHER = 1e-5  # that an alternative gives way to another in a step
 
 
-class Part(NamedTuple):
-    """What goes wrong together, such as all that one instrument drives.
+Part = Sequence[int] | slice
+"""Tangent components whose process noise goes wrong together, such as all that one instrument
+drives."""
 
-    Attributes:
-        moves: tangent components whose process noise is scaled; None: all.
-        constants: tangent components that the model holds for constant.
-    """
-
-    moves: Sequence[int] | None = None
-    constants: Sequence[int] = ()
+ALL = slice(None)
 
 
-def excited(parts: Sequence[Part], scales: ArrayLike, wanders: ArrayLike) -> Rule:
-    """Process noise of another scale, part by part; constants wander.
+def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
+    """Process noise of another scale, part by part.
 
     Args:
         parts: of the process noise.
         scales: (parts,) of the standard deviations of the noise.
-        wanders: (parts,) standard deviation of what is added to each constant in a step, over its
-            initial sigma.
     """
-    of = np.array([i for i, part in enumerate(parts) for _ in part.constants], int)
-    which = np.array([c for part in parts for c in part.constants], int)
 
-    def init(belief: Belief, dims: Any) -> Array:
-        return jnp.sqrt(jnp.sum(belief.factor[which] ** 2, axis=1))
-
-    def process(first: Array, t: Transition):
+    def process(memory: Any, t: Transition):
         noise = t.noise
         for i, part in enumerate(parts):
-            rows = slice(None) if part.moves is None else np.asarray(part.moves, int)
+            rows = part if isinstance(part, slice) else np.asarray(part, int)
             noise = noise.at[rows].multiply(jnp.asarray(scales)[i])
-        if len(which):
-            columns = jnp.zeros((len(noise), len(which)))
-            columns = columns.at[which, np.arange(len(which))].set(jnp.asarray(wanders)[of] * first)
-            noise = jnp.concatenate([noise, columns], axis=1)
-        return first, t._replace(noise=noise)
+        return memory, t._replace(noise=noise)
 
-    return Rule(init=init, process=process, name="excited")
+    return Rule(process=process, name="excited")
 
 
 def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
@@ -116,7 +99,7 @@ def adaptive(
     robust: float = 0.99,
     up: float = UP,
     back: float = BACK,
-    parts: Sequence[Part] = (Part(),),
+    parts: Sequence[Part] = (ALL,),
     motions: Callable[[Any], Motion] | None = None,
     alternatives: Any = None,
     linearise: Linearisation | None = None,
@@ -153,22 +136,20 @@ def adaptive(
     own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
     gains = s[0] * np.ones((1 + len(louder), len(parts)))
     gains[1:] = np.where(own > 0.0, louder[:, None], gains[1:])
-    wanders = np.zeros_like(gains)
-    wanders[1:] = np.sqrt(back) * own * louder[:, None]
     by = taylor() if linearise is None else linearise
 
     def one(row: Any) -> Filter | Mode:
-        gain, wander, *other = row
-        made = kalman(by, (excited(parts, gain, wander), huber(robust)), form)
+        gain, *other = row
+        made = kalman(by, (excited(parts, gain), huber(robust)), form)
         return made if motions is None else Mode(made, motions(other[0]))
 
     change = changes([s[0], *louder], up, back)
     start, modes = lasting(change), len(change)
     if motions is None:
-        return imm(Family(one, (gains, wanders)), change, start)
+        return imm(Family(one, (gains,)), change, start)
     (count,) = {np.shape(x)[0] for x in jax.tree_util.tree_leaves(alternatives)}
     here = np.repeat(np.arange(count), modes)
     rows = jax.tree_util.tree_map(lambda x: np.asarray(x)[here], alternatives)
     between = np.full((count, count), OTHER) + np.diag(np.full(count, 1.0 - count * OTHER))
-    numbers = (np.tile(gains, (count, 1)), np.tile(wanders, (count, 1)), rows)
+    numbers = (np.tile(gains, (count, 1)), rows)
     return imm(Family(one, numbers), np.kron(between, change), np.tile(start, count) / count)

@@ -7,6 +7,6 @@ a product model with states for the biases and for the error of the wind.
 from robins.systems.airship.study import NAVIGATION
 from robins.systems.study import System
 
-SYSTEM = System(name="airship", studies={"navigation": NAVIGATION})
+SYSTEM = System(name="airship", studies={"navigation": NAVIGATION}, default="adaptive")
 
 __all__ = ["SYSTEM"]

@@ -19,7 +19,6 @@ from jaxtyping import Array
 
 from robins import filters
 from robins.filters import Belief, Filter, Model, Rule, kalman, rules, taylor
-from robins.filters.composite.adaptive import Part
 from robins.manifold import retract
 from robins.systems.aboard import Taken, aboard, taken
 from robins.systems.airship import instruments
@@ -39,9 +38,7 @@ from robins.systems.study import Case, Contender, Instrument, Norm, StateBlock, 
 LEVEL = np.diag([1e12] * 3 + [1.0] * 6)
 
 COMMON = 9  # states that all local filters have
-# What each of them drives, and their biases, of filters that have states for these
-GYROS = Part(range(0, 3), range(9, 12))
-ACCELEROMETERS = Part(range(3, 9), range(12, 15))
+GYROS, ACCELEROMETERS = range(0, 3), range(3, 9)  # what each of them drives
 BOTH = (WIND, WIND_OF_STAR)
 
 

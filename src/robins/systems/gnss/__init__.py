@@ -12,6 +12,7 @@ from robins.systems.study import System
 SYSTEM = System(
     name="gnss",
     studies={"city": CITY},
+    default="delays",
     replay_filters=NAMES,
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",

@@ -11,6 +11,7 @@ from robins.systems.study import System
 SYSTEM = System(
     name="marg",
     studies={},
+    default="marg",
     replay_filters=FILTERS,
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",

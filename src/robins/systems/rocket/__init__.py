@@ -11,6 +11,7 @@ from robins.systems.study import System
 SYSTEM = System(
     name="rocket",
     studies={"magnetic-attitude": MAGNETIC_ATTITUDE, "field-vector": FIELD_VECTOR},
+    default="adaptive",
 )
 
 __all__ = ["SYSTEM"]

@@ -250,4 +250,4 @@ STUDY = Study(
     view=view,
     claims=CLAIMS,
 )
-SYSTEM = System(name="satellite", studies={"attitude-loop": STUDY})
+SYSTEM = System(name="satellite", studies={"attitude-loop": STUDY}, default="adaptive")

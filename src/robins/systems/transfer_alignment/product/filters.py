@@ -33,7 +33,6 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from robins.filters import Family, Filter, Motion, adaptive, imm, kalman, taylor, unscented
-from robins.filters.composite.adaptive import Part
 from robins.filters.linearise import Transition
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -130,8 +129,7 @@ STRUCTURES = (
     _TEN_ARCMIN * np.array([_STIFF, 1.0, 1.0, 1.0]),
     np.array([_DECADES_S[0], *_DECADES_S]),
 )
-GYROS = Part(range(0, 3), range(9, 12))  # attitude, and the biases
-ACCELEROMETERS = Part(range(3, 9), range(12, 15))
+GYROS, ACCELEROMETERS = range(0, 3), range(3, 9)  # what each of them drives
 
 
 def blind(moving: Moving) -> Filter:
