@@ -63,7 +63,7 @@ def discriminator(
                            lambda = (tr V - m) / tr H P H'
 
     with r, H whitened by R^-1/2 as in `strong_tracking`. "Significantly" is by a factor that chance
-    alone exceeds in a whole run with the probability ``false_alarm`` at most: every one of the run's
+    alone exceeds in a whole run with the probability ``false_alarm`` at most: each of the run's
     ``looks`` may fail with false_alarm / looks (Bonferroni), and the factor is the quantile of such
     an average of squares (`chance_levels` in `robins.filters.rules._fading`). Neighbouring averages
     are nearly the same number, so with rho = 0.98 false alarms are three to four times rarer than
