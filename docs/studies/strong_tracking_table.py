@@ -26,7 +26,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
-from robins.filters.rules.discriminator import discriminator
+from robins.filters.rules.discriminator import PUBLISHED, discriminator
 from robins.filters.rules.huber import huber
 from robins.filters.rules.strong_tracking import strong_tracking
 
@@ -71,15 +71,23 @@ ROWS = [
     ),
     Row(
         "discriminator",
-        (discriminator(patience=30, fade="multiple"),),
+        (discriminator(patience=30, fade="multiple", threshold=PUBLISHED),),
         (0.164, 0.286, 0.228, 0.344),
         DECIDED,
         1.006,
     ),
     Row(
         "discriminator, projected",
-        (discriminator(patience=30),),
+        (discriminator(patience=30, threshold=PUBLISHED),),
         (None, None, None, None),
+        DECIDED,
+        None,
+    ),
+    Row("discriminator, default", (discriminator(),), (None,) * 4, DECIDED, None),
+    Row(
+        "discriminator, default, multiple",
+        (discriminator(fade="multiple"),),
+        (None,) * 4,
         DECIDED,
         None,
     ),

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_kalman import System, random_system, simulate
-from scipy import optimize, stats
+from scipy import optimize, signal, stats
 
 from robins.filters import Belief, Code, Model, Motion, Observation, Sensor, kalman, run, unscented
+from robins.filters.rules._fading import chance_levels
 from robins.filters.rules._robust import MOST, scale_to_quantile
-from robins.filters.rules.discriminator import Verdict, discriminator
+from robins.filters.rules.discriminator import PUBLISHED, Verdict, discriminator
 from robins.manifold import Angle
 
 T, PATIENCE, RHO = 60, 4, 0.9
@@ -31,7 +32,7 @@ Y = disturbed()
 # Rule and form, and what the recursion is told: probability, multiple, gated, sigmas, limit.
 KINDS = {
     "projected, Huber": (
-        discriminator(PATIENCE, 0.999, RHO, limit=20.0),
+        discriminator(PATIENCE, 0.999, RHO, threshold=PUBLISHED, limit=20.0),
         "sqrt",
         (0.999, False, False, 3.0, 20.0),
     ),
@@ -124,13 +125,50 @@ def test_is_its_recursion(name):
 
 
 def test_clean_data_is_left_alone():
-    # 0.1 % of right measurements are taken for outliers, and V exceeds three deviations rarely.
+    # 0.1 % of right measurements are taken for outliers, and V exceeds no level by chance.
     y = simulate(SYSTEM, 8, 4000)[1]
     strict = kalman(rules=[discriminator(30)])
     notes = run(strict, MODEL, START, y).steps.info["y"].notes
     outliers = np.mean(np.asarray(notes["discriminator.state"]) == Verdict.OUTLIER)
     assert abs(outliers - 0.001) < 4 * np.sqrt(0.001 / 4000)
-    assert np.mean(np.asarray(notes["discriminator.lambda"])) < 1.02
+    assert np.all(np.asarray(notes["discriminator.lambda"]) == 1.0)
+
+
+@pytest.mark.parametrize(("rho", "least"), [(0.9, 0.4), (0.98, 0.1)])
+@pytest.mark.parametrize("m", [1, 3])
+def test_levels_are_exceeded_in_a_run_no_more_often_than_stated(rho, least, m):
+    rng, runs, steps, stated = np.random.default_rng(6), 4000, 600, 0.2
+    squares = rng.chisquare(m, size=(runs, steps))
+    average, _ = signal.lfilter([1 - rho], [1, -rho], squares, zi=np.full((runs, 1), rho * m))
+    level = chance_levels(rho, m, stated / steps)[m]
+    share = np.mean(np.max(average, axis=1) > level * m)
+    assert least * stated < share < stated
+    # At one time alone it is the tail that it should be, of which the runs are independent.
+    level = chance_levels(rho, m, 0.002)[m]
+    share = np.mean(average[:, 299::300] > level * m)
+    assert abs(share - 0.002) < 4 * np.sqrt(0.002 / (2 * runs))
+
+
+def test_a_right_model_is_doubted_no_more_often_in_a_run_than_stated():
+    runs, steps, stated = 200, 600, 0.5
+    model = Model(
+        Motion(lambda x, u: x, jnp.array([0.05])),
+        (Sensor(lambda x, aux: x, jnp.array([1.0]), 1),),
+    )
+    rng = np.random.default_rng(9)
+    x = np.cumsum(0.05 * rng.normal(size=(runs, steps)), axis=1)
+    y = jnp.asarray((x + rng.normal(size=(runs, steps)))[..., None])
+
+    def doubted(**given):
+        one = kalman(rules=[discriminator(probability=1, **given)])
+        start = Belief.of(jnp.zeros(1), np.array([[1e-4]]))
+        notes = jax.jit(jax.vmap(lambda z: run(one, model, start, z).steps.info["y"].notes))(y)
+        factor = np.asarray(notes["discriminator.lambda"])
+        return np.mean(np.any(factor > 1.0, axis=1))
+
+    assert 0.1 * stated < doubted(rho=0.9, false_alarm=stated, looks=steps) < stated
+    assert doubted(rho=0.9, false_alarm=stated, looks=100 * steps) < 0.1 * stated
+    assert doubted(rho=0.9, threshold=PUBLISHED) > stated
 
 
 def test_each_sensor_has_a_counter_of_its_own_and_angles_wrap():

@@ -28,7 +28,8 @@ from two_sensors import (
 from robins import linalg
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run
 from robins.filters.composite.channels import channel
-from robins.filters.composite.federated import federated
+from robins.filters.composite.federated import FLOOR, federated
+from robins.filters.rules import huber
 
 VECTOR = np.array([[0.8, 0.3, 0.5, 0.1], [0.2, 0.7, 0.5, 0.9]])
 
@@ -42,6 +43,7 @@ EXACT = {
     ),
     "root, by the diagonals": federated(CHANNELS, shares="diagonal"),
     "zero-reset": federated(CHANNELS, mode="zero-reset"),
+    "root, shared anew after a time-out": federated(CHANNELS, shares=VECTOR, timeout=5),
 }
 
 
@@ -170,3 +172,71 @@ def test_modes_are_what_the_papers_say(mode):
     np.testing.assert_allclose(got[1], covariances, rtol=1e-8, atol=1e-9)
     central = centralised(SYSTEMS[0], Y[0, :40])[1]
     assert np.max(np.abs(got[1] - central)) > 1e-3  # none of these is the centralised filter
+
+
+# ------------------------------------------------------------------------------------- time-outs
+
+ROBUST = channel("a", kalman(rules=[huber(0.9)]))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"sharing": "scalar", "shares": [0.3, 0.7]}, {"shares": VECTOR}, {"shares": "diagonal"}],
+    ids=["scalar", "root", "diagonal"],
+)
+def test_a_silent_filter_hands_its_share_to_the_others(given):
+    """What is left is the federated filter of the others, with a master that holds the floor."""
+    s, y = SYSTEMS[0], {"a": Y[0, :12, :2] * 1.5, "b": np.full((12, 1), np.nan)}
+    motion = Motion(Partial(times, jnp.array(s.F)), s.G)
+    rows = {name: jnp.array(s.H[r]) for name, r in ROWS.items()}
+    sensors = [
+        Sensor(Partial(times, rows[k]), jnp.array(s.W[r, r]), r.stop - r.start, k)
+        for k, r in ROWS.items()
+    ]
+    both, alone = Model(motion, tuple(sensors)), Model(motion, (sensors[0],))
+    one = federated([ROBUST, channel("b")], **given, timeout=2)
+    got = run(one, both, s.start(), y)
+    start = run(one, both, s.start(), {k: v[:2] for k, v in y.items()}).final.belief
+    held = FLOOR / (1.0 + FLOOR)
+    late = given.get("sharing") != "scalar"
+    rest = federated([ROBUST], "fusion-reset", "scalar", [1.0 - held], held, after_prediction=late)
+    want = run(rest, alone, start, {"a": y["a"][2:]})
+    np.testing.assert_allclose(got.mean[2:], want.mean, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(got.covariance[2:], want.covariance, rtol=1e-10, atol=1e-10)
+    assert np.any(np.asarray(want.steps.info["a"].notes["huber.weight"]) < 0.9)
+    never = run(federated([ROBUST, channel("b")], **given), both, s.start(), y)
+    np.testing.assert_array_equal(never.mean[:2], got.mean[:2])
+    assert np.max(np.abs(never.mean - got.mean)) > 1e-3  # Huber judges by another covariance
+
+
+def test_a_share_comes_back_with_the_next_measurement_and_stays_where_all_are_silent():
+    y = {k: np.nan_to_num(Y[0, :11, r]) for k, r in ROWS.items()}
+    y["b"][2:6] = np.nan
+    y["a"][7:] = y["b"][7:] = np.nan
+    s = SYSTEMS[0]
+    model = Model(
+        Motion(Partial(times, jnp.array(s.F)), s.G),
+        tuple(
+            Sensor(Partial(times, jnp.array(s.H[r])), jnp.array(s.W[r, r]), r.stop - r.start, k)
+            for k, r in ROWS.items()
+        ),
+    )
+    one = federated(CHANNELS, sharing="scalar", shares=[0.3, 0.5], master=0.2, timeout=2)
+    got = run(one, model, s.start(), y)
+    share = np.asarray(got.steps.info["a"].notes["federated.share"])
+    left = 0.8 / (1.0 + FLOOR)
+    # Silent for two steps before the step that shares anew; heard again in step 6, shared in 7.
+    np.testing.assert_allclose(share, [0.3] * 4 + [left] * 3 + [0.3] * 4, rtol=1e-12)
+    assert float(got.final.memory.shares[2, 0]) == 0.2
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"mode": "no-reset", "timeout": 3}, "does not share anew"),
+        ({"timeout": 0}, "at least one step"),
+    ],
+)
+def test_a_timeout_that_makes_no_sense_is_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        federated(CHANNELS, **given)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy import integrate
 
 from robins import scenario
 from robins.campaign.statistics import Statistics
@@ -20,6 +21,7 @@ from robins.filters import Code, run
 from robins.systems import transfer_alignment
 from robins.systems.judgement import judging
 from robins.systems.tables import Update
+from robins.systems.transfer_alignment.product.world import _slave_errors
 from robins.systems.transfer_alignment.velocity_attitude import model as va
 from robins.systems.transfer_alignment.velocity_attitude import study
 from robins.systems.transfer_alignment.velocity_attitude.study import CLAIMS, STUDY, lay_out
@@ -280,3 +282,89 @@ def test_claims_are_judged_by_ratios_of_the_same_runs():
     del metrics["kf"]
     assert [c["id"] for c in judging(CLAIMS, ids)(metrics)] == ["beats-fixed", "compensation"]
     assert judging(CLAIMS, ())(metrics) == []
+
+
+# ----------------------------------------------------------- what compensation leaves of errors
+
+COMPENSATED = (
+    'slave.gyro_slow=["3 deg/h", "6 deg/h", "9 deg/h"]',
+    'slave.gyro_slow_time=["5 s", "10 s", "60 s"]',
+    'slave.gyro_calibration="2 deg/h"',
+    'slave.accel_calibration="0.1 mg"',
+)
+DEG_H = np.deg2rad(1.0) / 3600.0
+
+
+def test_compensated_errors_have_the_moments_of_their_parts():
+    """Constant + slow + fast - calibrated, (6) and (7), by integrals of their autocovariances."""
+    short = (
+        'manoeuvre.legs=[{bank="0 deg", seconds="40 s"}]',
+        'settle="0 s"',
+        'slave.rate="10 Hz"',
+    )
+    given = parsed("a", *short, *COMPENSATED)
+    course, runs, T = lay_out(given).pair, 3000, 40.0
+    keys = jax.random.split(jax.random.key(5), runs)
+    draw = jax.jit(jax.vmap(lambda key: _slave_errors(given, course, key)))
+    theta, dv, drift, bias = (np.asarray(a) for a in draw(keys))
+    sigma, tau = np.array([3.0, 6.0, 9.0]) * DEG_H, np.array([5.0, 10.0, 60.0])
+    left, white = 2.0 * DEG_H, np.deg2rad(0.05) / 60.0
+    near = 4.0 * math.sqrt(2.0 / runs)  # four sigma of a variance
+
+    def slow(axis, lag):
+        return sigma[axis] ** 2 * math.exp(-abs(lag) / tau[axis])
+
+    for axis in range(3):
+        seen = np.mean(theta[:, :, axis].sum(1) ** 2) / T**2
+        mean = integrate.quad(lambda s, i=axis: 2.0 * (T - s) * slow(i, s) / T**2, 0.0, T)[0]
+        assert_allclose(seen, left**2 + mean + white**2 / T, rtol=near)
+        for lag_s in (0.0, 8.0):
+            ends = drift[:, 99, axis] * drift[:, 99 + round(10 * lag_s), axis]
+            total = left**2 + slow(axis, 0.0)
+            assert_allclose(np.mean(ends), left**2 + slow(axis, lag_s), atol=near * total)
+    g = 9.80665e-3  # m/s^2 a mg
+    assert_allclose(np.std(bias[:, 0], axis=0), 0.1 * g, rtol=near)
+    assert np.ptp(bias, axis=1).max() < 1e-15  # (7) has no slow part
+    fast = 50e-6 * 9.80665
+    seen = np.mean(dv.sum(1) ** 2, axis=0) / T**2
+    assert_allclose(seen, (0.1 * g) ** 2 + fast**2 / T, rtol=near)
+
+
+def test_filters_are_told_of_what_compensation_leaves():
+    given = parsed("a", *COMPENSATED)
+    sigma = study.start_sigma(given)
+    # right, forward, up of what is forward, right, down
+    slow, tau = np.array([6.0, 3.0, 9.0]) * DEG_H, np.array([10.0, 5.0, 60.0])
+    assert_allclose(sigma[va.EPS], np.sqrt(slow**2 + (2.0 * DEG_H) ** 2))
+    assert_allclose(sigma[va.NABLA], 9.80665e-4)
+    plain, _, q, _ = (study.believed_noise(given, n, np.arange(1, 1201) * 0.1) for n in study.TOLD)
+    walk = slow * np.sqrt(2.0 * 0.1 / tau)
+    assert_allclose(plain.process[7, va.EPS], walk)
+    assert_allclose(q.process[:500, va.EPS], np.tile(walk, (500, 1)))
+    assert np.all(q.process[500:, va.EPS] > walk)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_slow_drift_that_is_told_leaves_the_kalman_filter_consistent(told):
+    """Its own sigma against 100 runs, where errors are small enough for the linear model."""
+    small = (
+        'start.attitude=["0.05 deg", "0.05 deg", "0.1 deg"]',
+        'slave.accel_bias=["1 mg", "1 mg", "0 mg"]',
+        'slave.gyro_slow="20 deg/h"',
+        'slave.gyro_slow_time="40 s"',
+    )
+    given = parsed("a", *small)
+    course = lay_out(given)
+    world = jax.jit(jax.vmap(lambda i: study.simulate(given, course, 0, i)))(jnp.arange(RUNS))
+    if not told:  # eps' = 0, as the patent's equation stands
+        slave = given.slave.model_copy(update={"gyro_slow_time": (1e12,) * 3})
+        given = given.model_copy(update={"slave": slave})
+    error, sigma, _ = errors_of(study.contender(given, course, "kf"), world)
+    late = slice(COUNT_FROM, None)
+    ratio = np.sqrt(np.mean(error[:, late] ** 2, (0, 1)) / np.mean(sigma[:, late] ** 2, (0, 1)))
+    if told:
+        assert np.all((ratio[:3] >= 0.9) & (ratio[:3] <= 1.1)), ratio
+        assert np.all((ratio[5:8] >= 0.85) & (ratio[5:8] <= 1.15)), ratio
+    else:
+        assert np.all(ratio[:3] > 1.5), ratio
+        assert np.all(ratio[5:8] > 1.5), ratio

@@ -14,7 +14,9 @@ that what they know is the whole when it is added up (Carlson 1990):
 
 A local filter that measures nothing stays in the fusion: it holds a share of what was known, and to
 leave it out would multiply P by 1 / (1 - b_i). With linear models fusion-reset with scalar or root
-sharing, and zero-reset, *are* the centralised filter.
+sharing, and zero-reset, *are* the centralised filter. With a ``timeout`` one that has been silent
+for so long, since it is not measured or refuses what is, hands its share over at the next reset:
+the others get it in proportion to theirs, and it keeps the `FLOOR`, until it measures again.
 
 A share a_ij in (0, 1) is what local filter i gets of the information about state j (or about all of
 them, b_i). Four ways to choose them (Zhao, Li & Wang 2016; Xiong et al. 2013):
@@ -158,6 +160,7 @@ def federated(
     keep: Number = 0.5,
     after_prediction: bool | None = None,
     linearise: Linearisation | None = None,
+    timeout: int | None = None,
 ) -> Filter:
     """A federated Kalman filter (Carlson 1990); runs, streams and batches as any `Filter`.
 
@@ -187,11 +190,14 @@ def federated(
             only so, and False else.
         linearise: how the fused belief and the master's are predicted; `taylor()` by default. Give
             that of the local filters.
+        timeout: fusion-reset: steps without a measurement that it used after which the share of a
+            local filter goes to the others, until it uses one again; None never. With linear models
+            it changes nothing that is fused but where local filters have rules.
 
     Raises:
         ValueError: a sensor in two channels, an unknown mode, sharing or kind of shares, shares
-            that are negative, not finite or do not sum to one, a master that the mode has not; at
-            `init`, a sensor without a channel.
+            that are negative, not finite or do not sum to one, a master or a timeout that the mode
+            has not; at `init`, a sensor without a channel.
     """
     channels = tuple(channels)
     _channels.owners(channels)
@@ -204,6 +210,9 @@ def federated(
         raise ValueError("scalar sharing takes one share a channel: use 'root' for one a state")
     if after_prediction and mode != "fusion-reset":
         raise ValueError(f"sharing after the prediction is of mode 'fusion-reset', not {mode!r}")
+    if timeout is not None:
+        require(mode == "fusion-reset", f"mode {mode!r} does not share anew: it has no timeout")
+        require(timeout >= 1, "federated timeout must be at least one step", timeout)
     if sharing == "half":
         warnings.warn(HALF, UserWarning, stacklevel=2)
 
@@ -241,12 +250,21 @@ def federated(
         return jnp.concatenate([(1.0 - master) * a, own])
 
     def next_shares(state: FilterState) -> Array:
+        a = chosen_shares(state)
+        if timeout is None:
+            return a
+        # The master's share is its own; where all are silent there is nobody to hand over to.
+        heard = (state.memory.silent < timeout)[:, None]
+        left = floored(jnp.where(heard, a[:count], 0.0)) * jnp.sum(a[:count], axis=0, keepdims=True)
+        return jnp.where(jnp.any(heard), a.at[:count].set(left), a)
+
+    def chosen_shares(state: FilterState) -> Array:
         locals_ = [m.belief for m in state.memory.members[:count]]
         if kind == "trace":
             return with_master(trace_shares(locals_, state.belief.sigma))
         if kind == "diagonal":
             return with_master(diagonal_shares(locals_))
-        return state.memory.shares
+        return initial_shares(state.belief)
 
     def parted(belief: Belief, a: Array) -> list[Belief]:
         return [Belief(belief.mean, factor) for factor in part(belief.factor, a, sharing)]

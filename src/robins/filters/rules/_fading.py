@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
+from scipy.special import chdtri
 
 from robins import linalg
 from robins.errors import require
@@ -90,7 +91,30 @@ def significant(power: Array, white: White, keep: Number, sigmas: Number) -> Arr
     """
     dof = jnp.maximum(white.dof, 1.0)
     deviation = math.sqrt(2.0 * (1.0 - keep) / (1.0 + keep)) / jnp.sqrt(dof)
-    return power > (1.0 + sigmas * deviation) * (white.predicted + white.dof)
+    return exceeds(power, white, 1.0 + sigmas * deviation)
+
+
+def exceeds(power: Array, white: White, level: Array) -> Array:
+    """Whether averaged squares exceed so many times what the filter expects."""
+    return power > level * (white.predicted + white.dof)
+
+
+def chance_levels(keep: float, most: int, probability: float) -> np.ndarray:
+    """(most + 1,) what the average of `significant` exceeds so rarely, of 0, 1, ..., most squares.
+
+    With weights w = (1 - keep) keep^i its cumulants are those of c_s = m sum w^s, s = 1, 2, 3. The
+    chi-square of h = c_2^3 / c_3^2 degrees that is shifted and scaled to the first two has the
+    third as well (Imhof, Biometrika 48, 1961, after Pearson 1959):
+
+        level = 1 + (chi2_h^-1(1 - probability) - h) sqrt(c_2 / h) / m
+    """
+    m = np.arange(1.0, most + 1.0)
+    if keep == 1.0:  # the average never moves
+        return np.ones(most + 1)
+    variance = (1.0 - keep) / (1.0 + keep)  # c_2 / m
+    h = m * variance**3 * (1.0 + keep + keep**2) ** 2 / (1.0 - keep) ** 4
+    levels = 1.0 + (chdtri(h, probability) - h) * np.sqrt(variance / (h * m))
+    return np.concatenate([[np.inf], levels])
 
 
 def total(power: Array, white: White) -> Array:

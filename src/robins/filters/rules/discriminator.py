@@ -21,6 +21,9 @@ from robins.filters.rules._robust import scale_to_quantile
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
 
+# Deviations of the specification; in nine of ten runs of 6000 measurements chance exceeds them.
+PUBLISHED = 3.0
+
 
 class Verdict(IntEnum):
     """What the discriminator takes a measurement for; noted as ``discriminator.state``."""
@@ -41,9 +44,12 @@ def discriminator(
     rho: Number = 0.98,
     fade: Fade = "projected",
     robust: Robust = "huber",
-    threshold: Number = 3.0,
+    threshold: Number | None = None,
     limit: Number = 1e3,
     weights: _fading.Weights = None,
+    *,
+    false_alarm: Number = 0.01,
+    looks: Number = 10_000,
 ) -> Rule:
     r"""Short excess is a fault of the sensor, lasting excess one of the model (a rule of robins).
 
@@ -56,7 +62,14 @@ def discriminator(
                            H P H' + R the model is wrong, and the prior is faded by
                            lambda = (tr V - m) / tr H P H'
 
-    with r, H whitened by R^-1/2 as in `strong_tracking`, and "significantly" as its "ewma" has it.
+    with r, H whitened by R^-1/2 as in `strong_tracking`. "Significantly" is by a factor that chance
+    alone exceeds in a whole run with the probability ``false_alarm`` at most: each of the run's
+    ``looks`` may fail with false_alarm / looks (Bonferroni), and the factor is the quantile of such
+    an average of squares (`chance_levels` in `robins.filters.rules._fading`). Neighbouring averages
+    are nearly the same number, so with rho = 0.98 false alarms are three to four times rarer than
+    stated; with rho = 0.9 they are as stated. With a ``threshold`` the factor is
+    1 + threshold sqrt(2 (1 - rho) / ((1 + rho) m)), as in `strong_tracking`.
+
     "projected" fades only what the channel sees, P + (lambda-1) P H' (H P H')^+ H P; "multiple"
     fades by weights a_j, Lam^1/2 P Lam^1/2 with Lam_j = max(1, a_j lambda).
 
@@ -77,9 +90,13 @@ def discriminator(
         fade: which part of the prior is faded. "multiple" adapts faster after a change, but where
             a sensor does not see all that has weight, the unseen grows without bound.
         robust: what is done to outliers. "gate" is safer where they last long.
-        threshold: standard deviations by which tr V must exceed what is expected.
+        threshold: standard deviations by which tr V must exceed what is expected, such as
+            `PUBLISHED`; None to have it follow from ``false_alarm`` and ``looks``.
         limit: upper bound of lambda, at least 1.
         weights: (n,) a_j >= 0 of the states for "multiple"; None is all alike, which fades all P.
+        false_alarm: probability, in (0, 1), that chance alone is taken for an error of the model at
+            some time of a run, for each sensor.
+        looks: measurements of a sensor in a run, at least 1.
 
     Raises:
         ValueError: an argument is out of its range; when the filter starts, if the weights are not
@@ -90,7 +107,10 @@ def discriminator(
     require(0.0 < rho <= 1.0, "discriminator rho must lie in (0, 1]", rho)
     one_of("discriminator fade", fade, Fade)
     one_of("discriminator robust", robust, Robust)
-    require(threshold >= 0.0, "discriminator threshold must not be negative", threshold)
+    positive = threshold is None or threshold >= 0.0
+    require(positive, "discriminator threshold must not be negative", threshold)
+    require(0.0 < false_alarm < 1.0, "discriminator false_alarm must lie in (0, 1)", false_alarm)
+    require(1.0 <= looks < math.inf, "discriminator looks must be at least 1 and finite", looks)
     require(1.0 <= limit < math.inf, "discriminator limit must be at least 1 and finite", limit)
     a = _fading.checked_weights("discriminator", weights, fade)
 
@@ -98,6 +118,12 @@ def discriminator(
         _fading.check_size("discriminator", a, belief)
         power = {name: jnp.ones(m) for name, m in dims.items()}
         return _Memory(power, {name: jnp.zeros((), int) for name in dims})
+
+    def significant(total: Array, white: _fading.White):
+        if threshold is not None:
+            return _fading.significant(total, white, rho, threshold)
+        levels = _fading.chance_levels(float(rho), len(white.residual), false_alarm / looks)
+        return _fading.exceeds(total, white, jnp.asarray(levels)[white.dof.astype(int)])
 
     def before(memory: _Memory, prior: Belief, o: Observation):
         seen = normalised(o)
@@ -110,8 +136,8 @@ def discriminator(
 
         white = _fading.whitened(o)
         power = jnp.where(outlier, power, _fading.averaged(power, white, rho))
-        lasting = ~outlier & _fading.significant(_fading.total(power, white), white, rho, threshold)
-        N = jnp.where(lasting, _fading.total(power, white) - white.dof, 0.0)
+        total = _fading.total(power, white)
+        N = jnp.where(~outlier & significant(total, white), total - white.dof, 0.0)
         S, factor = _fading.faded(prior.factor, white, N, fade, a, limit)
 
         if robust == "gate":

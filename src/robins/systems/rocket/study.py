@@ -24,6 +24,7 @@ from robins import filters
 from robins.filters import Belief, Filter, Model, Motion, Rule, Sensor, kalman
 from robins.filters.composite.fusion import Sharing
 from robins.filters.rules import discriminator, gate, huber, only, strong_tracking
+from robins.filters.rules.discriminator import PUBLISHED
 from robins.results import array
 from robins.rotation import Rotation
 from robins.systems.aboard import Taken, aboard, taken
@@ -76,12 +77,16 @@ def discriminator_of(sensor: str, given: MagneticAttitude) -> Rule:
     """Outliers told from model errors; faded are the states that the sensor reads."""
     rates = sensor == GYRO and given.gyro_reads == "rate"
     seen = RATES_SEEN if rates else ANGLES_SEEN
-    return only((sensor,), discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", weights=seen))
+    rule = discriminator(PATIENCE, PROBABILITY, 0.98, "multiple", threshold=PUBLISHED, weights=seen)
+    return only((sensor,), rule)
 
 
-def projected_discriminator(robust: Literal["huber", "gate"]) -> Rule:
-    """The same for one vector, that sees none of the states whole."""
-    return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust)
+def projected_discriminator(robust: Literal["huber", "gate"], looks: int) -> Rule:
+    """The same for one vector, that sees none of the states whole.
+
+    What is faded there by mistake is not found again, hence a threshold by the length of the run.
+    """
+    return discriminator(PATIENCE, PROBABILITY, 0.98, "projected", robust, looks=looks)
 
 
 def sensors_of(
@@ -219,24 +224,26 @@ def angle_contender(given: MagneticAttitude, course: Course, name: str) -> Conte
 class FieldFilter(NamedTuple):
     """A filter of "field-vector"."""
 
-    filter: Filter
+    filter: Filter = ukf()
     sensors: tuple[str, ...] = (FIELD,)  # or SNAPSHOT, the field taken at its word
     scaled: bool = False  # scale factors of the gyro are states
+    # outliers told from model errors, and what is done to outliers, in place of `filter`
+    discriminates: Literal["huber", "gate"] | None = None
 
 
 FIELD_FILTERS: dict[str, FieldFilter] = {
     "gyro": FieldFilter(kalman(filters.taylor()), ()),
     "magnetometer": FieldFilter(kalman(filters.taylor()), (SNAPSHOT,)),
-    "usque": FieldFilter(ukf()),
+    "usque": FieldFilter(),
     "huber": FieldFilter(ukf(huber(PROBABILITY))),
     "gate": FieldFilter(ukf(patient())),
-    "discriminator": FieldFilter(ukf(projected_discriminator("huber"))),
-    "discriminator-gate": FieldFilter(ukf(projected_discriminator("gate"))),
+    "discriminator": FieldFilter(discriminates="huber"),
+    "discriminator-gate": FieldFilter(discriminates="gate"),
     "adaptive": FieldFilter(bank()),
     "strong-tracking": FieldFilter(ukf(fading())),
     "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
     "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),
-    "usque-scale-factor": FieldFilter(ukf(), scaled=True),
+    "usque-scale-factor": FieldFilter(scaled=True),
 }
 
 
@@ -284,7 +291,10 @@ def field_contender(given: FieldVector, course: Course, name: str) -> Contender:
     _, of = sensors_of(given, course, chosen.sensors)
     numbers = field_sigma(given, chosen), jnp.asarray(course.field_n)
     case = recipe(field_case, chosen.scaled, of, numbers=numbers)
-    return Contender(chosen.filter, field_model(given, course, chosen), case)
+    filter_ = chosen.filter
+    if chosen.discriminates is not None:
+        filter_ = ukf(projected_discriminator(chosen.discriminates, len(course.time_s)))
+    return Contender(filter_, field_model(given, course, chosen), case)
 
 
 def _view(given: Flight, course: Course, **own: Any) -> View:

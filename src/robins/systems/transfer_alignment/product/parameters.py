@@ -97,13 +97,49 @@ class Vehicle(Departure):
 
 
 class Slave(Parameters):
-    """The inertial unit to be aligned; biases are constant in a run, drawn with these sigmas."""
+    """The inertial unit to be aligned; constants are drawn in each run, with these sigmas.
+
+    Its errors after compensation are, as a patent of Southeast University has them, (6) and (7),
+
+        eps   = eps_const + eps_slow + eps_fast - eps_calibrated        gyros
+        nabla = nabla_const + nabla_fast - nabla_calibrated             accelerometers
+
+    with fast for white noise and slow for a first-order Gauss-Markov process in its steady state. A
+    calibration finds the constant but for an error of the stated sigma, c = const + error, so that
+    const - c = -error is left of it; where none is stated nothing was calibrated, c = 0.
+    """
 
     rate: q.Frequency = default("50 Hz")
-    gyro_noise: q.AngleWalkSizes
+    gyro_noise: q.AngleWalkSizes  # fast
     accel_noise: q.AccelWalkSizes
-    gyro_bias: q.RateSizes
+    gyro_bias: q.RateSizes  # constant
     accel_bias: q.AccelSizes
+    gyro_slow: q.RateSizes = default("0 deg/h")
+    gyro_slow_time: q.Durations = default("300 s")  # correlation time of the slow part
+    gyro_calibration: q.RateSizes | None = None
+    accel_calibration: q.AccelSizes | None = None
+
+    @property
+    def gyro_left(self) -> np.ndarray:
+        """(3,) sigma of what is left of the constant drift [rad/s]."""
+        calibrated = self.gyro_calibration
+        return np.asarray(self.gyro_bias if calibrated is None else calibrated)
+
+    @property
+    def accel_left(self) -> np.ndarray:
+        """(3,) sigma of what is left of the constant bias [m/s^2]."""
+        calibrated = self.accel_calibration
+        return np.asarray(self.accel_bias if calibrated is None else calibrated)
+
+    @property
+    def gyro_sigma(self) -> np.ndarray:
+        """(3,) sigma of constant and slow drift at any one time [rad/s]."""
+        return np.hypot(self.gyro_left, self.gyro_slow)
+
+    @property
+    def gyro_walk(self) -> np.ndarray:
+        """(3,) random walk [rad/s/sqrt(s)] by which the slow drift leaves where it is."""
+        return np.asarray(self.gyro_slow) * np.sqrt(2.0 / np.asarray(self.gyro_slow_time))
 
 
 class Master(Parameters):

@@ -89,7 +89,7 @@ def model_of(pair: PairParameters, believed: Believed, flexure: Flexure | None) 
     noise = InsNoise(
         gyro_arw=np.asarray(pair.slave.gyro_noise),
         accel_vrw=np.asarray(pair.slave.accel_noise),
-        gyro_bias_rw=np.asarray(believed.gyro_bias_walk),
+        gyro_bias_rw=np.hypot(believed.gyro_bias_walk, pair.slave.gyro_walk),
         accel_bias_rw=np.asarray(believed.accel_bias_walk),
     )
     return pm.product_model(noise, installation_of(pair), sigmas, flexure)
@@ -99,7 +99,7 @@ def start_sigma(pair: PairParameters, believed: Believed, flexure: Flexure | Non
     """(n,) standard deviations of the initial tangent components, uncorrelated."""
     start, slave = pair.start, pair.slave
     parts = [start.attitude, start.velocity, start.position]
-    parts += [slave.gyro_bias, slave.accel_bias, believed.mounting]
+    parts += [slave.gyro_sigma, slave.accel_left, believed.mounting]
     sigma = np.maximum(np.concatenate([np.asarray(p, float) for p in parts]), _LEAST)
     if flexure is None:
         return sigma

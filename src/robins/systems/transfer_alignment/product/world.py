@@ -284,9 +284,14 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Arr
     All errors add, so the unit is asked what it reports of a body at rest in free fall.
     """
     s, dt, still = pair.slave, jnp.asarray(course.dt), jnp.zeros((len(course.dt), 3))
-    stated = ((s.gyro_bias, s.gyro_noise), (s.accel_bias, s.accel_noise))
-    triads = (TriadErrors(bias_sigma=np.asarray(b), white=np.asarray(w)) for b, w in stated)
-    theta, dv, seen = corrupt(dt, still, still, ImuErrorModel(*triads), key)
+    slow = (
+        {"markov_sigma": s.gyro_slow, "markov_tau_s": s.gyro_slow_time} if any(s.gyro_slow) else {}
+    )
+    unit = ImuErrorModel(
+        TriadErrors(bias_sigma=s.gyro_left, white=np.asarray(s.gyro_noise), **slow),
+        TriadErrors(bias_sigma=s.accel_left, white=np.asarray(s.accel_noise)),
+    )
+    theta, dv, seen = corrupt(dt, still, still, unit, key)
     bias = seen.gyro.bias
     d = pair.disturbance
     if d.gyro_noise_window is not None:

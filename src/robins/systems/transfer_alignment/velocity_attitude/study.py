@@ -6,10 +6,11 @@ outliers), the motion (gyro noise, a step of drift), both, or leave mounting ang
 stands for.
 
 What filters are told is white noise of a variance at each time. The plain ones believe in the
-stated noise of sensors and master. "told-r" also knows the variance of flexure and outliers, but
-not that flexure is correlated in time, for which a white R has no word. "told-q" also knows the
-gyro noise in its window, and that from its step on the drift may walk, as far until the end as the
-step was large. The model is linearised about what the master reports.
+stated noise of sensors and master; a slow drift of the gyros (`Slave`) they believe to walk.
+"told-r" also knows the variance of flexure and outliers, but not that flexure is correlated in
+time, for which a white R has no word. "told-q" also knows the gyro noise in its window, and that
+from its step on the drift may walk, as far until the end as the step was large. The model is
+linearised about what the master reports.
 """
 
 from __future__ import annotations
@@ -201,6 +202,8 @@ def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> N
     """
     s, m, told, d = given.slave, given.master, TOLD.get(name, ()), given.told.disturbance
     sigma = va.process_sigma(max(s.gyro_noise), max(s.accel_noise), 1.0 / m.rate)
+    # where it is stated, the slow drift of (6) walks away from the constant of (5)
+    sigma[va.EPS] = np.abs(swap(s.gyro_walk)) / math.sqrt(m.rate)
     (north, east, _), tilt = m.velocity_noise, max(m.attitude_noise[:2])
     rows = (sigma, [east, north], [m.attitude_noise[2], tilt, tilt])
     process, velocity, attitude = (np.tile(row, (len(epoch_s), 1)) for row in rows)
@@ -218,7 +221,8 @@ def believed_noise(given: VelocityAttitude, name: str, epoch_s: np.ndarray) -> N
     if "q" in told and d.drift_step_time is not None:
         after = begin >= d.drift_step_time
         step = np.abs(np.asarray(swap(np.asarray(d.drift_step))))
-        process[after, va.EPS] = step / math.sqrt(max(np.count_nonzero(after), 1))
+        walk = step / math.sqrt(max(np.count_nonzero(after), 1))
+        process[after, va.EPS] = np.hypot(process[after, va.EPS], walk)
     return Noise(process, velocity, attitude)
 
 
@@ -231,8 +235,8 @@ def start_sigma(given: VelocityAttitude) -> np.ndarray:
     sigma[va.POSITION] = start.position[0] / meridian, start.position[1] / east
     sigma[va.VELOCITY] = start.velocity[1], start.velocity[0]
     sigma[va.PHI] = np.abs(swap(np.asarray(start.attitude)))
-    sigma[va.NABLA] = np.abs(swap(np.asarray(s.accel_bias)))[:2]
-    sigma[va.EPS] = np.abs(swap(np.asarray(s.gyro_bias)))
+    sigma[va.NABLA] = np.abs(swap(s.accel_left))[:2]
+    sigma[va.EPS] = np.abs(swap(s.gyro_sigma))
     return sigma
 
 
