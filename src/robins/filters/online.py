@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
+from robins.filters.run import Step, filter_step
 from robins.filters.sameness import same, same_model
 
 
@@ -25,6 +27,11 @@ def _predict(filter_, motion, state, u):
 @partial(jax.jit, static_argnames=("filter_",))
 def _update(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
+
+
+@partial(jax.jit, static_argnames=("filter_",))
+def _step(filter_, model, state, u, y, aux):
+    return filter_step(filter_, model, state, u, y, aux)
 
 
 def _settled(state: FilterState) -> FilterState:
@@ -70,6 +77,23 @@ class OnlineFilter:
             self.counts[code.name] += 1
         audit(self.state, self.state, None, None)
         return prediction
+
+    def step(self, y: Mapping[str, Any], u: Any = None, aux: Mapping[str, Any] | None = None) -> Step:
+        """A whole step in one compiled call: predict, then update with each sensor in y.
+
+        Args:
+            y: measurements by sensor name, NaN where missing; they are not checked as those of
+                `update` are, and have the same shapes at every call.
+            u: input of the motion.
+            aux: what sensors need besides the state, by sensor name.
+        """
+        self.state, step = _step(self._filter, self._model, self.state, u, y, aux or {})
+        codes = jax.device_get((step.prediction.code, {k: i.code for k, i in step.info.items()}))
+        if codes[0] != Code.DONE:
+            self.counts[Code(int(codes[0])).name] += 1
+        self.counts.update(Code(int(code)).name for code in codes[1].values())
+        audit(self.state, self.state, None, None)
+        return step
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
         """Use a measurement; NaN is missing, per component.

@@ -16,7 +16,7 @@ _LEVEL = 0.005  # share of the level that its samples lie within
 _JUMP = 0.05  # share of the level, more than a smooth peak can fall by
 _LEAST_RATE = 1.0  # rad/s; no gyro ends below
 _OFTEN = 2  # jumps to or from the level
-_LONGEST_S = 0.2  # s, of a peak that is bridged
+LONGEST_S = 0.2  # s, of a peak that is bridged
 _MISSED = 0.3  # of what a bridge adds: the share that it may err by
 
 
@@ -51,7 +51,9 @@ def levels(rate: np.ndarray) -> np.ndarray:
     return out
 
 
-def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
+def bridged(
+    time_s: np.ndarray, rate: np.ndarray, most: float, known: np.ndarray | None = None
+) -> Bridged:
     """Put back the peaks that the range cut off.
 
     A peak is the cubic that leaves the last good sample and meets the next good one with the slopes
@@ -61,8 +63,9 @@ def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
         time_s: (N,).
         rate: (N, 3) rad/s.
         most: rad/s, the end of the range where it is told.
+        known: (3, 2) rad/s as of `levels`, where they were found before; None: found in `rate`.
     """
-    limit = np.minimum(levels(rate), 0.99 * most)
+    limit = np.minimum(levels(rate) if known is None else known, 0.99 * most)
     full = (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
     out, doubt = rate.copy(), np.full(rate.shape, np.nan)
     for axis in range(3):
@@ -73,7 +76,7 @@ def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
             if np.any(full[end : end + 3, axis]):
                 continue
             t0, t1 = time_s[begin - 1], time_s[end]
-            if t1 - t0 > _LONGEST_S:
+            if t1 - t0 > LONGEST_S:
                 continue
             x, sign = rate[:, axis], np.sign(rate[begin, axis])
             rise = _slope(time_s[begin - 3 : begin], x[begin - 3 : begin])
