@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
 from robins.filters.model import Model
 from robins.filters.observation import as_measurement
-from robins.filters.run import Step, filter_step
+from robins.filters.run import Step, everything, filter_step
 from robins.filters.sameness import same, same_model
 
 
@@ -29,9 +29,10 @@ def _update(filter_, sensor, state, y, aux):
     return filter_.update(state, sensor, y, aux)
 
 
-@partial(jax.jit, static_argnames=("filter_",))
-def _step(filter_, model, state, u, y, aux):
-    return filter_step(filter_, model, state, u, y, aux)
+@partial(jax.jit, static_argnames=("filter_", "keep"))
+def _step(filter_, model, state, u, y, aux, keep):
+    state, step = filter_step(filter_, model, state, u, y, aux)
+    return state, keep(step), step.prediction.code, {k: i.code for k, i in step.info.items()}
 
 
 def _settled(state: FilterState) -> FilterState:
@@ -78,22 +79,30 @@ class OnlineFilter:
         audit(self.state, self.state, None, None)
         return prediction
 
-    def step(self, y: Mapping[str, Any], u: Any = None, aux: Mapping[str, Any] | None = None) -> Step:
+    def step(
+        self,
+        y: Mapping[str, Any],
+        u: Any = None,
+        aux: Mapping[str, Any] | None = None,
+        keep: Callable[[Step], Any] = everything,
+    ) -> Any:
         """A whole step in one compiled call: predict, then update with each sensor in y.
 
         Args:
-            y: measurements by sensor name, NaN where missing; they are not checked as those of
-                `update` are, and have the same shapes at every call.
+            y: measurements by sensor name, NaN where missing, of the same shapes at every call;
+                they are not checked as those of `update` are.
             u: input of the motion.
             aux: what sensors need besides the state, by sensor name.
+            keep: what to give back of the `Step`, as in `run`.
         """
-        self.state, step = _step(self._filter, self._model, self.state, u, y, aux or {})
-        codes = jax.device_get((step.prediction.code, {k: i.code for k, i in step.info.items()}))
-        if codes[0] != Code.DONE:
-            self.counts[Code(int(codes[0])).name] += 1
-        self.counts.update(Code(int(code)).name for code in codes[1].values())
+        found = _step(self._filter, self._model, self.state, u, dict(y), aux or {}, keep)
+        self.state, kept, *codes = found
+        moved, used = jax.device_get(codes)
+        if moved != Code.DONE:
+            self.counts[Code(int(moved)).name] += 1
+        self.counts.update(Code(int(code)).name for code in used.values())
         audit(self.state, self.state, None, None)
-        return step
+        return kept
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
         """Use a measurement; NaN is missing, per component.
