@@ -48,6 +48,8 @@ class OnlineFilter:
     Gives the numbers of `robins.filters.run` to rounding.
 
     Attributes:
+        filter: what it steps, and
+        model: with what.
         state: the filter's state; assign to restore a saved one.
         counts: outcomes so far, by `Code` name: of updates, and of predictions not taken.
     """
@@ -60,7 +62,7 @@ class OnlineFilter:
             model: the motion and the sensors.
             start: initial belief or saved state.
         """
-        self._filter, self._model = same(filter_), same_model(model)
+        self.filter, self.model = same(filter_), same_model(model)
         state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
         self.state = _settled(state)
         self.counts: Counter[str] = Counter()
@@ -72,7 +74,7 @@ class OnlineFilter:
 
     def predict(self, u: Any = None) -> Prediction:
         """Move on by one step with input u."""
-        self.state, prediction = _predict(self._filter, self._model.motion, self.state, u)
+        self.state, prediction = _predict(self.filter, self.model.motion, self.state, u)
         code = Code(int(prediction.code))
         if code is not Code.DONE:
             self.counts[code.name] += 1
@@ -95,7 +97,7 @@ class OnlineFilter:
             aux: what sensors need besides the state, by sensor name.
             keep: what to give back of the `Step`, as in `run`.
         """
-        found = _step(self._filter, self._model, self.state, u, dict(y), aux or {}, keep)
+        found = _step(self.filter, self.model, self.state, u, dict(y), aux or {}, keep)
         self.state, kept, *codes = found
         moved, used = jax.device_get(codes)
         if moved != Code.DONE:
@@ -119,12 +121,12 @@ class OnlineFilter:
                 not of the shape that the sensor reads.
         """
         if sensor is None:
-            if len(self._model.sensors) != 1:
-                raise ValueError(f"name one of the sensors {sorted(self._model.dims)}")
-            sensor = self._model.sensors[0].name
-        chosen = self._model.sensor(sensor)
+            if len(self.model.sensors) != 1:
+                raise ValueError(f"name one of the sensors {sorted(self.model.dims)}")
+            sensor = self.model.sensors[0].name
+        chosen = self.model.sensor(sensor)
         numbers = as_measurement(sensor, y)
-        self.state, info = _update(self._filter, chosen, self.state, numbers, aux)
+        self.state, info = _update(self.filter, chosen, self.state, numbers, aux)
         self.counts[Code(int(info.code)).name] += 1
         audit(self.state, self.state, None, None)
         return info

@@ -27,7 +27,7 @@ class Blocks(NamedTuple):
 
 
 def epochs_between(
-    start_s: float, end_s: float, wanted_s: np.ndarray, longest_s: float
+    start_s: float, end_s: float, wanted_s: np.ndarray, longest_s: float, even: bool = True
 ) -> np.ndarray:
     """Epochs at all wanted times in (start, end], and between them so that none is too long.
 
@@ -36,6 +36,7 @@ def epochs_between(
         end_s: where the last block ends.
         wanted_s: times that need an epoch of their own (measurements).
         longest_s: longest block allowed.
+        even: split in even parts; else in longest ones and a rest, without knowing the next time.
 
     Returns:
         (E,) strictly increasing; the last one is end_s.
@@ -45,9 +46,10 @@ def epochs_between(
     edges = np.unique(np.concatenate([[start_s], wanted, [end_s]]))
     out = []
     for a, b in pairwise(edges):
-        # a block is split evenly; a hair of tolerance keeps 1.0000001 s from becoming two
+        # a hair of tolerance keeps 1.0000001 s from becoming two
         pieces = max(1, int(np.ceil((b - a) / longest_s - 1e-6)))
-        out.append(a + (b - a) * np.arange(1, pieces + 1) / pieces)
+        part = np.arange(1, pieces + 1)
+        out.append(a + (b - a) * part / pieces if even else a + longest_s * part)
         out[-1][-1] = b
     return np.concatenate(out) if out else np.zeros(0)
 
@@ -127,18 +129,26 @@ def cut(
     return Blocks(Increments(out_dt, out_theta, out_dv), epoch_s, duration, out_parent)
 
 
-def rate_about(increments: Increments, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+def reach_of_rate(usual_s: float) -> float:
+    """How far about a time `rate_about` looks [s], of a sensor with this sampling interval."""
+    return max(0.01, 1.5 * usual_s)
+
+
+def rate_about(
+    increments: Increments, time_s: np.ndarray, at_s: np.ndarray, usual_s: float | None = None
+) -> np.ndarray:
     """(E, 3) rad/s, gyro rate about times: mean over the increments that end within 10 ms of each.
 
     Args:
         increments: dt (N,), theta (N, 3).
         time_s: (N,) end of each.
         at_s: (E,) times.
+        usual_s: s, sampling interval; None: the median of dt.
     """
     dt, theta = increments[:2]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(theta, axis=0)])
     length = np.concatenate([[0.0], np.cumsum(dt)])
-    half = max(0.01, 1.5 * float(np.median(dt)))
+    half = reach_of_rate(float(np.median(dt)) if usual_s is None else usual_s)
     a = np.searchsorted(time_s, at_s - half)
     b = np.minimum(np.maximum(np.searchsorted(time_s, at_s + half), a + 1), len(dt))
     a = np.minimum(a, b - 1)
