@@ -8,6 +8,7 @@ is split there, so that every measurement meets the state at its own time.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -54,12 +55,18 @@ def epochs_between(
     return np.concatenate(out) if out else np.zeros(0)
 
 
+def usual_width(longest_s: float, usual_s: float) -> int:
+    """Pieces that the longest block of a sensor holds by its usual interval, and some to spare."""
+    return -(-math.ceil(1.1 * longest_s / usual_s + 2.0) // 8) * 8
+
+
 def cut(
     increments: Increments,
     time_s: np.ndarray,
     start_s: float,
     epoch_s: np.ndarray,
     width: int | None = None,
+    least: int = 8,
 ) -> Blocks:
     """Group increments by epoch, splitting those that an epoch falls into.
 
@@ -74,6 +81,7 @@ def cut(
         epoch_s: (E,) end of each block, increasing.
         width: pad every block to this many pieces; by default to the longest block, rounded up
             to a multiple of 8 so that logs of like rate share a compilation.
+        least: pad to this many at least, where no width is given.
 
     Raises:
         ValueError: the increments do not cover (start_s, last epoch], or width is too small.
@@ -113,7 +121,7 @@ def cut(
     count = np.bincount(block, minlength=len(epoch_s))
     needed = int(count.max(initial=1))
     if width is None:
-        width = -(-needed // 8) * 8
+        width = max(-(-needed // 8) * 8, least)
     elif needed > width:
         raise ValueError(f"a block holds {needed} IMU increments, more than the width {width}")
     first = np.concatenate([[0], np.cumsum(count)[:-1]])

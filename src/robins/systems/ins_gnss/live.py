@@ -36,7 +36,7 @@ from robins.dataset import GnssTable, ImuTable
 from robins.errors import require, require_known
 from robins.filters import OnlineFilter
 from robins.filters.run import Step
-from robins.ins.blocks import cut, rate_about, reach_of_rate
+from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
 from robins.systems.ins_gnss.log import (
@@ -153,7 +153,7 @@ class LiveInsGnss(Live):
         self._usual = Usual(1.0 / rate_hz, 1.0 / fix_rate_hz)
         self._reach_s = reach_of_rate(self._usual.sample_s)
         self._delay_s = longest_delay_s
-        self._width = 8 * math.ceil(2.0 * (p.update.longest_block + self._reach_s) * rate_hz / 8)
+        self._width = usual_width(p.update.longest_block, self._usual.sample_s)
         window_s = p.gnss.velocity_window
         self._window_s = self._usual.fix_s if window_s is None else window_s
         # what has to be looked back at from the oldest epoch
@@ -409,14 +409,10 @@ class LiveInsGnss(Live):
         self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
         self.start = found.sentence
 
-    def _block(self, end_s: float, rows: np.ndarray, origin: Epoch) -> Block:
+    def _block(self, end_s: float, rows: np.ndarray, origin: Epoch, least: int) -> Block:
         """Input of a step from an epoch to a time."""
         inc = Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8])
-        try:
-            blocks = cut(inc, rows[:, 0], origin.time_s, np.array([end_s]), self._width)
-        except ValueError as error:
-            fix = "give rate_hz as it is"
-            raise LiveError(str(error), "push_imu", fix) from error
+        blocks = cut(inc, rows[:, 0], origin.time_s, np.array([end_s]), least=least)
         scale = replaying.noise_scale(
             blocks, rows[:, 1], self.parameters.update.gap_noise, self._usual.sample_s
         )
@@ -430,11 +426,13 @@ class LiveInsGnss(Live):
         log, epochs = self._log(rows), np.array([to.time_s])
         rate = rate_about(log.increments, log.time_s, epochs, self._usual.sample_s)
         used = np.abs(log.gnss_s - to.time_s) < 1e-9
-        y, aux = measured_fixes(log, used, epochs, rate, self._window_s)
+        # the window is looked at where there is a velocity alone
+        window_s = self._window_s if np.any(np.isfinite(self._fixes[used, 7:10])) else 0.0
+        y, aux = measured_fixes(log, used, epochs, rate, window_s)
         usual = self._usual._replace(calmest=self._calmest)
         known, about = measured_rest(log, epochs, rate, p.aids, usual)
         row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (y | known, aux | about))
-        u = self._block(to.time_s, rows, at)
+        u = self._block(to.time_s, rows, at, self._width)
         self.counts["blocks_over_imu_gaps"] += int(u.noise_scale > 1.0)
         kept = np.asarray(self._online.step(row[0], u, row[1], keep=_kept))
         self.epoch = self._told(to.time_s, kept, Flag(0))
@@ -489,7 +487,7 @@ class LiveInsGnss(Live):
         last = self._newest[self._newest[:, 0] > final_s]
         rows = np.concatenate([rows, last])
         end_s = float(rows[-1, 0])
-        u = self._block(end_s, rows, at)
+        u = self._block(end_s, rows, at, self._width + 8)
         motion = self._online.model.motion
         found = _predicted(self._online.filter, motion, self._online.state, u)
         return self._told(end_s, np.asarray(found), mark)._replace(time_ns=time_ns)

@@ -21,7 +21,7 @@ from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief, StepWarning, run
-from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
+from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
@@ -80,7 +80,8 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     # a filter that runs while the log is made does not know when the next fix comes
     longest_s = parameters.update.longest_block
     epochs = epochs_between(begin_s, end_s, log.gnss_s[used], longest_s, even=False)
-    blocks = cut(increments, log.time_s, begin_s, epochs)
+    width = usual_width(longest_s, float(np.median(increments.dt)))
+    blocks = cut(increments, log.time_s, begin_s, epochs, least=width)
     scale = replaying.noise_scale(blocks, increments.dt, parameters.update.gap_noise)
     rate = rate_about(increments, log.time_s, epochs)
     y, aux = measured_fixes(log, used, epochs, rate, parameters.gnss.velocity_window)

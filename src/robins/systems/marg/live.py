@@ -25,6 +25,7 @@ import math
 from typing import Any, ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from robins.dataset import ImuTable
@@ -50,6 +51,7 @@ from robins.systems.marg.replay import filter_of, stated_sigma
 from robins.systems.marg.rest import RestFound, Watch
 from robins.systems.marg.saturation import LONGEST_S, Range, bridged
 from robins.systems.replaying import kept
+from robins.systems.tables import Update
 from robins.systems.streaming import (
     Door,
     Flag,
@@ -86,9 +88,49 @@ class _Block(NamedTuple):
     still: bool
 
 
-def _kept(step: Step) -> Any:
+class _Step(NamedTuple):
     """What is looked at of a step."""
-    return kept(step), step.prediction.code
+
+    q_nb: np.ndarray  # (4,)
+    gyro_bias: np.ndarray  # (3,)
+    gyro_gain: np.ndarray  # (9,)
+    declination: np.ndarray  # (1,)
+    sigma: np.ndarray  # (27,)
+    code: np.ndarray  # (1,) of the prediction
+    travel: np.ndarray  # (3,) NIS, degrees of freedom, code
+    magnetometer: np.ndarray  # (3,) likewise; none, none, `MISSING` without one
+
+
+_SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 3])
+
+
+def _kept(step: Step) -> jax.Array:
+    """A `_Step` as one vector, which leaves compiled code at once."""
+    mean, sigma, seen = kept(step)
+    parts = [mean.q_nb.wxyz, mean.gyro_bias, mean.gyro_gain.reshape(9), mean.declination[None]]
+    parts += [sigma, step.prediction.code[None]]
+    for name in (model.TRAVEL, model.MAGNETOMETER):
+        update = seen.get(name)
+        none = jnp.array([0.0, 0.0, float(Code.MISSING)])
+        parts.append(none if update is None else jnp.stack(
+            [jnp.asarray(x, float) for x in (update.nis, update.dof, update.code)]))  # fmt: skip
+    return jnp.concatenate([jnp.asarray(part, float) for part in parts])
+
+
+@jax.jit
+def _whole(samples: model.Samples) -> jax.Array:
+    """Integrals of one block and its mean field, in one vector."""
+    leaves = jax.tree_util.tree_leaves(model.integrate(samples))
+    return jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+
+
+def _parted(vector: np.ndarray) -> tuple[model.Integrals, np.ndarray]:
+    """What `_whole` gave, leading axis 1."""
+    dt, turn, dv, time, rates, angle, field = np.split(vector, np.cumsum([1, 4, 3, 9, 27, 1]))
+    integrals = model.Integrals(
+        dt, turn[None], dv[None], time.reshape(1, 3, 3), rates.reshape(1, 3, 9), angle
+    )
+    return integrals, field[None]
 
 
 class LiveMarg(Live):
@@ -141,7 +183,7 @@ class LiveMarg(Live):
         self._field = np.full(3, np.nan)  # of a sample that was refused
         self._pending: list[Any] = []  # blocks as tuples, which wait for a step
         self._begun: list[Any] = []  # increments and field, until the start is found
-        self._looks = np.zeros((0, 10))  # what the monitor is shown
+        self._looks = np.zeros((0, 8))  # what the monitor is shown
         self._since: list[Any] = []  # (dt, turn) of the samples after the last step
         self._q = (math.nan,) * 4
         self._sigma, self._bias, self._gain = np.full(3, np.nan), np.zeros(3), np.zeros((3, 3))
@@ -331,7 +373,7 @@ class LiveMarg(Live):
         """Add a block to those that wait for a step."""
         p = self.parameters
         samples = model.Samples(dt[None], theta[None], dv[None], field[None])
-        integrals, field_b = jax.device_get(model.integrate(samples))
+        integrals, field_b = _parted(np.asarray(_whole(samples)))
         rate, force = mean_rate(integrals), mean_force(integrals)
         still, sigma = self._watch.look(float(integrals.dt_s[0]), rate[0], force[0], field_b[0])
         rest = RestFound(np.array([still]), np.array([sigma]), None, sigma)
@@ -379,35 +421,30 @@ class LiveMarg(Live):
         p = self.parameters
         leaves, still = self._pending.pop(0)
         u, y, aux = jax.tree_util.tree_unflatten(self._like, leaves)
-        (mean, sigma, seen), code = jax.device_get(self._online.step(y, u, aux, keep=_kept))
-        self.counts["steps_not_taken"] += int(code != Code.DONE)
+        found = _Step(*np.split(np.asarray(self._online.step(y, u, aux, keep=_kept)), _SIZES))
+        self.counts["steps_not_taken"] += int(found.code[0] != Code.DONE)
         turned, lasted = u.samples.angle[None], u.samples.dt_s[None]
-        self._sigma = stated_sigma(sigma[None], turned, lasted, p)[0, :3]
-        self._bias, self._gain = np.asarray(mean.gyro_bias), np.asarray(mean.gyro_gain)
-        self._q = tuple(np.asarray(mean.q_nb.wxyz).tolist())
+        self._sigma = stated_sigma(found.sigma[None], turned, lasted, p)[0, :3]
+        self._bias, self._gain = found.gyro_bias, found.gyro_gain.reshape(3, 3)
+        self._q = tuple(found.q_nb.tolist())
         self._since = self._since[self._n :]
         for since in self._since:
             self._q = self._turned(self._q, *since)
-        self._marks = int(self._doubts(mean, seen) | (Flag.REST if still else Flag(0)))
+        self._marks = int(self._doubts(found) | (Flag.REST if still else Flag(0)))
 
-    def _doubts(self, mean: model.MargState, seen: Any) -> Flag:
+    def _doubts(self, found: _Step) -> Flag:
         """What the monitor says of the last looks."""
-        row = [float(mean.declination), float(np.max(np.abs(mean.gyro_gain)))]
-        for name in (model.TRAVEL, model.MAGNETOMETER):
-            update = seen.get(name)
-            told = (0.0, 0.0, 1.0) if update is None else (update.nis, update.dof, update.code)
-            row += [float(x) for x in told]
         most = math.ceil(_MONITORED_S / (self._n * self._usual_s))
-        padded = np.array([[*row, 0.0, 0.0]])
-        self._looks = np.concatenate([self._looks, padded])[-most:]
+        gain = [np.max(np.abs(found.gyro_gain))]
+        row = np.concatenate([found.declination, gain, found.travel, found.magnetometer])
+        self._looks = np.concatenate([self._looks, row[None]])[-most:]
         looks, none = self._looks, np.zeros(len(self._looks))
         updates = {
-            name: monitor.Update(none, none, looks[:, k], looks[:, k + 1], looks[:, k + 2])
+            name: Update(none, none, looks[:, k], looks[:, k + 1], looks[:, k + 2])
             for name, k in ((model.TRAVEL, 2), (model.MAGNETOMETER, 5))
-            if name in seen
         }
-        state = mean._replace(declination=looks[:, 0], gyro_gain=looks[:, 1])
-        doubt = monitor.doubts_of(state, updates, self.parameters)
+        states = model.MargState(*[None] * 4, looks[:, 1], None, looks[:, 0], None)
+        doubt = monitor.doubts_of(states, updates, self.parameters)
         told = bool(doubt.declination[-1] or doubt.gain[-1])
         for column, k in ((doubt.tilt, 2), (doubt.refused, 5)):
             refused = looks[:, k + 2] == Code.REFUSED
