@@ -500,21 +500,21 @@ class LiveInsGnss(Live):
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""
         counts, step = type(self.counts)(), round(1e9 * self._usual.sample_s)
+        door, second, ones = vars(self._door).copy(), max(1, round(1e9 / step)), np.ones(3)
         place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
         p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})
         C, self._C_bs = self._C_bs, None
-        last = math.ceil((3.0 + 2.0 * p.aids.window + p.update.longest_block) / self._usual.sample_s)
+        last = math.ceil((3.0 + 2.0 * p.aids.window + p.update.longest_block) * 1e9 / step)
         try:
             for k in range(last):
-                # a still unit, with fixes once a second
-                if k and k % max(1, round(1.0 / self._usual.sample_s)) == 0:
-                    self.push_fix(k * step - step, 0.7, 0.1, 100.0, np.ones(3), np.zeros(3), np.ones(3))
+                if k and k % second == 0:
+                    self.push_fix((k - 1) * step, 0.7, 0.1, 100.0, ones, 0.0 * ones, ones)
                 self.push_imu(k * step, np.zeros(3), np.array([0.0, 0.0, -9.8]))
         finally:
             self.parameters, self._C_bs, self.counts = p, C, counts
             self._compiled_state = None if self._online is None else self._online.state
             self._begin_anew()
-            self._door = Door(p.update.longest_gap, max(3, round(_PATIENCE_S / self._usual.sample_s)))
+            vars(self._door).update(door)
 
     # -------------------------------------------------------------------------------- the file
 

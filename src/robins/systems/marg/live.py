@@ -8,8 +8,8 @@ takes from later samples, a live object waits for or does without:
   samples are kept, and the filter then goes through them, two blocks a sample. From there on the
   answers are those of the replay.
 - A peak that the end of a gyro's range cut off is put back from both flanks. The filter waits for
-  the second one, at most 0.2 s and three samples; meanwhile the gyros carry the attitude on as they
-  read, and answers are `BEHIND`. Then they are again those of the replay.
+  the second one, at most 0.2 s and three samples; until its block is whole the gyros carry the
+  attitude on as they read, and answers are `BEHIND`. Then they are again those of the replay.
 - The end of a range that nobody told (`gyro.range`) is known once it was reached twice. Peaks before
   that are put back by a replay, and not here.
 - A stamp that comes late after a long interval is told from a gap by the next one: `BEHIND` for one
@@ -51,7 +51,6 @@ from robins.systems.marg.replay import filter_of, stated_sigma
 from robins.systems.marg.rest import RestFound, Watch
 from robins.systems.marg.saturation import LONGEST_S, Range, bridged
 from robins.systems.replaying import kept
-from robins.systems.tables import Update
 from robins.systems.streaming import (
     Door,
     Flag,
@@ -62,6 +61,7 @@ from robins.systems.streaming import (
     refuse_units,
     stamp,
 )
+from robins.systems.tables import Update
 
 _FLANK = 3  # samples of a flank, by which a peak is put back
 _STEPS = 2  # of the filter in a sample, where it has to catch up
@@ -146,7 +146,7 @@ class LiveMarg(Live):
     _parameters: ClassVar[type[Replay]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_time_ns", "_rows", "_context", "_field", "_pending", "_begun", "_looks", "_since",
-        "_q", "_sigma", "_bias", "_gain", "_marks", "_stepped", "_in_motion",
+        "_q", "_sigma", "_bias", "_gain", "_marks", "_stepped", "_in_motion", "_open",
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door", "_range", "_watch", "_pace")
 
@@ -189,6 +189,7 @@ class LiveMarg(Live):
         self._sigma, self._bias, self._gain = np.full(3, np.nan), np.zeros(3), np.zeros((3, 3))
         self._marks = 0  # flags that hold from a block to the next
         self._stepped = False  # whether the filter has begun
+        self._open = 0  # samples without a step, up to the last with a gyro at its end
         self._in_motion = False  # whether it has to begin in motion
         self._online = None
         self._range, self._pace = Range(), Pace()
@@ -210,9 +211,7 @@ class LiveMarg(Live):
 
     # ------------------------------------------------------------------------------ a sample
 
-    def push(
-        self, time_ns: Any, gyro_rad_s: Any, accel_m_s2: Any, field_t: Any = None
-    ) -> Attitude:
+    def push(self, time_ns: Any, gyro_rad_s: Any, accel_m_s2: Any, field_t: Any = None) -> Attitude:
         """Take a sample; the attitude at its stamp.
 
         Args:
@@ -265,6 +264,8 @@ class LiveMarg(Live):
         p = self.parameters
         limit = np.minimum(self._range.levels, 0.99 * p.gyro.range)
         full = np.any((gyro <= -limit[:, 0]) | (gyro >= limit[:, 1]))
+        if full:
+            self._open = len(self._rows) - self._context
         hard = np.any(np.abs(accel) >= 0.99 * p.accelerometer.range)
         return Flag.SATURATED if full or hard else Flag(0)
 
@@ -290,7 +291,7 @@ class LiveMarg(Live):
         if not self._stepped or self._pending:
             nothing = np.full(4, np.nan)
             return Attitude(time_ns, nothing, nothing[:3], mark | Flag.STARTING)
-        if len(self._rows) - self._context >= self._n:
+        if self._open > 0 or len(self._rows) - self._context >= self._n:
             flags |= Flag.BEHIND
         q = np.array(product(self._turn_north, self._q))
         return Attitude(time_ns, q / np.linalg.norm(q), self._sigma, flags)
@@ -360,6 +361,7 @@ class LiveMarg(Live):
         drop = max(0, end - self._most_context)
         del self._time_ns[:drop], self._rows[:drop]
         self._context = end - drop
+        self._open = max(0, self._open - self._n)
 
     def _integrated(
         self,

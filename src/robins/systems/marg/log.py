@@ -177,9 +177,7 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         _filled(field, blocks, n, np.nan),
     )
     integrals, block_field = jax.tree.map(np.asarray, model.integrate(samples))
-    rest = at_rest(
-        integrals.dt_s, mean_rate(integrals), mean_force(integrals), block_field, p.rest
-    )
+    rest = at_rest(integrals.dt_s, mean_rate(integrals), mean_force(integrals), block_field, p.rest)
     still = rest.still
 
     turn, lost, gaps = not_sampled(dt, full, doubt, accel_full, usual, p)
@@ -449,4 +447,3 @@ def mean_force(integrals: model.Integrals) -> np.ndarray:
     """(K, 3) m/s^2, mean specific force of each block."""
     dt = np.asarray(integrals.dt_s)[:, None]
     return np.asarray(integrals.dv) / np.where(dt > 0.0, dt, 1.0)
-
