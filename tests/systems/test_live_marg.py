@@ -222,15 +222,15 @@ def test_samples_in_other_units_are_told_by_their_size(live, gyro, accel, word):
             live.push(k * 10_000_000, rate * np.sin(k / 9.0), force)
         except LiveError as error:
             told.append(str(error))
-    assert 1 <= len(told) <= 4
+    assert 1 <= len(told) <= 8  # once a start is looked for, not at every sample
     assert word in told[0]
-    for k in range(1000, 1400):  # right ones are taken, once the others are forgotten
+    for k in range(1000, 1700):  # right ones are taken, once the others are forgotten
         try:
             found = live.push(k * 10_000_000, 0.0 * rate, force / accel)
         except LiveError as error:
             told.append(str(error))
     assert found.flags == REST
-    assert len(told) <= 5
+    assert len(told) <= 9
 
 
 def test_bad_samples_are_counted_and_leave_the_answers_as_if_they_were_not_there(live, tmp_path):

@@ -83,7 +83,7 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
         ResultError: the file cannot be read, is none, is damaged, or of another version or class.
     """
     try:
-        with np.load(path, allow_pickle=False) as packed:
+        with open(path, "rb") as file, np.load(_read(file), allow_pickle=False) as packed:
             told, arrays = _unpacked(packed)
     except OSError as error:
         raise cannot(path, "read the state", error) from error
@@ -100,6 +100,14 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
         fix = f"load it with {told['kind']}.load"
         raise ResultError(path, f"it holds a {told['kind']}, not a {kind}", fix)
     return Snapshot(told["parameters"], _thawed(told["state"], arrays))
+
+
+def _read(file: Any) -> io.BytesIO:
+    """All of a file that is not too large; NumPy does not close one that is damaged."""
+    content = file.read(_LARGEST + 1)
+    if len(content) > _LARGEST:
+        raise ValueError("larger than a state")
+    return io.BytesIO(content)
 
 
 def _unpacked(packed: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
