@@ -11,7 +11,13 @@ from robins.results import ResultError, snapshot
 
 STATE = {
     "plain": [1, 2.5, float("inf"), float("nan"), None, True, "word", (1, (2,))],
-    "arrays": [np.arange(3.0), np.float64(0.1), np.zeros((0, 3)), np.array(7), np.eye(2, dtype=bool)],
+    "arrays": [
+        np.arange(3.0),
+        np.float64(0.1),
+        np.zeros((0, 3)),
+        np.array(7),
+        np.eye(2, dtype=bool),
+    ],
 }
 
 
@@ -67,7 +73,9 @@ def test_every_flipped_bit_and_every_cut_is_refused(tmp_path):
 def test_another_version_class_or_file_is_refused_with_what_to_do(tmp_path, monkeypatch):
     path = tmp_path / "a.live"
     snapshot.write(path, "Unit", "", STATE)
-    with pytest.raises(ResultError, match=r"it holds a Unit, not a Vehicle; load it with Unit\.load"):
+    with pytest.raises(
+        ResultError, match=r"it holds a Unit, not a Vehicle; load it with Unit\.load"
+    ):
         snapshot.read(path, "Vehicle")
     with pytest.raises(ResultError, match="No such file"):
         snapshot.read(tmp_path / "b", "Unit")

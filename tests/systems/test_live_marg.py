@@ -1,4 +1,4 @@
-"""A live orientation is that of the causal replay, kept in a file, and not upset by a bad sample."""
+"""A live orientation is that of the causal replay, kept in a file, not upset by bad samples."""
 
 from dataclasses import replace
 
@@ -178,7 +178,9 @@ def test_peaks_beyond_the_range_wait_for_their_flank(told):
 def test_levels_found_sample_by_sample_are_those_of_all_samples_so_far():
     rng = np.random.default_rng(5)
     smooth = np.cumsum(rng.standard_normal((400, 3)), axis=0)
-    rate = np.clip(smooth + 12.0 * np.sin(np.arange(400) / 7.0)[:, None], [-9.0, -12.0, -50.0], 11.0)
+    rate = np.clip(
+        smooth + 12.0 * np.sin(np.arange(400) / 7.0)[:, None], [-9.0, -12.0, -50.0], 11.0
+    )
     seen = Range()
     found = 0
     for k, row in enumerate(rate):

@@ -12,13 +12,13 @@ at once and a live object has not:
   epoch is a mean about it, and the increment before the last sample is known with the next one. So
   the filter is that much behind, and the answer to a sample is its state carried on over what came
   since, exactly what it predicts; the last increment is made of the samples so far.
-- **The start.** The filter begins as the replay does: level on a quiet window, heading by the course
-  of the first fix that is fast enough or as it is given. With a given heading it waits for rest, at
+- **The start.** The filter begins as the replay does: level on a quiet window, heading by the
+  course of the first fix that is fast enough or as it is given. With a given heading it waits for rest, at
   most ten seconds from the first fix on, and then takes the quietest window so far, where a replay
   takes the quietest of the log. A magnetometer is asked where for 30 s no fix was fast enough; a
   replay asks it where none of the log is. Answers before are `STARTING`, without numbers.
-- A gap longer than `update.longest_gap` begins anew. `outages` are not looked at: fixes that are not
-  given are not there. Whether velocities are means is a hypothesis of `robust` here as there.
+- A gap longer than `update.longest_gap` begins anew. `outages` are not looked at: fixes that are
+  not given are not there. Whether velocities are means is a hypothesis of `robust` here as there.
 - Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
 """
 
