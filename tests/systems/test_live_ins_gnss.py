@@ -175,7 +175,8 @@ def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):
     # a fix without a number makes an epoch of the replay here
     g, blank = cut.gnss, np.full(3, np.nan)
     nothing = type(g)(
-        np.append(g.time_ns, last.time_ns), *(np.append(a, np.nan) for a in (g.lat_rad, g.lon_rad, g.alt_m)),
+        np.append(g.time_ns, last.time_ns),
+        *(np.append(a, np.nan) for a in (g.lat_rad, g.lon_rad, g.alt_m)),
         np.vstack([g.sigma_m, np.ones(3)]), np.vstack([g.v_n, blank]),
         np.vstack([g.sigma_v, np.ones(3)]),
     )  # fmt: skip
