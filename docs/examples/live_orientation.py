@@ -58,9 +58,7 @@ def main() -> None:
     a = asked.parse_args()
     kept = a.state is not None and a.state.exists()
     live = LiveMarg.load(a.state) if kept else LiveMarg(Replay(), a.rate)
-    lines = (
-        of_serial(a.serial, a.baud, a.silence) if a.serial else of_udp(a.port, a.silence)
-    )
+    lines = of_serial(a.serial, a.baud, a.silence) if a.serial else of_udp(a.port, a.silence)
     for number, line in enumerate(lines):
         try:
             values = [float(word) for word in line.split(",")]

@@ -20,7 +20,9 @@ def test_what_is_sent_by_udp_is_printed_as_angles(tmp_path):
     state = tmp_path / "unit.live"
     command = [sys.executable, str(EXAMPLE), "--rate", "100", "--port", "0", "--silence", "5",
                "--state", str(state)]  # fmt: skip
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as told:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as told:
         try:
             assert told.stdout is not None
             # in time: everything was compiled before the port was opened

@@ -13,10 +13,10 @@ at once and a live object has not:
   the filter is that much behind, and the answer to a sample is its state carried on over what came
   since, exactly what it predicts; the last increment is made of the samples so far.
 - **The start.** The filter begins as the replay does: level on a quiet window, heading by the
-  course of the first fix that is fast enough or as it is given. With a given heading it waits for rest, at
-  most ten seconds from the first fix on, and then takes the quietest window so far, where a replay
-  takes the quietest of the log. A magnetometer is asked where for 30 s no fix was fast enough; a
-  replay asks it where none of the log is. Answers before are `STARTING`, without numbers.
+  course of the first fix that is fast enough or as it is given. With a given heading it waits for
+  rest, at most ten seconds from the first fix on, and then takes the quietest window so far, where
+  a replay takes the quietest of the log. A magnetometer is asked where for 30 s no fix was fast
+  enough; a replay asks it where none of the log is. Answers before are `STARTING`, without numbers.
 - A gap longer than `update.longest_gap` begins anew. `outages` are not looked at: fixes that are
   not given are not there. Whether velocities are means is a hypothesis of `robust` here as there.
 - Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
@@ -49,7 +49,7 @@ from robins.systems.ins_gnss.log import (
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
-from robins.systems.ins_gnss.start import Usual, calmest, find_start
+from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
     Door,
@@ -500,6 +500,7 @@ class LiveInsGnss(Live):
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""
         counts, step = type(self.counts)(), round(1e9 * self._usual.sample_s)
+        turned(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros((CARRIED, 3)))
         door, second, ones = vars(self._door).copy(), max(1, round(1e9 / step)), np.ones(3)
         place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
         p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})

@@ -88,8 +88,13 @@ def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
     return time_s[told], way[told] > limit[told]
 
 
+CARRIED = 4096  # increments, to multiples of which those that carry the tilt are filled up
+
+
 @jax.jit
-def _turned(q, theta):
+def turned(q, theta):
+    """Attitude (4,) after rotation vectors (N, 3) in body axes."""
+
     def step(q, t):
         return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(t))), None
 
@@ -231,9 +236,11 @@ def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -
     else:
         assert v_n is not None
         assert fast is not None
-        carried = jnp.asarray(theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None])
+        carried = theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None]
+        # one compilation for most logs, and for a live start none
+        carried = jnp.asarray(np.pad(carried, ((0, -len(carried) % CARRIED), (0, 0))))
         heading = float(np.arctan2(v_n[fast, 1], v_n[fast, 0]))
-        q_nb = with_heading(np.asarray(_turned(jnp.asarray(q_nb), carried)), heading)
+        q_nb = with_heading(np.asarray(turned(jnp.asarray(q_nb), carried)), heading)
         begin_s = float(gnss_s[fast])
         sentence += (
             f"; heading {np.degrees(heading) % 360:.1f} deg from the course at {begin_s:.1f} s, "
