@@ -12,8 +12,8 @@ from robins.dataset import ImuTable
 from robins.filters import OnlineFilter
 from robins.ins.increments import from_imu
 from robins.systems.marg import Replay, filter_of, model_of, prepare, replay
-from robins.systems.marg.log import as_means, at_samples, every
-from robins.systems.marg.model import MAGNETOMETER
+from robins.systems.marg.log import Pace, as_means, at_samples
+from robins.systems.marg.model import MAGNETOMETER, TRAVEL
 
 GAIN = 0.01 * np.array([[0.6, -0.4, 0.2], [0.3, -0.7, 0.5], [-0.2, 0.4, 0.5]])
 PARAMETERS = Replay()
@@ -269,7 +269,7 @@ def test_readings_go_to_the_interval_they_fall_in_and_looks_are_spaced():
     np.testing.assert_array_equal(found[0], np.eye(5)[2, :3])
     np.testing.assert_array_equal(found[1], np.eye(5)[3, :3])
     assert np.isnan(found[2]).all()
-    taken = every(np.arange(1, 31) * 0.1, np.arange(30) > 4, 1.0)
+    taken = Pace().take(TRAVEL, np.arange(1, 31) * 0.1, np.arange(30) > 4, 1.0)
     assert np.flatnonzero(taken).tolist() == [5, 15, 25]
 
 

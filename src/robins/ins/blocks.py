@@ -8,6 +8,7 @@ is split there, so that every measurement meets the state at its own time.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ class Blocks(NamedTuple):
 
 
 def epochs_between(
-    start_s: float, end_s: float, wanted_s: np.ndarray, longest_s: float
+    start_s: float, end_s: float, wanted_s: np.ndarray, longest_s: float, even: bool = True
 ) -> np.ndarray:
     """Epochs at all wanted times in (start, end], and between them so that none is too long.
 
@@ -36,6 +37,7 @@ def epochs_between(
         end_s: where the last block ends.
         wanted_s: times that need an epoch of their own (measurements).
         longest_s: longest block allowed.
+        even: split in even parts; else in longest ones and a rest, without knowing the next time.
 
     Returns:
         (E,) strictly increasing; the last one is end_s.
@@ -45,11 +47,17 @@ def epochs_between(
     edges = np.unique(np.concatenate([[start_s], wanted, [end_s]]))
     out = []
     for a, b in pairwise(edges):
-        # a block is split evenly; a hair of tolerance keeps 1.0000001 s from becoming two
+        # a hair of tolerance keeps 1.0000001 s from becoming two
         pieces = max(1, int(np.ceil((b - a) / longest_s - 1e-6)))
-        out.append(a + (b - a) * np.arange(1, pieces + 1) / pieces)
+        part = np.arange(1, pieces + 1)
+        out.append(a + (b - a) * part / pieces if even else a + longest_s * part)
         out[-1][-1] = b
     return np.concatenate(out) if out else np.zeros(0)
+
+
+def usual_width(longest_s: float, usual_s: float) -> int:
+    """Pieces that the longest block of a sensor holds by its usual interval, and some to spare."""
+    return -(-math.ceil(1.1 * longest_s / usual_s + 2.0) // 8) * 8
 
 
 def cut(
@@ -58,6 +66,7 @@ def cut(
     start_s: float,
     epoch_s: np.ndarray,
     width: int | None = None,
+    least: int = 8,
 ) -> Blocks:
     """Group increments by epoch, splitting those that an epoch falls into.
 
@@ -72,6 +81,7 @@ def cut(
         epoch_s: (E,) end of each block, increasing.
         width: pad every block to this many pieces; by default to the longest block, rounded up
             to a multiple of 8 so that logs of like rate share a compilation.
+        least: pad to this many at least, where no width is given.
 
     Raises:
         ValueError: the increments do not cover (start_s, last epoch], or width is too small.
@@ -111,7 +121,7 @@ def cut(
     count = np.bincount(block, minlength=len(epoch_s))
     needed = int(count.max(initial=1))
     if width is None:
-        width = -(-needed // 8) * 8
+        width = max(-(-needed // 8) * 8, least)
     elif needed > width:
         raise ValueError(f"a block holds {needed} IMU increments, more than the width {width}")
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -127,18 +137,26 @@ def cut(
     return Blocks(Increments(out_dt, out_theta, out_dv), epoch_s, duration, out_parent)
 
 
-def rate_about(increments: Increments, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+def reach_of_rate(usual_s: float) -> float:
+    """How far about a time `rate_about` looks [s], of a sensor with this sampling interval."""
+    return max(0.01, 1.5 * usual_s)
+
+
+def rate_about(
+    increments: Increments, time_s: np.ndarray, at_s: np.ndarray, usual_s: float | None = None
+) -> np.ndarray:
     """(E, 3) rad/s, gyro rate about times: mean over the increments that end within 10 ms of each.
 
     Args:
         increments: dt (N,), theta (N, 3).
         time_s: (N,) end of each.
         at_s: (E,) times.
+        usual_s: s, sampling interval; None: the median of dt.
     """
     dt, theta = increments[:2]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(theta, axis=0)])
     length = np.concatenate([[0.0], np.cumsum(dt)])
-    half = max(0.01, 1.5 * float(np.median(dt)))
+    half = reach_of_rate(float(np.median(dt)) if usual_s is None else usual_s)
     a = np.searchsorted(time_s, at_s - half)
     b = np.minimum(np.maximum(np.searchsorted(time_s, at_s + half), a + 1), len(dt))
     a = np.minimum(a, b - 1)

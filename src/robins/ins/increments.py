@@ -59,12 +59,16 @@ class Increments(NamedTuple):
     dr: Any = None  # (N, 3) m, its double integral; None: as of a constant force in a turning body
 
 
-def from_imu(imu: ImuTable) -> tuple[Increments, np.ndarray]:
+def from_imu(imu: ImuTable, usual_s: float | None = None) -> tuple[Increments, np.ndarray]:
     """Increments of the intervals between samples, and the time each interval ends at.
 
     N samples make N - 1 intervals, from ``imu.time_ns[0]`` to ``imu.time_ns[-1]``. The first row of
     an increment table belongs to an interval that began before the table; it only shows the slope
     for the second, and is taken to be as long as that.
+
+    Args:
+        imu: the samples.
+        usual_s: s, sampling interval of the sensor, for a table too short to show it; None: shown.
 
     Raises:
         ValueError: fewer than two samples, time that does not increase, a value that is not finite.
@@ -75,7 +79,7 @@ def from_imu(imu: ImuTable) -> tuple[Increments, np.ndarray]:
     _check(imu, time, gyro, accel)
     dt = np.diff(time) * 1e-9
     if imu.kind == "increment":
-        theta, dv, dr = _from_increments(dt, gyro, accel)
+        theta, dv, dr = _from_increments(dt, gyro, accel, usual_s)
     else:
         theta, dv, dr = _from_rates(dt, gyro, accel)
     return Increments(dt, theta, dv, dr), time[1:]
@@ -108,13 +112,13 @@ def _row(imu: ImuTable, k: int) -> str:
     return f"row {k}" if imu.rows is None else f"line {imu.rows[k]}"
 
 
-def _from_increments(dt, gyro, accel):
+def _from_increments(dt, gyro, accel, usual_s):
     """The line through the mean before and the mean at the end of each interval, at Gauss points.
 
     Without a gap, a sample lasted as long as its interval, whose mean it has.
     """
     h = dt[:, None]
-    own = own_intervals(dt, gyro, accel)[:, None]
+    own = own_intervals(dt, gyro, accel, usual_s)[:, None]
     middle = 1.0 - 0.5 * own[1:] / h  # of the sample's own interval, in lengths of this one
     points = []
     for raw in (gyro, accel):
@@ -207,29 +211,33 @@ def usual_interval(dt: np.ndarray) -> float:
     return usual if usual > 0.5 * together else together
 
 
-def after_gap(dt: np.ndarray) -> np.ndarray:
+def after_gap(dt: np.ndarray, usual_s: float | None = None) -> np.ndarray:
     """(N,) bool: whether samples are missing in an interval, from the intervals (N,) [s].
 
-    A long interval with a short one behind it is a late stamp: nothing is missing there.
+    A long interval with a short one behind it is a late stamp: nothing is missing there. The usual
+    interval is that of `dt` unless it is given.
     """
-    usual = usual_interval(dt)
+    usual = usual_interval(dt) if usual_s is None else usual_s
     late = np.append(dt[1:] < (2.0 - _MISSING) * usual, False)
     return (dt > _MISSING * usual) & ~late
 
 
-def own_intervals(dt: np.ndarray, theta: np.ndarray, dv: np.ndarray) -> np.ndarray:
+def own_intervals(
+    dt: np.ndarray, theta: np.ndarray, dv: np.ndarray, usual_s: float | None = None
+) -> np.ndarray:
     """How long each increment of a table lasted [s]: the interval before it, or less after a gap.
 
     Args:
         dt: (N - 1,) s, between the samples.
         theta: (N, 3) rad, as recorded.
         dv: (N, 3) m/s.
+        usual_s: s, the usual interval; None: that of `dt`.
 
     Returns:
         (N,) s; the first as long as the second, or the usual interval if that ends a gap.
     """
-    gap = after_gap(dt)
-    usual = usual_interval(dt)
+    usual = usual_interval(dt) if usual_s is None else usual_s
+    gap = after_gap(dt, usual)
     own = np.concatenate([np.where(gap[:1], usual, dt[:1]), dt])
     both = np.hstack([theta, dv / _GRAVITY])
     for k in np.flatnonzero(gap) + 1:

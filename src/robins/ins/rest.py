@@ -39,8 +39,17 @@ def moving_statistics(values: np.ndarray, width: int) -> tuple[np.ndarray, np.nd
     return mean + shift, np.sqrt(variance)
 
 
+def _width(dt: np.ndarray, window_s: float, usual_s: float | None) -> int:
+    """Samples in a window."""
+    return max(2, round(window_s / (float(np.median(dt)) if usual_s is None else usual_s)))
+
+
 def standstill(
-    increments: Increments, window_s: float, quiet_rate: float, quiet_force: float
+    increments: Increments,
+    window_s: float,
+    quiet_rate: float,
+    quiet_force: float,
+    usual_s: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Whether the unit stood still over the window up to each increment.
 
@@ -52,12 +61,13 @@ def standstill(
         window_s: length of the window.
         quiet_rate: rad/s.
         quiet_force: m/s^2.
+        usual_s: s, sampling interval; None: the median of dt.
 
     Returns:
         (N,) bool, and (N, 3) mean gyro rate over the window [rad/s].
     """
     dt, theta, dv = increments[:3]
-    width = max(2, round(window_s / float(np.median(dt))))
+    width = _width(dt, window_s, usual_s)
     mean_rate, spread_rate = moving_statistics(theta / dt[:, None], width)
     _, spread_force = moving_statistics(dv / dt[:, None], width)
     still = np.all(spread_rate < quiet_rate, axis=1)
@@ -68,13 +78,17 @@ def standstill(
 
 
 def unrest(
-    increments: Increments, window_s: float, quiet_rate: float, quiet_force: float
+    increments: Increments,
+    window_s: float,
+    quiet_rate: float,
+    quiet_force: float,
+    usual_s: float | None = None,
 ) -> np.ndarray:
     """(N,) spread over the window up to each increment, in thresholds of `standstill`; the axis
     that is the farthest from still.
     """
     dt, theta, dv = increments[:3]
-    width = max(2, round(window_s / float(np.median(dt))))
+    width = _width(dt, window_s, usual_s)
     _, spread_rate = moving_statistics(theta / dt[:, None], width)
     _, spread_force = moving_statistics(dv / dt[:, None], width)
     each = np.concatenate([spread_rate / quiet_rate, spread_force / quiet_force], axis=1)
@@ -88,6 +102,7 @@ def confirmed(
     fix_s: np.ndarray,
     moves: np.ndarray,
     wait_s: float,
+    calmest: float = np.inf,
 ) -> np.ndarray:
     """Which samples that look still are: a vehicle on a smooth road looks like one at rest.
 
@@ -103,25 +118,37 @@ def confirmed(
         fix_s: (M,) increasing times of fixes that tell whether the vehicle moves.
         moves: (M,) bool, what they tell.
         wait_s: how long a fix tells it.
+        calmest: least unrest in motion that was known before the first of these fixes.
 
     Returns:
         (N,) bool.
     """
-    if len(fix_s) == 0:
+    if len(fix_s) == 0 and calmest == np.inf:
         return np.zeros(len(time_s), dtype=bool)
+    if len(fix_s) == 0:
+        return still & (unrest < _CALMER * calmest)
     last = np.searchsorted(fix_s, time_s + 1e-9, side="right") - 1
     known = (last >= 0) & (time_s - fix_s[np.maximum(last, 0)] <= wait_s)
     moving = known & moves[np.maximum(last, 0)]
-    calm = unrest < _CALMER * _calmest_in_motion(unrest, time_s, fix_s, moves, wait_s)[last + 1]
+    least = calmest_in_motion(unrest, time_s, fix_s, moves, wait_s, calmest)
+    calm = unrest < _CALMER * least[last + 1]
     return still & np.where(known, ~moving, calm)
 
 
-def _calmest_in_motion(
-    unrest: np.ndarray, time_s: np.ndarray, fix_s: np.ndarray, moves: np.ndarray, wait_s: float
+def calmest_in_motion(
+    unrest: np.ndarray,
+    time_s: np.ndarray,
+    fix_s: np.ndarray,
+    moves: np.ndarray,
+    wait_s: float,
+    calmest: float = np.inf,
 ) -> np.ndarray:
-    """(M + 1,) least unrest in motion as it is known after so many fixes; 0 where it is not."""
+    """(M + 1,) least unrest in motion as it is known after so many fixes; 0 where it is not.
+
+    Arguments as of `confirmed`.
+    """
     edges = np.searchsorted(time_s, fix_s)
-    least = np.full(len(fix_s) + 1, np.inf)
+    least = np.full(len(fix_s) + 1, calmest)
     for k in range(1, len(fix_s) - 1):
         begin, end = edges[k - 1], edges[k]
         if begin < end and np.all(moves[k - 1 : k + 2]) and fix_s[k] - fix_s[k - 1] <= wait_s:

@@ -114,12 +114,14 @@ def prepared(
     return found, problems
 
 
-def noise_scale(blocks: Blocks, dt_s: np.ndarray, across_gap: float) -> np.ndarray:
+def noise_scale(
+    blocks: Blocks, dt_s: np.ndarray, across_gap: float, usual_s: float | None = None
+) -> np.ndarray:
     """(E,) of the process noise factor: 1, or `across_gap` in a block in which samples are missing.
 
-    The blocks are cut from increments of lengths `dt_s` (N,).
+    The blocks are cut from increments of lengths `dt_s` (N,), usually `usual_s`, or as these tell.
     """
-    gap = after_gap(dt_s)
+    gap = after_gap(dt_s, usual_s)
     missing = np.any(gap[blocks.parent] & (blocks.parent >= 0), axis=1)
     return np.where(missing, across_gap, 1.0)
 

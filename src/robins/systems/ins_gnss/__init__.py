@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from robins.systems.ins_gnss.live import LiveInsGnss
 from robins.systems.ins_gnss.log import NAMES, replay
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
@@ -20,4 +21,4 @@ SYSTEM = System(
     orientation=lambda parameters: parameters.imu.orientation,
 )
 
-__all__ = ["SYSTEM", "Drive", "Replay", "drive_dataset", "ins_gnss_model", "replay"]
+__all__ = ["SYSTEM", "Drive", "LiveInsGnss", "Replay", "drive_dataset", "ins_gnss_model", "replay"]

@@ -21,7 +21,7 @@ from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.errors import require_known
 from robins.filters import Belief, StepWarning, run
-from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about
+from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsState
@@ -32,7 +32,7 @@ from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
 from robins.systems.ins_gnss.robust import robust, supposing_mean, weighed
-from robins.systems.ins_gnss.start import StartPoint, at_rest, find_start
+from robins.systems.ins_gnss.start import StartPoint, Usual, at_rest, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
@@ -77,13 +77,16 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     used = (log.gnss_s > begin_s) & (log.gnss_s <= end_s)
     if not np.any(used):
         raise ValueError(f"no GNSS fix after the start at {begin_s:.1f} s")
-    epochs = epochs_between(begin_s, end_s, log.gnss_s[used], parameters.update.longest_block)
-    blocks = cut(increments, log.time_s, begin_s, epochs)
+    # a filter that runs while the log is made does not know when the next fix comes
+    longest_s = parameters.update.longest_block
+    epochs = epochs_between(begin_s, end_s, log.gnss_s[used], longest_s, even=False)
+    width = usual_width(longest_s, float(np.median(increments.dt)))
+    blocks = cut(increments, log.time_s, begin_s, epochs, least=width)
     scale = replaying.noise_scale(blocks, increments.dt, parameters.update.gap_noise)
     rate = rate_about(increments, log.time_s, epochs)
-    y, aux = _fixes(log, used, epochs, rate, parameters.gnss.velocity_window)
-    known, about = _known(log, epochs, rate, parameters.aids)
-    belief, u = _belief(log, start, parameters), Block(blocks.increments, scale)
+    y, aux = measured_fixes(log, used, epochs, rate, parameters.gnss.velocity_window)
+    known, about = measured_rest(log, epochs, rate, parameters.aids)
+    belief, u = first_belief(log, start, parameters), Block(blocks.increments, scale)
     return Stretch(
         world=Case(belief, u, y | known, aux | about, None),
         begin_s=begin_s,
@@ -96,7 +99,7 @@ def prepare(whole: Log, parameters: Replay, rows: slice) -> Stretch:
     )
 
 
-def _belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
+def first_belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
     """At the first fix, moved from the antenna to the IMU."""
     g, row = log.gnss, start.fix
     v = np.zeros(3) if log.v_n is None else np.nan_to_num(log.v_n[row])
@@ -115,7 +118,7 @@ def _belief(log: Log, start: StartPoint, parameters: Replay) -> Belief:
     )
 
 
-def _fixes(
+def measured_fixes(
     log: Log, used: np.ndarray, epochs: np.ndarray, rate: np.ndarray, window_s: float | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """GNSS measurements by epoch; NaN where there is no fix or it is withheld."""
@@ -138,11 +141,11 @@ def _fixes(
     return y, aux
 
 
-def _known(
-    log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids
+def measured_rest(
+    log: Log, epochs: np.ndarray, rate: np.ndarray, aids: Aids, usual: Usual | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measurements of what is known without a receiver: standing still, or not slipping."""
-    still, mean_rate = at_rest(log, aids)
+    still, mean_rate = at_rest(log, aids, usual)
     last = np.minimum(np.searchsorted(log.time_s, epochs - 1e-9), len(log.time_s) - 1)
     stands = still[last][:, None]
     y: dict[str, Any] = {}

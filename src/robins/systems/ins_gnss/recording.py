@@ -12,7 +12,7 @@ from robins import rotation
 from robins.dataset import Dataset, GnssTable
 from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
-from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.parameters import Gnss, Replay
 
 
 class Log(NamedTuple):
@@ -39,9 +39,7 @@ def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
     """
     if dataset.mounted or not any(orientation):
         return dataset
-    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*orientation))).T
-    whole = np.round(C_bs)  # right angles exchange axes and mix nothing
-    C_bs = np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
+    C_bs = axes_of(orientation)
     imu = to_ned_frd(dataset.imu)
     imu = replace(imu, gyro=imu.gyro @ C_bs.T, accel=imu.accel @ C_bs.T)
     mag = dataset.mag
@@ -49,6 +47,25 @@ def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
         mag = to_ned_frd(mag)
         mag = replace(mag, field_t=mag.field_t @ C_bs.T)
     return replace(dataset, imu=imu, mag=mag, mounted=True)
+
+
+def axes_of(orientation: Sequence[float]) -> np.ndarray:
+    """(3, 3) from the sensor's axes to forward-right-down; orientation as in `in_body_axes`."""
+    C_bs = np.asarray(rotation.to_dcm(rotation.from_euler(*orientation))).T
+    whole = np.round(C_bs)  # right angles exchange axes and mix nothing
+    return np.where(np.abs(C_bs - whole) < 1e-15, whole, C_bs) + 0.0
+
+
+def believed_sigmas(gnss: GnssTable, parameters: Gnss) -> tuple[np.ndarray, np.ndarray | None]:
+    """(M, 3) m and m/s, sigmas of fixes as the filter shall believe them; None where not used."""
+    g, factor = parameters, np.ones(len(gnss))
+    if gnss.quality is not None:
+        for quality, value in g.sigma_factor.items():
+            factor[gnss.quality == int(quality)] = value
+    sigma_v = gnss.sigma_v if g.use_velocity else None
+    if sigma_v is not None:
+        sigma_v = np.maximum(sigma_v * factor[:, None], g.least_velocity_sigma)
+    return np.maximum(gnss.sigma_m * factor[:, None], g.least_sigma), sigma_v
 
 
 def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
@@ -68,20 +85,14 @@ def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
             f"no GNSS fix lies within the IMU log: the IMU spans 0 to {time_s[-1]:.1f} s, the "
             f"fixes {gnss_s[0]:.1f} to {gnss_s[-1]:.1f} s; do both use the same time scale?"
         )
-    factor = np.ones(len(gnss))
-    if gnss.quality is not None:
-        for quality, value in g.sigma_factor.items():
-            factor[gnss.quality == int(quality)] = value
-    v_n, sigma_v = (gnss.v_n, gnss.sigma_v) if g.use_velocity else (None, None)
-    if sigma_v is not None:
-        sigma_v = np.maximum(sigma_v * factor[:, None], g.least_velocity_sigma)
+    sigma_m, sigma_v = believed_sigmas(gnss, g)
     return Log(
         Increments(*(np.asarray(a, dtype=float) for a in increments[:3])),
         time_s,
         gnss,
         gnss_s,
-        np.maximum(gnss.sigma_m * factor[:, None], g.least_sigma),
-        v_n if sigma_v is not None else None,
+        sigma_m,
+        gnss.v_n if sigma_v is not None else None,
         sigma_v,
         parameters.withheld(gnss_s, gnss_s),
         *_field(dataset, origin),

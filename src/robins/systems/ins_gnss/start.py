@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,13 @@ from robins import rotation
 from robins.earth import Geodetic, gravity
 from robins.earth.magnetic import decimal_year, elements, field_n, wmm_for
 from robins.ins.alignment import level
-from robins.ins.rest import confirmed, moving_statistics, standstill, unrest
+from robins.ins.rest import (
+    calmest_in_motion,
+    confirmed,
+    moving_statistics,
+    standstill,
+    unrest,
+)
 from robins.systems.ins_gnss.parameters import Aids, Start
 from robins.systems.ins_gnss.recording import Log
 
@@ -27,13 +33,37 @@ class StartPoint(NamedTuple):
     sentence: str  # how it was found, for the reader
 
 
-def at_rest(log: Log, aids: Aids) -> tuple[np.ndarray, np.ndarray]:
+class Usual(NamedTuple):
+    """What a piece of a log that is too short does not tell of the whole."""
+
+    sample_s: float  # interval between samples
+    fix_s: float  # between fixes
+    calmest: float = np.inf  # least unrest in motion that was known before, as of `confirmed`
+
+
+def at_rest(log: Log, aids: Aids, usual: Usual | None = None) -> tuple[np.ndarray, np.ndarray]:
     """(N,) whether the vehicle stands still at each increment, by samples and fixes; mean rate."""
-    still, mean_rate = standstill(log.increments, *aids.quiet)
+    still, mean_rate, *heard = _heard(log, aids, usual)
+    calmest = np.inf if usual is None else usual.calmest
+    return confirmed(still, *heard, calmest), mean_rate
+
+
+def calmest(log: Log, aids: Aids, usual: Usual, fixes: int) -> float:
+    """Least unrest in motion as it is known after so many of the fixes that tell of motion."""
+    least = calmest_in_motion(*_heard(log, aids, usual)[2:], usual.calmest)
+    found = float(least[min(fixes, len(least) - 1)])
+    return found if found > 0.0 else np.inf
+
+
+def _heard(log: Log, aids: Aids, usual: Usual | None) -> tuple[Any, ...]:
+    """Stillness by spread, mean rate, and what `calmest_in_motion` takes."""
+    sample_s = None if usual is None else usual.sample_s
+    still, mean_rate = standstill(log.increments, *aids.quiet, sample_s)
     fix_s, moves = _moving_fixes(log, aids.moving_speed)
-    wait_s = 1.5 * max(1.0, float(np.median(np.diff(fix_s)))) if len(fix_s) > 1 else 1.5
-    quiet = unrest(log.increments, *aids.quiet)
-    return confirmed(still, quiet, log.time_s, fix_s, moves, wait_s), mean_rate
+    between = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
+    wait_s = 1.5 * max(1.0, between if usual is None else usual.fix_s)
+    quiet = unrest(log.increments, *aids.quiet, sample_s)
+    return still, mean_rate, quiet, log.time_s, fix_s, moves, wait_s
 
 
 def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
@@ -58,8 +88,13 @@ def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
     return time_s[told], way[told] > limit[told]
 
 
+CARRIED = 4096  # increments, to multiples of which those that carry the tilt are filled up
+
+
 @jax.jit
-def _turned(q, theta):
+def turned(q, theta):
+    """Attitude (4,) after rotation vectors (N, 3) in body axes."""
+
     def step(q, t):
         return rotation.normalise(rotation.multiply(q, rotation.from_rotvec(t))), None
 
@@ -135,13 +170,19 @@ def _compass(
     )
 
 
-def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
+def find_start(log: Log, start: Start, aids: Aids, usual: Usual | None = None) -> StartPoint:
     """Level on the quietest early window; take the heading as given or from the GNSS course.
 
     The gyros carry the tilt from that window to the moment the course is known (first fix faster
     than ``start.course_speed``); body forward is then taken along the course. The filter begins at
     the first whole fix from there on. Where no fix is fast enough a magnetometer is asked, if there
     is one.
+
+    Args:
+        log: at least up to that moment.
+        start: how well it is known.
+        aids: what rest is.
+        usual: where the log is too short to tell.
 
     Raises:
         ValueError: no heading is known: none was given, no fix is fast enough, and there is no
@@ -159,10 +200,13 @@ def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
         fast, unknown = _fast_fix(log, start)
         if unknown and log.field_b is None:
             raise ValueError(f"the heading at the start is not known: {unknown}")
-    still, mean_rate = at_rest(log, aids)
-    width = max(2, round(2.0 * aids.window / float(np.median(dt))))
+    still, mean_rate = at_rest(log, aids, usual)
+    sample_s = float(np.median(dt)) if usual is None else usual.sample_s
+    width = max(2, round(2.0 * aids.window / sample_s))
     mean_force, spread = moving_statistics(dv / dt[:, None], width)
-    last = len(dt) - 1 if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
+    # without a course nothing is taken from after the rest that it begins at
+    enough = np.append(np.flatnonzero(still)[width : width + 1], len(dt) - 1)[0]
+    last = int(enough) if fast is None else int(np.searchsorted(time_s, gnss_s[fast]))
     quiet_enough = np.flatnonzero(still[: last + 1])
     if len(quiet_enough):
         at = int(quiet_enough[min(len(quiet_enough) - 1, width)])
@@ -192,9 +236,11 @@ def find_start(log: Log, start: Start, aids: Aids) -> StartPoint:
     else:
         assert v_n is not None
         assert fast is not None
-        carried = jnp.asarray(theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None])
+        carried = theta[at + 1 : last + 1] - bias * dt[at + 1 : last + 1, None]
+        # one compilation for most logs, and for a live start none
+        carried = jnp.asarray(np.pad(carried, ((0, -len(carried) % CARRIED), (0, 0))))
         heading = float(np.arctan2(v_n[fast, 1], v_n[fast, 0]))
-        q_nb = with_heading(np.asarray(_turned(jnp.asarray(q_nb), carried)), heading)
+        q_nb = with_heading(np.asarray(turned(jnp.asarray(q_nb), carried)), heading)
         begin_s = float(gnss_s[fast])
         sentence += (
             f"; heading {np.degrees(heading) % 360:.1f} deg from the course at {begin_s:.1f} s, "

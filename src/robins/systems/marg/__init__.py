@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import first_belief, first_look, prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
 from robins.systems.marg.parameters import Replay
@@ -23,6 +24,7 @@ SYSTEM = System(
 __all__ = [
     "SYSTEM",
     "Block",
+    "LiveMarg",
     "Replay",
     "Samples",
     "filter_of",

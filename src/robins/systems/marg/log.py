@@ -96,16 +96,18 @@ def whole_samples(imu: ImuTable, gyro: Gyro, accelerometer: Accelerometer) -> Wh
     return Whole(kept, full, doubt, accel_full, counts)
 
 
-def as_means(imu: ImuTable) -> ImuTable:
+def as_means(imu: ImuTable, usual_s: float | None = None) -> ImuTable:
     """Rates as increments of the sampling intervals that end with them.
 
     What a MEMS chip puts out is the mean over its last sampling interval, or later still for its
     filters; to read it as the rate of that instant would run ahead of the motion by half of one.
+    The usual interval is that of the table unless it is given.
     """
     if imu.kind == "increment":
         return imu
     dt = np.diff(imu.time_ns) * 1e-9
-    own = np.where(after_gap(dt), usual_interval(dt), dt)
+    usual_s = usual_interval(dt) if usual_s is None else usual_s
+    own = np.where(after_gap(dt, usual_s), usual_s, dt)
     own = np.concatenate([own[:1], own])[:, None]
     return replace(imu, gyro=imu.gyro * own, accel=imu.accel * own, kind="increment")
 
@@ -175,38 +177,21 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         _filled(field, blocks, n, np.nan),
     )
     integrals, block_field = jax.tree.map(np.asarray, model.integrate(samples))
-    rest = at_rest(
-        integrals.dt_s, _mean_rate(integrals), _mean_force(integrals), block_field, p.rest
-    )
+    rest = at_rest(integrals.dt_s, mean_rate(integrals), mean_force(integrals), block_field, p.rest)
     still = rest.still
 
-    gap = np.where(dt > p.update.gap * usual, dt, 0.0)
-    known = np.isfinite(doubt)
-    unknown = full & ~known
-    lost = gap + dt * (accel_full[1:] | accel_full[:-1])
-    # what a gyro at its end did not say, about its own axis; what all samples of a gap did not
-    turn = p.update.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
-    turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
-    lost_turn = _filled(turn, blocks, n, 0.0).sum(axis=1)
-    lost = _filled(lost, blocks, n, 0.0).sum(axis=1)
-    counts["imu_gaps"] = int(np.sum(gap > 0.0))
-    weight = p.accelerometer.gravity * integrals.dt_s
-    falling = np.linalg.norm(integrals.dv, axis=1) < _FALLING * weight
+    turn, lost, gaps = not_sampled(dt, full, doubt, accel_full, usual, p)
+    counts["imu_gaps"] = gaps
+    lost_turn, lost = (_filled(a, blocks, n, 0.0).sum(axis=1) for a in (turn, lost))
+    u, falling = inputs(integrals, still, lost_turn, lost, p)
     counts["blocks_in_free_fall"] = int(np.sum(falling))
-    fall = np.where(falling, weight, 0.0)
-    u = model.Block(
-        integrals,
-        still=still.astype(float),
-        lost_turn=np.minimum(lost_turn, np.pi),
-        lost_dv=np.hypot(p.update.gap_accel * lost, fall),
-    )
     look = first_look(increments, field, parameters)
     ends = np.minimum((np.arange(blocks) + 1) * n, len(dt))
     return Prepared(
         world=Case(
             first_belief(look, parameters, rest),
             u,
-            *_measurements(integrals, block_field, rest, parameters),
+            *measurements(integrals, block_field, rest, parameters, Pace()),
             None,
         ),
         begin_s=0.0,
@@ -218,6 +203,64 @@ def prepare(dataset: Dataset, parameters: Replay) -> Prepared:
         still=still[:whole],
         counts=counts,
     )
+
+
+def not_sampled(
+    dt: np.ndarray,
+    full: np.ndarray,
+    doubt: np.ndarray,
+    accel_full: np.ndarray,
+    usual: float,
+    parameters: Replay,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Spread of the turn that intervals did not show (N, 3) [rad], seconds of specific force that
+    they did not show (N,), and how many are gaps.
+
+    Args:
+        dt: (N,) s, intervals between N + 1 samples.
+        full: (N + 1, 3) bool, a gyro at the end of its range, and
+        doubt: (N + 1, 3) rad/s, spread of what was put back; NaN where nothing.
+        accel_full: (N + 1,) bool.
+        usual: s, sampling interval.
+        parameters: of gaps.
+    """
+    p = parameters.update
+    gap = np.where(dt > p.gap * usual, dt, 0.0)
+    known = np.isfinite(doubt)
+    unknown = full & ~known
+    lost = gap + dt * (accel_full[1:] | accel_full[:-1])
+    # what a gyro at its end did not say, about its own axis; what all samples of a gap did not
+    turn = p.gap_rate * (gap[:, None] + dt[:, None] * (unknown[1:] | unknown[:-1]))
+    turn = turn + dt[:, None] * np.where(known, doubt, 0.0)[1:]
+    return turn, lost, int(np.sum(gap > 0.0))
+
+
+def inputs(
+    integrals: model.Integrals,
+    still: np.ndarray,
+    lost_turn: np.ndarray,
+    lost_s: np.ndarray,
+    parameters: Replay,
+) -> tuple[model.Block, np.ndarray]:
+    """What the motion takes of K blocks, and which of them fall freely (K,) bool.
+
+    Args:
+        integrals: of the blocks.
+        still: (K,) bool.
+        lost_turn: (K, 3) rad, spread of the turn that was not sampled.
+        lost_s: (K,) s, for how long the specific force was not sampled.
+        parameters: of gaps, and gravity.
+    """
+    weight = parameters.accelerometer.gravity * np.asarray(integrals.dt_s)
+    falling = np.linalg.norm(np.asarray(integrals.dv), axis=1) < _FALLING * weight
+    fall = np.where(falling, weight, 0.0)
+    u = model.Block(
+        integrals,
+        still=still.astype(float),
+        lost_turn=np.minimum(lost_turn, np.pi),
+        lost_dv=np.hypot(parameters.update.gap_accel * lost_s, fall),
+    )
+    return u, falling
 
 
 def attitude_of(force_b: np.ndarray, field_b: np.ndarray | None) -> np.ndarray:
@@ -337,28 +380,54 @@ def first_belief(look: FirstLook, parameters: Replay, rest: RestFound | None = N
     return Belief(mean, jnp.asarray(factor))
 
 
-def _measurements(
-    integrals: model.Integrals, field_b: np.ndarray, rest: RestFound, parameters: Replay
+class Pace:
+    """When travel and field were seen last, so that they are seen once in an interval."""
+
+    def __init__(self) -> None:
+        """Nothing was seen."""
+        self.clock_s = 0.0  # end of the last block
+        self.due_s = {model.TRAVEL: -np.inf, model.MAGNETOMETER: -np.inf}
+
+    def take(self, name: str, clock_s: np.ndarray, able: np.ndarray, every_s: float) -> np.ndarray:
+        """(K,) bool: which blocks to take so that about `every_s` lies between two."""
+        out = np.zeros(len(clock_s), dtype=bool)
+        for k in np.flatnonzero(able):
+            if clock_s[k] >= self.due_s[name]:
+                out[k] = True
+                self.due_s[name] = clock_s[k] + every_s * (1.0 - 1e-9)
+        return out
+
+
+def measurements(
+    integrals: model.Integrals,
+    field_b: np.ndarray,
+    rest: RestFound,
+    parameters: Replay,
+    pace: Pace,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What is known at the end of each block; NaN where nothing is."""
+    """What is known at the end of each block; NaN where nothing is.
+
+    The pace goes on with these blocks.
+    """
     p, time = parameters, np.asarray(integrals.dt_s)
-    blocks, clock = len(time), np.cumsum(time)
+    blocks, clock = len(time), np.cumsum(np.concatenate([[pace.clock_s], time]))[1:]
+    pace.clock_s = float(clock[-1])
     still = rest.still & (time > 0.0)
     travel = np.full((blocks, 6), np.nan)
     travel[still, :3] = 0.0
     # Noise that lasts is thinned out: it must be new at each reading to be what the filter thinks.
-    travel[every(clock, time > 0.0, p.travel.every)] = 0.0
+    travel[pace.take(model.TRAVEL, clock, time > 0.0, p.travel.every)] = 0.0
     y: dict[str, Any] = {
         model.TRAVEL: travel,
         model.REST_RATE: np.where(still[:, None], np.zeros((blocks, 3)), np.nan),
     }
     aux: dict[str, Any] = {
         model.TRAVEL: still.astype(float),
-        model.REST_RATE: np.concatenate([_mean_rate(integrals), rest.sigma[:, None]], axis=1),
+        model.REST_RATE: np.concatenate([mean_rate(integrals), rest.sigma[:, None]], axis=1),
     }
     if p.use_magnetometer != "never":
         there = np.all(np.isfinite(field_b), axis=1)
-        look = every(clock, there & ~still, p.travel.every)
+        look = pace.take(model.MAGNETOMETER, clock, there & ~still, p.travel.every)
         y[model.MAGNETOMETER] = (
             Angle(np.where(look, 0.0, np.nan)),
             np.where(look[:, None], np.zeros((blocks, 2)), np.nan),
@@ -367,25 +436,14 @@ def _measurements(
     return y, aux
 
 
-def _mean_rate(integrals: model.Integrals) -> np.ndarray:
+def mean_rate(integrals: model.Integrals) -> np.ndarray:
     """(K, 3) rad/s, mean over each block, from its rotation; meant for rest."""
     q, dt = np.asarray(integrals.turn), np.asarray(integrals.dt_s)[:, None]
     vector = 2.0 * q[:, 1:] * np.sign(q[:, :1])
     return np.where(dt > 0.0, vector / np.where(dt > 0.0, dt, 1.0), 0.0)
 
 
-def _mean_force(integrals: model.Integrals) -> np.ndarray:
+def mean_force(integrals: model.Integrals) -> np.ndarray:
     """(K, 3) m/s^2, mean specific force of each block."""
     dt = np.asarray(integrals.dt_s)[:, None]
     return np.asarray(integrals.dv) / np.where(dt > 0.0, dt, 1.0)
-
-
-def every(clock_s: np.ndarray, able: np.ndarray, interval_s: float) -> np.ndarray:
-    """Which blocks to take so that about `interval_s` lies between two; the first able one on."""
-    out = np.zeros(len(clock_s), dtype=bool)
-    due = -np.inf
-    for k in np.flatnonzero(able):
-        if clock_s[k] >= due:
-            out[k] = True
-            due = clock_s[k] + interval_s * (1.0 - 1e-9)
-    return out

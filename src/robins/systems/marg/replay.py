@@ -298,12 +298,27 @@ def _without_padding(log: Prepared, answer: Answer, parameters: Replay) -> Answe
     mean, sigma, seen = jax.tree_util.tree_map(
         lambda x: np.asarray(x)[: len(log.rows)], (answer.mean, answer.sigma, answer.updates)
     )
-    stated, samples = parameters.stated, log.world.u.samples
+    samples = log.world.u.samples
     turned, lasted = (np.asarray(a)[: len(log.rows)] for a in (samples.angle, samples.dt_s))
+    sigma = stated_sigma(sigma, turned, lasted, parameters)
+    return answer._replace(mean=mean, sigma=sigma, updates=seen)
+
+
+def stated_sigma(
+    sigma: np.ndarray, turned: np.ndarray, lasted: np.ndarray, parameters: Replay
+) -> np.ndarray:
+    """(B, n) standard deviations, those of attitude with what no state carries.
+
+    Args:
+        sigma: (B, n) of the filter, attitude first.
+        turned: (B,) rad, in each block.
+        lasted: (B,) s.
+        parameters: what is stated.
+    """
+    stated = parameters.stated
     late = stated.delay * turned / lasted
     floor = np.stack([np.hypot(x, late) for x in [stated.tilt] * 2 + [stated.heading]], axis=1)
-    sigma = np.concatenate([np.hypot(sigma[:, :3], floor), sigma[:, 3:]], axis=1)
-    return answer._replace(mean=mean, sigma=sigma, updates=seen)
+    return np.concatenate([np.hypot(sigma[:, :3], floor), sigma[:, 3:]], axis=1)
 
 
 def _estimates(mean: model.MargState) -> Mapping[str, Any]:

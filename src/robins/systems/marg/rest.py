@@ -26,16 +26,95 @@ class RestFound(NamedTuple):
     first_sigma: float  # rad/s, of that mean
 
 
-def at_rest(
-    dt_s: np.ndarray, rate: np.ndarray, force: np.ndarray, field: np.ndarray, rest: Rest
-) -> RestFound:
-    """Which blocks lie still, told causally.
+class Watch:
+    """Tells block by block whether the unit lies still.
 
     A quiet spell is one in which rate and specific force stay near their means over the last
     `rest.after`, and the field near the one the spell began with. It is rest once it has lasted
     `rest.after`, if its mean rate is within `rest.most_rate` of the bias that rest has shown last;
     otherwise, up to `rest.most_bias`, once it has lasted `rest.new_bias`, and then shows a new
     bias. The spell that the log begins with shows one at once.
+
+    Attributes:
+        first: (3,) rad/s, mean rate of the rest that the log begins with; None where there is none,
+            or not yet.
+        first_sigma: rad/s, of that mean.
+    """
+
+    def __init__(self, usual_s: float, rest: Rest):
+        """Begin.
+
+        Args:
+            usual_s: s, usual length of a block.
+            rest: thresholds.
+        """
+        self._usual_s, self._rest = usual_s, rest
+        self._width = round(rest.after / usual_s) if usual_s > 0.0 else 0
+        self._able = rest.detect and self._width >= _SHORT
+        self._rate, self._force = np.zeros((0, 3)), np.zeros((0, 3))  # of the spell, the last width
+        self._bias, self._held = np.zeros(3), np.full(3, np.nan)
+        self._clock_s, self._began_s, self._unbroken = 0.0, 0.0, True
+        self.first: np.ndarray | None = None
+        self.first_sigma = rest.rate
+
+    @property
+    def settled(self) -> bool:
+        """Whether it is known how the log begins: at rest, which lasts `rest.after`, or not."""
+        return not (self._able and self._unbroken) or self.first is not None
+
+    def look(
+        self, dt_s: float, rate: np.ndarray, force: np.ndarray, field: np.ndarray
+    ) -> tuple[bool, float]:
+        """Whether the unit lies still in the next block, and the spread of its mean rate [rad/s].
+
+        Args:
+            dt_s: s, length of the block.
+            rate: (3,) rad/s, mean over it.
+            force: (3,) m/s^2, mean specific force.
+            field: (3,) T in body axes; NaN where there is none.
+        """
+        rest = self._rest
+        self._clock_s += dt_s
+        if not self._able:
+            return False, rest.rate
+        # one block is too little to tell from; a pair that differs breaks the spell
+        self._rate = np.concatenate([self._rate, rate[None]])[-self._width :]
+        self._force = np.concatenate([self._force, force[None]])[-self._width :]
+        mean_rate, mean_force = self._rate.mean(axis=0), self._force.mean(axis=0)
+        off_rate = np.max(np.linalg.norm(self._rate - mean_rate, axis=1))
+        off_force = np.max(np.linalg.norm(self._force - mean_force, axis=1))
+        quiet = 0.0 < dt_s < 3.0 * self._usual_s
+        quiet &= bool(off_rate < rest.quiet_rate) and bool(off_force < rest.quiet_accel)
+        if np.all(np.isfinite(field)):
+            if np.any(np.isnan(self._held)):
+                self._held = field
+            turned = np.linalg.norm(field - self._held)
+            quiet &= bool(turned < rest.quiet_field * np.linalg.norm(self._held))
+        if not quiet:
+            self._rate, self._force = self._rate[:0], self._force[:0]
+            self._began_s, self._held = self._clock_s, np.full(3, np.nan)
+            self._unbroken = False
+            return False, rest.rate
+        lasted = self._clock_s - self._began_s
+        if lasted < rest.after * (1.0 - 1e-9):
+            return False, rest.rate
+        if not np.all(np.abs(mean_rate - self._bias) < rest.most_rate):
+            new = self._unbroken or lasted >= rest.new_bias
+            if not (new and np.all(np.abs(mean_rate) < rest.most_bias)):
+                self._unbroken = False  # a turn: the log does not begin with rest
+                return False, rest.rate
+        self._bias = mean_rate
+        spread = float(np.sqrt(np.mean((self._rate - mean_rate) ** 2)))
+        sigma = max(rest.rate, spread)
+        if self._unbroken and self.first is None:
+            self.first, self.first_sigma = mean_rate, sigma
+        return True, sigma
+
+
+def at_rest(
+    dt_s: np.ndarray, rate: np.ndarray, force: np.ndarray, field: np.ndarray, rest: Rest
+) -> RestFound:
+    """Which blocks lie still, told causally by a `Watch`; what the log begins with is told too.
 
     Args:
         dt_s: (K,) s, lengths of the blocks.
@@ -44,42 +123,9 @@ def at_rest(
         field: (K, 3) T in body axes; NaN where there is none.
         rest: thresholds.
     """
-    count = len(dt_s)
-    still, sigma = np.zeros(count, dtype=bool), np.full(count, rest.rate)
-    usual = float(np.median(dt_s[dt_s > 0.0])) if np.any(dt_s > 0.0) else 0.0
-    first, first_sigma = None, rest.rate
-    width = round(rest.after / usual) if usual > 0.0 else 0
-    if not rest.detect or width < _SHORT:
-        return RestFound(still, sigma, first, first_sigma)
-    bias, began, held = np.zeros(3), 0, np.full(3, np.nan)
-    clock = np.concatenate([[0.0], np.cumsum(dt_s)])
-    for k in range(count):
-        # one block is too little to tell from; a pair that differs breaks the spell
-        window = slice(max(began, k - width + 1), k + 1)
-        mean_rate, mean_force = rate[window].mean(axis=0), force[window].mean(axis=0)
-        quiet = 0.0 < dt_s[k] < 3.0 * usual
-        quiet &= bool(np.max(np.linalg.norm(rate[window] - mean_rate, axis=1)) < rest.quiet_rate)
-        quiet &= bool(np.max(np.linalg.norm(force[window] - mean_force, axis=1)) < rest.quiet_accel)
-        if np.all(np.isfinite(field[k])):
-            if np.any(np.isnan(held)):
-                held = field[k]
-            turned = np.linalg.norm(field[k] - held)
-            quiet &= bool(turned < rest.quiet_field * np.linalg.norm(held))
-        if not quiet:
-            began, held = k + 1, np.full(3, np.nan)
-            continue
-        lasted = clock[k + 1] - clock[began]
-        if lasted < rest.after * (1.0 - 1e-9):
-            continue
-        known = bool(np.all(np.abs(mean_rate - bias) < rest.most_rate))
-        if not known:
-            new = began == 0 or lasted >= rest.new_bias
-            if not (new and np.all(np.abs(mean_rate) < rest.most_bias)):
-                continue
-        bias = mean_rate
-        still[k] = True
-        spread = float(np.sqrt(np.mean((rate[window] - mean_rate) ** 2)))
-        sigma[k] = max(rest.rate, spread)
-        if began == 0 and first is None:
-            first, first_sigma = mean_rate, max(rest.rate, spread)
-    return RestFound(still, sigma, first, first_sigma)
+    there = dt_s[dt_s > 0.0]
+    watch = Watch(float(np.median(there)) if len(there) else 0.0, rest)
+    rows = zip(dt_s.tolist(), rate, force, field, strict=True)
+    seen = [watch.look(*row) for row in rows]
+    still, sigma = (np.array(column) for column in zip(*seen, strict=True))
+    return RestFound(still, sigma, watch.first, watch.first_sigma)

@@ -16,7 +16,8 @@ _LEVEL = 0.005  # share of the level that its samples lie within
 _JUMP = 0.05  # share of the level, more than a smooth peak can fall by
 _LEAST_RATE = 1.0  # rad/s; no gyro ends below
 _OFTEN = 2  # jumps to or from the level
-_LONGEST_S = 0.2  # s, of a peak that is bridged
+_KEPT_PAIRS = 100  # of samples at the level, more than a peak has
+LONGEST_S = 0.2  # s, of a peak that is bridged
 _MISSED = 0.3  # of what a bridge adds: the share that it may err by
 
 
@@ -51,7 +52,43 @@ def levels(rate: np.ndarray) -> np.ndarray:
     return out
 
 
-def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
+class Range:
+    """The end of each gyro's range as the samples so far show it: `levels`, sample by sample."""
+
+    def __init__(self) -> None:
+        """Nothing was read."""
+        self._last = np.zeros((0, 3))  # rad/s, the last three
+        self._top = np.zeros(6)  # rad/s, largest of each axis, positive; then negative
+        # of each: pairs that lie at its top, with the samples before and after
+        self._pairs: list[np.ndarray] = [np.zeros((0, 3))] * 6
+        self.levels = np.full((3, 2), np.inf)
+
+    def read(self, rate: np.ndarray) -> None:
+        """Take the next sample (3,) rad/s."""
+        window = np.concatenate([self._last, rate[None]])
+        self._last = window[-3:]
+        new = np.concatenate([rate, -rate])
+        grown = new > self._top
+        self._top = np.maximum(self._top, new)
+        near = grown & (self._top >= _LEAST_RATE)
+        if len(window) == 4:
+            x = np.concatenate([window, -window], axis=1)
+            low = np.minimum(x[1], x[2])
+            paired = (low > (1.0 - _LEVEL) * self._top) & (self._top >= _LEAST_RATE)
+            for k in np.flatnonzero(paired):
+                row = np.array([[low[k], x[0, k], x[3, k]]])
+                self._pairs[k] = np.concatenate([self._pairs[k][-_KEPT_PAIRS:], row])
+            near |= paired
+        for k in np.flatnonzero(near):
+            top, found = self._top[k], self._pairs[k]
+            found = self._pairs[k] = found[found[:, 0] > (1.0 - _LEVEL) * top]
+            jumps = np.sum(found[:, 1:] < (1.0 - _JUMP) * top)
+            self.levels[k % 3, int(k < 3)] = (1.0 - _LEVEL) * top if jumps >= _OFTEN else np.inf
+
+
+def bridged(
+    time_s: np.ndarray, rate: np.ndarray, most: float, known: np.ndarray | None = None
+) -> Bridged:
     """Put back the peaks that the range cut off.
 
     A peak is the cubic that leaves the last good sample and meets the next good one with the slopes
@@ -61,8 +98,9 @@ def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
         time_s: (N,).
         rate: (N, 3) rad/s.
         most: rad/s, the end of the range where it is told.
+        known: (3, 2) rad/s as of `levels`, where they were found before; None: found in `rate`.
     """
-    limit = np.minimum(levels(rate), 0.99 * most)
+    limit = np.minimum(levels(rate) if known is None else known, 0.99 * most)
     full = (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
     out, doubt = rate.copy(), np.full(rate.shape, np.nan)
     for axis in range(3):
@@ -73,7 +111,7 @@ def bridged(time_s: np.ndarray, rate: np.ndarray, most: float) -> Bridged:
             if np.any(full[end : end + 3, axis]):
                 continue
             t0, t1 = time_s[begin - 1], time_s[end]
-            if t1 - t0 > _LONGEST_S:
+            if t1 - t0 > LONGEST_S:
                 continue
             x, sign = rate[:, axis], np.sign(rate[begin, axis])
             rise = _slope(time_s[begin - 3 : begin], x[begin - 3 : begin])

@@ -1,0 +1,154 @@
+"""One file that holds all a live object knows, so that it goes on bit for bit after a restart.
+
+The file is an npz: numbered arrays, and a text in JSON with the name and version of the format, the
+class that wrote it, its parameters as TOML, the plain values between the arrays, and a digest of
+all that. It is written under another name, synced and renamed. Nothing in it is executed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import secrets
+import struct
+import zipfile
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins.results.errors import ResultError, cannot
+from robins.results.folder import sync
+
+# what NumPy and zipfile raise of a file that is none of theirs, or has a wrong bit
+_DAMAGE = (
+    ValueError, KeyError, TypeError, AttributeError, EOFError, NotImplementedError, RecursionError,
+    zipfile.BadZipFile, zlib.error, struct.error,
+)  # fmt: skip
+FORMAT, VERSION = "robins-live", 1
+_LARGEST = 1 << 30  # bytes of one array; keeps a damaged header from filling the memory
+
+
+class Snapshot(NamedTuple):
+    """What a file says."""
+
+    parameters: str  # TOML
+    state: Any  # as it was given to `write`, tuples as tuples, arrays as NumPy's
+
+
+def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) -> None:
+    """Write a snapshot, or leave what was there as it was.
+
+    Args:
+        path: of the file.
+        kind: name of the class.
+        parameters: TOML text.
+        state: dictionaries with texts as keys, lists, tuples, None, texts, numbers and arrays.
+
+    Raises:
+        ResultError: the file cannot be written.
+        TypeError: the state holds something else.
+    """
+    arrays: list[np.ndarray] = []
+    body = {"kind": kind, "parameters": parameters, "state": _frozen(state, arrays)}
+    told = {"format": FORMAT, "version": VERSION, **body, "digest": _digest(body, arrays)}
+    packed = io.BytesIO()
+    named = {f"a{k}": a for k, a in enumerate(arrays)}
+    np.savez(packed, told=np.frombuffer(json.dumps(told).encode(), np.uint8), **named)
+    target = Path(os.path.realpath(path))
+    aside = target.with_name(f".robins-live-{secrets.token_hex(6)}")
+    try:
+        with aside.open("xb") as file:
+            file.write(packed.getvalue())
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, target)
+        with suppress(OSError):
+            sync(target.parent)
+    except OSError as error:
+        raise cannot(target, "write the state", error) from error
+    finally:
+        with suppress(OSError):
+            aside.unlink()
+
+
+def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
+    """Read a snapshot that a class wrote.
+
+    Raises:
+        ResultError: the file cannot be read, is none, is damaged, or of another version or class.
+    """
+    try:
+        with open(path, "rb") as file, np.load(_read(file), allow_pickle=False) as packed:
+            told, arrays = _unpacked(packed)
+    except OSError as error:
+        raise cannot(path, "read the state", error) from error
+    except _DAMAGE as error:
+        why = "it is damaged or no file of a live state"
+        raise ResultError(path, why, "begin anew, or restore an older one") from error
+    if told.get("version") != VERSION:
+        what = f"it is of version {told.get('version')} of the format, this robins reads {VERSION}"
+        raise ResultError(path, what, "use the robins that wrote it, or begin anew")
+    body = {key: told.get(key) for key in ("kind", "parameters", "state")}
+    if told.get("digest") != _digest(body, arrays):
+        raise ResultError(path, "it is damaged", "begin anew, or restore an older one")
+    if told["kind"] != kind:
+        fix = f"load it with {told['kind']}.load"
+        raise ResultError(path, f"it holds a {told['kind']}, not a {kind}", fix)
+    return Snapshot(told["parameters"], _thawed(told["state"], arrays))
+
+
+def _read(file: Any) -> io.BytesIO:
+    """All of a file that is not too large; NumPy does not close one that is damaged."""
+    content = file.read(_LARGEST + 1)
+    if len(content) > _LARGEST:
+        raise ValueError("larger than a state")
+    return io.BytesIO(content)
+
+
+def _unpacked(packed: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
+    if any(info.file_size > _LARGEST for info in packed.zip.infolist()):
+        raise ValueError("larger than a state")
+    told = json.loads(packed["told"].tobytes().decode())
+    if not isinstance(told, dict) or told.get("format") != FORMAT:
+        raise ValueError("another format")
+    return told, [packed[f"a{k}"] for k in range(len(packed.files) - 1)]
+
+
+def _digest(body: Any, arrays: list[np.ndarray]) -> str:
+    seen = hashlib.sha256(json.dumps(body, sort_keys=True).encode())
+    for a in arrays:
+        seen.update(f"{a.dtype.str}{a.shape}".encode())
+        seen.update(np.ascontiguousarray(a).tobytes())
+    return seen.hexdigest()
+
+
+def _frozen(value: Any, arrays: list[np.ndarray]) -> Any:
+    """Plain JSON, in which an array is its number."""
+    if value is None or isinstance(value, bool | str) or type(value) in (int, float):
+        return value
+    if isinstance(value, dict):
+        return {"dict": {key: _frozen(v, arrays) for key, v in value.items()}}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__: [_frozen(v, arrays) for v in value]}
+    kept = np.asarray(value)
+    if kept.dtype.kind not in "fiub":
+        raise TypeError(f"a state cannot hold {type(value).__name__}")
+    arrays.append(kept)
+    return {"array": len(arrays) - 1}
+
+
+def _thawed(value: Any, arrays: list[np.ndarray]) -> Any:
+    if not isinstance(value, dict):
+        return value
+    ((kind, inner),) = value.items()
+    if kind == "array":
+        return arrays[inner]
+    if kind == "dict":
+        return {key: _thawed(v, arrays) for key, v in inner.items()}
+    items = [_thawed(v, arrays) for v in inner]
+    return items if kind == "list" else tuple(items)

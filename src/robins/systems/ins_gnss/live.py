@@ -1,0 +1,540 @@
+"""Navigation while the vehicle moves: samples and fixes in as they come, the state out at once.
+
+`LiveInsGnss` is a causal filter of a replay, by the same code, epoch after epoch. What a replay has
+at once and a live object has not:
+
+- **Late fixes.** The state of the filter at each epoch of the last `longest_delay_s` is kept. A fix
+  whose time has passed is used at its own time: the filter goes back to the epoch before it and
+  takes the samples and fixes since then again, so that the order of arrival changes nothing. An
+  older one is refused (`gnss_too_old`), one of the same time as another too (`gnss_duplicate`); one
+  that is newer than the newest sample waits.
+- **A look ahead of 10 ms**, or one and a half samples where these are rarer. The turn rate at an
+  epoch is a mean about it, and the increment before the last sample is known with the next one. So
+  the filter is that much behind, and the answer to a sample is its state carried on over what came
+  since, exactly what it predicts; the last increment is made of the samples so far.
+- **The start.** The filter begins as the replay does: level on a quiet window, heading by the
+  course of the first fix that is fast enough or as it is given. With a given heading it waits for
+  rest, at most ten seconds from the first fix on, and then takes the quietest window so far, where
+  a replay takes the quietest of the log. A magnetometer is asked where for 30 s no fix was fast
+  enough; a replay asks it where none of the log is. Answers before are `STARTING`, without numbers.
+- A gap longer than `update.longest_gap` begins anew. `outages` are not looked at: fixes that are
+  not given are not there. Whether velocities are means is a hypothesis of `robust` here as there.
+- Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins.dataset import GnssTable, ImuTable
+from robins.errors import require, require_known
+from robins.filters import OnlineFilter
+from robins.filters.run import Step
+from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
+from robins.ins.increments import Increments, from_imu
+from robins.systems import replaying
+from robins.systems.ins_gnss.log import (
+    SMOOTHED,
+    Unsaid,
+    contender,
+    first_belief,
+    measured_fixes,
+    measured_rest,
+)
+from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
+from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
+from robins.systems.parts import Block
+from robins.systems.streaming import (
+    Door,
+    Flag,
+    Live,
+    LiveError,
+    as_before,
+    numbers,
+    refuse_units,
+    stamp,
+)
+
+_PATIENCE_S = 0.1
+_AHEAD_S = 10.0  # of the newest sample, by which a fix may be
+_REST_S, _COURSE_S = 10.0, 30.0  # how long rest is waited for, and a course
+_UNITS_S = 1.0  # of samples, whose size tells their unit
+_MOST_START_S = 600.0  # of samples that the start is sought in
+
+
+class Navigation(NamedTuple):
+    """The answer to a sample or a fix: the state of the IMU; NaN while `STARTING`."""
+
+    time_ns: int
+    q_nb: np.ndarray  # (4,) forward-right-down to north-east-down, scalar first
+    v_n: np.ndarray  # (3,) m/s
+    lat_rad: float
+    lon_rad: float
+    alt_m: float
+    sigma: np.ndarray  # (9,) attitude [rad], velocity [m/s], position [m], each NED
+    flags: Flag
+
+
+class Epoch(NamedTuple):
+    """Where the filter is: the end of a block."""
+
+    time_s: float
+    wanted_s: float  # the fix, or the start, since which the blocks are counted
+    number: int  # of blocks since
+
+
+@partial(jax.jit, static_argnames=("filter_",))
+def _predicted(filter_, motion, state, u):
+    """Mean and standard deviations after a block, in one vector."""
+    return _vector(filter_.predict(state, motion, u)[1].belief)
+
+
+def _vector(belief: Any) -> jax.Array:
+    x, p = belief.mean, belief.mean.position
+    place = jnp.stack([p.lat, p.lon, p.alt])
+    return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma[:9]])
+
+
+def _kept(step: Step) -> jax.Array:
+    return _vector(step.posterior)
+
+
+class LiveInsGnss(Live):
+    """The state of a vehicle at each sample, at once (see the module for what differs).
+
+    Attributes:
+        counts: `imu_...` and `gnss_...`, refused by reason; `begun_anew`, `imu_gaps_declared`,
+            `blocks_over_imu_gaps`, `steps_again` (blocks repeated for late fixes).
+        start: the sentence on how the start was found; "" before.
+        epoch: what the filter itself said last, with the fixes up to then; None before.
+    """
+
+    _parameters: ClassVar[type[Replay]] = Replay
+    _kept: ClassVar[tuple[str, ...]] = (
+        "_origin_ns", "_raw_ns", "_raw", "_steps", "_newest", "_fixes", "_field", "_past",
+        "_calmest", "_velocities", "start", "_first_fix_s",
+    )  # fmt: skip
+    _parts: ClassVar[tuple[str, ...]] = ("_door",)
+
+    def __init__(
+        self,
+        parameters: Replay,
+        rate_hz: float,
+        fix_rate_hz: float = 1.0,
+        filter: str = "robust",
+        longest_delay_s: float = 1.0,
+    ):
+        """Begin; everything is compiled before the first sample.
+
+        Args:
+            parameters: as of a replay; the lever arm is `gnss.lever_arm`.
+            rate_hz: of the samples.
+            fix_rate_hz: of the receiver.
+            filter: a causal one of the replays.
+            longest_delay_s: how late a fix may come.
+
+        Raises:
+            ValueError: a rate or delay is not positive, or there is no causal filter of this name.
+        """
+        for what, value in (("rate_hz", rate_hz), ("fix_rate_hz", fix_rate_hz)):
+            require(value > 0.0, f"{what} must be positive", value)
+        require(longest_delay_s > 0.0, "longest_delay_s must be positive", longest_delay_s)
+        require(filter not in SMOOTHED, f"{filter} smooths: it needs the whole log")
+        made_with = {"fix_rate_hz": fix_rate_hz, "filter": filter, "rate_hz": rate_hz}
+        super().__init__(parameters, **made_with, longest_delay_s=longest_delay_s)
+        p = parameters
+        self._usual = Usual(1.0 / rate_hz, 1.0 / fix_rate_hz)
+        self._reach_s = reach_of_rate(self._usual.sample_s)
+        self._delay_s = longest_delay_s
+        self._width = usual_width(p.update.longest_block, self._usual.sample_s)
+        window_s = p.gnss.velocity_window
+        self._window_s = self._usual.fix_s if window_s is None else window_s
+        # what has to be looked back at from the oldest epoch
+        back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
+        self._back_s = longest_delay_s + 2.0 * self._reach_s + back
+        patience = max(2, math.ceil(p.update.patience / max(self._usual.fix_s, 1e-3)))
+        asked = contender(p, Unsaid(patience, 1.0), filter)
+        require_known("filter", filter, [filter])
+        self._filter, self._model = asked.filter, asked.model
+        self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
+        self._door = Door(p.update.longest_gap, max(3, round(_PATIENCE_S * rate_hz)))
+        self._begin_anew()
+        self._compile()
+
+    def _begin_anew(self) -> None:
+        """Forget all but the counts and the stamps."""
+        self._origin_ns: int | None = None
+        self._raw_ns: list[int] = []  # the last four samples
+        self._raw: list[np.ndarray] = []
+        self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment
+        self._newest = np.zeros((0, 8))  # the last increment, as far as it is known
+        # time [s], latitude, longitude, height, sigmas, velocity, its sigmas, quality; by time
+        self._fixes = np.zeros((0, 14))
+        self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
+        self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
+        self._states: list[Any] = []  # of the filter at them
+        self._calmest, self._velocities = math.inf, False
+        self._first_fix_s = math.inf
+        self.start, self.epoch = "", None
+        self._online: OnlineFilter | None = None
+
+    # --------------------------------------------------------------------------- what comes in
+
+    def push_imu(
+        self, time_ns: Any, gyro_rad_s: Any, accel_m_s2: Any, field_t: Any = None
+    ) -> Navigation:
+        """Take an inertial sample; the state at its stamp.
+
+        Args:
+            time_ns: stamp, whole nanoseconds, of the clock that fixes have too.
+            gyro_rad_s: (3,) rate along the axes of the sensor; NaN is missing.
+            accel_m_s2: (3,) specific force.
+            field_t: (3,) T of a magnetometer, for the start alone.
+
+        Raises:
+            LiveError: a stamp or vector of another kind, or numbers that are those of another unit;
+                the object goes on with the next sample.
+        """
+        time = stamp(time_ns)
+        values = np.stack([numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)])
+        field = None if field_t is None else numbers("field", field_t, 3)
+        why = self._door.ask(time, values.ravel())
+        if why == "anew":
+            kind = "imu_gaps_declared" if self._raw_ns and time > self._raw_ns[-1] else "begun_anew"
+            self.counts[kind] += 1
+            self._begin_anew()
+        elif why:
+            self.counts[f"imu_{why}"] += 1
+            return self._answer(time, Flag.REFUSED)
+        if self._C_bs is not None:
+            values = values @ self._C_bs.T
+            field = None if field is None else self._C_bs @ field
+        if self._origin_ns is None:
+            self._origin_ns = time
+        self._raw_ns, self._raw = [*self._raw_ns, time][-4:], [*self._raw, values.ravel()][-4:]
+        if field is not None and not self.start and np.all(np.isfinite(field)):
+            self._field = np.concatenate([self._field, [[self._seconds(time), *field]]])
+        self._integrate()
+        self._advance()
+        return self._answer(time, Flag(0))
+
+    def push_fix(
+        self,
+        time_ns: Any,
+        lat_rad: float,
+        lon_rad: float,
+        alt_m: float,
+        sigma_m: Any,
+        v_n: Any = None,
+        sigma_v: Any = None,
+        quality: int = 0,
+    ) -> Navigation:
+        """Take a fix, late or not; the state at the newest sample.
+
+        Args:
+            time_ns: when it was true (`gnss.latency` later), whole nanoseconds.
+            lat_rad: of the antenna, NaN where missing, and
+            lon_rad: likewise, and
+            alt_m: above the ellipsoid.
+            sigma_m: (3,) m, north, east, down.
+            v_n: (3,) m/s, north, east, down, or None.
+            sigma_v: (3,) m/s, with a velocity.
+            quality: of RTKLIB, 0 unknown.
+
+        Raises:
+            LiveError: a stamp or number of another kind, or angles that are those of another unit;
+                the object goes on.
+        """
+        row = self._row_of_fix(time_ns, (lat_rad, lon_rad, alt_m), sigma_m, v_n, sigma_v, quality)
+        newest = self._newest[0, 0] if len(self._newest) else 0.0
+        oldest = self._past[0][0] if self._past else -math.inf
+        if why := self._refused_fix(row, oldest, newest):
+            self.counts[f"gnss_{why}"] += 1
+            return self._answer(self._raw_ns[-1] if self._raw_ns else stamp(time_ns), Flag.REFUSED)
+        at = int(np.searchsorted(self._fixes[:, 0], row[0]))
+        self._fixes = np.insert(self._fixes, at, row, axis=0)
+        self._velocities |= bool(np.any(np.isfinite(row[7:10])))
+        self._first_fix_s = min(self._first_fix_s, float(row[0]))
+        self._go_back(float(row[0]))
+        self._advance()
+        return self._answer(self._raw_ns[-1], Flag(0))
+
+    def _row_of_fix(
+        self, time_ns: Any, place: Any, sigma_m: Any, v_n: Any, sigma_v: Any, quality: Any
+    ) -> np.ndarray:
+        time, where = stamp(time_ns), numbers("lat_rad, lon_rad, alt_m", place, 3)
+        sigma = numbers("sigma_m", sigma_m, 3)
+        missing = np.full(3, np.nan)
+        velocity = missing if v_n is None else numbers("v_n", v_n, 3)
+        if v_n is not None and sigma_v is None:
+            raise LiveError("a velocity needs sigmas", "sigma_v", "give (3,) m/s")
+        spread = missing if sigma_v is None else numbers("sigma_v", sigma_v, 3)
+        if abs(where[0]) > np.pi / 2 or abs(where[1]) > 2.0 * np.pi:
+            what = f"latitude {where[0]:.4g} and longitude {where[1]:.4g} are no radians"
+            raise LiveError(what, "push_fix", "of degrees give np.radians")
+        # as of a log that was cleaned: a component whose sigma is none is missing
+        where = np.where(np.isfinite(where) & (sigma > 0.0), where, np.nan)
+        velocity = np.where(np.isfinite(velocity) & (spread > 0.0), velocity, np.nan)
+        sigma = np.where(sigma > 0.0, sigma, 1.0)
+        spread = np.where(spread > 0.0, spread, 1.0)
+        seconds = self._seconds(time) if self._origin_ns is not None else math.nan
+        return np.array([seconds, *where, *sigma, *velocity, *spread, float(quality)])
+
+    def _refused_fix(self, row: np.ndarray, oldest: float, newest: float) -> str:
+        if not np.any(np.isfinite(row[[1, 2, 3, 7, 8, 9]])):
+            return "nan"
+        if math.isnan(row[0]) or row[0] <= 0.0:
+            return "too_old"  # before the first sample
+        if np.any(np.abs(self._fixes[:, 0] - row[0]) < 1e-9):
+            return "duplicate"
+        if row[0] <= oldest + 1e-9:
+            return "too_old"
+        return "ahead" if row[0] > newest + _AHEAD_S else ""
+
+    def _seconds(self, time_ns: int) -> float:
+        assert self._origin_ns is not None
+        return (time_ns - self._origin_ns) * 1e-9
+
+    # ------------------------------------------------------------------- samples to increments
+
+    def _integrate(self) -> None:
+        """The increment before the last is known with this sample; the last one nearly."""
+        if len(self._raw) < 2:
+            return
+        rows = np.array(self._raw)
+        table = ImuTable(np.array(self._raw_ns), rows[:, :3], rows[:, 3:], "rate")
+        made, end_ns = from_imu(table, self._usual.sample_s)
+        ends = np.array([self._seconds(int(t)) for t in end_ns])
+        found = np.column_stack([ends, *(np.asarray(a, float) for a in made[:3])])
+        # of four samples the middle increment, and at the beginning the first one, are final
+        if len(rows) == 4:
+            final = found[1:2] if len(self._steps) else found[:2]
+            self._steps = np.concatenate([self._steps, final])
+        self._newest = found[-1:]
+
+    def _log(self, rows: np.ndarray) -> Log:
+        """Increments and all fixes as a piece of a log."""
+        f = self._fixes
+        v = f[:, 7:10] if self._velocities else None
+        spread = f[:, 10:13] if self._velocities else None
+        time_ns = np.round(f[:, 0] * 1e9).astype(np.int64) + (self._origin_ns or 0)
+        table = GnssTable(
+            time_ns, f[:, 1], f[:, 2], f[:, 3], f[:, 4:7], v, spread, f[:, 13].astype(int)
+        )
+        gnss = self.parameters.gnss
+        sigma_m, _ = believed_sigmas(table, gnss)
+        log = Log(
+            Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]),
+            rows[:, 0],
+            table,
+            f[:, 0],
+            sigma_m,
+            None,
+            None,
+            np.zeros(len(f), dtype=bool),
+        )
+        if gnss.use_velocity:  # there or not, so that nothing is compiled when the first one comes
+            told = GnssTable(time_ns, f[:, 1], f[:, 2], f[:, 3], f[:, 4:7], f[:, 7:10], f[:, 10:13],
+                             table.quality)  # fmt: skip
+            log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(told, gnss)[1])
+        if len(self._field):
+            log = log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
+        return log
+
+    # --------------------------------------------------------------------- start and epochs
+
+    def _advance(self) -> None:
+        """Take all steps that can be taken."""
+        if self._online is None:
+            self._seek()
+        while self._online is not None:
+            at = Epoch(*self._past[-1])
+            longest_s, number = self.parameters.update.longest_block, at.number + 1
+            edge = at.wanted_s + longest_s * number
+            later = self._fixes[self._fixes[:, 0] > at.time_s, 0]
+            wanted = len(later) > 0 and (later[0] - at.wanted_s) / longest_s - 1e-6 <= number
+            edge = float(later[0]) if wanted else edge
+            if not len(self._steps) or self._steps[-1, 0] < edge + self._reach_s:
+                return
+            self._step(Epoch(edge, edge, 0) if wanted else Epoch(edge, at.wanted_s, number))
+
+    def _seek(self) -> None:
+        """Find the start where a replay of the log so far would, and begin."""
+        p, rows = self.parameters, self._steps
+        if not len(rows):
+            return
+        if rows[-1, 0] - rows[0, 0] > _MOST_START_S:
+            self._steps = rows = rows[len(rows) // 2 :]
+            self._field = self._field[self._field[:, 0] > rows[0, 0] - 1.0]
+        heard = self._fixes[self._fixes[:, 0] <= rows[-1, 0] - self._reach_s]
+        given, waits = p.start.known_heading is not None, rows[-1, 0] - self._first_fix_s
+        fast = np.hypot(heard[:, 7], heard[:, 8]) >= p.start.course_speed
+        compass = len(self._field) > 0 and waits > _COURSE_S
+        if not len(heard) or not (given or compass or np.any(fast)):
+            return
+        if int(10.0 * rows[-1, 0]) == int(10.0 * (rows[-1, 0] - rows[-1, 1])):
+            return  # ten times a second are enough
+        log = self._log(rows)
+        within = self._fixes[:, 0] <= rows[-1, 0] - self._reach_s
+        log = log._replace(
+            gnss=_some(log.gnss, within),
+            **{
+                name: None if (a := getattr(log, name)) is None else a[within]
+                for name in ("gnss_s", "sigma_m", "v_n", "sigma_v", "withheld")
+            },
+        )
+        try:
+            found = find_start(log, p.start, p.aids, self._usual)
+        except ValueError:
+            return  # not yet
+        rested = found.sentence.startswith("levelled at rest")
+        if given and not rested and waits < _REST_S:
+            return
+        begin_s = float(log.gnss_s[found.fix])
+        raw = rows[rows[:, 0] <= rows[0, 0] + _UNITS_S]
+        try:
+            refuse_units(*(raw[:, k : k + 3] / raw[:, 1:2] for k in (2, 5)))
+        except LiveError:
+            self._begin_anew()
+            raise
+        belief = first_belief(log, found, p)
+        self._online = OnlineFilter(self._filter, self._model, belief)
+        self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
+        self.start = found.sentence
+
+    def _block(self, end_s: float, rows: np.ndarray, origin: Epoch, least: int) -> Block:
+        """Input of a step from an epoch to a time."""
+        inc = Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8])
+        blocks = cut(inc, rows[:, 0], origin.time_s, np.array([end_s]), least=least)
+        scale = replaying.noise_scale(
+            blocks, rows[:, 1], self.parameters.update.gap_noise, self._usual.sample_s
+        )
+        return Block(jax.tree_util.tree_map(lambda a: a[0], blocks.increments), scale[0])
+
+    def _step(self, to: Epoch) -> None:
+        """One step of the filter, to an epoch, with what was measured there."""
+        assert self._online is not None
+        p, at = self.parameters, Epoch(*self._past[-1])
+        rows = self._steps[self._steps[:, 0] > to.time_s - self._back_s]
+        log, epochs = self._log(rows), np.array([to.time_s])
+        rate = rate_about(log.increments, log.time_s, epochs, self._usual.sample_s)
+        used = np.abs(log.gnss_s - to.time_s) < 1e-9
+        # the window is looked at where there is a velocity alone
+        window_s = self._window_s if np.any(np.isfinite(self._fixes[used, 7:10])) else 0.0
+        y, aux = measured_fixes(log, used, epochs, rate, window_s)
+        usual = self._usual._replace(calmest=self._calmest)
+        known, about = measured_rest(log, epochs, rate, p.aids, usual)
+        row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (y | known, aux | about))
+        u = self._block(to.time_s, rows, at, self._width)
+        self.counts["blocks_over_imu_gaps"] += int(u.noise_scale > 1.0)
+        kept = np.asarray(self._online.step(row[0], u, row[1], keep=_kept))
+        self.epoch = self._told(to.time_s, kept, Flag(0))
+        self._past.append(tuple(to))
+        self._states.append(self._online.state)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Drop what is older than the longest delay, in large pieces."""
+        now = self._past[-1][0]
+        first = next(k for k, e in enumerate(self._past) if e[0] >= now - self._delay_s)
+        # one epoch before it is where a fix of that age is counted from
+        keep = max(first - 1, 0)
+        del self._past[:keep], self._states[:keep]
+        begin = self._past[0][0] - self._back_s
+        if self._steps[0, 0] < begin - self._back_s:
+            log = self._log(self._steps)
+            margin = begin + self.parameters.aids.window + 2.0 * self._usual.sample_s
+            old = int(np.searchsorted(self._fixes[:, 0], margin))
+            usual = self._usual._replace(calmest=self._calmest)
+            self._calmest = calmest(log, self.parameters.aids, usual, old + 2)
+            self._fixes = self._fixes[old:]
+            self._steps = self._steps[self._steps[:, 0] > begin]
+
+    def _go_back(self, time_s: float) -> None:
+        """To the last epoch that does not know of a fix."""
+        if not self._past or time_s > self._past[-1][0] + self._reach_s:
+            return
+        longest_s, keep = self.parameters.update.longest_block, 1
+        for k, row in enumerate(self._past):
+            at = Epoch(*row)
+            due = (time_s - at.wanted_s) / longest_s - 1e-6
+            if at.time_s < time_s and (at.number == 0 or at.number < due):
+                keep = k + 1
+        if keep < len(self._past):
+            self.counts["steps_again"] += len(self._past) - keep
+            del self._past[keep:], self._states[keep:]
+            assert self._online is not None
+            self._online.state = self._states[-1]
+
+    # ------------------------------------------------------------------------------ the answer
+
+    def _answer(self, time_ns: int, mark: Flag) -> Navigation:
+        if self._online is None or not len(self._newest):
+            none = np.full(9, np.nan)
+            nan = math.nan
+            starting = mark | Flag.STARTING
+            return Navigation(time_ns, none[:4], none[:3], nan, nan, nan, none, starting)
+        at = Epoch(*self._past[-1])
+        rows = self._steps[self._steps[:, 0] > at.time_s - 2.0 * self._usual.sample_s]
+        final_s = rows[-1, 0] if len(rows) else at.time_s
+        last = self._newest[self._newest[:, 0] > final_s]
+        rows = np.concatenate([rows, last])
+        end_s = float(rows[-1, 0])
+        u = self._block(end_s, rows, at, self._width + 8)
+        motion = self._online.model.motion
+        found = _predicted(self._online.filter, motion, self._online.state, u)
+        return self._told(end_s, np.asarray(found), mark)._replace(time_ns=time_ns)
+
+    def _told(self, time_s: float, x: np.ndarray, flags: Flag) -> Navigation:
+        time_ns = round(time_s * 1e9) + (self._origin_ns or 0)
+        lat, lon, alt = x[7:10].tolist()
+        return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:], flags)
+
+    def _compile(self) -> None:
+        """Have all compiled by a standstill that is thrown away."""
+        counts, step = type(self.counts)(), round(1e9 * self._usual.sample_s)
+        turned(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros((CARRIED, 3)))
+        door, second, ones = vars(self._door).copy(), max(1, round(1e9 / step)), np.ones(3)
+        place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
+        p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})
+        C, self._C_bs = self._C_bs, None
+        last = math.ceil((3.0 + 2.0 * p.aids.window + p.update.longest_block) * 1e9 / step)
+        try:
+            for k in range(last):
+                if k and k % second == 0:
+                    self.push_fix((k - 1) * step, 0.7, 0.1, 100.0, ones, 0.0 * ones, ones)
+                self.push_imu(k * step, np.zeros(3), np.array([0.0, 0.0, -9.8]))
+        finally:
+            self.parameters, self._C_bs, self.counts = p, C, counts
+            self._compiled_state = None if self._online is None else self._online.state
+            self._begin_anew()
+            vars(self._door).update(door)
+
+    # -------------------------------------------------------------------------------- the file
+
+    def _state_now(self) -> Any:
+        return None if self._online is None else self._states
+
+    def _go_on_from(self, state: Any) -> None:
+        count = len(self._past)
+        each = len(state) // count
+        like = self._compiled_state
+        self._states = [as_before(like, state[k * each : (k + 1) * each]) for k in range(count)]
+        self._online = OnlineFilter(self._filter, self._model, self._states[-1])
+
+
+def _some(table: GnssTable, keep: np.ndarray) -> GnssTable:
+    """Some rows of a table of fixes."""
+    columns = {
+        name: None if (a := getattr(table, name)) is None else a[keep]
+        for name in ("time_ns", "lat_rad", "lon_rad", "alt_m", "sigma_m", "v_n", "sigma_v",
+                     "quality")
+    }  # fmt: skip
+    return GnssTable(**columns)

@@ -1,0 +1,209 @@
+"""What live objects share: samples that are refused, answers that say how they stand, the file.
+
+A live object takes a sample and answers at once. A sample that is no sample (another shape, text)
+raises; one that is wrong as a sensor can be (no number, absurd, out of order) is refused, counted,
+and answered from what is known. Stamps that stay elsewhere are a clock that was set, or a long
+pause: the object then begins anew.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from enum import IntFlag
+from typing import Any, ClassVar, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins.errors import RobinsError
+from robins.results import snapshot
+from robins.scenario import Parameters
+from robins.scenario.text import mapping_of, text_of
+
+_GYRO_LIMIT, _ACCEL_LIMIT = 1e4, 1e6  # rad/s, m/s^2: absurd, as `robins.logs.clean` has it
+_SPIN = 100.0  # rad/s, faster than any gyro that is not given in deg/s
+_ONE_G = (0.9, 1.1)  # size of gravity in g
+
+
+class LiveError(RobinsError, ValueError):
+    """A sample, or what a live object is made with, cannot be used; the object goes on."""
+
+
+class Flag(IntFlag):
+    """How an answer stands; several may hold."""
+
+    STARTING = 1  # the first attitude is not known yet: no numbers
+    REFUSED = 2  # this sample was not used, `counts` says why
+    REST = 4  # the unit lies still
+    SATURATED = 8  # a sensor is at the end of its range in this sample
+    DISTURBED = 16  # the last look at the magnetometer was refused
+    DOUBTFUL = 32  # states or innovations contradict what was assumed
+    BEHIND = 64  # the filter waits for what this sample alone cannot say; the gyros carry on
+
+
+class Door:
+    """Which samples come in, by their stamps and sizes."""
+
+    def __init__(self, longest_gap_s: float, patience: int):
+        """Begin.
+
+        Args:
+            longest_gap_s: s; a stamp further ahead is of another clock, or of a new beginning.
+            patience: stamps in a row that continue each other elsewhere until they are believed.
+        """
+        self._gap_ns, self._patience = round(longest_gap_s * 1e9), patience
+        self.last_ns: int | None = None
+        self._elsewhere_ns, self._row = 0, 0
+
+    def ask(self, time_ns: int, values: np.ndarray) -> str:
+        """Why a sample is refused; "" for one that comes in, "anew" for one that begins anew.
+
+        Args:
+            time_ns: its stamp.
+            values: (6,) rates and specific forces.
+        """
+        if not np.all(np.isfinite(values)):
+            return "nan" if np.any(np.isnan(values)) else "inf"
+        if np.max(np.abs(values[:3])) > _GYRO_LIMIT or np.max(np.abs(values[3:])) > _ACCEL_LIMIT:
+            return "absurd"
+        ahead = 1 if self.last_ns is None else time_ns - self.last_ns
+        if 0 < ahead <= self._gap_ns:
+            self.last_ns, self._row = time_ns, 0
+            return ""
+        goes_on = self._row > 0 and 0 < time_ns - self._elsewhere_ns <= self._gap_ns
+        self._row = self._row + 1 if goes_on else 1
+        self._elsewhere_ns = time_ns
+        if self._row >= self._patience:
+            self.last_ns, self._row = time_ns, 0
+            return "anew"
+        return "duplicate" if ahead == 0 else "backward" if ahead < 0 else "ahead"
+
+
+def stamp(time_ns: Any) -> int:
+    """A stamp in whole nanoseconds.
+
+    Raises:
+        LiveError: it is no whole number.
+    """
+    if isinstance(time_ns, bool) or not isinstance(time_ns, int | np.integer):
+        what = f"a stamp must be a whole number of nanoseconds, got {time_ns!r}"
+        raise LiveError(what, "time_ns", "of seconds give round(1e9 * seconds)")
+    return int(time_ns)
+
+
+def numbers(name: str, values: Any, size: int) -> np.ndarray:
+    """(size,) floats.
+
+    Raises:
+        LiveError: it is something else.
+    """
+    try:
+        found = np.asarray(values)
+        if found.dtype.kind not in "fiu" or found.shape != (size,):
+            raise TypeError
+    except (TypeError, ValueError):
+        what = f"must be {size} real numbers, got {values!r:.80}"
+        raise LiveError(what, name, "NaN says that a number is missing") from None
+    return found.astype(float)
+
+
+def refuse_units(gyro: np.ndarray, accel: np.ndarray) -> None:
+    """Refuse samples (K, 3) whose sizes are those of another unit.
+
+    Raises:
+        LiveError: rates that no gyro reads, or a mean specific force of one.
+    """
+    spin = float(np.max(np.linalg.norm(gyro, axis=1), initial=0.0))
+    if spin > _SPIN:
+        what = f"reads up to {spin:.0f}, which is no rate in rad/s"
+        raise LiveError(what, "gyro", "if it is in deg/s, give np.radians of it")
+    size = float(np.linalg.norm(np.mean(accel, axis=0)))
+    if _ONE_G[0] < size < _ONE_G[1]:
+        what = f"the mean reads {size:.2f}, which is gravity in g, not in m/s^2"
+        raise LiveError(what, "accel", "multiply it by 9.80665")
+
+
+LiveT = TypeVar("LiveT", bound="Live")
+
+
+class Live:
+    """Base of the live objects: counts, and a file that keeps all they know.
+
+    Attributes:
+        counts: samples refused by reason, and what else happened, so often.
+    """
+
+    _parameters: ClassVar[type[Parameters]]
+    _kept: ClassVar[tuple[str, ...]]  # names of attributes that change, plain values or arrays
+    _parts: ClassVar[tuple[str, ...]]  # names of objects whose attributes are such
+
+    def __init__(self, parameters: Parameters, **made_with: Any):
+        """Remember what it is made with, for the file."""
+        self.parameters: Any = parameters
+        self.counts: Counter[str] = Counter()
+        self._made_with = made_with
+
+    def _state_now(self) -> Any:
+        """State of the filter, or None before there is one."""
+        raise NotImplementedError
+
+    def _go_on_from(self, state: Any) -> None:
+        """Take a state of the filter whose leaves are these."""
+        raise NotImplementedError
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all that is known into one file, whole or not at all.
+
+        Raises:
+            ResultError: it cannot be written; the sentence says why.
+        """
+        leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(self._state_now())]
+        state = {
+            "made_with": self._made_with,
+            "counts": dict(self.counts),
+            "own": {name: getattr(self, name) for name in self._kept},
+            "parts": {name: dict(vars(getattr(self, name))) for name in self._parts},
+            "filter": leaves if self._state_now() is not None else None,
+        }
+        for part in state["parts"].values():
+            part.pop("_rest", None)  # parameters, which the file has as text
+        told = text_of(_plain(self.parameters.model_dump(exclude_none=True)))
+        snapshot.write(path, type(self).__name__, told, state)
+
+    @classmethod
+    def load(cls: type[LiveT], path: str | os.PathLike[str]) -> LiveT:
+        """The object that `save` wrote; it goes on bit for bit.
+
+        Raises:
+            ResultError: the file cannot be read, is damaged, or of another version or class.
+        """
+        found = snapshot.read(path, cls.__name__)
+        given = cls._parameters.model_validate(_tuples(mapping_of(found.parameters)))
+        made = cls(given, **found.state["made_with"])
+        made.counts.update(found.state["counts"])
+        for name, value in found.state["own"].items():
+            setattr(made, name, value)
+        for name, part in found.state["parts"].items():
+            vars(getattr(made, name)).update(part)
+        if found.state["filter"] is not None:
+            made._go_on_from([jnp.asarray(x) for x in found.state["filter"]])
+        return made
+
+
+def as_before(like: Any, leaves: list[Any]) -> Any:
+    """A state of the structure of another, with these leaves."""
+    return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(like), leaves)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _tuples(v) for k, v in value.items()}
+    return tuple(_tuples(v) for v in value) if isinstance(value, list | tuple) else value

@@ -1,0 +1,302 @@
+"""A live navigation is that of the causal replay, however late the fixes come."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from robins import scenario
+from robins.logs import clean, load_dataset
+from robins.logs.ordering import rows_where
+from robins.systems import replaying
+from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, Replay, drive_dataset
+from robins.systems.ins_gnss.log import Unsaid, contender, prepare
+from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
+from robins.systems.streaming import Flag, LiveError
+
+DRIVE = """
+imu_rate = "50 Hz"
+[place]
+latitude = "46 deg"
+longitude = "9 deg"
+height = "300 m"
+heading = "70 deg"
+[imu]
+gyro_noise = "0.004 deg/s/sqrt(Hz)"
+accel_noise = "150 ug/sqrt(Hz)"
+gyro_bias = "0.1 deg/s"
+accel_bias = "5 mg"
+gyro_bias_walk = "0.0005 deg/s/sqrt(s)"
+accel_bias_walk = "5 ug/sqrt(s)"
+[gnss]
+rate = "2 Hz"
+sigma = "0.5 m"
+velocity_sigma = "0.05 m/s"
+[[legs]]
+do = "stop"
+seconds = "4 s"
+[[legs]]
+do = "accelerate"
+seconds = "4 s"
+speed = "10 m/s"
+[[legs]]
+do = "turn"
+angle = "70 deg"
+rate = "14 deg/s"
+[[legs]]
+do = "accelerate"
+seconds = "4 s"
+speed = "0 m/s"
+[[legs]]
+do = "stop"
+seconds = "4 s"
+"""
+RATE_HZ, FIX_HZ = 50.0, 2.0
+
+
+def as_rates(dataset):
+    """The log with rates in the place of increments, as a unit of a phone gives them."""
+    imu, dt = dataset.imu, 1e-9 * float(dataset.imu.time_ns[1] - dataset.imu.time_ns[0])
+    table = type(imu)(imu.time_ns, imu.gyro / dt, imu.accel / dt, "rate")
+    return type(dataset)(dataset.name, table, dataset.gnss)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return as_rates(drive_dataset(scenario.parse(Drive, DRIVE), seed=4))
+
+
+def epochs_of_replay(dataset, parameters, name):
+    """Stamps [ns] and vectors (q, v, lat, lon, alt, sigmas) at the epochs of a causal replay."""
+    log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
+    pieces, _ = replaying.prepared(
+        log.time_s,
+        log.increments.dt,
+        parameters.update.longest_gap,
+        partial(prepare, log, parameters),
+    )
+    patience = int(np.ceil(parameters.update.patience / np.median(np.diff(log.gnss_s))))
+    of = partial(contender, parameters, Unsaid(max(2, patience), 1.0))
+    answer = replaying.navigated(pieces, (name,), of)[name]
+    x, place = answer.mean, answer.mean.position
+    rows = [x.q_nb.wxyz, x.v_n, np.stack([place.lat, place.lon, place.alt], axis=1)]
+    vectors = np.concatenate([*map(np.asarray, rows), np.asarray(answer.sigma)[:, :9]], axis=1)
+    seconds = replaying.epochs_of(pieces)
+    return np.round(seconds * 1e9).astype(np.int64) + int(dataset.imu.time_ns[0]), vectors
+
+
+def vector(n):
+    """The numbers of an answer."""
+    return np.concatenate([n.q_nb, n.v_n, [n.lat_rad, n.lon_rad, n.alt_m], n.sigma])
+
+
+def events(dataset, late_s, skipped=()):
+    """What comes in, by the time it does: (time, is a fix, row)."""
+    fixes = [k for k in range(len(dataset.gnss)) if k not in skipped]
+    comes = [(int(t), 0, k) for k, t in enumerate(dataset.imu.time_ns)]
+    comes += [(int(dataset.gnss.time_ns[k] + 1e9 * late_s[k]), 1, k) for k in fixes]
+    return sorted(comes)
+
+
+def push(live, dataset, event):
+    """One sample or fix."""
+    _, fix, k = event
+    imu, g = dataset.imu, dataset.gnss
+    if not fix:
+        return live.push_imu(int(imu.time_ns[k]), imu.gyro[k], imu.accel[k])
+    place = float(g.lat_rad[k]), float(g.lon_rad[k]), float(g.alt_m[k])
+    velocity = () if g.v_n is None else (g.v_n[k], g.sigma_v[k])
+    quality = {} if g.quality is None else {"quality": int(g.quality[k])}
+    return live.push_fix(int(g.time_ns[k]), *place, g.sigma_m[k], *velocity, **quality)
+
+
+def played(live, dataset, all_events):
+    """Answers to all, and what the filter said last of each epoch, by stamp."""
+    at, step = {}, live._step
+
+    def heard(to):
+        step(to)
+        at[live.epoch.time_ns] = vector(live.epoch)
+
+    live._step = heard
+    answers = [push(live, dataset, event) for event in all_events]
+    live._step = step
+    return answers, at
+
+
+def compare(at, stamps, vectors, shortest):
+    """Every epoch of the live filter is that of the replay; the last ones may be missing."""
+    found = [(at[int(t)], row) for t, row in zip(stamps, vectors, strict=True) if int(t) in at]
+    assert len(found) >= shortest
+    live, of = (np.array(side) for side in zip(*found, strict=True))
+    scale = np.concatenate([np.ones(7), [6.4e6, 6.4e6, 1.0], np.ones(9)])
+    np.testing.assert_allclose((live - of) * scale, 0.0, atol=2e-9)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return LiveInsGnss(Replay(), RATE_HZ, FIX_HZ, "ekf")
+
+
+@pytest.fixture
+def live(made, tmp_path):
+    made.save(tmp_path / "fresh.live")
+    return LiveInsGnss.load(tmp_path / "fresh.live")
+
+
+@pytest.mark.parametrize("order", ["at once", "late", "out of order"])
+def test_epochs_are_those_of_the_replay(live, log, order):
+    count = len(log.gnss)
+    late_s = {"at once": np.zeros(count), "late": np.full(count, 0.17)}.get(order)
+    if late_s is None:  # each comes after the next one
+        late_s = np.where(np.arange(count) % 2 == 0, 0.72, 0.1)
+    answers, at = played(live, log, events(log, late_s))
+    stamps, vectors = epochs_of_replay(log, Replay(), "ekf")
+    compare(at, stamps, vectors, len(stamps) - 3)
+    started = [not a.flags & Flag.STARTING for a in answers]
+    assert started == sorted(started)
+    assert np.mean(started) > 0.6
+    assert (live.counts["steps_again"] > 20) == (order != "at once")
+    assert live.start.startswith("levelled at rest")
+
+
+def test_an_answer_is_the_state_carried_on_over_the_samples_since(live, log):
+    """What a replay says that ends with a fix in this sample, but for that fix."""
+    all_events = events(log, np.zeros(len(log.gnss)))
+    end = next(i for i, e in enumerate(all_events) if e[0] > log.imu.time_ns[0] + 11.3e9)
+    answers, _ = played(live, log, all_events[:end])
+    last = answers[-1]
+    cut = type(log)(
+        log.name,
+        rows_where(log.imu, log.imu.time_ns <= last.time_ns),
+        rows_where(log.gnss, log.gnss.time_ns <= last.time_ns),
+    )
+    # a fix without a number makes an epoch of the replay here
+    g, blank = cut.gnss, np.full(3, np.nan)
+    nothing = type(g)(
+        np.append(g.time_ns, last.time_ns),
+        *(np.append(a, np.nan) for a in (g.lat_rad, g.lon_rad, g.alt_m)),
+        np.vstack([g.sigma_m, np.ones(3)]), np.vstack([g.v_n, blank]),
+        np.vstack([g.sigma_v, np.ones(3)]),
+    )  # fmt: skip
+    stamps, vectors = epochs_of_replay(type(log)(log.name, cut.imu, nothing), Replay(), "ekf")
+    assert stamps[-1] == last.time_ns
+    # the mean to rounding; the sigma but for what a rest of a sample more tells
+    np.testing.assert_allclose(vector(last)[:10], vectors[-1, :10], atol=1e-9)
+    np.testing.assert_allclose(last.sigma, vectors[-1, 10:], rtol=1e-3)
+
+
+def test_restored_in_between_it_goes_on_to_the_bit(live, log, tmp_path):
+    late_s = np.full(len(log.gnss), 0.23)
+    whole = events(log, late_s)
+    answers, _ = played(live, log, whole)
+    again, path, begun = LiveInsGnss(Replay(), RATE_HZ, FIX_HZ, "ekf"), tmp_path / "v.live", 0
+    for end in (100, 420, 501, 760):
+        played(again, log, whole[begun:end])
+        again.save(path)
+        again, begun = LiveInsGnss.load(path), end
+    rest, _ = played(again, log, whole[begun:])
+    for one, other in zip(rest, answers[begun:], strict=True):
+        np.testing.assert_array_equal(vector(one), vector(other))
+    assert again.counts == live.counts
+    assert again.start == live.start
+
+
+def test_an_outage_is_bridged_as_the_replay_does(live, log):
+    skipped = set(range(14, 22))
+    given = type(log)(log.name, log.imu, rows_where(
+        log.gnss, ~np.isin(np.arange(len(log.gnss)), list(skipped))))  # fmt: skip
+    _, at = played(live, log, events(log, np.full(len(log.gnss), 0.1), skipped))
+    stamps, vectors = epochs_of_replay(given, Replay(), "ekf")
+    compare(at, stamps, vectors, len(stamps) - 3)
+
+
+def test_nothing_is_compiled_once_it_has_started(live, log):
+    whole, compiled = events(log, np.full(len(log.gnss), 0.1)), []
+
+    def heard(event, seconds, **told):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(told["fun_name"])
+
+    begun = 420
+    answers, _ = played(live, log, whole[:begun])
+    assert not answers[-1].flags & Flag.STARTING
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    try:
+        played(live, log, whole[begun:])
+        assert compiled == []
+        jax.jit(lambda x: x + 3.5)(1.0)
+        assert len(compiled) == 1  # it would have been heard
+    finally:
+        jax.monitoring.unregister_event_duration_listener(heard)
+
+
+def test_bad_fixes_and_samples_are_refused_and_counted(live, log):
+    whole = events(log, np.full(len(log.gnss), 0.1))
+    played(live, log, whole[:600])
+    t, k = live._raw_ns[-1], next(e[2] for e in whole[600:] if e[1])
+    g = log.gnss
+    place, sigma = (float(g.lat_rad[k]), float(g.lon_rad[k]), float(g.alt_m[k])), g.sigma_m[k]
+    before = live.epoch
+    nan = float("nan")
+    for stamp, where, reason in (
+        (t, (nan, nan, nan), "nan"),
+        (t - 5_000_000_000, place, "too_old"),
+        (t + 60_000_000_000, place, "ahead"),
+    ):
+        assert live.push_fix(stamp, *where, sigma).flags == Flag.REFUSED
+        assert live.counts[f"gnss_{reason}"] >= 1
+    told = push(live, log, (0, 1, k - 1))  # it was there before
+    assert told.flags == Flag.REFUSED
+    assert live.counts["gnss_duplicate"] == 1
+    for wrong, word in (
+        (lambda: live.push_fix(t, 46.0, 9.0, 300.0, sigma), "are no radians"),
+        (lambda: live.push_fix(t, *place, 1.0), "sigma_m: must be 3 real numbers"),
+        (lambda: live.push_fix(t, *place, sigma, np.zeros(3)), "a velocity needs sigmas"),
+        (lambda: live.push_fix(0.5, *place, sigma), "whole number of nanoseconds"),
+        (lambda: live.push_imu(t + 1, np.zeros(2), np.zeros(3)), "gyro: must be 3 real numbers"),
+    ):
+        with pytest.raises(LiveError, match=word):
+            wrong()
+    assert live.push_imu(t - 1, np.zeros(3), np.zeros(3)).flags == Flag.REFUSED
+    assert live.epoch is before
+    answers, _ = played(live, log, whole[600:])
+    assert answers[-1].flags == Flag(0)
+
+
+def test_a_fix_of_the_future_waits(live, log):
+    _, at = played(live, log, events(log, np.full(len(log.gnss), -0.4)))
+    stamps, vectors = epochs_of_replay(log, Replay(), "ekf")
+    compare(at, stamps, vectors, len(stamps) - 3)
+    assert live.counts["steps_again"] == 0
+
+
+def test_a_long_gap_is_a_new_start(live, log):
+    whole = events(log, np.full(len(log.gnss), 0.1))
+    gone = log.imu.time_ns[0] + np.array([9.0, 11.5]) * 1e9
+    heard = [e for e in whole if e[1] or not gone[0] < log.imu.time_ns[e[2]] < gone[1]]
+    answers, _ = played(live, log, heard)
+    assert live.counts["imu_gaps_declared"] == 1
+    after = [a for a in answers if a.time_ns > gone[1] + 2e8]
+    assert after[0].flags == Flag.STARTING
+    assert after[-1].flags == Flag(0)
+
+
+@pytest.mark.parametrize("name", ["ekf", "robust"])
+def test_the_walk_has_the_epochs_of_its_replay(data_dir, name):
+    paths = [data_dir / f"gnssimu_walk_{part}.xz" for part in ("imu.csv", "gnss.pos")]
+    if not all(path.exists() for path in paths):
+        pytest.skip("the walk is not in the folder of real logs")
+    parameters = scenario.load(Replay, SYSTEM.replay_default.parent / "walk.toml")
+    parameters = parameters.model_copy(update={"outages": None})
+    log = clean(load_dataset(paths))
+    end = log.imu.time_ns[0] + 25_000_000_000
+    log = type(log)(log.name, rows_where(log.imu, log.imu.time_ns < end),
+                    rows_where(log.gnss, log.gnss.time_ns < end))  # fmt: skip
+    of = on_one_clock(log, parameters)
+    rates = (1.0 / float(np.median(a)) for a in (of.increments.dt, np.diff(of.gnss_s)))
+    live = LiveInsGnss(parameters, *rates, name)
+    _, at = played(live, log, events(log, np.full(len(log.gnss), 0.08)))
+    stamps, vectors = epochs_of_replay(log, parameters, name)
+    compare(at, stamps, vectors, len(stamps) - 3)
