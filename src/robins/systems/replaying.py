@@ -137,8 +137,11 @@ def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, in
 
 
 def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
-    """Keep the posterior's mean and standard deviations and how the updates went, by sensor."""
-    return step.posterior.mean, step.posterior.sigma, updates(step)
+    """Keep the posterior's mean and standard deviations and how the updates went, by sensor.
+
+    Of a bank also how likely each mode is.
+    """
+    return step.posterior.mean, step.posterior.sigma, updates(step, ("imm.probability",))
 
 
 @jax.jit

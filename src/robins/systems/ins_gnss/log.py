@@ -31,7 +31,7 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
-from robins.systems.ins_gnss.robust import robust, supposing_mean, weighed
+from robins.systems.ins_gnss.robust import AS_TOLD, case, fresh, navigation, robust, supposed, weighed
 from robins.systems.ins_gnss.start import StartPoint, at_rest, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
@@ -154,60 +154,24 @@ def _known(
     return y, {model.ROAD: rate} if aids.non_holonomic else {}
 
 
-class Unsaid(NamedTuple):
-    """What a log says of its receiver that its configuration does not."""
+def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
+    """A filter with the model it believes in.
 
-    patience: int  # positions in a row, `find_back`
-    mean: float  # 1 where velocities are means over the window, 0 where they are of the fix
-
-
-def contender(parameters: Replay, unsaid: Unsaid, name: str) -> Contender:
-    """A filter with the model it believes in."""
+    Args:
+        parameters: of the replay.
+        fix_step_s: between fixes, in the median.
+        name: of a filter, or `WEIGHED`.
+    """
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
     asked = parameters.gnss.velocity_window is None
     if name == ROBUST:
-        return Contender(robust(believed, asked, unsaid.patience), believed)
+        step_s = min(fix_step_s, parameters.update.longest_block)
+        bank = robust(believed, step_s, parameters.update.patience)
+        return Contender(bank, supposed(believed, AS_TOLD), partial(case, asked))
     if name == WEIGHED:
-        return Contender(weighed(unsaid.patience), supposing_mean(believed, unsaid.mean))
-    told = supposing_mean(believed, 0.0) if asked else believed
+        return Contender(weighed(), supposed(believed, AS_TOLD), partial(case, asked))
+    told = fresh(believed) if asked else believed
     return Contender(make_filter(name, parameters.update.gate), told)
-
-
-def _unsaid(
-    log: Log, pieces: Sequence[Stretch], parameters: Replay, wanted: Sequence[str]
-) -> tuple[Unsaid, list[str]]:
-    """What the log says, and a sentence for the reader where a smoother needed to know it.
-
-    Whether velocities are means over the time since the last fix is decided by the likelihood of
-    the whole log; a causal filter has that as a hypothesis of its own.
-    """
-    step = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
-    unsaid = Unsaid(max(2, math.ceil(parameters.update.patience / max(step, 1e-3))), 1.0)
-    smooths = any(SMOOTHED.get(name) == WEIGHED for name in wanted)
-    if parameters.gnss.velocity_window is not None or log.v_n is None or not smooths:
-        return unsaid, []
-    likely = [_likelihood(pieces, parameters, unsaid._replace(mean=f)) for f in (0.0, 1.0)]
-    means = likely[1] > likely[0]
-    what = f"means over the {step:.3g} s since the last fix" if means else "those of the fix"
-    sentence = (
-        f"For the smoother the velocities are taken as {what}, which makes the log-likelihood "
-        f"higher by {abs(likely[1] - likely[0]):.0f}."
-    )
-    return unsaid._replace(mean=float(means)), [sentence]
-
-
-def _likelihood(pieces: Sequence[Stretch], parameters: Replay, unsaid: Unsaid) -> float:
-    total = 0.0
-    for piece in pieces:
-        one = contender(parameters, unsaid, WEIGHED)
-        case = one.case(piece.world)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", StepWarning)
-            found = run(
-                one.filter, one.model, case.start, case.y, case.u, case.aux, keep=replaying.kept
-            )
-        total += float(found.log_likelihood)
-    return total
 
 
 def replay(
@@ -235,10 +199,12 @@ def replay(
     wanted = filters or parameters.filters
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
-    unsaid, found = _unsaid(log, pieces, parameters, wanted)
+    fix_step_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
     answers = replaying.navigated(
-        pieces, wanted, partial(contender, parameters, unsaid), SMOOTHED, progress
+        pieces, wanted, partial(contender, parameters, fix_step_s), SMOOTHED, progress
     )
+    answers = {k: a._replace(mean=navigation(a.mean)) for k, a in answers.items()}
+    found: list[str] = []
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
