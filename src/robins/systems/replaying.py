@@ -49,6 +49,8 @@ class Piece:
     noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
+PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step
+
 PieceT = TypeVar("PieceT", bound=Piece)
 
 
@@ -141,7 +143,7 @@ def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
 
     Of a bank also how likely each mode is.
     """
-    return step.posterior.mean, step.posterior.sigma, updates(step, ("imm.probability",))
+    return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY,))
 
 
 @jax.jit

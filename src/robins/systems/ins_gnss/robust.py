@@ -217,6 +217,42 @@ def case(asked: bool, world: Case) -> Case:
     return world._replace(start=widened(world.start, asked))
 
 
+# ----------------------------------------------------------------------------- in hindsight
+
+
+class Verdict(NamedTuple):
+    """What a bank thinks of each step once the whole log is known."""
+
+    off: np.ndarray  # (E,) probability that positions are off
+    scale: np.ndarray  # (E,) of the covariance of the process noise, geometric mean
+    strayed: np.ndarray  # (E,) probability that the estimate was off and took the fixes' word
+
+
+def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
+    """Probabilities of the modes given all of a log (Kim 1994, *Dynamic linear models with
+    Markov-switching*, J. Econometrics 60, eq. 2.20), backwards from the filtered ones.
+
+        P(i at k | all) = P(i at k) sum_j P(j at k+1 | all) p_ij / P(j at k+1 | k)
+
+    Args:
+        probability: (E, modes) after each step.
+        change: (modes, modes), from `changes`.
+    """
+    known = np.array(probability, float)
+    for k in range(len(known) - 2, -1, -1):
+        ahead = known[k] @ change
+        known[k] *= change @ np.divide(known[k + 1], ahead, np.zeros_like(ahead), where=ahead > 0.0)
+        known[k] /= known[k].sum()
+    off = known[:, HYPOTHESES.read > 0.0].sum(axis=1)
+    return Verdict(off, np.exp(known @ np.log(HYPOTHESES.scale)), known[:, STRAYED])
+
+
+def stretches(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
+    """First and last time of each run of steps for which something holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(int)))
+    return [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
+
+
 # ----------------------------------------------------------------------------------- the filters
 
 
