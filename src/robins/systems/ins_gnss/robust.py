@@ -31,8 +31,9 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.filters import Belief, Family, Filter, Model, Motion, Sensor, imm, kalman, taylor
+from robins.filters import Belief, Family, Filter, Model, Motion, Rule, Sensor, imm, kalman, taylor
 from robins.filters.composite.imm import Mode
+from robins.filters.observation import Observation
 from robins.filters.rules import student_t
 from robins.ins.state import InsState
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Velocity
@@ -256,6 +257,26 @@ def stretches(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]
 # ----------------------------------------------------------------------------------- the filters
 
 
+def tails(off: Any) -> Rule:
+    """Student's t on every measurement, but not on positions that are off already.
+
+    Where a second offset takes the place of the first, one that is weighed down step by step would
+    never be found: `begins` must be likelier than that.
+
+    Args:
+        off: 1 where positions are off.
+    """
+    t = student_t(_TAILS)
+
+    def before(memory: Any, prior: Belief, o: Observation):
+        memory, prior, seen = t.before(memory, prior, o)
+        if o.sensor == POSITION:
+            seen = seen._replace(noise=jnp.where(off > 0.0, o.noise, seen.noise))
+        return memory, prior, seen
+
+    return Rule(before=before, name="tails")
+
+
 def weighed() -> Filter:
     """A filter of one hypothesis; it can be smoothed."""
     return kalman(taylor(), [student_t(_TAILS)])
@@ -273,7 +294,7 @@ def robust(model: Model, step_s: float, patience_s: float) -> Filter:
     def mode(row: Hypothesis) -> Mode:
         own = supposed(model, row)
         mine = tuple(s for s in own.sensors if s.name == POSITION)
-        return Mode(kalman(taylor(), [student_t(_TAILS)]), own.motion, mine)
+        return Mode(kalman(taylor(), [tails(row.read)]), own.motion, mine)
 
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
