@@ -1,6 +1,6 @@
 """INS/GNSS on a minute of comma2k19, replayed by the defaults; nothing here was tuned on it.
 
-    python benchmarks/second_drive.py FOLDER
+    python benchmarks/second_drive.py FOLDER [--cases all,outages,wheels] [--raw]
 
 FOLDER is a segment of comma2k19 (Schafer et al. 2018), with `processed_log` and `global_pose`. A
 phone behind the windscreen, a u-blox receiver without correction data at 10 Hz, 100 Hz of MEMS; the
@@ -9,12 +9,14 @@ pose of the camera, computed afterwards from all sensors with carrier phases, se
 Told are the sigmas of the receiver's data sheet, as the log has none. Fixes are placed on the clock
 of the IMU by their own time, which the frames have in both. Vertical velocities are not recorded.
 Axes are forward, right, down, as published. `outages` withholds all fixes for two times ten
-seconds.
+seconds, `wheels` gives the speed of the CAN bus besides. `--raw` takes the gyro without the
+correction of its bias by the phone, which is 4 deg/s.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +24,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import logs, rotation, scenario
-from robins.dataset import Dataset, GnssTable, ImuTable, Trajectory
+from robins.dataset import Dataset, GnssTable, ImuTable, OdometryTable, Trajectory
 from robins.earth import dcm_en, geodetic_from_ecef
 from robins.systems.ins_gnss import Replay, replay
 
 SIGMA_M = 2.1, 2.1, 4.0  # 2.5 m circular error probable
 SIGMA_V = 0.05  # m/s
+SIGMA_WHEEL = 0.05  # m/s
 SIGMA_COURSE = np.deg2rad(0.3)
 LEAP_S, WEEK_S, GPS_EPOCH_S = 18.0, 604800.0, 315964800.0  # in 2018; 1980-01-06
 OUTAGES = '[outages]\nlength = "10 s"\nfirst = "15 s"\ngap = "10 s"\nlast = "15 s"\n'
 
 
-def loaded(folder: Path) -> Dataset:
+def loaded(folder: Path, raw: bool = False) -> Dataset:
     """The segment as a log whose clock is that of the device."""
 
     def array(name: str) -> np.ndarray:
@@ -60,7 +63,9 @@ def loaded(folder: Path) -> Dataset:
     )
     imu = ImuTable(
         _ns(array("processed_log/IMU/gyro/t")),
-        array("processed_log/IMU/gyro_uncalibrated/value"),
+        array(
+            "processed_log/IMU/gyro_uncalibrated/value" if raw else "processed_log/IMU/gyro/value"
+        ),
         array("processed_log/IMU/accelerometer/value"),
         kind="rate",
         source="phone",
@@ -77,31 +82,42 @@ def loaded(folder: Path) -> Dataset:
         np.asarray(rotation.from_dcm(jnp.asarray(C_nb))),
         source="global pose",
     )
-    return Dataset("comma2k19", imu, gnss, truth)
+    wheel_s = array("processed_log/CAN/speed/t")
+    none = np.full(len(wheel_s), np.nan)
+    wheels = OdometryTable(
+        _ns(wheel_s),
+        array("processed_log/CAN/speed/value")[:, 0],
+        none,
+        np.full(len(wheel_s), SIGMA_WHEEL),
+        none,
+        source="CAN",
+    )
+    return Dataset("comma2k19", imu, gnss, truth, odometry=wheels)
 
 
 def _ns(seconds: np.ndarray) -> np.ndarray:
     return np.round(seconds * 1e9).astype(np.int64)
 
 
-def against(truth: Trajectory, time_ns: np.ndarray, solution: Any) -> np.ndarray:
+def against(truth: Trajectory, time_ns: np.ndarray, lat: Any, lon: Any, alt: Any) -> np.ndarray:
     """(E, 3) m, north, east, down from the true place to the estimated."""
     at = [np.interp(time_ns, truth.time_ns, x) for x in (truth.lat_rad, truth.lon_rad, truth.alt_m)]
-    lat, lon, alt = (solution[n].values for n in ("lat_rad", "lon_rad", "alt_m"))
     north, east = 6.36e6 * (lat - at[0]), 6.38e6 * np.cos(at[0]) * (lon - at[1])
     return np.stack([north, east, at[2] - alt], -1)
 
 
-def told(dataset: Dataset, outages: bool, names: tuple[str, ...]) -> None:
+def told(dataset: Dataset, case: str, names: tuple[str, ...]) -> None:
     """Replay and print."""
+    outages = case != "all"
     parameters = scenario.parse(Replay, OUTAGES if outages else "")
-    outcome = replay(dataset, parameters, names)
+    heard = dataset if case == "wheels" else replace(dataset, odometry=None)
+    outcome = replay(heard, parameters, names)
     assert dataset.truth is not None
-    print("with outages" if outages else "with all fixes")
+    print(case)
     for name in names:
         s = outcome.solution.sel(filter=name)
         time_ns = s.time.values * 1e9 + float(outcome.solution.attrs["origin_ns"])
-        error = against(dataset.truth, time_ns, s)
+        error = against(dataset.truth, time_ns, s.lat_rad.values, s.lon_rad.values, s.alt_m.values)
         inside = (time_ns >= dataset.truth.time_ns[0]) & (time_ns <= dataset.truth.time_ns[-1])
         out = s.outage.values.astype(bool) & inside
         across = np.hypot(error[:, 0], error[:, 1])
@@ -130,27 +146,23 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("folder", type=Path)
     options.add_argument("--filters", default="robust,robust+rts,ekf")
+    options.add_argument("--cases", default="all,outages,wheels")
+    options.add_argument("--raw", action="store_true")
     asked = options.parse_args()
-    raw = loaded(asked.folder)
-    for finding in logs.examine(raw) if hasattr(logs, "examine") else []:
+    raw = loaded(asked.folder, asked.raw)
+    for finding in logs.examine(raw):
         print(finding)
     dataset = logs.clean(raw)
     g, truth = dataset.gnss, dataset.truth
     assert g is not None
     assert truth is not None
-    at = {"lat_rad": g.lat_rad, "lon_rad": g.lon_rad, "alt_m": g.alt_m}
-
-    class Column:
-        def __init__(self, values: np.ndarray):
-            self.values = values
-
-    error = against(truth, g.time_ns, {k: Column(v) for k, v in at.items()})
+    error = against(truth, g.time_ns, g.lat_rad, g.lon_rad, g.alt_m)
     print(
         f"fixes: {len(g)}, horizontal RMS {_rms(np.hypot(error[:, 0], error[:, 1])):.2f} m, mean "
         f"{np.mean(error, axis=0).round(2)} m"
     )
-    for outages in (False, True):
-        told(dataset, outages, tuple(asked.filters.split(",")))
+    for case in asked.cases.split(","):
+        told(dataset, case, tuple(asked.filters.split(",")))
 
 
 if __name__ == "__main__":

@@ -57,6 +57,7 @@ CAUSES = (
     "mean over the receiver's interval, or a vehicle that was taken for still; `robins doctor` "
     "tells some of them."
 )
+WHEELS_S = 0.5  # between two rows of the odometry within which the speed is interpolated
 UNSURE_S = 2.0  # longer than this, a doubt is told
 ROBUST, WEIGHED = "robust", "weighed"
 SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
@@ -163,7 +164,14 @@ def _known(
         y[model.STILL_RATE] = np.where(stands, mean_rate[last], np.nan)
     if aids.non_holonomic:
         y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
-    return y, {model.ROAD: rate} if aids.non_holonomic else {}
+    about: dict[str, Any] = {model.ROAD: rate} if aids.non_holonomic else {}
+    if log.wheels is not None and len(log.wheels.time_s) > 1:
+        t, speed, sigma = log.wheels
+        near = np.clip(np.searchsorted(t, epochs), 1, len(t) - 1)
+        heard = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])
+        y[model.ODOMETER] = np.where(heard, np.interp(epochs, t, speed), np.nan)[:, None]
+        about[model.ODOMETER] = model.Wheel(np.interp(epochs, t, sigma)[:, None], rate)
+    return y, about
 
 
 def bank_step_s(parameters: Replay, fix_step_s: float) -> float:

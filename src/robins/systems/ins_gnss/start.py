@@ -30,10 +30,21 @@ class StartPoint(NamedTuple):
 def at_rest(log: Log, aids: Aids) -> tuple[np.ndarray, np.ndarray]:
     """(N,) whether the vehicle stands still at each increment, by samples and fixes; mean rate."""
     still, mean_rate = standstill(log.increments, *aids.quiet)
-    fix_s, moves = _moving_fixes(log, aids.moving_speed)
+    fix_s, moves = _moving(log, aids.moving_speed)
     wait_s = 1.5 * max(1.0, float(np.median(np.diff(fix_s)))) if len(fix_s) > 1 else 1.5
     quiet = unrest(log.increments, *aids.quiet)
     return confirmed(still, quiet, log.time_s, fix_s, moves, wait_s), mean_rate
+
+
+def _moving(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times at which fixes or wheels tell whether the vehicle moves, and what they tell."""
+    time_s, moves = _moving_fixes(log, speed)
+    if log.wheels is None:
+        return time_s, moves
+    turn = np.abs(log.wheels.speed) > np.maximum(speed, 4.0 * log.wheels.sigma)
+    time_s = np.concatenate([time_s, log.wheels.time_s])
+    order = np.argsort(time_s, kind="stable")
+    return time_s[order], np.concatenate([moves, turn])[order]
 
 
 def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
