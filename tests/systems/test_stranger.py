@@ -171,7 +171,7 @@ def test_the_linear_motion_of_each_hypothesis_is_the_slope_of_its_step(log):
         assert np.all(np.abs(manifold.local(motion.step(x, u), new)) < 1e-9)
         wide = [
             manifold.local(motion.step(x, u), motion.step(manifold.retract(x, 0.1 * e), u)) / 0.1
-            for e in np.eye(n)[-4:]
+            for e in jnp.eye(n)[-4:]
         ]
         np.testing.assert_allclose(np.asarray(Phi)[:, -4:], np.stack(wide, -1), atol=1e-5)
         assert noise.shape[0] == n

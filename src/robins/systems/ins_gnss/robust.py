@@ -48,6 +48,7 @@ SELDOM_S = 100.0  # s from one time that positions are off to the next, in the m
 LATER = math.exp(4.0) - 1.0  # `strayed` is so much rarer than `ends`: as likely after 4 patiences
 _SHARE = 0.5, 0.5  # mean and sigma before anything is seen
 _TAILS = 4.0  # degrees of freedom of Student's t
+HEAVIEST = 16.0  # times the covariance of a position, by its weight in a mode
 
 
 class Wide(NamedTuple):
@@ -257,21 +258,19 @@ def stretches(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]
 # ----------------------------------------------------------------------------------- the filters
 
 
-def tails(off: Any) -> Rule:
-    """Student's t on every measurement, but not on positions that are off already.
+def tails() -> Rule:
+    """Student's t on every measurement; of a position no more than `HEAVIEST`.
 
-    Where a second offset takes the place of the first, one that is weighed down step by step would
-    never be found: `begins` must be likelier than that.
-
-    Args:
-        off: 1 where positions are off.
+    A position far away is a matter of the hypotheses. A mode that explains it by a weight, again at
+    every step, would stay likelier than what has to be believed once, and swallow it in the mixing.
     """
     t = student_t(_TAILS)
 
     def before(memory: Any, prior: Belief, o: Observation):
         memory, prior, seen = t.before(memory, prior, o)
         if o.sensor == POSITION:
-            seen = seen._replace(noise=jnp.where(off > 0.0, o.noise, seen.noise))
+            scale = jnp.minimum(1.0 / seen.notes["student_t.weight"], HEAVIEST)
+            seen = seen._replace(noise=jnp.sqrt(scale) * o.noise)
         return memory, prior, seen
 
     return Rule(before=before, name="tails")
@@ -294,7 +293,7 @@ def robust(model: Model, step_s: float, patience_s: float) -> Filter:
     def mode(row: Hypothesis) -> Mode:
         own = supposed(model, row)
         mine = tuple(s for s in own.sensors if s.name == POSITION)
-        return Mode(kalman(taylor(), [tails(row.read)]), own.motion, mine)
+        return Mode(kalman(taylor(), [tails()]), own.motion, mine)
 
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
