@@ -233,10 +233,11 @@ def main() -> None:
                 shown = " ".join(f"{k} {v:.3g}" for k, v in found[name][-1].items())
                 print(run, name, shown, file=sys.stderr, flush=True)
     for name, rows in found.items():
-        print(f"{name}: {asked.runs} runs; median, worst")
+        print(f"{name}: {asked.runs} runs; median, nine tenths, worst")
         for key in rows[0]:
             values = [row[key] for row in rows]
-            print(f"  {key:<14}{np.nanmedian(values):>10.3f}{np.nanmax(values):>10.3f}")
+            low, high, worst = np.nanquantile(values, [0.5, 0.9, 1.0])
+            print(f"  {key:<14}{low:>10.4f}{high:>10.4f}{worst:>10.4f}")
 
 
 if __name__ == "__main__":

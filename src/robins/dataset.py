@@ -136,6 +136,7 @@ class Dataset:
     master: Trajectory | None = None  # another INS on the vehicle, to align the IMU to
     mag: MagTable | None = None
     attitude: AttitudeTable | None = None  # true attitude, where nothing else is known
+    odometry: OdometryTable | None = None  # speed of the wheels, from Python only
     counts: dict[str, int] = field(default_factory=dict)  # refused samples by reason
     findings: list[Finding] = field(default_factory=list)  # of the readers: what they left out
     time_unit_known: tuple[str, ...] = ()  # files that say in which unit their stamps are
@@ -172,7 +173,7 @@ class OdometryTable(_Rows):
 
     time_ns: np.ndarray  # (M,) int64
     speed_mps: np.ndarray  # (M,) forward
-    yaw_rate: np.ndarray  # (M,) rad/s, positive to the right
+    yaw_rate: np.ndarray  # (M,) rad/s, positive to the right; NaN where there is none
     sigma_speed: np.ndarray  # (M,) of the noise of a row
     sigma_yaw: np.ndarray  # (M,)
     source: str = ""

@@ -49,6 +49,8 @@ class Piece:
     noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
+PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step
+
 PieceT = TypeVar("PieceT", bound=Piece)
 
 
@@ -139,8 +141,11 @@ def gap_counts(pieces: Sequence[Piece], problems: Sequence[str]) -> dict[str, in
 
 
 def kept(step: Step) -> tuple[Any, Any, dict[str, Update]]:
-    """Keep the posterior's mean and standard deviations and how the updates went, by sensor."""
-    return step.posterior.mean, step.posterior.sigma, updates(step)
+    """Keep the posterior's mean and standard deviations and how the updates went, by sensor.
+
+    Of a bank also how likely each mode is.
+    """
+    return step.posterior.mean, step.posterior.sigma, updates(step, (PROBABILITY,))
 
 
 @jax.jit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,9 +26,15 @@ class Update(NamedTuple):
     notes: Mapping[str, Any] = {}
 
 
-def updates(step: Step) -> dict[str, Update]:
-    """What is kept of a step, by sensor, without what its rules noted."""
-    return {k: Update(i.innovation, i.sigma, i.nis, i.dof, i.code) for k, i in step.info.items()}
+def updates(step: Step, notes: Collection[str] = ()) -> dict[str, Update]:
+    """What is kept of a step, by sensor, and of what its rules noted that of these names."""
+    return {
+        k: Update(
+            *(i.innovation, i.sigma, i.nis, i.dof, i.code),
+            {name: i.notes[name] for name in notes if name in i.notes},
+        )
+        for k, i in step.info.items()
+    }
 
 
 def block_array(

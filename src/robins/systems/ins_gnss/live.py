@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.dataset import GnssTable, ImuTable
-from robins.errors import require, require_known
+from robins.errors import require
 from robins.filters import OnlineFilter
 from robins.filters.run import Step
 from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
@@ -41,7 +41,6 @@ from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
 from robins.systems.ins_gnss.log import (
     SMOOTHED,
-    Unsaid,
     contender,
     first_belief,
     measured_fixes,
@@ -49,6 +48,7 @@ from robins.systems.ins_gnss.log import (
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
+from robins.systems.ins_gnss.robust import navigation
 from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
@@ -61,6 +61,7 @@ from robins.systems.streaming import (
     refuse_units,
     stamp,
 )
+from robins.systems.study import Case
 
 _PATIENCE_S = 0.1
 _AHEAD_S = 10.0  # of the newest sample, by which a fix may be
@@ -97,7 +98,8 @@ def _predicted(filter_, motion, state, u):
 
 
 def _vector(belief: Any) -> jax.Array:
-    x, p = belief.mean, belief.mean.position
+    x = navigation(belief.mean)
+    p = x.position
     place = jnp.stack([p.lat, p.lon, p.alt])
     return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma[:9]])
 
@@ -159,10 +161,8 @@ class LiveInsGnss(Live):
         # what has to be looked back at from the oldest epoch
         back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
         self._back_s = longest_delay_s + 2.0 * self._reach_s + back
-        patience = max(2, math.ceil(p.update.patience / max(self._usual.fix_s, 1e-3)))
-        asked = contender(p, Unsaid(patience, 1.0), filter)
-        require_known("filter", filter, [filter])
-        self._filter, self._model = asked.filter, asked.model
+        asked = contender(p, self._usual.fix_s, filter)
+        self._filter, self._model, self._case = asked.filter, asked.model, asked.case
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
         self._door = Door(p.update.longest_gap, max(3, round(_PATIENCE_S * rate_hz)))
         self._begin_anew()
@@ -404,7 +404,7 @@ class LiveInsGnss(Live):
         except LiveError:
             self._begin_anew()
             raise
-        belief = first_belief(log, found, p)
+        belief = self._case(Case(first_belief(log, found, p), None, {}, {}, None)).start
         self._online = OnlineFilter(self._filter, self._model, belief)
         self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
         self.start = found.sentence

@@ -6,12 +6,10 @@ is too long to bridge ends a piece of the log; the next piece is aligned anew.
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +18,7 @@ import numpy as np
 from robins.dataset import Dataset
 from robins.earth import Geodetic
 from robins.errors import require_known
-from robins.filters import Belief, StepWarning, run
+from robins.filters import Belief
 from robins.ins.blocks import cut, epochs_between, gained_in_window, rate_about, usual_width
 from robins.ins.increments import Increments
 from robins.ins.mechanise import Nav
@@ -31,12 +29,25 @@ from robins.systems import replaying
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.parameters import Aids, Replay
 from robins.systems.ins_gnss.recording import Log, in_body_axes, on_one_clock, with_lever_arm
-from robins.systems.ins_gnss.robust import robust, supposing_mean, weighed
+from robins.systems.ins_gnss.robust import (
+    AS_TOLD,
+    HYPOTHESES,
+    Verdict,
+    case,
+    changes,
+    fresh,
+    in_hindsight,
+    navigation,
+    robust,
+    stretches,
+    supposed,
+    weighed,
+)
 from robins.systems.ins_gnss.start import StartPoint, Usual, at_rest, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
-from robins.systems.replaying import Piece, Reported
+from robins.systems.replaying import PROBABILITY, Answer, Piece, Reported
 from robins.systems.study import Case, Contender
 from robins.systems.tables import place_arrays, track_arrays
 
@@ -46,6 +57,8 @@ CAUSES = (
     "mean over the receiver's interval, or a vehicle that was taken for still; `robins doctor` "
     "tells some of them."
 )
+WHEELS_S = 0.5  # between two rows of the odometry within which the speed is interpolated
+UNSURE_S = 2.0  # longer than this, a doubt is told
 ROBUST, WEIGHED = "robust", "weighed"
 SMOOTHED = {**SMOOTHERS, f"{ROBUST}+rts": WEIGHED}
 NAMES = (ROBUST, f"{ROBUST}+rts", *STUDIED)
@@ -154,63 +167,135 @@ def measured_rest(
         y[model.STILL_RATE] = np.where(stands, mean_rate[last], np.nan)
     if aids.non_holonomic:
         y[model.ROAD] = np.where(stands, np.nan, np.zeros((len(epochs), 2)))
-    return y, {model.ROAD: rate} if aids.non_holonomic else {}
+    about: dict[str, Any] = {model.ROAD: rate} if aids.non_holonomic else {}
+    if log.wheels is not None and len(log.wheels.time_s) > 1:
+        t, speed, sigma = log.wheels
+        near = np.clip(np.searchsorted(t, epochs), 1, len(t) - 1)
+        heard = (t[near] - t[near - 1] < WHEELS_S) & (epochs >= t[0]) & (epochs <= t[-1])
+        y[model.ODOMETER] = np.where(heard, np.interp(epochs, t, speed), np.nan)[:, None]
+        about[model.ODOMETER] = model.Wheel(np.interp(epochs, t, sigma)[:, None], rate)
+    return y, about
 
 
-class Unsaid(NamedTuple):
-    """What a log says of its receiver that its configuration does not."""
-
-    patience: int  # positions in a row, `find_back`
-    mean: float  # 1 where velocities are means over the window, 0 where they are of the fix
+def bank_step_s(parameters: Replay, fix_step_s: float) -> float:
+    """Length of most steps."""
+    return min(fix_step_s, parameters.update.longest_block)
 
 
-def contender(parameters: Replay, unsaid: Unsaid, name: str) -> Contender:
-    """A filter with the model it believes in."""
+def contender(parameters: Replay, fix_step_s: float, name: str) -> Contender:
+    """A filter with the model it believes in.
+
+    Args:
+        parameters: of the replay.
+        fix_step_s: between fixes, in the median.
+        name: of a filter, or `WEIGHED`.
+    """
     believed = model.ins_gnss_model(parameters.imu, parameters.gnss, parameters.aids)
     asked = parameters.gnss.velocity_window is None
     if name == ROBUST:
-        return Contender(robust(believed, asked, unsaid.patience), believed)
+        bank = robust(believed, bank_step_s(parameters, fix_step_s), parameters.update.patience)
+        return Contender(bank, supposed(believed, AS_TOLD), partial(case, asked))
     if name == WEIGHED:
-        return Contender(weighed(unsaid.patience), supposing_mean(believed, unsaid.mean))
-    told = supposing_mean(believed, 0.0) if asked else believed
+        return Contender(weighed(), supposed(believed, AS_TOLD), partial(case, asked))
+    told = fresh(believed) if asked else believed
     return Contender(make_filter(name, parameters.update.gate), told)
 
 
-def _unsaid(
-    log: Log, pieces: Sequence[Stretch], parameters: Replay, wanted: Sequence[str]
-) -> tuple[Unsaid, list[str]]:
-    """What the log says, and a sentence for the reader where a smoother needed to know it.
+def _answers(
+    pieces: Sequence[Stretch],
+    parameters: Replay,
+    fix_step_s: float,
+    wanted: Sequence[str],
+    progress: Progress,
+) -> tuple[dict[str, Answer], list[str], list[str]]:
+    """What each filter and smoother says, notes and warnings of the bank.
 
-    Whether velocities are means over the time since the last fix is decided by the likelihood of
-    the whole log; a causal filter has that as a hypothesis of its own.
+    The smoother of one hypothesis takes that which the bank thinks likely in hindsight: it does not
+    see positions that were off, and has the bank's process noise.
     """
-    step = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
-    unsaid = Unsaid(max(2, math.ceil(parameters.update.patience / max(step, 1e-3))), 1.0)
-    smooths = any(SMOOTHED.get(name) == WEIGHED for name in wanted)
-    if parameters.gnss.velocity_window is not None or log.v_n is None or not smooths:
-        return unsaid, []
-    likely = [_likelihood(pieces, parameters, unsaid._replace(mean=f)) for f in (0.0, 1.0)]
-    means = likely[1] > likely[0]
-    what = f"means over the {step:.3g} s since the last fix" if means else "those of the fix"
-    sentence = (
-        f"For the smoother the velocities are taken as {what}, which makes the log-likelihood "
-        f"higher by {abs(likely[1] - likely[0]):.0f}."
+
+    def navigated(pieces: Sequence[Stretch], wanted: Sequence[str]) -> dict[str, Answer]:
+        made = partial(contender, parameters, fix_step_s)
+        return replaying.navigated(pieces, wanted, made, SMOOTHED, progress)
+
+    smooths = [name for name in wanted if SMOOTHED.get(name) == WEIGHED]
+    causal = [name for name in wanted if name not in smooths]
+    asks = bool(smooths) and ROBUST not in causal
+    found = navigated(pieces, [*causal, ROBUST] if asks else causal)
+    notes, doubts = [], []
+    if ROBUST in found:
+        change = changes(bank_step_s(parameters, fix_step_s), parameters.update.patience)
+        probability = np.asarray(list(found[ROBUST].updates.values())[-1].notes[PROBABILITY])
+        verdicts, first = [], 0
+        for piece in pieces:
+            last = first + len(piece.epoch_s)
+            verdicts.append(in_hindsight(probability[first:last], change))
+            doubts += _doubts(piece, probability[first:last], verdicts[-1])
+            first = last + 1
+        notes += _share_note(found[ROBUST], parameters, fix_step_s)
+        if smooths:
+            seen = [_settled(*of) for of in zip(pieces, verdicts, strict=True)]
+            found |= navigated(seen, smooths)
+    kept = {k: found[k]._replace(mean=navigation(found[k].mean)) for k in wanted}
+    return kept, notes, doubts
+
+
+def _settled(piece: Stretch, verdict: Verdict) -> Stretch:
+    """The piece without the positions that were off, with the process noise that it had."""
+    world: Case = piece.world
+    off = verdict.off > 0.5
+    position = jax.tree_util.tree_map(lambda x: np.where(off, np.nan, x), world.y[model.POSITION])
+    u = world.u._replace(noise_scale=world.u.noise_scale * np.sqrt(verdict.scale))
+    return replace(piece, world=world._replace(u=u, y={**world.y, model.POSITION: position}))
+
+
+def _doubts(piece: Stretch, probability: np.ndarray, verdict: Verdict) -> list[str]:
+    """Sentences on where positions were off, and on where that could not be told in time."""
+    seen = np.isfinite(np.asarray(piece.world.y[model.POSITION].lat))
+    said = []
+    if off := stretches(piece.epoch_s[seen], verdict.off[seen] > 0.5):
+        shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in off[:6])
+        more = "" if len(off) <= 6 else f" and {len(off) - 6} more"
+        said.append(
+            f"{ROBUST}: positions were off, all to one side, against velocities and the IMU: "
+            f"{shown}{more}. They were not followed."
+        )
+    now = probability[:, HYPOTHESES.read > 0.0].sum(axis=1)
+    open_ = [(a, b) for a, b in stretches(piece.epoch_s, (now > 0.05) & (now < 0.95) & seen)]
+    if long := [(a, b) for a, b in open_ if b - a >= UNSURE_S]:
+        shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in long[:6])
+        said.append(
+            f"{ROBUST}: for a while it could not be told whether positions were off or the "
+            f"estimate, and its sigma says so: {shown}."
+        )
+    if np.any(verdict.strayed > 0.5):
+        at = piece.epoch_s[np.flatnonzero(verdict.strayed > 0.5)]
+        shown = ", ".join(f"{t:.1f} s" for t in at[:6])
+        said.append(
+            f"{ROBUST}: the estimate was off and took the word of positions that stayed away: "
+            f"{shown}. Before, its sigma did not hold."
+        )
+    return said
+
+
+def _share_note(answer: Answer, parameters: Replay, fix_step_s: float) -> list[str]:
+    """A sentence on what the velocities are, where the configuration does not say."""
+    wide = answer.mean
+    if wide.share is None or model.VELOCITY not in answer.updates:
+        return []
+    share = float(np.asarray(wide.share)[-1, 0])
+    sigma = float(np.asarray(answer.sigma)[-1, -4])
+    if sigma > 0.2:
+        return []
+    what = (
+        f"means over the {fix_step_s:.3g} s since the last fix"
+        if share > 0.5
+        else "those of the fix"
     )
-    return unsaid._replace(mean=float(means)), [sentence]
-
-
-def _likelihood(pieces: Sequence[Stretch], parameters: Replay, unsaid: Unsaid) -> float:
-    total = 0.0
-    for piece in pieces:
-        one = contender(parameters, unsaid, WEIGHED)
-        case = one.case(piece.world)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", StepWarning)
-            found = run(
-                one.filter, one.model, case.start, case.y, case.u, case.aux, keep=replaying.kept
-            )
-        total += float(found.log_likelihood)
-    return total
+    return [
+        f"The receiver's velocities are {what} (by {share:.2f} +- {sigma:.2f} of that time); "
+        "gnss.velocity_window says so to the other filters."
+    ]
 
 
 def replay(
@@ -238,10 +323,8 @@ def replay(
     wanted = filters or parameters.filters
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
-    unsaid, found = _unsaid(log, pieces, parameters, wanted)
-    answers = replaying.navigated(
-        pieces, wanted, partial(contender, parameters, unsaid), SMOOTHED, progress
-    )
+    fix_step_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
+    answers, found, doubts = _answers(pieces, parameters, fix_step_s, wanted, progress)
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
@@ -250,7 +333,7 @@ def replay(
     variables |= array("outage", withheld.astype(np.int8), long_name="GNSS withheld")
     used = np.any([piece.used for piece in pieces], axis=0)
     counts = replaying.gap_counts(pieces, problems) | {"pieces_not_navigated": len(problems)}
-    return replaying.outcome(
+    outcome = replaying.outcome(
         epoch_s,
         answers,
         Reported(
@@ -268,6 +351,8 @@ def replay(
         + [f"Not navigated, {problem}." for problem in problems],
         origin_ns=int(dataset.imu.time_ns[0]),
     )
+    outcome.warnings[:0] = doubts
+    return outcome
 
 
 @jax.jit

@@ -14,6 +14,7 @@ against the Earth w_eb = w - b_g - C' w_ie, and lever arms l, the sensors read :
     zero_velocity   v
     zero_rate       b_g + C' w_ie
     non_holonomic   C' v + w_eb x l_axle, right and down
+    odometer        the same, forward
 
 and their Jacobians H follow by differentiation on the manifold.
 """
@@ -43,12 +44,14 @@ POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
     "zero_rate",
     "non_holonomic",
 )
+ODOMETER = "odometer"
 SENSORS = {
     POSITION: SensorAxes("m", "NED", NED),
     VELOCITY: SensorAxes("m/s", "NED", NED),
     STANDSTILL: SensorAxes("m/s", "NED", NED),
     STILL_RATE: SensorAxes("rad/s", "FRD", FRD),
     ROAD: SensorAxes("m/s", "FRD", FRD[1:]),
+    ODOMETER: SensorAxes("m/s", "FRD", FRD[:1]),
 }
 
 
@@ -71,6 +74,13 @@ class Fix(NamedTuple):
 
     sigma: ArrayLike  # (3,) m, north east down
     omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the fix
+
+
+class Wheel(NamedTuple):
+    """What a speed of the wheels needs besides the state."""
+
+    sigma: ArrayLike  # (1,) m/s
+    omega_b: ArrayLike  # (3,) rad/s mean raw gyro rate about the time
 
 
 class Velocity(NamedTuple):
@@ -129,7 +139,7 @@ def _read_velocity(mount: Mount, x: InsState, fix: Velocity):
     return antenna_velocity(x, mount, jnp.asarray(fix.omega_b)) - gained
 
 
-def _fix_sigma(x: InsState, fix: Fix | Velocity):
+def _fix_sigma(x: InsState, fix: Fix | Velocity | Wheel):
     return fix.sigma
 
 
@@ -141,9 +151,16 @@ def _read_still_rate(x: InsState, aux: Any):
     return -turn_rate_b(x, jnp.zeros(3))
 
 
+def _axle_velocity_b(mount: Mount, x: InsState, omega_b: Array):
+    return x.q_nb.inverse().apply(x.v_n) + jnp.cross(turn_rate_b(x, omega_b), mount.axle_b)
+
+
 def _read_road(mount: Mount, x: InsState, omega_b: Array):
-    v_b = x.q_nb.inverse().apply(x.v_n) + jnp.cross(turn_rate_b(x, omega_b), mount.axle_b)
-    return v_b[1:]
+    return _axle_velocity_b(mount, x, omega_b)[1:]
+
+
+def _read_wheel(mount: Mount, x: InsState, wheel: Wheel):
+    return _axle_velocity_b(mount, x, jnp.asarray(wheel.omega_b))[:1]
 
 
 def noise_of(imu: Imu) -> InsNoise:
@@ -185,7 +202,8 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
     Returns:
         A model with sensors, in order: "gnss_position" (a `Geodetic`, aux `Fix`),
         "gnss_velocity" ((3,) NED, aux `Velocity`), "zero_velocity" ((3,), zeros), "zero_rate" ((3,)
-        mean gyro rate at rest) and "non_holonomic" ((2,) zeros; aux mean gyro rate). A sensor is
+        mean gyro rate at rest), "non_holonomic" ((2,) zeros; aux mean gyro rate) and "odometer"
+        ((1,), aux `Wheel`). A sensor is
         silent at an epoch where its measurement is NaN, and left out of a run that does not name
         it.
     """
@@ -199,6 +217,7 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
             Sensor(_read_standstill, jnp.full(3, still), 3, STANDSTILL),
             Sensor(_read_still_rate, jnp.full(3, still_rate), 3, STILL_RATE),
             Sensor(Partial(_read_road, mount), jnp.asarray(aids.road_velocity), 2, ROAD),
+            Sensor(Partial(_read_wheel, mount), _fix_sigma, 1, ODOMETER),
         ),
     )
 

@@ -111,7 +111,7 @@ class Update(Cutting):
     longest_gap: q.Duration = default("1 s")
     # of the other filters than `robust`; 0: no gate
     gate: Annotated[float, pydantic.Field(ge=0.0, lt=1.0)] = 0.9999
-    # `robust` follows positions that stay away for longer than this
+    # `robust`: for how long positions are off, where they are, in the mean
     patience: q.Duration = default("10 s")
 
 

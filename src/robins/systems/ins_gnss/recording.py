@@ -14,6 +14,16 @@ from robins.ins.frames import to_ned_frd
 from robins.ins.increments import Increments, from_imu
 from robins.systems.ins_gnss.parameters import Gnss, Replay
 
+TYRES = 0.02  # share of the speed by which wheels may read wrong: tyres, pressure, slip
+
+
+class Wheels(NamedTuple):
+    """Forward speed by the wheels."""
+
+    time_s: np.ndarray  # (W,)
+    speed: np.ndarray  # (W,) m/s
+    sigma: np.ndarray  # (W,) m/s, with what tyres may do
+
 
 class Log(NamedTuple):
     """A log or a piece of it, NED/FRD, in seconds since the first IMU sample."""
@@ -28,6 +38,7 @@ class Log(NamedTuple):
     withheld: np.ndarray  # (M,) bool
     field_s: np.ndarray | None = None  # (K,) of a magnetometer, where there is one
     field_b: np.ndarray | None = None  # (K, 3) T, body axes
+    wheels: Wheels | None = None
 
 
 def in_body_axes(dataset: Dataset, orientation: Sequence[float]) -> Dataset:
@@ -96,7 +107,20 @@ def on_one_clock(dataset: Dataset, parameters: Replay) -> Log:
         sigma_v,
         parameters.withheld(gnss_s, gnss_s),
         *_field(dataset, origin),
+        _wheels(dataset, origin),
     )
+
+
+def _wheels(dataset: Dataset, origin_ns: int) -> Wheels | None:
+    """Whole rows of the odometry, in the order of time; None without one."""
+    rows = dataset.odometry
+    if rows is None:
+        return None
+    order = np.argsort(rows.time_ns, kind="stable")
+    order = order[np.isfinite(rows.speed_mps[order]) & (rows.sigma_speed[order] > 0.0)]
+    speed = rows.speed_mps[order]
+    sigma = np.hypot(rows.sigma_speed[order], TYRES * speed)
+    return Wheels((rows.time_ns[order] - origin_ns) * 1e-9, speed, sigma)
 
 
 def _field(dataset: Dataset, origin_ns: int) -> tuple[np.ndarray | None, np.ndarray | None]:

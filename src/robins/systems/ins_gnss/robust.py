@@ -1,155 +1,300 @@
 """The filter of a log that nobody tuned it for: fixes are weighed, none is refused for ever.
 
-Every measurement has a weight of its own, that of noise with Student's t (`rules.student_t`), and
-the estimate follows positions that stay away from it (`find_back`). What the files of a log do not
-say is asked as hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
+Every measurement has a weight of its own, that of noise with Student's t (`rules.student_t`), which
+answers a single one that is off. What the files of a log do not say is in the state, or is asked as
+hypotheses of an interacting multiple model (`robins.filters.composite.imm`):
 
-    s   how much larger the covariance of the process noise is than told, 1, 8 or 64
-    f   what the receiver's velocity is: that of the fix (0), or the mean since the last one (1)
+    x = (ins, share, o)      ins: the navigation state; tangent components behind its 15 or 21
 
-A measurement that is off is weighed down in all modes alike and moves no probability; a motion that
-is off is explained by a larger s without weighing anything down. What the velocities are does not
-change in a run; s rises rarely and falls back within seconds.
+    share   what a velocity is: that of the fix (0), or the mean since the last one (1); constant
+    o       (3,) m, NED: by how much positions are off, as multipath makes them
+
+    right 1, 8, 64   positions are right; the covariance of the process noise is so many times that
+                     which is told. A motion that was not foreseen is answered here.
+    begins           from this step on positions are off: o is new, of `OFF_M`
+    lasts            they are still off: o stays, but for a walk. Fixes tell the motion, not where
+    ends             they are right again, and the state was: o is dropped
+    strayed          they were right, and the state was off: o is added to the position and dropped
+
+Whether positions that stay away are off or the state is, both are weighed: the stated covariance is
+that of the mixture, and grows while the two disagree. Probabilities of a change are rates times the
+time of a step, so that they do not depend on how often fixes come.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
+from jaxtyping import Array
 
-from robins.filters import Family, Filter, Model, Rule, Sensor, imm, kalman, taylor
-from robins.filters.belief import Belief
-from robins.filters.chi_square import quantiles
+from robins.filters import Belief, Family, Filter, Model, Motion, Rule, Sensor, imm, kalman, taylor
 from robins.filters.composite.imm import Mode
-from robins.filters.observation import Observation, normalised
+from robins.filters.observation import Observation
 from robins.filters.rules import student_t
-from robins.filters.rules._robust import widened
+from robins.ins.state import InsState
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Velocity
+from robins.systems.parts import Block, moved_by
+from robins.systems.study import Case
 
 SCALES = (1.0, 8.0, 64.0)
-RISE, FALL = 1e-4, 1e-2  # probability in a step that s changes upwards, and back
+RISE, FALL = 1e-4, 1e-2  # probability in a step that the process noise changes upwards, and back
+OFF_M = 10.0  # m, sigma of what positions are off by when they are
+WALK = 0.005  # m/sqrt(s), by which that wanders; more makes `lasts` less likely than `right`
+SELDOM_S = 100.0  # s from one time that positions are off to the next, in the mean
+LATER = math.exp(4.0) - 1.0  # `strayed` is so much rarer than `ends`: as likely after 4 patiences
+_SHARE = 0.5, 0.5  # mean and sigma before anything is seen
 _TAILS = 4.0  # degrees of freedom of Student's t
-_AWAY = 0.9999  # a position is away from the estimate if its NIS is beyond this quantile
+HEAVIEST = 16.0  # times the covariance of a position, by its weight in a mode
 
 
-class Strayed(NamedTuple):
-    """What is remembered of positions that lie away from the estimate."""
+class Wide(NamedTuple):
+    """The navigation state and what is not known of its receiver."""
 
-    count: Any  # () of them in a row, all on one side
-    mean: Any  # (3,) m, of their innovations
-
-
-def find_back(patience: int) -> Rule:
-    """Follow positions that stay away from the estimate, all to one side, for long enough.
-
-    A weight that falls with the distance locks out an estimate that has strayed: the farther off it
-    is, the less the fixes can pull. After ``patience`` positions in a row whose NIS is beyond the
-    0.9999 quantile, each nearer to the mean of those before than half of that mean's length, the
-    next one finds the covariance widened by the square of its innovation along what it sees. A
-    receiver that is deceived for less long is not followed. A position with a missing component
-    tells nothing here.
-
-    Args:
-        patience: positions in a row.
-    """
-
-    def init(belief, dims):
-        return Strayed(jnp.zeros((), int), jnp.zeros(3))
-
-    def before(memory: Strayed, prior: Belief, o: Observation):
-        if o.sensor != POSITION:
-            return memory, prior, o
-        seen = normalised(o)
-        judged = seen.dof == len(o.residual)
-        r = jnp.where(judged, o.residual, 0.0)
-        off = judged & (seen.nis > quantiles(_AWAY, 3)[3])
-        apart = jnp.linalg.norm(r - memory.mean) > 0.5 * jnp.linalg.norm(memory.mean)
-        held = jnp.where(apart, 0, memory.count)
-        due = off & (held >= patience)
-        now = Strayed(
-            jnp.where(off & ~due, held + 1, 0),
-            jnp.where(held > 0, memory.mean + (r - memory.mean) / (held + 1).astype(float), r),
-        )
-        kept = Strayed(*(jnp.where(judged, a, b) for a, b in zip(now, memory, strict=True)))
-        prior = widened(due, prior, o, jnp.full(3, True), r[:, None])
-        return kept, prior, o.noted("find_back", followed=due)
-
-    return Rule(init=init, before=before, name="find_back")
-
-
-def supposing(scale: Any) -> Rule:
-    """Process noise whose covariance is larger than told, by this factor."""
-
-    def process(memory, transition):
-        return memory, transition._replace(noise=jnp.sqrt(scale) * transition.noise)
-
-    return Rule(process=process, name="supposing")
-
-
-def weighed(patience: int) -> Filter:
-    """A filter of one hypothesis, the one that is told; it can be smoothed."""
-    return kalman(taylor(), [find_back(patience), student_t(_TAILS)])
-
-
-# ----------------------------------------------------------------------------------- the bank
+    ins: InsState
+    share: Array | None  # (1,); None where the configuration says it
+    offset: Array  # (3,) m, NED
 
 
 class Hypothesis(NamedTuple):
     """Numbers of a mode; of the bank with a leading axis."""
 
-    scale: Any  # s
-    mean: Any  # f
+    scale: Any  # of the covariance of the process noise
+    read: Any  # 1 where positions are off by o
+    kept: Any  # 1 where o lasts
+    new: Any  # 1 where o is drawn anew
+    taken: Any  # 1 where the position takes o
 
 
-def hypotheses(asked: bool) -> Hypothesis:
-    """The numbers of all modes, with both f or with f = 1 alone."""
-    rows = np.array([(s, f) for f in ((0.0, 1.0) if asked else (1.0,)) for s in SCALES])
-    return Hypothesis(rows[:, 0], rows[:, 1])
+COUNT = len(SCALES)
+RIGHT, LASTS = slice(COUNT), slice(COUNT, 2 * COUNT)
+BEGINS, ENDS, STRAYED = range(2 * COUNT, 2 * COUNT + 3)
+"""Where the modes stand in the bank."""
+
+_ROWS = [(s, float(off), float(off), 0.0, 0.0) for off in (0, 1) for s in SCALES] + [
+    (SCALES[1], 1.0, 0.0, 1.0, 0.0),
+    (SCALES[1], 0.0, 0.0, 0.0, 0.0),
+    (SCALES[1], 0.0, 0.0, 0.0, 1.0),
+]
+HYPOTHESES = Hypothesis(*np.array(_ROWS).T)
+AS_TOLD = Hypothesis(*_ROWS[0])
 
 
-def changes(of: Hypothesis) -> np.ndarray:
-    """(modes, modes) probabilities to change in a step."""
-    up = of.scale[None, :] > of.scale[:, None]
-    other = (of.scale[None, :] != of.scale[:, None]) & (of.mean[None, :] == of.mean[:, None])
-    p = np.where(up, RISE, FALL) * other
-    return p + np.diag(1.0 - p.sum(axis=1))
+def changes(step_s: float, patience_s: float) -> np.ndarray:
+    """(modes, modes) probabilities to change in a step.
+
+    Args:
+        step_s: its length.
+        patience_s: how long positions are off, in the mean.
+    """
+    step_s = min(step_s, 0.5 * patience_s)
+    begin, over = (-math.expm1(-step_s / length) for length in (SELDOM_S, patience_s))
+    scale = np.array(SCALES)
+    p = np.zeros((len(_ROWS), len(_ROWS)))
+    for same in (RIGHT, LASTS):
+        p[same, same] = np.where(scale[None] > scale[:, None], RISE, FALL)
+    p[:, BEGINS] = begin
+    for off in (LASTS, BEGINS):
+        p[off, ENDS] = over
+        p[off, STRAYED] = over / LATER
+    # where the rest goes
+    at, rest = np.arange(len(p)), np.array([*range(2 * COUNT), COUNT, 0, 0])
+    p[at, rest] = 0.0
+    p[at, rest] = 1.0 - p.sum(axis=1)
+    return p
 
 
-def _read_share(read: Any, share: Any, x: Any, fix: Velocity):
+# ------------------------------------------------------------------------------------ the model
+
+
+def widened(start: Belief, asked: bool) -> Belief:
+    """A belief about the navigation state with what the bank adds to it."""
+    mean, sigma = _SHARE
+    share = jnp.full(1, mean) if asked else None
+    spread = np.zeros((3 + asked, 3 + asked))
+    if asked:
+        spread[0, 0] = sigma
+    return Belief(Wide(start.mean, share, jnp.zeros(3)), _diagonal(start.factor, spread))
+
+
+def navigation(x: Any) -> InsState:
+    """The navigation state of a wide one; another as it is."""
+    return x.ins if isinstance(x, Wide) else x
+
+
+def _diagonal(a: Any, b: Any) -> Array:
+    a, b = jnp.asarray(a, float), jnp.asarray(b, float)
+    right, left = jnp.zeros((len(a), b.shape[1])), jnp.zeros((len(b), a.shape[1]))
+    return jnp.concatenate(
+        [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
+    )
+
+
+def _as_data(function: Any) -> Partial:
+    # a `Partial` of one would be equal to itself only, and every run would compile anew
+    return function if isinstance(function, Partial) else Partial(function)
+
+
+def _moved(of: Hypothesis, x: Wide) -> Wide:
+    place = x.ins.position.retract(of.taken * x.offset)
+    return x._replace(ins=x.ins._replace(position=place), offset=of.kept * x.offset)
+
+
+def _step(motion: Motion, of: Hypothesis, x: Wide, u: Block) -> Wide:
+    x = _moved(of, x)
+    return x._replace(ins=motion.step(x.ins, u))
+
+
+def _step_linear(motion: Motion, of: Hypothesis, x: Wide, u: Block):
+    assert motion.linear is not None
+    x = _moved(of, x)
+    ins, Phi, factor = motion.linear(x.ins, u)
+    free = 0 if x.share is None else 1
+    unit, zero = jnp.eye(free), jnp.zeros((free, free))
+    Phi = _diagonal(Phi, _diagonal(unit, of.kept * jnp.eye(3)))
+    n = len(Phi)
+    takes = jnp.eye(n).at[jnp.arange(6, 9), jnp.arange(n - 3, n)].set(of.taken)
+    drawn = of.new * OFF_M + of.kept * WALK * jnp.sqrt(jnp.sum(u.increments.dt))
+    noise = _diagonal(jnp.sqrt(of.scale) * factor, _diagonal(zero, drawn * jnp.eye(3)))
+    return x._replace(ins=ins), Phi @ takes, noise
+
+
+def _read(read: Any, x: Wide, aux: Any):
+    return read(x.ins, aux)
+
+
+def _read_off(read: Any, off: Any, x: Wide, aux: Any):
+    return read(x.ins, aux).retract(off * x.offset)
+
+
+def _aged(fix: Velocity, share: Any) -> Velocity:
     gained, age = share * jnp.asarray(fix.gained_b), share * jnp.asarray(fix.age_s)
-    return read(x, fix._replace(gained_b=gained, age_s=age))
+    return fix._replace(gained_b=gained, age_s=age)
 
 
-def mean_velocity(model: Model, share: Any) -> Sensor:
-    """The sensor of velocities with the window that ``aux`` says (1), with none (0)."""
-    (velocity,) = (s for s in model.sensors if s.name == VELOCITY)
-    read = Partial(_read_share, velocity.read, share)
-    return Sensor(read, velocity.noise, velocity.dim, velocity.name)
+def _read_share(read: Any, x: Wide, fix: Velocity):
+    return read(x.ins, fix if x.share is None else _aged(fix, x.share[0]))
 
 
-def supposing_mean(model: Model, share: float) -> Model:
-    """The model whose velocities are such."""
-    own = mean_velocity(model, share)
-    return Model(model.motion, tuple(own if s.name == VELOCITY else s for s in model.sensors))
+def _read_fresh(read: Any, x: InsState, fix: Velocity):
+    return read(x, _aged(fix, 0.0))
 
 
-def robust(model: Model, asked: bool, patience: int) -> Filter:
-    """The bank over the hypotheses, for a model.
+def fresh(model: Model) -> Model:
+    """The model whose velocities are those of the fix, whatever window ``aux`` says."""
+
+    def sensor(s: Sensor) -> Sensor:
+        read = Partial(_read_fresh, _as_data(s.read))
+        return Sensor(read, s.noise, s.dim, s.name) if s.name == VELOCITY else s
+
+    return Model(model.motion, tuple(map(sensor, model.sensors)))
+
+
+def supposed(model: Model, of: Hypothesis) -> Model:
+    """The model of the wide state under a hypothesis.
 
     Args:
         model: from `ins_gnss_model`.
-        asked: whether velocities may be of the fix or means over the window that ``aux`` says; else
-            they are the latter.
-        patience: positions in a row that stay away before they are followed.
+        of: its numbers.
     """
-    numbers = hypotheses(asked)
+
+    def sensor(s: Sensor) -> Sensor:
+        own = _as_data(s.read)
+        if s.name == POSITION:
+            read = Partial(_read_off, own, of.read)
+        else:
+            read = Partial(_read_share if s.name == VELOCITY else _read, own)
+        noise = Partial(_read, _as_data(s.noise)) if callable(s.noise) else s.noise
+        return Sensor(read, noise, s.dim, s.name)
+
+    sensors = tuple(map(sensor, model.sensors))
+    return Model(moved_by(_step, _step_linear, model.motion, of), sensors)
+
+
+def case(asked: bool, world: Case) -> Case:
+    """The case of a world whose start is about the navigation state alone."""
+    return world._replace(start=widened(world.start, asked))
+
+
+# ----------------------------------------------------------------------------- in hindsight
+
+
+class Verdict(NamedTuple):
+    """What a bank thinks of each step once the whole log is known."""
+
+    off: np.ndarray  # (E,) probability that positions are off
+    scale: np.ndarray  # (E,) of the covariance of the process noise, geometric mean
+    strayed: np.ndarray  # (E,) probability that the estimate was off and took the fixes' word
+
+
+def in_hindsight(probability: np.ndarray, change: np.ndarray) -> Verdict:
+    """Probabilities of the modes given all of a log (Kim 1994, *Dynamic linear models with
+    Markov-switching*, J. Econometrics 60, eq. 2.20), backwards from the filtered ones.
+
+        P(i at k | all) = P(i at k) sum_j P(j at k+1 | all) p_ij / P(j at k+1 | k)
+
+    Args:
+        probability: (E, modes) after each step.
+        change: (modes, modes), from `changes`.
+    """
+    known = np.array(probability, float)
+    for k in range(len(known) - 2, -1, -1):
+        ahead = known[k] @ change
+        known[k] *= change @ np.divide(known[k + 1], ahead, np.zeros_like(ahead), where=ahead > 0.0)
+        known[k] /= known[k].sum()
+    off = known[:, HYPOTHESES.read > 0.0].sum(axis=1)
+    return Verdict(off, np.exp(known @ np.log(HYPOTHESES.scale)), known[:, STRAYED])
+
+
+def stretches(time_s: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
+    """First and last time of each run of steps for which something holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(int)))
+    return [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
+
+
+# ----------------------------------------------------------------------------------- the filters
+
+
+def tails() -> Rule:
+    """Student's t on every measurement; of a position no more than `HEAVIEST`.
+
+    A position far away is a matter of the hypotheses. A mode that explains it by a weight, again at
+    every step, would stay likelier than what has to be believed once, and swallow it in the mixing.
+    """
+    t = student_t(_TAILS)
+
+    def before(memory: Any, prior: Belief, o: Observation):
+        memory, prior, seen = t.before(memory, prior, o)
+        if o.sensor == POSITION:
+            scale = jnp.minimum(1.0 / seen.notes["student_t.weight"], HEAVIEST)
+            seen = seen._replace(noise=jnp.sqrt(scale) * o.noise)
+        return memory, prior, seen
+
+    return Rule(before=before, name="tails")
+
+
+def weighed() -> Filter:
+    """A filter of one hypothesis; it can be smoothed."""
+    return kalman(taylor(), [student_t(_TAILS)])
+
+
+def robust(model: Model, step_s: float, patience_s: float) -> Filter:
+    """The bank over the hypotheses, for a model.
+
+    Args:
+        model: from `ins_gnss_model`; the filter runs on `supposed` of it, begun by `widened`.
+        step_s: between fixes, or of the longest block where that is shorter.
+        patience_s: how long positions are off where they are, in the mean.
+    """
 
     def mode(row: Hypothesis) -> Mode:
-        rules = [supposing(row.scale), find_back(patience), student_t(_TAILS)]
-        own = mean_velocity(model, row.mean)
-        return Mode(kalman(taylor(), rules), sensors=(own,))
+        own = supposed(model, row)
+        mine = tuple(s for s in own.sensors if s.name == POSITION)
+        return Mode(kalman(taylor(), [tails()]), own.motion, mine)
 
-    return imm(Family(mode, numbers), changes(numbers))
+    start = np.zeros(len(_ROWS))
+    start[RIGHT] = 1.0 / COUNT
+    return imm(Family(mode, HYPOTHESES), changes(step_s, patience_s), start)

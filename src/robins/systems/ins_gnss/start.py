@@ -59,11 +59,22 @@ def _heard(log: Log, aids: Aids, usual: Usual | None) -> tuple[Any, ...]:
     """Stillness by spread, mean rate, and what `calmest_in_motion` takes."""
     sample_s = None if usual is None else usual.sample_s
     still, mean_rate = standstill(log.increments, *aids.quiet, sample_s)
-    fix_s, moves = _moving_fixes(log, aids.moving_speed)
+    fix_s, moves = _moving(log, aids.moving_speed)
     between = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
     wait_s = 1.5 * max(1.0, between if usual is None else usual.fix_s)
     quiet = unrest(log.increments, *aids.quiet, sample_s)
     return still, mean_rate, quiet, log.time_s, fix_s, moves, wait_s
+
+
+def _moving(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times at which fixes or wheels tell whether the vehicle moves, and what they tell."""
+    time_s, moves = _moving_fixes(log, speed)
+    if log.wheels is None:
+        return time_s, moves
+    turn = np.abs(log.wheels.speed) > np.maximum(speed, 4.0 * log.wheels.sigma)
+    time_s = np.concatenate([time_s, log.wheels.time_s])
+    order = np.argsort(time_s, kind="stable")
+    return time_s[order], np.concatenate([moves, turn])[order]
 
 
 def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:
