@@ -11,8 +11,9 @@ from robins.logs import clean, load_dataset
 from robins.logs.ordering import rows_where
 from robins.systems import replaying
 from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, Replay, drive_dataset
-from robins.systems.ins_gnss.log import Unsaid, contender, prepare
+from robins.systems.ins_gnss.log import contender, prepare
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
+from robins.systems.ins_gnss.robust import navigation
 from robins.systems.streaming import Flag, LiveError
 
 DRIVE = """
@@ -76,10 +77,10 @@ def epochs_of_replay(dataset, parameters, name):
         parameters.update.longest_gap,
         partial(prepare, log, parameters),
     )
-    patience = int(np.ceil(parameters.update.patience / np.median(np.diff(log.gnss_s))))
-    of = partial(contender, parameters, Unsaid(max(2, patience), 1.0))
+    of = partial(contender, parameters, float(np.median(np.diff(log.gnss_s))))
     answer = replaying.navigated(pieces, (name,), of)[name]
-    x, place = answer.mean, answer.mean.position
+    x = navigation(answer.mean)
+    place = x.position
     rows = [x.q_nb.wxyz, x.v_n, np.stack([place.lat, place.lon, place.alt], axis=1)]
     vectors = np.concatenate([*map(np.asarray, rows), np.asarray(answer.sigma)[:, :9]], axis=1)
     seconds = replaying.epochs_of(pieces)

@@ -135,7 +135,7 @@ class Live:
         counts: samples refused by reason, and what else happened, so often.
     """
 
-    _parameters: ClassVar[type[Parameters]]
+    _parameters: ClassVar[type[Any]]  # those it is made with
     _kept: ClassVar[tuple[str, ...]]  # names of attributes that change, plain values or arrays
     _parts: ClassVar[tuple[str, ...]]  # names of objects whose attributes are such
 

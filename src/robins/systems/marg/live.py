@@ -377,11 +377,13 @@ class LiveMarg(Live):
         samples = model.Samples(dt[None], theta[None], dv[None], field[None])
         integrals, field_b = _parted(np.asarray(_whole(samples)))
         rate, force = mean_rate(integrals), mean_force(integrals)
-        still, sigma = self._watch.look(float(integrals.dt_s[0]), rate[0], force[0], field_b[0])
+        still, sigma = self._watch.look(
+            float(np.asarray(integrals.dt_s)[0]), rate[0], force[0], field_b[0]
+        )
         rest = RestFound(np.array([still]), np.array([sigma]), None, sigma)
         u, falling = inputs(integrals, rest.still, lost_turn.sum(0)[None], lost_s.sum()[None], p)
         y, aux = measurements(integrals, field_b, rest, p, self._pace)
-        self.counts["blocks_in_free_fall"] += int(falling[0])
+        self.counts["blocks_in_free_fall"] += int(np.asarray(falling)[0])
         row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (u, y, aux))
         leaves = jax.tree_util.tree_leaves(row)
         self._like = jax.tree_util.tree_structure(row)
@@ -445,7 +447,9 @@ class LiveMarg(Live):
             name: Update(none, none, looks[:, k], looks[:, k + 1], looks[:, k + 2])
             for name, k in ((model.TRAVEL, 2), (model.MAGNETOMETER, 5))
         }
-        states = model.MargState(*[None] * 4, looks[:, 1], None, looks[:, 0], None)
+        no: Any = None  # not asked
+        gains, declination = jnp.asarray(looks[:, 1]), jnp.asarray(looks[:, 0])
+        states = model.MargState(no, no, no, no, gains, no, declination, no)
         doubt = monitor.doubts_of(states, updates, self.parameters)
         told = bool(doubt.declination[-1] or doubt.gain[-1])
         for column, k in ((doubt.tilt, 2), (doubt.refused, 5)):
