@@ -19,7 +19,8 @@ Every folder is optional, and nothing is fetched. What is read:
 
 Columns: total, heading and inclination error (root mean square, deg, as BROAD defines them), mean
 squared heading error over its stated variance (one is right), seconds with a heading or inclination
-beyond three stated sigmas, whether the replay warned, and the time of a sample.
+beyond three stated sigmas, whether the replay warned (of this filter, or of the samples that both
+have), and the time of a sample.
 """
 
 from __future__ import annotations
@@ -223,6 +224,8 @@ def of_robins(trial: Trial, parameters: Replay) -> dict[str, Row]:
     clock = found.solution["time"].values
     begin_ns = trial.log.imu.time_ns[0]
     _, counts = truth_at(trial.log.attitude, begin_ns + np.round(clock * 1e9).astype(np.int64))
+    lost = found.counts["imu_saturated"] - found.counts["imu_bridged"]
+    of_both = f"{lost} samples are at the end of their range"
     for name, words in (("marg", "robins"), ("marg-smoothed", "robins smoothed")):
         m, one = found.metrics[name], found.solution.sel(filter=name)
         ratio = np.abs(one["error_inclination"].values / one["sigma_inclination"].values).max(
@@ -239,7 +242,7 @@ def of_robins(trial: Trial, parameters: Replay) -> dict[str, Row]:
             m["inclination_rmse_deg"],
             free * m["heading_nees"],
             beyond,
-            any(w.startswith(f"{name}:") for w in found.warnings),
+            any(w.startswith((f"{name}:", of_both)) for w in found.warnings),
             took,
         )
     return out
@@ -294,6 +297,8 @@ def fused(imufusion: Any, step: float, gyro: Any, accel: Any, field: Any) -> np.
     return multiply(NWU_TO_ENU, out)
 
 
+READERS = {"broad": broad, "euroc": euroc, "repoimu": repoimu}
+
 # --------------------------------------------------------------------------------------- printing
 
 
@@ -316,12 +321,11 @@ def mean_of(rows: list[Row]) -> Row:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    readers = {"broad": broad, "euroc": euroc, "repoimu": repoimu}
-    for name in readers:
+    for name in READERS:
         parser.add_argument(f"--{name}", type=Path, action="append", default=[])
     given = vars(parser.parse_args())
     trials = [
-        t for name, reader in readers.items() for folder in given[name] for t in reader(folder)
+        t for name, reader in READERS.items() for folder in given[name] for t in reader(folder)
     ]
     if not trials:
         parser.error("no trial found: give a folder of logs")

@@ -20,7 +20,7 @@ def shakes(hertz=4.0, size=10.0, seed=0):
 def test_a_range_that_cuts_is_found_on_its_axis_and_no_other():
     cut = np.clip(shakes(), -7.37, 7.25)
     cut[:, 0] += 0.005 * np.random.default_rng(1).standard_normal(len(TIME))
-    found = levels(cut)
+    found = levels(cut, 0.01)
     np.testing.assert_allclose(found[0], [7.37, 7.25], rtol=0.01)
     assert np.all(np.isinf(found[1:]))
 
@@ -29,7 +29,27 @@ def test_a_range_that_cuts_is_found_on_its_axis_and_no_other():
 def test_no_smooth_motion_has_a_range(hertz):
     """Sines of one height, whose peaks all fill the same level."""
     rate = np.stack([9.0 * np.sin(2.0 * np.pi * hertz * TIME + p) for p in (0.0, 0.3, 1.0)], axis=1)
-    assert np.all(np.isinf(levels(rate)))
+    assert np.all(np.isinf(levels(rate, 0.01)))
+
+
+def test_a_range_whose_edge_the_chip_filters_is_found():
+    """No jump is left, but a plateau that slopes a little, as a unit with its own filter reads."""
+    cut = np.clip(shakes(hertz=1.2), -7.3, np.inf)
+    cut = np.stack([np.convolve(x, np.ones(4) / 4.0, "same") for x in cut.T], axis=1)
+    low = cut[:, 0] <= -7.3
+    cut[:, 0] += 0.02 * low * np.linspace(0.0, 1.0, len(cut))
+    found = levels(cut, 0.01)
+    assert found[0, 0] == pytest.approx(7.3, rel=0.015)
+    assert np.isinf(found[0, 1])
+    assert np.all(np.isinf(found[1:]))
+
+
+@pytest.mark.parametrize("stays_s", [0.03, 0.6, 5.0])
+def test_a_turn_at_one_rate_is_no_plateau(stays_s):
+    """Of a machine that gets there in 0.3 s."""
+    edges = np.cumsum([5.0, 0.3, stays_s, 0.3])
+    rate = np.interp(TIME, edges, [0.0, 6.0, 6.0, 0.0])
+    assert np.all(np.isinf(levels(np.stack([rate] * 3, axis=1), 0.01)))
 
 
 def test_peaks_are_put_back_to_within_what_is_stated():

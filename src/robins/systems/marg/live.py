@@ -10,8 +10,9 @@ takes from later samples, a live object waits for or does without:
 - A peak that the end of a gyro's range cut off is put back from both flanks. The filter waits for
   the second one, at most 0.2 s and three samples; until its block is whole the gyros carry the
   attitude on as they read, and answers are `BEHIND`. Then they are again those of the replay.
-- The end of a range that nobody told (`gyro.range`) is known once it was reached twice. Peaks
-  before that are put back by a replay, and not here.
+- The end of a range that nobody told (`gyro.range`) is known once it was reached twice by jumps.
+  Peaks before that are put back by a replay, and not here; so are those of a chip that filters
+  what it cuts off, where plateaus alone show the end.
 - A stamp that comes late after a long interval is told from a gap by the next one: `BEHIND` for one
   sample, at the end of a block.
 - A gap of more than ten seconds, or a clock that was set, is a new start; a replay bridges it.

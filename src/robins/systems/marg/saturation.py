@@ -4,6 +4,13 @@ A signal that is cut off jumps to a level, stays, and leaves it by a jump. A smo
 two samples within 0.5 % of its height has its next sample within 4.5 % of it (of a sine: half an
 interval is at most 0.1 rad, and cos 0.3 is 0.955); so a level that is reached or left by a jump of
 more, twice, is the end of the range.
+
+Where the chip filters after it cuts off, there is no jump, but a plateau: the same law over more
+samples. What stays within 0.5 % for d seconds and is more than 5 % lower d before and d after is
+cut off. It has to last 0.08 s, since the peak of a hand's motion can be flatter than a sine, and
+0.4 s at most: a machine that turns at one rate does so for longer.
+
+Levels are found over the whole log: a peak before the first that shows the range is put back too.
 """
 
 from __future__ import annotations
@@ -16,6 +23,7 @@ _LEVEL = 0.005  # share of the level that its samples lie within
 _JUMP = 0.05  # share of the level, more than a smooth peak can fall by
 _LEAST_RATE = 1.0  # rad/s; no gyro ends below
 _OFTEN = 2  # jumps to or from the level
+_PLATEAU_S = (0.08, 0.4)  # s, that a level without jumps may last; a machine turns for longer
 _KEPT_PAIRS = 100  # of samples at the level, more than a peak has
 LONGEST_S = 0.2  # s, of a peak that is bridged
 _MISSED = 0.3  # of what a bridge adds: the share that it may err by
@@ -29,12 +37,13 @@ class Bridged(NamedTuple):
     doubt: np.ndarray  # (N, 3) rad/s, standard deviation of what was put back; NaN where nothing
 
 
-def levels(rate: np.ndarray) -> np.ndarray:
+def levels(rate: np.ndarray, step_s: float = 0.0) -> np.ndarray:
     """(3, 2) rad/s: largest negative and positive rate that an axis can read; infinite where
     none shows.
 
     Args:
         rate: (N, 3) rad/s.
+        step_s: s, between samples; 0: no plateaus are looked for.
     """
     out = np.full((3, 2), np.inf)
     for axis in range(3):
@@ -49,7 +58,23 @@ def levels(rate: np.ndarray) -> np.ndarray:
             jumps = np.sum(pair & (x[:-3] < low)) + np.sum(pair & (x[3:] < low))
             if jumps >= _OFTEN:
                 out[axis, side] = (1.0 - _LEVEL) * top
+            elif _has_plateau(x, top, step_s):
+                # filtered, it is not quite level
+                out[axis, side] = (1.0 - 2.0 * _LEVEL) * top
     return out
+
+
+def _has_plateau(x: np.ndarray, top: float, step_s: float) -> bool:
+    """Whether a stay at the top of (N,) is that of a range and of no smooth peak."""
+    high = np.concatenate([[False], x > (1.0 - _LEVEL) * top, [False]])
+    for begin, end in np.flatnonzero(np.diff(high)).reshape(-1, 2):
+        long = end - 1 - begin
+        before, after = begin - long, end - 1 + long
+        if not _PLATEAU_S[0] <= long * step_s <= _PLATEAU_S[1] or before < 0 or after >= len(x):
+            continue
+        if max(x[before], x[after]) < (1.0 - _JUMP) * top:
+            return True
+    return False
 
 
 class Range:
@@ -100,7 +125,9 @@ def bridged(
         most: rad/s, the end of the range where it is told.
         known: (3, 2) rad/s as of `levels`, where they were found before; None: found in `rate`.
     """
-    limit = np.minimum(levels(rate) if known is None else known, 0.99 * most)
+    if known is None:
+        known = levels(rate, float(np.median(np.diff(time_s))))
+    limit = np.minimum(known, 0.99 * most)
     full = (rate <= -limit[:, 0]) | (rate >= limit[:, 1])
     out, doubt = rate.copy(), np.full(rate.shape, np.nan)
     for axis in range(3):

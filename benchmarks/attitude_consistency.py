@@ -1,0 +1,112 @@
+"""What the heading NEES of a trial would be if the filter were right, beside what it is.
+
+    python benchmarks/attitude_consistency.py --broad FOLDER --repoimu FOLDER
+
+The heading error of a trial changes so slowly that its mean square over its variance is nearly the
+square of one draw, with a spread far beyond that of a mean of many. So the NEES of a trial is
+compared with what errors drawn from the filter's own covariances give in this very trial: with
+P- = L L' the predicted and P = S S' the updated covariance, errors e = S z of a filter that is
+right go on by
+
+    z_k = S_k' P-_k^-1 F S_{k-1} z_{k-1} + w,
+
+and smoothed ones back by z_k = (F S_k)' P-_{k+1}^-1 S_{k+1} z_{k+1} + w, w filling up to unit
+variance. What no state carries (`[stated]`) is one draw a trial.
+
+Columns: the NEES, the share of draws with a NEES within 0.5 to 2, and the share below the NEES of
+the trial. If the filter is right the last is uniform over trials: a Kolmogorov-Smirnov test says
+how probable a deviation as large is. The trials are the development trials of `attitude_board.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from attitude_board import READERS
+from scipy.linalg import solve_triangular
+from scipy.stats import kstest
+
+from robins.filters import rts_smoother, run
+from robins.systems.marg import Replay, filter_of, model_of, prepare
+from robins.systems.marg.model import HEADING
+from robins.systems.marg.replay import orientation_errors, truth_at
+
+DRAWS = 300
+
+
+def filled(M: np.ndarray, z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """M z + w of unit variance; what M is beyond one, where a rule forgot the field, is cut."""
+    u, size, vt = np.linalg.svd(M)
+    size = np.minimum(size, 1.0)
+    left = np.sqrt(1.0 - size**2)
+    return u @ (size[:, None] * (vt @ z) + left[:, None] * rng.standard_normal(z.shape))
+
+
+def drawn(steps: Any, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(count, DRAWS) heading errors, causal and smoothed [rad], as the filter thinks they are."""
+    S = np.asarray(steps.posterior.factor)[:count]
+    L = np.asarray(steps.prediction.belief.factor)[:count]
+    spread = np.asarray(steps.prediction.transition.spread)[:count]
+    after = [solve_triangular(a, b, lower=True) for a, b in zip(L, S, strict=True)]
+    before = [solve_triangular(a, b, lower=True) for a, b in zip(L, spread, strict=True)]
+    z = rng.standard_normal((S.shape[1], DRAWS))
+    causal, smoothed = np.empty((2, count, DRAWS))
+    for k in range(count):
+        z = z if k == 0 else filled(after[k].T @ before[k], z, rng)
+        causal[k] = S[k, HEADING] @ z
+    for k in reversed(range(count)):
+        z = z if k == count - 1 else filled(before[k + 1].T @ after[k + 1], z, rng)
+        smoothed[k] = S[k, HEADING] @ z
+    return causal, smoothed
+
+
+def main() -> None:
+    """Print a line a trial, and the tests."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    for name in ("broad", "repoimu"):
+        parser.add_argument(f"--{name}", type=Path, action="append", default=[])
+    given, rng, p = vars(parser.parse_args()), np.random.default_rng(0), Replay()
+    found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    print(f"| trial, way | NEES | share within 0.5 to 2 | share below |\n|{'---|' * 4}")
+    for name, folders in given.items():
+        for trial in (t for folder in folders for t in READERS[name](folder) if t.development):
+            log = prepare(trial.log, p)
+            w, count = log.world, len(log.rows)
+            answer = run(filter_of(p), model_of(p), w.start, w.y, w.u, w.aux)
+            beliefs = answer.steps.posterior, rts_smoother(answer)
+            true, counts = truth_at(trial.log.attitude, log.time_ns[log.rows])
+            turned, lasted = (np.asarray(a)[:count] for a in (w.u.samples.angle, w.u.samples.dt_s))
+            floor = np.hypot(p.stated.heading, p.stated.delay * turned / lasted)
+            for way, belief, errors in zip(
+                ("causal", "smoothed"), beliefs, drawn(answer.steps, count, rng), strict=True
+            ):
+                q = np.asarray(belief.mean.q_nb.wxyz)[:count]
+                sigma = np.hypot(np.asarray(belief.sigma)[:count, HEADING], floor)
+                seen = (orientation_errors(q, true).heading / sigma)[counts]
+                nees = float(np.mean(seen**2))
+                errors = errors + floor[:, None] * rng.standard_normal(DRAWS)
+                would = np.mean((errors / sigma[:, None])[counts] ** 2, axis=0)
+                row = (
+                    nees,
+                    float(np.mean((would > 0.5) & (would < 2.0))),
+                    float(np.mean(would < nees)),
+                )
+                found.setdefault((trial.set, way), []).append(row)
+                print(f"| {trial.name}, {way} | " + " | ".join(f"{x:.2f}" for x in row) + " |")
+    head = "mean NEES | within 0.5 to 2 | a filter that is right | KS distance | probability"
+    print(f"\n| set, trials, way | {head} |\n|{'---|' * 6}")
+    for (which, way), rows in found.items():
+        nees, share, below = np.array(rows).T
+        test = kstest(below, "uniform")
+        print(
+            f"| {which}, {len(rows)}, {way} | {nees.mean():.2f} | "
+            f"{np.mean((nees > 0.5) & (nees < 2.0)):.2f} | {share.mean():.2f} | "
+            f"{test.statistic:.2f} | {test.pvalue:.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
