@@ -57,7 +57,7 @@ def write(path: str | os.PathLike[str], kind: str, parameters: str, state: Any) 
     body = {"kind": kind, "parameters": parameters, "state": _frozen(state, arrays)}
     told = {"format": FORMAT, "version": VERSION, **body, "digest": _digest(body, arrays)}
     packed = io.BytesIO()
-    named = {f"a{k}": a for k, a in enumerate(arrays)}
+    named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
     np.savez(packed, told=np.frombuffer(json.dumps(told).encode(), np.uint8), **named)
     target = Path(os.path.realpath(path))
     aside = target.with_name(f".robins-live-{secrets.token_hex(6)}")

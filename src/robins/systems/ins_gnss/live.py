@@ -32,13 +32,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.dataset import GnssTable, ImuTable
+from robins.dataset import ImuTable
 from robins.errors import require, require_known
 from robins.filters import OnlineFilter
 from robins.filters.run import Step
 from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
+from robins.scenario import Parameters
 from robins.systems import replaying
+from robins.systems.ins_gnss import window
 from robins.systems.ins_gnss.log import (
     SMOOTHED,
     Unsaid,
@@ -48,7 +50,7 @@ from robins.systems.ins_gnss.log import (
     measured_rest,
 )
 from robins.systems.ins_gnss.parameters import Replay
-from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
+from robins.systems.ins_gnss.recording import Log, axes_of
 from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
@@ -116,7 +118,7 @@ class LiveInsGnss(Live):
         epoch: what the filter itself said last, with the fixes up to then; None before.
     """
 
-    _parameters: ClassVar[type[Replay]] = Replay
+    _parameters: ClassVar[type[Parameters]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_origin_ns", "_raw_ns", "_raw", "_steps", "_newest", "_fixes", "_field", "_past",
         "_calmest", "_velocities", "start", "_first_fix_s",
@@ -175,8 +177,7 @@ class LiveInsGnss(Live):
         self._raw: list[np.ndarray] = []
         self._steps = np.zeros((0, 8))  # end [s], dt, turn, velocity of each increment
         self._newest = np.zeros((0, 8))  # the last increment, as far as it is known
-        # time [s], latitude, longitude, height, sigmas, velocity, its sigmas, quality; by time
-        self._fixes = np.zeros((0, 14))
+        self._fixes = np.zeros((0, window.COLUMNS))  # by time
         self._field = np.zeros((0, 4))  # time [s] and field [T], until the start
         self._past: list[Any] = []  # epochs of the longest delay, as plain tuples
         self._states: list[Any] = []  # of the filter at them
@@ -252,12 +253,15 @@ class LiveInsGnss(Live):
             LiveError: a stamp or number of another kind, or angles that are those of another unit;
                 the object goes on.
         """
-        row = self._row_of_fix(time_ns, (lat_rad, lon_rad, alt_m), sigma_m, v_n, sigma_v, quality)
+        place = lat_rad, lon_rad, alt_m
+        time = stamp(time_ns)
+        seconds = math.nan if self._origin_ns is None else self._seconds(time)
+        row = window.row_of_fix(seconds, place, sigma_m, v_n, sigma_v, quality)
         newest = self._newest[0, 0] if len(self._newest) else 0.0
         oldest = self._past[0][0] if self._past else -math.inf
         if why := self._refused_fix(row, oldest, newest):
             self.counts[f"gnss_{why}"] += 1
-            return self._answer(self._raw_ns[-1] if self._raw_ns else stamp(time_ns), Flag.REFUSED)
+            return self._answer(self._raw_ns[-1] if self._raw_ns else time, Flag.REFUSED)
         at = int(np.searchsorted(self._fixes[:, 0], row[0]))
         self._fixes = np.insert(self._fixes, at, row, axis=0)
         self._velocities |= bool(np.any(np.isfinite(row[7:10])))
@@ -265,27 +269,6 @@ class LiveInsGnss(Live):
         self._go_back(float(row[0]))
         self._advance()
         return self._answer(self._raw_ns[-1], Flag(0))
-
-    def _row_of_fix(
-        self, time_ns: Any, place: Any, sigma_m: Any, v_n: Any, sigma_v: Any, quality: Any
-    ) -> np.ndarray:
-        time, where = stamp(time_ns), numbers("lat_rad, lon_rad, alt_m", place, 3)
-        sigma = numbers("sigma_m", sigma_m, 3)
-        missing = np.full(3, np.nan)
-        velocity = missing if v_n is None else numbers("v_n", v_n, 3)
-        if v_n is not None and sigma_v is None:
-            raise LiveError("a velocity needs sigmas", "sigma_v", "give (3,) m/s")
-        spread = missing if sigma_v is None else numbers("sigma_v", sigma_v, 3)
-        if abs(where[0]) > np.pi / 2 or abs(where[1]) > 2.0 * np.pi:
-            what = f"latitude {where[0]:.4g} and longitude {where[1]:.4g} are no radians"
-            raise LiveError(what, "push_fix", "of degrees give np.radians")
-        # as of a log that was cleaned: a component whose sigma is none is missing
-        where = np.where(np.isfinite(where) & (sigma > 0.0), where, np.nan)
-        velocity = np.where(np.isfinite(velocity) & (spread > 0.0), velocity, np.nan)
-        sigma = np.where(sigma > 0.0, sigma, 1.0)
-        spread = np.where(spread > 0.0, spread, 1.0)
-        seconds = self._seconds(time) if self._origin_ns is not None else math.nan
-        return np.array([seconds, *where, *sigma, *velocity, *spread, float(quality)])
 
     def _refused_fix(self, row: np.ndarray, oldest: float, newest: float) -> str:
         if not np.any(np.isfinite(row[[1, 2, 3, 7, 8, 9]])):
@@ -319,34 +302,10 @@ class LiveInsGnss(Live):
             self._steps = np.concatenate([self._steps, final])
         self._newest = found[-1:]
 
-    def _log(self, rows: np.ndarray) -> Log:
-        """Increments and all fixes as a piece of a log."""
-        f = self._fixes
-        v = f[:, 7:10] if self._velocities else None
-        spread = f[:, 10:13] if self._velocities else None
-        time_ns = np.round(f[:, 0] * 1e9).astype(np.int64) + (self._origin_ns or 0)
-        table = GnssTable(
-            time_ns, f[:, 1], f[:, 2], f[:, 3], f[:, 4:7], v, spread, f[:, 13].astype(int)
-        )
-        gnss = self.parameters.gnss
-        sigma_m, _ = believed_sigmas(table, gnss)
-        log = Log(
-            Increments(rows[:, 1], rows[:, 2:5], rows[:, 5:8]),
-            rows[:, 0],
-            table,
-            f[:, 0],
-            sigma_m,
-            None,
-            None,
-            np.zeros(len(f), dtype=bool),
-        )
-        if gnss.use_velocity:  # there or not, so that nothing is compiled when the first one comes
-            told = GnssTable(time_ns, f[:, 1], f[:, 2], f[:, 3], f[:, 4:7], f[:, 7:10], f[:, 10:13],
-                             table.quality)  # fmt: skip
-            log = log._replace(v_n=f[:, 7:10], sigma_v=believed_sigmas(told, gnss)[1])
-        if len(self._field):
-            log = log._replace(field_s=self._field[:, 0], field_b=self._field[:, 1:])
-        return log
+    def _log(self, rows: np.ndarray, fixes: np.ndarray) -> Log:
+        """Increments and fixes as a piece of a log."""
+        gnss, origin_ns = self.parameters.gnss, self._origin_ns or 0
+        return window.log_of(rows, fixes, self._field, gnss, origin_ns, self._velocities)
 
     # --------------------------------------------------------------------- start and epochs
 
@@ -381,15 +340,7 @@ class LiveInsGnss(Live):
             return
         if int(10.0 * rows[-1, 0]) == int(10.0 * (rows[-1, 0] - rows[-1, 1])):
             return  # ten times a second are enough
-        log = self._log(rows)
-        within = self._fixes[:, 0] <= rows[-1, 0] - self._reach_s
-        log = log._replace(
-            gnss=_some(log.gnss, within),
-            **{
-                name: None if (a := getattr(log, name)) is None else a[within]
-                for name in ("gnss_s", "sigma_m", "v_n", "sigma_v", "withheld")
-            },
-        )
+        log = self._log(rows, heard)
         try:
             found = find_start(log, p.start, p.aids, self._usual)
         except ValueError:
@@ -423,7 +374,7 @@ class LiveInsGnss(Live):
         assert self._online is not None
         p, at = self.parameters, Epoch(*self._past[-1])
         rows = self._steps[self._steps[:, 0] > to.time_s - self._back_s]
-        log, epochs = self._log(rows), np.array([to.time_s])
+        log, epochs = self._log(rows, self._fixes), np.array([to.time_s])
         rate = rate_about(log.increments, log.time_s, epochs, self._usual.sample_s)
         used = np.abs(log.gnss_s - to.time_s) < 1e-9
         # the window is looked at where there is a velocity alone
@@ -433,7 +384,7 @@ class LiveInsGnss(Live):
         known, about = measured_rest(log, epochs, rate, p.aids, usual)
         row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (y | known, aux | about))
         u = self._block(to.time_s, rows, at, self._width)
-        self.counts["blocks_over_imu_gaps"] += int(u.noise_scale > 1.0)
+        self.counts["blocks_over_imu_gaps"] += int(float(np.asarray(u.noise_scale)) > 1.0)
         kept = np.asarray(self._online.step(row[0], u, row[1], keep=_kept))
         self.epoch = self._told(to.time_s, kept, Flag(0))
         self._past.append(tuple(to))
@@ -449,7 +400,7 @@ class LiveInsGnss(Live):
         del self._past[:keep], self._states[:keep]
         begin = self._past[0][0] - self._back_s
         if self._steps[0, 0] < begin - self._back_s:
-            log = self._log(self._steps)
+            log = self._log(self._steps, self._fixes)
             margin = begin + self.parameters.aids.window + 2.0 * self._usual.sample_s
             old = int(np.searchsorted(self._fixes[:, 0], margin))
             usual = self._usual._replace(calmest=self._calmest)
@@ -528,13 +479,3 @@ class LiveInsGnss(Live):
         like = self._compiled_state
         self._states = [as_before(like, state[k * each : (k + 1) * each]) for k in range(count)]
         self._online = OnlineFilter(self._filter, self._model, self._states[-1])
-
-
-def _some(table: GnssTable, keep: np.ndarray) -> GnssTable:
-    """Some rows of a table of fixes."""
-    columns = {
-        name: None if (a := getattr(table, name)) is None else a[keep]
-        for name in ("time_ns", "lat_rad", "lon_rad", "alt_m", "sigma_m", "v_n", "sigma_v",
-                     "quality")
-    }  # fmt: skip
-    return GnssTable(**columns)

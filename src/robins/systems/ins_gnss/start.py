@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,19 +43,20 @@ class Usual(NamedTuple):
 
 def at_rest(log: Log, aids: Aids, usual: Usual | None = None) -> tuple[np.ndarray, np.ndarray]:
     """(N,) whether the vehicle stands still at each increment, by samples and fixes; mean rate."""
-    still, mean_rate, *heard = _heard(log, aids, usual)
-    calmest = np.inf if usual is None else usual.calmest
-    return confirmed(still, *heard, calmest), mean_rate
+    still, mean_rate, heard = _heard(log, aids, usual)
+    return confirmed(still, *heard, np.inf if usual is None else usual.calmest), mean_rate
 
 
 def calmest(log: Log, aids: Aids, usual: Usual, fixes: int) -> float:
     """Least unrest in motion as it is known after so many of the fixes that tell of motion."""
-    least = calmest_in_motion(*_heard(log, aids, usual)[2:], usual.calmest)
+    least = calmest_in_motion(*_heard(log, aids, usual)[2], usual.calmest)
     found = float(least[min(fixes, len(least) - 1)])
     return found if found > 0.0 else np.inf
 
 
-def _heard(log: Log, aids: Aids, usual: Usual | None) -> tuple[Any, ...]:
+def _heard(
+    log: Log, aids: Aids, usual: Usual | None
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]]:
     """Stillness by spread, mean rate, and what `calmest_in_motion` takes."""
     sample_s = None if usual is None else usual.sample_s
     still, mean_rate = standstill(log.increments, *aids.quiet, sample_s)
@@ -63,7 +64,7 @@ def _heard(log: Log, aids: Aids, usual: Usual | None) -> tuple[Any, ...]:
     between = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
     wait_s = 1.5 * max(1.0, between if usual is None else usual.fix_s)
     quiet = unrest(log.increments, *aids.quiet, sample_s)
-    return still, mean_rate, quiet, log.time_s, fix_s, moves, wait_s
+    return still, mean_rate, (quiet, log.time_s, fix_s, moves, wait_s)
 
 
 def _moving_fixes(log: Log, speed: float) -> tuple[np.ndarray, np.ndarray]:

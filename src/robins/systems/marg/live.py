@@ -34,6 +34,7 @@ from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.run import Step
 from robins.ins.increments import Increments, from_imu
 from robins.linalg.scalars import product
+from robins.scenario import Parameters
 from robins.systems.marg import model, monitor
 from robins.systems.marg.log import (
     Pace,
@@ -101,6 +102,10 @@ class _Step(NamedTuple):
     magnetometer: np.ndarray  # (3,) likewise; none, none, `MISSING` without one
 
 
+def _first(rows: Any) -> Any:
+    return np.asarray(rows)[0]
+
+
 _SIZES = np.cumsum([4, 3, 9, 1, model.DIM, 1, 3])
 
 
@@ -143,7 +148,7 @@ class LiveMarg(Live):
         look: what the start was found from; None before.
     """
 
-    _parameters: ClassVar[type[Replay]] = Replay
+    _parameters: ClassVar[type[Parameters]] = Replay
     _kept: ClassVar[tuple[str, ...]] = (
         "_time_ns", "_rows", "_context", "_field", "_pending", "_begun", "_looks", "_since",
         "_q", "_sigma", "_bias", "_gain", "_marks", "_stepped", "_in_motion", "_open",
@@ -379,10 +384,11 @@ class LiveMarg(Live):
         rate, force = mean_rate(integrals), mean_force(integrals)
         still, sigma = self._watch.look(float(integrals.dt_s[0]), rate[0], force[0], field_b[0])
         rest = RestFound(np.array([still]), np.array([sigma]), None, sigma)
-        u, falling = inputs(integrals, rest.still, lost_turn.sum(0)[None], lost_s.sum()[None], p)
+        lost = np.sum(lost_turn, axis=0)[None], np.array([np.sum(lost_s)])
+        u, falling = inputs(integrals, rest.still, *lost, p)
         y, aux = measurements(integrals, field_b, rest, p, self._pace)
         self.counts["blocks_in_free_fall"] += int(falling[0])
-        row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (u, y, aux))
+        row = jax.tree_util.tree_map(_first, (u, y, aux))
         leaves = jax.tree_util.tree_leaves(row)
         self._like = jax.tree_util.tree_structure(row)
         self._pending.append((leaves, bool(still)))
@@ -445,7 +451,9 @@ class LiveMarg(Live):
             name: Update(none, none, looks[:, k], looks[:, k + 1], looks[:, k + 2])
             for name, k in ((model.TRAVEL, 2), (model.MAGNETOMETER, 5))
         }
-        states = model.MargState(*[None] * 4, looks[:, 1], None, looks[:, 0], None)
+        shown: list[Any] = [none] * 8
+        shown[4], shown[6] = looks[:, 1], looks[:, 0]  # gains and declination
+        states = model.MargState(*shown)
         doubt = monitor.doubts_of(states, updates, self.parameters)
         told = bool(doubt.declination[-1] or doubt.gain[-1])
         for column, k in ((doubt.tilt, 2), (doubt.refused, 5)):
