@@ -138,7 +138,7 @@ def main() -> None:
     for k, candidate in enumerate(GRID):
         for which in sets:
             print(f"| {told(candidate)}; {which} | {figures(of[which, k])} |")
-    rules = {"north chosen too": range(len(GRID))}
+    rules = {"north chosen too": list(range(len(GRID)))}
     rules["north of the start"] = [k for k, c in enumerate(GRID) if c["start.north"] == "start"]
     print(f"\n| judged on | chosen on the others | {head} |\n|{'---|' * 7}")
     for name, able in rules.items():

@@ -59,7 +59,7 @@ def test_what_is_within_its_assumptions_is_not_doubted():
     ("mean", "updates", "word"),
     [
         (states(declination=3.1 * PARAMETERS.magnetometer.declination), {}, "the field is turned"),
-        (states(gain=3.1 * PARAMETERS.gyro.gain), {}, "a gain of the gyros is 1.6 %"),
+        (states(gain=3.1 * PARAMETERS.gyro.gain), {}, "a gain of the gyros is 0.9 %"),
         (states(), {TRAVEL: looks(nis=19.0)}, "velocity and place do not stay"),
         (states(), {MAGNETOMETER: looks(3.0, 3, range(9, 209, 10))}, "the field was refused"),
     ],

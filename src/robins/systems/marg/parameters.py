@@ -30,7 +30,7 @@ class Gyro(Parameters):
     # vibration and warmth of the hand move a bias faster than rest does
     bias_walk_moving: q.RateWalkSize = default("0.01 deg/s/sqrt(s)")
     # scale factors, misalignment and cross-coupling: each of nine numbers has this spread
-    gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("5000 ppm")
+    gain: Annotated[float, Quantity("scale factor", least="0 ppm")] = default("3000 ppm")
     # what nine numbers do not explain, as a share of the angle turned
     turn_error: Annotated[float, pydantic.Field(ge=0.0, le=1e6)] = 0.001
     range: q.AngleRate = default("2000 deg/s")
