@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from robins import logs, manifold, scenario
+from robins.dataset import OdometryTable
 from robins.ins.rest import confirmed, standstill
 from robins.logs.mounting import Mounting, turned
 from robins.systems.ins_gnss import SYSTEM, Drive, Replay, drive_dataset, replay
 from robins.systems.ins_gnss.log import prepare
 from robins.systems.ins_gnss.model import ins_gnss_model
-from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock
+from robins.systems.ins_gnss.recording import TYRES, in_body_axes, on_one_clock
 from robins.systems.ins_gnss.robust import (
     HYPOTHESES,
     STRAYED,
@@ -69,6 +70,14 @@ speed = "0 m/s"
 [[legs]]
 do = "stop"
 seconds = "4 s"
+"""
+
+OUTAGE = """
+[outages]
+length = "12 s"
+first = "16 s"
+gap = "60 s"
+last = "1 s"
 """
 
 
@@ -137,6 +146,42 @@ def test_a_smooth_road_is_not_taken_for_rest(log, velocities):
     assert np.sum(by_spread & (speed > 5.0)) > 300, "the spread alone takes it for rest"
     assert not np.any(found & (speed > 0.5))
     assert np.mean(found[speed == 0.0]) > 0.5
+
+
+def _with_wheels(log, until_s=np.inf):
+    """The log with speeds of the wheels at 10 Hz, and fixes until a time only."""
+    t = log.truth.time_ns[::5]
+    speed = np.linalg.norm(log.truth.v_n, axis=1)[::5]
+    none = np.full(len(t), np.nan)
+    wheels = OdometryTable(t, speed, none, np.full(len(t), 0.05), none)
+    early = log.gnss.time_ns * 1e-9 < until_s
+    columns = ("time_ns", "lat_rad", "lon_rad", "alt_m", "sigma_m", "v_n", "sigma_v")
+    gnss = replace(log.gnss, **{name: getattr(log.gnss, name)[early] for name in columns})
+    return replace(log, gnss=gnss, odometry=wheels)
+
+
+def test_wheels_tell_rest_from_a_smooth_road_where_no_fix_comes(log):
+    given, aids = _with_wheels(log, until_s=14.0), Replay().aids
+    whole = on_one_clock(given, Replay())
+    found, _ = at_rest(whole, aids)
+    alone, _ = at_rest(whole._replace(wheels=None), aids)
+    speed = np.interp(whole.time_s, log.truth.time_ns * 1e-9, np.linalg.norm(log.truth.v_n, axis=1))
+    stands = (speed == 0.0) & (whole.time_s > 14.0)
+    assert not np.any(found & (speed > 0.5))
+    assert np.mean(found[stands]) > 0.7
+    assert not np.any(alone[stands]), "without wheels it is no calmer than on the road"
+
+
+def test_a_speed_of_the_wheels_holds_the_way_where_no_fix_comes(log):
+    heard = on_one_clock(_with_wheels(log), Replay()).wheels
+    np.testing.assert_allclose(heard.sigma, np.hypot(0.05, TYRES * heard.speed), rtol=1e-12)
+    outage = scenario.parse(Replay, OUTAGE)
+    given = logs.clean(_with_wheels(log))
+    errors = [
+        replay(one, outage, ("ekf",)).metrics["ekf"]["outage_horizontal_max_m"]
+        for one in (replace(given, odometry=None), given)
+    ]
+    assert errors[1] < 0.5 * errors[0]
 
 
 # ------------------------------------------------------------------------------------- the filter
