@@ -5,6 +5,16 @@ velocity random walk N, bias instability B, rate random walk K and, where asked 
 and rate ramp R. Everything is NumPy and per axis; SI units go through, so for gyros in rad/s
 the coefficients come in rad, rad/sqrt(s), rad/s, rad/s/sqrt(s), rad/s^2.
 
+Outputs that are low-passed, averaged or resampled have too little power at short times: there the
+slope is not that of white noise. Whatever the filter, an autocovariance that ends leaves of white
+noise, for times beyond it,
+
+    N^2 / tau - C / tau^2,    C = 3 integral_0^inf t r(t) dt
+
+of the rate's autocovariance r. Where the terms asked for do not explain the curve, `fit` takes C
+with them, leaves out so many of the shortest times as it takes to explain the rest, and then goes
+on to twice that time.
+
 Bounds and weights rest on one thing, the covariance of the estimates under the noises found in the
 data (`robins.ins.allan_noise`), not on a rule of thumb for white noise.
 """
@@ -17,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
-from scipy.special import chdtri, ndtri
+from scipy.special import chdtrc, chdtri, ndtri
 
 from robins.errors import require
 from robins.ins.allan_noise import TERMS, Moments, mean_variances, moments
@@ -26,6 +36,10 @@ from robins.units import from_si
 
 _FEWEST_CLUSTERS = 9  # in the longest averages; gives them about ten degrees of freedom
 _PER_DECADE = 10
+# Probabilities of a residual so large: below the first a whole curve is doubted, above the second a
+# part of it is explained, above the third it is so for want of a better.
+_DOUBTED, _EXPLAINED, _BARELY = 1e-3, 1e-2, 1e-5
+_FURTHER = 2  # points, each 1.5 times the time of the one before at least
 _WHITE = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
 _FIELD_UNITS = {  # name -> term, unit; of a ramp, what the sensor drifts in an hour
     "gyro": {
@@ -78,9 +92,10 @@ class AllanFit(NamedTuple):
     lower: Coefficients  # interval of the confidence asked for; 0 where a term is not resolved
     upper: Coefficients
     chi2: np.ndarray  # (A,) weighted squared residual; far above dof: the terms do not explain it
-    dof: int
+    dof: np.ndarray  # (A,) degrees of freedom of it
     terms: str
     confidence: float
+    from_s: np.ndarray  # (A,) shortest cluster time that was fitted; above the first: coloured
 
 
 def deviation(
@@ -156,6 +171,12 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
     covariance knows it, so the intervals are not too short. They hold if the terms explain the
     curve: look at ``chi2`` against ``dof``.
 
+    Where the terms do not explain the whole curve (a residual of a probability below 1e-3), short
+    times are taken to be coloured (module docstring): the term -C / tau^2 joins in, and the
+    shortest times are left out one by one until the rest is explained, and two more; ``from_s``
+    says from where.
+    If nothing explains it, the fit is that of the whole curve.
+
     Args:
         allan: from `deviation`.
         terms: any of Q, N, B, K, R.
@@ -179,15 +200,16 @@ def fit(allan: Allan, terms: str = "NBK", confidence: float = 0.95) -> AllanFit:
             keep.append(i)
     expected = moments(allan.clusters[keep], allan.n_samples, allan.dt_s)
     index = np.array(sorted(TERMS.index(t) for t in terms))
-    columns = [_fit_axis(v, expected, index) for v in (allan.deviation[keep] ** 2).T]
+    least = max(len(terms) + 3, 6)
+    columns = [_explained(v, expected, index, least) for v in (allan.deviation[keep] ** 2).T]
 
     squares, sigmas = (np.stack([c[k] for c in columns], axis=-1) for k in (0, 1))  # (5, A)
     reach = ndtri((1.0 + confidence) / 2.0) * sigmas
     value, lower, upper = (
         Coefficients(*np.sqrt(np.maximum(squares + side * reach, 0.0))) for side in (0.0, -1.0, 1.0)
     )
-    chi2 = np.array([c[2] for c in columns])
-    return AllanFit(value, lower, upper, chi2, len(keep) - len(terms), terms, confidence)
+    chi2, dof, first = (np.array([c[k] for c in columns]) for k in (2, 3, 4))
+    return AllanFit(value, lower, upper, chi2, dof, terms, confidence, allan.tau_s[keep][first])
 
 
 def term_curves(coefficients: Coefficients, tau_s: np.ndarray) -> np.ndarray:
@@ -255,15 +277,55 @@ def triad_errors(fitted: AllanFit, correlation_time_s: float | None = None) -> T
     )
 
 
+def _explained(
+    variance: np.ndarray, expected: Moments, index: np.ndarray, least: int
+) -> tuple[np.ndarray, np.ndarray, float, int, int]:
+    """`_fit_axis` of the curve, or of what is explained of it; degrees of freedom, and from where.
+
+    At least so many points are fitted.
+    """
+    points, count = len(variance), len(index)
+
+    def tried(first: int, coloured: bool = True) -> tuple | None:
+        rest = Moments(*(part[first:] for part in expected))
+        rest = Moments(rest.mean, rest.quadratic[:, first:], rest.ramp[:, first:])
+        try:
+            found = _fit_axis(variance[first:], rest, index, coloured)
+        except (ArithmeticError, ValueError):  # no such noise in what is left
+            return None
+        return *found, points - first - count - coloured, first
+
+    def unlikely(found: tuple | None) -> float:
+        """Probability of a residual so large; 0 without a fit."""
+        return 0.0 if found is None else float(chdtrc(found[3], found[2]))
+
+    whole = tried(0, coloured=False)
+    if whole is not None and unlikely(whole) >= _DOUBTED:
+        return whole
+    parts = [tried(first) for first in range(points - least)]
+    chance = [unlikely(part) for part in parts]
+    for enough in (_EXPLAINED, _BARELY):
+        for first, p in enumerate(chance):
+            if p >= enough:
+                # What is explained may still be wrong by as much as does not show: what colour does
+                # beyond C / tau^2 dies away, so on to more than twice the time.
+                further = parts[min(first + _FURTHER, len(parts) - 1)]
+                if further is not None:
+                    return further
+    if whole is None:
+        _fit_axis(variance, expected, index)  # for what it has to say
+    return whole
+
+
 def _fit_axis(
-    variance: np.ndarray, expected: Moments, index: np.ndarray
+    variance: np.ndarray, expected: Moments, index: np.ndarray, coloured: bool = False
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Squared coefficients (5,), their sigmas (5,) and the weighted squared residual."""
     white = expected.degrees_of_freedom(_WHITE)
     p = _rough_mix(variance, expected.mean, white, index)
     for _ in range(100):
         before = expected.mean @ p
-        p, sigma, chi2 = _weighted_fit(variance, expected, index, p)
+        p, sigma, chi2 = _weighted_fit(variance, expected, index, p, coloured)
         _refuse_no_noise(p)
         # Far below what the data can tell, and reached in ten to thirty passes.
         if np.all(np.abs(expected.mean @ p - before) <= 1e-6 * before):
@@ -275,18 +337,29 @@ def _fit_axis(
 
 
 def _weighted_fit(
-    variance: np.ndarray, expected: Moments, index: np.ndarray, p: np.ndarray
+    variance: np.ndarray, expected: Moments, index: np.ndarray, p: np.ndarray, coloured: bool
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """One pass of `_fit_axis`, weighted by the covariance under the mix p."""
+    """One pass of `_fit_axis`, weighted by the covariance under the mix p.
+
+    Coloured: with -C / tau^2, which has no part in that covariance.
+    """
     root = np.linalg.cholesky(expected.covariance(p))
-    system = np.column_stack([expected.mean[:, index], variance])
+    colour = [-expected.mean[:, 0]] if coloured else []
+    system = np.column_stack([expected.mean[:, index], *colour, variance])
     whitened = solve_triangular(root, system, lower=True)
     size = np.linalg.norm(whitened[:, :-1], axis=0)
     design = whitened[:, :-1] / size
     solution, residual = nnls(design, whitened[:, -1])
     squares, sigma = np.zeros(5), np.zeros(5)
-    squares[index] = solution / size
-    sigma[index] = np.sqrt(np.diag(np.linalg.inv(design.T @ design))) / size
+    # Q and C are one term with two signs: with both asked for, the one that is zero is left out
+    free = np.ones(len(size), bool)
+    if coloured and 0 in index:
+        free[0 if solution[-1] > 0.0 else -1] = False
+    spread = np.full(len(size), np.inf)
+    spread[free] = np.sqrt(np.diag(np.linalg.inv(design[:, free].T @ design[:, free])))
+    count = len(index)
+    squares[index] = (solution / size)[:count]
+    sigma[index] = np.where(free, spread / size, 0.0)[:count]
     return squares, sigma, residual**2
 
 

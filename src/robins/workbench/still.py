@@ -126,6 +126,20 @@ def _metrics(sensor: str, fitted: AllanFit) -> dict[str, dict[str, Any]]:
     return by_axis
 
 
+def _coloured(sensor: str, curve: Allan, fitted: AllanFit) -> list[str]:
+    """A note where short times were left out of the fit."""
+    late = [
+        f"{axis} from {first:.3g} s"
+        for axis, first in zip(_AXES, fitted.from_s, strict=True)
+        if first > curve.tau_s[0]
+    ]
+    if not late:
+        return []
+    return [
+        f"The {sensor} is coloured at short times: its noises are fitted on {', '.join(late)} on."
+    ]
+
+
 def allan(
     log: str | os.PathLike[str],
     *,
@@ -165,6 +179,7 @@ def allan(
         else:
             for axis, found in _metrics(sensor, fitted).items():
                 by_axis[axis] |= found
+            notes += _coloured(sensor, curve, fitted)
         arrays |= _arrays(sensor, curve, fitted, given.body)
         tau_s = curve.tau_s
     solution = xr.Dataset(arrays | {"tau": variable("tau", tau_s, "s", "averaging time")})
