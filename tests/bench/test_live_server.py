@@ -126,7 +126,7 @@ def test_a_page_that_comes_late_sees_what_was(shared):
         shared.event("info", float(k), f"event {k}")
     shared.status({"state": "running", "deadlines": {"missed": 2}})
     with page_of(shared) as first:  # the feed keeps the order: with the last sample all is there
-        while numbers(frames(first, 1)) != [499]:
+        while list(numbers(frames(first, 1))) != [499]:
             pass
     with page_of(shared) as page:
         hello = texts(page, "hello")
