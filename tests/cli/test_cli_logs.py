@@ -313,7 +313,8 @@ def curve():
 @pytest.mark.parametrize("terms", ["Q", "N", "B", "K", "QNBKR"])
 def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
-    fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), 1, terms, 0.95)
+    dof = np.ones(3, int)
+    fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), dof, terms, 0.95, curve.tau_s[:1])
     parts = still.expected(fitted, curve.tau_s)
     assert "".join(parts) == terms
     mean = moments(curve.clusters, curve.n_samples, curve.dt_s).mean
