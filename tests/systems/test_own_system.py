@@ -74,6 +74,28 @@ def test_a_scenario_file_names_the_file_beside_it(tmp_path, capsys):
     assert results.read(out).solution.sizes["time"] == 20
 
 
+def test_a_default_runs_beside_the_filters_of_a_scenario_and_is_not_judged(tmp_path, capsys):
+    shutil.copy(EXAMPLE, tmp_path / "sky.py")
+    (tmp_path / "much.py").write_text(
+        "from sky import study as kite\n"
+        "from robins.systems import System\n"
+        "from robins.systems.judgement import Claim\n"
+        'CLAIM = Claim("there is one filter", (), len, (1, 1))\n'
+        'much = System("much", {"": kite._replace(claims={"one": CLAIM})}, default="gated")\n'
+    )
+    text = 'system = "much.py:much"\nruns = 2\nfilters = ["kf"]\nduration = "20 s"\n'
+    (tmp_path / "much.toml").write_text(text)
+
+    def told(*more):
+        words = ["run", str(tmp_path / "much.toml"), *more, "--json", "--out", str(tmp_path / "o")]
+        assert main(words) == 0
+        found = json.loads(capsys.readouterr().out)
+        return list(found["filters"]), [claim["value"] for claim in found["claims"]]
+
+    assert told() == (["kf", "gated"], [1])
+    assert told("--filters", "kf,gated") == (["kf", "gated"], [2])  # both were asked for
+
+
 def test_its_filters_and_claims_are_listed(capsys):
     assert main(["list", f"{EXAMPLE}:study"]) == 0
     told = capsys.readouterr().out

@@ -75,6 +75,13 @@ def judging(
     return partial(_verdicts, {key: claims[key] for key in chosen})
 
 
+def about(
+    filters: Sequence[str], claims: Callable[[Metrics], list[dict[str, Any]]]
+) -> Callable[[Metrics], list[dict[str, Any]]]:
+    """Verdicts on these filters alone, whatever else was run beside them."""
+    return lambda metrics: claims({k: m for k, m in metrics.items() if k in filters})
+
+
 def _verdicts(claims: Mapping[str, Claim], metrics: Metrics) -> list[dict[str, Any]]:
     out = []
     for key, claim in claims.items():

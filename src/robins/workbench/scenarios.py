@@ -91,12 +91,9 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
     return tuple(dict.fromkeys(wanted))
 
 
-def unasked(system: System, study: Study, parameters: Any) -> tuple[str, ...]:
-    """The filters that run where none is named: the scenario's, and the default of the system."""
-    return (
-        *(parameters.filters or study.filters),
-        *(name for name in (system.default,) if name in study.filters),
-    )
+def beside(own: Sequence[str], system: System, study: Study) -> tuple[str, ...]:
+    """Filters of a scenario and, where the study has it, the default of the system."""
+    return (*own, *(name for name in (system.default,) if name in study.filters))
 
 
 def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:

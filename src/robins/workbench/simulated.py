@@ -10,8 +10,9 @@ from robins.campaign import simulate
 from robins.campaign.bound import bound as bound_of
 from robins.report import bounds
 from robins.results import Outcome, Progress, silent
+from robins.systems.judgement import about
 from robins.workbench.errors import refusing
-from robins.workbench.scenarios import asked, check_filters, find_scenario, study_of, unasked
+from robins.workbench.scenarios import asked, beside, check_filters, find_scenario, study_of
 
 
 def run(
@@ -29,7 +30,8 @@ def run(
         name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
         runs: how many; by default what the scenario says.
         seed: of the random streams.
-        filters: names; by default those of the scenario and the default of its system.
+        filters: names; by default those of the scenario, on which its claims are judged, and beside
+            them the default of its system.
         settings: "path=value" texts that change the scenario.
         progress: called with the share done and what is being done.
 
@@ -41,10 +43,13 @@ def run(
     study = study_of(system, text, name)
     more = settings if runs is None else (*settings, f"runs={runs}")
     parameters = scenario.parse(study.parameters, text, more, source=name)
-    chosen = check_filters(label, study.filters, filters or unasked(system, study, parameters))
+    own = parameters.filters or study.filters
+    chosen = check_filters(label, study.filters, filters or beside(own, system, study))
     progress(0.0, "setting up the simulation")
     with refusing(name):
         problem = study.problem(parameters, chosen, seed)
+    if not filters:  # the default was not there when the claims were stated
+        problem = replace(problem, claims=about(own, problem.claims))
     return replace(
         simulate(problem, parameters.runs, progress=progress),
         scenario=label,
