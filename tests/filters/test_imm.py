@@ -136,6 +136,27 @@ def test_it_is_the_dense_recursion(solution, k):
         assert int(info.dof[t]) == here.sum()
 
 
+def test_the_likeliest_mode_is_told_where_one_is_rare_and_wide():
+    """Of a right narrow mode and a rare wide one: NIS is chi-square, the estimate is the same."""
+    wide = Sensor(Partial(times, jnp.array(H)), jnp.array(100.0 * W[0]), 2)
+    modes = [mode(kalman()), mode(kalman(), sensors=[wide])]
+    change = np.array([[0.99, 0.01], [0.5, 0.5]])
+    rng, x, y = np.random.default_rng(4), np.linalg.cholesky(P0) @ np.array([0.3, -0.8]) + M0, []
+    for _ in range(400):
+        x = F[0] @ x + G[0] @ rng.normal(size=2)
+        y.append(H @ x + W[0] @ rng.normal(size=2))
+    each = [run(imm(modes, change, likeliest=b), MODEL, START, np.array(y)) for b in (False, True)]
+    np.testing.assert_array_equal(each[0].mean, each[1].mean)
+    np.testing.assert_array_equal(each[0].log_likelihood, each[1].log_likelihood)
+    mixture, one = (float(np.mean(s.steps.info["y"].nis)) / 2.0 for s in each)
+    assert mixture < 0.1
+    assert abs(one - 1.0) < 4.0 * np.sqrt(2.0 / 800.0)
+    # and it is that mode's own: the innovation whitened by its factor
+    last = jax.tree_util.tree_map(lambda a: np.asarray(a)[-1], each[1].steps.info["y"])
+    white = np.linalg.solve(last.factor, last.innovation)
+    np.testing.assert_allclose(last.nis, white @ white, rtol=1e-10)
+
+
 def test_with_nothing_measured_probabilities_only_mix(solution):
     steps = jax.tree.map(lambda a: a[3], solution[1].steps)
     info = steps.info["y"]

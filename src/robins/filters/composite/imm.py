@@ -179,7 +179,10 @@ def mode(filter_: Filter, motion: Motion | None = None, sensors: Sequence[Sensor
 
 
 def imm(
-    modes: Sequence[Filter | Mode] | Family, transition: Rows, start: Rows | None = None
+    modes: Sequence[Filter | Mode] | Family,
+    transition: Rows,
+    start: Rows | None = None,
+    likeliest: bool = False,
 ) -> Filter:
     """Interacting multiple model filter over any filters of the same state.
 
@@ -188,7 +191,8 @@ def imm(
 
     The `StepInfo` is that of the mixture: innovation and factor are its moments before the update,
     the gain is the mean of the modes' gains, and ``imm.probability`` (modes,) is noted. What rules
-    of mode i note is found under ``imm.i.`` and its name.
+    of mode i note is found under ``imm.i.`` and its name. A mode that is rare and wide makes these
+    moments those of no Gaussian, and the NIS says nothing: then ask for the ``likeliest``.
 
     Likelihoods only compare where all modes use the same components. Where a rule of one mode
     refuses what another uses, the measurement leaves the probabilities as they are. A mode whose
@@ -198,6 +202,8 @@ def imm(
         modes: filters, or what `mode` makes of one; a `Family` where they differ in numbers only.
         transition: (modes, modes), row i the probabilities to change from i in one step.
         start: (modes,) probabilities before the first prediction; all equal where not given.
+        likeliest: innovation, factor, NIS and what was used are those of the mode that is likeliest
+            after the update. Beliefs and likelihoods are the same either way.
 
     Raises:
         ValueError: no modes, or probabilities that are negative, of a wrong shape or do not sum to
@@ -263,6 +269,9 @@ def imm(
             info = jax.tree_util.tree_map(lambda a: a[0], seen)
         else:
             info = _seen(seen, jnp.where(sound, log_prior, -jnp.inf), log_post, of_all)
+        if likeliest:
+            one = jax.tree_util.tree_map(lambda a: a[jnp.argmax(log_post)], seen)
+            info = one._replace(gain=info.gain, log_likelihood=info.log_likelihood)
         notes = {f"imm.{i}.{k}": v for i, own in enumerate(each) for k, v in own.items()}
         notes["imm.probability"] = jnp.exp(log_post)
         # Where no mode has moved the mixture stands bit for bit.

@@ -297,4 +297,5 @@ def robust(model: Model, step_s: float, patience_s: float) -> Filter:
 
     start = np.zeros(len(_ROWS))
     start[RIGHT] = 1.0 / COUNT
-    return imm(Family(mode, HYPOTHESES), changes(step_s, patience_s), start)
+    # a position that may be off by `OFF_M` is seldom expected, and would hide what is
+    return imm(Family(mode, HYPOTHESES), changes(step_s, patience_s), start, likeliest=True)
