@@ -43,7 +43,8 @@ def looks(nis=6.0, dof=6, refused=()):
 
 
 def said(mean, updates):
-    doubt = doubts_of(mean, updates, PARAMETERS)
+    gain = np.asarray(mean.gyro_gain)
+    doubt = doubts_of(np.asarray(mean.declination), gain, updates, PARAMETERS)
     return sentences("marg", doubt, mean, DT), doubt
 
 

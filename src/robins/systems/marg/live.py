@@ -448,10 +448,7 @@ class LiveMarg(Live):
             name: Update(none, none, looks[:, k], looks[:, k + 1], looks[:, k + 2])
             for name, k in ((model.TRAVEL, 2), (model.MAGNETOMETER, 5))
         }
-        no: Any = None  # not asked
-        gains, declination = jnp.asarray(looks[:, 1]), jnp.asarray(looks[:, 0])
-        states = model.MargState(no, no, no, no, gains, no, declination, no)
-        doubt = monitor.doubts_of(states, updates, self.parameters)
+        doubt = monitor.doubts_of(looks[:, 0], looks[:, 1], updates, self.parameters)
         told = bool(doubt.declination[-1] or doubt.gain[-1])
         for column, k in ((doubt.tilt, 2), (doubt.refused, 5)):
             refused = looks[:, k + 2] == Code.REFUSED

@@ -38,7 +38,12 @@ class Doubt(NamedTuple):
         return self.declination | self.gain | self.tilt | self.refused
 
 
-def doubts_of(mean: MargState, updates: Mapping[str, Update], parameters: Replay) -> Doubt:
+def doubts_of(
+    declination: np.ndarray,
+    gain: np.ndarray,
+    updates: Mapping[str, Update],
+    parameters: Replay,
+) -> Doubt:
     """Where the states of a filter or a smoother, or its innovations, contradict the parameters.
 
     - declination: further from zero than three of its standard deviations;
@@ -47,12 +52,13 @@ def doubts_of(mean: MargState, updates: Mapping[str, Update], parameters: Replay
     - refused: the magnetometer at ten looks in a row or more.
 
     Args:
-        mean: leading axis B.
+        declination: (B,) of the states [rad], and
+        gain: (B, ...) of the gyros, each.
         updates: by sensor, of the filter or of the run that was smoothed.
         parameters: what was assumed.
     """
-    declination = np.abs(np.asarray(mean.declination))
-    gain = np.max(np.abs(np.asarray(mean.gyro_gain).reshape(len(declination), -1)), axis=1)
+    declination = np.abs(declination)
+    gain = np.max(np.abs(gain.reshape(len(declination), -1)), axis=1)
     none = np.zeros(len(declination), dtype=bool)
     tilt, refused = none, none
     if TRAVEL in updates:

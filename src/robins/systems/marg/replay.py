@@ -199,7 +199,10 @@ def replay(
         q_nb = {name: _turned_north(q, north) for name, q in q_nb.items()}
         answers = {name: _turned_answer(answer, north) for name, answer in answers.items()}
     doubt = {
-        name: monitor.doubts_of(answer.mean, seen, parameters) for name, answer in answers.items()
+        name: monitor.doubts_of(
+            np.asarray(answer.mean.declination), np.asarray(answer.mean.gyro_gain), seen, parameters
+        )
+        for name, answer in answers.items()
     }
     variables, errors = _variables(log, answers, doubt) | _attitudes(log, q_nb), {}
     if dataset.attitude is not None:
