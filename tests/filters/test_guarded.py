@@ -152,6 +152,30 @@ def test_what_is_right_keeps_most_of_its_gain():
     assert np.mean(said["wind"].notes["guarded.trips"][:, -1]) < 0.3
 
 
+def test_what_is_said_of_the_error_is_true():
+    """Error squared over the stated variance, of level velocity: wrong as the reference is at most.
+
+    The reference is off by an offset that it does not know.
+    """
+
+    @jax.jit
+    def ratio(sigma, wind):
+        def one(y, z, truth):
+            data = {"sar": y, "wind": z}
+            found = [run(f, model(sigma), START, data) for f in (ONE, PLAIN)]
+            silent = data | {"wind": jnp.full_like(z, jnp.nan)}
+            found.append(run(PLAIN, model(sigma), START, silent))
+            return [((x.mean - truth) / x.sigma)[100:, V] ** 2 for x in found]
+
+        return [jnp.mean(x) for x in jax.vmap(one)(SAR, wind, TRUTH)]
+
+    for white, lasting, jump, sigma in WRONG.values():
+        got, bold, plain = map(float, ratio(sigma, held(TRUTH, white, lasting, jump)))
+        assert got < 2.0 * max(plain, 1.0) < bold
+    got, _, _ = map(float, ratio(0.05, held(TRUTH, 0.05, 0.0)))
+    assert got < 1.0
+
+
 # --------------------------------------------------------------------- the verdict, step by step
 
 LIMIT, PATIENCE, RATIO = 6.0, 2.0, 1.6
@@ -187,8 +211,8 @@ def by_the_book(sar, wind, sigma):
             c, g, trips = u, np.zeros(2), trips + 1
 
     def weight():
-        beta = np.max(E / (gain + 0.1 * np.maximum(looks, 1.0)))
-        return 1.0 / (1.0 + max(beta - 0.5, 0.0))
+        beta = max(np.max(E / (gain + 0.1 * np.maximum(looks, 1.0))), 0.0)
+        return 1.0 / (1.0 + max(beta - 0.5, 0.0)), beta
 
     for y, z in zip(sar, wind, strict=True):
         c, u = ((F @ x, F @ A @ F.T + Q) for x, A in (c, u))
@@ -197,11 +221,13 @@ def by_the_book(sar, wind, sigma):
             before = np.diag(u[1])
             c, u = (corrected(*s, H, y, SAR_M**2 * np.eye(2)) for s in (c, u))
             verdict(1 - np.diag(u[1]) / before)
-        believed = weight() >= 0.5
+        believed = weight()[0] >= 0.5
         c = corrected(*c, HOLD, z, sigma**2 * np.eye(2))
         verdict(np.zeros(4))
-        w = weight()
-        mean, P = u[0] + w * (c[0] - u[0]), (1.0 - w) * u[1] + w * c[1]
+        w, beta = weight()
+        # of u's error, and w times the difference's, of which P_u - P_c is common to both
+        G = u[1] - c[1]
+        mean, P = u[0] + w * (c[0] - u[0]), u[1] - 2.0 * w * G + w**2 * (1.1 + beta) * G
         out.append((mean, P, w, believed, g.max() / LIMIT, trips))
     return [np.array(series) for series in zip(*out, strict=True)]
 

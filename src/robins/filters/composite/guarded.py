@@ -10,10 +10,11 @@ is efficient, and differs from the reference's x_u by exactly what was gained (H
 Where it brings in an error of variance B of its own, this is G + B, and the best estimate from both
 weighs them (cov(x_u error, x_c - x_u) = -G): with B = beta G
 
-    x = x_u + w (x_c - x_u),   P = (1 - w) P_u + w P_c,   w = 1 / (1 + beta)
+    x = x_u + w (x_c - x_u),   P = P_u - w (2 - w (1 + beta)) G,   w = 1 / (1 + beta)
 
-which is never worse than the reference; a weight that is wrong is, where it is above 2 w. beta is
-learnt from the same differences,
+which is never worse than the reference; a weight that is wrong is, where it is above 2 w. P holds
+for any w, and is stated with a beta larger by what the test does not see. beta is learnt from the
+same differences,
 
     T_i = (x_c - x_u)_i^2 / P_u,ii        v_i = 1 - P_c,ii / P_u,ii  (not below 0)
 
@@ -72,10 +73,15 @@ class Watch(NamedTuple):
     trips: Array  # () how often the filter was sent back to its reference
 
     @property
+    def beta(self) -> Array:
+        """() of the worst group, not below 0."""
+        beta = self.excess / (self.gained + SLACK * jnp.maximum(self.looks, 1.0))
+        return jnp.maximum(jnp.max(beta), 0.0)
+
+    @property
     def weight(self) -> Array:
         """() w."""
-        beta = self.excess / (self.gained + SLACK * jnp.maximum(self.looks, 1.0))
-        return 1.0 / (1.0 + jnp.maximum(jnp.max(beta) - _CHANCE, 0.0))
+        return 1.0 / (1.0 + jnp.maximum(self.beta - _CHANCE, 0.0))
 
 
 def guarded(
@@ -246,10 +252,10 @@ def guarded(
 def _given_out(watch: Watch) -> FilterState:
     w, mine, other = watch.weight, watch.filter.belief, watch.reference.belief
     mean = manifold.retract(other.mean, w * manifold.local(other.mean, mine.mean))
-    # Gradients: the root of 1 - w has no slope where w is one, and is not taken there.
-    part = jnp.where(w < 1.0, w, 0.5)
-    factor = linalg.tria(jnp.sqrt(1.0 - part) * other.factor, jnp.sqrt(part) * mine.factor)
-    return FilterState(select(w < 1.0, Belief(mean, factor), mine), watch)
+    # (1 - f) P_u + f P_c; f is above 0 and at most 1 - SLACK
+    f = w * (2.0 - w * (1.0 + watch.beta + SLACK))
+    factor = linalg.tria(jnp.sqrt(1.0 - f) * other.factor, jnp.sqrt(f) * mine.factor)
+    return FilterState(Belief(select(w < 1.0, mean, mine.mean), factor), watch)
 
 
 def _quotient(a: Array, b: Array) -> Array:
