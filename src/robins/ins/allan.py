@@ -312,8 +312,8 @@ def _explained(
                 further = parts[min(first + _FURTHER, len(parts) - 1)]
                 if further is not None:
                     return further
-    if whole is None:
-        _fit_axis(variance, expected, index)  # for what it has to say
+    if whole is None:  # which `_fit_axis` says why
+        return *_fit_axis(variance, expected, index), points - count, 0
     return whole
 
 
