@@ -313,7 +313,11 @@ def curve():
 @pytest.mark.parametrize("terms", ["Q", "N", "B", "K", "QNBKR"])
 def test_the_parts_of_the_fit_are_those_it_was_fitted_with(terms, curve):
     ones = allan.Coefficients(*(np.full(3, 1.0 + k) for k in range(5)))
-    fitted = allan.AllanFit(ones, ones, ones, np.zeros(3), 1, terms, 0.95)
+    none = np.zeros(3)
+    fitted = allan.AllanFit(ones, ones, ones, none, none + 1, terms, 0.95, none + curve.tau_s[0])
+    assert not still._coloured("gyro", curve, fitted)
+    (note,) = still._coloured("gyro", curve, fitted._replace(from_s=np.array([0.0, 1e3, 0.0])))
+    assert "fitted on y from 1e+03 s on" in note
     parts = still.expected(fitted, curve.tau_s)
     assert "".join(parts) == terms
     mean = moments(curve.clusters, curve.n_samples, curve.dt_s).mean
