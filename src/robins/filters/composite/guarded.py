@@ -1,27 +1,34 @@
-r"""Guarded filters: an assumption is used as long as there is no evidence against it.
+r"""Guarded filters: an assumption is weighed by the error that is learnt of it.
 
 A wrong assumption (an exact constraint, air data whose errors are modelled as white) makes the
 covariance of a filter too small, so its own residuals do not show the fault. A *reference* that
 does without the assumption shows it: where the assumption is right, the estimate x_c that uses it
 is efficient, and differs from the reference's x_u by exactly what was gained (Hausman 1978),
 
-    E (x_c - x_u)(x_c - x_u)' = P_u - P_c
+    E (x_c - x_u)(x_c - x_u)' = P_u - P_c = G
 
-Where it is wrong by an error of variance b^2 in some component, the difference has P_u - P_c + b^2,
-and the filter is worse than the reference just where b^2 > P_u - P_c: where the square of the
-difference is on average more than *twice* what it should be. So with
+Where it brings in an error of variance B of its own, this is G + B, and the best estimate from both
+weighs them (cov(x_u error, x_c - x_u) = -G): with B = beta G
+
+    x = x_u + w (x_c - x_u),   P = P_u - w (2 - w (1 + beta)) G,   w = 1 / (1 + beta)
+
+which is never worse than the reference; a weight that is wrong is, where it is above 2 w. P holds
+for any w, and is stated with a beta larger by what the test does not see. beta is learnt from the
+same differences,
 
     T_i = (x_c - x_u)_i^2 / P_u,ii        v_i = 1 - P_c,ii / P_u,ii  (not below 0)
 
-the mean of T_i is v_i, or 2 v_i where nothing is gained, and evidence is summed up as Page (1954)
-has it for the quickest detection of a change:
+whose means are E T_i = (1 + beta) v_i, in sums that forget. The sum of w_i makes samples
+comparable: differences of consecutive steps are nearly the same number. A measurement of a
+*judge*, a sensor that both filters use, renews the share w_i = 1 - P+_u,ii/P-_u,ii of what the
+reference knows; the sums count in such renewals, *looks*. Where no judge measures nothing is
+renewed, and the weight stands.
 
-    g_i := max(0, g_i + w_i (T_i - ratio v_i - slack)),   g_i > limit: wrong
+A filter that has gone astray does not come back by itself when its assumption is right again. So
+it goes on from the reference's belief, with what was learnt, where it is worse than that: B > G, in
+evidence that is summed up as Page (1954) has it for the quickest detection of a change,
 
-The w_i make samples comparable: differences of consecutive steps are nearly the same number. A
-measurement of a *judge*, a sensor that both filters use, renews the share w_i = 1 - P+_u,ii/P-_u,ii
-of what the reference knows; evidence and patience are counted in such renewals, *looks*. Where no
-judge measures nothing is renewed, and the verdict stands.
+    g_i := max(0, g_i + w_i (T_i - ratio v_i - slack)),   g_i > limit
 """
 
 from __future__ import annotations
@@ -46,11 +53,12 @@ Groups = Sequence[Sequence[int]]
 # Harm that is not worth a word: a tenth of the reference's variance, 5 % of its deviation.
 SLACK = 0.1
 
-# Patience doubles no more often than this: 64 times the first outlasts most missions.
-_DOUBLINGS = 6
+# beta up to a half is chance, in sums over some ten looks. To neglect it costs little: at most a
+# sixth of what is gained, at beta = 1/2.
+_CHANCE = 0.5
 
-# A group that is renewed this much slower than the fastest is none the judges judge.
-_JUDGED = 0.25
+# Six deviations of the reference, squared, say all there is to say; more would not be forgotten.
+_SURE = 36.0
 
 
 class Watch(NamedTuple):
@@ -58,11 +66,22 @@ class Watch(NamedTuple):
 
     filter: FilterState
     reference: FilterState
-    trusted: Array  # () bool
     evidence: Array  # (groups,) g
-    looks: Array  # (groups,) renewals since evidence last exceeded half its limit
-    failures: Array  # () how often the patience has doubled
-    trips: Array  # () how often trust was lost
+    excess: Array  # (groups,) sum of T - v, of a component
+    gained: Array  # (groups,) sum of v
+    looks: Array  # (groups,) sum of renewals
+    trips: Array  # () how often the filter was sent back to its reference
+
+    @property
+    def beta(self) -> Array:
+        """() of the worst group, not below 0."""
+        beta = self.excess / (self.gained + SLACK * jnp.maximum(self.looks, 1.0))
+        return jnp.maximum(jnp.max(beta), 0.0)
+
+    @property
+    def weight(self) -> Array:
+        """() w."""
+        return 1.0 / (1.0 + jnp.maximum(self.beta - _CHANCE, 0.0))
 
 
 def guarded(
@@ -77,24 +96,23 @@ def guarded(
     leap: Number = 6.0,
     trusted: bool = True,
 ) -> Filter:
-    """A filter under an assumption, and beside it one without that takes over where it is wrong.
+    """A filter under an assumption, weighed against one without by the error learnt of it.
 
-    The belief is that of ``filter`` while it is trusted, else that of ``reference``, which never
-    sees the sensors of the assumption. Trust is lost when the evidence of a group of states exceeds
-    its limit (module docstring), when a component is further off than ``leap`` deviations of the
-    reference, or when the filter cannot take a step that the reference can. The filter then goes on
-    *unseen* from the reference's belief. It is trusted again after ``patience`` looks of every
-    group the judges see, in none of which the evidence exceeded half its limit. Each loss of trust
-    doubles the patience, up to 64 times, so that what is always wrong costs a vanishing share of
-    the time.
+    The belief lies between those of ``filter`` and of ``reference``, which never sees the sensors
+    of the assumption, by the weight w of the worst group (module docstring); where nothing speaks
+    against the assumption it is that of ``filter``. What was learnt is forgotten to 1/e in
+    ``patience`` looks. The filter goes on from the reference's belief when the evidence of a group
+    of states exceeds its limit, when a component is further off than ``leap`` deviations of the
+    reference, or when it cannot take a step that the reference can; by the last two its weight
+    falls at once.
 
     The test is of harm to the estimate, and relies on the reference's covariance: where that is
     overconfident (NEES per state above one) a ratio larger by that makes up for it.
 
-    What an update says of itself is what the filter that is in charge says; a sensor of the
-    assumption that is not trusted is refused. Notes: those of the filter, those of the reference as
-    ``reference.`` and their name, ``guarded.trusted``, ``guarded.evidence`` (the greatest, as a
-    share of the limit) and ``guarded.trips``.
+    What an update says of itself is what the filter with the greater weight says; a sensor of the
+    assumption that has the smaller one is refused. Notes: those of the filter, those of the
+    reference as ``reference.`` and their name, ``guarded.weight``, ``guarded.evidence`` (the
+    greatest, as a share of the limit) and ``guarded.trips``.
 
     Args:
         filter: believes the assumption.
@@ -104,12 +122,13 @@ def guarded(
         groups: tangent components that are judged together, by their sum, such as
             ``[(3, 4), (6, 7)]``; others are not watched. Two axes tell twice as fast as one. By
             default each component by itself.
-        ratio: how many times what it should be a squared difference may be on average: at 2 a
-            filter that is no better than its reference is still believed.
+        ratio: how many times what it should be a squared difference may be on average before the
+            filter goes on from its reference, which then is as good as it; half of it is what is
+            expected under a right assumption.
         limit: of the evidence. Small: quick; large: rarely wrong.
-        patience: looks with evidence below half its limit before trust is given again.
+        patience: looks in which the learnt error is forgotten.
         leap: deviations of the reference that no difference exceeds by chance; `inf` to leave out.
-        trusted: whether the filter is in charge at the start.
+        trusted: whether the assumption is taken to be right at the start.
 
     Raises:
         ValueError: a sensor is on both sides, no judge or no assumption is named, a group is empty
@@ -136,10 +155,10 @@ def guarded(
         watch = Watch(
             filter.init(belief, dims),
             reference.init(belief, without),
-            jnp.asarray(trusted),
+            jnp.zeros(count),
+            jnp.full(count, 0.0 if trusted else _SURE * SLACK),
             jnp.zeros(count),
             jnp.zeros(count),
-            jnp.zeros((), int),
             jnp.zeros((), int),
         )
         return _given_out(watch)
@@ -157,30 +176,32 @@ def guarded(
         return filter.reset(watch.filter, watch.reference.belief)
 
     def judged(watch: Watch, failed: Array, renewed: Array | float) -> Watch:
-        """The verdict after a step: evidence taken, trust lost or given."""
+        """What is learnt of a step, and whether the filter goes on from its reference."""
         square, gained = _difference(watch.filter.belief, watch.reference.belief)
         renewed = jnp.broadcast_to(jnp.asarray(renewed), square.shape)
         M = _members(groups, len(square))
+        mean = M / np.sum(M, axis=1, keepdims=True)
         fresh = M @ (renewed * (square - ratio * gained - SLACK))
         evidence = jnp.maximum(watch.evidence + fresh, 0.0)
-        looks = watch.looks + M @ renewed / np.sum(M, axis=1)
-        off = jnp.any(np.any(M > 0.0, axis=0) & (square > leap**2))
-        wrong = failed | off | jnp.any(evidence > limit)
-        doubted = wrong | (~watch.trusted & jnp.any(evidence > 0.5 * limit))
-        looks = jnp.where(doubted, 0.0, looks)
-        lost = watch.trusted & wrong
-        failures = jnp.minimum(watch.failures + lost.astype(int), _DOUBLINGS)
-        wait = patience * 2.0 ** failures.astype(float)
-        most = jnp.max(looks)
-        earned = (most >= wait) & jnp.all((looks >= wait) | (looks < _JUDGED * most))
+        sure = failed | ((M @ (square > leap**2).astype(float)) > 0.0)
+        wrong = jnp.any(sure | (evidence > limit))
+
+        looks = mean @ renewed
+        # One clock for all, or a group that no judge sees would never forget.
+        kept = jnp.exp(-jnp.max(looks) / patience)
+        gain = kept * watch.gained + mean @ (renewed * gained)
+        looks = kept * watch.looks + looks
+        excess = jnp.minimum(square, _SURE) * (2.0 / ratio) - gained
+        excess = kept * watch.excess + mean @ (renewed * excess)
+        most = _SURE * (gain + SLACK * jnp.maximum(looks, 1.0))
         return Watch(
             select(wrong, taken_over(watch), watch.filter),
             watch.reference,
-            (watch.trusted & ~wrong) | earned,
             jnp.where(wrong, 0.0, evidence),
+            jnp.where(sure, most, excess),
+            gain,
             looks,
-            failures,
-            watch.trips + lost.astype(int),
+            watch.trips + wrong.astype(int),
         )
 
     def predict(state: FilterState, motion: Motion, u: Any = None):
@@ -199,7 +220,7 @@ def guarded(
         notes = dict(info.notes)
         if sensor.name in assumed:
             new = judged(watch._replace(filter=mine), _failure(info), 0.0)
-            said = select(watch.trusted, info._replace(notes={}), _not_believed(info))
+            said = select(watch.weight >= 0.5, info._replace(notes={}), _not_believed(info))
         else:
             other, plain = reference.update(watch.reference, sensor, y, aux)
             renewed = 0.0
@@ -210,8 +231,8 @@ def guarded(
             both = watch._replace(filter=mine, reference=other)
             new = judged(both, _failure(info) & ~_failure(plain), renewed)
             notes |= {f"reference.{name}": value for name, value in plain.notes.items()}
-            said = select(watch.trusted, info._replace(notes={}), plain._replace(notes={}))
-        notes["guarded.trusted"] = new.trusted
+            said = select(watch.weight >= 0.5, info._replace(notes={}), plain._replace(notes={}))
+        notes["guarded.weight"] = new.weight
         notes["guarded.evidence"] = jnp.max(new.evidence) / limit
         notes["guarded.trips"] = new.trips
         return _given_out(new), said._replace(notes=notes)
@@ -229,8 +250,12 @@ def guarded(
 
 
 def _given_out(watch: Watch) -> FilterState:
-    belief = select(watch.trusted, watch.filter.belief, watch.reference.belief)
-    return FilterState(belief, watch)
+    w, mine, other = watch.weight, watch.filter.belief, watch.reference.belief
+    mean = manifold.retract(other.mean, w * manifold.local(other.mean, mine.mean))
+    # (1 - f) P_u + f P_c; f is above 0 and at most 1 - SLACK
+    f = w * (2.0 - w * (1.0 + watch.beta + SLACK))
+    factor = linalg.tria(jnp.sqrt(1.0 - f) * other.factor, jnp.sqrt(f) * mine.factor)
+    return FilterState(Belief(select(w < 1.0, mean, mine.mean), factor), watch)
 
 
 def _quotient(a: Array, b: Array) -> Array:
