@@ -117,25 +117,6 @@ def test_a_part_has_its_own_noise():
     np.testing.assert_allclose(found.noise, np.diag([5.0, 2.0, 2.0, 1.0]) @ N, rtol=1e-15)
 
 
-def test_of_alternatives_the_right_one_is_found():
-    """A motion that decays at one of three rates for good."""
-    rates = np.array([0.2, 0.7, 0.98])
-
-    def decaying(rate):
-        return Motion(lambda x, u: jnp.reshape(rate, (1,)) * x, np.ones(1))
-
-    rng, x, y = np.random.default_rng(6), np.zeros(1), []
-    for _ in range(300):
-        x = 0.7 * x + rng.normal(size=1)
-        y.append(x + 0.1 * rng.normal(size=1))
-    model = Model(decaying(0.98), (Sensor(lambda x, aux: x, 0.1 * np.ones(1), 1),))
-    bank = adaptive((1.0, 8.0), motions=decaying, alternatives=rates)
-    found = run(bank, model, Belief.of(np.zeros(1), np.eye(1)), np.array(y))
-    last = np.asarray(found.steps.info["y"].notes[PROBABILITY])[-1]
-    assert last.shape == (6,)
-    assert last[2] > 0.9  # the second rate, the first scale
-
-
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="rise"):
         adaptive((1.0, 1.0))
@@ -143,5 +124,3 @@ def test_what_cannot_be_is_refused():
         adaptive((0.0, 8.0))
     with pytest.raises(ValueError, match="chance to stay"):
         adaptive(back=0.6)
-    with pytest.raises(ValueError, match="both motions and alternatives"):
-        adaptive(alternatives=np.ones(2))

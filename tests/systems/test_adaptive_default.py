@@ -1,27 +1,28 @@
 """The filter "adaptive" of every simulated system: that it is there, blind, one and the same."""
 
+import jax
 import numpy as np
 import pytest
 
-from robins.filters import Belief, adaptive
 from robins.scenario import load
-from robins.systems import transfer_alignment
+from robins.sim.flexure import Flexure
 from robins.systems.finding import find_system
-from robins.systems.transfer_alignment.product.filters import (
-    ACCELEROMETERS,
-    GYROS,
-    STRUCTURES,
-    VARIANTS,
+from robins.systems.transfer_alignment.attitude_matching.model import ATTITUDE, linear_system
+from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
+from robins.systems.transfer_alignment.attitude_matching.structures import (
+    START,
+    Supposed,
+    blind,
+    hypotheses,
+    supposed,
 )
-from robins.systems.transfer_alignment.product.parameters import Product, Structure
-from robins.systems.transfer_alignment.product.study import product_contender
 
 STUDIES = {
     "airship": ("navigation",),
     "ins-gnss": ("drive",),
     "rocket": ("magnetic-attitude", "field-vector"),
     "satellite": ("attitude-loop",),
-    "transfer-alignment": ("product", "velocity-attitude"),
+    "transfer-alignment": ("product", "velocity-attitude", "attitude-matching"),
 }
 
 
@@ -32,27 +33,51 @@ def test_every_simulated_system_has_it(system):
         assert "adaptive" in studies[name].filters
 
 
-def test_alignment_supposes_every_structure_at_every_scale_and_is_told_of_none():
-    told = Structure(sigma=(1e-3, 1e-3, 1e-3), time=(3.0, 3.0, 3.0))
-    supposed, in_spite = (VARIANTS["adaptive"].flexure(x) for x in (None, told))
-    assert supposed is not None
-    assert in_spite is not None
-    for a, b in zip(supposed[:3], in_spite[:3], strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert not set(STRUCTURES[1]) & {3.0, 1.5}  # times that scenarios have
-
-    scenario = find_system(transfer_alignment.SYSTEM.name).scenarios["aircraft"]
-    contender = product_contender(load(Product, scenario), "adaptive")
-    n = 24
-    assert contender.reported is not None
-    assert contender.reported.shape[1] == n
-    state = contender.filter.init(Belief.of(np.zeros(n), np.eye(n)), contender.model.dims)
+def test_attitude_matching_supposes_structures_and_no_louder_gyros():
+    rows = hypotheses()
+    count = len(rows.sigma)
+    swings = {(float(s), float(t)) for s, t in zip(rows.sigma, rows.time, strict=True)}
+    assert count == 2 * len(swings) == 18  # with flutter and without
+    given = load(AttitudeMatching, find_system("transfer-alignment").scenarios["s1"])
+    system = linear_system(given, 3, START)
+    bank = blind(system, given.master.attitude_noise, given.period)
+    state = bank.init(system.start(), {ATTITUDE: 3})
     probability = np.exp(state.memory.log_probability)
-    alone = adaptive(parts=(GYROS, ACCELEROMETERS))
-    scales = len(alone.init(Belief.of(np.zeros(n), np.eye(n)), {"y": 1}).memory.log_probability)
-    assert scales == 5
-    assert probability.shape == (len(STRUCTURES[0]) * scales,)
-    by_structure = probability.reshape(-1, scales)
-    np.testing.assert_allclose(by_structure, by_structure[:1].repeat(len(STRUCTURES[0]), axis=0))
+    np.testing.assert_allclose(probability[np.asarray(rows.sigma) == 0.0].sum(), 0.5)
     np.testing.assert_allclose(probability.sum(), 1.0)
-    assert np.all(by_structure[:, 0] > 0.9 / len(STRUCTURES[0]))
+
+
+def test_each_hypothesis_is_the_kalman_filter_of_its_structure():
+    """Against matrices of the linear system that is told that structure."""
+    given = load(AttitudeMatching, find_system("transfer-alignment").scenarios["s0"])
+    noise, T = given.master.attitude_noise, given.period
+    told, flutter = Flexure(np.full(3, 2e-3), np.full(3, 4.0)), 3.0
+    system, own = linear_system(given, 3, START), linear_system(given, 3, told)
+    y = 1e-3 * np.random.default_rng(1).normal(size=(3, 3))
+    mode = supposed(system, noise, T)(Supposed(2e-3, 4.0, flutter))
+    model = own.model(noise)
+    u, aux = system.inputs()
+    state = mode.filter_.init(system.start(), model.dims)
+    x, P = np.zeros(15), np.diag(system.sigma) ** 2
+    for k in range(3):
+        at = jax.tree.map(lambda a, k=k: a[k], (u, aux))
+        state, *_ = mode.predict(state, model.motion, at[0])
+        state, *_ = mode.update(state, model.sensor(ATTITUDE), y[k], at[1][ATTITUDE])
+        x, P = own.F[k] @ x, own.F[k] @ P @ own.F[k].T + own.G @ own.G.T
+        H, R = own.H[k], noise**2 * (1.0 + flutter**2) * np.eye(3)
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+        x, P = x + K @ (y[k] - H @ x), P - K @ H @ P
+    np.testing.assert_allclose(state.belief.mean, x, rtol=1e-9, atol=1e-15)
+    sigma = np.sqrt(np.diag(P))
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(state.belief.covariance / scale, P / scale, atol=1e-9)
+
+
+def test_a_stiff_structure_is_forgotten():
+    given = load(AttitudeMatching, find_system("transfer-alignment").scenarios["s1"])
+    system = linear_system(given, 3, START)
+    mode = supposed(system, 3e-4, given.period)(Supposed(0.0, 1.0, 0.0))
+    state = mode.filter_.init(system.start(), {ATTITUDE: 3})
+    state, *_ = mode.predict(state, system.model(3e-4).motion, system.inputs()[0][0])
+    assert np.all(state.belief.sigma[9:] == 0.0)
+    assert np.all(state.belief.sigma[:9] > 0.0)

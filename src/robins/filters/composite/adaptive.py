@@ -22,26 +22,22 @@ not make an accelerometer doubtful by which the tilt is known.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
 from robins.errors import require
-from robins.filters.composite.imm import Family, Mode, imm
+from robins.filters.composite.imm import Family, imm
 from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
-from robins.filters.model import Motion
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
 
 SCALES = (1.0, 8.0, 64.0)
 UP, BACK = 1e-5, 1e-2
-OTHER = 1e-5  # that an alternative gives way to another in a step
-
 
 Part = Sequence[int] | slice
 """Tangent components whose process noise goes wrong together, such as all that one instrument
@@ -100,8 +96,6 @@ def adaptive(
     up: float = UP,
     back: float = BACK,
     parts: Sequence[Part] = (ALL,),
-    motions: Callable[[Any], Motion] | None = None,
-    alternatives: Any = None,
     linearise: Linearisation | None = None,
     form: Form = "sqrt",
 ) -> Filter:
@@ -116,21 +110,15 @@ def adaptive(
         up: probability of a change to one louder scale in a step.
         back: of a change to one quieter scale.
         parts: of the process noise; a mode makes one of them louder.
-        motions: makes the motion of one row of the alternatives.
-        alternatives: pytree of arrays, one row an alternative of the motion that holds for good.
-            Each is combined with every scale.
         linearise: of each mode; by Taylor where not given.
         form: of the update, "sqrt" or "joseph".
 
     Raises:
-        ValueError: scales that do not rise from above zero; probabilities that are none; of motions
-            and alternatives one without the other.
+        ValueError: scales that do not rise from above zero; probabilities that are none.
     """
     s = np.asarray(scales, float)
     rising = s.ndim == 1 and len(s) > 0 and s[0] > 0.0 and bool(np.all(np.diff(s) > 0.0))
     require(rising, "scales of adaptive must rise, from above zero", scales)
-    if (motions is None) != (alternatives is None):
-        raise ValueError("adaptive needs both motions and alternatives, or neither")
     # The quiet mode, then each louder scale of each part.
     louder = np.tile(s[1:], len(parts))
     own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
@@ -138,18 +126,8 @@ def adaptive(
     gains[1:] = np.where(own > 0.0, louder[:, None], gains[1:])
     by = taylor() if linearise is None else linearise
 
-    def one(row: Any) -> Filter | Mode:
-        gain, *other = row
-        made = kalman(by, (excited(parts, gain), huber(robust)), form)
-        return made if motions is None else Mode(made, motions(other[0]))
+    def one(gain: Any) -> Filter:
+        return kalman(by, (excited(parts, gain), huber(robust)), form)
 
     change = changes([s[0], *louder], up, back)
-    start, modes = lasting(change), len(change)
-    if motions is None:
-        return imm(Family(one, (gains,)), change, start)
-    (count,) = {np.shape(x)[0] for x in jax.tree_util.tree_leaves(alternatives)}
-    here = np.repeat(np.arange(count), modes)
-    rows = jax.tree_util.tree_map(lambda x: np.asarray(x)[here], alternatives)
-    between = np.full((count, count), OTHER) + np.diag(np.full(count, 1.0 - count * OTHER))
-    numbers = (np.tile(gains, (count, 1)), rows)
-    return imm(Family(one, numbers), np.kron(between, change), np.tile(start, count) / count)
+    return imm(Family(one, gains), change, lasting(change))

@@ -15,7 +15,7 @@ SYSTEM = System(
         "velocity-attitude": velocity_attitude.STUDY,
         "product": product.STUDY,
     },
-    default="product-adaptive",
+    default="adaptive",
     orientation=product.orientation,
     alignment=product.ALIGNMENT,
 )

@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jax.tree_util import Partial
+from jaxtyping import ArrayLike
 
 from robins import _float64, units  # noqa: F401
 from robins.earth import earth_rate_n, transport_rate_n
@@ -129,12 +130,16 @@ class LinearSystem(NamedTuple):
         sensor needs: see `inputs`.
         """
         G = jnp.asarray(self.G)
-        sensor = Sensor(_read, jnp.full(3, float(sigma)), 3, ATTITUDE, linear=_seen)
-        return Model(Motion(_move, G, linear=Partial(_moved, G)), (sensor,))
+        return Model(Motion(_move, G, linear=Partial(_moved, G)), (reading(float(sigma)),))
 
     def inputs(self) -> tuple[Any, dict[str, Any]]:
         """``u`` and ``aux`` of a run."""
         return jnp.asarray(self.F), {ATTITUDE: jnp.asarray(self.H)}
+
+
+def reading(sigma: ArrayLike) -> Sensor:
+    """The matched attitude, with white noise of this size on each axis."""
+    return Sensor(_read, jnp.full(3, sigma), 3, ATTITUDE, linear=_seen)
 
 
 def _move(x, F):

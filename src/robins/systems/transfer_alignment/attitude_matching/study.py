@@ -26,6 +26,7 @@ from robins.systems.judgement import Claim, Metrics, graded, ratio, rms_by_axis
 from robins.systems.parts import ENU, RFU
 from robins.systems.study import Case, Contender, Limit, SensorAxes, StateBlock, Study, View
 from robins.systems.transfer_alignment.attitude_matching import model as am
+from robins.systems.transfer_alignment.attitude_matching import structures
 from robins.systems.transfer_alignment.attitude_matching.parameters import AttitudeMatching
 from robins.systems.transfer_alignment.attitude_matching.world import (
     Course,
@@ -61,7 +62,7 @@ IN_UNIT = {
     "hinf-deg-inf": InUnit("deg", bounded=False),
     "hinf-arcmin": InUnit("arcmin"),
 }
-FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted")
+FILTERS = (*TOLD, *IN_UNIT, "hinf-weighted", "adaptive")
 
 
 def central_filter() -> Filter:
@@ -90,6 +91,10 @@ def contender(given: AttitudeMatching, course: Course, name: str) -> Contender:
             flexure.damping,
         )
         return _contender(kalman(), am.linear_system(given, updates, believed), sigma)
+    if name == "adaptive":
+        system = am.linear_system(given, updates, structures.START)
+        filter_ = structures.blind(system, given.master.attitude_noise, given.period)
+        return _contender(filter_, system, sigma)
     system = am.linear_system(given, updates)
     if name in TOLD:
         return _contender(kalman(), system, sigma)

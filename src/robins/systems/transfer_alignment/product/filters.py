@@ -1,6 +1,6 @@
 """The filters of the product model; one of them has no information on the disturbance.
 
-That one, "product-adaptive", is a bank of hypotheses. A single innovation does not say whether the
+That one, "adaptive", is a bank of hypotheses. A single innovation does not say whether the
 record or the gyros are disturbed. The following innovations do, and so does the velocity, which
 neither flexure nor gyro noise affects directly. So several filters of the same 24 states run side
 by side, each with a hypothesis of its own, as an interacting multiple model
@@ -16,10 +16,6 @@ Each weighs outliers by Huber's rule. A structure is stiff or flexes for good, s
 between the two halves but one part in 10^5. The numbers are the same in every scenario, but not
 blind: 20 is the factor of scenario C, and the strength of a kick and the probabilities were chosen
 on runs like those of scenarios B, C and D. How it does elsewhere is not shown by these.
-
-"adaptive" is blind: the bank of every system (`robins.filters.composite.adaptive`) over the scale
-of the process noise, for a structure that is stiff or flexes within a tenth of a second, a second
-or ten. Nothing in it was chosen for a scenario, nor is it told what flexure a scenario believes in.
 """
 
 from __future__ import annotations
@@ -32,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from robins.filters import Family, Filter, Motion, adaptive, imm, kalman, taylor, unscented
+from robins.filters import Family, Filter, imm, kalman, taylor, unscented
 from robins.filters.linearise import Transition
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
@@ -118,64 +114,34 @@ def seven() -> Filter:
     return imm(Family(one, numbers), changes(), start)
 
 
-# ------------------------------------------------------------------------------------------ blind
-
-Moving = Callable[[Flexure], Motion]  # the product model's motion of a structure
-
-_TEN_ARCMIN = math.radians(10.0 / 60.0)
-_DECADES_S = (0.1, 1.0, 10.0)
-# sigma [rad] and time [s] of the structures that may be there, the first a stiff one
-STRUCTURES = (
-    _TEN_ARCMIN * np.array([_STIFF, 1.0, 1.0, 1.0]),
-    np.array([_DECADES_S[0], *_DECADES_S]),
-)
-GYROS, ACCELEROMETERS = range(0, 3), range(3, 9)  # what each of them drives
-
-
-def blind(moving: Moving) -> Filter:
-    """The bank over the scale of the process noise, for each of `STRUCTURES`."""
-
-    def motion(row: tuple[ArrayLike, ArrayLike]) -> Motion:
-        sigma, time = (jnp.broadcast_to(jnp.asarray(x), 3) for x in row)
-        return moving(Flexure(sigma, time))
-
-    units = (GYROS, ACCELEROMETERS)
-    return adaptive(parts=units, motions=motion, alternatives=STRUCTURES, form="joseph")
-
-
 # ----------------------------------------------------------------------------------- by name
 
 
 OUTLIERS = 0.999  # share of right records that keep their weight in the other filters
 # What a structure may do of which nothing is known. Too short a time is safe, too long is not.
+_TEN_ARCMIN = math.radians(10.0 / 60.0)
 UNKNOWN = Structure(sigma=(_TEN_ARCMIN, _TEN_ARCMIN, _TEN_ARCMIN), time=(3.0, 3.0, 3.0))
-# How uncertain the states of a structure are at the start, where its time may be any decade.
-ANY = Structure(sigma=UNKNOWN.sigma, time=(1.0, 1.0, 1.0))
 
 
 class Variant(NamedTuple):
     """How a filter of a name is made, and when the model it runs on has flexure states."""
 
-    flexes: Literal["never", "believed", "always", "somehow"]
-    make: Callable[[Moving], Filter]
+    flexes: Literal["never", "believed", "always"]
+    make: Callable[[], Filter]
 
     def flexure(self, believed: Structure | None) -> Flexure | None:
         """What the flexure states of the filter stand for; None where it has none."""
-        if self.flexes == "somehow":
-            return ANY.flexure
         structure = UNKNOWN if believed is None and self.flexes == "always" else believed
         return None if structure is None or self.flexes == "never" else structure.flexure
 
 
 VARIANTS = {
-    "kf": Variant("never", lambda moving: kalman(taylor())),
-    "product": Variant("believed", lambda moving: kalman(taylor(), (huber(OUTLIERS),))),
-    "product-joseph": Variant(
-        "believed", lambda moving: kalman(taylor(), (huber(OUTLIERS),), "joseph")
-    ),
-    "product-flexure": Variant("always", lambda moving: kalman(taylor(), (huber(OUTLIERS),))),
-    "product-ukf": Variant("believed", lambda moving: kalman(unscented(), (huber(OUTLIERS),))),
-    "product-adaptive": Variant("always", lambda moving: seven()),
-    "adaptive": Variant("somehow", blind),
+    "kf": Variant("never", lambda: kalman(taylor())),
+    "product": Variant("believed", lambda: kalman(taylor(), (huber(OUTLIERS),))),
+    "product-joseph": Variant("believed", lambda: kalman(taylor(), (huber(OUTLIERS),), "joseph")),
+    "product-flexure": Variant("always", lambda: kalman(taylor(), (huber(OUTLIERS),))),
+    "product-ukf": Variant("believed", lambda: kalman(unscented(), (huber(OUTLIERS),))),
+    "adaptive": Variant("always", seven),
+    "product-adaptive": Variant("always", seven),  # its name in earlier versions
 }
 FILTERS = tuple(VARIANTS)

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from robins import units
 from robins.errors import require_known
-from robins.filters import Belief, Model, Motion
+from robins.filters import Belief, Model
 from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
 from robins.rotation import Rotation
@@ -175,12 +175,8 @@ def product_contender(
     flexure = VARIANTS[name].flexure(told.flexure)
     model, sigma = model_of(pair, told, flexure), start_sigma(pair, told, flexure)
     start = jnp.asarray(sigma), jnp.asarray(pair.master.delay)
-
-    def moving(structure: Flexure) -> Motion:
-        return model_of(pair, told, structure).motion
-
     return Contender(
-        filter=VARIANTS[name].make(moving),
+        filter=VARIANTS[name].make(),
         model=model,
         case=recipe(_case, tuple(model.dims), numbers=start),
         reported=reported(len(sigma), blocks, frame),

@@ -73,9 +73,9 @@ ADAPTIVE: dict[str, dict[str, Any]] = {
     "adaptive-hinf-compensated": {"weight": ATTITUDE_ROWS, "compensate_first": True},
     "hinf-patent-weights": {"weight": np.ones(va.STATES)},  # L = I, and R = I below
 }
-# Of the product model: closed loop, with states for the mounting. Run by default is the first; the
-# others are banks of seven and of twenty filters.
-PRODUCT = ("product", "product-adaptive", "adaptive")
+# Of the product model: closed loop, with states for the mounting. A scenario has the first by
+# itself; the others, one filter under two names, are the bank of seven that runs beside.
+PRODUCT = ("product", "adaptive", "product-adaptive")
 FILTERS = (*TOLD, *FIXED, *ADAPTIVE, *PRODUCT)
 
 
