@@ -126,9 +126,12 @@ def _turned(u: Any, change: Callable[[Array, Array], Array]) -> Any:
     return u._replace(theta=jnp.where(late, change(u.theta, dt), u.theta))
 
 
+_BIASES = slice(9, 12)  # of the gyros
+
+
 def bias_step(case: Case, base: Contender, dt_s: float) -> Case:
     """Ten sigma of the stated bias of the gyros."""
-    step = 10.0 * jnp.sqrt(jnp.sum(case.start.factor[9:12] ** 2, axis=1))
+    step = 10.0 * jnp.sqrt(jnp.sum(case.start.factor[_BIASES] ** 2, axis=1))
     return case._replace(u=_turned(case.u, lambda theta, dt: theta + step * dt))
 
 
@@ -200,11 +203,13 @@ def _spoilt(trouble: Callable[..., Case], dt_s: float, base: Contender, world: A
 
 
 def spoilt(problem: Problem, trouble: Callable[..., Case]) -> Problem:
-    """The same problem with trouble in what all its filters are given."""
+    """The same problem with trouble in what its filters with states for biases are given."""
     dt_s = float(problem.epoch_s[1] - problem.epoch_s[0])
+    world = jax.eval_shape(problem.simulate, jnp.asarray(0))
     cases = {
         name: c._replace(case=Partial(lambda world, c=c: _spoilt(trouble, dt_s, c, world)))
         for name, c in problem.contenders.items()
+        if jax.eval_shape(c.case, world).start.factor.shape[0] >= _BIASES.stop
     }
     return replace(problem, contenders=cases)
 
