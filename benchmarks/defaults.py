@@ -1,7 +1,7 @@
 """The default filter of every system against the best of those that were told.
 
-    python benchmarks/defaults.py [SYSTEM/SCENARIO ...] [--runs 50] [--seeds 0] [--troubles]
-        [--keep scores.json] [--out table.md]
+    python benchmarks/defaults.py [SYSTEM/SCENARIO ...] [--runs 50] [--seeds 0] [--named]
+        [--troubles] [--keep scores.json] [--out table.md]
 
 Without a name, every simulated scenario. A row says the RMS error of what the scenario is about
 (attitude, or position), over epochs and runs that count, of the default filter over that of the
@@ -223,7 +223,9 @@ def every() -> Iterator[str]:
         yield from (f"{system}/{name}" for name in catalogue.listed(system))
 
 
-def problem_of(where: str, seed: int, changes: tuple[str, ...] = ()) -> Problem:
+def problem_of(
+    where: str, seed: int, changes: tuple[str, ...] = (), scales: tuple[float, ...] = SCALES
+) -> Problem:
     """A scenario with the filters it names, the default and those that are told."""
     system, name = where.split("/")
     found = find_system(system)
@@ -237,7 +239,7 @@ def problem_of(where: str, seed: int, changes: tuple[str, ...] = ()) -> Problem:
     if system not in ("satellite", "gnss"):  # whose filters are told by their names
         aligns = "product" in study.filters and system == "transfer-alignment"
         base = told_structure(given) if aligns else problem.contenders[found.default]
-        more = {f"told, noise times {s:g}": told(base, s) for s in SCALES}
+        more = {f"told, noise times {s:g}": told(base, s) for s in scales}
     return replace(problem, contenders={**problem.contenders, **more})
 
 
@@ -306,6 +308,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=50, help="of each scenario")
     parser.add_argument("--chunk", type=int, default=25, help="runs at a time")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the random numbers")
+    parser.add_argument("--named", action="store_true", help="no scales of the process noise")
     parser.add_argument("--troubles", action="store_true", help="what no scenario has")
     parser.add_argument("--keep", type=Path, help="file of what is found, to go on from")
     parser.add_argument("--out", type=Path, help="file for the table")
@@ -324,7 +327,7 @@ def main() -> None:
 
     for seed in arguments.seeds:
         for where in arguments.scenarios or (TROUBLED if arguments.troubles else every()):
-            problem = problem_of(where, seed)
+            problem = problem_of(where, seed, scales=() if arguments.named else SCALES)
             if not arguments.troubles:
                 say(where, "", problem, seed)
                 continue

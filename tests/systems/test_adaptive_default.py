@@ -16,6 +16,11 @@ from robins.systems.transfer_alignment.attitude_matching.structures import (
     hypotheses,
     supposed,
 )
+from robins.systems.transfer_alignment.product.filters import NOISY, UNKNOWN, VARIANTS
+from robins.systems.transfer_alignment.product.parameters import Product, Structure
+from robins.systems.transfer_alignment.velocity_attitude.study import VelocityAttitude
+
+SCENARIOS = find_system("transfer-alignment").scenarios
 
 STUDIES = {
     "airship": ("navigation",),
@@ -33,12 +38,25 @@ def test_every_simulated_system_has_it(system):
         assert "adaptive" in studies[name].filters
 
 
+def test_alignment_is_told_of_no_structure_and_has_no_number_of_a_scenario():
+    told = Structure(sigma=(1e-3, 1e-3, 1e-3), time=(3.0, 3.0, 3.0))
+    for name, believed in (("adaptive", UNKNOWN), ("product-flexure", told)):
+        found = VARIANTS[name].flexure(told)
+        assert found is not None
+        np.testing.assert_array_equal(found.sigma_rad, believed.sigma)
+        np.testing.assert_array_equal(found.tau_s, believed.time)
+    given = [load(VelocityAttitude, SCENARIOS[name]) for name in "abcde"]
+    given += [load(Product, SCENARIOS[name]) for name in ("aircraft", "ship", "vehicle")]
+    assert not {t for g in given for t in g.flexure.time} & set(UNKNOWN.time)
+    assert NOISY.gyro not in {g.disturbance.gyro_noise_factor for g in given}
+
+
 def test_attitude_matching_supposes_structures_and_no_louder_gyros():
     rows = hypotheses()
     count = len(rows.sigma)
     swings = {(float(s), float(t)) for s, t in zip(rows.sigma, rows.time, strict=True)}
     assert count == 2 * len(swings) == 18  # with flutter and without
-    given = load(AttitudeMatching, find_system("transfer-alignment").scenarios["s1"])
+    given = load(AttitudeMatching, SCENARIOS["s1"])
     system = linear_system(given, 3, START)
     bank = blind(system, given.master.attitude_noise, given.period)
     state = bank.init(system.start(), {ATTITUDE: 3})
@@ -49,7 +67,7 @@ def test_attitude_matching_supposes_structures_and_no_louder_gyros():
 
 def test_each_hypothesis_is_the_kalman_filter_of_its_structure():
     """Against matrices of the linear system that is told that structure."""
-    given = load(AttitudeMatching, find_system("transfer-alignment").scenarios["s0"])
+    given = load(AttitudeMatching, SCENARIOS["s0"])
     noise, T = given.master.attitude_noise, given.period
     told, flutter = Flexure(np.full(3, 2e-3), np.full(3, 4.0)), 3.0
     system, own = linear_system(given, 3, START), linear_system(given, 3, told)
@@ -74,7 +92,7 @@ def test_each_hypothesis_is_the_kalman_filter_of_its_structure():
 
 
 def test_a_stiff_structure_is_forgotten():
-    given = load(AttitudeMatching, find_system("transfer-alignment").scenarios["s1"])
+    given = load(AttitudeMatching, SCENARIOS["s1"])
     system = linear_system(given, 3, START)
     mode = supposed(system, 3e-4, given.period)(Supposed(0.0, 1.0, 0.0))
     state = mode.filter_.init(system.start(), {ATTITUDE: 3})

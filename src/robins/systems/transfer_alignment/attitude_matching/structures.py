@@ -47,7 +47,7 @@ class Supposed(NamedTuple):
 
 
 def hypotheses() -> Supposed:
-    """(14,) of each: every swing with every flutter."""
+    """(18,) of each: every swing with every flutter."""
     swings = [(0.0, 1.0), *((s * _ARCMIN, t) for s in _SIGMAS for t in _TIMES_S)]
     return Supposed(*np.array([(*swing, f) for swing in swings for f in _FLUTTERS]).T)
 

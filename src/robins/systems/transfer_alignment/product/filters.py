@@ -14,8 +14,10 @@ by side, each with a hypothesis of its own, as an interacting multiple model
 
 Each weighs outliers by Huber's rule. A structure is stiff or flexes for good, so nothing is mixed
 between the two halves but one part in 10^5. It is told of no structure, not even of the one that is
-believed: one that is wrong costs more than none. The numbers are the same everywhere, and those of
-no scenario. They were chosen on runs of A to D and on wrong structures, random seed 100.
+believed: one that is wrong costs more than none. The numbers are the same everywhere. The factor of
+the gyros and the structure are no scenario's own; they were chosen on runs of A to D and on wrong
+structures, random seed 100. The strength of a kick and the probabilities are older, and were chosen
+with B to D in view.
 """
 
 from __future__ import annotations
