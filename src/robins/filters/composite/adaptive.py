@@ -18,6 +18,10 @@ lost when the modes are mixed.
 Where several instruments drive the motion, one goes wrong at a time. So a mode scales one part of
 the noise, and the part that is sound still tells the error of the other: a gyro that drifts must
 not make an accelerometer doubtful by which the tilt is known.
+
+Neither more noise nor less weight answers a sensor whose records are off and stay off, or that
+contradicts another because the model between the two is wrong. Where that may be, the sensors are
+named, and each has two modes more (`robins.filters.composite.offsets`).
 """
 
 from __future__ import annotations
@@ -27,10 +31,18 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jax.tree_util import Partial
+from jaxtyping import Array, ArrayLike
 
 from robins.errors import require
 from robins.filters.composite.imm import Family, imm
+from robins.filters.composite.offsets import (
+    Supposed,
+    narrowed,
+    sensors_off,
+    supposing,
+    with_offsets,
+)
 from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.rule import Rule
@@ -55,13 +67,17 @@ def excited(parts: Sequence[Part], scales: ArrayLike) -> Rule:
     """
 
     def process(memory: Any, t: Transition):
-        noise = t.noise
-        for i, part in enumerate(parts):
-            rows = part if isinstance(part, slice) else np.asarray(part, int)
-            noise = noise.at[rows].multiply(jnp.asarray(scales)[i])
-        return memory, t._replace(noise=noise)
+        return memory, t._replace(noise=louder(t.noise, parts, scales))
 
     return Rule(process=process, name="excited")
+
+
+def louder(noise: Array, parts: Sequence[Part], scales: ArrayLike) -> Array:
+    """A factor (n, q) of the process noise, each part of its rows times its scale."""
+    for i, part in enumerate(parts):
+        rows = part if isinstance(part, slice) else np.asarray(part, int)
+        noise = noise.at[rows].multiply(jnp.asarray(scales)[i])
+    return noise
 
 
 def changes(scales: Sequence[float | int], up: float = UP, back: float = BACK) -> np.ndarray:
@@ -98,6 +114,7 @@ def adaptive(
     parts: Sequence[Part] = (ALL,),
     linearise: Linearisation | None = None,
     form: Form = "sqrt",
+    off: Sequence[str] = (),
 ) -> Filter:
     """A bank of Kalman filters over the scale of the process noise, with Huber's rule in each.
 
@@ -112,22 +129,37 @@ def adaptive(
         parts: of the process noise; a mode makes one of them louder.
         linearise: of each mode; by Taylor where not given.
         form: of the update, "sqrt" or "joseph".
+        off: names of sensors whose records may be off for some time, one at a time. It costs a
+            state for each of their components, and two modes for each of them.
 
     Raises:
-        ValueError: scales that do not rise from above zero; probabilities that are none.
+        ValueError: scales that do not rise from above zero; probabilities that are none. When a run
+            begins: the model has no sensor of a name in `off`.
     """
     s = np.asarray(scales, float)
     rising = s.ndim == 1 and len(s) > 0 and s[0] > 0.0 and bool(np.all(np.diff(s) > 0.0))
     require(rising, "scales of adaptive must rise, from above zero", scales)
     # The quiet mode, then each louder scale of each part.
-    louder = np.tile(s[1:], len(parts))
+    more = np.tile(s[1:], len(parts))
     own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
-    gains = s[0] * np.ones((1 + len(louder), len(parts)))
-    gains[1:] = np.where(own > 0.0, louder[:, None], gains[1:])
+    gains = s[0] * np.ones((1 + len(more), len(parts)))
+    gains[1:] = np.where(own > 0.0, more[:, None], gains[1:])
     by = taylor() if linearise is None else linearise
+    change = changes([s[0], *more], up, back)
+    if not off:
 
-    def one(gain: Any) -> Filter:
-        return kalman(by, (excited(parts, gain), huber(robust)), form)
+        def one(gain: Any) -> Filter:
+            return kalman(by, (excited(parts, gain), huber(robust)), form)
 
-    change = changes([s[0], *louder], up, back)
-    return imm(Family(one, gains), change, lasting(change))
+        return imm(Family(one, gains), change, lasting(change))
+
+    weighed, plain = kalman(by, (huber(robust),), form), len(gains)
+
+    def supposes(row: tuple[Any, Supposed]) -> Filter:
+        gain, of = row
+        return supposing(weighed, off, of, Partial(lambda g, N: louder(N, parts, g), gain))
+
+    change = with_offsets(change, len(off))
+    gains = np.vstack([gains, np.repeat(gains[:1], len(change) - plain, axis=0)])
+    rows = gains, sensors_off(plain, len(off))
+    return narrowed(imm(Family(supposes, rows), change, lasting(change)), off)

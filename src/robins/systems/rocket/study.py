@@ -96,9 +96,9 @@ def sensors_of(
     return aboard([i for i in instruments(given) if i.name in names], given, course)
 
 
-def bank() -> Filter:
-    """A bank over the scale of the process noise, with the sigma points of the studies."""
-    return filters.adaptive(linearise=_POINTS)
+def bank(*off: str) -> Filter:
+    """A bank with the sigma points of the studies, in which these sensors may be off."""
+    return filters.adaptive(linearise=_POINTS, off=off)
 
 
 # ------------------------------------------------------------------------------- magnetic attitude
@@ -147,7 +147,9 @@ def angle_filter(given: MagneticAttitude, chosen: AngleFilter) -> Filter:
     if chosen.raw:
         return kalman(filters.taylor())
     if chosen.adapts:
-        return bank()
+        # Of two that read the angles an integrated gyro is off, sooner or later: it only adds up.
+        adds_up = given.gyro_reads == "attitude"
+        return bank(GYRO) if adds_up else bank(GYRO, MAGNETIC)
     if chosen.sharing is None:
         return own(*chosen.sensors)
     channels = [filters.channel((sensor,), own(sensor)) for sensor in chosen.sensors]
@@ -239,7 +241,7 @@ FIELD_FILTERS: dict[str, FieldFilter] = {
     "gate": FieldFilter(ukf(patient())),
     "discriminator": FieldFilter(discriminates="huber"),
     "discriminator-gate": FieldFilter(discriminates="gate"),
-    "adaptive": FieldFilter(bank()),
+    "adaptive": FieldFilter(bank(FIELD), scaled=True),
     "strong-tracking": FieldFilter(ukf(fading())),
     "strong-tracking-projected": FieldFilter(ukf(fading("projected"))),
     "gate-scale-factor": FieldFilter(ukf(patient()), scaled=True),

@@ -1,0 +1,220 @@
+"""Hypotheses of sensors whose records are off for some time: an offset as a state, on and off.
+
+    y = h(x) [+] sigma * b + v,      v ~ N(0, R),  sigma the standard deviations of R
+
+b is a state beside x, counted in the noise of its sensor, so that the same numbers serve every
+sensor. Modes of a bank (`robins.filters.composite.imm`) suppose that
+
+    no sensor is off        b is not read
+    an offset begins        b is read, b ~ N(0, BEGINS^2 I): drawn anew
+    it lasts                b is read, and wanders by N(0, WANDERS^2 I) in a step
+
+and change by
+
+    none is off  -- BEGIN -->  begins  -- at once -->  lasts  -- END -->  none is off
+
+The last two are apart because a mode that is unlikely is mixed anew from the likely ones in every
+step: a single one would begin with an unknown offset again and again, and pay for it each time.
+
+A weight (`robins.filters.rules.huber`) says that a record is bad, and forgets it at once. Where
+records stay away, because a sensor is disturbed for a while or because the model between two
+sensors is wrong, the offset is learnt, and what the records say of changes of x is not lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins import linalg, manifold
+from robins.filters.belief import Belief
+from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.model import Motion, Sensor
+
+BEGINS = 10.0  # sigma of an offset that begins, in standard deviations of the records
+WANDERS = 0.03  # by which it wanders in a step, in the same
+BEGIN, END = 1e-3, 1e-2  # probabilities in a step that an offset begins, and that it ends
+
+
+class Wide(NamedTuple):
+    """A state, and by how much each sensor is off."""
+
+    state: Any
+    offset: tuple[Array, ...]  # (m,) of each sensor, in standard deviations of its noise
+
+
+class Supposed(NamedTuple):
+    """A hypothesis, or with a leading axis those of a bank."""
+
+    off: Any  # (sensors,) one where the records are off, else zero
+    lasts: Any  # (sensors,) one where the offset is the one of the step before, else zero
+
+
+# ------------------------------------------------------------------------------------- the bank
+
+
+def sensors_off(plain: int, sensors: int) -> Supposed:
+    """The hypotheses of a bank: of each sensor two, behind plain ones in which none is off."""
+    none, each = np.zeros((plain, sensors)), np.repeat(np.eye(sensors), 2, axis=0)
+    second = np.tile([0.0, 1.0], sensors)[:, None]
+    return Supposed(np.vstack([none, each]), np.vstack([none, second * each]))
+
+
+def with_offsets(change: np.ndarray, sensors: int) -> np.ndarray:
+    """Probabilities of a change in one step, with those of the hypotheses of `sensors_off`.
+
+    Args:
+        change: (plain, plain) between modes without offsets, the first that in which all is right.
+        sensors: how many may be off, one at a time.
+
+    Returns:
+        (plain + 2 sensors, plain + 2 sensors).
+    """
+    plain, count = len(change), len(change) + 2 * sensors
+    begins = plain + 2 * np.arange(sensors)
+    p = np.zeros((count, count))
+    p[:plain, :plain] = change
+    p[plain:, 0] = END
+    p[:, begins] = BEGIN
+    at = np.arange(count)
+    rest = np.where(np.isin(at, begins), at + 1, at)
+    p[at, rest] = 0.0
+    p[at, rest] = 1.0 - p.sum(axis=1)
+    return p
+
+
+# ----------------------------------------------------------------------------- the model of a mode
+
+
+def _beside(a: Array, b: Array) -> Array:
+    """Block diagonal."""
+    right, left = jnp.zeros((len(a), b.shape[1])), jnp.zeros((len(b), a.shape[1]))
+    return jnp.concatenate(
+        [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
+    )
+
+
+def _components(x: Wide, each: Array) -> Array:
+    """A number of each sensor, for every component of its offset."""
+    return jnp.concatenate([jnp.broadcast_to(each[i], b.shape) for i, b in enumerate(x.offset)])
+
+
+def _kept(x: Wide, of: Supposed) -> tuple[Array, ...]:
+    return tuple(of.lasts[i] * b for i, b in enumerate(x.offset))
+
+
+def _drawn(x: Wide, of: Supposed) -> Array:
+    return jnp.diag(_components(x, jnp.where(of.lasts > 0.0, WANDERS, BEGINS)))
+
+
+Scaled = Partial  # what a mode makes of a factor of the process noise
+
+
+def _step(motion: Motion, of: Supposed, x: Wide, u: Any) -> Wide:
+    return Wide(motion.moved(x.state, u), _kept(x, of))
+
+
+def _noise(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any) -> Array:
+    return _beside(scaled(motion.noise_factor(x.state, u)), _drawn(x, of))
+
+
+def _step_linear(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any):
+    assert motion.linear is not None
+    state, F, noise = motion.linear(x.state, u)
+    F = _beside(F, jnp.diag(_components(x, of.lasts)))
+    noise = _beside(scaled(linalg.as_factor(noise)), _drawn(x, of))
+    return Wide(state, _kept(x, of)), F, noise
+
+
+def _read(sensor: Sensor, x: Wide, aux: Any):
+    return sensor.reading(x.state, aux)
+
+
+def _read_noise(sensor: Sensor, x: Wide, aux: Any):
+    return sensor.noise_factor(x.state, aux)
+
+
+def _read_off(sensor: Sensor, at: int, off: Array, x: Wide, aux: Any):
+    sigma = jnp.sqrt(jnp.sum(sensor.noise_factor(x.state, aux) ** 2, axis=1))
+    return manifold.retract(sensor.reading(x.state, aux), off * sigma * x.offset[at])
+
+
+def _wide_sensor(sensor: Sensor, names: Sequence[str], of: Supposed) -> Sensor:
+    """Of the wide state; a `linear` of its own is not used."""
+    read = Partial(_read, sensor)
+    if sensor.name in names:
+        at = names.index(sensor.name)
+        read = Partial(lambda s, off, x, aux: _read_off(s, at, off, x, aux), sensor, of.off[at])
+    return Sensor(read, Partial(_read_noise, sensor), sensor.dim, sensor.name)
+
+
+def supposing(filter_: Filter, names: Sequence[str], of: Supposed, scaled: Scaled) -> Filter:
+    """A filter of the `Wide` state under a hypothesis, given motion and sensors of the state.
+
+    Args:
+        filter_: of any state, as `kalman` makes it.
+        names: of the sensors that may be off, in the order of the offsets.
+        of: the hypothesis; its numbers may be traced.
+        scaled: what the mode makes of a factor of the process noise; data of a program.
+    """
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        linear = None if motion.linear is None else Partial(_step_linear, motion, of, scaled)
+        noise = Partial(_noise, motion, of, scaled)
+        return filter_.predict(state, Motion(Partial(_step, motion, of), noise, linear), u)
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        return filter_.update(state, _wide_sensor(sensor, names, of), y, aux)
+
+    return filter_._replace(predict=predict, update=update)
+
+
+def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
+    """A filter of the state made of one of the `Wide` state; what it believes of offsets it keeps.
+
+    Args:
+        filter_: of the wide state.
+        names: of the sensors that may be off.
+
+    Raises:
+        ValueError: when a run begins: the model has no sensor of one of these names.
+    """
+
+    def widened(belief: Belief, offset: tuple[Array, ...], factor: Array) -> Belief:
+        return Belief(Wide(belief.mean, offset), _beside(belief.factor, factor))
+
+    def narrow(wide: FilterState) -> FilterState:
+        mean, n = wide.belief.mean.state, manifold.dim(wide.belief.mean.state)
+        # the first rows of a lower triangle are the factor of the first components
+        return FilterState(Belief(mean, wide.belief.factor[:n, :n]), wide, (), wide.current)
+
+    def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
+        if unknown := set(names) - set(dims):
+            raise ValueError(
+                f"off names {sorted(unknown)}, but the sensors of the model are {list(dims)}"
+            )
+        offset = tuple(jnp.zeros(dims[name]) for name in names)
+        factor = BEGINS * jnp.eye(sum(dims[name] for name in names))
+        return narrow(filter_.init(widened(belief, offset, factor), dims))
+
+    def predict(state: FilterState, motion: Motion, u: Any = None):
+        wide, prediction = filter_.predict(state.memory, motion, u)
+        new = narrow(wide)
+        return new, Prediction(None, new.belief, prediction.code)
+
+    def update(state: FilterState, sensor: Sensor, y: Any, aux: Any = None):
+        wide, info = filter_.update(state.memory, sensor, y, aux)
+        new = narrow(wide)
+        return new, info._replace(gain=info.gain[: len(new.belief.factor)])
+
+    def reset(state: FilterState, belief: Belief) -> FilterState:
+        wide = state.memory.belief
+        factor = linalg.tria(wide.factor[len(belief.factor) :])
+        return narrow(filter_.reset(state.memory, widened(belief, wide.mean.offset, factor)))
+
+    return Filter(init, predict, update, reset)
