@@ -87,9 +87,9 @@ def dense(y, scale):
                 K = P[j] @ H.T @ np.linalg.inv(S)
                 m[j], P[j] = m[j] + K @ r, P[j] - K @ H @ P[j]
             mu = mu * likelihood / (mu @ likelihood)
-        mean = sum(p * x for p, x in zip(mu, m, strict=True))
-        parts = [V + np.outer(x - mean, x - mean) for x, V in zip(m, P, strict=True)]
-        V = sum(p * V for p, V in zip(mu, parts, strict=True))
+        mean, V = mu @ np.array(m), np.zeros((3, 3))
+        for p, x, own in zip(mu, m, P, strict=True):
+            V += p * (own + np.outer(x - mean, x - mean))
         out.append((mean[:2], V[:2, :2], mu))
     return [np.array(x) for x in zip(*out, strict=True)]
 
