@@ -1,0 +1,218 @@
+"""From a function of JAX to a program: its jaxpr, walked with arrays of nodes for values.
+
+Each primitive has a rule, in `robins.program.primitives`: arrays of nodes in, arrays of nodes out.
+A rule that only moves data moves nodes, and so leaves no code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core as jex
+
+from robins import _float64  # noqa: F401
+from robins.program.nodes import Graph, Node
+from robins.program.refusal import ProgramError
+
+Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
+
+Rule = Callable[..., Any]  # (walk, equation, *arrays) -> array, or a list of them
+RULES: dict[str, Rule] = {}
+
+
+def rule(*names: str) -> Callable[[Rule], Rule]:
+    """Make a function the rule of some primitives."""
+
+    def register(function: Rule) -> Rule:
+        RULES.update(dict.fromkeys(names, function))
+        return function
+
+    return register
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """An array among the arguments or results: what it is made of, and where in them it lies."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+    kind: str
+    path: str
+
+
+@dataclass(frozen=True)
+class Program:
+    """A function as scalars.
+
+    Attributes:
+        graph: its nodes.
+        inputs: arrays in the order of the function's leaves; ``input`` nodes count their entries,
+            reals by themselves and all other kinds by themselves.
+        outputs: arrays of nodes, and
+        results: what they are.
+        structure: pytrees of the arguments and of the results.
+    """
+
+    graph: Graph
+    inputs: list[Leaf]
+    outputs: list[Nodes]
+    results: list[Leaf]
+    structure: tuple[Any, Any]
+
+    @property
+    def live(self) -> list[Node]:
+        """The nodes that its results need, in the order of computation."""
+        return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
+
+
+def kind_of(dtype: Any, where: str = "") -> str:
+    """The kind of scalar that holds numbers of a type.
+
+    Raises:
+        ProgramError: none does: single precision, complex numbers.
+    """
+    dtype = np.dtype(dtype)
+    known = {"f8": "real", "b1": "flag", "u4": "word", "u8": "word64"}
+    if (found := known.get(f"{dtype.kind}{dtype.itemsize}")) is not None:
+        return found
+    if dtype.kind == "i":
+        return "whole"
+    raise ProgramError(f"numbers of type {dtype} have no place in a program", where, "use float64")
+
+
+def line_of(equation: Any) -> str:
+    """File and line of the user's code that an equation comes from."""
+    from jax._src import source_info_util
+
+    frame = source_info_util.user_frame(equation.source_info.traceback)
+    return f"{frame.file_name}:{frame.start_line}" if frame else ""
+
+
+class Walk:
+    """A walk through jaxprs that writes into one graph."""
+
+    def __init__(self, graph: Graph, unroll: float = np.inf):
+        """Where a loop or a routine would be written out in more scalars than `unroll`, it is not.
+
+        What stays together then is a loop of C, or a call of a routine.
+        """
+        self.graph, self.unroll = graph, unroll
+
+    def constants(self, value: Any) -> Nodes:
+        """Nodes of known numbers."""
+        array = np.asarray(value)
+        kind = kind_of(array.dtype)
+        return self.each(lambda x: self.graph.constant(x, kind), array)
+
+    def each(self, function: Callable[..., Node], *arrays: np.ndarray) -> Nodes:
+        """A function of nodes on all entries of arrays of one shape."""
+        if len({a.shape for a in arrays}) > 1:
+            arrays = tuple(np.broadcast_arrays(*arrays))
+        flat = [a.ravel().tolist() for a in arrays]
+        made = [function(*entries) for entries in zip(*flat, strict=True)]
+        return np.array(made, dtype=np.int64).reshape(arrays[0].shape)
+
+    def apply(self, op: str, *arrays: Nodes) -> Nodes:
+        """An operation on all entries."""
+        return self.each(lambda *nodes: self.graph.apply(op, *nodes), *arrays)
+
+    def select(self, condition: Nodes, new: Nodes, old: Nodes) -> Nodes:
+        """``new`` where a condition holds, else ``old``."""
+        return self.each(self.graph.select, condition, new, old)
+
+    def known(self, nodes: Nodes) -> np.ndarray | None:
+        """The numbers of an array, if all are known."""
+        values = [self.graph.known(n) for n in nodes.ravel().tolist()]
+        if any(v is None for v in values):
+            return None
+        return np.array(values).reshape(nodes.shape)
+
+    def closed(self, jaxpr: Any, *args: Nodes) -> list[Nodes]:
+        """What a closed jaxpr makes of arrays of nodes."""
+        return self.open(jaxpr.jaxpr, [self.constants(c) for c in jaxpr.consts], args)
+
+    def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
+        """What a jaxpr makes of arrays of nodes."""
+        values: dict[Any, Nodes] = {}
+        values.update(zip(jaxpr.constvars, consts, strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+
+        def read(v: Any) -> Nodes:
+            return self.constants(v.val) if isinstance(v, jex.Literal) else values[v]
+
+        for equation in jaxpr.eqns:
+            found = self.equation(equation, *map(read, equation.invars))
+            values.update(zip(equation.outvars, found, strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def equation(self, equation: Any, *args: Nodes) -> list[Nodes]:
+        """What an equation makes of arrays of nodes.
+
+        Raises:
+            ProgramError: there is no rule for it, or not for this use of it.
+        """
+        name = equation.primitive.name
+        if name not in RULES:
+            raise ProgramError(
+                f"'{name}' has no place in a program of scalars",
+                line_of(equation),
+                "write it with other operations, or run this filter by JAX",
+            )
+        try:
+            found = RULES[name](self, equation, *args)
+        except ProgramError as error:
+            if error.where:
+                raise
+            raise ProgramError(error.what, line_of(equation), error.fix) from None
+        return list(found) if isinstance(found, (list, tuple)) else [found]
+
+    def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
+        """What a function of JAX makes of arrays of nodes, which stand for arrays `like` these."""
+        return self.closed(jax.make_jaxpr(function)(*like), *args)
+
+
+def _leaves(tree: Any, root: str) -> list[Leaf]:
+    """The arrays of a pytree of shapes."""
+    found = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        where = root + jax.tree_util.keystr(path)
+        found.append(Leaf(leaf.shape, leaf.dtype, kind_of(leaf.dtype, where), where))
+    return found
+
+
+def trace(function: Callable[..., Any], *args: Any, unroll: float = np.inf) -> Program:
+    """A pure function of JAX as a program of scalars.
+
+    Args:
+        function: of pytrees of arrays; nothing else of it is looked at than its jaxpr.
+        args: arguments of the shapes and types that the program will be given; their values do not
+            matter. What the function holds otherwise is known, and folded.
+        unroll: the number of scalar operations up to which a loop or a factorisation is written
+            out; above it is a loop or a call.
+
+    Raises:
+        ProgramError: it does something that has no place in a program; the message names the line.
+    """
+    import robins.program.primitives  # noqa: F401
+
+    given = jax.tree_util.tree_map(lambda x: jax.typeof(jax.numpy.asarray(x)), args)
+    given = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), given)
+    jaxpr, results = jax.make_jaxpr(function, return_shape=True)(*given)
+    graph = Graph()
+    walk = Walk(graph, unroll)
+    counted = {"real": 0, "other": 0}
+    nodes = []
+    inputs = _leaves(given, "arguments")
+    for leaf in inputs:
+        pool = "real" if leaf.kind == "real" else "other"
+        size = int(np.prod(leaf.shape))
+        ids = [graph.input(counted[pool] + k, leaf.kind) for k in range(size)]
+        counted[pool] += size
+        nodes.append(np.array(ids, dtype=np.int64).reshape(leaf.shape))
+    outputs = walk.closed(jaxpr, *nodes)
+    structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
+    return Program(graph, inputs, outputs, _leaves(results, "results"), structures)
