@@ -158,13 +158,13 @@ class _Writer:
                 k, row = graph.value[node]
                 return f"l{loop.scope}_{k}" if row is None else f"k{loop.scope}_{k}[{row}]"
         text = self.names[node]
-        infix = bare and node in self.inlined and graph.op[node] in INFIX
+        infix = bare and node in self.inlined and self._infix(node)
         return f"({text})" if infix else text
 
     def _expression(self, node: Node) -> str:
         graph, op, args = self.graph, self.graph.op[node], self.graph.args[node]
         kind = graph.kind[args[0]]
-        if (sign := self._infix(node)) is not None:
+        if sign := self._infix(node):
             parts = [self._read(a, bare=True) for a in args]
             return f"{sign}{parts[0]}" if len(parts) == 1 else f" {sign} ".join(parts)
         if op == "pick":
@@ -179,11 +179,12 @@ class _Writer:
         }.get(op, f"{kind}_{op}")
         return f"{name}({', '.join(map(self._read, args))})"
 
-    def _infix(self, node: Node) -> str | None:
-        op, kind = self.graph.op[node], self.graph.kind[node]
-        if op == "div" and kind == "real":
-            return "/"
-        return INFIX.get(op)
+    def _infix(self, node: Node) -> str:
+        """The operator of a node, if it is one in C for numbers of its kind."""
+        op = self.graph.op[node]
+        if op == "div":
+            return "/" if self.graph.kind[node] == "real" else ""
+        return OPERATIONS[op].infix if op in OPERATIONS else ""
 
     # -------------------------------------------------------------------- arrays, blocks, loops
 
@@ -247,10 +248,6 @@ class _Writer:
                 text = f"{kind}_select({self._read(loop.condition)}, {text}, l{s}_{k})"
             self.lines.append(f"{inner}l{s}_{k} = {text};")
         self.lines.append(f"{pad}}}")
-
-
-INFIX = {name: row.infix for name, row in OPERATIONS.items() if row.infix} | {"div": "/"}
-INFIX_KINDS = {"div": ("real",)}
 
 
 def literal(value: object, kind: str, bare: bool = False) -> str:

@@ -155,7 +155,7 @@ def _laid_out(leaves: list[Leaf]) -> tuple[np.ndarray, np.ndarray, list[np.ndarr
 def native(
     function: Callable[..., Any],
     *args: Any,
-    unroll: float = np.inf,
+    unroll: int | None = None,
     flags: tuple[str, ...] = FLAGS,
 ) -> Native:
     """Trace a function with arguments, compile its program, and give it back as a function.

@@ -95,12 +95,12 @@ def line_of(equation: Any) -> str:
 class Walk:
     """A walk through jaxprs that writes into one graph."""
 
-    def __init__(self, graph: Graph, unroll: float = np.inf):
-        """Where a loop or a routine would be written out in more scalars than `unroll`, it is not.
-
-        What stays together then is a loop of C, or a call of a routine.
-        """
+    def __init__(self, graph: Graph, unroll: int | None = None):
         self.graph, self.unroll = graph, unroll
+
+    def stays_whole(self, size: int) -> bool:
+        """Whether what is so many scalar operations is not written out, but a loop or a call."""
+        return self.unroll is not None and size > self.unroll
 
     def constants(self, value: Any) -> Nodes:
         """Nodes of known numbers."""
@@ -184,7 +184,7 @@ def _leaves(tree: Any, root: str) -> list[Leaf]:
     return found
 
 
-def trace(function: Callable[..., Any], *args: Any, unroll: float = np.inf) -> Program:
+def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -> Program:
     """A pure function of JAX as a program of scalars.
 
     Args:
@@ -192,7 +192,8 @@ def trace(function: Callable[..., Any], *args: Any, unroll: float = np.inf) -> P
         args: arguments of the shapes and types that the program will be given; their values do not
             matter. What the function holds otherwise is known, and folded.
         unroll: the number of scalar operations up to which a loop or a factorisation is written
-            out; above it is a loop or a call.
+            out; above, it is a loop or a call. None writes out everything that ends when it is
+            known to end.
 
     Raises:
         ProgramError: it does something that has no place in a program; the message names the line.

@@ -67,7 +67,7 @@ def _product(walk: Walk, A: Nodes, B: Nodes) -> Nodes:
     zero = [n for n in {*A.ravel().tolist(), *B.ravel().tolist()} if walk.graph._is(n, 0)]
     dense = (~np.isin(A, zero)).astype(int) @ (~np.isin(B, zero)).astype(int).T
     real = A.size and walk.graph.kind[int(A.flat[0])] == "real"
-    if real and min(m, n) > 1 and 2 * dense.sum() > walk.unroll:
+    if real and min(m, n) > 1 and walk.stays_whole(2 * int(dense.sum())):
         return call(walk, "product", [m, depth, n], [A, B], [(m, n)])[0]
     rows = [[dot(walk, x, y) for y in B.tolist()] for x in A.tolist()]
     return np.array(rows, dtype=np.int64).reshape(m, n)
@@ -81,7 +81,7 @@ def _cholesky(walk: Walk, equation: Any, P: Nodes) -> list[Nodes]:
 def _cholesky_of(walk: Walk, P: Nodes) -> tuple[Nodes]:
     """Lower factor by rows; all NaN where a pivot is not positive, as LAPACK's caller says it."""
     n, apply = len(P), walk.graph.apply
-    if n**3 / 3 > walk.unroll:
+    if walk.stays_whole(n**3 // 3):
         return tuple(call(walk, "cholesky", [n], [P], [(n, n)]))
     L = np.full((n, n), walk.graph.constant(0, "real"))
     positive = walk.graph.constant(True, "flag")
@@ -123,7 +123,7 @@ def _solve_lower(walk: Walk, A: Nodes, B: Nodes, unit: bool) -> Nodes:
     apply, n = walk.graph.apply, len(A)
     if unit:
         A = np.where(np.eye(n, dtype=bool), walk.graph.constant(1, "real"), A)
-    if n * n * B.shape[1] > walk.unroll:
+    if walk.stays_whole(n * n * B.shape[1]):
         return call(walk, "solve_lower", [n, B.shape[1]], [A, B], [B.shape])[0]
     X = B.copy()
     for j in range(B.shape[1]):
@@ -159,7 +159,7 @@ def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes,
     m, n = A.shape
     zero, one = constant(0, "real"), constant(1, "real")
     width = m if full else min(m, n)
-    if 2 * m * n * n > walk.unroll:
+    if walk.stays_whole(2 * m * n * n):
         Q, R = call(walk, "householder", [m, n, width], [A], [(m, width), (width, n)])
         return Q, R
     R = A.copy()

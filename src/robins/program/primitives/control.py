@@ -85,12 +85,12 @@ def _scan(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
     consts, carry = args[: p["num_consts"]], list(args[p["num_consts"] :][: p["num_carry"]])
     rows = args[p["num_consts"] + p["num_carry"] :]
     length, body = p["length"], p["jaxpr"]
-    if length > 1 and length * size_of(body.jaxpr) > walk.unroll:
+    if length > 1 and walk.stays_whole(length * size_of(body.jaxpr)):
         return _rolled_scan(walk, equation, consts, carry, rows)
     kept: list[list[Nodes]] = []
     order = range(length)
     for k in reversed(order) if p["reverse"] else order:
-        found = walk.closed(body, *consts, *carry, *(row[k] for row in rows))
+        found = walk.closed(body, *consts, *carry, *(np.asarray(row[k]) for row in rows))
         carry = found[: p["num_carry"]]
         kept.append(found[p["num_carry"] :])
     if p["reverse"]:
@@ -114,7 +114,7 @@ def _rolled_scan(
 
     def row(a: Nodes) -> Nodes:
         columns = a[::-1] if p["reverse"] else a
-        return walk.each(lambda *nodes: graph.pick(nodes, index), *columns)
+        return walk.each(lambda *nodes: graph.pick(nodes, index), *map(np.asarray, columns))
 
     now = _shaped(loop.leaves, carry)
     found = walk.closed(p["jaxpr"], *consts, *now, *map(row, rows))
@@ -137,15 +137,15 @@ def _while(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
     cond_consts = args[: p["cond_nconsts"]]
     body_consts = args[p["cond_nconsts"] :][: p["body_nconsts"]]
     begin = list(args[p["cond_nconsts"] + p["body_nconsts"] :])
-    budget, carry = walk.unroll, begin
+    written, carry = 0, begin
     for _ in range(LONGEST):
         going = graph.known(walk.closed(p["cond_jaxpr"], *cond_consts, *carry)[0].item())
-        if going is None or budget < 0:
+        if going is None or walk.stays_whole(written):
             break
         if not going:
             return carry
         carry = walk.closed(p["body_jaxpr"], *body_consts, *carry)
-        budget -= size_of(p["body_jaxpr"].jaxpr)
+        written += size_of(p["body_jaxpr"].jaxpr)
     loop = graph.open(_flat(begin), None)
     now = _shaped(loop.leaves, begin)
     loop.condition = walk.closed(p["cond_jaxpr"], *cond_consts, *now)[0].item()

@@ -57,9 +57,9 @@ def _cumulated(op: str):
     def of(walk: Walk, equation: Any, a: Nodes) -> Nodes:
         axis, back = equation.params["axis"], equation.params["reverse"]
         rows = np.moveaxis(np.flip(a, axis) if back else a, axis, 0)
-        out = list(rows[:1])
-        for row in rows[1:]:
-            out.append(walk.apply(op, out[-1], row))
+        out = [np.asarray(row) for row in rows]
+        for k in range(1, len(out)):
+            out[k] = walk.apply(op, out[k - 1], out[k])
         found = np.moveaxis(np.stack(out), 0, axis) if out else a
         return np.flip(found, axis) if back else found
 
@@ -97,7 +97,7 @@ def _sort(walk: Walk, equation: Any, *arrays: Nodes) -> list[Nodes]:
     """Stable, by exchanges of neighbours: n (n - 1) / 2 comparisons, none of them a branch."""
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
     graph = walk.graph
-    rows = [list(np.moveaxis(a, axis, 0)) for a in arrays]
+    rows = [[np.asarray(row) for row in np.moveaxis(a, axis, 0)] for a in arrays]
 
     def less(p: int, q: int) -> Nodes:
         """Whether row p comes before row q."""
