@@ -19,7 +19,7 @@ SPD = SQUARE @ SQUARE.T + np.eye(5)
 V, W = RNG.normal(size=6), RNG.normal(size=6)
 POSITIVE = np.abs(V) + 0.1
 ODD = np.array([0.0, -0.0, 1.5, -2.5, np.inf, -np.inf, np.nan, 1e300, 2.5, 0.5])
-I, J = np.array([7, -7, 0, 3, -1]), np.array([2, 2, 5, -2, 0])
+COUNTS, OTHERS = np.array([7, -7, 0, 3, -1]), np.array([2, 2, 5, -2, 0])
 U = np.array([1, 2**31, 4_000_000_000, 7], dtype=np.uint32)
 AT = jnp.asarray(2)
 
@@ -57,57 +57,110 @@ EXACT = {
     "clamp": (lambda a: lax.clamp(-0.5, a, 0.5), ODD),
     "whole": (
         lambda i, j: (i + j, i * j, lax.div(i, j), lax.rem(i, j), jnp.sign(i), abs(i), i // 3),
-        I,
-        J,
+        COUNTS,
+        OTHERS,
     ),
-    "whole, compared": (lambda i, j: (i < j, jnp.maximum(i, j), i == j, i & j, i | j, i ^ j), I, J),
+    "whole, compared": (
+        lambda i, j: (i < j, jnp.maximum(i, j), i == j, i & j, i | j, i ^ j),
+        COUNTS,
+        OTHERS,
+    ),
     "words": (
         lambda u: (u + u, u * u, u << 3, u >> 5, ~u, u ^ U[::-1], u.astype(jnp.uint64) << 20),
         U,
     ),
     "flags": (lambda a, b: (a & b, a | b, a ^ b, ~a), V > 0, W > 0),
-    "select": (lambda c, a, b: (jnp.where(c, a, b), jnp.where(c, 0.0, b), jnp.where(c, c, ~c)), V > 0, V, W),
-    "select among five": (lambda i, a: lax.select_n(i, *(a + k for k in range(5))), np.array([4, 0, 2, 1, 3, 3], np.int32), V),
+    "select": (
+        lambda c, a, b: (jnp.where(c, a, b), jnp.where(c, 0.0, b), jnp.where(c, c, ~c)),
+        V > 0,
+        V,
+        W,
+    ),
+    "select among five": (
+        lambda i, a: lax.select_n(i, *(a + k for k in range(5))),
+        np.array([4, 0, 2, 1, 3, 3], np.int32),
+        V,
+    ),
     "converted": (
-        lambda a, i, c: (a.astype(int), i.astype(float), c.astype(float), i.astype(bool), c.astype(int), a.astype(bool)),
+        lambda a, i, c: (
+            a.astype(int),
+            i.astype(float),
+            c.astype(float),
+            i.astype(bool),
+            c.astype(int),
+            a.astype(bool),
+        ),
         V * 10,
-        I,
+        COUNTS,
         V > 0,
     ),
     "bits": (
-        lambda a, u: (lax.bitcast_convert_type(a, jnp.uint64), lax.bitcast_convert_type(u, jnp.float64)),
+        lambda a, u: (
+            lax.bitcast_convert_type(a, jnp.uint64),
+            lax.bitcast_convert_type(u, jnp.float64),
+        ),
         V,
         np.array([4607182418800017408, 5], dtype=np.uint64),
     ),
     "next": (lambda a: jnp.nextafter(a, jnp.inf), V),
     "moved": (
         lambda a, w: (
-            a.T, a.reshape(2, 6), a[1:, ::2], a[::-1], a[0], a[None], jnp.tile(a, (2, 3)),
-            jnp.concatenate([a, a + 1], axis=1), jnp.stack([a, -a], axis=1), jnp.split(w, 7, axis=1),
-            jnp.broadcast_to(a, (2, 3, 4)), jnp.moveaxis(w, 0, 2), jnp.arange(5), jnp.eye(3, 4, 1),
-            lax.pad(a, 9.0, ((1, 2, 1), (-1, 2, 0))), lax.broadcasted_iota(float, (2, 3), 1),
+            a.T,
+            a.reshape(2, 6),
+            a[1:, ::2],
+            a[::-1],
+            a[0],
+            a[None],
+            jnp.tile(a, (2, 3)),
+            jnp.concatenate([a, a + 1], axis=1),
+            jnp.stack([a, -a], axis=1),
+            jnp.split(w, 7, axis=1),
+            jnp.broadcast_to(a, (2, 3, 4)),
+            jnp.moveaxis(w, 0, 2),
+            jnp.arange(5),
+            jnp.eye(3, 4, 1),
+            lax.pad(a, 9.0, ((1, 2, 1), (-1, 2, 0))),
+            lax.broadcasted_iota(float, (2, 3), 1),
             lax.expand_dims(a, (1,)),
         ),
         A,
         WIDE,
     ),
     "indexed": (
-        lambda a, i: (a[i], a[:, i], a[i, 1:], a.at[i].set(0.0), a.at[i, 1].add(1.0), lax.dynamic_slice(a, (i, i), (2, 2))),
+        lambda a, i: (
+            a[i],
+            a[:, i],
+            a[i, 1:],
+            a.at[i].set(0.0),
+            a.at[i, 1].add(1.0),
+            lax.dynamic_slice(a, (i, i), (2, 2)),
+        ),
         A,
         AT,
     ),
     "indexed beyond": (
         lambda a, i: (
-            a[i], a.at[i].get(mode="fill"), a.at[i].get(mode="clip"), a.at[i].set(5.0),
-            lax.dynamic_slice(a, (i, 0), (2, 2)), lax.dynamic_update_slice(a, a[:2, :2], (i, 1)),
+            a[i],
+            a.at[i].get(mode="fill"),
+            a.at[i].get(mode="clip"),
+            a.at[i].set(5.0),
+            lax.dynamic_slice(a, (i, 0), (2, 2)),
+            lax.dynamic_update_slice(a, a[:2, :2], (i, 1)),
         ),
         A,
         jnp.asarray(-5),
     ),
     "indexed by many": (
         lambda a, k: (
-            a[k], a[:, k], a[k, k + 1], a.at[k].add(1.0), a.at[k, k].mul(2.0), a.at[:, k].set(0.0),
-            a.at[k].min(0.1), a.at[k].max(0.1), jnp.take_along_axis(a, k[None], axis=1),
+            a[k],
+            a[:, k],
+            a[k, k + 1],
+            a.at[k].add(1.0),
+            a.at[k, k].mul(2.0),
+            a.at[:, k].set(0.0),
+            a.at[k].min(0.1),
+            a.at[k].max(0.1),
+            jnp.take_along_axis(a, k[None], axis=1),
         ),
         A,
         np.array([2, 0, 0]),
@@ -118,17 +171,33 @@ EXACT = {
         np.array([3, 6]),
     ),
     "indexed by numbers that are known": (
-        lambda a: (a[np.array([2, 0])], a[:, [3, 1]], a.at[np.array([1, 2])].set(a[:2]), a.at[:, 2].add(1.0)),
+        lambda a: (
+            a[np.array([2, 0])],
+            a[:, [3, 1]],
+            a.at[np.array([1, 2])].set(a[:2]),
+            a.at[:, 2].add(1.0),
+        ),
         A,
     ),
     "extremes": (
-        lambda a: (a.max(), a.min(axis=0), jnp.argmax(a, axis=1), jnp.argmin(a), jnp.any(a > 0), jnp.all(a > 0, axis=0)),
+        lambda a: (
+            a.max(),
+            a.min(axis=0),
+            jnp.argmax(a, axis=1),
+            jnp.argmin(a),
+            jnp.any(a > 0),
+            jnp.all(a > 0, axis=0),
+        ),
         A,
     ),
     "extremes with NaN": (lambda a: (jnp.argmax(a), jnp.argmin(a), a.max(), a.min()), ODD),
     "parity": (lambda a: lax.reduce_xor(a, (0,)), V > 0),
     "cumulated extremes": (lambda a: (lax.cummax(a), lax.cummin(a, reverse=True)), V),
-    "sorted": (lambda a, i: (jnp.sort(a), jnp.argsort(i), lax.sort((i, a[:5]), num_keys=2)), ODD[2:], I),
+    "sorted": (
+        lambda a, i: (jnp.sort(a), jnp.argsort(i), lax.sort((i, a[:5]), num_keys=2)),
+        ODD[2:],
+        COUNTS,
+    ),
     "sorted rows": (lambda a: (jnp.sort(a, axis=0), jnp.argsort(-a, axis=1)), A),
     "branches": (
         lambda c, i, a: (
@@ -141,16 +210,25 @@ EXACT = {
     ),
     "calls": (
         lambda a: (
-            jax.jit(lambda x: x + 1.0)(a), jax.checkpoint(lambda x: x * 2.0)(a), jax.nn.relu(a),
-            lax.stop_gradient(a), lax.optimization_barrier(a), lax.reduce_precision(a, 11, 52),
+            jax.jit(lambda x: x + 1.0)(a),
+            jax.checkpoint(lambda x: x * 2.0)(a),
+            jax.nn.relu(a),
+            lax.stop_gradient(a),
+            lax.optimization_barrier(a),
+            lax.reduce_precision(a, 11, 52),
             lax.platform_dependent(a, cpu=lambda x: x + 5.0, default=lambda x: x),
         ),
         V,
     ),
     "a batched rule of its own": (jax.jit(a_batch_of_its_own), A),
-    "counted loop": (lambda a: lax.fori_loop(0, 5, lambda k, x: x.at[k].set(x[k] + x[k - 1]), a), V),
+    "counted loop": (
+        lambda a: lax.fori_loop(0, 5, lambda k, x: x.at[k].set(x[k] + x[k - 1]), a),
+        V,
+    ),
     "loop that ends by numbers": (
-        lambda a: lax.while_loop(lambda s: s[0] < 10.0, lambda s: (s[0] * 2.0, s[2], s[1]), (a, 1, 2)),
+        lambda a: lax.while_loop(
+            lambda s: s[0] < 10.0, lambda s: (s[0] * 2.0, s[2], s[1]), (a, 1, 2)
+        ),
         1.3,
     ),
     "scan": (
@@ -167,7 +245,7 @@ EXACT = {
         ),
         WIDE[0],
     ),
-}  # fmt: skip
+}
 ROUNDED = {
     "trigonometry": (
         lambda a: (jnp.sin(a), jnp.cos(a), jnp.tan(a), jnp.arctan(a), jnp.arctan2(a, a[::-1])),
@@ -184,11 +262,20 @@ ROUNDED = {
         lambda a: (lax.erf(a), lax.erfc(a), lax.lgamma(a), lax.logistic(a), jnp.cbrt(a)),
         POSITIVE,
     ),
-    "sums of many": (lambda a: (a.sum(), a.sum(axis=1), a.prod(axis=0), jnp.cumsum(a), a.mean()), A),
+    "sums of many": (
+        lambda a: (a.sum(), a.sum(axis=1), a.prod(axis=0), jnp.cumsum(a), a.mean()),
+        A,
+    ),
     "cumulated": (lambda a: (jnp.cumprod(a), lax.cumsum(a, reverse=True)), V),
     "remainder": (lambda a: (lax.rem(a, 0.3), jnp.mod(a, 0.3)), V),
     "products": (
-        lambda a, b, w: (a @ b, w @ b, jnp.einsum("bij,bkj->bik", w, w), b[:, 0] @ b[:, 1], w[0].T @ w[1]),
+        lambda a, b, w: (
+            a @ b,
+            w @ b,
+            jnp.einsum("bij,bkj->bik", w, w),
+            b[:, 0] @ b[:, 1],
+            w[0].T @ w[1],
+        ),
         A,
         B,
         WIDE,
@@ -201,7 +288,9 @@ ROUNDED = {
             lax.linalg.triangular_solve(
                 L, b, left_side=True, lower=lower, transpose_a=turned, unit_diagonal=unit
             )
-            for lower in (True, False) for turned in (True, False) for unit in (True, False)
+            for lower in (True, False)
+            for turned in (True, False)
+            for unit in (True, False)
         ],
         SPD,
         SQUARE[:, :2],
@@ -209,7 +298,8 @@ ROUNDED = {
     "solve from the right": (
         lambda L, b: [
             lax.linalg.triangular_solve(L, b, left_side=False, lower=lower, transpose_a=turned)
-            for lower in (True, False) for turned in (True, False)
+            for lower in (True, False)
+            for turned in (True, False)
         ],
         SPD,
         SQUARE[:2],
@@ -221,7 +311,7 @@ ROUNDED = {
     "inverse of a matrix": (lambda a: (jnp.linalg.inv(a), jnp.linalg.solve(a, a[0])), SQUARE),
     "exponential of a matrix": (jax.scipy.linalg.expm, 0.1 * SQUARE),
     "eigenvalues": (lambda a: jnp.linalg.eigvalsh(a), SPD),
-}  # fmt: skip
+}
 CASES = {
     **{k: (0.0, v) for k, v in EXACT.items()},
     **{k: (30 * ROUNDING, v) for k, v in ROUNDED.items()},
@@ -251,7 +341,7 @@ ELSEWHERE = {
     *("pjit", "closed_call", "core_call", "remat", "remat2", "custom_vjp_call_jaxpr", "custom_lin"),
     *("copy", "copy_p", "device_put", "add_any", "reduce_prod", "custom_vjp_call", "le_to"),
     *("igamma", "igammac", "random_gamma_grad", "bessel_i0e", "regularized_incomplete_beta"),
-    *("digamma", "expand_dims", "lt_to"),
+    *("digamma", "expand_dims", "lt_to", "checkpoint"),
 }
 
 

@@ -69,10 +69,10 @@ def _own_folder() -> Path:
 
 
 def build(text: str, flags: tuple[str, ...] = FLAGS) -> Path:
-    """A shared library of a file of C; if text, compiler and flags are equal, the one there is.
+    """A shared library of a file of C: the one there is if text, compiler, flags are equal.
 
     Raises:
-        BuildError: there is no compiler, or it refuses the text; the message ends with what it said.
+        BuildError: there is no compiler, or it refuses the text; it says what was said.
     """
     command = compiler()
     told = "\0".join([text, *command, _version(command), *flags])

@@ -43,7 +43,7 @@ def fold(walk: Walk, op: str, number: Any, a: Nodes, axes: tuple[int, ...], kind
 def _reduced(op: str, number: Any):
     def of(walk: Walk, equation: Any, a: Nodes) -> Nodes:
         kind = kind_of(equation.invars[0].aval.dtype)
-        return fold(walk, op, number, a, tuple(equation.params["axes"]), kind)
+        return fold(walk, op, number, a, tuple(map(int, equation.params["axes"])), kind)
 
     return of
 
