@@ -231,6 +231,10 @@ EXACT = {
         ),
         1.3,
     ),
+    "loops that end by numbers, in a batch": (
+        jax.vmap(lambda a: lax.while_loop(lambda s: s < 10.0, lambda s: s * 2.0, a)),
+        np.array([1.3, 20.0, 9.9]),
+    ),
     "scan": (
         lambda a: lax.scan(lambda c, row: ((c[1], c[0] + row[0]), (c[0], row[1:])), (0.0, 1.0), a),
         WIDE[0],

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from robins.program.nodes import Node
+from robins.program.primitives.reductions import fold
 from robins.program.trace import Nodes, Walk, rule
 
 LONGEST = 100_000  # rounds of a loop that are written out
@@ -132,25 +133,40 @@ def _rolled_scan(
 
 @rule("while")
 def _while(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
-    """Written out where it is known when it ends, and that is soon; else a loop of C."""
+    """Written out where it is known when it ends, and that is soon; else a loop of C.
+
+    In a batch each member goes on for as long as its own condition holds.
+    """
     p, graph = equation.params, walk.graph
     cond_consts = args[: p["cond_nconsts"]]
     body_consts = args[p["cond_nconsts"] :][: p["body_nconsts"]]
     begin = list(args[p["cond_nconsts"] + p["body_nconsts"] :])
     written, carry = 0, begin
+
+    def round_of(going: Nodes, now: list[Nodes]) -> list[Nodes]:
+        new = _converted(walk, walk.closed(p["body_jaxpr"], *body_consts, *now), now)
+        if going.ndim == 0:
+            return new
+        wide = [
+            np.broadcast_to(going.reshape(going.shape + (1,) * (a.ndim - going.ndim)), a.shape)
+            for a in now
+        ]
+        return [walk.select(*each) for each in zip(wide, new, now, strict=True)]
+
     for _ in range(LONGEST):
-        going = graph.known(walk.closed(p["cond_jaxpr"], *cond_consts, *carry)[0].item())
-        if going is None or walk.stays_whole(written):
+        going = walk.closed(p["cond_jaxpr"], *cond_consts, *carry)[0]
+        known = walk.known(going)
+        if known is None or walk.stays_whole(written):
             break
-        if not going:
+        if not np.any(known):
             return carry
-        carry = walk.closed(p["body_jaxpr"], *body_consts, *carry)
+        carry = round_of(going, carry)
         written += size_of(p["body_jaxpr"].jaxpr)
     loop = graph.open(_flat(begin), None)
     now = _shaped(loop.leaves, begin)
-    loop.condition = walk.closed(p["cond_jaxpr"], *cond_consts, *now)[0].item()
-    new = walk.closed(p["body_jaxpr"], *body_consts, *now)
-    loop.next = _flat(_converted(walk, new, now))
+    going = walk.closed(p["cond_jaxpr"], *cond_consts, *now)[0]
+    loop.condition = fold(walk, "or", False, going, tuple(range(going.ndim)), "flag").item()
+    loop.next = _flat(round_of(going, now))
     return _shaped(graph.close(loop)[0], begin)
 
 
