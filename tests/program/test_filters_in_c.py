@@ -23,8 +23,8 @@ from robins.filters import (
     taylor,
     unscented,
 )
-from robins.filters.iterated import iterated
 from robins.filters.composite.adaptive import excited
+from robins.filters.iterated import iterated
 from robins.manifold import Angle
 
 WAYS = {

@@ -27,7 +27,7 @@ def header(name: str = "scalars.h") -> str:
     return "\n".join((folder / part).read_text("utf-8") for part in (name, "routines.h"))
 
 
-def function(program: Program, name: str = "step", linkage: str = "") -> str:
+def function(program: Program, name: str = "robins_step", linkage: str = "") -> str:
     """The function of a program: ``void name(const real *x, const whole *k, real *y, whole *m)``.
 
     x and y hold the reals of arguments and results, k and m all else, in the order of the leaves.
@@ -36,7 +36,7 @@ def function(program: Program, name: str = "step", linkage: str = "") -> str:
     return "\n".join(_Writer(program).function(name, linkage)) + "\n"
 
 
-def to_c(program: Program, name: str = "step") -> str:
+def to_c(program: Program, name: str = "robins_step") -> str:
     """A file of C by itself: what the program stands on, and its function."""
     return header() + "\n" + function(program, name)
 

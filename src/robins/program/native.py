@@ -101,8 +101,8 @@ class Native:
 
     def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS):
         self.program = program
-        self.library = ctypes.CDLL(str(build(to_c(program, "step"), flags)))
-        self._step = self.library.step
+        self.library = ctypes.CDLL(str(build(to_c(program), flags)))
+        self._step = self.library.robins_step
         self._step.restype = None
         self._x, self._k, self._given = _laid_out(program.inputs)
         self._y, self._m, self._made = _laid_out(program.results)
