@@ -14,6 +14,7 @@ import numpy as np
 
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
+from robins.program.roll import Pack, Packing, Roll, stride
 from robins.program.trace import Program
 
 PREFIX = {"real": "r", "flag": "f", "whole": "i", "word": "u", "word64": "v"}
@@ -49,7 +50,7 @@ class _Writer:
         self.lines: list[str] = []
         self.names: dict[Node, str] = {}  # how a node is read
         self.inlined: set[Node] = set()
-        self.indices: dict[Node, str] = {}  # variables of C that count rounds
+        self.written: set[int] = set()  # loops over packs
         live = program.live
         self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
         roots = [*self.results]
@@ -63,15 +64,20 @@ class _Writer:
                 roots += self.graph.value[node].roots
         self.user = {n: u[0] for n, u in users.items() if len(u) == 1}
         self.roots = set(roots)
-        self.by_scope: dict[int, list[Node]] = defaultdict(list)
-        for node in live:
-            self.by_scope[self.graph.scope[node]].append(node)
+        self.schedule: dict[int, list[Node | Roll]] = defaultdict(list)
+        self.place: dict[Node, tuple[Pack, int]] = {}
+        if program.alike:
+            packing = Packing(self.graph, live, self.roots, program.alike)
+            self.place, self.schedule = packing.place, packing.schedule()
+        else:
+            for node in live:
+                self.schedule[self.graph.scope[node]].append(node)
 
     def function(self, name: str, linkage: str) -> list[str]:
         """The lines of the function."""
         head = f"{linkage}void {name}(const real *x, const whole *k, real *y, whole *m)"
-        for node in self.by_scope[0]:
-            if self.graph.op[node] == "input" and node in self.roots:
+        for node in live_inputs(self.program):
+            if node in self.roots:
                 self._declare(node, self._read_input(node), 1)
         self._scope(0, 1)
         reals, others = 0, 0
@@ -88,14 +94,17 @@ class _Writer:
         return [head, "{", *unused, *self.lines, "}"]
 
     def _empty(self, reals: int, others: int) -> list[tuple[str, bool]]:
-        used = {POOL[self.graph.kind[n]] for n in self.by_scope[0] if self.graph.op[n] == "input"}
+        used = {POOL[self.graph.kind[n]] for n in live_inputs(self.program)}
         return [("x", "x" in used), ("k", "k" in used), ("y", reals > 0), ("m", others > 0)]
 
     def _scope(self, scope: int, depth: int, only: set[Node] | None = None) -> None:
         """Write the nodes of a scope, or those of them that are named."""
-        for node in self.by_scope[scope]:
-            if node not in self.names and (only is None or node in only):
-                self._node(node, depth)
+        for one in self.schedule[scope]:
+            if isinstance(one, Roll):
+                if id(one) not in self.written and (only is None or one.packs[0].index in only):
+                    self._roll(one, depth)
+            elif one not in self.names and (only is None or one in only):
+                self._node(one, depth)
 
     def _node(self, node: Node, depth: int) -> None:
         graph, op = self.graph, self.graph.op[node]
@@ -122,6 +131,7 @@ class _Writer:
         graph, user = self.graph, self.user.get(node)
         return (
             user is not None
+            and user not in self.place
             and node not in self.roots
             and len(text) <= WIDEST
             and graph.scope[user] == graph.scope[node]
@@ -136,7 +146,9 @@ class _Writer:
     # ---------------------------------------------------------------------------- expressions
 
     def _read_input(self, node: Node) -> str:
-        kind, at = self.graph.kind[node], self.graph.value[node]
+        return self._input_at(self.graph.kind[node], str(self.graph.value[node]))
+
+    def _input_at(self, kind: str, at: str) -> str:
         read = f"{POOL[kind]}[{at}]"
         if kind == "flag":
             return f"whole_ne({read}, WHOLE(0))"
@@ -157,15 +169,21 @@ class _Writer:
                 loop: Loop = graph.value[graph.args[node][0]]
                 k, row = graph.value[node]
                 return f"l{loop.scope}_{k}" if row is None else f"k{loop.scope}_{k}[{row}]"
+        if node in self.place:
+            pack, k = self.place[node]
+            return f"p{pack.index}[{k}]"
         text = self.names[node]
         infix = bare and node in self.inlined and self._infix(node)
         return f"({text})" if infix else text
 
-    def _expression(self, node: Node) -> str:
+    def _expression(
+        self, node: Node, read: list[str] | None = None, bare: list[str] | None = None
+    ) -> str:
+        """The operation of a node, on arguments as they are read, and as beside an operator."""
         graph, op, args = self.graph, self.graph.op[node], self.graph.args[node]
         kind = graph.kind[args[0]]
         if sign := self._infix(node):
-            parts = [self._read(a, bare=True) for a in args]
+            parts = [self._read(a, bare=True) for a in args] if bare is None else bare
             return f"{sign}{parts[0]}" if len(parts) == 1 else f" {sign} ".join(parts)
         if op == "pick":
             array, index = args
@@ -177,7 +195,7 @@ class _Writer:
             "convert": f"{graph.kind[node]}_of_{kind}",
             "bits": f"{graph.kind[node]}_bits_{kind}",
         }.get(op, f"{kind}_{op}")
-        return f"{name}({', '.join(map(self._read, args))})"
+        return f"{name}({', '.join(map(self._read, args) if read is None else read)})"
 
     def _infix(self, node: Node) -> str:
         """The operator of a node, if it is one in C for numbers of its kind."""
@@ -248,6 +266,63 @@ class _Writer:
                 text = f"{kind}_select({self._read(loop.condition)}, {text}, l{s}_{k})"
             self.lines.append(f"{inner}l{s}_{k} = {text};")
         self.lines.append(f"{pad}}}")
+
+    def _roll(self, roll: Roll, depth: int) -> None:
+        """A loop over packs: one round of it, its names those of the first."""
+        self.written.add(id(roll))
+        pad, index = "    " * depth, f"q{roll.packs[0].index}"
+        uses = Counter(id(a) for pack in roll.packs for a in pack.args if isinstance(a, Pack))
+        rows = {nodes: self._row(nodes, index, depth) for nodes in roll.gathered}
+        for pack in roll.packs:
+            if pack.kept:
+                kind = self.graph.kind[pack.index]
+                self.lines.append(f"{pad}{kind} p{pack.index}[{roll.rounds}];")
+        self.lines.append(f"{pad}for (int {index} = 0; {index} < {roll.rounds}; ++{index}) {{")
+        names: dict[int, tuple[str, bool]] = {}  # of a pack, and whether it is an expression
+
+        def read(arg: Node | Pack | tuple[Node, ...], bare: bool) -> str:
+            if isinstance(arg, Pack):
+                text, is_expression = names[id(arg)]
+                return f"({text})" if bare and is_expression else text
+            return rows[arg] if isinstance(arg, tuple) else self._read(arg, bare)
+
+        for pack in roll.packs:
+            first, kind = pack.index, self.graph.kind[pack.index]
+            text = self._expression(
+                first, *([read(a, b) for a in pack.args] for b in (False, True))
+            )
+            if pack.kept or uses[id(pack)] > 1 or len(text) > WIDEST:
+                names[id(pack)] = f"{PREFIX[kind]}{first}", False
+                self.lines.append(f"{pad}    const {kind} {PREFIX[kind]}{first} = {text};")
+                if pack.kept:
+                    self.lines.append(f"{pad}    p{first}[{index}] = {PREFIX[kind]}{first};")
+            else:
+                names[id(pack)] = text, bool(self._infix(first))
+        self.lines.append(f"{pad}}}")
+
+    def _row(self, nodes: tuple[Node, ...], index: str, depth: int) -> str:
+        """How a round reads the one of some nodes that is its own."""
+        graph, kind = self.graph, self.graph.kind[nodes[0]]
+        found = stride(graph, self.place, nodes)
+        if found is None:
+            name = f"g{len(self.lines)}"
+            entries = [self._read(n) for n in nodes]
+            self._listed(f"const {kind} {name}[{len(nodes)}]", entries, depth)
+            return f"{name}[{index}]"
+        (where, name), first, step = found
+        times = index if step == 1 else f"{step} * {index}"
+        at = f"{first} + {times}" if first else times
+        match where:
+            case "pack":
+                return f"p{name}[{at}]"
+            case "block":
+                return f"b{name}[{at}]"
+        return self._input_at(kind, at)
+
+
+def live_inputs(program: Program) -> list[Node]:
+    """The arguments that a program reads."""
+    return [n for n in program.live if program.graph.op[n] == "input"]
 
 
 def literal(value: object, kind: str, bare: bool = False) -> str:

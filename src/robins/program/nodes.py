@@ -87,10 +87,12 @@ class Graph:
         value: Any = None,
         key: Any = None,
         scope: int | None = None,
+        order: Sequence[Node] | None = None,
     ) -> Node:
         """The node of these fields; the one there is, if there is one."""
         args = tuple(args)
-        known = (op, args, kind, value if key is None else key)
+        same = args if order is None else tuple(order)
+        known = (op, same, kind, value if key is None else key)
         if (found := self._known.get(known)) is not None:
             return found
         node = self._known[known] = len(self.op)
@@ -134,9 +136,8 @@ class Graph:
                 return self.constant(row.fold(*(self.value[a] for a in args)), gives)
         if (simple := self._simpler(op, args)) is not None:
             return simple
-        if row.commutes and args[0] > args[1]:
-            args = args[::-1]
-        return self.add(op, args, gives)
+        # The order of arguments is kept as it was written, so that equal trees look equal.
+        return self.add(op, args, gives, order=sorted(args) if row.commutes else args)
 
     def select(self, condition: Node, new: Node, old: Node) -> Node:
         """``new`` where the condition holds, else ``old``."""

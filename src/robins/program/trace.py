@@ -7,7 +7,7 @@ A rule that only moves data moves nodes, and so leaves no code.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -17,6 +17,7 @@ from jax.extend import core as jex
 from robins import _float64  # noqa: F401
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
+from robins.program.roll import FEWEST
 
 Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
 
@@ -55,6 +56,7 @@ class Program:
         outputs: arrays of nodes, and
         results: what they are.
         structure: pytrees of the arguments and of the results.
+        alike: rows of nodes which may be computed in loops; nothing where all is written out.
     """
 
     graph: Graph
@@ -62,6 +64,7 @@ class Program:
     outputs: list[Nodes]
     results: list[Leaf]
     structure: tuple[Any, Any]
+    alike: list[tuple[Node, ...]] = field(default_factory=list)
 
     @property
     def live(self) -> list[Node]:
@@ -97,6 +100,7 @@ class Walk:
 
     def __init__(self, graph: Graph, unroll: int | None = None):
         self.graph, self.unroll = graph, unroll
+        self.alike: list[tuple[Node, ...]] = []  # rows of arrays, which may be computed in a loop
 
     def stays_whole(self, size: int) -> bool:
         """Whether what is so many scalar operations is not written out, but a loop or a call."""
@@ -168,7 +172,15 @@ class Walk:
             if error.where:
                 raise
             raise ProgramError(error.what, line_of(equation), error.fix) from None
-        return list(found) if isinstance(found, (list, tuple)) else [found]
+        found = list(found) if isinstance(found, (list, tuple)) else [found]
+        if self.unroll is not None:
+            for array in found:
+                for axis, size in enumerate(array.shape):
+                    if size >= FEWEST:
+                        self.alike += map(
+                            tuple, np.moveaxis(array, axis, -1).reshape(-1, size).tolist()
+                        )
+        return found
 
     def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
         """What a function of JAX makes of arrays of nodes, which stand for arrays `like` these."""
@@ -216,4 +228,4 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -
         nodes.append(np.array(ids, dtype=np.int64).reshape(leaf.shape))
     outputs = walk.closed(jaxpr, *nodes)
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
-    return Program(graph, inputs, outputs, _leaves(results, "results"), structures)
+    return Program(graph, inputs, outputs, _leaves(results, "results"), structures, walk.alike)
