@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from robins.program.nodes import Graph, Node
 from robins.program.operations import OPERATIONS
 
-FEWEST = 4  # rounds of a loop
+FEWEST = 8  # rounds of a loop
 LEAST = 3  # operations in a round, and so many times the arrays that are gathered for it
 
 PACKED = {*OPERATIONS, "select", "convert", "bits"}
