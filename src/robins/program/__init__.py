@@ -4,9 +4,10 @@ A filter is traced to its jaxpr and taken apart into the scalars that it compute
 leaves no code, equal scalars are computed once, what is known is folded, and what no result needs
 is left out. What remains is emitted as C99, compiled, and called from Python; or flown.
 
-    trace    function -> `Program`
-    to_c     `Program` -> text
-    native   function -> the same function, compiled
+    trace        function -> `Program`
+    trace_step   the same of a step from state to state, whose lasting zeros are structural
+    to_c         `Program` -> text
+    native       function -> the same function, compiled
 
 This room knows JAX and no filter: no filter, rule or system is written for it.
 """
@@ -15,7 +16,7 @@ from robins.program.c import function, header, to_c
 from robins.program.native import FLAGS, Native, build, compiler, native
 from robins.program.nodes import Graph
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import Leaf, Program, trace
+from robins.program.trace import Leaf, Program, trace, trace_step
 
 __all__ = [
     "FLAGS",
@@ -32,4 +33,5 @@ __all__ = [
     "native",
     "to_c",
     "trace",
+    "trace_step",
 ]

@@ -109,6 +109,11 @@ class Native:
         self._step.restype = None
         self._x, self._k, self._given = _laid_out(program.inputs)
         self._y, self._m, self._made = _laid_out(program.results)
+        self._zeros = [
+            (self._given[k], mask, program.inputs[k].path)
+            for k, mask in program.zeros.items()
+            if mask.any()
+        ]
         self._buffers = [_pointer(a) for a in (self._x, self._k, self._y, self._m)]
 
     def __call__(self, *args: Any) -> Any:
@@ -129,6 +134,13 @@ class Native:
                     f"{np.shape(value)} was given where {leaf.shape} was traced", leaf.path
                 )
             view[...] = value
+        for view, mask, path in self._zeros:
+            if np.any(view[mask]):
+                raise ProgramError(
+                    "a number is not zero that is zero in all states that follow from the first",
+                    path,
+                    "trace the step with a state like this one, or use `trace`",
+                )
         self._step(*self._buffers)
         made = [
             view.astype(leaf.dtype)

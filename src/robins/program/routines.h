@@ -131,54 +131,53 @@ static inline void solve_lower(int n, int width, real *in, real *out)
     }
 }
 
-/* Q (m, width) and R (width, n) of a matrix (m, n), by reflections I - tau v v' with v[k] = 1; the
-   signs are LAPACK's. R is made in the place of the matrix, with the v below its diagonal. */
+/* Add g v v' a to column j of a (rows from k to m, so many columns); v is column k of in. */
+static inline void reflect(int m, int n, int columns, int k, int j, real g, const real *in, real *a)
+{
+    real along = in[k * n + k] * a[k * columns + j];
+    for (int i = k + 1; i < m; ++i) { along = along + in[i * n + k] * a[i * columns + j]; }
+    along = along * g;
+    for (int i = k; i < m; ++i) {
+        a[i * columns + j] = a[i * columns + j] + along * in[i * n + k];
+    }
+}
+
+/* Q (m, width) and R (width, n) of a matrix (m, n), by reflections I + g v v', v = (alpha - beta,
+   tail), g = -1 / (beta (beta - alpha)); the signs are LAPACK's. R is made in the place of the
+   matrix, with the v in its lower triangle and its diagonal beside it. */
 static inline void householder(int m, int n, int width, real *in, real *out)
 {
     const int last = m - 1 < n ? m - 1 : n;
     real *q = out, *r = out + m * width;
+    for (int i = 0; i < width * n; ++i) { r[i] = REAL(0.0); }
     for (int k = 0; k < last; ++k) {
         const real alpha = in[k * n + k];
         real below = REAL(0.0);
         for (int i = k + 1; i < m; ++i) { below = below + in[i * n + k] * in[i * n + k]; }
         const real length = real_sqrt(alpha * alpha + below);
         const real beta = real_select(real_lt(alpha, REAL(0.0)), length, -length);
-        const flag nothing = real_eq(below, REAL(0.0));
-        const real rest = alpha - beta;
-        const real inverse = REAL(1.0) / real_select(nothing, REAL(1.0), rest);
-        real tau = -(rest / real_select(nothing, REAL(1.0), beta));
-        tau = real_select(nothing, REAL(0.0), tau);
-        in[k * n + k] = real_select(nothing, alpha, beta);
-        for (int i = k + 1; i < m; ++i) { in[i * n + k] = in[i * n + k] * inverse; }
-        for (int j = k + 1; j < n; ++j) {
-            real along = in[k * n + j];
-            for (int i = k + 1; i < m; ++i) { along = along + in[i * n + k] * in[i * n + j]; }
-            along = along * tau;
-            in[k * n + j] = in[k * n + j] - along;
-            for (int i = k + 1; i < m; ++i) {
-                in[i * n + j] = in[i * n + j] - along * in[i * n + k];
-            }
-        }
+        const flag nothing = real_lt(below, REAL(1e-290));
+        const real head = alpha - beta;
+        const real g = real_select(nothing, REAL(0.0),
+                                   REAL(1.0) / real_select(nothing, REAL(1.0), beta * head));
+        r[k * n + k] = real_select(nothing, alpha, beta);
+        in[k * n + k] = head;
+        for (int j = k + 1; j < n; ++j) { reflect(m, n, n, k, j, g, in, in); }
     }
     for (int i = 0; i < width; ++i) {
-        for (int j = 0; j < n; ++j) { r[i * n + j] = i <= j ? in[i * n + j] : REAL(0.0); }
+        for (int j = i < last ? i + 1 : i; j < n; ++j) { r[i * n + j] = in[i * n + j]; }
     }
     for (int i = 0; i < m; ++i) {
         for (int j = 0; j < width; ++j) { q[i * width + j] = REAL(i == j ? 1.0 : 0.0); }
     }
     for (int k = last - 1; k >= 0; --k) {
-        real square = REAL(1.0);
-        for (int i = k + 1; i < m; ++i) { square = square + in[i * n + k] * in[i * n + k]; }
-        const real tau = real_select(real_eq(square, REAL(1.0)), REAL(0.0), REAL(2.0) / square);
-        for (int j = k; j < width; ++j) {
-            real along = q[k * width + j];
-            for (int i = k + 1; i < m; ++i) { along = along + in[i * n + k] * q[i * width + j]; }
-            along = along * tau;
-            q[k * width + j] = q[k * width + j] - along;
-            for (int i = k + 1; i < m; ++i) {
-                q[i * width + j] = q[i * width + j] - along * in[i * n + k];
-            }
-        }
+        real below = REAL(0.0);
+        for (int i = k + 1; i < m; ++i) { below = below + in[i * n + k] * in[i * n + k]; }
+        const flag nothing = real_lt(below, REAL(1e-290));
+        const real h = r[k * n + k] * in[k * n + k];
+        const real g = real_select(nothing, REAL(0.0),
+                                   REAL(1.0) / real_select(nothing, REAL(1.0), h));
+        for (int j = k; j < width; ++j) { reflect(m, n, width, k, j, g, in, q); }
     }
 }
 

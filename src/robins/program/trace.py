@@ -57,6 +57,7 @@ class Program:
         results: what they are.
         structure: pytrees of the arguments and of the results.
         alike: rows of nodes which may be computed in loops; nothing where all is written out.
+        zeros: of an argument, by its number, which entries it takes to be zero.
     """
 
     graph: Graph
@@ -65,6 +66,7 @@ class Program:
     results: list[Leaf]
     structure: tuple[Any, Any]
     alike: list[tuple[Node, ...]] = field(default_factory=list)
+    zeros: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def live(self) -> list[Node]:
@@ -210,22 +212,84 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -
     Raises:
         ProgramError: it does something that has no place in a program; the message names the line.
     """
+    jaxpr, given, results = _jaxpr(function, args)
+    return _program(jaxpr, given, results, unroll, {})
+
+
+def trace_step(
+    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = None
+) -> Program:
+    """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
+
+    Zeros of the state that every step leaves zero are structural, such as those above the diagonal
+    of a factor. Which they are follows by induction: those are tried that are zero in the state
+    given; those are dropped for which the next state has anything but a known zero; and so on until
+    none is dropped. The program is for states that have them, as the one given and all that follow
+    from it; `Native` refuses others.
+
+    Args:
+        function: the step; the first of its results has the structure of the state.
+        state: one to begin with: its zeros matter.
+        args: as in `trace`.
+        unroll: as in `trace`.
+
+    Raises:
+        ProgramError: as in `trace`; or the first result is no state.
+    """
+    jaxpr, given, results = _jaxpr(function, (state, *args))
+    leaves, tree = jax.tree_util.tree_flatten(state)
+    first = results[0] if isinstance(results, tuple) and results else None
+    if jax.tree_util.tree_structure(first) != tree:
+        raise ProgramError(
+            "the first result of a step has another structure than its state",
+            fix="return (state, ...)",
+        )
+    zeros = {}
+    for k, leaf in enumerate(map(np.asarray, leaves)):
+        if leaf.dtype == np.float64:
+            zeros[k] = (leaf == 0.0) & ~np.signbit(leaf)
+    while True:
+        program = _program(jaxpr, given, results, unroll, zeros)
+        zero = program.graph.constant(0, "real")
+        kept = {k: mask & (program.outputs[k] == zero) for k, mask in zeros.items()}
+        if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
+            return program
+        zeros = kept
+
+
+def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """The jaxpr of a function, and what it takes and gives as pytrees of shapes."""
+
+    def shape(x: Any) -> jax.ShapeDtypeStruct:
+        array = jax.typeof(jax.numpy.asarray(x))
+        return jax.ShapeDtypeStruct(array.shape, array.dtype)
+
+    given = jax.tree_util.tree_map(shape, args)
+    jaxpr, results = jax.make_jaxpr(function, return_shape=True)(*given)
+    return jaxpr, given, results
+
+
+def _program(
+    jaxpr: Any, given: Any, results: Any, unroll: int | None, zeros: dict[int, np.ndarray]
+) -> Program:
+    """The program of a jaxpr, some entries of its arguments known to be zero."""
     import robins.program.primitives  # noqa: F401
 
-    given = jax.tree_util.tree_map(lambda x: jax.typeof(jax.numpy.asarray(x)), args)
-    given = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), given)
-    jaxpr, results = jax.make_jaxpr(function, return_shape=True)(*given)
     graph = Graph()
     walk = Walk(graph, unroll)
     counted = {"real": 0, "other": 0}
     nodes = []
     inputs = _leaves(given, "arguments")
-    for leaf in inputs:
+    for index, leaf in enumerate(inputs):
         pool = "real" if leaf.kind == "real" else "other"
         size = int(np.prod(leaf.shape))
         ids = [graph.input(counted[pool] + k, leaf.kind) for k in range(size)]
         counted[pool] += size
-        nodes.append(np.array(ids, dtype=np.int64).reshape(leaf.shape))
+        array = np.array(ids, dtype=np.int64).reshape(leaf.shape)
+        if index in zeros:
+            array = np.where(zeros[index], graph.constant(0, "real"), array)
+        nodes.append(array)
     outputs = walk.closed(jaxpr, *nodes)
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
-    return Program(graph, inputs, outputs, _leaves(results, "results"), structures, walk.alike)
+    leaves = _leaves(results, "results")
+    return Program(graph, inputs, outputs, leaves, structures, walk.alike, zeros)

@@ -148,12 +148,15 @@ def _qr(walk: Walk, equation: Any, A: Nodes) -> list[Nodes]:
     return per_matrix(walk, one, A)
 
 
-def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes, Nodes]:
-    """Q and R by reflections, signs as LAPACK has them: R's diagonal has the sign it takes away.
+TINY = 1e-290  # of a sum of squares: what is shorter than its root is nothing
 
-    H = I - tau v v', v = (1, tail / (alpha - beta)), beta = -sign(alpha) |column|; there is no
-    reflection where nothing stands below the diagonal (Golub & Van Loan 2013, sec. 5.1; LAPACK's
-    dlarfg).
+
+def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes, Nodes]:
+    """Q and R by reflections, with the signs of LAPACK's dgeqrf.
+
+    H = I + g v v' takes a column to beta = -sign(alpha) |column|, with v = (alpha - beta, tail)
+    and 1 / g = beta (alpha - beta): one division and one root a column (Golub & Van Loan 2013,
+    sec. 5.1). There is no reflection where nothing stands below the diagonal.
     """
     apply, constant = walk.graph.apply, walk.graph.constant
     m, n = A.shape
@@ -173,36 +176,30 @@ def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes,
         length = apply("sqrt", apply("add", apply("mul", alpha, alpha), below))
         negative = apply("lt", alpha, zero)
         beta = walk.graph.select(negative, length, apply("neg", length))
-        nothing = apply("eq", below, zero)
-        rest = apply("sub", alpha, beta)
-        safe = walk.graph.select(nothing, one, rest)
-        tau = apply("neg", apply("div", rest, walk.graph.select(nothing, one, beta)))
-        tau = walk.graph.select(nothing, zero, tau)
-        inverse = apply("div", one, safe)
-        v = [(i, apply("mul", R[i, k].item(), inverse)) for i in tail]
+        nothing = apply("lt", below, constant(TINY, "real"))
+        head = apply("sub", alpha, beta)
+        h = walk.graph.select(nothing, one, apply("mul", beta, head))
+        g = walk.graph.select(nothing, zero, apply("div", one, h))
+        v = [(k, head), *((i, R[i, k].item()) for i in tail)]
         R[k, k] = walk.graph.select(nothing, alpha, beta)
         R[tail, k] = zero
         for j in range(k + 1, n):
-            _reflect(walk, R, j, k, v, tau)
-        reflections.append((k, v, tau))
+            _reflect(walk, R, j, v, g)
+        reflections.append((k, v, g))
     Q = np.where(np.eye(m, width, dtype=bool), one, zero)
     if wanted:
-        for k, v, tau in reversed(reflections):
+        for k, v, g in reversed(reflections):
             for j in range(k, width):
-                _reflect(walk, Q, j, k, v, tau)
+                _reflect(walk, Q, j, v, g)
     return Q, np.where(np.arange(width)[:, None] <= np.arange(n), R[:width], zero)
 
 
-def _reflect(walk: Walk, A: Nodes, j: int, k: int, v: list[tuple[int, Node]], tau: Node) -> None:
-    """Apply I - tau v v' to a column, in place; v is 1 at k."""
+def _reflect(walk: Walk, A: Nodes, j: int, v: list[tuple[int, Node]], g: Node) -> None:
+    """Add g v v' a to a column a, in place."""
     apply = walk.graph.apply
-    along = A[k, j].item()
+    along = apply("mul", g, dot(walk, [x for _, x in v], [A[i, j].item() for i, _ in v]))
     for i, x in v:
-        along = apply("add", along, apply("mul", x, A[i, j].item()))
-    along = apply("mul", tau, along)
-    A[k, j] = apply("sub", A[k, j].item(), along)
-    for i, x in v:
-        A[i, j] = apply("sub", A[i, j].item(), apply("mul", along, x))
+        A[i, j] = apply("add", A[i, j].item(), apply("mul", along, x))
 
 
 @rule("eigh")

@@ -36,8 +36,24 @@ def fold(walk: Walk, op: str, number: Any, a: Nodes, axes: tuple[int, ...], kind
         return np.full(rows.shape[:-1], _empty(walk, kind, number))
     flat = rows.reshape(-1, rows.shape[-1]).tolist()
     join = functools.partial(walk.graph.apply, op)
-    found = [functools.reduce(join, row) for row in flat]
+    found = [functools.reduce(join, _finite(walk, row) if op == "and" else row) for row in flat]
     return np.array(found, dtype=np.int64).reshape(rows.shape[:-1])
+
+
+def _finite(walk: Walk, row: list[Node]) -> list[Node]:
+    """Flags of which all must hold, with those that numbers are finite made one.
+
+    x - x is zero of a finite number, NaN of any other: a sum of them is zero if all are finite, and
+    costs two operations a number, none of them on flags.
+    """
+    graph = walk.graph
+    checks = [n for n in row if graph.op[n] == "is_finite"]
+    if len(checks) < 3:
+        return row
+    nothing = [graph.apply("sub", *2 * graph.args[n]) for n in checks]
+    total = functools.reduce(functools.partial(graph.apply, "add"), nothing)
+    one = graph.apply("eq", total, graph.constant(0, "real"))
+    return [one, *(n for n in row if graph.op[n] != "is_finite")]
 
 
 def _reduced(op: str, number: Any):
