@@ -13,6 +13,7 @@ import heapq
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from robins.program.nodes import Graph, Node
 from robins.program.operations import OPERATIONS
@@ -292,7 +293,12 @@ def ordered(needs: Mapping[Node, set[Node]]) -> tuple[list[Node], set[Node]]:
     return order, set(needs) - set(order)
 
 
-def source(graph: Graph, place: dict[Node, tuple[Pack, int]], node: Node) -> tuple[object, int]:
+Array = tuple[str, Any]  # of C: what it is, and its number or kind
+
+
+def source(
+    graph: Graph, place: dict[Node, tuple[Pack, int]], node: Node
+) -> tuple[Array | None, int]:
     """The array of C in which a node lies, and where in it; None for what is in none."""
     if node in place:
         return ("pack", place[node][0].index), place[node][1]
@@ -305,7 +311,7 @@ def source(graph: Graph, place: dict[Node, tuple[Pack, int]], node: Node) -> tup
 
 def stride(
     graph: Graph, place: dict[Node, tuple[Pack, int]], nodes: tuple[Node, ...]
-) -> tuple[object, int, int] | None:
+) -> tuple[Array, int, int] | None:
     """The array in which nodes lie one step from each other: array, first place, step."""
     found = [source(graph, place, n) for n in nodes]
     array, first = found[0]
