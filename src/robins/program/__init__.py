@@ -1,0 +1,37 @@
+"""Functions of JAX as programs of scalars: the step of a filter as C, without a change to it.
+
+A filter is traced to its jaxpr and taken apart into the scalars that it computes with. Moving data
+leaves no code, equal scalars are computed once, what is known is folded, and what no result needs
+is left out. What remains is emitted as C99, compiled, and called from Python; or flown.
+
+    trace        function -> `Program`
+    trace_step   the same of a step from state to state, whose lasting zeros are structural
+    to_c         `Program` -> text
+    native       function -> the same function, compiled
+
+This room knows JAX and no filter: no filter, rule or system is written for it.
+"""
+
+from robins.program.c import function, header, to_c
+from robins.program.native import FLAGS, Native, build, compiler, native
+from robins.program.nodes import Graph
+from robins.program.refusal import BuildError, ProgramError
+from robins.program.trace import Leaf, Program, trace, trace_step
+
+__all__ = [
+    "FLAGS",
+    "BuildError",
+    "Graph",
+    "Leaf",
+    "Native",
+    "Program",
+    "ProgramError",
+    "build",
+    "compiler",
+    "function",
+    "header",
+    "native",
+    "to_c",
+    "trace",
+    "trace_step",
+]

@@ -1,0 +1,343 @@
+"""A program as C99: one function, locals only, no allocation, no library but the mathematics.
+
+The text names every scalar once, in the order of computation; a scalar that is used once is
+written where it is used. Selects, comparisons and functions are calls of `scalars.h` and
+`routines.h`, which stand at the head of the text, so that the same text can be compiled for lanes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from importlib.resources import files
+
+import numpy as np
+
+from robins.program.nodes import Loop, Node
+from robins.program.operations import OPERATIONS
+from robins.program.roll import Pack, Packing, Roll, stride
+from robins.program.trace import Program
+
+PREFIX = {"real": "r", "flag": "f", "whole": "i", "word": "u", "word64": "v"}
+POOL = {"real": "x", "flag": "k", "whole": "k", "word": "k", "word64": "k"}
+WIDEST = 60  # characters of a scalar that is written where it is used
+
+
+def header(name: str = "scalars.h") -> str:
+    """The text that a program stands on, for single numbers or for lanes."""
+    folder = files("robins.program")
+    return "\n".join((folder / part).read_text("utf-8") for part in (name, "routines.h"))
+
+
+def function(program: Program, name: str = "robins_step", linkage: str = "") -> str:
+    """The function of a program: ``void name(const real *x, const whole *k, real *y, whole *m)``.
+
+    x and y hold the reals of arguments and results, k and m all else, in the order of the leaves.
+    The results may lie where the arguments do: they are written last.
+    """
+    return "\n".join(_Writer(program).function(name, linkage)) + "\n"
+
+
+def to_c(program: Program, name: str = "robins_step") -> str:
+    """A file of C by itself: what the program stands on, and its function."""
+    return header() + "\n" + function(program, name)
+
+
+class _Writer:
+    """Writes one program, scope by scope."""
+
+    def __init__(self, program: Program):
+        self.program, self.graph = program, program.graph
+        self.lines: list[str] = []
+        self.names: dict[Node, str] = {}  # how a node is read
+        self.inlined: set[Node] = set()
+        self.written: set[int] = set()  # loops over packs
+        live = program.live
+        self.results = [n for nodes in program.outputs for n in nodes.ravel().tolist()]
+        roots = [*self.results]
+        users: dict[Node, list[Node]] = defaultdict(list)
+        self.uses: Counter[Node] = Counter()
+        for node in live:
+            for arg in self.graph.args[node]:
+                self.uses[arg] += 1
+                users[arg].append(node)
+            if self.graph.op[node] == "loop":
+                roots += self.graph.value[node].roots
+        self.user = {n: u[0] for n, u in users.items() if len(u) == 1}
+        self.roots = set(roots)
+        self.schedule: dict[int, list[Node | Roll]] = defaultdict(list)
+        self.place: dict[Node, tuple[Pack, int]] = {}
+        if program.alike:
+            packing = Packing(self.graph, live, self.roots, program.alike)
+            self.place, self.schedule = packing.place, packing.schedule()
+        else:
+            for node in live:
+                self.schedule[self.graph.scope[node]].append(node)
+
+    def function(self, name: str, linkage: str) -> list[str]:
+        """The lines of the function."""
+        head = f"{linkage}void {name}(const real *x, const whole *k, real *y, whole *m)"
+        for node in live_inputs(self.program):
+            if node in self.roots:
+                self._declare(node, self._read_input(node), 1)
+        self._scope(0, 1)
+        reals, others = 0, 0
+        for node in self.results:
+            kind, read = self.graph.kind[node], self._read(node)
+            if kind == "real":
+                self.lines.append(f"    y[{reals}] = {read};")
+                reals += 1
+            else:
+                whole = read if kind == "whole" else f"whole_of_{kind}({read})"
+                self.lines.append(f"    m[{others}] = {whole};")
+                others += 1
+        unused = [f"    (void){p};" for p, there in self._empty(reals, others) if not there]
+        return [head, "{", *unused, *self.lines, "}"]
+
+    def _empty(self, reals: int, others: int) -> list[tuple[str, bool]]:
+        used = {POOL[self.graph.kind[n]] for n in live_inputs(self.program)}
+        return [("x", "x" in used), ("k", "k" in used), ("y", reals > 0), ("m", others > 0)]
+
+    def _scope(self, scope: int, depth: int, only: set[Node] | None = None) -> None:
+        """Write the nodes of a scope, or those of them that are named."""
+        for one in self.schedule[scope]:
+            if isinstance(one, Roll):
+                if id(one) not in self.written and (only is None or one.packs[0].index in only):
+                    self._roll(one, depth)
+            elif one not in self.names and (only is None or one in only):
+                self._node(one, depth)
+
+    def _node(self, node: Node, depth: int) -> None:
+        graph, op = self.graph, self.graph.op[node]
+        match op:
+            case "constant" | "leaf" | "after" | "item":
+                return
+            case "input":
+                self.names[node] = self._read_input(node)
+            case "array":
+                self._array(node, depth)
+            case "block":
+                self._block(node, depth)
+            case "loop":
+                self._loop(graph.value[node], node, depth)
+            case _:
+                text = self._expression(node)
+                if self._may_be_inlined(node, text):
+                    self.inlined.add(node)
+                    self.names[node] = text
+                else:
+                    self._declare(node, text, depth)
+
+    def _may_be_inlined(self, node: Node, text: str) -> bool:
+        graph, user = self.graph, self.user.get(node)
+        return (
+            user is not None
+            and user not in self.place
+            and node not in self.roots
+            and len(text) <= WIDEST
+            and graph.scope[user] == graph.scope[node]
+            and graph.op[user] not in ("array", "block", "loop", "pick")
+        )
+
+    def _declare(self, node: Node, text: str, depth: int) -> None:
+        kind = self.graph.kind[node]
+        name = self.names[node] = f"{PREFIX[kind]}{node}"
+        self.lines.append(f"{'    ' * depth}const {kind} {name} = {text};")
+
+    # ---------------------------------------------------------------------------- expressions
+
+    def _read_input(self, node: Node) -> str:
+        return self._input_at(self.graph.kind[node], str(self.graph.value[node]))
+
+    def _input_at(self, kind: str, at: str) -> str:
+        read = f"{POOL[kind]}[{at}]"
+        if kind == "flag":
+            return f"whole_ne({read}, WHOLE(0))"
+        return read if kind in ("real", "whole") else f"{kind}_of_whole({read})"
+
+    def _read(self, node: Node, bare: bool = False) -> str:
+        """A node as an argument; bare where a number needs no macro, beside an operator."""
+        graph = self.graph
+        match graph.op[node]:
+            case "constant":
+                return literal(graph.value[node], graph.kind[node], bare)
+            case "leaf":
+                scope, k = graph.value[node]
+                return f"WHOLE(n{scope})" if k < 0 else f"l{scope}_{k}"
+            case "item":
+                return f"b{graph.args[node][0]}[{graph.value[node]}]"
+            case "after":
+                loop: Loop = graph.value[graph.args[node][0]]
+                k, row = graph.value[node]
+                return f"l{loop.scope}_{k}" if row is None else f"k{loop.scope}_{k}[{row}]"
+        if node in self.place:
+            pack, k = self.place[node]
+            return f"p{pack.index}[{k}]"
+        text = self.names[node]
+        infix = bare and node in self.inlined and self._infix(node)
+        return f"({text})" if infix else text
+
+    def _expression(
+        self, node: Node, read: list[str] | None = None, bare: list[str] | None = None
+    ) -> str:
+        """The operation of a node, on arguments as they are read, and as beside an operator."""
+        graph, op, args = self.graph, self.graph.op[node], self.graph.args[node]
+        kind = graph.kind[args[0]]
+        if sign := self._infix(node):
+            parts = [self._read(a, bare=True) for a in args] if bare is None else bare
+            return f"{sign}{parts[0]}" if len(parts) == 1 else f" {sign} ".join(parts)
+        if op == "pick":
+            array, index = args
+            if graph.op[index] == "leaf" and graph.value[index][1] < 0:
+                return f"a{array}[n{graph.value[index][0]}]"
+            return f"{graph.kind[node]}_pick(a{array}, {self._read(index)})"
+        name = {
+            "select": f"{graph.kind[node]}_select",
+            "convert": f"{graph.kind[node]}_of_{kind}",
+            "bits": f"{graph.kind[node]}_bits_{kind}",
+        }.get(op, f"{kind}_{op}")
+        return f"{name}({', '.join(map(self._read, args) if read is None else read)})"
+
+    def _infix(self, node: Node) -> str:
+        """The operator of a node, if it is one in C for numbers of its kind."""
+        op = self.graph.op[node]
+        if op == "div":
+            return "/" if self.graph.kind[node] == "real" else ""
+        return OPERATIONS[op].infix if op in OPERATIONS else ""
+
+    # -------------------------------------------------------------------- arrays, blocks, loops
+
+    def _array(self, node: Node, depth: int) -> None:
+        entries = [self._read(a) for a in self.graph.args[node]]
+        self._listed(f"const {self.graph.kind[node]} a{node}[{len(entries)}]", entries, depth)
+        self.names[node] = f"a{node}"
+
+    def _listed(self, head: str, entries: list[str], depth: int) -> None:
+        """An array with its entries, some to a line."""
+        pad = "    " * depth
+        self.lines.append(f"{pad}{head} = {{")
+        line = ""
+        for entry in entries:
+            if line and len(line) + len(entry) > 80:
+                self.lines.append(f"{pad}    {line.rstrip()}")
+                line = ""
+            line += f"{entry}, "
+        self.lines += [f"{pad}    {line.rstrip(' ,')}", f"{pad}}};"]
+
+    def _block(self, node: Node, depth: int) -> None:
+        routine, sizes, count = self.graph.value[node]
+        entries = [self._read(a) for a in self.graph.args[node]]
+        self._listed(f"real in{node}[{len(entries)}]", entries, depth)
+        told = ", ".join([*map(str, sizes), f"in{node}", f"b{node}"])
+        pad = "    " * depth
+        self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{routine}({told});"]
+        self.names[node] = f"b{node}"
+
+    def _loop(self, loop: Loop, node: Node, depth: int) -> None:
+        graph, pad, s = self.graph, "    " * depth, loop.scope
+        self.names[node] = ""
+        for k, n in enumerate(loop.begin):
+            self.lines.append(f"{pad}{graph.kind[n]} l{s}_{k} = {self._read(n)};")
+        for k, n in enumerate(loop.kept):
+            self.lines.append(f"{pad}{graph.kind[n]} k{s}_{k}[{loop.count}];")
+        inner = f"{pad}    "
+        if loop.count is not None:
+            self.lines.append(f"{pad}for (int n{s} = 0; n{s} < {loop.count}; ++n{s}) {{")
+            self._scope(s, depth + 1)
+        else:
+            assert loop.condition is not None
+            self.lines.append(f"{pad}for (;;) {{")
+            self._scope(s, depth + 1, set(graph.live([loop.condition])))
+            going = self._read(loop.condition)
+            self.lines.append(f"{inner}if (!ANY({going})) {{ break; }}")
+            self._scope(s, depth + 1)
+        for k, n in enumerate(loop.kept):
+            self.lines.append(f"{inner}k{s}_{k}[n{s}] = {self._read(n)};")
+        changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
+        new = {k: self._read(loop.next[k]) for k in changed}
+        for k in changed:  # a leaf that becomes another is read before that one is written
+            n = loop.next[k]
+            if graph.op[n] == "leaf" and graph.value[n][0] == s and graph.value[n][1] >= 0:
+                new[k] = f"t{s}_{k}"
+                self.lines.append(f"{inner}const {graph.kind[n]} t{s}_{k} = {self._read(n)};")
+        for k in changed:
+            kind = graph.kind[loop.leaves[k]]
+            text = new[k]
+            if loop.condition is not None:
+                text = f"{kind}_select({self._read(loop.condition)}, {text}, l{s}_{k})"
+            self.lines.append(f"{inner}l{s}_{k} = {text};")
+        self.lines.append(f"{pad}}}")
+
+    def _roll(self, roll: Roll, depth: int) -> None:
+        """A loop over packs: one round of it, its names those of the first."""
+        self.written.add(id(roll))
+        pad, index = "    " * depth, f"q{roll.packs[0].index}"
+        uses = Counter(id(a) for pack in roll.packs for a in pack.args if isinstance(a, Pack))
+        rows = {nodes: self._row(nodes, index, depth) for nodes in roll.gathered}
+        for pack in roll.packs:
+            if pack.kept:
+                kind = self.graph.kind[pack.index]
+                self.lines.append(f"{pad}{kind} p{pack.index}[{roll.rounds}];")
+        self.lines.append(f"{pad}for (int {index} = 0; {index} < {roll.rounds}; ++{index}) {{")
+        names: dict[int, tuple[str, bool]] = {}  # of a pack, and whether it is an expression
+
+        def read(arg: Node | Pack | tuple[Node, ...], bare: bool) -> str:
+            if isinstance(arg, Pack):
+                text, is_expression = names[id(arg)]
+                return f"({text})" if bare and is_expression else text
+            return rows[arg] if isinstance(arg, tuple) else self._read(arg, bare)
+
+        for pack in roll.packs:
+            first, kind = pack.index, self.graph.kind[pack.index]
+            text = self._expression(
+                first, *([read(a, b) for a in pack.args] for b in (False, True))
+            )
+            if pack.kept or uses[id(pack)] > 1 or len(text) > WIDEST:
+                names[id(pack)] = f"{PREFIX[kind]}{first}", False
+                self.lines.append(f"{pad}    const {kind} {PREFIX[kind]}{first} = {text};")
+                if pack.kept:
+                    self.lines.append(f"{pad}    p{first}[{index}] = {PREFIX[kind]}{first};")
+            else:
+                names[id(pack)] = text, bool(self._infix(first))
+        self.lines.append(f"{pad}}}")
+
+    def _row(self, nodes: tuple[Node, ...], index: str, depth: int) -> str:
+        """How a round reads the one of some nodes that is its own."""
+        graph, kind = self.graph, self.graph.kind[nodes[0]]
+        found = stride(graph, self.place, nodes)
+        if found is None:
+            name = f"g{len(self.lines)}"
+            entries = [self._read(n) for n in nodes]
+            self._listed(f"const {kind} {name}[{len(nodes)}]", entries, depth)
+            return f"{name}[{index}]"
+        (where, name), first, step = found
+        times = index if step == 1 else f"{step} * {index}"
+        at = f"{first} + {times}" if first else times
+        match where:
+            case "pack":
+                return f"p{name}[{at}]"
+            case "block":
+                return f"b{name}[{at}]"
+        return self._input_at(kind, at)
+
+
+def live_inputs(program: Program) -> list[Node]:
+    """The arguments that a program reads."""
+    return [n for n in program.live if program.graph.op[n] == "input"]
+
+
+def literal(value: object, kind: str, bare: bool = False) -> str:
+    """A number in C; bare beside an operator, else in the macro of its kind."""
+    if kind == "real":
+        number = float(value)  # type: ignore[arg-type]
+        if np.isnan(number):
+            text = "NAN"
+        elif np.isinf(number):
+            text = "INFINITY" if number > 0 else "-INFINITY"
+        else:
+            text = repr(number)
+        return (f"({text})" if text.startswith("-") else text) if bare else f"REAL({text})"
+    number = int(value)  # type: ignore[call-overload]
+    if kind == "whole" and number == -(2**63):
+        return "WHOLE(INT64_MIN)"
+    suffix = {"word": "u", "word64": "u"}.get(kind, "")
+    return f"{kind.upper()}({number}{suffix})"

@@ -1,0 +1,188 @@
+"""Programs compiled on this machine by its C compiler, kept by content, called from Python."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from robins.program.c import to_c
+from robins.program.refusal import BuildError, ProgramError
+from robins.program.trace import Leaf, Program, trace
+
+# Passes that look for what is computed twice: there is nothing left to find, and it takes half of
+# the time of the compiler. Compilers that do not know them say nothing.
+FASTER = ("-fno-gcse", "-fno-tree-pre")
+# Contraction would join a product and a sum into one rounding: other bits on other machines.
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
+NO_COMPILER = (
+    "install one (Debian: `apt install gcc`; anywhere: `pip install ziglang`), or name it in CC"
+)
+
+
+def compiler() -> tuple[str, ...]:
+    """The command of a C compiler: what CC says, else the system's, else that of `ziglang`.
+
+    Raises:
+        BuildError: there is none.
+    """
+    if told := shlex.split(os.environ.get("CC", "")):
+        if shutil.which(told[0]) is None:
+            raise BuildError(f"there is no program '{told[0]}'", "CC", NO_COMPILER)
+        return tuple(told)
+    for name in ("cc", "gcc", "clang"):
+        if (found := shutil.which(name)) is not None:
+            return (found,)
+    if importlib.util.find_spec("ziglang") is not None:
+        return (sys.executable, "-m", "ziglang", "cc")
+    raise BuildError("there is no C compiler on this machine", "", NO_COMPILER)
+
+
+@lru_cache
+def _version(command: tuple[str, ...]) -> str:
+    return subprocess.run([*command, "--version"], capture_output=True, text=True).stdout
+
+
+def cache_folder() -> Path:
+    """Where what was compiled is kept: the user's cache, else a folder that this process makes."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "robins" / "native"
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder if os.access(folder, os.W_OK) else _own_folder()
+
+
+@lru_cache
+def _own_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="robins-native-"))
+
+
+def build(text: str, flags: tuple[str, ...] = FLAGS) -> Path:
+    """A shared library of a file of C: the one there is if text, compiler, flags are equal.
+
+    Raises:
+        BuildError: there is no compiler, or it refuses the text; it says what was said.
+    """
+    command = compiler()
+    told = "\0".join([text, *command, _version(command), *flags])
+    folder, name = cache_folder(), hashlib.sha256(told.encode()).hexdigest()[:24]
+    library = folder / f"{name}.so"
+    if library.exists():
+        return library
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        source, made = Path(own) / "program.c", Path(own) / library.name
+        source.write_text(text, "utf-8")
+        line = [*command, *flags, "-shared", "-fPIC", str(source), "-o", str(made), "-lm"]
+        done = subprocess.run(line, capture_output=True, text=True)
+        if done.returncode:
+            said = "\n".join(done.stderr.strip().splitlines()[:5])
+            raise BuildError(f"the compiler does not accept a program: {said}", command[0])
+        made.replace(library)  # of two processes that build the same, either's will do
+    return library
+
+
+class Native:
+    """A program as a function of Python: takes and gives what the traced function did.
+
+    Its results are arrays of NumPy. One call takes some microseconds a leaf; a loop that steps a
+    filter millions of times calls `address` from C.
+    """
+
+    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS):
+        self.program = program
+        self.library = ctypes.CDLL(str(build(to_c(program), flags)))
+        self._step = self.library.robins_step
+        self._step.restype = None
+        self._x, self._k, self._given = _laid_out(program.inputs)
+        self._y, self._m, self._made = _laid_out(program.results)
+        self._zeros = [
+            (self._given[k], mask, program.inputs[k].path)
+            for k, mask in program.zeros.items()
+            if mask.any()
+        ]
+        self._buffers = [_pointer(a) for a in (self._x, self._k, self._y, self._m)]
+
+    def __call__(self, *args: Any) -> Any:
+        """The function on pytrees of numbers.
+
+        Raises:
+            ProgramError: the arguments are not of the structure or the shapes that were traced.
+        """
+        leaves, tree = jax.tree_util.tree_flatten(args)
+        if tree != self.program.structure[0]:
+            raise ProgramError(
+                f"arguments of another structure than was traced: {tree}",
+                fix="trace the function with arguments like these",
+            )
+        for leaf, view, value in zip(self.program.inputs, self._given, leaves, strict=True):
+            if np.shape(value) != leaf.shape:
+                raise ProgramError(
+                    f"{np.shape(value)} was given where {leaf.shape} was traced", leaf.path
+                )
+            view[...] = value
+        for view, mask, path in self._zeros:
+            if np.any(view[mask]):
+                raise ProgramError(
+                    "a number is not zero that is zero in all states that follow from the first",
+                    path,
+                    "trace the step with a state like this one, or use `trace`",
+                )
+        self._step(*self._buffers)
+        made = [
+            view.astype(leaf.dtype)
+            for leaf, view in zip(self.program.results, self._made, strict=True)
+        ]
+        return jax.tree_util.tree_unflatten(self.program.structure[1], made)
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _laid_out(leaves: list[Leaf]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Memory for the reals and for all else of some leaves, and the view of each into it."""
+    sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
+    totals = [0, 0]
+    places = []
+    for leaf, size in zip(leaves, sizes, strict=True):
+        pool = int(leaf.kind != "real")
+        places.append((pool, totals[pool], size, leaf.shape))
+        totals[pool] += size
+    memory = np.zeros(max(totals[0], 1)), np.zeros(max(totals[1], 1), dtype=np.int64)
+    views = [memory[pool][at : at + n].reshape(shape) for pool, at, n, shape in places]
+    return *memory, views
+
+
+def native(
+    function: Callable[..., Any],
+    *args: Any,
+    unroll: int | None = None,
+    flags: tuple[str, ...] = FLAGS,
+) -> Native:
+    """Trace a function with arguments, compile its program, and give it back as a function.
+
+    Args:
+        function: a pure function of JAX.
+        args: arguments of the shapes and types that it will be given.
+        unroll: as in `trace`.
+        flags: for the compiler.
+
+    Raises:
+        ProgramError: the function does something that has no place in a program.
+        BuildError: there is no compiler, or it refuses the program.
+    """
+    return Native(trace(function, *args, unroll=unroll), flags)

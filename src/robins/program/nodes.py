@@ -1,0 +1,302 @@
+"""The graph of a program: scalars, each written once, folded where they are known.
+
+A node is a number, an index into the lists of a `Graph`. Its arguments are nodes before it, so the
+order of nodes is an order of computation. Two equal nodes are one node. Beside scalar operations
+there are
+
+- *blocks*: a routine on arrays, such as a QR; its arguments are gathered, its results are leaves;
+- *loops*: `Loop`; what depends on the leaves of a loop is computed inside it, all else before.
+
+Zeros are structural: a product with a known zero is zero, whatever the other factor is. A step
+looks at its inputs before it trusts a product, so an infinity is not lost by that.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from robins.program.operations import KINDS, OPERATIONS
+
+Node = int
+
+
+@dataclass
+class Loop:
+    """A loop: leaves that each round begins with, and what it leaves for the next.
+
+    Attributes:
+        scope: its number.
+        begin: what the leaves are in the first round.
+        leaves: one for each of `begin`.
+        index: the number of the round, from 0.
+        count: how many rounds; None: as long as `condition` holds at the beginning of a round.
+        condition: a node inside the loop, of its leaves.
+        next: what the leaves are in the next round.
+        kept: nodes whose values in all rounds are kept; only where `count` is known.
+    """
+
+    scope: int
+    begin: list[Node]
+    leaves: list[Node]
+    index: Node
+    count: int | None
+    condition: Node | None = None
+    next: list[Node] = field(default_factory=list)
+    kept: list[Node] = field(default_factory=list)
+
+    @property
+    def roots(self) -> list[Node]:
+        """What is to be computed inside."""
+        return [*self.next, *self.kept, *([] if self.condition is None else [self.condition])]
+
+
+class Graph:
+    """Nodes, by their fields: ``op``, ``args``, ``kind``, ``value``, ``scope``.
+
+    Attributes:
+        op: an operation of `OPERATIONS`, or ``constant``, ``input``, ``select``, ``convert``,
+            ``bits``; ``array`` of nodes, and ``pick`` of an array; ``block`` and ``item``; of loops
+            ``leaf``, ``loop`` and ``after``.
+        value: of a constant its number; what else an op needs besides its arguments.
+        scope: the loop in which a node is computed, 0 outside of all.
+        within: of each scope the one around it.
+    """
+
+    def __init__(self) -> None:
+        self.op: list[str] = []
+        self.args: list[tuple[Node, ...]] = []
+        self.kind: list[str] = []
+        self.value: list[Any] = []
+        self.scope: list[int] = []
+        self.within: list[int] = [0]
+        self._known: dict[Any, Node] = {}
+
+    def __len__(self) -> int:
+        return len(self.op)
+
+    def add(
+        self,
+        op: str,
+        args: Sequence[Node],
+        kind: str,
+        value: Any = None,
+        key: Any = None,
+        scope: int | None = None,
+        order: Sequence[Node] | None = None,
+    ) -> Node:
+        """The node of these fields; the one there is, if there is one."""
+        args = tuple(args)
+        same = args if order is None else tuple(order)
+        known = (op, same, kind, value if key is None else key)
+        if (found := self._known.get(known)) is not None:
+            return found
+        node = self._known[known] = len(self.op)
+        self.op.append(op)
+        self.args.append(args)
+        self.kind.append(kind)
+        self.value.append(value)
+        inner = max((self.scope[a] for a in args), default=0)  # later scopes lie further in
+        self.scope.append(inner if scope is None else scope)
+        return node
+
+    # ------------------------------------------------------------------------------- leaves
+
+    def constant(self, value: Any, kind: str) -> Node:
+        """A number that is known."""
+        number = KINDS[kind](value)
+        key = struct.pack("<d", number) if kind == "real" else int(number)
+        return self.add("constant", (), kind, number, key)
+
+    def input(self, index: int, kind: str) -> Node:
+        """One of the arguments of the program, counted by kind."""
+        return self.add("input", (), kind, index)
+
+    def is_constant(self, node: Node) -> bool:
+        """Whether its number is known."""
+        return self.op[node] == "constant"
+
+    def known(self, node: Node) -> Any:
+        """The number of a constant, None of any other node."""
+        return self.value[node] if self.op[node] == "constant" else None
+
+    # --------------------------------------------------------------------------- operations
+
+    def apply(self, op: str, *args: Node) -> Node:
+        """An operation of `OPERATIONS` on nodes of one kind."""
+        row = OPERATIONS[op]
+        kind = self.kind[args[0]]
+        gives = row.gives or kind
+        if all(self.op[a] == "constant" for a in args):
+            with np.errstate(all="ignore"):
+                return self.constant(row.fold(*(self.value[a] for a in args)), gives)
+        if (simple := self._simpler(op, args)) is not None:
+            return simple
+        # The order of arguments is kept as it was written, so that equal trees look equal.
+        return self.add(op, args, gives, order=sorted(args) if row.commutes else args)
+
+    def select(self, condition: Node, new: Node, old: Node) -> Node:
+        """``new`` where the condition holds, else ``old``."""
+        known = self.known(condition)
+        if known is not None:
+            return new if known else old
+        if new == old:
+            return new
+        if self.op[condition] == "not":
+            return self.select(self.args[condition][0], old, new)
+        if self.kind[new] == "flag":
+            if (value := self.known(new)) is not None:
+                left = condition if value else self.apply("not", condition)
+                return self.apply("or" if value else "and", left, old)
+            if (value := self.known(old)) is not None:
+                left = self.apply("not", condition) if value else condition
+                return self.apply("or" if value else "and", left, new)
+        return self.add("select", (condition, new, old), self.kind[new])
+
+    def convert(self, node: Node, kind: str) -> Node:
+        """The same number in another kind; a flag is 0 or 1, a real is cut towards zero."""
+        given = self.kind[node]
+        if given == kind:
+            return node
+        if (value := self.known(node)) is not None:
+            with np.errstate(all="ignore"):
+                return self.constant(value.astype(KINDS[kind]), kind)
+        if kind == "flag":
+            return self.apply("ne", node, self.constant(0, given))
+        return self.add("convert", (node,), kind)
+
+    def bits(self, node: Node, kind: str) -> Node:
+        """The same bits read as another kind of the same width."""
+        if (value := self.known(node)) is not None:
+            return self.constant(np.array(value).view(KINDS[kind])[()], kind)
+        return self.add("bits", (node,), kind)
+
+    def pick(self, among: Sequence[Node], index: Node) -> Node:
+        """One of some nodes, by an index that lies among them."""
+        if (value := self.known(index)) is not None:
+            return among[int(value)]
+        if len(set(among)) == 1:
+            return among[0]
+        if len(among) > 4:
+            array = self.add("array", among, self.kind[among[0]])
+            return self.add("pick", (array, index), self.kind[among[0]])
+        found = among[-1]
+        for k in reversed(range(len(among) - 1)):
+            here = self.apply("eq", index, self.constant(k, self.kind[index]))
+            found = self.select(here, among[k], found)
+        return found
+
+    def block(
+        self, routine: str, sizes: Sequence[int], args: Sequence[Node], count: int
+    ) -> list[Node]:
+        """What a routine of `scalars.h` makes of an array of reals: so many reals."""
+        block = self.add("block", args, "real", (routine, tuple(sizes), count))
+        return [self.add("item", (block,), "real", k) for k in range(count)]
+
+    # -------------------------------------------------------------------------------- loops
+
+    def open(self, begin: Sequence[Node], count: int | None) -> Loop:
+        """A loop; what is made of its leaves from here on is computed inside it."""
+        scope = len(self.within)
+        self.within.append(max((self.scope[n] for n in begin), default=0))
+        leaves = [
+            self.add("leaf", (), self.kind[n], (scope, k), scope=scope) for k, n in enumerate(begin)
+        ]
+        index = self.add("leaf", (), "whole", (scope, -1), scope=scope)
+        return Loop(scope, list(begin), leaves, index, count)
+
+    def close(self, loop: Loop) -> tuple[list[Node], list[list[Node]]]:
+        """The leaves after the last round, and of each kept node its values in all rounds."""
+        outside = [n for n in self._needed_by(loop) if self.scope[n] < loop.scope]
+        args = list(dict.fromkeys([*loop.begin, *outside]))
+        node = self.add("loop", args, "", loop, key=loop.scope)
+        self.within[loop.scope] = self.scope[node]
+        after = [
+            self.add("after", (node,), self.kind[n], (k, None)) for k, n in enumerate(loop.begin)
+        ]
+        kept = [
+            [self.add("after", (node,), self.kind[n], (k, i)) for i in range(loop.count or 0)]
+            for k, n in enumerate(loop.kept)
+        ]
+        return after, kept
+
+    def _needed_by(self, loop: Loop) -> list[Node]:
+        """All nodes inside a loop that its roots need, and the nodes outside that these use."""
+        seen: set[Node] = set()
+        ahead = loop.roots
+        while ahead:
+            node = ahead.pop()
+            if node not in seen:
+                seen.add(node)
+                if self.scope[node] >= loop.scope:
+                    ahead += self.args[node]
+                    if self.op[node] == "loop":
+                        ahead += self.value[node].roots
+        return sorted(seen)
+
+    def live(self, roots: Sequence[Node]) -> list[Node]:
+        """All nodes that some need, in the order of computation."""
+        seen: set[Node] = set()
+        ahead = list(roots)
+        while ahead:
+            node = ahead.pop()
+            if node not in seen:
+                seen.add(node)
+                ahead += self.args[node]
+                if self.op[node] == "loop":
+                    ahead += self.value[node].roots
+        return sorted(seen)
+
+    # ------------------------------------------------------------------------------ folding
+
+    def _simpler(self, op: str, args: tuple[Node, ...]) -> Node | None:
+        """A node that is the same, for less; None where there is none."""
+        match op:
+            case "add" | "or" | "xor":
+                for one, other in (args, args[::-1]):
+                    if self._is(other, 0):
+                        return one
+                    if op == "or" and self.kind[one] == "flag" and self._is(other, 1):
+                        return other
+                if op == "or" and args[0] == args[1]:
+                    return args[0]
+            case "sub":
+                if self._is(args[1], 0):
+                    return args[0]
+            case "mul":
+                for one, other in (args, args[::-1]):
+                    if self._is(other, 1):
+                        return one
+                    if self._is(other, 0):
+                        return self.constant(0, self.kind[other])
+                    if self._is(other, -1) and self.kind[one] == "real":
+                        return self.apply("neg", one)
+            case "div":
+                if self._is(args[1], 1):
+                    return args[0]
+                if self.kind[args[0]] == "real" and self._is(args[0], 0):
+                    return args[0]
+            case "and":
+                for one, other in (args, args[::-1]):
+                    if self._is(other, 0):
+                        return other
+                    if self.kind[one] == "flag" and self._is(other, 1):
+                        return one
+                if args[0] == args[1]:
+                    return args[0]
+            case "not" | "neg" if self.op[args[0]] == op:
+                return self.args[args[0]][0]
+            case "eq" | "ne" if self.kind[args[0]] == "flag":
+                for one, other in (args, args[::-1]):
+                    if (value := self.known(other)) is not None:
+                        return one if bool(value) == (op == "eq") else self.apply("not", one)
+            case "max" | "min" if args[0] == args[1]:
+                return args[0]
+        return None
+
+    def _is(self, node: Node, number: int) -> bool:
+        return self.op[node] == "constant" and bool(self.value[node] == number)

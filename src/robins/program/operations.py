@@ -1,0 +1,115 @@
+"""The operations of scalars: one row each, with its value on known numbers and its C.
+
+A program computes with five kinds of scalars. What C calls them stands in `scalars.h`: typedefs, so
+that one text serves a single number and a vector of lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.special
+
+KINDS: dict[str, type[np.generic]] = {
+    "real": np.float64,
+    "flag": np.bool_,
+    "whole": np.int64,  # all signed integers
+    "word": np.uint32,
+    "word64": np.uint64,
+}
+
+
+class Operation(NamedTuple):
+    """One operation: ``fold`` is its value on NumPy scalars, all of one kind.
+
+    Attributes:
+        fold: its value where all arguments are known.
+        infix: the operator in C; where there is none, a function of `scalars.h` or of C's
+            mathematics is called, ``real_sin(x)``: kind of the first argument, name of the row.
+        gives: the kind of the result; None is the kind of the arguments.
+        commutes: whether the order of two arguments does not matter, to the bit.
+    """
+
+    fold: Callable[..., Any]
+    infix: str = ""
+    gives: str | None = None
+    commutes: bool = False
+
+
+def _rem(a: Any, b: Any) -> Any:
+    return np.fmod(a, b) if b != 0 or isinstance(a, np.floating) else a
+
+
+def _div(a: Any, b: Any) -> Any:
+    if isinstance(a, np.floating):
+        return a / b
+    return type(a)(math.trunc(int(a) / int(b))) if b != 0 else type(a)(-1)
+
+
+def _total(a: Any) -> tuple[bool, Any, bool]:
+    """A key of the total order of numbers: -0 before 0, NaN last."""
+    return (bool(a != a), a if a == a else 0.0, not np.signbit(a)) if a == a else (True, 0.0, True)
+
+
+def _away(a: Any) -> Any:
+    return np.copysign(np.floor(np.abs(a) + 0.5), a)
+
+
+OPERATIONS: dict[str, Operation] = {
+    "add": Operation(lambda a, b: a + b, "+", commutes=True),
+    "sub": Operation(lambda a, b: a - b, "-"),
+    "mul": Operation(lambda a, b: a * b, "*", commutes=True),
+    "div": Operation(_div),
+    "rem": Operation(_rem),
+    "neg": Operation(lambda a: -a, "-"),
+    "abs": Operation(np.abs),
+    "sign": Operation(np.sign),
+    "max": Operation(np.maximum),  # NaN if either is
+    "min": Operation(np.minimum),
+    "pow": Operation(np.power),
+    "eq": Operation(lambda a, b: a == b, gives="flag", commutes=True),
+    "ne": Operation(lambda a, b: a != b, gives="flag", commutes=True),
+    "lt": Operation(lambda a, b: a < b, gives="flag"),
+    "le": Operation(lambda a, b: a <= b, gives="flag"),
+    "lt_to": Operation(lambda a, b: _total(a) < _total(b), gives="flag"),
+    "le_to": Operation(lambda a, b: _total(a) <= _total(b), gives="flag"),
+    "and": Operation(lambda a, b: a & b, "&", commutes=True),
+    "or": Operation(lambda a, b: a | b, "|", commutes=True),
+    "xor": Operation(lambda a, b: a ^ b, "^", commutes=True),
+    "not": Operation(lambda a: ~a),
+    "shift_left": Operation(np.left_shift),
+    "shift_right": Operation(np.right_shift),
+    "is_finite": Operation(np.isfinite, gives="flag"),
+    "sqrt": Operation(np.sqrt),
+    "cbrt": Operation(np.cbrt),
+    "floor": Operation(np.floor),
+    "ceil": Operation(np.ceil),
+    "round_even": Operation(np.round),
+    "round_away": Operation(_away),
+    "sin": Operation(np.sin),
+    "cos": Operation(np.cos),
+    "tan": Operation(np.tan),
+    "asin": Operation(np.arcsin),
+    "acos": Operation(np.arccos),
+    "atan": Operation(np.arctan),
+    "atan2": Operation(np.arctan2),
+    "sinh": Operation(np.sinh),
+    "cosh": Operation(np.cosh),
+    "tanh": Operation(np.tanh),
+    "asinh": Operation(np.arcsinh),
+    "acosh": Operation(np.arccosh),
+    "atanh": Operation(np.arctanh),
+    "exp": Operation(np.exp),
+    "exp2": Operation(np.exp2),
+    "expm1": Operation(np.expm1),
+    "log": Operation(np.log),
+    "log1p": Operation(np.log1p),
+    "erf": Operation(scipy.special.erf),
+    "erfc": Operation(scipy.special.erfc),
+    "erf_inv": Operation(scipy.special.erfinv),
+    "lgamma": Operation(scipy.special.gammaln),
+    "nextafter": Operation(np.nextafter),
+}

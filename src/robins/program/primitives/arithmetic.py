@@ -1,0 +1,139 @@
+"""Primitives that compute entry by entry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from robins.program.nodes import Node
+from robins.program.refusal import ProgramError
+from robins.program.trace import RULES, Nodes, Walk, kind_of, rule
+
+# Primitives that are one operation of `OPERATIONS`, by their names in JAX.
+SAME = {
+    **{n: n for n in ("add", "sub", "mul", "div", "rem", "neg", "abs", "sign", "max", "min")},
+    **{n: n for n in ("pow", "eq", "ne", "lt", "le", "lt_to", "le_to", "and", "or", "xor", "not")},
+    **{n: n for n in ("is_finite", "sqrt", "cbrt", "floor", "ceil", "nextafter", "lgamma")},
+    **{n: n for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh")},
+    **{n: n for n in ("tanh", "asinh", "acosh", "atanh", "exp", "exp2", "log", "log1p", "expm1")},
+    **{n: n for n in ("erf", "erfc")},
+    "add_any": "add",
+    "shift_left": "shift_left",
+    "shift_right_logical": "shift_right",
+}
+
+
+def _same(op: str):
+    def of(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
+        return walk.apply(op, *arrays)
+
+    return of
+
+
+RULES.update({name: _same(op) for name, op in SAME.items()})
+
+
+@rule("gt")
+def _gt(walk: Walk, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    return walk.apply("lt", b, a)
+
+
+@rule("ge")
+def _ge(walk: Walk, equation: Any, a: Nodes, b: Nodes) -> Nodes:
+    return walk.apply("le", b, a)
+
+
+@rule("square")
+def _square(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return walk.apply("mul", a, a)
+
+
+@rule("rsqrt")
+def _rsqrt(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return walk.apply("div", walk.constants(1.0), walk.apply("sqrt", a))
+
+
+@rule("logistic")
+def _logistic(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    one = walk.constants(1.0)
+    return walk.apply("div", one, walk.apply("add", one, walk.apply("exp", walk.apply("neg", a))))
+
+
+@rule("integer_pow")
+def _integer_pow(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    """By squaring, in the order in which JAX multiplies."""
+    y = equation.params["y"]
+    one = walk.each(lambda n: walk.graph.constant(1, walk.graph.kind[n]), a)
+    power, factor, left = None, a, abs(y)
+    while left:
+        if left & 1:
+            power = factor if power is None else walk.apply("mul", power, factor)
+        left >>= 1
+        if left:
+            factor = walk.apply("mul", factor, factor)
+    power = one if power is None else power
+    return power if y >= 0 else walk.apply("div", one, power)
+
+
+@rule("round")
+def _round(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    to_even = equation.params["rounding_method"].name == "TO_NEAREST_EVEN"
+    return walk.apply("round_even" if to_even else "round_away", a)
+
+
+@rule("clamp")
+def _clamp(walk: Walk, equation: Any, low: Nodes, a: Nodes, high: Nodes) -> Nodes:
+    return walk.apply("min", walk.apply("max", a, low), high)
+
+
+@rule("select_n")
+def _select_n(walk: Walk, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
+    graph = walk.graph
+    if len(cases) == 2 and equation.invars[0].aval.dtype == np.bool_:
+        return walk.select(which, cases[1], cases[0])
+
+    def among(index: Node, *nodes: Node) -> Node:
+        return graph.pick(nodes, index)
+
+    return walk.each(among, which, *cases)
+
+
+@rule("convert_element_type")
+def _convert(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    kind = kind_of(equation.params["new_dtype"])
+    return walk.each(lambda n: walk.graph.convert(n, kind), a)
+
+
+@rule("bitcast_convert_type")
+def _bits(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    kind = kind_of(equation.params["new_dtype"])
+    given = equation.invars[0].aval.dtype
+    if given.itemsize != np.dtype(equation.params["new_dtype"]).itemsize:
+        raise ProgramError("bits are read as numbers of another width", "", "keep the width")
+    return walk.each(lambda n: walk.graph.bits(n, kind), a)
+
+
+@rule("stop_gradient", "copy", "copy_p", "reduce_precision", "device_put", "optimization_barrier")
+def _as_it_is(walk: Walk, equation: Any, *arrays: Nodes) -> list[Nodes]:
+    if equation.primitive.name == "reduce_precision" and equation.params["mantissa_bits"] < 52:
+        raise ProgramError("numbers are rounded to fewer bits", "", "leave them in float64")
+    return list(arrays)
+
+
+@rule(
+    "digamma", "igamma", "igammac", "random_gamma_grad", "bessel_i0e", "regularized_incomplete_beta"
+)
+def _special(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
+    """Functions of two and more pages: only of numbers that are known."""
+    import jax
+
+    values = [walk.known(a) for a in arrays]
+    if any(v is None for v in values):
+        raise ProgramError(
+            f"'{equation.primitive.name}' of numbers that are not known has no place in a program",
+            "",
+            "compute it beforehand, or run this filter by JAX",
+        )
+    found = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)
+    return walk.constants(np.asarray(found))

@@ -1,0 +1,204 @@
+"""Primitives that contain jaxprs: calls, branches and loops."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from robins.program.nodes import Node
+from robins.program.primitives.reductions import fold
+from robins.program.trace import Nodes, Walk, rule
+
+LONGEST = 100_000  # rounds of a loop that are written out
+
+
+@rule("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat")
+@rule("checkpoint", "custom_vjp_call_jaxpr", "custom_vmap_call", "custom_lin", "remat2")
+def _call(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+    """A function called is a function written in its place."""
+    p = equation.params
+    inner = next(p[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call") if k in p)
+    return walk.closed(inner, *args) if hasattr(inner, "consts") else walk.open(inner, (), args)
+
+
+@rule("custom_linear_solve")
+def _linear_solve(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+    lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
+    begin = lengths.matvec + lengths.vecmat
+    consts = args[begin : begin + lengths.solve]
+    return walk.closed(jaxprs.solve, *consts, *args[sum(lengths) :])
+
+
+@rule("platform_index")
+def _platform(walk: Walk, equation: Any) -> Nodes:
+    """The branch of a function written for several platforms that is meant for processors."""
+    platforms = equation.params["platforms"]
+    default = next((k for k, names in enumerate(platforms) if names is None), len(platforms) - 1)
+    mine = (k for k, names in enumerate(platforms) if names is not None and "cpu" in names)
+    return walk.constants(np.int32(next(mine, default)))
+
+
+@rule("cond")
+def _cond(walk: Walk, equation: Any, index: Nodes, *args: Nodes) -> list[Nodes]:
+    """Its branch where the index is known; else all of them, and a choice of their results."""
+    branches, graph = equation.params["branches"], walk.graph
+    last = len(branches) - 1
+    which: Node = index.item()
+    if (value := graph.known(which)) is not None:
+        return walk.closed(branches[min(max(int(value), 0), last)], *args)
+    results = [walk.closed(branch, *args) for branch in branches]
+    if graph.kind[which] == "flag":
+        return [walk.select(index, new, old) for old, new in zip(*results, strict=True)]
+    which = graph.apply("max", which, graph.constant(0, "whole"))
+    which = graph.apply("min", which, graph.constant(last, "whole"))
+    return [
+        walk.each(lambda *nodes: graph.pick(nodes, which), *cases)
+        for cases in zip(*results, strict=True)
+    ]
+
+
+def _flat(arrays: Any) -> list[Node]:
+    return [n for a in arrays for n in a.ravel().tolist()]
+
+
+def _shaped(nodes: list[Node], like: Any) -> list[Nodes]:
+    """Nodes one after the other as arrays of the shapes of some."""
+    out, at = [], 0
+    for a in like:
+        out.append(np.array(nodes[at : at + a.size], dtype=np.int64).reshape(a.shape))
+        at += a.size
+    return out
+
+
+def _converted(walk: Walk, arrays: list[Nodes], like: list[Nodes]) -> list[Nodes]:
+    """What a round leaves, in the kinds that it began with."""
+    graph = walk.graph
+    return [
+        walk.each(lambda n, old: graph.convert(n, graph.kind[old]), a, b) if a.size else a
+        for a, b in zip(arrays, like, strict=True)
+    ]
+
+
+@rule("scan")
+def _scan(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+    p = equation.params
+    consts, carry = args[: p["num_consts"]], list(args[p["num_consts"] :][: p["num_carry"]])
+    rows = args[p["num_consts"] + p["num_carry"] :]
+    length, body = p["length"], p["jaxpr"]
+    if length > 1 and walk.stays_whole(length * size_of(body.jaxpr)):
+        return _rolled_scan(walk, equation, consts, carry, rows)
+    kept: list[list[Nodes]] = []
+    order = range(length)
+    for k in reversed(order) if p["reverse"] else order:
+        found = walk.closed(body, *consts, *carry, *(np.asarray(row[k]) for row in rows))
+        carry = found[: p["num_carry"]]
+        kept.append(found[p["num_carry"] :])
+    if p["reverse"]:
+        kept.reverse()
+    shapes = [v.aval.shape for v in equation.outvars[p["num_carry"] :]]
+    stacked = [
+        np.stack([found[j] for found in kept]) if kept else np.zeros(shape, dtype=np.int64)
+        for j, shape in enumerate(shapes)
+    ]
+    return [*carry, *stacked]
+
+
+def _rolled_scan(
+    walk: Walk, equation: Any, consts: Any, carry: list[Nodes], rows: Any
+) -> list[Nodes]:
+    """A loop of C; the rows of its inputs are arrays, of which each round picks one."""
+    graph, p = walk.graph, equation.params
+    length = p["length"]
+    loop = graph.open(_flat(carry), length)
+    index = loop.index
+
+    def row(a: Nodes) -> Nodes:
+        columns = a[::-1] if p["reverse"] else a
+        return walk.each(lambda *nodes: graph.pick(nodes, index), *map(np.asarray, columns))
+
+    now = _shaped(loop.leaves, carry)
+    found = walk.closed(p["jaxpr"], *consts, *now, *map(row, rows))
+    new, kept = found[: len(carry)], found[len(carry) :]
+    loop.next, loop.kept = _flat(_converted(walk, new, now)), _flat(kept)
+    after, rounds = graph.close(loop)
+    out, at = _shaped(after, carry), 0
+    for a in kept:
+        columns = np.array(rounds[at : at + a.size], dtype=np.int64).reshape(a.size, length)
+        stacked = columns.T.reshape(length, *a.shape)
+        out.append(stacked[::-1] if p["reverse"] else stacked)
+        at += a.size
+    return out
+
+
+@rule("while")
+def _while(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
+    """Written out where it is known when it ends, and that is soon; else a loop of C.
+
+    In a batch each member goes on for as long as its own condition holds.
+    """
+    p, graph = equation.params, walk.graph
+    cond_consts = args[: p["cond_nconsts"]]
+    body_consts = args[p["cond_nconsts"] :][: p["body_nconsts"]]
+    begin = list(args[p["cond_nconsts"] + p["body_nconsts"] :])
+    written, carry = 0, begin
+
+    def round_of(going: Nodes, now: list[Nodes]) -> list[Nodes]:
+        new = _converted(walk, walk.closed(p["body_jaxpr"], *body_consts, *now), now)
+        if going.ndim == 0:
+            return new
+        wide = [
+            np.broadcast_to(going.reshape(going.shape + (1,) * (a.ndim - going.ndim)), a.shape)
+            for a in now
+        ]
+        return [walk.select(*each) for each in zip(wide, new, now, strict=True)]
+
+    for _ in range(LONGEST):
+        going = walk.closed(p["cond_jaxpr"], *cond_consts, *carry)[0]
+        known = walk.known(going)
+        if known is None or walk.stays_whole(written):
+            break
+        if not np.any(known):
+            return carry
+        carry = round_of(going, carry)
+        written += size_of(p["body_jaxpr"].jaxpr)
+    loop = graph.open(_flat(begin), None)
+    now = _shaped(loop.leaves, begin)
+    going = walk.closed(p["cond_jaxpr"], *cond_consts, *now)[0]
+    loop.condition = fold(walk, "or", False, going, tuple(range(going.ndim)), "flag").item()
+    loop.next = _flat(round_of(going, now))
+    return _shaped(graph.close(loop)[0], begin)
+
+
+FREE = {
+    *("broadcast_in_dim", "reshape", "transpose", "squeeze", "slice", "concatenate", "stack"),
+    *("split", "rev", "iota", "pad", "tile", "stop_gradient", "expand_dims", "gather", "copy"),
+}
+
+
+def size_of(jaxpr: Any) -> int:
+    """About how many scalar operations a jaxpr is, before anything is folded."""
+    total = 0
+    for equation in jaxpr.eqns:
+        name, p = equation.primitive.name, equation.params
+        inner = [
+            getattr(x, "jaxpr", x)
+            for value in p.values()
+            for x in (value if isinstance(value, (tuple, list)) else [value])
+            if hasattr(getattr(x, "jaxpr", x), "eqns")
+        ]
+        if inner:
+            total += p.get("length", 1) * sum(map(size_of, inner))
+        elif name == "dot_general":
+            ((axes, _), _) = p["dimension_numbers"]
+            shape = equation.invars[0].aval.shape
+            depth = int(np.prod([shape[k] for k in axes]))
+            total += 2 * depth * equation.outvars[0].aval.size
+        elif name.startswith(("reduce", "cum", "arg")):
+            total += equation.invars[0].aval.size
+        elif name in ("qr", "cholesky", "triangular_solve", "lu", "eigh"):
+            shape = equation.invars[0].aval.shape
+            total += 2 * int(np.prod(shape)) * shape[-1]
+        elif name not in FREE:
+            total += sum(v.aval.size for v in equation.outvars)
+    return total

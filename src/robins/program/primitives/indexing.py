@@ -1,0 +1,179 @@
+"""Primitives that read and write at indices, known or not.
+
+Where an index is known, nodes are moved. Where it is not, each entry is a choice among those that
+it may be: few are chains of selects, many an array of C with an index.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from robins.program.nodes import Node
+from robins.program.trace import Nodes, Walk, rule
+
+SIZES = tuple[int, ...]
+
+
+def _clamped(walk: Walk, index: Node, most: int) -> Node:
+    """An index between 0 and the most it may be."""
+    graph = walk.graph
+    kind = graph.kind[index]
+    if most == 0:
+        return graph.constant(0, kind)
+    lowest = graph.apply("max", index, graph.constant(0, kind))
+    return graph.apply("min", lowest, graph.constant(most, kind))
+
+
+def window(walk: Walk, a: Nodes, start: list[Node], sizes: SIZES) -> Nodes:
+    """A window of an array, moved inside where it would reach beyond."""
+    graph = walk.graph
+    for axis, (index, size) in enumerate(zip(start, sizes, strict=True)):
+        most = a.shape[axis] - size
+        at = _clamped(walk, index, most)
+        views = [np.take(a, range(k, k + size), axis) for k in range(most + 1)]
+        if (value := graph.known(at)) is not None:
+            a = views[int(value)]
+        elif views[0].size == 0:
+            a = views[0]
+        else:
+            a = walk.each(lambda *nodes, at=at: graph.pick(nodes, at), *views)
+    return a
+
+
+def _inside(walk: Walk, start: list[Node], shape: SIZES, sizes: SIZES) -> Node:
+    """Whether a window lies inside an array."""
+    graph = walk.graph
+    found = graph.constant(True, "flag")
+    for index, n, size in zip(start, shape, sizes, strict=True):
+        kind = graph.kind[index]
+        low = graph.apply("le", graph.constant(0, kind), index)
+        high = graph.apply("le", index, graph.constant(max(0, n - size), kind))
+        found = graph.apply("and", found, graph.apply("and", low, high))
+        if size > n:
+            return graph.constant(False, "flag")
+    return found
+
+
+def _places(
+    walk: Walk, start: list[Node], shape: SIZES, sizes: SIZES
+) -> Iterator[tuple[tuple[slice, ...], Node]]:
+    """Every window that a start may mean, and whether it does."""
+    graph = walk.graph
+    ranges = []
+    for index, n, size in zip(start, shape, sizes, strict=True):
+        value = graph.known(index)
+        ranges.append(range(n - size + 1) if value is None else [int(value)])
+    for place in itertools.product(*ranges):
+        here = graph.constant(True, "flag")
+        for index, k in zip(start, place, strict=True):
+            same = graph.apply("eq", index, graph.constant(k, graph.kind[index]))
+            here = graph.apply("and", here, same)
+        yield tuple(slice(k, k + size) for k, size in zip(place, sizes, strict=True)), here
+
+
+@rule("dynamic_slice")
+def _dynamic_slice(walk: Walk, equation: Any, a: Nodes, *start: Nodes) -> Nodes:
+    return window(walk, a, [s.item() for s in start], tuple(equation.params["slice_sizes"]))
+
+
+@rule("dynamic_update_slice")
+def _dynamic_update(walk: Walk, equation: Any, a: Nodes, new: Nodes, *start: Nodes) -> Nodes:
+    out = a.copy()
+    most = [n - size for n, size in zip(a.shape, new.shape, strict=True)]
+    inside = [_clamped(walk, s.item(), m) for s, m in zip(start, most, strict=True)]
+    if new.size:
+        for place, here in _places(walk, inside, a.shape, new.shape):
+            out[place] = walk.select(np.full(new.shape, here), new, out[place])
+    return out
+
+
+def _drops(equation: Any) -> bool:
+    """Whether what lies outside is left out, not moved inside."""
+    return getattr(equation.params["mode"], "name", "") == "FILL_OR_DROP"
+
+
+def _starts(
+    walk: Walk, indices: Nodes, batch: tuple[int, ...], rank: int, axes: Any, along: Any, by: Any
+) -> list[Node]:
+    """Where the window of one index vector begins, in all axes of the array."""
+    start = [walk.graph.constant(0, "whole")] * rank
+    for k, axis in enumerate(axes):
+        start[axis] = walk.graph.convert(indices[(*batch, k)].item(), "whole")
+    for axis, dim in zip(along, by, strict=True):
+        start[axis] = walk.graph.constant(batch[dim], "whole")
+    return start
+
+
+@rule("gather")
+def _gather(walk: Walk, equation: Any, a: Nodes, indices: Nodes) -> Nodes:
+    p, d = equation.params, equation.params["dimension_numbers"]
+    sizes = tuple(int(n) for n in p["slice_sizes"])
+    gone = {*d.collapsed_slice_dims, *d.operand_batching_dims}
+    kept = tuple(n for axis, n in enumerate(sizes) if axis not in gone)
+    batches = indices.shape[:-1]
+    found = np.zeros((*batches, *kept), dtype=np.int64)
+    dtype = equation.outvars[0].aval.dtype
+    for batch in np.ndindex(*batches):
+        start = _starts(
+            *(walk, indices, batch, a.ndim, d.start_index_map),
+            *(d.operand_batching_dims, d.start_indices_batching_dims),
+        )
+        one = window(walk, a, start, sizes).reshape(kept)
+        if _drops(equation):
+            inside = _inside(walk, start, a.shape, sizes)
+            one = walk.select(np.full(kept, inside), one, np.full(kept, _filling(walk, p, dtype)))
+        found[batch] = one
+    # The axes of a window go where the primitive says, those of the indices to the other places.
+    offsets = [int(k) for k in d.offset_dims]
+    others = [k for k in range(found.ndim) if k not in offsets]
+    return np.moveaxis(found, range(found.ndim), [*others, *offsets])
+
+
+def _filling(walk: Walk, p: Any, dtype: Any) -> Node:
+    value = p["fill_value"]
+    if value is None:
+        kind = np.dtype(dtype).kind
+        value = {"f": np.nan, "b": True}.get(kind)
+        if value is None:
+            value = np.iinfo(dtype).min if kind == "i" else np.iinfo(dtype).max
+    return walk.constants(np.asarray(value, dtype)).item()
+
+
+JOINED = {
+    "scatter": None,
+    "scatter-add": "add",
+    "scatter-mul": "mul",
+    "scatter-min": "min",
+    "scatter-max": "max",
+}
+
+
+@rule(*JOINED)
+def _scatter(walk: Walk, equation: Any, a: Nodes, indices: Nodes, new: Nodes) -> Nodes:
+    d, join = equation.params["dimension_numbers"], JOINED[equation.primitive.name]
+    windows = [int(k) for k in d.update_window_dims]
+    others = [k for k in range(new.ndim) if k not in windows]
+    rows = new.transpose([*others, *windows])
+    kept = iter(new.shape[k] for k in windows)
+    gone = {*d.inserted_window_dims, *d.operand_batching_dims}
+    sizes = tuple(1 if axis in gone else next(kept) for axis in range(a.ndim))
+    out = a.copy()
+    for batch in np.ndindex(*indices.shape[:-1]):
+        start = _starts(
+            *(walk, indices, batch, a.ndim, d.scatter_dims_to_operand_dims),
+            *(d.operand_batching_dims, d.scatter_indices_batching_dims),
+        )
+        if not _drops(equation):
+            most = [n - size for n, size in zip(a.shape, sizes, strict=True)]
+            start = [_clamped(walk, s, m) for s, m in zip(start, most, strict=True)]
+        elif walk.graph.known(_inside(walk, start, a.shape, sizes)) is np.False_:
+            continue
+        update = rows[batch].reshape(sizes)
+        for place, here in _places(walk, start, a.shape, sizes):
+            joined = update if join is None else walk.apply(join, out[place], update)
+            out[place] = walk.select(np.full(sizes, here), joined, out[place])
+    return out

@@ -1,0 +1,100 @@
+"""Primitives that move data: they move nodes, and leave no code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from robins.program.trace import Nodes, Walk, rule
+
+
+@rule("broadcast_in_dim")
+def _broadcast(walk: Walk, equation: Any, a: Nodes, *dynamic: Nodes) -> Nodes:
+    shape = tuple(equation.params["shape"])
+    axes = equation.params["broadcast_dimensions"]
+    wide = [1] * len(shape)
+    for size, axis in zip(a.shape, axes, strict=True):
+        wide[axis] = size
+    return np.broadcast_to(a.reshape(wide), shape)
+
+
+@rule("reshape")
+def _reshape(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return a.reshape(equation.params["new_sizes"])
+
+
+@rule("transpose")
+def _transpose(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return a.transpose(equation.params["permutation"])
+
+
+@rule("squeeze")
+def _squeeze(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return a.squeeze(tuple(equation.params["dimensions"]))
+
+
+@rule("expand_dims")
+def _expand(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return np.expand_dims(a, tuple(equation.params["dimensions"]))
+
+
+@rule("slice")
+def _slice(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    p = equation.params
+    strides = p["strides"] or (1,) * a.ndim
+    return a[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
+
+
+@rule("concatenate")
+def _concatenate(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
+    return np.concatenate(arrays, axis=equation.params["dimension"])
+
+
+@rule("stack")
+def _stack(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
+    return np.stack(arrays, axis=equation.params["axis"])
+
+
+@rule("tile")
+def _tile(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return np.tile(a, equation.params["reps"])
+
+
+@rule("split")
+def _split(walk: Walk, equation: Any, a: Nodes) -> list[Nodes]:
+    ends = np.cumsum(equation.params["sizes"])[:-1]
+    return np.split(a, ends, axis=equation.params["axis"])
+
+
+@rule("rev")
+def _rev(walk: Walk, equation: Any, a: Nodes) -> Nodes:
+    return np.flip(a, tuple(equation.params["dimensions"]))
+
+
+@rule("iota")
+def _iota(walk: Walk, equation: Any, *dynamic: Nodes) -> Nodes:
+    p = equation.params
+    along = [1] * len(p["shape"])
+    along[p["dimension"]] = -1
+    numbers = np.arange(p["shape"][p["dimension"]], dtype=p["dtype"])
+    return np.broadcast_to(walk.constants(numbers).reshape(along), p["shape"])
+
+
+@rule("pad")
+def _pad(walk: Walk, equation: Any, a: Nodes, filling: Nodes) -> Nodes:
+    config = equation.params["padding_config"]
+    sizes = [
+        max(0, low + high + n + max(0, n - 1) * inner)
+        for n, (low, high, inner) in zip(a.shape, config, strict=True)
+    ]
+    out = np.full(sizes, filling.item())
+    places, sources = [], []
+    for n, size, (low, _, inner) in zip(a.shape, sizes, config, strict=True):
+        at = low + np.arange(n) * (inner + 1)
+        inside = (at >= 0) & (at < size)
+        places.append(at[inside])
+        sources.append(np.flatnonzero(inside))
+    if a.size:
+        out[np.ix_(*places)] = a[np.ix_(*sources)]
+    return out

@@ -1,0 +1,295 @@
+"""From a function of JAX to a program: its jaxpr, walked with arrays of nodes for values.
+
+Each primitive has a rule, in `robins.program.primitives`: arrays of nodes in, arrays of nodes out.
+A rule that only moves data moves nodes, and so leaves no code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core as jex
+
+from robins import _float64  # noqa: F401
+from robins.program.nodes import Graph, Node
+from robins.program.refusal import ProgramError
+from robins.program.roll import FEWEST
+
+Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
+
+Rule = Callable[..., Any]  # (walk, equation, *arrays) -> array, or a list of them
+RULES: dict[str, Rule] = {}
+
+
+def rule(*names: str) -> Callable[[Rule], Rule]:
+    """Make a function the rule of some primitives."""
+
+    def register(function: Rule) -> Rule:
+        RULES.update(dict.fromkeys(names, function))
+        return function
+
+    return register
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """An array among the arguments or results: what it is made of, and where in them it lies."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+    kind: str
+    path: str
+
+
+@dataclass(frozen=True)
+class Program:
+    """A function as scalars.
+
+    Attributes:
+        graph: its nodes.
+        inputs: arrays in the order of the function's leaves; ``input`` nodes count their entries,
+            reals by themselves and all other kinds by themselves.
+        outputs: arrays of nodes, and
+        results: what they are.
+        structure: pytrees of the arguments and of the results.
+        alike: rows of nodes which may be computed in loops; nothing where all is written out.
+        zeros: of an argument, by its number, which entries it takes to be zero.
+    """
+
+    graph: Graph
+    inputs: list[Leaf]
+    outputs: list[Nodes]
+    results: list[Leaf]
+    structure: tuple[Any, Any]
+    alike: list[tuple[Node, ...]] = field(default_factory=list)
+    zeros: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def live(self) -> list[Node]:
+        """The nodes that its results need, in the order of computation."""
+        return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
+
+
+def kind_of(dtype: Any, where: str = "") -> str:
+    """The kind of scalar that holds numbers of a type.
+
+    Raises:
+        ProgramError: none does: single precision, complex numbers.
+    """
+    dtype = np.dtype(dtype)
+    known = {"f8": "real", "b1": "flag", "u4": "word", "u8": "word64"}
+    if (found := known.get(f"{dtype.kind}{dtype.itemsize}")) is not None:
+        return found
+    if dtype.kind == "i":
+        return "whole"
+    raise ProgramError(f"numbers of type {dtype} have no place in a program", where, "use float64")
+
+
+def line_of(equation: Any) -> str:
+    """File and line of the user's code that an equation comes from."""
+    from jax._src import source_info_util
+
+    frame = source_info_util.user_frame(equation.source_info.traceback)
+    return f"{frame.file_name}:{frame.start_line}" if frame else ""
+
+
+class Walk:
+    """A walk through jaxprs that writes into one graph."""
+
+    def __init__(self, graph: Graph, unroll: int | None = None):
+        self.graph, self.unroll = graph, unroll
+        self.alike: list[tuple[Node, ...]] = []  # rows of arrays, which may be computed in a loop
+
+    def stays_whole(self, size: int) -> bool:
+        """Whether what is so many scalar operations is not written out, but a loop or a call."""
+        return self.unroll is not None and size > self.unroll
+
+    def constants(self, value: Any) -> Nodes:
+        """Nodes of known numbers."""
+        array = np.asarray(value)
+        kind = kind_of(array.dtype)
+        return self.each(lambda x: self.graph.constant(x, kind), array)
+
+    def each(self, function: Callable[..., Node], *arrays: np.ndarray) -> Nodes:
+        """A function of nodes on all entries of arrays of one shape."""
+        if len({a.shape for a in arrays}) > 1:
+            arrays = tuple(np.broadcast_arrays(*arrays))
+        flat = [a.ravel().tolist() for a in arrays]
+        made = [function(*entries) for entries in zip(*flat, strict=True)]
+        return np.array(made, dtype=np.int64).reshape(arrays[0].shape)
+
+    def apply(self, op: str, *arrays: Nodes) -> Nodes:
+        """An operation on all entries."""
+        return self.each(lambda *nodes: self.graph.apply(op, *nodes), *arrays)
+
+    def select(self, condition: Nodes, new: Nodes, old: Nodes) -> Nodes:
+        """``new`` where a condition holds, else ``old``."""
+        return self.each(self.graph.select, condition, new, old)
+
+    def known(self, nodes: Nodes) -> np.ndarray | None:
+        """The numbers of an array, if all are known."""
+        values = [self.graph.known(n) for n in nodes.ravel().tolist()]
+        if any(v is None for v in values):
+            return None
+        return np.array(values).reshape(nodes.shape)
+
+    def closed(self, jaxpr: Any, *args: Nodes) -> list[Nodes]:
+        """What a closed jaxpr makes of arrays of nodes."""
+        return self.open(jaxpr.jaxpr, [self.constants(c) for c in jaxpr.consts], args)
+
+    def open(self, jaxpr: Any, consts: Sequence[Nodes], args: Sequence[Nodes]) -> list[Nodes]:
+        """What a jaxpr makes of arrays of nodes."""
+        values: dict[Any, Nodes] = {}
+        values.update(zip(jaxpr.constvars, consts, strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+
+        def read(v: Any) -> Nodes:
+            return self.constants(v.val) if isinstance(v, jex.Literal) else values[v]
+
+        for equation in jaxpr.eqns:
+            found = self.equation(equation, *map(read, equation.invars))
+            values.update(zip(equation.outvars, found, strict=True))
+        return [read(v) for v in jaxpr.outvars]
+
+    def equation(self, equation: Any, *args: Nodes) -> list[Nodes]:
+        """What an equation makes of arrays of nodes.
+
+        Raises:
+            ProgramError: there is no rule for it, or not for this use of it.
+        """
+        name = equation.primitive.name
+        if name not in RULES:
+            raise ProgramError(
+                f"'{name}' has no place in a program of scalars",
+                line_of(equation),
+                "write it with other operations, or run this filter by JAX",
+            )
+        try:
+            found = RULES[name](self, equation, *args)
+        except ProgramError as error:
+            if error.where:
+                raise
+            raise ProgramError(error.what, line_of(equation), error.fix) from None
+        found = list(found) if isinstance(found, (list, tuple)) else [found]
+        if self.unroll is not None:
+            for array in found:
+                for axis, size in enumerate(array.shape):
+                    if size >= FEWEST:
+                        self.alike += map(
+                            tuple, np.moveaxis(array, axis, -1).reshape(-1, size).tolist()
+                        )
+        return found
+
+    def function(self, function: Callable[..., Any], *args: Nodes, like: Sequence[Any]) -> Any:
+        """What a function of JAX makes of arrays of nodes, which stand for arrays `like` these."""
+        return self.closed(jax.make_jaxpr(function)(*like), *args)
+
+
+def _leaves(tree: Any, root: str) -> list[Leaf]:
+    """The arrays of a pytree of shapes."""
+    found = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        where = root + jax.tree_util.keystr(path)
+        found.append(Leaf(leaf.shape, leaf.dtype, kind_of(leaf.dtype, where), where))
+    return found
+
+
+def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -> Program:
+    """A pure function of JAX as a program of scalars.
+
+    Args:
+        function: of pytrees of arrays; nothing else of it is looked at than its jaxpr.
+        args: arguments of the shapes and types that the program will be given; their values do not
+            matter. What the function holds otherwise is known, and folded.
+        unroll: the number of scalar operations up to which a loop or a factorisation is written
+            out; above, it is a loop or a call. None writes out everything that ends when it is
+            known to end.
+
+    Raises:
+        ProgramError: it does something that has no place in a program; the message names the line.
+    """
+    jaxpr, given, results = _jaxpr(function, args)
+    return _program(jaxpr, given, results, unroll, {})
+
+
+def trace_step(
+    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = None
+) -> Program:
+    """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
+
+    Zeros of the state that every step leaves zero are structural, such as those above the diagonal
+    of a factor. Which they are follows by induction: those are tried that are zero in the state
+    given; those are dropped for which the next state has anything but a known zero; and so on until
+    none is dropped. The program is for states that have them, as the one given and all that follow
+    from it; `Native` refuses others.
+
+    Args:
+        function: the step; the first of its results has the structure of the state.
+        state: one to begin with: its zeros matter.
+        args: as in `trace`.
+        unroll: as in `trace`.
+
+    Raises:
+        ProgramError: as in `trace`; or the first result is no state.
+    """
+    jaxpr, given, results = _jaxpr(function, (state, *args))
+    leaves, tree = jax.tree_util.tree_flatten(state)
+    first = results[0] if isinstance(results, tuple) and results else None
+    if jax.tree_util.tree_structure(first) != tree:
+        raise ProgramError(
+            "the first result of a step has another structure than its state",
+            fix="return (state, ...)",
+        )
+    zeros = {}
+    for k, leaf in enumerate(map(np.asarray, leaves)):
+        if leaf.dtype == np.float64:
+            zeros[k] = (leaf == 0.0) & ~np.signbit(leaf)
+    while True:
+        program = _program(jaxpr, given, results, unroll, zeros)
+        zero = program.graph.constant(0, "real")
+        kept = {k: mask & (program.outputs[k] == zero) for k, mask in zeros.items()}
+        if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
+            return program
+        zeros = kept
+
+
+def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """The jaxpr of a function, and what it takes and gives as pytrees of shapes."""
+
+    def shape(x: Any) -> jax.ShapeDtypeStruct:
+        array = jax.typeof(jax.numpy.asarray(x))
+        return jax.ShapeDtypeStruct(array.shape, array.dtype)
+
+    given = jax.tree_util.tree_map(shape, args)
+    jaxpr, results = jax.make_jaxpr(function, return_shape=True)(*given)
+    return jaxpr, given, results
+
+
+def _program(
+    jaxpr: Any, given: Any, results: Any, unroll: int | None, zeros: dict[int, np.ndarray]
+) -> Program:
+    """The program of a jaxpr, some entries of its arguments known to be zero."""
+    import robins.program.primitives  # noqa: F401
+
+    graph = Graph()
+    walk = Walk(graph, unroll)
+    counted = {"real": 0, "other": 0}
+    nodes = []
+    inputs = _leaves(given, "arguments")
+    for index, leaf in enumerate(inputs):
+        pool = "real" if leaf.kind == "real" else "other"
+        size = int(np.prod(leaf.shape))
+        ids = [graph.input(counted[pool] + k, leaf.kind) for k in range(size)]
+        counted[pool] += size
+        array = np.array(ids, dtype=np.int64).reshape(leaf.shape)
+        if index in zeros:
+            array = np.where(zeros[index], graph.constant(0, "real"), array)
+        nodes.append(array)
+    outputs = walk.closed(jaxpr, *nodes)
+    structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
+    leaves = _leaves(results, "results")
+    return Program(graph, inputs, outputs, leaves, structures, walk.alike, zeros)

@@ -1,0 +1,92 @@
+"""Lanes: the same text, compiled for vectors of runs, gives each run the bits of its own."""
+
+import ctypes
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from machines import QUICK, stepping
+from rule_table import RULES, START, Y, line
+
+from robins.filters import kalman
+from robins.program import Native, function, header, trace
+
+CPP = shutil.which("g++") or shutil.which("clang++")
+pytestmark = pytest.mark.skipif(CPP is None, reason="lanes need a C++ compiler")
+FLAGS = ("-std=gnu++17", "-O0", "-ffp-contract=off", "-fno-math-errno", "-Wno-psabi", "-fPIC")
+
+
+def in_lanes(program, folder, lanes):
+    """A program on arrays with a trailing axis of lanes."""
+    text = header("lanes.h") + 'extern "C" {\n' + function(program) + "}\n"
+    source, library = folder / "lanes.cc", folder / "lanes.so"
+    source.write_text(text)
+    told = [str(CPP), *FLAGS, f"-DLANES={lanes}", "-shared", str(source), "-o", str(library)]
+    done = subprocess.run(told, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(library)).robins_step
+
+
+def flat(leaves):
+    """Reals, and all else, of arrays."""
+    leaves = [np.asarray(x) for x in leaves]
+    reals = [x.ravel() for x in leaves if x.dtype == float]
+    others = [x.ravel().astype(np.int64) for x in leaves if x.dtype != float]
+    return (np.concatenate([*reals, np.zeros(0)]), np.concatenate([*others, np.zeros(0, np.int64)]))
+
+
+def check(step, cases, folder, unroll=None):
+    """That lanes give to the bit what one run after the other gives."""
+    program = trace(step, *cases[0], unroll=unroll)
+    one = Native(program, QUICK)
+    given = [flat(jax.tree.leaves(case)) for case in cases]
+    want = [flat(jax.tree.leaves(one(*case))) for case in cases]
+    x, k = (np.ascontiguousarray(np.stack(rows, axis=-1)) for rows in zip(*given, strict=True))
+    y, m = (np.zeros_like(np.stack(rows, axis=-1)) for rows in zip(*want, strict=True))
+    in_lanes(program, folder, len(cases))(*(ctypes.c_void_p(a.ctypes.data) for a in (x, k, y, m)))
+    for lane, (reals, others) in enumerate(want):
+        np.testing.assert_array_equal(y[:, lane], reals)
+        np.testing.assert_array_equal(m[:, lane], others)
+
+
+@pytest.mark.parametrize(("lanes", "unroll"), [(8, None), (4, 200)])
+def test_a_filter(tmp_path, lanes, unroll):
+    model = line()
+    one = kalman(rules=[RULES["gate"], RULES["h_infinity"]])
+    state = jax.tree.map(jnp.asarray, one.init(START, model.dims))
+    state = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), state)
+    spread = [
+        state._replace(belief=state.belief._replace(mean=state.belief.mean + 0.1 * k))
+        for k in range(lanes)
+    ]
+    rows = [Y[3], Y[4], Y[7], Y[9], Y[11], np.full(3, np.inf), Y[0], Y[1]]
+    cases = [(s, None, {"y": y}, {}) for s, y in zip(spread, rows, strict=False)]
+    check(stepping(one, model), cases, tmp_path, unroll)
+
+
+def numbers(x, k, u, c):
+    """What a filter may not use: words, conversions, loops that end by numbers, indices."""
+    i = jnp.clip(k, 0, 8)
+    return (
+        jax.lax.while_loop(lambda s: s < 100.0, lambda s: s * 1.7, jnp.abs(x[0]) + 1.0),
+        x[i], x.at[i].set(0.0), jnp.floor(x), jnp.round(x), jnp.sqrt(jnp.abs(x)),
+        jnp.sin(100.0 * x),
+        jnp.cos(1e7 * x), jnp.exp(x), jnp.arctan2(x, x[::-1]), x.astype(int), k.astype(float),
+        jnp.where(c, k, -k), k // 3, jnp.sign(x), jnp.maximum(k, 2), c.astype(int), c.astype(float),
+        u * u + 7, u >> 3, jnp.where(c, u, u + 1), u.astype(jnp.uint64) << 5, jnp.linalg.eigvalsh(
+            x[:5, None] @ x[None, :5]), jnp.linalg.inv(x[:3, None] @ x[None, :3] + jnp.eye(3)),
+        jnp.isfinite(x), jnp.nextafter(x, 0.0), jnp.argsort(x), ~c & (x[0] > 0.0),
+    )  # fmt: skip
+
+
+def test_all_kinds_of_numbers(tmp_path):
+    rng = np.random.default_rng(0)
+    cases = [
+        (rng.normal(size=9), np.int64(k - 2), np.uint32(2**31 + 77 * k), np.bool_(k % 2))
+        for k in range(8)
+    ]
+    check(numbers, cases, tmp_path)
+    check(numbers, cases, tmp_path, unroll=0)
