@@ -1,8 +1,8 @@
 """Steps of filters as programs: what it takes to make them, and how long one step takes in C.
 
-Nine states, three measurements, ``A x + 0.01 sin x`` with a full A, square-root form; complete steps
-with checks, codes and NIS. JAX steps a batch of 256 runs, each with its own P0; C steps one run in one
-lane. By default all is timed on this machine in one go; the best of some rounds.
+Nine states, three measurements, ``A x + 0.01 sin x`` with a full A, square-root form; complete
+steps with checks, codes and NIS. JAX steps a batch of 256 runs, each with its own P0; C steps one
+run in one lane. All is timed on this machine in one go; the best of some rounds.
 """
 
 import ctypes
@@ -22,8 +22,8 @@ UNROLLED = (None, 1000, 100)
 
 # Steps a filter in C: reals and counts of the state come first among arguments and results.
 REPEAT = """
-void repeat(int steps, int reals, int counts, int width, const real *rows, real *x, whole *k, real *y,
-            whole *m, int at)
+void repeat(int steps, int reals, int counts, int width, const real *rows, real *x, whole *k,
+            real *y, whole *m, int at)
 {
     for (int s = 0; s < steps; ++s) {
         memcpy(x + at, rows + s * width, (size_t)width * sizeof(real));
@@ -100,7 +100,10 @@ def in_c(program, state, y):
 
 def main():
     model, P0, y = problem()
-    print(f"{'filter':12s} {'unroll':>8s} {'nodes':>7s} {'trace s':>8s} {'build s':>8s} {'C ns':>8s} {'JAX ns':>8s}")
+    print(
+        f"{'filter':12s} {'unroll':>8s} {'nodes':>7s} {'trace s':>8s} {'build s':>8s}"
+        f" {'C ns':>8s} {'JAX ns':>8s}"
+    )
     for name, filter_ in FILTERS.items():
         if len(sys.argv) > 1 and name not in sys.argv[1:]:
             continue
@@ -119,7 +122,11 @@ def main():
             traced = time.perf_counter() - begun
             ns, built = in_c(program, first, y)
             told = "all" if unroll is None else str(unroll)
-            print(f"{name:12s} {told:>8s} {len(program.live):7d} {traced:8.2f} {built:8.2f} {ns:8.0f} {reference:8.0f}", flush=True)
+            print(
+                f"{name:12s} {told:>8s} {len(program.live):7d} {traced:8.2f} {built:8.2f}"
+                f" {ns:8.0f} {reference:8.0f}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
