@@ -12,12 +12,14 @@ from click import option
 from robins import __version__
 from robins.cli.bench import bench
 from robins.cli.doctor import judge
+from robins.cli.export import write
 from robins.cli.frame import Status
 from robins.cli.listing import listing
 from robins.cli.options import (
     COLUMNS,
     LOGS,
     RESULTS,
+    SETTINGS,
     answers,
     as_names,
     choices,
@@ -44,6 +46,7 @@ Examples:
   robins allan still.csv                         noise parameters of my IMU
   robins calibrate turned.csv                    hard and soft iron of my magnetometer
   robins design attitude-axis                    gains that bound the worst case, and their price
+  robins export ins-gnss/drive --to drive-c      a filter as C for a board
   robins bench up satellite/s1                   the same filter over serial lines, part by part
 
 Every command that computes writes a folder with a summary, the time series, figures and a page
@@ -304,6 +307,33 @@ def design(problem: str, out: Path | None, **options: Any) -> None:
 
 
 app.add_command(bench)
+
+
+@app.command(
+    short_help="Write a filter as C for a board.",
+    epilog=examples(
+        "robins export ins-gnss/drive --filter ekf --to drive-c",
+        "robins export transfer-alignment/s0 --filter kf-flexure --to alignment-c --fast",
+        "make -C drive-c check",
+    ),
+)
+@click.argument("scenario")
+@option(
+    "--filter", "filter_name", default="", metavar="NAME", help="Which. [default: the system's]"
+)
+@option("--to", type=click.Path(path_type=Path), required=True, metavar="DIR", help="A new folder.")
+@option("--small/--fast", "small", default=True, help="Keep loops, or write them out.")
+@option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of the recorded run.")
+@SETTINGS
+@answers
+def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) -> None:
+    """Write a filter of SCENARIO as C99, with a test of it for your own compiler.
+
+    DIR gets one file of C that needs math.h alone, a header that names all fields with their units,
+    a page that says how to call it, and `make check`: it replays recorded steps and compares each
+    state and each code with those of this program.
+    """
+    write(scenario, to, fast=not small, as_json=as_json, **options)
 
 
 @app.command(

@@ -56,7 +56,11 @@ class _Writer:
         roots = [*self.results]
         users: dict[Node, list[Node]] = defaultdict(list)
         self.uses: Counter[Node] = Counter()
+        self.looked_at = set()  # what loops keep of all rounds, where something reads it
         for node in live:
+            if self.graph.op[node] == "after" and self.graph.value[node][1] is not None:
+                loop: Loop = self.graph.value[self.graph.args[node][0]]
+                self.looked_at.add((loop.scope, self.graph.value[node][0]))
             for arg in self.graph.args[node]:
                 self.uses[arg] += 1
                 users[arg].append(node)
@@ -237,7 +241,8 @@ class _Writer:
         self.names[node] = ""
         for k, n in enumerate(loop.begin):
             self.lines.append(f"{pad}{graph.kind[n]} l{s}_{k} = {self._read(n)};")
-        for k, n in enumerate(loop.kept):
+        kept = {k: n for k, n in enumerate(loop.kept) if (s, k) in self.looked_at}
+        for k, n in kept.items():
             self.lines.append(f"{pad}{graph.kind[n]} k{s}_{k}[{loop.count}];")
         inner = f"{pad}    "
         if loop.count is not None:
@@ -250,7 +255,7 @@ class _Writer:
             going = self._read(loop.condition)
             self.lines.append(f"{inner}if (!ANY({going})) {{ break; }}")
             self._scope(s, depth + 1)
-        for k, n in enumerate(loop.kept):
+        for k, n in kept.items():
             self.lines.append(f"{inner}k{s}_{k}[n{s}] = {self._read(n)};")
         changed = [k for k, n in enumerate(loop.next) if n != loop.leaves[k]]
         new = {k: self._read(loop.next[k]) for k in changed}

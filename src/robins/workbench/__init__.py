@@ -29,6 +29,7 @@ _WHERE = {
     "design": "gains",
     "examine": "examination",
     "export": "exporting",
+    "export_filter": "boards",
     "inventory": "contents",
     "overview": "contents",
     "part": "publication",

@@ -1,0 +1,26 @@
+"""The command `export`: a filter as C."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from robins.cli import cache
+from robins.cli.tell import say
+
+
+def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
+    """Write the folder and say what is in it."""
+    cache.enable()
+    workbench = importlib.import_module("robins.workbench")
+    made = workbench.export_filter(scenario, to, **options)
+    scalars = ", ".join(f"{name} {count}" for name, count in made.scalars.items())
+    text = (
+        f"Filter {made.filter} of {scenario} as C: {made.bytes / 1000.0:.0f} kB of text; "
+        f"scalars of each call: {scalars}.\n\n"
+        f"Wrote:  {to}/  {', '.join(made.files)}\n"
+        f"Next:   make -C {to} check   compiles it here and replays recorded steps\n"
+        f"        {to}/README.md says how to call it"
+    )
+    say({**made._asdict(), "folder": str(to), "scenario": scenario}, text, as_json)

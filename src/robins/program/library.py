@@ -1,0 +1,239 @@
+"""Several programs on one state as a library of C: a header with named fields, one file, no more.
+
+A program takes and gives bare arrays of numbers. Here each array has the name that it has in the
+model, in a struct: the state, which all entry points change, and the arguments and the result of
+each. What is left of Python are the comments.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins.program.c import function, header
+from robins.program.trace import Leaf, Program
+
+C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
+CODE = "code"  # of a result: what the entry point returns
+
+
+class Entry(NamedTuple):
+    """One entry point, ``(state, *args) -> (state, result)``.
+
+    Attributes:
+        name: of its function, after that of the library.
+        program: of `trace`.
+        takes: names of its arguments after the state.
+        about: a sentence of what it does.
+    """
+
+    name: str
+    program: Program
+    takes: tuple[str, ...]
+    about: str
+
+
+class Field(NamedTuple):
+    """An array in a struct, and where it lies in the arrays of a program."""
+
+    name: str
+    leaf: Leaf
+    at: int  # in the reals or in all else
+
+    @property
+    def size(self) -> int:
+        """How many numbers it holds."""
+        return int(np.prod(self.leaf.shape))
+
+    @property
+    def is_real(self) -> bool:
+        """Whether it lies among the reals."""
+        return self.leaf.kind == "real"
+
+    def first(self, struct: str) -> str:
+        """A pointer to its first number in C."""
+        return f"&{struct}->{self.name}" + "[0]" * len(self.leaf.shape)
+
+
+def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
+    """The fields of one of the arguments or results; empty arrays have none."""
+    counted, found, taken = {True: 0, False: 0}, [], set()
+    for leaf in leaves:
+        real, size = leaf.kind == "real", int(np.prod(leaf.shape))
+        root = re.match(r"[a-z]+\[(\d+)\]", leaf.path)
+        assert root is not None
+        if int(root[1]) == which and size > 0:
+            name = base = _identifier(leaf.path[root.end() :])
+            k = 2
+            while name in taken:
+                name, k = f"{base}_{k}", k + 1
+            taken.add(name)
+            found.append(Field(name, leaf, counted[real]))
+        counted[real] += size
+    return found
+
+
+def _identifier(path: str) -> str:
+    """A path in a pytree as a name in C: attributes and indices, the belief's own left out."""
+    words = re.findall(r"[A-Za-z_]\w*|\d+", path)
+    words = words[1:] if words[:1] == ["belief"] else words
+    name = "_".join(words) or "value"
+    return f"at_{name}" if name[0].isdigit() else name
+
+
+class Library(NamedTuple):
+    """A filter as C.
+
+    Attributes:
+        name: prefix of all that the header names.
+        entries: the entry points; all have the same state.
+        start: the state to begin with.
+        about: lines of comment for the head of both files.
+        notes: what more to say of a field, by struct and name.
+    """
+
+    name: str
+    entries: Sequence[Entry]
+    start: Any
+    about: Sequence[str] = ()
+    notes: dict[tuple[str, str], str] = {}  # noqa: RUF012 a default that nobody changes
+
+    @property
+    def state(self) -> list[Field]:
+        """Fields of the state."""
+        return fields_of(self.entries[0].program.inputs, 0)
+
+    def structs(self) -> Iterator[tuple[str, list[Field], str]]:
+        """Name, fields and a sentence of each struct of the header."""
+        yield "state", self.state, "All that is carried from one call to the next."
+        for entry in self.entries:
+            for k, name in enumerate(entry.takes):
+                if fields := fields_of(entry.program.inputs, k + 1):
+                    yield self.argument(entry, name), fields, f"What {entry.name} takes."
+            yield f"{entry.name}_result", self.result(entry), f"What {entry.name} tells."
+
+    def argument(self, entry: Entry, name: str) -> str:
+        """The name of the struct of an argument."""
+        return f"{entry.name}_{name}"
+
+    def result(self, entry: Entry) -> list[Field]:
+        """Fields of what an entry point tells."""
+        return fields_of(entry.program.results, 1)
+
+    # ------------------------------------------------------------------------------ the header
+
+    def signature(self, entry: Entry) -> str:
+        """The declaration of an entry point."""
+        given = [
+            f"const {self.name}_{self.argument(entry, name)} *{name}"
+            for k, name in enumerate(entry.takes)
+            if fields_of(entry.program.inputs, k + 1)
+        ]
+        all_ = [f"{self.name}_state *state", *given, f"{self.name}_{entry.name}_result *result"]
+        return f"int {self.name}_{entry.name}({', '.join(all_)})"
+
+    def header(self) -> str:
+        """The header: types, structs, entry points."""
+        guard = f"{self.name.upper()}_H"
+        lines = [*self._head(), f"#ifndef {guard}", f"#define {guard}", "", "#include <stdint.h>"]
+        lines += ["", f"typedef double {self.name}_real;", ""]
+        for name, fields, about in self.structs():
+            lines += [f"/* {about} */", "typedef struct {"]
+            for f in fields:
+                kind = f"{self.name}_real" if f.is_real else C_TYPES[f.leaf.kind]
+                sizes = "".join(f"[{n}]" for n in f.leaf.shape)
+                note = self.notes.get((name, f.name), "")
+                lines.append(f"    {kind} {f.name}{sizes};" + (f" /* {note} */" if note else ""))
+            lines += [f"}} {self.name}_{name};", ""]
+        lines += [
+            "/* The state to begin with. */",
+            f"void {self.name}_init({self.name}_state *state);",
+        ]
+        for entry in self.entries:
+            lines += ["", f"/* {entry.about} Returns its code. */", f"{self.signature(entry)};"]
+        return "\n".join([*lines, "", "#endif", ""])
+
+    def _head(self) -> list[str]:
+        return ["/*", *(f" * {line}".rstrip() for line in self.about), " */"] if self.about else []
+
+    # -------------------------------------------------------------------------------- the file
+
+    def source(self) -> str:
+        """The file: the scalars, the start, and each entry point around its program."""
+        lines = [*self._head(), f'#include "{self.name}.h"', "", header()]
+        for entry in self.entries:
+            lines.append(function(entry.program, f"of_{entry.name}", "static "))
+        lines += self._init()
+        for entry in self.entries:
+            lines += self._entry(entry)
+        return "\n".join(lines) + "\n"
+
+    def _init(self) -> list[str]:
+        lines = [f"void {self.name}_init({self.name}_state *state)", "{"]
+        leaves = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(self.start)]
+        copies = []
+        kept = [leaf for leaf in leaves if leaf.size]
+        for f, value in zip(self.state, kept, strict=True):
+            kind = "real" if f.is_real else C_TYPES[f.leaf.kind]
+            entries = ", ".join(number(x, f.is_real) for x in value.ravel().tolist())
+            lines.append(f"    static const {kind} {f.name}[{f.size}] = {{{entries}}};")
+            copies.append(f"    memcpy({f.first('state')}, {f.name}, sizeof {f.name});")
+        return [*lines, *copies, "}", ""]
+
+    def _entry(self, entry: Entry) -> list[str]:
+        program, lines = entry.program, [self.signature(entry), "{"]
+        reals, others = counts(program.inputs)
+        made, told = counts(program.results)
+        lines += [f"    real x[{reals}], y[{made}];", f"    whole k[{others}], m[{told}];"]
+        lines += _copied(self.state, "state", "x", "k", inwards=True)
+        for j, name in enumerate(entry.takes):
+            lines += _copied(fields_of(program.inputs, j + 1), name, "x", "k", inwards=True)
+        lines.append(f"    of_{entry.name}(x, k, y, m);")
+        lines += _copied(fields_of(program.results, 0), "state", "y", "m", inwards=False)
+        result = self.result(entry)
+        lines += _copied(result, "result", "y", "m", inwards=False)
+        code = next(f for f in result if f.name == CODE)
+        return [*lines, f"    return (int)m[{code.at}];", "}", ""]
+
+
+def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
+    """How many reals, and how many other numbers; one at least of each, for an array in C."""
+    sizes = {True: 0, False: 0}
+    for leaf in leaves:
+        sizes[leaf.kind == "real"] += int(np.prod(leaf.shape))
+    return max(sizes[True], 1), max(sizes[False], 1)
+
+
+def number(value: Any, real: bool) -> str:
+    """A number in C, to the bit."""
+    if not real:
+        return str(int(value))
+    if np.isnan(value):
+        return "NAN"
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return repr(float(value))
+
+
+def _copied(
+    fields: Sequence[Field], struct: str, reals: str, others: str, inwards: bool
+) -> list[str]:
+    """Between a struct and the arrays of a program."""
+    lines = []
+    for f in fields:
+        if f.is_real:
+            there, size = f"{reals} + {f.at}", f"{f.size} * sizeof(real)"
+            to, source = (there, f.first(struct)) if inwards else (f.first(struct), there)
+            lines.append(f"    memcpy({to}, {source}, {size});")
+            continue
+        here = f"({f.first(struct)})[i]" if f.leaf.shape else f"{struct}->{f.name}"
+        there = f"{others}[{f.at} + i]" if f.leaf.shape else f"{others}[{f.at}]"
+        kind = C_TYPES[f.leaf.kind]
+        move = f"{there} = (whole){here};" if inwards else f"{here} = ({kind}){there};"
+        loop = f"for (int i = 0; i < {f.size}; ++i) {{ {move} }}" if f.leaf.shape else move
+        lines.append(f"    {loop}")
+    return lines
