@@ -64,8 +64,14 @@ Seeds = Iterable[tuple[Node, ...]]
 class Packing:
     """Packs and loops among the live nodes of a graph."""
 
-    def __init__(self, graph: Graph, live: Sequence[Node], roots: set[Node], seeds: Seeds):
-        """Pack live nodes, from rows that may be alike; roots are read where all is done."""
+    def __init__(
+        self, graph: Graph, live: Sequence[Node], roots: set[Node], seeds: Seeds, unroll: int = 0
+    ):
+        """Pack live nodes, from rows that may be alike; roots are read where all is done.
+
+        What is not more than so many operations in all rounds is written out.
+        """
+        self.unroll = unroll
         self.graph, self.live, self.roots = graph, set(live), roots
         self.place: dict[Node, tuple[Pack, int]] = {}  # of a node in a pack: which round
         # What says whether a loop goes on is computed before all else in it.
@@ -228,8 +234,13 @@ class Packing:
                 pack.args.append(nodes)
 
     def _dissolve_small(self) -> bool:
-        """Take apart loops that do less than it takes to gather what they need."""
-        small = [r for r in self.rolls if len(r.packs) < LEAST * max(1, self._cost(r))]
+        """Take apart loops that are short, or do less than it takes to gather what they need."""
+        small = [
+            r
+            for r in self.rolls
+            if r.rounds * len(r.packs) <= self.unroll
+            or len(r.packs) < LEAST * max(1, self._cost(r))
+        ]
         for roll in small:
             for pack in roll.packs:
                 self._dissolve(pack)

@@ -57,6 +57,7 @@ class Program:
         results: what they are.
         structure: pytrees of the arguments and of the results.
         alike: rows of nodes which may be computed in loops; nothing where all is written out.
+        unroll: as it was told to `trace`.
         zeros: of an argument, by its number, which entries it takes to be zero.
     """
 
@@ -66,6 +67,7 @@ class Program:
     results: list[Leaf]
     structure: tuple[Any, Any]
     alike: list[tuple[Node, ...]] = field(default_factory=list)
+    unroll: int | None = None
     zeros: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -292,4 +294,4 @@ def _program(
     outputs = walk.closed(jaxpr, *nodes)
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
     leaves = _leaves(results, "results")
-    return Program(graph, inputs, outputs, leaves, structures, walk.alike, zeros)
+    return Program(graph, inputs, outputs, leaves, structures, walk.alike, unroll, zeros)
