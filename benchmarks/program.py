@@ -20,7 +20,7 @@ from robins.filters.rules import h_infinity
 from robins.program import CPP, LANE_FLAGS, build, function, header, to_c, trace_step
 
 N, M, BATCH, STEPS, LANES = 9, 3, 256, 200, 8
-UNROLLED = (None, 10000, 4000, 300)
+UNROLLED = (10_000, 300)
 
 # Steps a filter: reals and counts of the state come first among arguments and results, and behind
 # those of the state the measurement.

@@ -22,7 +22,7 @@ import numpy as np
 
 from robins.program.c import to_c
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import Leaf, Program, trace
+from robins.program.trace import UNROLL, Leaf, Program, trace
 
 # Passes that look for what is computed twice: there is nothing left to find, and it takes half of
 # the time of the compiler. Compilers that do not know them say nothing.
@@ -185,7 +185,7 @@ def _laid_out(leaves: list[Leaf]) -> tuple[np.ndarray, np.ndarray, list[np.ndarr
 def native(
     function: Callable[..., Any],
     *args: Any,
-    unroll: int | None = None,
+    unroll: int | None = UNROLL,
     flags: tuple[str, ...] = FLAGS,
 ) -> Native:
     """Trace a function with arguments, compile its program, and give it back as a function.

@@ -19,6 +19,10 @@ from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
 from robins.program.roll import FEWEST
 
+# Scalar operations up to which a loop or a factorisation is written out: all of a filter of nine
+# states, not the thirty samples of an IMU between two fixes.
+UNROLL = 10_000
+
 Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
 
 Rule = Callable[..., Any]  # (walk, equation, *arrays) -> array, or a list of them
@@ -200,7 +204,7 @@ def _leaves(tree: Any, root: str) -> list[Leaf]:
     return found
 
 
-def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -> Program:
+def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL) -> Program:
     """A pure function of JAX as a program of scalars.
 
     Args:
@@ -208,8 +212,8 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -
         args: arguments of the shapes and types that the program will be given; their values do not
             matter. What the function holds otherwise is known, and folded.
         unroll: the number of scalar operations up to which a loop or a factorisation is written
-            out; above, it is a loop or a call. None writes out everything that ends when it is
-            known to end.
+            out; above, it is a loop or a call. Written out it is faster, and longer. None writes
+            out everything that is known to end.
 
     Raises:
         ProgramError: it does something that has no place in a program; the message names the line.
@@ -219,7 +223,7 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -
 
 
 def trace_step(
-    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = None
+    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = UNROLL
 ) -> Program:
     """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
 
