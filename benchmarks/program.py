@@ -1,8 +1,10 @@
-"""Steps of filters as programs: what it takes to make them, and how long one step takes in C.
+"""Steps of filters as programs: what it takes to make them, and how long one step takes.
 
 Nine states, three measurements, ``A x + 0.01 sin x`` with a full A, square-root form; complete
 steps with checks, codes and NIS. JAX steps a batch of 256 runs, each with its own P0; C steps one
-run in one lane. All is timed on this machine in one go; the best of some rounds.
+run, or eight in lanes. All on one core of this machine, in one go; the best of some rounds.
+
+    python benchmarks/program.py [EKF] [UKF] [H-infinity]
 """
 
 import ctypes
@@ -15,18 +17,19 @@ import numpy as np
 
 from robins.filters import Belief, Model, Motion, Sensor, filter_step, kalman, taylor, unscented
 from robins.filters.rules import h_infinity
-from robins.program import FLAGS, build, to_c, trace
+from robins.program import CPP, LANE_FLAGS, build, function, header, to_c, trace_step
 
-N, M, BATCH, STEPS = 9, 3, 256, 200
-UNROLLED = (None, 1000, 100)
+N, M, BATCH, STEPS, LANES = 9, 3, 256, 200, 8
+UNROLLED = (10_000, 300)
 
-# Steps a filter in C: reals and counts of the state come first among arguments and results.
+# Steps a filter: reals and counts of the state come first among arguments and results, and behind
+# those of the state the measurement.
 REPEAT = """
-void repeat(int steps, int reals, int counts, int width, const real *rows, real *x, whole *k,
-            real *y, whole *m, int at)
+void repeat(int steps, int reals, int counts, const double *rows, real *x, whole *k, real *y,
+            whole *m)
 {
     for (int s = 0; s < steps; ++s) {
-        memcpy(x + at, rows + s * width, (size_t)width * sizeof(real));
+        for (int j = 0; j < 3; ++j) { x[reals + j] = REAL(rows[s * 3 + j]); }
         robins_step(x, k, y, m);
         memcpy(x, y, (size_t)reals * sizeof(real));
         memcpy(k, m, (size_t)counts * sizeof(whole));
@@ -34,8 +37,15 @@ void repeat(int steps, int reals, int counts, int width, const real *rows, real 
 }
 """
 
+FILTERS = {
+    "EKF": kalman(taylor()),
+    "UKF": kalman(unscented()),
+    "H-infinity": kalman(taylor(), [h_infinity(50.0, np.eye(N))]),
+}
+
 
 def problem():
+    """The model, a P0 for each run, measurements."""
     rng = np.random.default_rng(0)
     A = np.eye(N) + 0.01 * rng.normal(size=(N, N))
     A /= max(1.0, np.abs(np.linalg.eigvals(A)).max())
@@ -46,85 +56,83 @@ def problem():
     return model, P0, rng.normal(size=(STEPS, M))
 
 
-FILTERS = {
-    "EKF": kalman(taylor()),
-    "UKF": kalman(unscented()),
-    "H-infinity": kalman(taylor(), [h_infinity(50.0, np.eye(N))]),
-}
-
-
-def best(function, rounds=5):
+def best(go, rounds=5):
     """Seconds of the fastest of some rounds."""
     taken = []
     for _ in range(rounds):
         begun = time.perf_counter()
-        function()
+        go()
         taken.append(time.perf_counter() - begun)
     return min(taken)
 
 
 def by_jax(step, states, y):
-    """Nanoseconds a step and run in a batch."""
+    """Nanoseconds a step and run in a batch, and the mean of each run in the end."""
 
     def one(state):
         return jax.lax.scan(lambda s, row: (step(s, row)[0], None), state, y)[0]
 
     go = jax.jit(jax.vmap(one))
-    jax.block_until_ready(go(states))
-    return best(lambda: jax.block_until_ready(go(states))) / (STEPS * BATCH) * 1e9
+    end = np.asarray(jax.block_until_ready(go(states)).belief.mean)
+    return best(lambda: jax.block_until_ready(go(states))) / (STEPS * BATCH) * 1e9, end
 
 
-def in_c(program, state, y):
-    """Nanoseconds a step of one run, and the seconds of the compiler."""
+def in_c(program, states, y, lanes):
+    """Nanoseconds a step and run, seconds of the compiler, and the mean of each run in the end."""
     begun = time.perf_counter()
-    library = ctypes.CDLL(str(build(to_c(program) + REPEAT, FLAGS)))
+    if lanes:
+        text = header("lanes.h") + 'extern "C" {\n' + function(program) + REPEAT + "}\n"
+        library = ctypes.CDLL(str(build(text, LANE_FLAGS, CPP)))
+    else:
+        library = ctypes.CDLL(str(build(to_c(program) + REPEAT)))
     built = time.perf_counter() - begun
-    leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
-    reals = np.concatenate([x.ravel() for x in leaves if x.dtype == float])
-    others = [x.ravel().astype(np.int64) for x in leaves if x.dtype != float]
-    counts = np.concatenate(others) if others else np.zeros(0, np.int64)
+    runs = LANES if lanes else 1
+    rows = [np.asarray(x)[:runs].reshape(runs, -1).T for x in jax.tree.leaves(states)]
+    reals = np.concatenate([r for r in rows if r.dtype == float])
+    counts = np.concatenate([r.astype(np.int64) for r in rows if r.dtype != float])
     sizes = [0, 0]
     for leaf in program.results:
         sizes[leaf.kind != "real"] += int(np.prod(leaf.shape))
-    x, k = np.zeros(len(reals) + M), np.zeros(max(1, len(counts)), np.int64)
-    out, m = np.zeros(sizes[0]), np.zeros(max(1, sizes[1]), np.int64)
-    told = [len(reals), len(counts), M]
+    x, k = np.zeros((len(reals) + M, runs)), np.zeros(counts.shape, np.int64)
+    out, m = np.zeros((sizes[0], runs)), np.zeros((sizes[1], runs), np.int64)
+    pointers = [ctypes.c_void_p(a.ctypes.data) for a in (y, x, k, out, m)]
 
     def go():
-        x[: len(reals)], k[: len(counts)] = reals, counts
-        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (y, x, k, out, m)]
-        library.repeat(STEPS, *told, *pointers, len(reals))
+        x[: len(reals)], k[:] = reals, counts
+        library.repeat(STEPS, len(reals), len(counts), *pointers)
 
-    return best(go, 20) / STEPS * 1e9, built
+    return best(go, 20) / STEPS / runs * 1e9, built, out[:N].T
 
 
 def main():
     model, P0, y = problem()
-    print(
-        f"{'filter':12s} {'unroll':>8s} {'nodes':>7s} {'trace s':>8s} {'build s':>8s}"
-        f" {'C ns':>8s} {'JAX ns':>8s}"
-    )
-    for name, filter_ in FILTERS.items():
-        if len(sys.argv) > 1 and name not in sys.argv[1:]:
-            continue
-        starts = [filter_.init(Belief.of(jnp.zeros(N), P), model.dims) for P in P0]
+    names = [name for name in FILTERS if name in sys.argv[1:]] or list(FILTERS)
+    head = ("filter", "unroll", "nodes", "trace s", "C s", "C++ s", "C ns", "8 lanes ns", "JAX ns")
+    print(("{:12s}" + "{:>11s}" * 9).format(*head, "JAX/lanes"))
+    for name in names:
+        starts = [FILTERS[name].init(Belief.of(jnp.zeros(N), P), model.dims) for P in P0]
         states = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *starts)
         first = jax.tree.map(lambda x: x[0], states)
 
-        def step(state, row, filter_=filter_):
+        def step(state, row, filter_=FILTERS[name]):
             state, done = filter_step(filter_, model, state, None, {"y": row}, {})
             return state, (done.info["y"].nis, done.info["y"].code)
 
-        reference = by_jax(step, states, y)
+        reference, end = by_jax(step, states, y)
         for unroll in UNROLLED:
             begun = time.perf_counter()
-            program = trace(step, first, jnp.asarray(y[0]), unroll=unroll)
+            program = trace_step(step, first, jnp.asarray(y[0]), unroll=unroll)
             traced = time.perf_counter() - begun
-            ns, built = in_c(program, first, y)
+            one, c_s, alone = in_c(program, states, y, False)
+            eight, cpp_s, together = in_c(program, states, y, True)
+            assert np.array_equal(alone[0], together[0])
+            assert np.allclose(together, end[:LANES], rtol=1e-12, atol=1e-13)
             told = "all" if unroll is None else str(unroll)
+            numbers = (traced, c_s, cpp_s)
             print(
-                f"{name:12s} {told:>8s} {len(program.live):7d} {traced:8.2f} {built:8.2f}"
-                f" {ns:8.0f} {reference:8.0f}",
+                f"{name:12s}{told:>11s}{len(program.live):11d}"
+                + "".join(f"{x:11.2f}" for x in numbers)
+                + f"{one:11.0f}{eight:11.0f}{reference:11.0f}{reference / eight:11.1f}",
                 flush=True,
             )
 

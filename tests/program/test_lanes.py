@@ -2,7 +2,6 @@
 
 import ctypes
 import shutil
-import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -12,22 +11,17 @@ from machines import QUICK, stepping
 from rule_table import RULES, START, Y, line
 
 from robins.filters import kalman
-from robins.program import Native, function, header, trace
+from robins.program import CPP, LANE_FLAGS, Native, build, function, header, trace
 
-CPP = shutil.which("g++") or shutil.which("clang++")
-pytestmark = pytest.mark.skipif(CPP is None, reason="lanes need a C++ compiler")
-FLAGS = ("-std=gnu++17", "-O0", "-ffp-contract=off", "-fno-math-errno", "-Wno-psabi", "-fPIC")
+FOUND = any(map(shutil.which, CPP.names))
+pytestmark = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
+FLAGS = tuple("-O0" if flag == "-O2" else flag for flag in LANE_FLAGS)
 
 
-def in_lanes(program, folder, lanes):
+def in_lanes(program, lanes):
     """A program on arrays with a trailing axis of lanes."""
     text = header("lanes.h") + 'extern "C" {\n' + function(program) + "}\n"
-    source, library = folder / "lanes.cc", folder / "lanes.so"
-    source.write_text(text)
-    told = [str(CPP), *FLAGS, f"-DLANES={lanes}", "-shared", str(source), "-o", str(library)]
-    done = subprocess.run(told, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return ctypes.CDLL(str(library)).robins_step
+    return ctypes.CDLL(str(build(text, (*FLAGS, f"-DLANES={lanes}"), CPP))).robins_step
 
 
 def flat(leaves):
@@ -38,7 +32,7 @@ def flat(leaves):
     return (np.concatenate([*reals, np.zeros(0)]), np.concatenate([*others, np.zeros(0, np.int64)]))
 
 
-def check(step, cases, folder, unroll=None):
+def check(step, cases, unroll=None):
     """That lanes give to the bit what one run after the other gives."""
     program = trace(step, *cases[0], unroll=unroll)
     one = Native(program, QUICK)
@@ -46,14 +40,14 @@ def check(step, cases, folder, unroll=None):
     want = [flat(jax.tree.leaves(one(*case))) for case in cases]
     x, k = (np.ascontiguousarray(np.stack(rows, axis=-1)) for rows in zip(*given, strict=True))
     y, m = (np.zeros_like(np.stack(rows, axis=-1)) for rows in zip(*want, strict=True))
-    in_lanes(program, folder, len(cases))(*(ctypes.c_void_p(a.ctypes.data) for a in (x, k, y, m)))
+    in_lanes(program, len(cases))(*(ctypes.c_void_p(a.ctypes.data) for a in (x, k, y, m)))
     for lane, (reals, others) in enumerate(want):
         np.testing.assert_array_equal(y[:, lane], reals)
         np.testing.assert_array_equal(m[:, lane], others)
 
 
 @pytest.mark.parametrize(("lanes", "unroll"), [(8, None), (4, 200)])
-def test_a_filter(tmp_path, lanes, unroll):
+def test_a_filter(lanes, unroll):
     model = line()
     one = kalman(rules=[RULES["gate"], RULES["h_infinity"]])
     state = jax.tree.map(jnp.asarray, one.init(START, model.dims))
@@ -64,7 +58,7 @@ def test_a_filter(tmp_path, lanes, unroll):
     ]
     rows = [Y[3], Y[4], Y[7], Y[9], Y[11], np.full(3, np.inf), Y[0], Y[1]]
     cases = [(s, None, {"y": y}, {}) for s, y in zip(spread, rows, strict=False)]
-    check(stepping(one, model), cases, tmp_path, unroll)
+    check(stepping(one, model), cases, unroll)
 
 
 def numbers(x, k, u, c):
@@ -82,11 +76,11 @@ def numbers(x, k, u, c):
     )  # fmt: skip
 
 
-def test_all_kinds_of_numbers(tmp_path):
+def test_all_kinds_of_numbers():
     rng = np.random.default_rng(0)
     cases = [
         (rng.normal(size=9), np.int64(k - 2), np.uint32(2**31 + 77 * k), np.bool_(k % 2))
         for k in range(8)
     ]
-    check(numbers, cases, tmp_path)
-    check(numbers, cases, tmp_path, unroll=0)
+    check(numbers, cases)
+    check(numbers, cases, unroll=0)

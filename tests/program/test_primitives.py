@@ -190,7 +190,11 @@ EXACT = {
         ),
         A,
     ),
-    "extremes with NaN": (lambda a: (jnp.argmax(a), jnp.argmin(a), a.max(), a.min()), ODD),
+    "turned round": (lambda w: (w[:, ::-1], w[::-1, :, ::-1]), WIDE),
+    "extremes with NaN": (
+        lambda a: (jnp.argmax(a), jnp.argmin(a), a.max(), a.min()),
+        np.tile(ODD, 2),
+    ),
     "parity": (lambda a: lax.reduce_xor(a, (0,)), V > 0),
     "cumulated extremes": (lambda a: (lax.cummax(a), lax.cummin(a, reverse=True)), V),
     "sorted": (
@@ -287,6 +291,10 @@ ROUNDED = {
     "cholesky": (jnp.linalg.cholesky, SPD),
     "cholesky in a batch": (jnp.linalg.cholesky, np.stack([SPD, 2 * SPD])),
     "cholesky of nothing positive": (jnp.linalg.cholesky, -SPD),
+    "cholesky of what is not positive in the end": (
+        jnp.linalg.cholesky,
+        SPD - 1e3 * np.diag([0.0, 0.0, 0.0, 0.0, 1.0]),
+    ),
     "solve": (
         lambda L, b: [
             lax.linalg.triangular_solve(

@@ -13,13 +13,15 @@ This room knows JAX and no filter: no filter, rule or system is written for it.
 """
 
 from robins.program.c import function, header, to_c
-from robins.program.native import FLAGS, Native, build, compiler, native
+from robins.program.native import CPP, FLAGS, LANE_FLAGS, Native, build, compiler, native
 from robins.program.nodes import Graph
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import Leaf, Program, trace, trace_step
 
 __all__ = [
+    "CPP",
     "FLAGS",
+    "LANE_FLAGS",
     "BuildError",
     "Graph",
     "Leaf",

@@ -71,7 +71,7 @@ class _Writer:
         self.schedule: dict[int, list[Node | Roll]] = defaultdict(list)
         self.place: dict[Node, tuple[Pack, int]] = {}
         if program.alike:
-            packing = Packing(self.graph, live, self.roots, program.alike)
+            packing = Packing(self.graph, live, self.roots, program.alike, program.unroll or 0)
             self.place, self.schedule = packing.place, packing.schedule()
         else:
             for node in live:

@@ -15,40 +15,55 @@ import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from robins.program.c import to_c
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import Leaf, Program, trace
+from robins.program.trace import UNROLL, Leaf, Program, trace
 
 # Passes that look for what is computed twice: there is nothing left to find, and it takes half of
 # the time of the compiler. Compilers that do not know them say nothing.
 FASTER = ("-fno-gcse", "-fno-tree-pre")
 # Contraction would join a product and a sum into one rounding: other bits on other machines.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
+# Lanes are as wide as the processor that compiles them.
+LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
 NO_COMPILER = (
     "install one (Debian: `apt install gcc`; anywhere: `pip install ziglang`), or name it in CC"
 )
 
 
-def compiler() -> tuple[str, ...]:
-    """The command of a C compiler: what CC says, else the system's, else that of `ziglang`.
+class Language(NamedTuple):
+    """How texts are compiled: one number by C, lanes by C++, which chooses between vectors."""
+
+    suffix: str
+    variable: str  # of the environment, that names the compiler
+    names: tuple[str, ...]  # of compilers
+    zig: str
+
+
+C = Language(".c", "CC", ("cc", "gcc", "clang"), "cc")
+CPP = Language(".cc", "CXX", ("c++", "g++", "clang++"), "c++")
+
+
+def compiler(language: Language = C) -> tuple[str, ...]:
+    """The command of a compiler: what CC or CXX says, else the system's, else that of `ziglang`.
 
     Raises:
         BuildError: there is none.
     """
-    if told := shlex.split(os.environ.get("CC", "")):
+    if told := shlex.split(os.environ.get(language.variable, "")):
         if shutil.which(told[0]) is None:
-            raise BuildError(f"there is no program '{told[0]}'", "CC", NO_COMPILER)
+            raise BuildError(f"there is no program '{told[0]}'", language.variable, NO_COMPILER)
         return tuple(told)
-    for name in ("cc", "gcc", "clang"):
+    for name in language.names:
         if (found := shutil.which(name)) is not None:
             return (found,)
     if importlib.util.find_spec("ziglang") is not None:
-        return (sys.executable, "-m", "ziglang", "cc")
+        return (sys.executable, "-m", "ziglang", language.zig)
     raise BuildError("there is no C compiler on this machine", "", NO_COMPILER)
 
 
@@ -71,20 +86,20 @@ def _own_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="robins-native-"))
 
 
-def build(text: str, flags: tuple[str, ...] = FLAGS) -> Path:
-    """A shared library of a file of C: the one there is if text, compiler, flags are equal.
+def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> Path:
+    """A shared library of a text: the one there is if text, compiler, flags are equal.
 
     Raises:
         BuildError: there is no compiler, or it refuses the text; it says what was said.
     """
-    command = compiler()
+    command = compiler(language)
     told = "\0".join([text, *command, _version(command), *flags])
     folder, name = cache_folder(), hashlib.sha256(told.encode()).hexdigest()[:24]
     library = folder / f"{name}.so"
     if library.exists():
         return library
     with tempfile.TemporaryDirectory(dir=folder) as own:
-        source, made = Path(own) / "program.c", Path(own) / library.name
+        source, made = Path(own) / f"program{language.suffix}", Path(own) / library.name
         source.write_text(text, "utf-8")
         line = [*command, *flags, "-shared", "-fPIC", str(source), "-o", str(made), "-lm"]
         done = subprocess.run(line, capture_output=True, text=True)
@@ -170,7 +185,7 @@ def _laid_out(leaves: list[Leaf]) -> tuple[np.ndarray, np.ndarray, list[np.ndarr
 def native(
     function: Callable[..., Any],
     *args: Any,
-    unroll: int | None = None,
+    unroll: int | None = UNROLL,
     flags: tuple[str, ...] = FLAGS,
 ) -> Native:
     """Trace a function with arguments, compile its program, and give it back as a function.

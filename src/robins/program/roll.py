@@ -64,8 +64,14 @@ Seeds = Iterable[tuple[Node, ...]]
 class Packing:
     """Packs and loops among the live nodes of a graph."""
 
-    def __init__(self, graph: Graph, live: Sequence[Node], roots: set[Node], seeds: Seeds):
-        """Pack live nodes, from rows that may be alike; roots are read where all is done."""
+    def __init__(
+        self, graph: Graph, live: Sequence[Node], roots: set[Node], seeds: Seeds, unroll: int = 0
+    ):
+        """Pack live nodes, from rows that may be alike; roots are read where all is done.
+
+        What is not more than so many operations in all rounds is written out.
+        """
+        self.unroll = unroll
         self.graph, self.live, self.roots = graph, set(live), roots
         self.place: dict[Node, tuple[Pack, int]] = {}  # of a node in a pack: which round
         # What says whether a loop goes on is computed before all else in it.
@@ -74,6 +80,7 @@ class Packing:
         self.first = {n for n in graph.live(going) if graph.scope[n] > 0}
         for nodes in sorted(set(seeds), key=lambda s: (-len(s), -s[0])):
             self._pack(nodes)
+        self.suspects = self.live
         while self._dissolve_circles():
             pass
         self._join()
@@ -122,17 +129,18 @@ class Packing:
 
     def _order(self) -> list[Node]:
         """Units in an order of computation; those that wait for themselves are left out."""
-        return ordered(self._needs(self._unit))[0]
+        return ordered(self._needs(self._unit, self.live))[0]
 
-    def _needs(self, unit_of: Callable[[Node], Node]) -> dict[Node, set[Node]]:
+    def _needs(self, unit_of: Callable[[Node], Node], nodes: set[Node]) -> dict[Node, set[Node]]:
+        """Of the units of some nodes, the units that they need."""
         needs: dict[Node, set[Node]] = {}
-        for node in self.live:
+        for node in nodes:
             needs.setdefault(unit_of(node), set()).update(map(unit_of, self.graph.args[node]))
         return needs
 
     def _dissolve_circles(self) -> bool:
         """Take apart some packs that wait for themselves, directly or by way of others."""
-        needs = self._needs(self._unit)
+        needs = self._needs(self._unit, self.suspects)
         _, stuck = ordered(needs)
         users: dict[Node, set[Node]] = {unit: set() for unit in stuck}
         for unit in stuck:
@@ -140,6 +148,8 @@ class Packing:
                 users[a].add(unit)
         _, circles = ordered(users)  # without what only waits for a circle
         packs = sorted(unit for unit in circles if unit in self.place)
+        # What is in no circle now will be in none when packs are taken apart.
+        self.suspects = {n for n in self.suspects if self._unit(n) in circles}
         for unit in packs[: max(1, len(packs) // 8)]:
             self._dissolve(self.place[unit][0])
         return bool(packs)
@@ -224,8 +234,13 @@ class Packing:
                 pack.args.append(nodes)
 
     def _dissolve_small(self) -> bool:
-        """Take apart loops that do less than it takes to gather what they need."""
-        small = [r for r in self.rolls if len(r.packs) < LEAST * max(1, self._cost(r))]
+        """Take apart loops that are short, or do less than it takes to gather what they need."""
+        small = [
+            r
+            for r in self.rolls
+            if r.rounds * len(r.packs) <= self.unroll
+            or len(r.packs) < LEAST * max(1, self._cost(r))
+        ]
         for roll in small:
             for pack in roll.packs:
                 self._dissolve(pack)
@@ -259,7 +274,7 @@ class Packing:
             place = self.place.get(node)
             return node if place is None else head[id(place[0].loop)]
 
-        needs = self._needs(unit_of)
+        needs = self._needs(unit_of, self.live)
         for unit, args in needs.items():
             args.discard(unit)
         order, stuck = ordered(needs)

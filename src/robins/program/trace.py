@@ -19,6 +19,10 @@ from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
 from robins.program.roll import FEWEST
 
+# Scalar operations up to which a loop or a factorisation is written out: all of a filter of nine
+# states, not the thirty samples of an IMU between two fixes.
+UNROLL = 10_000
+
 Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
 
 Rule = Callable[..., Any]  # (walk, equation, *arrays) -> array, or a list of them
@@ -57,6 +61,7 @@ class Program:
         results: what they are.
         structure: pytrees of the arguments and of the results.
         alike: rows of nodes which may be computed in loops; nothing where all is written out.
+        unroll: as it was told to `trace`.
         zeros: of an argument, by its number, which entries it takes to be zero.
     """
 
@@ -66,6 +71,7 @@ class Program:
     results: list[Leaf]
     structure: tuple[Any, Any]
     alike: list[tuple[Node, ...]] = field(default_factory=list)
+    unroll: int | None = None
     zeros: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -198,7 +204,7 @@ def _leaves(tree: Any, root: str) -> list[Leaf]:
     return found
 
 
-def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -> Program:
+def trace(function: Callable[..., Any], *args: Any, unroll: int | None = UNROLL) -> Program:
     """A pure function of JAX as a program of scalars.
 
     Args:
@@ -206,8 +212,8 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -
         args: arguments of the shapes and types that the program will be given; their values do not
             matter. What the function holds otherwise is known, and folded.
         unroll: the number of scalar operations up to which a loop or a factorisation is written
-            out; above, it is a loop or a call. None writes out everything that ends when it is
-            known to end.
+            out; above, it is a loop or a call. Written out it is faster, and longer. None writes
+            out everything that is known to end.
 
     Raises:
         ProgramError: it does something that has no place in a program; the message names the line.
@@ -217,7 +223,7 @@ def trace(function: Callable[..., Any], *args: Any, unroll: int | None = None) -
 
 
 def trace_step(
-    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = None
+    function: Callable[..., Any], state: Any, *args: Any, unroll: int | None = UNROLL
 ) -> Program:
     """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
 
@@ -292,4 +298,4 @@ def _program(
     outputs = walk.closed(jaxpr, *nodes)
     structures = tuple(jax.tree_util.tree_structure(tree) for tree in (given, results))
     leaves = _leaves(results, "results")
-    return Program(graph, inputs, outputs, leaves, structures, walk.alike, zeros)
+    return Program(graph, inputs, outputs, leaves, structures, walk.alike, unroll, zeros)
