@@ -40,6 +40,13 @@ def test_tria_is_a_factor_of_the_sum_of_squares(n, k, decades):
     assert not np.any(tria(jnp.zeros((n, k))))
 
 
+@pytest.mark.parametrize(("a", "b"), [((2, 3), (1, 2)), ((0, 0), (3, 3)), ((2, 0), (0, 2))])
+def test_block_diagonal_leaves_the_rest_zero(a, b):
+    A, B = draw(1, *a), draw(2, *b)
+    found = linalg.block_diagonal(jnp.array(A), jnp.array(B))
+    np.testing.assert_array_equal(found, scipy.linalg.block_diag(A, B))
+
+
 def test_tria_is_cholesky_where_there_is_one():
     A = draw(3, 5, 9)
     np.testing.assert_allclose(

@@ -7,6 +7,7 @@ that another matrix layout can take the place of `robins.linalg.dense` without t
 
 from robins.linalg.dense import (
     as_factor,
+    block_diagonal,
     block_factor,
     cholesky,
     downdate,
@@ -30,6 +31,7 @@ from robins.linalg.dense import (
 
 __all__ = [
     "as_factor",
+    "block_diagonal",
     "block_factor",
     "cholesky",
     "downdate",

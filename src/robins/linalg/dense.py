@@ -35,6 +35,14 @@ def where(condition, a, b):
     return jnp.where(condition, a, b)
 
 
+def block_diagonal(a: Float[Array, "m k"], b: Float[Array, "n l"]) -> Float[Array, "m+n k+l"]:
+    """Two matrices as one: a factor of what is independent, or a transition of what moves alone."""
+    right, left = jnp.zeros((a.shape[0], b.shape[1])), jnp.zeros((b.shape[0], a.shape[1]))
+    return jnp.concatenate(
+        [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
+    )
+
+
 def tria(*blocks: Float[Array, "n _"]) -> Float[Array, "n n"]:
     """Lower-triangular L, diagonal not negative, with ``L L' = sum of B B'`` over the blocks.
 

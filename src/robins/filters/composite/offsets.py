@@ -91,14 +91,6 @@ def with_offsets(change: np.ndarray, sensors: int) -> np.ndarray:
 # ----------------------------------------------------------------------------- the model of a mode
 
 
-def _beside(a: Array, b: Array) -> Array:
-    """Block diagonal."""
-    right, left = jnp.zeros((len(a), b.shape[1])), jnp.zeros((len(b), a.shape[1]))
-    return jnp.concatenate(
-        [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
-    )
-
-
 def _components(x: Wide, each: Array) -> Array:
     """A number of each sensor, for every component of its offset."""
     return jnp.concatenate([jnp.broadcast_to(each[i], b.shape) for i, b in enumerate(x.offset)])
@@ -120,14 +112,14 @@ def _step(motion: Motion, of: Supposed, x: Wide, u: Any) -> Wide:
 
 
 def _noise(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any) -> Array:
-    return _beside(scaled(motion.noise_factor(x.state, u)), _drawn(x, of))
+    return linalg.block_diagonal(scaled(motion.noise_factor(x.state, u)), _drawn(x, of))
 
 
 def _step_linear(motion: Motion, of: Supposed, scaled: Scaled, x: Wide, u: Any):
     assert motion.linear is not None
     state, F, noise = motion.linear(x.state, u)
-    F = _beside(F, jnp.diag(_components(x, of.lasts)))
-    noise = _beside(scaled(linalg.as_factor(noise)), _drawn(x, of))
+    F = linalg.block_diagonal(F, jnp.diag(_components(x, of.lasts)))
+    noise = linalg.block_diagonal(scaled(linalg.as_factor(noise)), _drawn(x, of))
     return Wide(state, _kept(x, of)), F, noise
 
 
@@ -186,7 +178,7 @@ def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
     """
 
     def widened(belief: Belief, offset: tuple[Array, ...], factor: Array) -> Belief:
-        return Belief(Wide(belief.mean, offset), _beside(belief.factor, factor))
+        return Belief(Wide(belief.mean, offset), linalg.block_diagonal(belief.factor, factor))
 
     def narrow(wide: FilterState) -> FilterState:
         mean, n = wide.belief.mean.state, manifold.dim(wide.belief.mean.state)
@@ -196,7 +188,7 @@ def narrowed(filter_: Filter, names: Sequence[str]) -> Filter:
     def init(belief: Belief, dims: Mapping[str, int]) -> FilterState:
         if unknown := set(names) - set(dims):
             raise ValueError(
-                f"off names {sorted(unknown)}, but the sensors of the model are {list(dims)}"
+                f"off names {sorted(unknown)}: name sensors of the model, which has {list(dims)}"
             )
         offset = tuple(jnp.zeros(dims[name]) for name in names)
         factor = BEGINS * jnp.eye(sum(dims[name] for name in names))

@@ -36,6 +36,7 @@ from robins.filters.composite.imm import Mode
 from robins.filters.observation import Observation
 from robins.filters.rules import student_t
 from robins.ins.state import InsState
+from robins.linalg import block_diagonal
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Velocity
 from robins.systems.parts import Block, moved_by
 from robins.systems.study import Case
@@ -117,20 +118,13 @@ def widened(start: Belief, asked: bool) -> Belief:
     spread = np.zeros((3 + asked, 3 + asked))
     if asked:
         spread[0, 0] = sigma
-    return Belief(Wide(start.mean, share, jnp.zeros(3)), _diagonal(start.factor, spread))
+    factor = block_diagonal(jnp.asarray(start.factor, float), jnp.asarray(spread))
+    return Belief(Wide(start.mean, share, jnp.zeros(3)), factor)
 
 
 def navigation(x: Any) -> InsState:
     """The navigation state of a wide one; another as it is."""
     return x.ins if isinstance(x, Wide) else x
-
-
-def _diagonal(a: Any, b: Any) -> Array:
-    a, b = jnp.asarray(a, float), jnp.asarray(b, float)
-    right, left = jnp.zeros((len(a), b.shape[1])), jnp.zeros((len(b), a.shape[1]))
-    return jnp.concatenate(
-        [jnp.concatenate([a, right], axis=1), jnp.concatenate([left, b], axis=1)]
-    )
 
 
 def _as_data(function: Any) -> Partial:
@@ -154,11 +148,11 @@ def _step_linear(motion: Motion, of: Hypothesis, x: Wide, u: Block):
     ins, Phi, factor = motion.linear(x.ins, u)
     free = 0 if x.share is None else 1
     unit, zero = jnp.eye(free), jnp.zeros((free, free))
-    Phi = _diagonal(Phi, _diagonal(unit, of.kept * jnp.eye(3)))
+    Phi = block_diagonal(Phi, block_diagonal(unit, of.kept * jnp.eye(3)))
     n = len(Phi)
     takes = jnp.eye(n).at[jnp.arange(6, 9), jnp.arange(n - 3, n)].set(of.taken)
     drawn = of.new * OFF_M + of.kept * WALK * jnp.sqrt(jnp.sum(u.increments.dt))
-    noise = _diagonal(jnp.sqrt(of.scale) * factor, _diagonal(zero, drawn * jnp.eye(3)))
+    noise = block_diagonal(jnp.sqrt(of.scale) * factor, block_diagonal(zero, drawn * jnp.eye(3)))
     return x._replace(ins=ins), Phi @ takes, noise
 
 
