@@ -46,7 +46,7 @@ Examples:
   robins allan still.csv                         noise parameters of my IMU
   robins calibrate turned.csv                    hard and soft iron of my magnetometer
   robins design attitude-axis                    gains that bound the worst case, and their price
-  robins export ins-gnss/drive --to drive-c      a filter as C for a board
+  robins export satellite/s1 --to satellite-c    a filter as C for a board
   robins bench up satellite/s1                   the same filter over serial lines, part by part
 
 Every command that computes writes a folder with a summary, the time series, figures and a page
