@@ -250,10 +250,29 @@ def trace_step(
             "the first result of a step has another structure than its state",
             fix="return (state, ...)",
         )
-    zeros = {}
-    for k, leaf in enumerate(map(np.asarray, leaves)):
-        if leaf.dtype == np.float64:
-            zeros[k] = (leaf == 0.0) & ~np.signbit(leaf)
+    zeros = {k: positive_zeros(np.asarray(leaf)) for k, leaf in enumerate(leaves)}
+    return step_of(jaxpr, given, results, unroll, zeros)
+
+
+def positive_zeros(a: np.ndarray) -> np.ndarray:
+    """Which entries of an array are reals, and zero."""
+    if a.dtype != np.float64:
+        return np.zeros(a.shape, bool)
+    return (a == 0.0) & ~np.signbit(a)
+
+
+def step_of(
+    jaxpr: Any, given: Any, results: Any, unroll: int | None, zeros: dict[int, np.ndarray]
+) -> Program:
+    """The program of a step, with those of some zeros of its state that last.
+
+    Args:
+        jaxpr: closed; its first results are the state that its first arguments become.
+        given: its arguments, a pytree of shapes, and
+        results: its results.
+        unroll: as in `trace`.
+        zeros: of an argument, by its number, the entries to try.
+    """
     while True:
         program = _program(jaxpr, given, results, unroll, zeros)
         zero = program.graph.constant(0, "real")
