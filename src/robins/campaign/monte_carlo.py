@@ -87,7 +87,9 @@ def at_once(function: Callable[..., Any], rows: Any) -> Any:
     return jax.vmap(function)(rows)
 
 
-def _record(blocks: _Blocks, contender: Contender, world: Any, over: Over = at_once) -> dict:
+def one_record(
+    blocks: _Blocks, contender: Contender, world: Any, over: Over = at_once
+) -> dict[str, Any]:
     """One run of one filter, to what statistics need."""
     steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
@@ -111,7 +113,7 @@ def _record(blocks: _Blocks, contender: Contender, world: Any, over: Over = at_o
 @partial(jax.jit, static_argnames=("filter_", "blocks"))
 def _records(filter_, blocks: _Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
     contender = Contender(filter_, model, case, reported)
-    return _each(partial(_record, blocks, contender), worlds)
+    return _each(partial(one_record, blocks, contender), worlds)
 
 
 def _each(one: Callable[[Any], Any], many: Any) -> Any:
@@ -174,4 +176,9 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     c = contender(problem, name)
     blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
     found = _records(c.filter, blocks, c.model, c.case, c.reported, worlds)
-    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
+    return cut(found, count)
+
+
+def cut(records: Any, count: int) -> Any:
+    """Of records with a leading axis of runs the first so many, as NumPy."""
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], records)

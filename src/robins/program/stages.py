@@ -1,76 +1,63 @@
-"""A function of one run, for many: its scans in lanes, all else as batches of JAX.
+"""A function of one run, for many: its long loops in lanes, all else as batches of JAX.
 
-The jaxpr of the function is cut into *stages*: a scan is one, and what lies between scans is one.
-What depends on no run is computed once. A scan whose body has no place in a program stays with JAX,
-and so do short ones.
+The jaxpr of the function is cut into *stages*. A scan is one, so is a call that draws a large array
+of random numbers; what lies between them is one. What depends on no run is computed once. What has
+no place in a program stays with JAX, which is said; so does what is too short to be worth it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import threading
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend import core as jex
 
-from robins.program.lanes import Given, LaneScan
-from robins.program.primitives.control import size_of
+from robins.program import rows
+from robins.program.lanes import Given, Rounds, of_scan
+from robins.program.primitives.control import called, size_of
 from robins.program.refusal import ProgramError
 
 ROUNDS = 30  # of a scan that is worth a program
 WORTH = 5_000  # scalar operations of all its rounds
-FOLDED = 2_000  # numbers of a known array that becomes part of the program
+DRAWN = 1_000  # random numbers of a call that is worth one
+DRAW = 150  # operations of a scan that cost JAX as much as a normal number
+FOLDED = 2_000  # numbers of a known array that becomes part of a program
 UNROLL = 3_000
 
-INLINED = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
 
-
-@dataclass
-class Batch:
-    """Equations between scans."""
-
-    equations: list[Any] = field(default_factory=list)
-    compiled: Any = None
-    takes: list[Any] = field(default_factory=list)
-    makes: list[Any] = field(default_factory=list)
-
-
-@dataclass
-class Scan:
-    """A scan, which lanes may do."""
-
-    equation: Any
-    compiled: LaneScan | None = None
-
-
-def worthwhile(equation: Any) -> bool:
+def is_scan(equation: Any) -> bool:
     """Whether an equation is a scan with enough to do."""
     p = equation.params
     return (
         equation.primitive.name == "scan"
         and p["length"] >= ROUNDS
-        and p["length"] * size_of(p["jaxpr"].jaxpr) >= WORTH
+        and operations(equation) >= WORTH
     )
 
 
-def called(equation: Any) -> Any:
-    """The jaxpr that an equation calls, if it is a call."""
-    if equation.primitive.name not in INLINED:
-        return None
-    p = equation.params
-    return next((p[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in p), None)
+def operations(equation: Any) -> int:
+    """About how many scalar operations a scan is, or a call that draws random numbers."""
+    if equation.primitive.name != "scan":
+        return DRAW * rows.draws(equation)
+    return equation.params["length"] * size_of(equation.params["jaxpr"].jaxpr)
 
 
-def has_scan(jaxpr: Any) -> bool:
-    """Whether a scan that is worthwhile is in a jaxpr or in what it calls."""
-    calls = (getattr(c, "jaxpr", c) for c in map(called, jaxpr.eqns) if c is not None)
-    return any(map(worthwhile, jaxpr.eqns)) or any(map(has_scan, calls))
+def worthwhile(equation: Any) -> bool:
+    """Whether an equation is worth a program."""
+    return is_scan(equation) or rows.draws(equation) >= DRAWN
+
+
+def has_worth(jaxpr: Any) -> bool:
+    """Whether something worth a program is in a jaxpr or in what it calls."""
+    calls = (c.jaxpr for c in map(called, jaxpr.eqns) if c is not None)
+    return any(map(worthwhile, jaxpr.eqns)) or any(map(has_worth, calls))
 
 
 class Flat:
-    """A jaxpr with the calls that hold scans written out.
+    """A jaxpr with the calls written out that hold something worth a program.
 
     Attributes:
         equations: of variables of their own.
@@ -87,11 +74,12 @@ class Flat:
         self.equations: list[Any] = []
         self.known: dict[Any, Any] = {}
         self.takes = [jex.Var(v.aval) for v in closed.jaxpr.invars]
-        self.makes = self._write(closed.jaxpr, closed.consts, self.takes)
+        self.makes = self._write(closed, self.takes)
 
-    def _write(self, jaxpr: Any, consts: Any, args: Any) -> list[Any]:
+    def _write(self, closed: Any, args: Sequence[Any]) -> list[Any]:
+        jaxpr = closed.jaxpr
         now: dict[Any, Any] = dict(zip(jaxpr.invars, args, strict=True))
-        for v, value in zip(jaxpr.constvars, consts, strict=True):
+        for v, value in zip(jaxpr.constvars, closed.consts, strict=True):
             now[v] = jex.Var(v.aval)
             self.known[now[v]] = value
 
@@ -100,10 +88,9 @@ class Flat:
 
         for e in jaxpr.eqns:
             given = list(map(read, e.invars))
-            whole = called(e)
-            if whole is not None and has_scan(getattr(whole, "jaxpr", whole)):
-                inner = getattr(whole, "jaxpr", whole)
-                found = self._write(inner, getattr(whole, "consts", ()), given)
+            inner = called(e)
+            if inner is not None and not worthwhile(e) and has_worth(inner.jaxpr):
+                found = self._write(inner, given)
             else:
                 found = [jex.Var(v.aval) for v in e.outvars]
                 self.equations.append(e.replace(invars=given, outvars=found))
@@ -111,115 +98,183 @@ class Flat:
         return list(map(read, jaxpr.outvars))
 
 
-class Staged:
-    """A function of one run as a function of a batch of them.
+class Batch:
+    """Equations that JAX computes for all runs at once.
 
     Attributes:
-        lanes: scans in lanes so far, and
-        left: why others are not.
+        takes, makes: variables.
     """
 
-    def __init__(self, function: Callable[..., Any], *shapes: Any, unroll: int | None = UNROLL):
-        """Cut a function into stages.
+    def __init__(self) -> None:
+        self.equations: list[Any] = []
+        self.takes: list[Any] = []
+        self.makes: list[Any] = []
+        self._compiled: Callable[..., Any] | None = None
 
-        Args:
-            function: pure, of the arguments of one run.
-            shapes: of one run, a pytree of `jax.ShapeDtypeStruct`.
-            unroll: as in `robins.program.trace`.
-        """
-        self.unroll = unroll
-        self._flat = flat = Flat(function, *shapes)
-        self.lanes: list[LaneScan] = []
-        self.left: list[str] = []
-        level: dict[Any, int] = dict.fromkeys(flat.takes, 0)
-        self._levels: dict[int, tuple[Batch, list[Scan]]] = {}
-        known = Batch()
-        for e in flat.equations:
-            of = [level[v] for v in e.invars if not isinstance(v, jex.Literal) and v in level]
-            if not of and not e.effects:
-                known.equations.append(e)
-                continue
-            here = max(of)
-            batch, scans = self._levels.setdefault(here, (Batch(), []))
-            if worthwhile(e):
-                scans.append(Scan(e))
-                here += 1
-            else:
-                batch.equations.append(e)
-            level.update((v, here) for v in e.outvars)
-        self._batched = set(level)
-        self._last_use(known)
-        self._known = dict(flat.known)
-        self._known.update(self._run(known, self._known))
+    def compile(self, batched: set[Any]) -> None:
+        """Let JAX compile it."""
+        jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations)
+        function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
+        axes = tuple(0 if v in batched else None for v in self.takes)
+        self._compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)
 
-    # ------------------------------------------------------------------------------- stages
+    def __call__(self, values: dict[Any, Any]) -> dict[Any, Any]:
+        """What it makes of what is there."""
+        assert self._compiled is not None
+        found = self._compiled(*(values[v] for v in self.takes)) if self.makes else []
+        return dict(zip(self.makes, found, strict=True))
 
-    def _last_use(self, known: Batch) -> None:
-        """Let JAX compile the batches, each to give what others use."""
-        batches = [known, *(batch for batch, _ in self._levels.values())]
-        of = {id(e): k for k, b in enumerate(batches) for e in b.equations}
-        made = {v: of.get(id(e)) for e in self._flat.equations for v in e.outvars}
-        takes: list[dict[Any, None]] = [{} for _ in batches]
-        gives: list[dict[Any, None]] = [{} for _ in batches]
-        users = [(of.get(id(e)), e.invars) for e in self._flat.equations]
-        for here, atoms in (*users, (None, self._flat.makes)):
-            for v in atoms:
-                if isinstance(v, jex.Literal) or (there := made.get(v, -1)) == here is not None:
-                    continue
-                if here is not None:
-                    takes[here][v] = None
-                if there is not None and there >= 0:
-                    gives[there][v] = None
-        for batch, used, given in zip(batches, takes, gives, strict=True):
-            batch.takes, batch.makes = list(used), list(given)
-            jaxpr = jex.Jaxpr([], batch.takes, batch.makes, batch.equations)
-            function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
-            axes = tuple(0 if v in self._batched else None for v in batch.takes)
-            batch.compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)
 
-    def _run(self, batch: Batch, values: dict[Any, Any]) -> dict[Any, Any]:
-        found = batch.compiled(*(values[v] for v in batch.takes)) if batch.makes else []
-        return dict(zip(batch.makes, found, strict=True))
+class Long:
+    """An equation worth a program: rounds in lanes, or JAX if it has no place there.
 
-    def __call__(self, *args: Any) -> Any:
-        """The function on arguments with a leading axis of runs; NumPy or JAX arrays."""
-        leaves = jax.tree_util.tree_leaves(args)
-        runs = leaves[0].shape[0]
-        values = dict(self._known)
-        values.update(zip(self._flat.takes, leaves, strict=True))
-        for level in sorted(self._levels):
-            batch, scans = self._levels[level]
-            values.update(self._run(batch, values))
-            for scan in scans:
-                values.update(self._scanned(scan, runs, values))
+    Attributes:
+        equation: of the jaxpr.
+        rounds: where it is compiled.
+        refused: why it is not.
+    """
 
-        def wide(v: Any) -> Any:
-            if v in self._batched if not isinstance(v, jex.Literal) else False:
-                return values[v]
-            alone = v.val if isinstance(v, jex.Literal) else values[v]
-            return np.broadcast_to(alone, (runs, *np.shape(alone)))
+    def __init__(self, equation: Any, unroll: int | None):
+        self.equation, self.unroll = equation, unroll
+        self.rounds: Rounds | None = None
+        self.refused: ProgramError | None = None
+        self._by_jax = Batch()
+        self._lock = threading.Lock()
 
-        return jax.tree_util.tree_unflatten(self._flat.tree, map(wide, self._flat.makes))
-
-    def _scanned(self, scan: Scan, runs: int, values: dict[Any, Any]) -> dict[Any, Any]:
-        e, p = scan.equation, scan.equation.params
+    def __call__(self, runs: int, values: dict[Any, Any], batched: set[Any]) -> dict[Any, Any]:
+        """What it makes of what is there."""
+        e = self.equation
 
         def given(v: Any) -> Given:
             if isinstance(v, jex.Literal):
                 return Given(np.asarray(v.val, v.aval.dtype), False)
-            return Given(np.asarray(values[v]), v in self._batched)
+            return Given(values[v], v in batched)
 
-        all_ = list(map(given, e.invars))
-        fixed, carried = p["num_consts"], p["num_carry"]
-        begin, taken = all_[fixed : fixed + carried], all_[fixed + carried :]
-        if scan.compiled is None or not scan.compiled.holds_for(begin):
+        args = list(map(given, e.invars))
+        if e.primitive.name == "scan":
+            fixed, carried = e.params["num_consts"], e.params["num_carry"]
+            consts, begin = args[:fixed], args[fixed : fixed + carried]
             known = {
-                k: g.array
-                for k, g in enumerate(all_[:fixed])
+                k: np.asarray(g.array)
+                for k, g in enumerate(consts)
                 if not g.batched and g.array.size <= FOLDED
             }
-            scan.compiled = LaneScan(e, known, begin, self.unroll)
-            self.lanes.append(scan.compiled)
-        stays = [all_[k] for k in scan.compiled.fixed]
-        after, rows = scan.compiled(runs, begin, stays, taken)
-        return dict(zip(e.outvars, [*after, *rows], strict=True))
+            with self._lock:
+                self._compile(lambda: of_scan(e, known, begin, self.unroll), begin)
+            free = [g for k, g in enumerate(consts) if k not in known]
+            args = [*begin, *free, *args[fixed + carried :]]
+            dropped = 0
+        else:
+            with self._lock:
+                self._compile(lambda: rows.of_call(e), [])
+            args = [Given(np.zeros((), np.int64), False), *(args[k] for k in rows.order_of(e))]
+            dropped = 1  # the number of the round
+        if self.rounds is None:
+            return self._whole(values, batched)
+        found = self.rounds(runs, args)
+        return dict(zip(e.outvars, found[dropped:], strict=True))
+
+    def _compile(self, make: Callable[[], Rounds], begin: Sequence[Given]) -> None:
+        if self.refused or (self.rounds is not None and self.rounds.holds_for(begin)):
+            return
+        try:
+            self.rounds = make()
+        except ProgramError as error:
+            self.refused = error
+
+    def _whole(self, values: dict[Any, Any], batched: set[Any]) -> dict[Any, Any]:
+        if not self._by_jax.equations:
+            free = dict.fromkeys(v for v in self.equation.invars if not isinstance(v, jex.Literal))
+            self._by_jax.equations = [self.equation]
+            self._by_jax.takes, self._by_jax.makes = list(free), list(self.equation.outvars)
+            self._by_jax.compile(batched)
+        return self._by_jax(values)
+
+
+class Staged:
+    """A function of one run as a function of a batch of them.
+
+    The numbers of a run do not depend on the runs beside it, nor on how many there are.
+
+    Attributes:
+        long: its equations that are worth a program.
+    """
+
+    def __init__(self, function: Callable[..., Any], *shapes: Any, unroll: int | None = UNROLL):
+        """Cut a function into stages; they are compiled when it is called.
+
+        Args:
+            function: pure, of the arguments of one run.
+            shapes: of these, pytrees of `jax.ShapeDtypeStruct`.
+            unroll: as in `robins.program.trace`.
+        """
+        self._flat = flat = Flat(function, *shapes)
+        level: dict[Any, int] = dict.fromkeys(flat.takes, 0)
+        self._levels: list[tuple[Batch, list[Long]]] = []
+        known = Batch()
+        for e in flat.equations:
+            of = [level[v] for v in e.invars if not isinstance(v, jex.Literal) and v in level]
+            if not of:
+                known.equations.append(e)
+                continue
+            here = max(of)
+            while len(self._levels) <= here:
+                self._levels.append((Batch(), []))
+            if worthwhile(e):
+                self._levels[here][1].append(Long(e, unroll))
+                here += 1
+            else:
+                self._levels[here][0].equations.append(e)
+            level.update((v, here) for v in e.outvars)
+        self._batched = set(level)
+        self._connect([known, *(batch for batch, _ in self._levels)])
+        self._known = flat.known | known(flat.known)
+
+    @property
+    def long(self) -> list[Long]:
+        """The equations that are worth a program."""
+        return [one for _, some in self._levels for one in some]
+
+    @property
+    def operations(self) -> int:
+        """About how many scalar operations they are, for a run."""
+        return sum(operations(one.equation) for one in self.long)
+
+    def _connect(self, batches: Sequence[Batch]) -> None:
+        """Let each batch give what others use, and JAX compile it."""
+        of = {id(e): b for b in batches for e in b.equations}
+        made = {v: of.get(id(e)) for e in self._flat.equations for v in e.outvars}
+        takes: dict[int, dict[Any, None]] = {id(b): {} for b in batches}
+        makes: dict[int, dict[Any, None]] = {id(b): {} for b in batches}
+        users = [(of.get(id(e)), e.invars) for e in self._flat.equations]
+        for here, atoms in (*users, (None, self._flat.makes)):
+            for v in atoms:
+                there = None if isinstance(v, jex.Literal) else made.get(v)
+                if isinstance(v, jex.Literal) or (here is not None and there is here):
+                    continue
+                if here is not None:
+                    takes[id(here)][v] = None
+                if there is not None:
+                    makes[id(there)][v] = None
+        for b in batches:
+            b.takes, b.makes = list(takes[id(b)]), list(makes[id(b)])
+            b.compile(self._batched)
+
+    def __call__(self, *args: Any) -> Any:
+        """The function on arguments with a leading axis of runs, as arrays of NumPy or JAX."""
+        leaves = jax.tree_util.tree_leaves(args)
+        runs = leaves[0].shape[0]
+        values = dict(self._known)
+        values.update(zip(self._flat.takes, leaves, strict=True))
+        for batch, some in self._levels:
+            values.update(batch(values))
+            for one in some:
+                values.update(one(runs, values, self._batched))
+
+        def of_all(v: Any) -> Any:
+            if not isinstance(v, jex.Literal) and v in self._batched:
+                return values[v]
+            alone = np.asarray(v.val if isinstance(v, jex.Literal) else values[v])
+            return np.broadcast_to(alone, (runs, *alone.shape))
+
+        return jax.tree_util.tree_unflatten(self._flat.tree, map(of_all, self._flat.makes))
