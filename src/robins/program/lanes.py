@@ -16,6 +16,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from robins.program.c import function, header
+from robins.program.kinds import array_of, is_key, numbers_of
 from robins.program.native import CPP, LANE_FLAGS, build
 from robins.program.trace import Leaf, Program, positive_zeros, step_of
 
@@ -79,11 +80,13 @@ class Rounds:
             MemoryError: there is none for the rows of some rounds.
         """
         inputs, results = self.program.inputs, self.program.results
-        arrays = [_plain(g.array, leaf) for g, leaf in zip(given, inputs, strict=True)]
+        arrays = [
+            np.ascontiguousarray(numbers_of(g.array), _dtype(leaf.dtype))
+            for g, leaf in zip(given, inputs, strict=True)
+        ]
         made = [
-            np.empty((runs, *(() if k < self.carried else (self.length,)), *_shape(leaf)), kind)
+            np.empty((runs, *((self.length,) if k >= self.carried else ()), *leaf.shape), _dtype(leaf.dtype))
             for k, leaf in enumerate(results)
-            for kind in (_dtype(leaf),)
         ]
         first = self.carried + self.stays
         taken = [
@@ -103,7 +106,7 @@ class Rounds:
         )
         if failed:
             raise MemoryError(f"no memory for rounds of {runs} runs")
-        return [_keyed(a, leaf) for a, leaf in zip(made, results, strict=True)]
+        return [array_of(a, leaf.dtype) if is_key(leaf.dtype) else a for a, leaf in zip(made, results)]
 
 
 def of_scan(
@@ -141,42 +144,13 @@ def of_scan(
 
 def zero_in_all(given: Given) -> np.ndarray:
     """Which entries of an array are zero in all runs."""
-    if is_key(given.array.dtype):
-        return np.zeros(given.array.shape[1:] if given.batched else given.array.shape, bool)
-    zero = positive_zeros(np.asarray(given.array))
+    zero = positive_zeros(numbers_of(given.array))
     return np.all(zero, axis=0) if given.batched else zero
 
 
-# ------------------------------------------------------------------------------ arrays of C
-
-
-def is_key(dtype: Any) -> bool:
-    """Whether numbers of a type are keys of random numbers."""
-    return jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
-
-
-def _dtype(leaf: Leaf) -> Any:
-    return np.dtype(np.uint64) if is_key(leaf.dtype) else np.dtype(leaf.dtype)
-
-
-def _shape(leaf: Leaf) -> tuple[int, ...]:
-    return leaf.shape
-
-
-def _plain(array: Any, leaf: Leaf) -> np.ndarray:
-    """An array as C takes it; a key as one number, its first word above its second."""
-    if is_key(leaf.dtype):
-        words = np.asarray(jax.random.key_data(array)).astype(np.uint64)
-        return np.ascontiguousarray((words[..., 0] << np.uint64(32)) | words[..., 1])
-    return np.ascontiguousarray(array, leaf.dtype)
-
-
-def _keyed(array: np.ndarray, leaf: Leaf) -> Any:
-    """A result as JAX takes it."""
-    if not is_key(leaf.dtype):
-        return array
-    words = np.stack([array >> np.uint64(32), array & np.uint64(0xFFFFFFFF)], -1)
-    return jax.random.wrap_key_data(words.astype(np.uint32))
+def _dtype(dtype: Any) -> np.dtype:
+    """Of an array of C: a key is one number."""
+    return np.dtype(np.uint64) if is_key(dtype) else np.dtype(dtype)
 
 
 def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> Rows:

@@ -12,12 +12,13 @@ import jax
 import numpy as np
 from jax.extend import core as jex
 
+from robins.program.kinds import kind_of
 from robins.program.lanes import Rounds
 from robins.program.nodes import Graph, Node
-from robins.program.primitives.random import numbered
+from robins.program.primitives.random import bits_of
 from robins.program.refusal import ProgramError
 from robins.program.primitives.control import called
-from robins.program.trace import RULES, Leaf, Nodes, Program, Walk, kind_of
+from robins.program.trace import RULES, Leaf, Nodes, Program, Walk
 
 WIDEST = 64  # entries of a row
 ENTRYWISE = {
@@ -137,14 +138,16 @@ class _Row:
         if name == "broadcast_in_dim" and starts and arrays[0].ndim == 0:
             return np.full(shape[1:], arrays[0]), True
         if name == "random_bits" and starts and not any(rows):
-            return self._bits(e, arrays[0], shape[1:]), True
+            dtype = e.outvars[0].aval.dtype
+            return bits_of(self.walk, arrays[0], shape[1:], dtype, self.index), True
         if not any(rows):
             return self.walk.equation(e, *arrays)[0], False
+        # What stays may have a first axis of one, along which it is the same.
+        arrays = [
+            a if row or a.ndim < len(shape) or a.shape[0] > 1 else a[0]
+            for a, row in zip(arrays, rows, strict=True)
+        ]
         entrywise = name in ENTRYWISE or name == "random_bits"
-        if not entrywise or any(a.ndim and not r for a, r in zip(arrays, rows, strict=True)):
+        if not entrywise or any(a.ndim >= max(len(shape), 1) for a in arrays):
             raise ProgramError(f"'{name}' does not compute entry by entry")
         return RULES[name](self.walk, e, *arrays), True
-
-    def _bits(self, e: Any, key: Nodes, shape: tuple[int, ...]) -> Nodes:
-        """The bits of the row that a round is at, of those that one key gives for all."""
-        return drawn(self.walk, key, shape, e.outvars[0].aval.dtype, self.index)
