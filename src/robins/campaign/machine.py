@@ -84,7 +84,7 @@ class InLanes:
         return [
             f"{name}: a loop stays with JAX, as {one.refused}"
             for name, staged in of.items()
-            for one in staged.long
+            for one in staged.loops
             if one.refused
         ]
 

@@ -27,7 +27,12 @@ WORTH = 5_000  # operations of a loop that is worth a program
 FEWEST = 8  # equations without a scan or random numbers that are
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
 UNROLL = 3_000
-CUMULATED = {"cumsum": lax.add, "cumprod": lax.mul, "cummax": lax.max, "cummin": lax.min}
+CUMULATED = {
+    "cumsum": (lax.add, lambda dtype: 0),
+    "cumprod": (lax.mul, lambda dtype: 1),
+    "cummax": (lax.max, lambda dtype: _extreme(dtype, -1)),
+    "cummin": (lax.min, lambda dtype: _extreme(dtype, 1)),
+}
 
 
 class Flat:
@@ -77,21 +82,25 @@ def cumulated(e: Any) -> Any:
     name, p = e.primitive.name, e.params
     if name not in CUMULATED or p["axis"] != 0:
         return None
-    join = CUMULATED[name]
+    join, neutral = CUMULATED[name]
 
     def scanned(a: Any) -> Any:
-        # The first row begins: no number is neutral for all.
-        first, others = (a[-1], a[:-1]) if p["reverse"] else (a[0], a[1:])
-
         def step(total: Any, row: Any) -> tuple[Any, Any]:
             total = join(total, row)
             return total, total
 
-        _, rows = lax.scan(step, first, others, reverse=p["reverse"])
-        return lax.concatenate([rows, first[None]] if p["reverse"] else [first[None], rows], 0)
+        begin = jax.numpy.full(a.shape[1:], neutral(a.dtype), a.dtype)
+        return lax.scan(step, begin, a, reverse=p["reverse"])[1]
 
     aval = e.invars[0].aval
     return jax.make_jaxpr(scanned)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+
+
+def _extreme(dtype: Any, sign: int) -> Any:
+    """The least or greatest number of a type."""
+    if np.issubdtype(dtype, np.floating):
+        return sign * np.inf
+    return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
 
 
 class Batch:
