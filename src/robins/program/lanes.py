@@ -83,7 +83,10 @@ class Rounds:
             for g, leaf in zip(given, inputs, strict=True)
         ]
         made = [
-            np.empty((runs, *((self.length,) if k >= self.carried else ()), *leaf.shape), _dtype(leaf.dtype))
+            np.empty(
+                (runs, *((self.length,) if k >= self.carried else ()), *leaf.shape),
+                _dtype(leaf.dtype),
+            )
             for k, leaf in enumerate(results)
         ]
         first = self.carried + self.stays
@@ -104,7 +107,10 @@ class Rounds:
         )
         if failed:
             raise MemoryError(f"no memory for rounds of {runs} runs")
-        return [array_of(a, leaf.dtype) if is_key(leaf.dtype) else a for a, leaf in zip(made, results)]
+        return [
+            array_of(a, leaf.dtype) if is_key(leaf.dtype) else a
+            for a, leaf in zip(made, results, strict=True)
+        ]
 
 
 def zero_in_all(given: Given) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Equations of a jaxpr that go along one axis, as rounds of one loop.
 
-A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it does to
-each row the same by itself; and so do random numbers, as the generator can be told the number of an
-entry. What goes along the same axis is one loop: a row that the next equation needs is never
+A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it does
+to each row the same by itself; and so do random numbers, as the generator can be told the number of
+an entry. What goes along the same axis is one loop: a row that the next equation needs is never
 written to memory. What a round leaves for the next is carried.
 """
 
@@ -33,7 +33,7 @@ ENTRYWISE = {
     *("asin", "acos", "atan", "atan2", "tanh", "erf_inv", "convert_element_type", "copy"),
     *("bitcast_convert_type", "random_fold_in", "random_wrap", "random_unwrap", "stop_gradient"),
 }
-# What a primitive calls the axes that it works on: it goes along the first if that is not among them.
+# What a primitive calls the axes that it works on; it goes along the first if that is not one.
 AXES = {
     **dict.fromkeys(("squeeze", "expand_dims", "rev"), "dimensions"),
     **dict.fromkeys(("reduce_sum", "reduce_max", "reduce_min", "reduce_and", "reduce_or"), "axes"),
@@ -78,7 +78,9 @@ def _by_rows(e: Any, name: str, p: Any, length: int) -> bool:
         return 0 not in dims or (dims[0] == 0 and shape[0] == length)
     rows = [bool(s) and s[0] == length for s in given]
     if name in ENTRYWISE or name == "random_bits":
-        same = (r or not s or (len(s) == rank and s[0] == 1) for r, s in zip(rows, given, strict=True))
+        same = (
+            r or not s or (len(s) == rank and s[0] == 1) for r, s in zip(rows, given, strict=True)
+        )
         return any(rows) and all(same)
     if not rows or not all(rows):
         return False
@@ -92,7 +94,10 @@ def _by_rows(e: Any, name: str, p: Any, length: int) -> bool:
             return p["new_sizes"][0] == length and p["dimensions"] is None
         case "slice":
             strides = p["strides"] or (1,)
-            return p["start_indices"][0] == 0 and p["limit_indices"][0] == length == length * strides[0]
+            return (
+                p["start_indices"][0] == 0
+                and p["limit_indices"][0] == length == length * strides[0]
+            )
         case "dot_general":
             (_, _), (left, right) = p["dimension_numbers"]
             return bool(left) and left[0] == 0 == right[0]
@@ -234,7 +239,7 @@ class Body:
 
         def read(v: Any, of: dict[Any, Nodes]) -> Nodes:
             if isinstance(v, jex.Literal):
-                return walk.constants(np.asarray(v.val, v.aval.dtype))
+                return walk.constants(number_of(v))
             return of[v]
 
         consts = [read(v, whole) for v in e.invars[:fixed]]
@@ -253,7 +258,7 @@ class Body:
             return [np.full(e.outvars[0].aval.shape[1:], at)]
         if name in RANDOM and not by_row:
             (key,) = e.invars
-            keys = walk.constants(key.val) if isinstance(key, jex.Literal) else whole[key]
+            keys = whole[key]
             shape, at = tuple(p["shape"][1:]), index.item()
             if name == "random_split":
                 return [numbered(walk, keys, shape, at)]
@@ -279,11 +284,16 @@ class Body:
 
         def read(v: Any, row: bool) -> Nodes:
             if isinstance(v, jex.Literal):
-                return walk.constants(np.asarray(v.val, v.aval.dtype))
+                return walk.constants(number_of(v))
             return rows[v][None] if row else whole[v]
 
         found = walk.equation(same, *(read(v, f) for v, f in zip(e.invars, flags, strict=True)))
         return [np.asarray(a)[0] for a in found]
+
+
+def number_of(literal: Any) -> np.ndarray:
+    """The number of a literal, in its type."""
+    return np.asarray(literal.val, literal.aval.dtype)
 
 
 def foldable(value: Any, most: int) -> bool:

@@ -18,7 +18,16 @@ from jax import lax
 from jax.extend import core as jex
 
 from robins.program.lanes import Given, Rounds, zero_in_all
-from robins.program.loops import Along, Body, along, foldable, makes_rows, operations, uses
+from robins.program.loops import (
+    Along,
+    Body,
+    along,
+    foldable,
+    makes_rows,
+    number_of,
+    operations,
+    uses,
+)
 from robins.program.primitives.control import called
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import lasting
@@ -149,9 +158,7 @@ class Loop:
         self.rounds: Rounds | None = None
         self._lock = threading.Lock()
 
-    def connect(
-        self, batched: set[Any], wanted: Callable[[Any], bool], unroll: int | None
-    ) -> None:
+    def connect(self, batched: set[Any], wanted: Callable[[Any], bool], unroll: int | None) -> None:
         """Find what goes in and out."""
         self._batched, self._wanted, self._unroll = batched, wanted, unroll
         self.body = Body(self.equations, self.axis, wanted)
@@ -162,7 +169,7 @@ class Loop:
 
         def given(v: Any) -> Given:
             if isinstance(v, jex.Literal):
-                return Given(np.asarray(v.val, v.aval.dtype), False)
+                return Given(number_of(v), False)
             return Given(values[v], v in self._batched)
 
         known = {
