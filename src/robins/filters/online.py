@@ -18,6 +18,9 @@ from robins.filters.observation import as_measurement, as_real
 from robins.filters.run import Step, everything
 from robins.filters.sameness import same, same_model
 
+_DONE = int(Code.DONE)
+_NAMES = {int(code): code.name for code in Code}
+
 
 class OnlineFilter:
     """A filter with a current state; `predict` and `update` are those of a run, compiled.
@@ -78,7 +81,7 @@ class OnlineFilter:
     def predict(self, u: Any = None) -> Prediction:
         """Move on by one step with input u."""
         prediction = self._machine.predict(u)
-        self._count(moved=prediction.code)
+        self._count(prediction.code)
         return prediction
 
     def step(
@@ -122,7 +125,7 @@ class OnlineFilter:
         self.model.sensor(sensor)
         numbers = (as_real if self._machine.is_numpy else as_measurement)(sensor, y)
         info = self._machine.update(sensor, numbers, aux)
-        self._count(Code.DONE, info.code)
+        self._count(_DONE, info.code)
         return info
 
     def look(self, question: Callable[..., Any], *args: Any) -> Any:
@@ -135,12 +138,13 @@ class OnlineFilter:
         """
         return self._machine.look(question, *args)
 
-    def _count(self, moved: Any = Code.DONE, *used: Any) -> None:
+    def _count(self, moved: Any, *used: Any) -> None:
         """Count a prediction that was not taken, and updates; let the memories report."""
-        if moved != Code.DONE:
-            self.counts[Code(int(moved)).name] += 1
-        for code in used:
-            self.counts[Code(int(code)).name] += 1
+        # whole numbers of Python: to compare one of NumPy with a `Code` takes as long as a step
+        if (code := int(moved)) != _DONE:
+            self.counts[_NAMES[code]] += 1
+        for one in used:
+            self.counts[_NAMES[int(one)]] += 1
         if self._reports:
             # memories compute by JAX
             state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state

@@ -73,22 +73,31 @@ class Reader:
     def __init__(self, told: list[Slot], tree: Any):
         """Of some slots, and of the structure of what they are the leaves of."""
         self._tree = tree
-        self._plan = [
-            (slice(s.first, s.last) if s.shape else s.first, s.is_real, s.shape, s.dtype)
-            for s in told
+        self._blank = [None] * len(told)
+        self._arrays = [
+            (k, slice(s.first, s.last), s.shape if len(s.shape) > 1 else None)
+            for k, s in enumerate(told)
+            if s.is_real and s.shape
+        ]
+        self._numbers = [(k, s.first) for k, s in enumerate(told) if s.is_real and not s.shape]
+        self._others = [
+            (k, slice(s.first, s.last) if s.shape else s.first, s.shape, s.dtype)
+            for k, s in enumerate(told)
+            if not s.is_real
         ]
 
     def read(self, reals: np.ndarray, others: np.ndarray) -> Any:
         """A pytree: views of the reals, copies of all else, scalars of NumPy."""
-        leaves = []
-        for at, is_real, shape, dtype in self._plan:
-            if is_real:
-                found = reals[at]
-                leaves.append(found.reshape(shape) if len(shape) > 1 else found)
-            elif shape:
-                leaves.append(others[at].astype(dtype).reshape(shape))
+        leaves: list[Any] = self._blank.copy()
+        for k, at, shape in self._arrays:
+            leaves[k] = reals[at] if shape is None else reals[at].reshape(shape)
+        for k, at in self._numbers:
+            leaves[k] = reals[at]
+        for k, at, shape, dtype in self._others:
+            if shape:
+                leaves[k] = others[at].astype(dtype).reshape(shape)
             else:
-                leaves.append(dtype.type(others[at]))
+                leaves[k] = others[at] if dtype == np.int64 else others[at].astype(dtype)
         return self._tree.unflatten(leaves)
 
 
