@@ -108,7 +108,9 @@ def test_it_refuses_what_jax_refuses():
             live.update([0.1], "gps")
         with pytest.raises(TypeError, match="measurements of 'b' hold <U4"):
             live.update(["fast"], "b")
-        with pytest.raises(ValueError, match=r"sensor .a. reads shape \(2,\), but was given \(3,\)"):
+        with pytest.raises(
+            ValueError, match=r"sensor .a. reads shape \(2,\), but was given \(3,\)"
+        ):
             live.update(np.zeros(3), "a")
         assert live.counts == {"DONE": 1}
 
