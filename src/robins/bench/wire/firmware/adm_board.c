@@ -1,12 +1,13 @@
 /* Attitude determination as a part of the test bench: a filter of the satellite that
  * `robins export` wrote, on the wire. See docs/board.md.
  *
- *     robins export satellite/s1 --filter mekf --to .
+ *     robins export satellite/s1 --filter mekf --to adm-c
  *     cc -std=c99 -O2 -ffp-contract=off adm_board.c robins.c platform_posix.c -lm -o adm_board
  *
- * It does what the part "adm" does: predicts with the gyro, updates with the star sensor, reports.
- * A sample of the gyro stands for one step more; then nobody knows how the craft turns, and the
- * filter begins anew with the next star frame after the gyro is back. */
+ * the second in that folder, with this file and its neighbours in it. It does what the part "adm"
+ * does: predicts with the gyro, updates with the star sensor, reports. A sample of the gyro stands
+ * for one step more; then nobody knows how the craft turns, and the filter begins anew with the next
+ * star frame after the gyro is back. */
 #include <math.h>
 
 #include "platform.h"
