@@ -288,7 +288,7 @@ def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, An
 
     def shape(x: Any) -> jax.ShapeDtypeStruct:
         array = jax.typeof(jax.numpy.asarray(x))
-        return jax.ShapeDtypeStruct(array.shape, array.dtype)
+        return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=array.weak_type)
 
     given = jax.tree_util.tree_map(shape, args)
     jaxpr, results = jax.make_jaxpr(function, return_shape=True)(*given)
