@@ -154,7 +154,7 @@ def counting(state, row):
         "real": jnp.where(state["flag"], jnp.sin(row["x"]), state["real"]),
         "whole": state["whole"] - row["u"],
     }
-    return new, (jnp.sum(new["real"]), new["flag"], new["wide"] >> 1)
+    return new, (3.0 * new["real"], new["flag"], new["wide"] >> 1)
 
 
 def counted(runs, steps, width):
@@ -180,7 +180,7 @@ def test_all_kinds_of_numbers(width, every):
     one = jax.tree.map(lambda x: x[0], (states, jax.tree.map(lambda x: x[0], rows)))
     program = trace(counting, *one)
     _, kept = check(program, states, (rows,), runs, steps, every)
-    assert kept[0].shape == (steps // every, runs)
+    assert kept[0].shape == (steps // every, runs, 2)
 
 
 def test_nothing_is_kept_but_the_end():
@@ -189,7 +189,7 @@ def test_nothing_is_kept_but_the_end():
     kernel = emulated(trace(counting, *one))
     end, kept = kernel(states, rows, every=0)
     np.testing.assert_array_equal(end["real"], kernel(states, rows)[0]["real"])
-    assert [x.shape for x in kept] == [(0, 3)] * 3
+    assert [x.shape for x in kept] == [(0, 3, 2), (0, 3), (0, 3)]
 
 
 def test_what_does_not_fit_is_refused():
