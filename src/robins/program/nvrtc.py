@@ -18,6 +18,8 @@ from robins.program.refusal import BuildError
 WHEELS = "install JAX for a GPU (`pip install 'jax[cuda12]'` or `'jax[cuda13]'`)"
 # No contraction: a product and a sum are rounded each, so that the bits are those of the C.
 EXACT = ("--fmad=false",)
+# Say what registers and stack are used; that functions of `scalars.h` are not used is no news.
+TOLD = ("--ptxas-options=-v", "--diag-suppress=177")
 
 
 class Compiled(NamedTuple):
@@ -61,7 +63,7 @@ def compile_cuda(text: str, architecture: str, options: tuple[str, ...] = EXACT)
     library = _library(path)
     version = ctypes.c_int(), ctypes.c_int()
     library.nvrtcVersion(*map(ctypes.byref, version))
-    told = (f"--gpu-architecture={architecture}", "--ptxas-options=-v", *options)
+    told = (f"--gpu-architecture={architecture}", *TOLD, *options)
     key = "\0".join([text, *told, *(str(v.value) for v in version)])
     name = hashlib.sha256(key.encode()).hexdigest()[:24]
     kept, said = (cache_folder() / f"{name}{end}" for end in (".cubin", ".log"))
