@@ -183,6 +183,25 @@ def test_all_kinds_of_numbers(width, every):
     assert kept[0].shape == (steps // every, runs, 2)
 
 
+def test_random_numbers_are_those_of_jax():
+    """A walk with a key in its state: whole words and shifts, in threads as by JAX."""
+
+    def step(state, row):
+        key, draw = jax.random.split(jax.random.wrap_key_data(state["key"], impl="threefry2x32"))
+        moved = state["at"] + row + jax.random.uniform(draw, (2,))
+        return {"key": jax.random.key_data(key), "at": moved}, jax.random.bits(draw)
+
+    runs, steps = 5, 4
+    keys = jax.random.key_data(jax.random.split(jax.random.key(0), runs))
+    states, rows = {"key": keys, "at": jnp.zeros((runs, 2))}, jnp.ones((steps, 1, 2))
+    program = trace(step, jax.tree.map(lambda x: x[0], states), rows[0, 0])
+    end, kept = emulated(program)(states, rows)
+    want, drawn = jax.vmap(lambda s: jax.lax.scan(step, s, rows[:, 0]))(states)
+    np.testing.assert_array_equal(end["key"], want["key"])
+    np.testing.assert_array_equal(kept.T, drawn)
+    np.testing.assert_array_equal(end["at"], want["at"])
+
+
 def test_nothing_is_kept_but_the_end():
     states, rows = counted(3, 4, 3)
     one = jax.tree.map(lambda x: x[0], (states, jax.tree.map(lambda x: x[0], rows)))
