@@ -11,6 +11,7 @@ namespace {
 
 constexpr int N = 9, M = 3;
 constexpr double PROCESS = 0.1, NOISE = 1.0;  // standard deviations
+constexpr double GAMMA = 50.0;  // of the H-infinity filter, which bounds the error of all states
 // Points at the mean and +-REACH columns of the factor: alpha = 1, beta = 2, kappa = 0.
 constexpr double REACH = 3.0, W = 1.0 / (2.0 * REACH * REACH);
 
@@ -99,6 +100,19 @@ struct Unscented {
     }
 };
 
+// S (I - S'S / gamma^2)^-1 S', as S N^-T with N upper triangular, N N' that matrix: its Cholesky
+// factor with rows and columns in reverse. False where there is none.
+bool inflate(Factor &S)
+{
+    const Factor left = Factor::Identity() - S.transpose() * S / (GAMMA * GAMMA);
+    const Eigen::LLT<Factor> llt(left.reverse().eval());
+    if (llt.info() != Eigen::Success) { return false; }
+    const Factor turned = S.transpose().colwise().reverse();
+    const Factor divided = llt.matrixL().solve(turned);
+    S = divided.colwise().reverse().transpose();
+    return true;
+}
+
 template <int Excess>
 void predict(const Seen<N, Excess> &moved, Belief &b)
 {
@@ -151,7 +165,7 @@ void update(const Seen<M, Excess> &seen, const Reading &y, Belief &b, double &ni
     code = used == M ? DONE : PARTLY_MISSING;
 }
 
-template <typename Way>
+template <typename Way, bool Bounded = false>
 void run(int steps, const double *A, const double *H, const double *rows, double *mean,
          double *factor, double *nis, int *code)
 {
@@ -159,10 +173,19 @@ void run(int steps, const double *A, const double *H, const double *rows, double
     const Model model = {Eigen::Map<const RowMajor>(A),
                          Eigen::Map<const Eigen::Matrix<double, M, N, Eigen::RowMajor>>(H)};
     Belief b = {Eigen::Map<State>(mean), Eigen::Map<RowMajor>(factor), true};
+    bool feasible = true, measured = false;
     for (int s = 0; s < steps; ++s) {
-        predict(Way::transition(model, b), b);
+        Belief from = b;
+        if (Bounded && measured) { feasible = inflate(from.factor); }
+        if (feasible) {
+            measured = false;
+            predict(Way::transition(model, from), b);
+        } else {
+            b.current = false;
+        }
         const Reading y = Eigen::Map<const Reading>(rows + s * M);
         update(Way::observation(model, b), y, b, nis[s], code[s]);
+        measured |= code[s] == DONE || code[s] == PARTLY_MISSING;
     }
     Eigen::Map<State>(mean, N) = b.mean;
     Eigen::Map<RowMajor>(factor, N, N) = b.factor;
@@ -181,4 +204,10 @@ extern "C" void run_ukf(int steps, const double *A, const double *H, const doubl
                         double *mean, double *factor, double *nis, int *code)
 {
     run<Unscented>(steps, A, H, rows, mean, factor, nis, code);
+}
+
+extern "C" void run_hinf(int steps, const double *A, const double *H, const double *rows,
+                         double *mean, double *factor, double *nis, int *code)
+{
+    run<Taylor, true>(steps, A, H, rows, mean, factor, nis, code);
 }
