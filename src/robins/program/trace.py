@@ -260,7 +260,7 @@ def positive_zeros(a: np.ndarray) -> np.ndarray:
     """Which entries of an array are reals, and zero."""
     if a.dtype != np.float64:
         return np.zeros(a.shape, bool)
-    return (a == 0.0) & ~np.signbit(a)
+    return np.asarray((a == 0.0) & ~np.signbit(a))
 
 
 Zeros = dict[int, np.ndarray]  # of an argument, by its number, entries that are zero
