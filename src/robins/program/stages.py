@@ -131,7 +131,8 @@ class Batch:
         free = (v for e in self.equations for v in e.invars if not isinstance(v, jex.Literal))
         self.takes = list(dict.fromkeys(v for v in free if v not in made))
         self.makes = [v for e in self.equations for v in e.outvars if wanted(v)]
-        jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations)
+        about = jex.DebugInfo("jit", "stage", None, None)
+        jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations, debug_info=about)
         function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
         axes = tuple(0 if v in batched else None for v in self.takes)
         self._compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)

@@ -51,7 +51,7 @@ def numbered(walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None =
     Raises:
         ProgramError: JAX is told to number in another way.
     """
-    if not jax.config.read("jax_threefry_partitionable"):
+    if not jax.config.values["jax_threefry_partitionable"]:
         raise ProgramError(
             "JAX draws numbers by its older scheme", "", "set jax_threefry_partitionable"
         )
