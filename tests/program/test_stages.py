@@ -83,13 +83,15 @@ def test_a_simulation(staged):
 
 def test_a_run_has_the_bits_of_a_run_alone(staged):
     many, alone = staged(jnp.arange(N)), staged(jnp.array([7]))
+    # A mean over the time is JAX's, whose order of a sum depends on the shape of the batch.
+    assert apart(many.pop("mean")[7], alone.pop("mean")[0]) <= 1e-15
     for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(np.asarray(a)[7], np.asarray(b)[0])
 
 
 def test_what_goes_along_one_axis_is_one_loop():
     def function(x):
-        rows = jnp.sin(x) * jnp.arange(T, dtype=float)[:, None]
+        rows = jnp.sin(x) * jnp.arange(T, dtype=float)[:, None] / T
         total, sums = lax.scan(lambda s, r: (s + r, s), jnp.zeros(3), rows)
         return jnp.cos(sums) + 1.0, total
 

@@ -1,6 +1,6 @@
 """Campaigns: many runs of a problem, in chunks, with statistics and their confidence."""
 
-from robins.campaign.machine import MACHINES
+from robins.campaign.machine import MACHINES, check_machine
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
 from robins.campaign.statistics import Statistics, mean_with_bounds, rms_with_bounds
@@ -10,6 +10,7 @@ __all__ = [
     "MACHINES",
     "Statistics",
     "campaign_solution",
+    "check_machine",
     "mean_with_bounds",
     "record",
     "rms_with_bounds",

@@ -7,12 +7,11 @@ they are chosen where JAX would take longer than that.
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -54,10 +53,7 @@ class ByJax:
 
 
 class InLanes:
-    """Chunks as programs in lanes, one on each core.
-
-    A run has the same bits in any chunk of any campaign.
-    """
+    """Chunks as programs in lanes, one on each core."""
 
     name = "c"
 
@@ -96,26 +92,18 @@ class InLanes:
         width = min(chunk, max(LEAST, -(-runs // cores)))
         before = threading.stack_size(STACK)
         pool = ThreadPoolExecutor(cores)
-        ahead: deque[tuple[int, Future[Any]]] = deque()
-        begins = iter(range(0, runs, width))
-
-        def submit() -> None:
-            for begin in itertools.islice(begins, 1):
-                ahead.append((min(width, runs - begin), pool.submit(self._chunk, begin, width)))
-
+        begins = range(width, runs, width)
         try:
             # The first chunk compiles: each filter on a core of its own.
-            world = pool.submit(self._worlds, next(begins), width).result()
-            first = {n: pool.submit(self._filters[n], world) for n in self._filters}
-            count = min(width, runs)
-            yield world, count, lambda name: cut(first[name].result(), count)
-            for _ in range(2 * cores):
-                submit()
-            while ahead:
-                count, future = ahead.popleft()
-                world, found = future.result()
-                submit()
-                yield world, count, partial(_of, found, count)
+            world = pool.submit(self._worlds, 0, width).result()
+            first = {name: pool.submit(one, world) for name, one in self._filters.items()}
+            yield world, min(width, runs), lambda name: cut(first[name].result(), runs)
+            ahead = deque(pool.submit(self._chunk, begin, width) for begin in begins[: 2 * cores])
+            for k, begin in enumerate(begins):
+                world, found = ahead.popleft().result()
+                for later in begins[k + 2 * cores : k + 2 * cores + 1]:
+                    ahead.append(pool.submit(self._chunk, later, width))
+                yield world, min(width, runs - begin), partial(_of, found, runs - begin)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             threading.stack_size(before)
@@ -129,6 +117,7 @@ class InLanes:
 
 
 def _of(found: dict[str, Any], count: int, name: str) -> Any:
+    """The record of a filter, without the runs that only fill a chunk."""
     return cut(found[name], count)
 
 
@@ -144,6 +133,29 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def check_machine(name: str) -> None:
+    """Refuse a machine that is not there, before anything is computed.
+
+    Raises:
+        RobinsError: there is no such machine, or no compiler for it.
+    """
+    if name == "cuda":
+        raise RobinsError(
+            "campaigns do not run as a kernel of a GPU yet", "--machine cuda", "say jax or c."
+        )
+    if name == "c":
+        compiler(CPP)
+
+
+def has_compiler() -> bool:
+    """Whether lanes can be compiled here."""
+    try:
+        compiler(CPP)
+    except BuildError:
+        return False
+    return True
+
+
 def machine_for(problem: Problem, runs: int, name: str = "") -> ByJax | InLanes:
     """The machine of a campaign.
 
@@ -155,17 +167,8 @@ def machine_for(problem: Problem, runs: int, name: str = "") -> ByJax | InLanes:
     Raises:
         RobinsError: the machine asked for is not there.
     """
-    if name == "cuda":
-        raise RobinsError(
-            "campaigns do not run as a kernel of a GPU yet", "--machine cuda", "say jax or c."
-        )
-    if name == "jax" or (not name and runs < FEWEST):
-        return ByJax(problem)
-    try:
-        compiler(CPP)
-    except BuildError:
-        if name:
-            raise
+    check_machine(name)
+    if name == "jax" or (not name and (runs < FEWEST or not has_compiler())):
         return ByJax(problem)
     lanes = InLanes(problem)
     if name or runs * lanes.operations * NS * 1e-9 > PAYS:

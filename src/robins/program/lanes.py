@@ -116,7 +116,7 @@ class Rounds:
 def zero_in_all(given: Given) -> np.ndarray:
     """Which entries of an array are zero in all runs."""
     zero = positive_zeros(numbers_of(given.array))
-    return np.all(zero, axis=0) if given.batched else zero
+    return np.asarray(np.all(zero, axis=0)) if given.batched else zero
 
 
 def _dtype(dtype: Any) -> np.dtype:

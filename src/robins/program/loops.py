@@ -288,7 +288,7 @@ class Body:
             return rows[v][None] if row else whole[v]
 
         found = walk.equation(same, *(read(v, f) for v, f in zip(e.invars, flags, strict=True)))
-        return [np.asarray(a)[0] for a in found]
+        return [np.asarray(np.asarray(a)[0]) for a in found]
 
 
 def number_of(literal: Any) -> np.ndarray:

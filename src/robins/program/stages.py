@@ -179,12 +179,13 @@ class Loop:
             if v not in self._batched and foldable(values[v], FOLDED)
         }
         begin = [Given(np.zeros((), np.int64), False), *map(given, body.begin)]
-        with self._lock:
+        with self._lock:  # of the threads that come first, one compiles
             self._compile(known, begin)
-        if self.rounds is None:
+            rounds = self.rounds
+        if rounds is None:
             return self._by_jax(values)
         free = [v for v in body.stays if v not in known]
-        found = self.rounds(runs, [*begin, *map(given, free), *map(given, body.rows)])
+        found = rounds(runs, [*begin, *map(given, free), *map(given, body.rows)])
         return dict(zip([*body.after, *body.made], found[1:], strict=True))
 
     def _compile(self, known: dict[Any, np.ndarray], begin: Sequence[Given]) -> None:
@@ -204,6 +205,8 @@ class Loop:
 
 class Staged:
     """A function of one run as a function of a batch of them.
+
+    What loops make of a run has the same bits in any batch; what JAX makes has them to rounding.
 
     Attributes:
         loops: that are worth a program.

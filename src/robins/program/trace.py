@@ -277,7 +277,7 @@ def lasting(made: Callable[[Zeros], Program], zeros: Zeros) -> Program:
     while True:
         program = made(zeros)
         zero = program.graph.constant(0, "real")
-        kept = {k: mask & (program.outputs[k] == zero) for k, mask in zeros.items()}
+        kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in zeros.items()}
         if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
             return program
         zeros = kept

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from robins import _float64, scenario, units
-from robins.campaign import simulate
+from robins.campaign import check_machine, simulate
 from robins.campaign.bound import bound as bound_of
 from robins.report import bounds
 from robins.results import Outcome, Progress, silent
@@ -42,6 +42,7 @@ def run(
         robins.errors.RobinsError: the machine asked for is not there.
     """
     _float64.require()
+    check_machine(machine)
     system, label, text = find_scenario(name)
     study = study_of(system, text, name)
     more = settings if runs is None else (*settings, f"runs={runs}")

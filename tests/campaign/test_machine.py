@@ -1,0 +1,104 @@
+"""The same campaign by batches of JAX and by programs in lanes."""
+
+import shutil
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from test_campaign import problem as three  # noqa: F401 a fixture
+
+from robins.campaign import machine as machines
+from robins.campaign import simulate
+from robins.campaign.machine import ByJax, InLanes, machine_for
+from robins.errors import RobinsError
+from robins.filters import Belief
+from robins.program import CPP, LANE_FLAGS
+
+FOUND = any(map(shutil.which, CPP.names))
+needs_compiler = pytest.mark.skipif(not FOUND, reason="lanes need a C++ compiler")
+RUNS = 53  # no whole number of chunks or lanes
+
+
+@pytest.fixture
+def problem(three):  # noqa: F811
+    """With one filter, as each is compiled."""
+    return replace(three, contenders={"right": three.contenders["right"]})
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Compile without optimisation; the bits are the same."""
+    flags = tuple("-O0" if flag == "-O2" else flag for flag in LANE_FLAGS)
+    monkeypatch.setattr("robins.program.lanes.LANE_FLAGS", flags)
+
+
+@needs_compiler
+def test_lanes_have_the_results_of_jax(problem):
+    said = []
+    mine = simulate(problem, RUNS, 16, machine="c", progress=lambda share, what: said.append(what))
+    want = simulate(problem, RUNS, 16, machine="jax")
+    assert (mine.machine, want.machine) == ("c", "jax")
+    assert mine.summary["machine"] == "c"
+    assert mine.notes == want.notes
+    assert mine.counts == want.counts
+    assert set(mine.solution.variables) == set(want.solution.variables)
+    for name, variable in want.solution.variables.items():
+        if variable.dtype.kind == "f":
+            np.testing.assert_allclose(mine.solution[name], variable, rtol=1e-11, atol=1e-12)
+    assert f"right: runs 49 to {RUNS} of {RUNS}" in said
+
+
+@needs_compiler
+def test_chunks_in_lanes_come_in_order_and_without_what_fills_them(problem):
+    records = [(n, of("right")) for _, n, of in InLanes(problem).chunks(RUNS, 8)]
+    assert sum(n for n, _ in records) == RUNS == sum(len(r["error"]) for _, r in records)
+    found = np.concatenate([r["error"] for _, r in records])
+    want = np.concatenate([of("right")["error"] for _, _, of in ByJax(problem).chunks(RUNS)])
+    np.testing.assert_allclose(found, want, atol=1e-12)
+
+
+@needs_compiler
+def test_a_failure_in_a_chunk_comes_out(problem, monkeypatch):
+    lanes = InLanes(problem)
+
+    def failing(begin, width):
+        raise RuntimeError("no more")
+
+    monkeypatch.setattr(lanes, "_chunk", failing)
+    with pytest.raises(RuntimeError, match="no more"):
+        list(lanes.chunks(RUNS, 8))
+
+
+def test_lanes_are_chosen_where_they_pay(problem, monkeypatch):
+    assert isinstance(machine_for(problem, 50), ByJax)
+    monkeypatch.setattr(machines, "PAYS", 0.0)
+    assert isinstance(machine_for(problem, 50), ByJax)  # nobody asks
+    assert isinstance(machine_for(problem, 500), InLanes if FOUND else ByJax)
+    monkeypatch.setattr(machines, "PAYS", 1e3)
+    assert isinstance(machine_for(problem, 500), ByJax)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(machines, "PAYS", 0.0)
+    assert isinstance(machine_for(problem, 500), ByJax)
+    with pytest.raises(RobinsError, match="no-such-compiler"):
+        machine_for(problem, 500, "c")
+
+
+def test_a_machine_that_is_not_there_is_refused(problem):
+    with pytest.raises(RobinsError, match="GPU"):
+        machine_for(problem, 1, "cuda")
+
+
+@needs_compiler
+def test_what_stays_with_jax_is_said(problem, monkeypatch):
+    monkeypatch.setattr("robins.program.stages.WORTH", 0)  # nothing is too little
+
+    def simulated(index):
+        case = problem.simulate(index)
+        rows = jax.lax.map(lambda y: y + 0.0 * jax.lax.digamma(1.0 + y * y), case.y["y"])
+        return case._replace(y={"y": rows}, start=Belief(case.start.mean, case.start.factor))
+
+    one = simulate(replace(problem, simulate=simulated), 9, machine="c")
+    (note,) = one.notes
+    assert "digamma" in note
+    assert "the simulation" in note
