@@ -1,7 +1,7 @@
 """Campaigns by batches of JAX on one core, and in lanes on all cores: what a run costs each.
 
-Both are timed after they have compiled, over all that a campaign does but its report; the table says
-how long compiling took, how far the errors of the two are apart, and the most memory in use.
+Both are timed after they have compiled, over all that a campaign does but its report; the table
+says how long compiling took, how far the errors of the two are apart, and the most memory in use.
 
     python benchmarks/campaigns.py [RUNS]
 """

@@ -46,7 +46,7 @@ def check(step, cases, unroll=None):
         np.testing.assert_array_equal(m[:, lane], others)
 
 
-@pytest.mark.parametrize(("lanes", "unroll"), [(8, None), (4, 200)])
+@pytest.mark.parametrize(("lanes", "unroll"), [(8, None), (4, 200), (2, None), (1, None)])
 def test_a_filter(lanes, unroll):
     model = line()
     one = kalman(rules=[RULES["gate"], RULES["h_infinity"]])

@@ -5,8 +5,16 @@
 #include <stdint.h>
 #include <string.h>
 
-#ifndef LANES
+#ifndef LANES /* as many as the vectors of the processor hold */
+#if defined(__AVX512F__)
 #define LANES 8
+#elif defined(__AVX__)
+#define LANES 4
+#elif defined(__SSE2__) || defined(__ARM_NEON)
+#define LANES 2
+#else
+#define LANES 1
+#endif
 #endif
 
 typedef double real __attribute__((vector_size(8 * LANES), aligned(8)));

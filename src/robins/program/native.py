@@ -7,6 +7,7 @@ import ctypes
 import hashlib
 import importlib.util
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -33,7 +34,7 @@ FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
 # Lanes are as wide as the processor that compiles them.
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
 NO_COMPILER = (
-    "install one (Debian: `apt install gcc`; anywhere: `pip install ziglang`), or name it in CC"
+    "install one (Debian: `apt install gcc`; anywhere: `pip install 'robins[native]'`), or name it in CC"
 )
 
 
@@ -73,6 +74,16 @@ def _version(command: tuple[str, ...]) -> str:
     return subprocess.run([*command, "--version"], capture_output=True, text=True).stdout
 
 
+@lru_cache
+def _processor() -> str:
+    """What this processor can do, as far as the system tells: a cache may be shared by machines."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text("utf-8").splitlines():
+            if line.startswith(("flags", "Features")):
+                return line
+    return f"{platform.machine()} {platform.processor()}"
+
+
 def cache_folder() -> Path:
     """Where what was compiled is kept: the user's cache, else a folder that this process makes."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -94,7 +105,8 @@ def build(text: str, flags: tuple[str, ...] = FLAGS, language: Language = C) -> 
         BuildError: there is no compiler, or it refuses the text; it says what was said.
     """
     command = compiler(language)
-    told = "\0".join([text, *command, _version(command), *flags])
+    made_for = _processor() if "-march=native" in flags else ""
+    told = "\0".join([text, *command, _version(command), *flags, made_for])
     folder, name = cache_folder(), hashlib.sha256(told.encode()).hexdigest()[:24]
     library = folder / f"{name}.so"
     if library.exists():

@@ -36,6 +36,9 @@ WORTH = 5_000  # operations of a loop that is worth a program
 FEWEST = 8  # equations without a scan or random numbers that are
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
 UNROLL = 3_000
+# Of these XLA must not run two batches at once (`docs/performance.md`).
+FACTORISED = ("qr[", "lu[", "eigh[", "svd[", "cholesky[", "triangular_solve[")
+_one_at_a_time = threading.Lock()
 CUMULATED = {
     "cumsum": (lax.add, lambda dtype: 0),
     "cumprod": (lax.mul, lambda dtype: 1),
@@ -124,6 +127,7 @@ class Batch:
         self.takes: list[Any] = []
         self.makes: list[Any] = []
         self._compiled: Callable[..., Any] | None = None
+        self._alone = False
 
     def compile(self, batched: set[Any], wanted: Callable[[Any], bool]) -> None:
         """Find what goes in and out, and let JAX compile it."""
@@ -135,12 +139,18 @@ class Batch:
         jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations, debug_info=about)
         function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
         axes = tuple(0 if v in batched else None for v in self.takes)
+        self._alone = any(name in str(jaxpr) for name in FACTORISED)
         self._compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)
 
     def __call__(self, values: dict[Any, Any]) -> dict[Any, Any]:
         """What it makes of what is there."""
         assert self._compiled is not None
-        found = self._compiled(*(values[v] for v in self.takes)) if self.makes else []
+        given = [values[v] for v in self.takes]
+        if self._alone:
+            with _one_at_a_time:
+                found = jax.block_until_ready(self._compiled(*given)) if self.makes else []
+        else:
+            found = self._compiled(*given) if self.makes else []
         return dict(zip(self.makes, found, strict=True))
 
 
