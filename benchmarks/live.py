@@ -2,17 +2,24 @@
 
 The sample in the middle, the mean, and the slowest of a hundred, after the start, in wall time and,
 in brackets, in time of all processors, which other programs disturb less; samples at the end of a
-block or with a fix take a step of the filter. Nothing is compiled meanwhile.
+block or with a fix take a step of the filter. Nothing is compiled meanwhile. First what a call of
+an `OnlineFilter` of fifteen states takes; then the live objects, with their filters by JAX and in
+C, whose programs are compiled for minutes where they were not yet.
+
+    python benchmarks/live.py [calls] [marg] [ekf] [robust]
 """
 
+import sys
 import time
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from marg import RATE_HZ, made_log
 
 from robins import scenario
+from robins.filters import Belief, Model, Motion, OnlineFilter, Sensor, kalman, taylor, unscented
 from robins.systems.ins_gnss import SYSTEM, Drive, LiveInsGnss, drive_dataset
 from robins.systems.ins_gnss import Replay as Navigated
 from robins.systems.marg import LiveMarg, Replay
@@ -20,9 +27,11 @@ from robins.systems.streaming import Flag
 
 SAMPLES = 6_000
 LATE_S = 0.1
+N, M = 15, 3
+MACHINES = ("jax", "c")
 
 
-def told(name: str, rows: list[tuple[float, float, bool]], period_s: float) -> None:
+def told(name: str, rows: list[tuple[float, float, bool]], period_s: float = 0.0) -> None:
     """A line of microseconds."""
     wall, used = (1e6 * np.array(column) for column in list(zip(*rows, strict=True))[:2])
     known = np.array([row[2] for row in rows])
@@ -34,7 +43,8 @@ def told(name: str, rows: list[tuple[float, float, bool]], period_s: float) -> N
             ("99 %", lambda x: np.percentile(x, 99.0)),
         )
     ]
-    print(f"{name:28}", *figures, f"us; a sample lasts {1e6 * period_s:.0f} us", flush=True)
+    lasts = f"; a sample lasts {1e6 * period_s:.0f} us" if period_s else ""
+    print(f"{name:36}", *figures, f"us{lasts}", flush=True)
 
 
 def timed(call: Any, *arguments: Any) -> tuple[float, float, bool]:
@@ -45,18 +55,52 @@ def timed(call: Any, *arguments: Any) -> tuple[float, float, bool]:
     return *spent, not answer.flags & Flag.STARTING
 
 
-def orientation() -> None:
+def mean_of(step: Any) -> Any:
+    """All that is looked at of a step."""
+    return step.posterior.mean
+
+
+def calls() -> None:
+    """Calls of filters of 15 states, ``A x + 0.01 sin x`` with a full A, square-root form."""
+    rng = np.random.default_rng(0)
+    A = np.eye(N) + 0.01 * rng.normal(size=(N, N))
+    A /= max(1.0, np.abs(np.linalg.eigvals(A)).max())
+    F, H, y = jnp.asarray(A), jnp.asarray(rng.normal(size=(M, N))), rng.normal(size=M)
+    motion = Motion(lambda x, u: F @ x + 0.01 * jnp.sin(x), 0.1 * np.ones(N))
+    model = Model(motion, (Sensor(lambda x, aux: H @ x, np.ones(M), M),))
+    start = Belief.of(jnp.zeros(N), np.eye(N))
+    for kind, way in (("EKF-15", taylor()), ("UKF-15", unscented())):
+        for machine in MACHINES:
+            live = OnlineFilter(kalman(way), model, start, machine)
+            kinds = {
+                "predict": live.predict,
+                "update": lambda live=live: live.update(y),
+                "step": lambda live=live: live.step({"y": y}),
+                "step, mean kept": lambda live=live: live.step({"y": y}, keep=mean_of),
+            }
+            for name, call in kinds.items():
+                told(f"{kind}, {machine}: {name}", [called(call) for _ in range(SAMPLES)])
+
+
+def called(call: Any) -> tuple[float, float, bool]:
+    """Seconds of a call, by both clocks; the first one compiles."""
+    begin, used = time.perf_counter(), time.process_time()
+    call()
+    return time.perf_counter() - begin, time.process_time() - used, True
+
+
+def orientation(machine: str) -> None:
     """Nine axes at 286 Hz."""
-    log, live = made_log(), LiveMarg(Replay(), RATE_HZ)
+    log, live = made_log(), LiveMarg(Replay(), RATE_HZ, machine=machine)
     assert log.mag is not None
     stamps, imu, field = log.imu.time_ns.tolist(), log.imu, log.mag.field_t
     rows = [
         timed(live.push, stamps[k], imu.gyro[k], imu.accel[k], field[k]) for k in range(SAMPLES)
     ]
-    told("LiveMarg", rows, 1.0 / RATE_HZ)
+    told(f"LiveMarg, {machine}", rows, 1.0 / RATE_HZ)
 
 
-def navigation(name: str) -> None:
+def navigation(name: str, machine: str) -> None:
     """A drive at 100 Hz, fixes at 1 Hz that come late."""
     drive = scenario.parse(Drive, SYSTEM.scenarios["drive"].read_text(), [])
     log = drive_dataset(drive, seed=0)
@@ -66,7 +110,7 @@ def navigation(name: str) -> None:
     assert g is not None
     assert g.v_n is not None
     assert g.sigma_v is not None
-    live = LiveInsGnss(Navigated(), drive.imu_rate, drive.gnss.rate, name)
+    live = LiveInsGnss(Navigated(), drive.imu_rate, drive.gnss.rate, name, machine=machine)
     comes = [(int(t), 0, k) for k, t in enumerate(imu.time_ns[:SAMPLES])]
     comes += [(int(t + 1e9 * LATE_S), 1, k) for k, t in enumerate(g.time_ns)]
     samples, fixes = [], []
@@ -78,11 +122,17 @@ def navigation(name: str) -> None:
         elif not fix:
             stamp = int(imu.time_ns[k])
             samples.append(timed(live.push_imu, stamp, imu.gyro[k], imu.accel[k]))
-    told(f"LiveInsGnss {name}, a sample", samples, step_s)
-    told(f"LiveInsGnss {name}, a fix", fixes, step_s)
+    told(f"LiveInsGnss {name}, {machine}, a sample", samples, step_s)
+    told(f"LiveInsGnss {name}, {machine}, a fix", fixes, step_s)
 
 
 if __name__ == "__main__":
-    orientation()
-    for name in ("ekf", "robust"):
-        navigation(name)
+    asked = sys.argv[1:] or ["calls", "marg", "ekf", "robust"]
+    if "calls" in asked:
+        calls()
+    for machine in MACHINES:
+        if "marg" in asked:
+            orientation(machine)
+        for name in ("ekf", "robust"):
+            if name in asked:
+                navigation(name, machine)

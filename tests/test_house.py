@@ -130,7 +130,9 @@ def test_imports_point_down(drawn):
 
 
 def test_filters_know_no_navigation_sensor_or_file(drawn):
-    assert allowed(drawn)["filters"] == {"linalg", "manifold", "rotation", "errors", "_float64"}
+    below = {"linalg", "manifold", "rotation", "program", "errors", "_float64"}
+    assert allowed(drawn)["filters"] == below
+    assert allowed(drawn)["program"] == {"errors", "_float64"}  # it knows no filter either
 
 
 PLANTED = {

@@ -300,7 +300,13 @@ def test_the_loop_has_forty_lines_and_no_heap():
 
 
 def test_every_file_of_the_example_is_given():
-    assert list(firmware()) == ["gyro_board.c", "platform.h", "platform_posix.c", "robins_wire.h"]
+    assert list(firmware()) == [
+        "adm_board.c",
+        "gyro_board.c",
+        "platform.h",
+        "platform_posix.c",
+        "robins_wire.h",
+    ]
 
 
 # ------------------------------------------------------------------------------------------ page

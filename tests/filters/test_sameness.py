@@ -135,7 +135,7 @@ def test_what_a_transformation_is_looking_at_is_not_remembered():
 
 
 def test_a_stream_made_again_is_compiled_once():
-    from robins.filters.online import _update
+    from robins.filters.machine import _update
 
     def stream():
         it = OnlineFilter(

@@ -1,8 +1,8 @@
 """On what a campaign runs: batches of JAX, or programs in lanes on all cores.
 
-Both have the same random numbers and, to rounding, the same results; JAX is the reference. Lanes are
-compiled for each problem, which takes from seconds to a minute and is kept on this machine: they are
-chosen where JAX would take longer than that.
+Both have the same random numbers and, to rounding, the same results; JAX is the reference. Lanes
+are compiled for each problem, which takes from seconds to a minute and is kept on this machine:
+they are chosen where JAX would take longer than that.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ class InLanes:
         world = jax.eval_shape(problem.simulate, number)
         blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
         self._filters = {
-            name: Staged(partial(one_record, blocks, contender(problem, name), over=one_by_one), world)
+            name: Staged(
+                partial(one_record, blocks, contender(problem, name), over=one_by_one), world
+            )
             for name in problem.contenders
         }
 
@@ -84,7 +86,7 @@ class InLanes:
         return [
             f"{name}: a loop stays with JAX, as {one.refused}"
             for name, staged in of.items()
-            for one in staged.long
+            for one in staged.loops
             if one.refused
         ]
 

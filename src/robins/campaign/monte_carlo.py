@@ -39,7 +39,7 @@ def _kept(step: Step) -> Any:
 def _judged(
     blocks: _Blocks, belief: Belief, truth: State, rows: Array | None, lost: Array
 ) -> dict[str, Any]:
-    """Of one epoch: the error of what the filters of a problem report alike, and what was stated."""
+    """Of one epoch the error of what the filters of a problem report alike, and what was stated."""
     whole, factor = local(belief.mean, truth), belief.factor
     error = whole if rows is None else rows @ whole
     stated = factor if rows is None else rows @ factor

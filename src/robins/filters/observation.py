@@ -49,7 +49,18 @@ class Normalised(NamedTuple):
 
 
 def as_measurement(sensor: str, data: Any) -> Any:
-    """Measurements as 64-bit floats, from arrays of any real kind or lists of numbers."""
+    """Measurements as 64-bit floats of JAX, from arrays of any real kind or lists of numbers."""
+    return jax.tree_util.tree_map(jnp.asarray, as_real(sensor, data))
+
+
+def as_real(sensor: str, data: Any) -> Any:
+    """Measurements as 64-bit floats, of NumPy where they are not of JAX.
+
+    Raises:
+        TypeError: they are not real numbers.
+    """
+    if type(data) is np.ndarray and data.dtype == float:
+        return data
 
     def as_numbers(leaf):
         array = leaf if isinstance(leaf, jax.Array) else np.asarray(leaf)
@@ -60,8 +71,7 @@ def as_measurement(sensor: str, data: Any) -> Any:
             )
         return array.astype(float)
 
-    numbers = jax.tree_util.tree_map(as_numbers, data, is_leaf=lambda x: isinstance(x, list))
-    return jax.tree_util.tree_map(jnp.asarray, numbers)
+    return jax.tree_util.tree_map(as_numbers, data, is_leaf=lambda x: isinstance(x, list))
 
 
 def innovation(z: Any, y: Any) -> tuple[Array, Array]:

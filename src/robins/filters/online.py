@@ -4,68 +4,74 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+from jax.tree_util import tree_leaves, tree_map
 
-from robins.filters.audit import audit
+from robins.filters.audit import audit, reports
 from robins.filters.belief import Belief, Code, StepInfo
 from robins.filters.kalman import Filter, FilterState, Prediction
+from robins.filters.machine import Machine, on, settled
 from robins.filters.model import Model
-from robins.filters.observation import as_measurement
-from robins.filters.run import Step, everything, filter_step
+from robins.filters.observation import as_measurement, as_real
+from robins.filters.run import Step, everything
 from robins.filters.sameness import same, same_model
 
-
-@partial(jax.jit, static_argnames=("filter_",))
-def _predict(filter_, motion, state, u):
-    return filter_.predict(state, motion, u)
-
-
-@partial(jax.jit, static_argnames=("filter_",))
-def _update(filter_, sensor, state, y, aux):
-    return filter_.update(state, sensor, y, aux)
-
-
-@partial(jax.jit, static_argnames=("filter_", "keep"))
-def _step(filter_, model, state, u, y, aux, keep):
-    state, step = filter_step(filter_, model, state, u, y, aux)
-    return state, keep(step), step.prediction.code, {k: i.code for k, i in step.info.items()}
-
-
-def _settled(state: FilterState) -> FilterState:
-    """With types of their own: a weak one would have all compiled again after the first step."""
-    if not any(getattr(x, "weak_type", False) for x in jax.tree_util.tree_leaves(state)):
-        return state
-    return jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)
+_DONE = int(Code.DONE)
+_NAMES = {int(code): code.name for code in Code}
 
 
 class OnlineFilter:
     """A filter with a current state; `predict` and `update` are those of a run, compiled.
 
-    Gives the numbers of `robins.filters.run` to rounding.
+    Gives the numbers of `robins.filters.run` to rounding. In C a call takes some ten microseconds
+    where JAX takes a hundred; what it tells are then arrays of NumPy.
 
     Attributes:
         filter: what it steps, and
         model: with what.
-        state: the filter's state; assign to restore a saved one.
         counts: outcomes so far, by `Code` name: of updates, and of predictions not taken.
     """
 
-    def __init__(self, filter_: Filter, model: Model, start: Belief | FilterState):
+    def __init__(
+        self,
+        filter_: Filter,
+        model: Model,
+        start: Belief | FilterState,
+        machine: Machine | str = "jax",
+    ):
         """Begin at a belief, or go on from a state.
 
         Args:
             filter_: from `kalman` and its kin.
             model: the motion and the sensors.
             start: initial belief or saved state.
+            machine: "jax", or "c" for compiled programs of scalars, which need a C compiler. The
+                first call of each kind is traced and compiled, for seconds; the compiler's work is
+                kept on disk. Or what makes a `robins.filters.machine.Memory` of a state.
+
+        Raises:
+            ValueError: there is no such machine.
+            robins.program.BuildError: there is no C compiler.
+            robins.program.ProgramError: the state holds numbers that have no place in C. What a
+                function does that has no place there is told by the call that needs it, with the
+                line of the model or the rule.
         """
         self.filter, self.model = same(filter_), same_model(model)
-        state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-        self.state = _settled(state)
+        state = settled(filter_.init(start, model.dims) if isinstance(start, Belief) else start)
+        self._machine = on(machine, self.filter, self.model, state)
+        self._reports = any(map(reports, tree_leaves(state, is_leaf=reports)))
         self.counts: Counter[str] = Counter()
+
+    @property
+    def state(self) -> FilterState:
+        """The filter's state, in C of arrays of NumPy; assign to restore a saved one."""
+        return self._machine.state
+
+    @state.setter
+    def state(self, state: FilterState) -> None:
+        self._machine.state = state
 
     @property
     def belief(self) -> Belief:
@@ -74,11 +80,8 @@ class OnlineFilter:
 
     def predict(self, u: Any = None) -> Prediction:
         """Move on by one step with input u."""
-        self.state, prediction = _predict(self.filter, self.model.motion, self.state, u)
-        code = Code(int(prediction.code))
-        if code is not Code.DONE:
-            self.counts[code.name] += 1
-        audit(self.state, self.state, None, None)
+        prediction = self._machine.predict(u)
+        self._count(prediction.code)
         return prediction
 
     def step(
@@ -97,13 +100,8 @@ class OnlineFilter:
             aux: what sensors need besides the state, by sensor name.
             keep: what to give back of the `Step`, as in `run`.
         """
-        found = _step(self.filter, self.model, self.state, u, dict(y), aux or {}, keep)
-        self.state, kept, *codes = found
-        moved, used = jax.device_get(codes)
-        if moved != Code.DONE:
-            self.counts[Code(int(moved)).name] += 1
-        self.counts.update(Code(int(code)).name for code in used.values())
-        audit(self.state, self.state, None, None)
+        kept, (moved, used) = self._machine.step(u, dict(y), dict(aux or {}), keep)
+        self._count(moved, *used.values())
         return kept
 
     def update(self, y: Any, sensor: str | None = None, aux: Any = None) -> StepInfo:
@@ -124,9 +122,30 @@ class OnlineFilter:
             if len(self.model.sensors) != 1:
                 raise ValueError(f"name one of the sensors {sorted(self.model.dims)}")
             sensor = self.model.sensors[0].name
-        chosen = self.model.sensor(sensor)
-        numbers = as_measurement(sensor, y)
-        self.state, info = _update(self.filter, chosen, self.state, numbers, aux)
-        self.counts[Code(int(info.code)).name] += 1
-        audit(self.state, self.state, None, None)
+        self.model.sensor(sensor)
+        numbers = (as_real if self._machine.is_numpy else as_measurement)(sensor, y)
+        info = self._machine.update(sensor, numbers, aux)
+        self._count(_DONE, info.code)
         return info
+
+    def look(self, question: Callable[..., Any], *args: Any) -> Any:
+        """What ``question(filter, model, state, *args)`` gives, compiled; the state stays.
+
+        Args:
+            question: a pure function, the same object at every call, such as one that predicts to
+                another time than that of the next step.
+            args: pytrees of numbers.
+        """
+        return self._machine.look(question, *args)
+
+    def _count(self, moved: Any, *used: Any) -> None:
+        """Count a prediction that was not taken, and updates; let the memories report."""
+        # whole numbers of Python: to compare one of NumPy with a `Code` takes as long as a step
+        if (code := int(moved)) != _DONE:
+            self.counts[_NAMES[code]] += 1
+        for one in used:
+            self.counts[_NAMES[int(one)]] += 1
+        if self._reports:
+            # memories compute by JAX
+            state = tree_map(jnp.asarray, self.state) if self._machine.is_numpy else self.state
+            audit(state, state, None, None)

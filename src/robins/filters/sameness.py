@@ -84,6 +84,16 @@ def same_model(model: Model) -> Model:
     return Model(_settled(model.motion), tuple(map(_settled, model.sensors)))
 
 
+def content(made: Any) -> Hashable:
+    """What other things must share to be the same as this one.
+
+    Args:
+        made: of filters, models and functions; a user's function is the same as itself only, and is
+            kept alive by what is returned.
+    """
+    return _content(made, {})
+
+
 def _settled(part: Any) -> Any:
     named = {f.name: getattr(part, f.name) for f in dataclasses.fields(part)}
     return dataclasses.replace(part, **{k: same(v) for k, v in named.items() if callable(v)})

@@ -8,11 +8,13 @@ is left out. What remains is emitted as C99, compiled, and called from Python; o
     trace_step   the same of a step from state to state, whose lasting zeros are structural
     to_c         `Program` -> text
     native       function -> the same function, compiled
+    Memory       a state that stays in the memory of C, and compiled functions that step it
 
 This room knows JAX and no filter: no filter, rule or system is written for it.
 """
 
 from robins.program.c import function, header, to_c
+from robins.program.memory import Memory
 from robins.program.native import CPP, FLAGS, LANE_FLAGS, Native, build, compiler, native
 from robins.program.nodes import Graph
 from robins.program.refusal import BuildError, ProgramError
@@ -25,6 +27,7 @@ __all__ = [
     "BuildError",
     "Graph",
     "Leaf",
+    "Memory",
     "Native",
     "Program",
     "ProgramError",

@@ -7,18 +7,16 @@ carried on, and a row of each array that is made. The body of a `scan` is one.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from jax.extend import core as jex
 
 from robins.program.c import function, header
 from robins.program.kinds import array_of, is_key, numbers_of
 from robins.program.native import CPP, LANE_FLAGS, build
-from robins.program.trace import Leaf, Program, positive_zeros, step_of
+from robins.program.trace import Leaf, Program, positive_zeros
 
 KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as `scan.h` counts them
 
@@ -85,7 +83,10 @@ class Rounds:
             for g, leaf in zip(given, inputs, strict=True)
         ]
         made = [
-            np.empty((runs, *((self.length,) if k >= self.carried else ()), *leaf.shape), _dtype(leaf.dtype))
+            np.empty(
+                (runs, *((self.length,) if k >= self.carried else ()), *leaf.shape),
+                _dtype(leaf.dtype),
+            )
             for k, leaf in enumerate(results)
         ]
         first = self.carried + self.stays
@@ -106,40 +107,10 @@ class Rounds:
         )
         if failed:
             raise MemoryError(f"no memory for rounds of {runs} runs")
-        return [array_of(a, leaf.dtype) if is_key(leaf.dtype) else a for a, leaf in zip(made, results)]
-
-
-def of_scan(
-    equation: Any, known: Mapping[int, np.ndarray], begin: Sequence[Given], unroll: int | None
-) -> Rounds:
-    """A scan of a jaxpr as rounds.
-
-    Args:
-        equation: the scan.
-        known: numbers of some of its constants, folded into the program.
-        begin: what it begins with: entries that are zero in all runs and stay so are left out.
-        unroll: as in `trace`.
-
-    Raises:
-        ProgramError: its body does what has no place in a program.
-        BuildError: there is no compiler, or it refuses the program.
-    """
-    p = equation.params
-    body, fixed, carried = p["jaxpr"], p["num_consts"], p["num_carry"]
-    inner = body.jaxpr
-    consts, carry = inner.invars[:fixed], inner.invars[fixed : fixed + carried]
-    free = [v for k, v in enumerate(consts) if k not in known]
-    invars = [*carry, *free, *inner.invars[fixed + carried :]]
-    constvars = [*inner.constvars, *(consts[k] for k in known)]
-    jaxpr = jex.Jaxpr(constvars, invars, inner.outvars, inner.eqns)
-    closed = jex.ClosedJaxpr(jaxpr, [*body.consts, *known.values()])
-    zeros = {k: zero_in_all(g) for k, g in enumerate(begin)}
-    shapes = [
-        tuple(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in some)
-        for some in (invars, inner.outvars)
-    ]
-    program = step_of(closed, *shapes, unroll, zeros)
-    return Rounds(program, p["length"], carried, len(free), p["reverse"])
+        return [
+            array_of(a, leaf.dtype) if is_key(leaf.dtype) else a
+            for a, leaf in zip(made, results, strict=True)
+        ]
 
 
 def zero_in_all(given: Given) -> np.ndarray:

@@ -1,63 +1,51 @@
-"""A function of one run, for many: its long loops in lanes, all else as batches of JAX.
+"""A function of one run, for many: its loops in lanes, all else as batches of JAX.
 
-The jaxpr of the function is cut into *stages*. A scan is one, so is a call that draws a large array
-of random numbers; what lies between them is one. What depends on no run is computed once. What has
-no place in a program stays with JAX, which is said; so does what is too short to be worth it.
+The jaxpr of the function is cut into *stages*: what goes along one axis is a loop
+(`robins.program.loops`), what lies between loops is a batch. What depends on no run is computed
+once. What has no place in a program stays with JAX, which is said.
 """
 
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jax import lax
 from jax.extend import core as jex
 
-from robins.program import rows
-from robins.program.lanes import Given, Rounds, of_scan
-from robins.program.primitives.control import called, size_of
-from robins.program.refusal import ProgramError
+from robins.program.lanes import Given, Rounds, zero_in_all
+from robins.program.loops import (
+    Along,
+    Body,
+    along,
+    foldable,
+    makes_rows,
+    number_of,
+    operations,
+    uses,
+)
+from robins.program.primitives.control import called
+from robins.program.refusal import BuildError, ProgramError
+from robins.program.trace import lasting
 
-ROUNDS = 30  # of a scan that is worth a program
-WORTH = 5_000  # scalar operations of all its rounds
-DRAWN = 1_000  # random numbers of a call that is worth one
-DRAW = 150  # operations of a scan that cost JAX as much as a normal number
+WORTH = 5_000  # operations of a loop that is worth a program
+FEWEST = 8  # equations without a scan or random numbers that are
 FOLDED = 2_000  # numbers of a known array that becomes part of a program
 UNROLL = 3_000
-
-
-def is_scan(equation: Any) -> bool:
-    """Whether an equation is a scan with enough to do."""
-    p = equation.params
-    return (
-        equation.primitive.name == "scan"
-        and p["length"] >= ROUNDS
-        and operations(equation) >= WORTH
-    )
-
-
-def operations(equation: Any) -> int:
-    """About how many scalar operations a scan is, or a call that draws random numbers."""
-    if equation.primitive.name != "scan":
-        return DRAW * rows.draws(equation)
-    return equation.params["length"] * size_of(equation.params["jaxpr"].jaxpr)
-
-
-def worthwhile(equation: Any) -> bool:
-    """Whether an equation is worth a program."""
-    return is_scan(equation) or rows.draws(equation) >= DRAWN
-
-
-def has_worth(jaxpr: Any) -> bool:
-    """Whether something worth a program is in a jaxpr or in what it calls."""
-    calls = (c.jaxpr for c in map(called, jaxpr.eqns) if c is not None)
-    return any(map(worthwhile, jaxpr.eqns)) or any(map(has_worth, calls))
+CUMULATED = {
+    "cumsum": (lax.add, lambda dtype: 0),
+    "cumprod": (lax.mul, lambda dtype: 1),
+    "cummax": (lax.max, lambda dtype: _extreme(dtype, -1)),
+    "cummin": (lax.min, lambda dtype: _extreme(dtype, 1)),
+}
 
 
 class Flat:
-    """A jaxpr with the calls written out that hold something worth a program.
+    """A jaxpr with all calls written out, and sums along the first axis as scans.
 
     Attributes:
         equations: of variables of their own.
@@ -88,14 +76,40 @@ class Flat:
 
         for e in jaxpr.eqns:
             given = list(map(read, e.invars))
-            inner = called(e)
-            if inner is not None and not worthwhile(e) and has_worth(inner.jaxpr):
+            inner = called(e) or cumulated(e)
+            if inner is not None:
                 found = self._write(inner, given)
             else:
                 found = [jex.Var(v.aval) for v in e.outvars]
                 self.equations.append(e.replace(invars=given, outvars=found))
             now.update(zip(e.outvars, found, strict=True))
         return list(map(read, jaxpr.outvars))
+
+
+def cumulated(e: Any) -> Any:
+    """A sum, product or extreme along the first axis as the closed jaxpr of a scan."""
+    name, p = e.primitive.name, e.params
+    if name not in CUMULATED or p["axis"] != 0:
+        return None
+    join, neutral = CUMULATED[name]
+
+    def scanned(a: Any) -> Any:
+        def step(total: Any, row: Any) -> tuple[Any, Any]:
+            total = join(total, row)
+            return total, total
+
+        begin = jax.numpy.full(a.shape[1:], neutral(a.dtype), a.dtype)
+        return lax.scan(step, begin, a, reverse=p["reverse"])[1]
+
+    aval = e.invars[0].aval
+    return jax.make_jaxpr(scanned)(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
+
+
+def _extreme(dtype: Any, sign: int) -> Any:
+    """The least or greatest number of a type."""
+    if np.issubdtype(dtype, np.floating):
+        return sign * np.inf
+    return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
 
 
 class Batch:
@@ -105,15 +119,20 @@ class Batch:
         takes, makes: variables.
     """
 
-    def __init__(self) -> None:
-        self.equations: list[Any] = []
+    def __init__(self, equations: Sequence[Any] = ()) -> None:
+        self.equations = list(equations)
         self.takes: list[Any] = []
         self.makes: list[Any] = []
         self._compiled: Callable[..., Any] | None = None
 
-    def compile(self, batched: set[Any]) -> None:
-        """Let JAX compile it."""
-        jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations)
+    def compile(self, batched: set[Any], wanted: Callable[[Any], bool]) -> None:
+        """Find what goes in and out, and let JAX compile it."""
+        made = {v for e in self.equations for v in e.outvars}
+        free = (v for e in self.equations for v in e.invars if not isinstance(v, jex.Literal))
+        self.takes = list(dict.fromkeys(v for v in free if v not in made))
+        self.makes = [v for e in self.equations for v in e.outvars if wanted(v)]
+        about = jex.DebugInfo("jit", "stage", None, None)
+        jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations, debug_info=about)
         function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
         axes = tuple(0 if v in batched else None for v in self.takes)
         self._compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)
@@ -125,79 +144,69 @@ class Batch:
         return dict(zip(self.makes, found, strict=True))
 
 
-class Long:
-    """An equation worth a program: rounds in lanes, or JAX if it has no place there.
+class Loop:
+    """Equations along one axis: rounds in lanes, or JAX if they have no place there.
 
     Attributes:
-        equation: of the jaxpr.
-        rounds: where it is compiled.
-        refused: why it is not.
+        equations: in an order of computation.
+        refused: why they are not in lanes.
     """
 
-    def __init__(self, equation: Any, unroll: int | None):
-        self.equation, self.unroll = equation, unroll
+    def __init__(self, axis: Along):
+        self.axis = axis
+        self.equations: list[Any] = []
+        self.refused: ProgramError | BuildError | None = None
         self.rounds: Rounds | None = None
-        self.refused: ProgramError | None = None
-        self._by_jax = Batch()
         self._lock = threading.Lock()
 
-    def __call__(self, runs: int, values: dict[Any, Any], batched: set[Any]) -> dict[Any, Any]:
+    def connect(self, batched: set[Any], wanted: Callable[[Any], bool], unroll: int | None) -> None:
+        """Find what goes in and out."""
+        self._batched, self._wanted, self._unroll = batched, wanted, unroll
+        self.body = Body(self.equations, self.axis, wanted)
+
+    def __call__(self, runs: int, values: dict[Any, Any]) -> dict[Any, Any]:
         """What it makes of what is there."""
-        e = self.equation
+        body = self.body
 
         def given(v: Any) -> Given:
             if isinstance(v, jex.Literal):
-                return Given(np.asarray(v.val, v.aval.dtype), False)
-            return Given(values[v], v in batched)
+                return Given(number_of(v), False)
+            return Given(values[v], v in self._batched)
 
-        args = list(map(given, e.invars))
-        if e.primitive.name == "scan":
-            fixed, carried = e.params["num_consts"], e.params["num_carry"]
-            consts, begin = args[:fixed], args[fixed : fixed + carried]
-            known = {
-                k: np.asarray(g.array)
-                for k, g in enumerate(consts)
-                if not g.batched and g.array.size <= FOLDED
-            }
-            with self._lock:
-                self._compile(lambda: of_scan(e, known, begin, self.unroll), begin)
-            free = [g for k, g in enumerate(consts) if k not in known]
-            args = [*begin, *free, *args[fixed + carried :]]
-            dropped = 0
-        else:
-            with self._lock:
-                self._compile(lambda: rows.of_call(e), [])
-            args = [Given(np.zeros((), np.int64), False), *(args[k] for k in rows.order_of(e))]
-            dropped = 1  # the number of the round
+        known = {
+            v: np.asarray(values[v])
+            for v in body.stays
+            if v not in self._batched and foldable(values[v], FOLDED)
+        }
+        begin = [Given(np.zeros((), np.int64), False), *map(given, body.begin)]
+        with self._lock:
+            self._compile(known, begin)
         if self.rounds is None:
-            return self._whole(values, batched)
-        found = self.rounds(runs, args)
-        return dict(zip(e.outvars, found[dropped:], strict=True))
+            return self._by_jax(values)
+        free = [v for v in body.stays if v not in known]
+        found = self.rounds(runs, [*begin, *map(given, free), *map(given, body.rows)])
+        return dict(zip([*body.after, *body.made], found[1:], strict=True))
 
-    def _compile(self, make: Callable[[], Rounds], begin: Sequence[Given]) -> None:
+    def _compile(self, known: dict[Any, np.ndarray], begin: Sequence[Given]) -> None:
         if self.refused or (self.rounds is not None and self.rounds.holds_for(begin)):
             return
+        body, zeros = self.body, {k: zero_in_all(g) for k, g in enumerate(begin) if k}
         try:
-            self.rounds = make()
-        except ProgramError as error:
+            program = lasting(lambda some: body.program(known, some, self._unroll), zeros)
+            stays = len(body.stays) - len(known)
+            axis = self.axis
+            self.rounds = Rounds(program, axis.length, len(begin), stays, axis.backwards)
+        except (ProgramError, BuildError) as error:
             self.refused = error
-
-    def _whole(self, values: dict[Any, Any], batched: set[Any]) -> dict[Any, Any]:
-        if not self._by_jax.equations:
-            free = dict.fromkeys(v for v in self.equation.invars if not isinstance(v, jex.Literal))
-            self._by_jax.equations = [self.equation]
-            self._by_jax.takes, self._by_jax.makes = list(free), list(self.equation.outvars)
-            self._by_jax.compile(batched)
-        return self._by_jax(values)
+            self._by_jax = Batch(self.equations)
+            self._by_jax.compile(self._batched, self._wanted)
 
 
 class Staged:
     """A function of one run as a function of a batch of them.
 
-    The numbers of a run do not depend on the runs beside it, nor on how many there are.
-
     Attributes:
-        long: its equations that are worth a program.
+        loops: that are worth a program.
     """
 
     def __init__(self, function: Callable[..., Any], *shapes: Any, unroll: int | None = UNROLL):
@@ -209,56 +218,73 @@ class Staged:
             unroll: as in `robins.program.trace`.
         """
         self._flat = flat = Flat(function, *shapes)
-        level: dict[Any, int] = dict.fromkeys(flat.takes, 0)
-        self._levels: list[tuple[Batch, list[Long]]] = []
-        known = Batch()
+        axes = {id(e): axis for e in flat.equations if (axis := along(e)) is not None}
+        worth: Counter[Along] = Counter()
         for e in flat.equations:
-            of = [level[v] for v in e.invars if not isinstance(v, jex.Literal) and v in level]
+            if (axis := axes.get(id(e))) is not None:
+                worth[axis] += operations(e) + WORTH // FEWEST
+        level: dict[Any, int] = dict.fromkeys(flat.takes, 0)
+        source: dict[Any, Along] = {}  # of what a loop makes, row by row
+        after: set[Any] = set()  # what a loop leaves
+        known = Batch()
+        batches: dict[int, Batch] = {}
+        loops: dict[tuple[int, Along], Loop] = {}
+        for e in flat.equations:
+            axis = axes.get(id(e))
+            axis = axis if axis is not None and worth[axis] >= WORTH else None
+            if axis is None:
+                whole, rows = [v for v in e.invars if not isinstance(v, jex.Literal)], []
+            else:
+                whole, rows = uses(e, axis.length)
+            of = [level[v] + (v in source or v in after) for v in whole if v in level]
+            for v in rows:
+                if v in level:
+                    same = v in source and source[v] == axis
+                    of.append(level[v] + (not same and (v in source or v in after)))
             if not of:
                 known.equations.append(e)
                 continue
             here = max(of)
-            while len(self._levels) <= here:
-                self._levels.append((Batch(), []))
-            if worthwhile(e):
-                self._levels[here][1].append(Long(e, unroll))
-                here += 1
-            else:
-                self._levels[here][0].equations.append(e)
             level.update((v, here) for v in e.outvars)
-        self._batched = set(level)
-        self._connect([known, *(batch for batch, _ in self._levels)])
+            if axis is None:
+                batches.setdefault(here, Batch()).equations.append(e)
+                continue
+            loops.setdefault((here, axis), Loop(axis)).equations.append(e)
+            made = makes_rows(e)
+            source.update((v, axis) for v in made)
+            after.update(v for v in e.outvars if v not in source)
+        batched = self._batched = set(level)
+        parts = [known, *batches.values(), *loops.values()]
+        wanted = self._wanted(parts)
+        for one in (known, *batches.values()):
+            one.compile(batched, wanted)
+        for one in loops.values():
+            one.connect(batched, wanted, unroll)
+        self._levels = [
+            (batches.get(k), [one for (at, _), one in loops.items() if at == k])
+            for k in range(max(level.values(), default=0) + 1)
+        ]
         self._known = flat.known | known(flat.known)
 
+    def _wanted(self, parts: Sequence[Batch | Loop]) -> Callable[[Any], bool]:
+        """Whether a variable is needed outside of the part that makes it."""
+        home = {v: id(p) for p in parts for e in p.equations for v in e.outvars}
+        out = {v for v in self._flat.makes if not isinstance(v, jex.Literal)}
+        for p in parts:
+            for e in p.equations:
+                free = (v for v in e.invars if not isinstance(v, jex.Literal))
+                out.update(v for v in free if home.get(v, id(p)) != id(p))
+        return out.__contains__
+
     @property
-    def long(self) -> list[Long]:
-        """The equations that are worth a program."""
+    def loops(self) -> list[Loop]:
+        """The loops, in an order of computation."""
         return [one for _, some in self._levels for one in some]
 
     @property
     def operations(self) -> int:
-        """About how many scalar operations they are, for a run."""
-        return sum(operations(one.equation) for one in self.long)
-
-    def _connect(self, batches: Sequence[Batch]) -> None:
-        """Let each batch give what others use, and JAX compile it."""
-        of = {id(e): b for b in batches for e in b.equations}
-        made = {v: of.get(id(e)) for e in self._flat.equations for v in e.outvars}
-        takes: dict[int, dict[Any, None]] = {id(b): {} for b in batches}
-        makes: dict[int, dict[Any, None]] = {id(b): {} for b in batches}
-        users = [(of.get(id(e)), e.invars) for e in self._flat.equations]
-        for here, atoms in (*users, (None, self._flat.makes)):
-            for v in atoms:
-                there = None if isinstance(v, jex.Literal) else made.get(v)
-                if isinstance(v, jex.Literal) or (here is not None and there is here):
-                    continue
-                if here is not None:
-                    takes[id(here)][v] = None
-                if there is not None:
-                    makes[id(there)][v] = None
-        for b in batches:
-            b.takes, b.makes = list(takes[id(b)]), list(makes[id(b)])
-            b.compile(self._batched)
+        """About how many scalar operations of a scan the loops are worth to JAX, for a run."""
+        return sum(operations(e) for one in self.loops for e in one.equations)
 
     def __call__(self, *args: Any) -> Any:
         """The function on arguments with a leading axis of runs, as arrays of NumPy or JAX."""
@@ -266,10 +292,11 @@ class Staged:
         runs = leaves[0].shape[0]
         values = dict(self._known)
         values.update(zip(self._flat.takes, leaves, strict=True))
-        for batch, some in self._levels:
-            values.update(batch(values))
-            for one in some:
-                values.update(one(runs, values, self._batched))
+        for batch, loops in self._levels:
+            if batch is not None:
+                values.update(batch(values))
+            for loop in loops:
+                values.update(loop(runs, values))
 
         def of_all(v: Any) -> Any:
             if not isinstance(v, jex.Literal) and v in self._batched:

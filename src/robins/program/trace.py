@@ -253,7 +253,7 @@ def trace_step(
             fix="return (state, ...)",
         )
     zeros = {k: positive_zeros(numbers_of(leaf)) for k, leaf in enumerate(leaves)}
-    return step_of(jaxpr, given, results, unroll, zeros)
+    return lasting(lambda zeros: _program(jaxpr, given, results, unroll, zeros), zeros)
 
 
 def positive_zeros(a: np.ndarray) -> np.ndarray:
@@ -263,22 +263,21 @@ def positive_zeros(a: np.ndarray) -> np.ndarray:
     return np.asarray((a == 0.0) & ~np.signbit(a))
 
 
-def step_of(
-    jaxpr: Any, given: Any, results: Any, unroll: int | None, zeros: dict[int, np.ndarray]
-) -> Program:
+Zeros = dict[int, np.ndarray]  # of an argument, by its number, entries that are zero
+
+
+def lasting(made: Callable[[Zeros], Program], zeros: Zeros) -> Program:
     """The program of a step, with those of some zeros of its state that last.
 
     Args:
-        jaxpr: closed; its first results are the state that its first arguments become.
-        given: its arguments, a pytree of shapes, and
-        results: its results.
-        unroll: as in `trace`.
-        zeros: of an argument, by its number, the entries to try.
+        made: the program that takes some entries of its first arguments for zero, whose next values
+            its first results are.
+        zeros: the entries to try.
     """
     while True:
-        program = _program(jaxpr, given, results, unroll, zeros)
+        program = made(zeros)
         zero = program.graph.constant(0, "real")
-        kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in zeros.items()}
+        kept = {k: mask & (program.outputs[k] == zero) for k, mask in zeros.items()}
         if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
             return program
         zeros = kept
@@ -289,7 +288,7 @@ def _jaxpr(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, An
 
     def shape(x: Any) -> jax.ShapeDtypeStruct:
         array = jax.typeof(jax.numpy.asarray(x))
-        return jax.ShapeDtypeStruct(array.shape, array.dtype)
+        return jax.ShapeDtypeStruct(array.shape, array.dtype, weak_type=array.weak_type)
 
     given = jax.tree_util.tree_map(shape, args)
     jaxpr, results = jax.make_jaxpr(function, return_shape=True)(*given)

@@ -43,9 +43,7 @@ def words(walk: Walk, both: Node) -> tuple[Node, Node]:
     return graph.convert(high, "word"), graph.convert(both, "word")
 
 
-def numbered(
-    walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None = None
-) -> Nodes:
+def numbered(walk: Walk, keys: Nodes, shape: tuple[int, ...], row: Node | None = None) -> Nodes:
     """What a generator makes of each key and the numbers from 0, in the order of a shape.
 
     Where a row is given, of this shape, the numbers go on from those of the rows before it.
@@ -53,7 +51,7 @@ def numbered(
     Raises:
         ProgramError: JAX is told to number in another way.
     """
-    if not jax.config.jax_threefry_partitionable:
+    if not jax.config.values["jax_threefry_partitionable"]:
         raise ProgramError(
             "JAX draws numbers by its older scheme", "", "set jax_threefry_partitionable"
         )

@@ -92,10 +92,9 @@ class Epoch(NamedTuple):
     number: int  # of blocks since
 
 
-@partial(jax.jit, static_argnames=("filter_",))
-def _predicted(filter_, motion, state, u):
+def _predicted(filter_: Any, model: Any, state: Any, u: Block) -> jax.Array:
     """Mean and standard deviations after a block, in one vector."""
-    return _vector(filter_.predict(state, motion, u)[1].belief)
+    return _vector(filter_.predict(state, model.motion, u)[1].belief)
 
 
 def _vector(belief: Any) -> jax.Array:
@@ -133,6 +132,7 @@ class LiveInsGnss(Live):
         fix_rate_hz: float = 1.0,
         filter: str = "robust",
         longest_delay_s: float = 1.0,
+        machine: str = "jax",
     ):
         """Begin; everything is compiled before the first sample.
 
@@ -142,16 +142,19 @@ class LiveInsGnss(Live):
             fix_rate_hz: of the receiver.
             filter: a causal one of the replays.
             longest_delay_s: how late a fix may come.
+            machine: that steps the filter, as of `OnlineFilter`; "c" is compiled for minutes once.
 
         Raises:
-            ValueError: a rate or delay is not positive, or there is no causal filter of this name.
+            ValueError: a rate or delay is not positive, or there is no such machine or no causal
+                filter of this name.
         """
         for what, value in (("rate_hz", rate_hz), ("fix_rate_hz", fix_rate_hz)):
             require(value > 0.0, f"{what} must be positive", value)
         require(longest_delay_s > 0.0, "longest_delay_s must be positive", longest_delay_s)
         require(filter not in SMOOTHED, f"{filter} smooths: it needs the whole log")
         made_with = {"fix_rate_hz": fix_rate_hz, "filter": filter, "rate_hz": rate_hz}
-        super().__init__(parameters, **made_with, longest_delay_s=longest_delay_s)
+        made_with |= {"longest_delay_s": longest_delay_s, "machine": machine}
+        super().__init__(parameters, **made_with)
         p = parameters
         self._usual = Usual(1.0 / rate_hz, 1.0 / fix_rate_hz)
         self._reach_s = reach_of_rate(self._usual.sample_s)
@@ -163,7 +166,8 @@ class LiveInsGnss(Live):
         back = max(self._window_s, 2.0 * p.aids.window, 1.5, 4.0 * self._usual.fix_s)
         self._back_s = longest_delay_s + 2.0 * self._reach_s + back
         asked = contender(p, self._usual.fix_s, filter)
-        self._filter, self._model, self._case = asked.filter, asked.model, asked.case
+        self._on = partial(OnlineFilter, asked.filter, asked.model, machine=machine)
+        self._case = asked.case
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
         self._door = Door(p.update.longest_gap, max(3, round(_PATIENCE_S * rate_hz)))
         self._begin_anew()
@@ -374,7 +378,7 @@ class LiveInsGnss(Live):
             self._begin_anew()
             raise
         belief = self._case(Case(first_belief(log, found, p), None, {}, {}, None)).start
-        self._online = OnlineFilter(self._filter, self._model, belief)
+        self._online = self._on(belief)
         self._past, self._states = [tuple(Epoch(begin_s, begin_s, 0))], [self._online.state]
         self.start = found.sentence
 
@@ -455,8 +459,7 @@ class LiveInsGnss(Live):
         rows = np.concatenate([rows, last])
         end_s = float(rows[-1, 0])
         u = self._block(end_s, rows, at, self._width + 8)
-        motion = self._online.model.motion
-        found = _predicted(self._online.filter, motion, self._online.state, u)
+        found = self._online.look(_predicted, u)
         return self._told(end_s, np.asarray(found), mark)._replace(time_ns=time_ns)
 
     def _told(self, time_s: float, x: np.ndarray, flags: Flag) -> Navigation:
@@ -492,4 +495,4 @@ class LiveInsGnss(Live):
         each = len(state) // count
         like = self._compiled_state
         self._states = [as_before(like, state[k * each : (k + 1) * each]) for k in range(count)]
-        self._online = OnlineFilter(self._filter, self._model, self._states[-1])
+        self._online = self._on(self._states[-1])

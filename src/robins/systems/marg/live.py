@@ -23,6 +23,7 @@ takes from later samples, a live object waits for or does without:
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -151,26 +152,34 @@ class LiveMarg(Live):
     )  # fmt: skip
     _parts: ClassVar[tuple[str, ...]] = ("_door", "_range", "_watch", "_pace")
 
-    def __init__(self, parameters: Replay, rate_hz: float, declination_rad: float = 0.0):
+    def __init__(
+        self,
+        parameters: Replay,
+        rate_hz: float,
+        declination_rad: float = 0.0,
+        machine: str = "jax",
+    ):
         """Begin; everything is compiled before the first sample.
 
         Args:
             parameters: as of a replay.
             rate_hz: of the samples, as the data sheet says; lost ones are told by it.
             declination_rad: of the Earth's field here, clockwise from true north.
+            machine: that steps the filter, as of `OnlineFilter`; "c" is compiled for minutes once.
 
         Raises:
-            ValueError: the rate is not positive.
+            ValueError: the rate is not positive, or there is no such machine.
         """
         require(rate_hz > 0.0, "rate_hz must be positive", rate_hz)
-        super().__init__(parameters, rate_hz=rate_hz, declination_rad=declination_rad)
+        made_with = {"rate_hz": rate_hz, "declination_rad": declination_rad, "machine": machine}
+        super().__init__(parameters, **made_with)
         p, self._usual_s = parameters, 1.0 / rate_hz
         self._n = max(1, round(p.update.block / self._usual_s))
         # a peak that ends in a block may have begun in those before
         self._most_context = math.ceil(LONGEST_S * rate_hz) + 2 * _FLANK
         half = 0.5 * declination_rad
         self._turn_north = (math.cos(half), 0.0, 0.0, math.sin(half))
-        self._filter, self._model = filter_of(p), model.model_of(p)
+        self._on = partial(OnlineFilter, filter_of(p), model.model_of(p), machine=machine)
         self._online: OnlineFilter | None = None
         self._door = Door(_LONGEST_GAP_S, max(3, round(_PATIENCE_S * rate_hz)))
         self._begin_anew()
@@ -417,7 +426,7 @@ class LiveMarg(Live):
         nothing = np.zeros(0)
         rest = RestFound(nothing, nothing, self._watch.first, self._watch.first_sigma)
         belief: Belief = first_belief(look, p, rest)
-        self._online = OnlineFilter(self._filter, self._model, belief)
+        self._online = self._on(belief)
         self._begun, self._stepped = [], True
 
     def _step(self) -> None:
@@ -468,5 +477,5 @@ class LiveMarg(Live):
         increments = Increments(np.ones(1), np.zeros((1, 3)), np.array([[0.0, 0.0, -9.81]]))
         belief = first_belief(first_look(increments, np.full((1, 3), np.nan), self.parameters),
                               self.parameters)  # fmt: skip
-        self._online = OnlineFilter(self._filter, self._model, belief)
+        self._online = self._on(belief)
         self._online.state = as_before(self._online.state, state)

@@ -1,4 +1,5 @@
-/* What a board has to give the loop in gyro_board.c: its serial line, its clock, its gyros. */
+/* What a board has to give the loop in gyro_board.c: its serial line, its clock, its gyros. That in
+ * adm_board.c needs the line and the clock. */
 #ifndef ROBINS_PLATFORM_H
 #define ROBINS_PLATFORM_H
 

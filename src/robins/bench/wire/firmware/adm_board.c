@@ -1,0 +1,154 @@
+/* Attitude determination as a part of the test bench: a filter of the satellite that
+ * `robins export` wrote, on the wire. See docs/board.md.
+ *
+ *     robins export satellite/s1 --filter mekf --to adm-c
+ *     cc -std=c99 -O2 -ffp-contract=off adm_board.c robins.c platform_posix.c -lm -o adm_board
+ *
+ * the second in that folder, with this file and its neighbours in it. It does what the part "adm"
+ * does: predicts with the gyro, updates with the star sensor, reports. A sample of the gyro stands
+ * for one step more; then nobody knows how the craft turns, and the filter begins anew with the next
+ * star frame after the gyro is back. */
+#include <math.h>
+
+#include "platform.h"
+#include "robins.h"
+
+#ifndef STAR_STEPS
+#define STAR_STEPS 5u /* between two frames of the star sensor */
+#endif
+#define SILENT_STEPS (4u * STAR_STEPS) /* after which it is said to be silent */
+#define UNIT 1e-3 /* that the length of a quaternion may be off by */
+#define LIMIT 27.906455492522596 /* of the squared innovation: chi-square of 3 at 0.9999962 */
+
+enum { USED = 1, REFUSED = 2, HELD = 4, SAFE = 8, SILENT = 16, SHORT = 32 }; /* of the estimate */
+
+static uint32_t run, sequence, next; /* run 0: none; next: the step that has not been done yet */
+static robins_state filter;
+static robins_predict_input turn; /* of the last step that the gyro told */
+static uint32_t gyro_age, since_star;
+static int lost; /* waits for a star frame to begin anew */
+
+static robins_gyro gyro; /* what came, and the ends of its steps */
+static robins_star star;
+static uint64_t gyro_ns, star_ns;
+
+static robins_innovation innovation; /* what was answered */
+static robins_estimate estimate;
+static robins_done done;
+static int heard;
+
+static void send(uint8_t type, uint64_t time_ns, const void *payload, size_t size) {
+  static uint8_t out[ROBINS_MOST_FRAME];
+  write_bytes(out, robins_encode(type, run, sequence++, time_ns, payload, size, out));
+}
+
+static int finite(const double *x, int count) {
+  for (int k = 0; k < count; k++) {
+    if (!isfinite(x[k])) return 0;
+  }
+  return 1;
+}
+
+static void begin(uint32_t number) {
+  run = number, sequence = next = 0;
+  gyro_ns = star_ns = 0;
+  gyro_age = since_star = 0;
+  lost = 0;
+  memset(&turn, 0, sizeof turn); /* before the first sample: at rest */
+  robins_init(&filter);
+}
+
+static int predicts(uint64_t time_ns) {
+  robins_predict_result moved;
+  double theta_b[3];
+  memcpy(theta_b, gyro.theta_b, sizeof theta_b);
+  int came = gyro_ns == time_ns && finite(theta_b, 3);
+  if (came) memcpy(turn.value, theta_b, sizeof theta_b);
+  gyro_age = came ? 0 : gyro_age + 1;
+  lost |= gyro_age > 1;
+  if (!lost) robins_predict(&filter, &turn, &moved);
+  return came ? 0 : HELD;
+}
+
+/* The attitude of a frame, with the bias that was known and all else as at the start. */
+static void restart(const double *q_ib, double squared) {
+  double bias[3];
+  memcpy(bias, filter.mean_gyro_bias, sizeof bias);
+  robins_init(&filter);
+  memcpy(filter.mean_gyro_bias, bias, sizeof bias);
+  for (int k = 0; k < 4; k++) filter.mean_attitude_wxyz[k] = q_ib[k] / sqrt(squared);
+  lost = 0;
+}
+
+static int updates(void) {
+  robins_update_star_reading reading;
+  robins_update_star_result seen;
+  double q_ib[4], squared = 0.0;
+  memcpy(q_ib, star.q_ib, sizeof q_ib);
+  for (int k = 0; k < 4; k++) squared += q_ib[k] * q_ib[k];
+  int whole = finite(q_ib, 4);
+  heard = whole && fabs(squared - 1.0) <= 2.0 * UNIT;
+  int flags = whole && !heard ? SHORT : 0;
+  if (lost) {
+    if (!heard || gyro_age > 1) return flags;
+    restart(q_ib, squared);
+    heard = 2; /* nothing was expected */
+    return flags | USED;
+  }
+  for (int k = 0; k < 4; k++) reading.wxyz[k] = heard ? q_ib[k] : NAN;
+  int code = robins_update_star(&filter, &reading, &seen);
+  memcpy(innovation.innovation, seen.innovation, sizeof innovation.innovation);
+  for (int k = 0; k < 3; k++) innovation.sigma[k] = NAN; /* the library does not tell it */
+  innovation.ratio = seen.dof ? seen.nis / LIMIT : NAN;
+  return flags | (code == 0 ? USED : 0) | (code == 3 ? REFUSED : 0);
+}
+
+static void determine(uint64_t time_ns) {
+  heard = 0;
+  int flags = predicts(time_ns);
+  if (star_ns == time_ns) flags |= updates();
+  since_star = heard ? 0 : since_star + 1;
+  if (since_star > SILENT_STEPS) flags |= SILENT;
+  if (lost) flags |= SAFE;
+  memcpy(estimate.q_ib, filter.mean_attitude_wxyz, sizeof estimate.q_ib);
+  memcpy(estimate.gyro_bias, filter.mean_gyro_bias, sizeof estimate.gyro_bias);
+  for (int i = 0; i < 6; i++) {
+    double sum = 0.0;
+    for (int j = 0; j <= i; j++) sum += filter.factor[i][j] * filter.factor[i][j];
+    estimate.sigma[i] = lost ? NAN : sqrt(sum);
+  }
+  estimate.flags = (uint8_t)flags;
+}
+
+static void take(robins_header head, const uint8_t *payload) {
+  if (head.type == ROBINS_BEGIN && head.run != run) begin(head.run);
+  if (!run || head.run != run) return; /* an earlier run left it in a buffer */
+  if (head.type == ROBINS_STOP) run = sequence = 0;
+  if (head.type == ROBINS_GYRO) memcpy(&gyro, payload, sizeof gyro), gyro_ns = head.time_ns;
+  if (head.type == ROBINS_STAR) memcpy(&star, payload, sizeof star), star_ns = head.time_ns;
+  if (head.type != ROBINS_TICK) return;
+  uint32_t step = ((const robins_tick *)payload)->step;
+  if (step >= next) {
+    uint64_t began_ns = now_ns();
+    determine(head.time_ns);
+    done.step = step, done.compute = (uint32_t)(now_ns() - began_ns);
+    next = step + 1;
+  }
+  if (step + 1 != next) return; /* its answer is forgotten */
+  if (heard == 1) send(ROBINS_INNOVATION, head.time_ns, &innovation, sizeof innovation);
+  send(ROBINS_ESTIMATE, head.time_ns, &estimate, sizeof estimate);
+  send(ROBINS_DONE, head.time_ns, &done, sizeof done);
+}
+
+int main(int argc, char **argv) {
+  static const robins_hello hello = {ROBINS_PART_ADM, ROBINS_SCHEMA};
+  static robins_receiver in;
+  uint8_t byte;
+  open_line(argc > 1 ? argv[1] : "");
+  for (uint64_t hello_ns = 0;;) {
+    if (read_bytes(&byte, 1) && robins_message(&in, byte)) take(robins_head(&in), robins_payload(&in));
+    if (run || now_ns() < hello_ns) continue;
+    send(ROBINS_HELLO, 0, &hello, sizeof hello);
+    hello_ns = now_ns() + 500000000u;
+  }
+}

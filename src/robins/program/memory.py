@@ -1,0 +1,306 @@
+"""A state that stays in the memory of C from call to call, and compiled functions that step it.
+
+`Native` takes a function's arguments apart and puts its results together at every call. Here the
+state is never taken apart: every program has it at the head of its arguments and of its results,
+and these lie in one memory, so that a call copies only what is given besides and what is told.
+Programs are kept for the process, so that a filter made again is not traced again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins.program.c import to_c
+from robins.program.kinds import kind_of
+from robins.program.native import FLAGS, build, compiler
+from robins.program.refusal import ProgramError
+from robins.program.trace import Leaf, Program, trace
+
+LIVE_UNROLL = 300  # of 15 states as fast as written out, and compiled in two thirds of the time
+_MOST = 128  # programs remembered; the least recently used are forgotten
+_known: OrderedDict[Hashable, Compiled] = OrderedDict()
+_FLOAT = np.dtype(float)
+_PYTHON = {float: _FLOAT, int: np.dtype(np.int64), bool: np.dtype(bool)}
+
+
+class Compiled(NamedTuple):
+    """A program and its function in C."""
+
+    program: Program
+    library: ctypes.CDLL
+
+
+class Slot(NamedTuple):
+    """Where an array lies in the memory of the reals, or in that of all else."""
+
+    is_real: bool
+    first: int
+    last: int
+    shape: tuple[int, ...]
+    dtype: Any
+
+    def view(self, reals: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """The array in memory, to be written to."""
+        pool = reals if self.is_real else others
+        return pool[self.first : self.last].reshape(self.shape)
+
+
+def slots(leaves: list[Leaf], counted: tuple[int, int] = (0, 0)) -> tuple[list[Slot], int, int]:
+    """The slots of arrays one after the other, and how many reals and others there are then.
+
+    Args:
+        leaves: the arrays.
+        counted: reals and others before them.
+    """
+    reals, others = counted
+    found = []
+    for leaf in leaves:
+        size, real = int(np.prod(leaf.shape)), leaf.kind == "real"
+        at = reals if real else others
+        found.append(Slot(real, at, at + size, leaf.shape, np.dtype(leaf.dtype)))
+        reals, others = (reals + size, others) if real else (reals, others + size)
+    return found, reals, others
+
+
+class Reader:
+    """Puts arrays together from where they lie in memory."""
+
+    def __init__(self, told: list[Slot], tree: Any):
+        """Of some slots, and of the structure of what they are the leaves of."""
+        self._tree = tree
+        self._blank = [None] * len(told)
+        self._arrays = [
+            (k, slice(s.first, s.last), s.shape if len(s.shape) > 1 else None)
+            for k, s in enumerate(told)
+            if s.is_real and s.shape
+        ]
+        self._numbers = [(k, s.first) for k, s in enumerate(told) if s.is_real and not s.shape]
+        self._others = [
+            (k, slice(s.first, s.last) if s.shape else s.first, s.shape, s.dtype)
+            for k, s in enumerate(told)
+            if not s.is_real
+        ]
+
+    def read(self, reals: np.ndarray, others: np.ndarray) -> Any:
+        """A pytree: views of the reals, copies of all else, scalars of NumPy."""
+        leaves: list[Any] = self._blank.copy()
+        for k, at, shape in self._arrays:
+            leaves[k] = reals[at] if shape is None else reals[at].reshape(shape)
+        for k, at in self._numbers:
+            leaves[k] = reals[at]
+        for k, at, shape, dtype in self._others:
+            if shape:
+                leaves[k] = others[at].astype(dtype).reshape(shape)
+            else:
+                leaves[k] = others[at] if dtype == np.int64 else others[at].astype(dtype)
+        return self._tree.unflatten(leaves)
+
+
+Form = tuple[tuple[int, ...], Any, bool]
+
+
+def form(x: Any) -> Form:
+    """Shape and type of an argument, and whether the type is weak: programs differ by these."""
+    if (dtype := _PYTHON.get(type(x))) is not None:
+        return (), dtype, dtype.kind != "b"
+    array = x if hasattr(x, "dtype") else np.asarray(x)
+    return array.shape, array.dtype, getattr(array, "weak_type", False)
+
+
+def _leaf(shape: tuple[int, ...], dtype: Any, path: str) -> Leaf:
+    if not isinstance(dtype, np.dtype):  # keys of random streams
+        raise ProgramError(f"{dtype} has no place in a program", path, "run this filter by JAX")
+    return Leaf(shape, dtype, kind_of(dtype, path), path)
+
+
+class _Call(NamedTuple):
+    """A compiled function in the memory of a state."""
+
+    tree: Any  # of its arguments after the state
+    forms: list[Form]  # of these
+    views: list[np.ndarray]  # where they go
+    run: Any
+    pointers: tuple[ctypes.c_void_p, ...]
+    begin: tuple[int, int]  # in the memories, of what it tells, and
+    end: tuple[int, int]  # behind it
+    result: Reader  # of what it tells, counted from there
+
+    def takes(self, leaves: list[Any], tree: Any) -> bool:
+        """Whether it was traced for arguments like these."""
+        return tree == self.tree and all(map(_alike, leaves, self.forms))
+
+
+def _alike(x: Any, known: Form) -> bool:
+    if type(x) is np.ndarray:
+        return x.shape == known[0] and x.dtype == known[1] and not known[2]
+    return form(x) == known
+
+
+class Memory:
+    """A state in the memory of C, and functions that step it or look at it.
+
+    Attributes:
+        state: as a pytree of arrays, a copy; assign to go on from another of the same shapes.
+    """
+
+    def __init__(
+        self,
+        state: Any,
+        content: Hashable,
+        flags: tuple[str, ...] = FLAGS,
+        unroll: int | None = LIVE_UNROLL,
+    ):
+        """Take a state.
+
+        Args:
+            state: a pytree of arrays.
+            content: what the functions hold, by which those of equal names are told apart in this
+                process.
+            flags: for the compiler.
+            unroll: as in `trace`.
+
+        Raises:
+            BuildError: there is no compiler.
+            ProgramError: the state holds numbers that have no place in a program.
+        """
+        compiler()
+        self._content, self._how = content, (flags, unroll)
+        leaves, self._tree = jax.tree_util.tree_flatten(state)
+        paths = jax.tree_util.tree_flatten_with_path(state)[0]
+        self._forms = [form(x) for x in leaves]
+        self._leaves = [
+            _leaf(shape, dtype, "state" + jax.tree_util.keystr(path))
+            for (shape, dtype, _), (path, _) in zip(self._forms, paths, strict=True)
+        ]
+        self._slots, self._reals, self._others = slots(self._leaves)
+        self._reader = Reader(self._slots, self._tree)
+        self._x = np.zeros(max(self._reals, 1))
+        self._k = np.zeros(max(self._others, 1), np.int64)
+        self._calls: dict[Hashable, _Call] = {}
+        self._pytree: Any = None
+        self.state = state
+
+    @property
+    def state(self) -> Any:
+        """The state now."""
+        if self._pytree is None:
+            reals, others = self._x[: self._reals].copy(), self._k[: self._others]
+            self._pytree = self._reader.read(reals, others)
+        return self._pytree
+
+    @state.setter
+    def state(self, state: Any) -> None:
+        leaves, tree = jax.tree_util.tree_flatten(state)
+        if tree != self._tree:
+            raise ProgramError(f"a state of another structure than the first one: {tree}")
+        for leaf, known in zip(leaves, self._leaves, strict=True):
+            shape, dtype, _ = form(leaf)
+            if shape != known.shape or not np.can_cast(dtype, known.dtype, "same_kind"):
+                raise ProgramError(
+                    f"{dtype}{shape} was given where the first state has "
+                    f"{known.dtype}{known.shape}",
+                    known.path,
+                )
+        for slot, leaf in zip(self._slots, leaves, strict=True):
+            slot.view(self._x, self._k)[...] = leaf
+        self._pytree = None
+
+    def step(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
+        """Step the state by ``(state, *args) -> (state, result)``; gives the result.
+
+        Args:
+            name: of the function; with equal content and name it is the same function.
+            function: a pure function of JAX; looked at when there is no program of its name yet
+                for arguments of these shapes.
+            args: numbers and arrays of NumPy are the quickest.
+
+        Raises:
+            ProgramError: the function does what has no place in a program, or the state that it
+                gives is of another form than it takes.
+            BuildError: the compiler refuses the program.
+        """
+        leaves, tree = jax.tree_util.tree_flatten(args)
+        call = self._calls.get(name)
+        if call is None or not call.takes(leaves, tree):
+            call = self._calls[name] = self._call(name, function, args, leaves, tree)
+        for view, leaf in zip(call.views, leaves, strict=True):
+            view[...] = leaf
+        call.run(*call.pointers)
+        self._pytree = None
+        (x, k), (x_end, k_end) = call.begin, call.end
+        reals, others = self._x[x:x_end].copy(), self._k[k:k_end]
+        return call.result.read(reals, others)
+
+    def look(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
+        """What ``(state, *args) -> result`` gives; the state stays.
+
+        Args:
+            name: as in `step`.
+            function: likewise.
+            args: likewise.
+
+        Raises:
+            ProgramError: as in `step`.
+            BuildError: likewise.
+        """
+
+        def still(state: Any, *args: Any) -> Any:
+            return state, function(state, *args)
+
+        return self.step(("look", name), still, *args)
+
+    def _call(
+        self, name: Hashable, function: Callable[..., Any], args: Any, leaves: list[Any], tree: Any
+    ) -> _Call:
+        """A function in this memory, which grows where that is wanted."""
+        forms = [form(x) for x in leaves]
+        key = (self._content, name, self._tree, tuple(self._forms), tree, tuple(forms), self._how)
+        made = _known.get(key)
+        if made is None:
+            made = _known[key] = self._compiled(function, args)
+            if len(_known) > _MOST:
+                _known.popitem(last=False)
+        _known.move_to_end(key)
+        count, program = len(self._slots), made.program
+        begin = self._reals, self._others
+        given, *after = slots(program.inputs[count:], begin)
+        told, *end = slots(program.results[count:])
+        behind = [max(a, b + e) for a, b, e in zip(after, begin, end, strict=True)]
+        if behind[0] > len(self._x) or behind[1] > len(self._k):
+            self._calls.clear()  # they point to the memory that was
+            self._x = np.concatenate([self._x[: begin[0]], np.zeros(behind[0] - begin[0])])
+            self._k = np.append(self._k[: begin[1]], np.zeros(behind[1] - begin[1], np.int64))
+        x, k = (ctypes.c_void_p(a.ctypes.data) for a in (self._x, self._k))
+        return _Call(
+            tree,
+            forms,
+            [slot.view(self._x, self._k) for slot in given],
+            made.library.robins_step,
+            (x, k, x, k),
+            begin,
+            (begin[0] + end[0], begin[1] + end[1]),
+            Reader(told, jax.tree_util.treedef_children(program.structure[1])[1]),
+        )
+
+    def _compiled(self, function: Callable[..., Any], args: Any) -> Compiled:
+        flags, unroll = self._how
+        program = trace(function, self.state, *args, unroll=unroll)
+        parts = jax.tree_util.treedef_children(program.structure[1])
+        now = [(leaf.shape, leaf.kind) for leaf in program.results[: len(self._leaves)]]
+        if (
+            len(parts) != 2
+            or parts[0] != self._tree
+            or now != [(leaf.shape, leaf.kind) for leaf in self._leaves]
+        ):
+            raise ProgramError(
+                "a step gives a state of another form than it takes", fix="return (state, result)"
+            )
+        library = ctypes.CDLL(str(build(to_c(program), flags)))
+        library.robins_step.restype = None
+        return Compiled(program, library)

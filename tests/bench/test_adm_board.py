@@ -1,0 +1,136 @@
+"""The filter of the satellite, exported as C, as the part that determines the attitude."""
+
+import json
+import shutil
+import subprocess
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from stations import Loop, kit, on_threads
+from test_firmware import SANITISERS, Board, build, sanitised, unpacked
+
+from robins.bench import wire
+from robins.bench.ports.cable import cable
+from robins.bench.ports.port import open_pair
+from robins.bench.wire.schema import HELD, SAFE, SHORT, SILENT, USED
+from robins.cli import main
+from robins.filters import OnlineFilter
+from robins.program import Memory
+from robins.systems.satellite.nodes import STAR, believable
+from robins.workbench.boards import SMALL, export_filter
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
+SETTINGS = "duration=60 s", "counted_from=10 s"
+STEPS = 170
+# Steps in which something does not reach the filter: one sample of the gyro, two in a row, frames
+# of the star sensor for longer than it may be silent; and a frame of no length.
+NO_GYRO, NO_STAR, NO_LENGTH = (30, 60, 61), range(90, 130), range(48, 53)
+
+
+@pytest.fixture(scope="module")
+def of():
+    return kit("satellite/s1", "mekf", *SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """The board, as docs/board.md builds it; every access to memory checked where that can be."""
+    folder = tmp_path_factory.mktemp("adm")
+    export_filter("satellite/s1", folder / "c", filter_name="mekf", settings=SETTINGS)
+    unpacked(folder / "c")
+    extra = SANITISERS if sanitised(folder) else []
+    sources = "adm_board.c", "robins.c", "platform_posix.c"
+    return build(folder / "c", *sources, extra=("-ffp-contract=off", *extra))
+
+
+def flown(of, meddled):
+    """What reaches the filter in each step, and what the part of Python answers to it."""
+    reached = [{} for _ in range(STEPS)]
+
+    def meddle(step, name, taker, payload):
+        if taker == "adm":
+            if meddled and (step in NO_GYRO if name == "gyro" else step in NO_STAR):
+                return []
+            if meddled and name == "star" and step in NO_LENGTH:
+                said = wire.decode(name, payload)
+                payload = wire.encode(name, {**said, "q_ib": 0.9 * said["q_ib"]})
+            reached[step][name] = wire.decode(name, payload)
+        return [((step + 1) * of.step_ns, payload)]
+
+    return reached, Loop(of, meddle).run(STEPS)
+
+
+def answers(program, of, reached):
+    """What the board answers to the same, by message, with the steps of innovations."""
+    told = {"estimate": [], "innovation": [], "done": []}
+    with open_pair() as pair:
+        board = Board(program, pair)
+        try:
+            board.begin(5)
+            for k, inputs in enumerate(reached):
+                time_ns = (k + 1) * of.step_ns
+                for name, values in inputs.items():
+                    board.send(name, time_ns, **values)
+                board.send("tick", time_ns, step=k)
+                while len(told["done"]) <= k:
+                    frame = board.frame()
+                    assert frame is not None, f"no answer in step {k}"
+                    name = wire.message(frame.header.type).name
+                    told[name].append(wire.decode(name, frame.payload))
+        finally:
+            board.process.kill()
+            board.process.communicate()
+    return told
+
+
+def all_of(rows, field):
+    return np.array([row[field] for row in rows])
+
+
+def test_it_says_what_the_part_says_whatever_is_missing(program, of):
+    reached, loop = flown(of, meddled=True)
+    told = answers(program, of, reached)
+    for name, fields in (("estimate", ("q_ib", "gyro_bias", "sigma")), ("innovation", ("ratio",))):
+        for field in fields:
+            want, got = loop.all(name, field), all_of(told[name], field)
+            np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-15, err_msg=field)
+    want, got = (x for x in (loop.all("innovation", "innovation"), told["innovation"]))
+    np.testing.assert_allclose(all_of(got, "innovation"), want, rtol=0.0, atol=1e-15)
+    flags = all_of(told["estimate"], "flags").astype(int)
+    np.testing.assert_array_equal(flags, loop.flags())
+    for flag in (HELD, SAFE, SHORT, SILENT, USED):
+        assert np.any(flags & flag)
+
+
+def test_it_has_the_bits_of_the_same_filter_in_c_on_the_host(program, of):
+    reached, loop = flown(of, meddled=False)
+    told = answers(program, of, reached)["estimate"]
+    host = OnlineFilter(of.filter, of.model, of.start, partial(Memory, unroll=SMALL))
+    for k, inputs in enumerate(reached):
+        host.predict(inputs["gyro"]["theta_b"])
+        if "star" in inputs:
+            host.update(believable(jnp.asarray(inputs["star"]["q_ib"])), STAR)
+        mean = host.belief.mean
+        np.testing.assert_array_equal(told[k]["q_ib"], mean.attitude.wxyz)
+        np.testing.assert_array_equal(told[k]["gyro_bias"], mean.gyro_bias)
+    np.testing.assert_allclose(all_of(told, "q_ib"), loop.all("estimate", "q_ib"), atol=1e-14)
+
+
+def test_the_satellite_flies_with_it(program, tmp_path, capsys, monkeypatch):
+    on_threads(monkeypatch)  # the other parts
+    common = ["bench", "up", "satellite/s1", "--seconds", "20", "--json"]
+    asked = [*common, *(f"--set={one}" for one in SETTINGS)]
+    with cable() as ends, subprocess.Popen([program, ends.board]) as board:
+        node = ["--node", f"adm={ends.bench}", "--filter", "mekf"]
+        status = main([*asked, *node, "--out", str(tmp_path / "out")])
+        board.kill()
+    answer = capsys.readouterr()
+    assert status == 0, answer.err
+    said = json.loads(answer.out)
+    counts = said["counts"]
+    assert (said["steps"], said["failure"]) == (200, "")
+    assert (counts["wrong_frames"], counts["lost_frames"], counts["silent_parts"]) == (0, 0, 0)
+    assert (counts["steps_without_gyro"], counts["refused_frames"]) == (0, 0)
+    assert said["attitude_rms_arcsec"] < 30.0
