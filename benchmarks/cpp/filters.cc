@@ -1,7 +1,7 @@
-// The filters of benchmarks/program.py as one writes them in C++ with Eigen: matrices of fixed size,
-// no allocation, square-root form by one Householder QR each for prediction and update. A complete
-// step: gaps (a measurement that is not finite is missing), a step that would leave something that
-// is not finite is not taken, a code and the NIS.
+// The filters of benchmarks/program.py as one writes them in C++ with Eigen: matrices of fixed
+// size, no allocation, square-root form by one Householder QR each for prediction and update. A
+// complete step: gaps (a measurement that is not finite is missing), a step that would leave
+// something that is not finite is not taken, a code and the NIS.
 //
 //     g++ -std=gnu++17 -O3 -march=native -DNDEBUG -I/usr/include/eigen3 -shared -fPIC filters.cc
 #include <Eigen/Dense>

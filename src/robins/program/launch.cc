@@ -14,17 +14,17 @@ namespace ffi = xla::ffi;
 
 namespace {
 
-struct Kernel {
-    void *function;
-    unsigned block;
-};
-
 using Launch = int (*)(void *, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned,
                        void *, void **, void **);
 
+struct Kernel {
+    void *function;
+    unsigned block;
+    Launch launch;  // of the driver that loaded it
+};
+
 std::mutex guard;
 std::map<std::string, Kernel, std::less<>> kernels;
-Launch launch = nullptr;
 
 template <typename T>
 T symbol(void *library, const char *name)
@@ -61,7 +61,8 @@ ffi::Error run(void *stream, ffi::AnyBuffer state_before, ffi::AnyBuffer counts_
     for (int i = 0; i < 4; ++i) { told[i] = &sizes[i]; }
     for (int i = 0; i < 6; ++i) { told[4 + i] = &arrays[i]; }
     const unsigned blocks = (static_cast<unsigned>(runs) + one.block - 1) / one.block;
-    const int code = launch(one.function, blocks, 1, 1, one.block, 1, 1, 0, stream, told, nullptr);
+    const int code =
+        one.launch(one.function, blocks, 1, 1, one.block, 1, 1, 0, stream, told, nullptr);
     return code == 0 ? ffi::Error::Success()
                      : failed("cuLaunchKernel returned " + std::to_string(code));
 }
@@ -88,16 +89,19 @@ extern "C" int robins_load(const char *driver, const char *name, const void *cod
     void *const library = dlopen(driver, RTLD_NOW | RTLD_LOCAL);
     if (library == nullptr) { return -1; }
     const auto init = symbol<int (*)(unsigned)>(library, "cuInit");
-    const auto load = symbol<int (*)(void **, const void *, void *, void *, unsigned, void *, void *,
-                                     unsigned)>(library, "cuLibraryLoadData");
+    const auto load = symbol<int (*)(void **, const void *, void *, void *, unsigned, void *,
+                                     void *, unsigned)>(library, "cuLibraryLoadData");
     const auto get = symbol<int (*)(void **, void *, const char *)>(library, "cuLibraryGetKernel");
-    launch = symbol<Launch>(library, "cuLaunchKernel");
+    const auto launch = symbol<Launch>(library, "cuLaunchKernel");
     if (!init || !load || !get || !launch) { return -1; }
     void *loaded = nullptr, *function = nullptr;
-    if (const int said = init(0)) { return said; }
-    if (const int said = load(&loaded, code, nullptr, nullptr, 0, nullptr, nullptr, 0)) { return said; }
-    if (const int said = get(&function, loaded, "robins_steps")) { return said; }
-    kernels[name] = {function, block};
+    int said = init(0);
+    if (said != 0) { return said; }
+    said = load(&loaded, code, nullptr, nullptr, 0, nullptr, nullptr, 0);
+    if (said != 0) { return said; }
+    said = get(&function, loaded, "robins_steps");
+    if (said != 0) { return said; }
+    kernels[name] = {function, block, launch};
     return 0;
 }
 
