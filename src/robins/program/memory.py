@@ -136,7 +136,7 @@ class _Call(NamedTuple):
 
 
 def _alike(x: Any, known: Form) -> bool:
-    if type(x) is np.ndarray:
+    if type(x) in (np.ndarray, np.float64):
         return x.shape == known[0] and x.dtype == known[1] and not known[2]
     return form(x) == known
 
