@@ -179,7 +179,7 @@ def dotted(node: ast.AST, names: dict[str, str]) -> str:
 
 
 def foreign_linalg(code: str) -> list[str]:
-    """Uses of JAX's linear algebra that would pin a filter to one layout of matrices."""
+    """Uses of JAX's linear algebra, which knows no singular factors."""
     tree = ast.parse(code)
     names, found = {}, []
     for node in ast.walk(tree):

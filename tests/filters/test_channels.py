@@ -202,7 +202,7 @@ def test_infinite_information_is_refused_with_what_to_do():
         live.update([1.0], "b")
     np.testing.assert_array_equal(live.belief.factor, before.factor)
     assert live.counts == {"NOT_FINITE": 1}
-    known = Belief(START.mean, linalg.zeros(N, N))
+    known = Belief(START.mean, jnp.zeros((N, N)))
     still = Model(Motion(MODEL.motion.step, jnp.zeros(N)), MODEL.sensors)
     state, prediction = jax.jit(one.predict)(one.init(known, still.dims), still.motion, None)
     assert int(prediction.code) == Code.NOT_FINITE

@@ -20,6 +20,7 @@ from robins.filters import (
     guarded,
     imm,
     kalman,
+    particle,
     taylor,
     unscented,
 )
@@ -107,6 +108,19 @@ MADE = {
     ),
     "bank over the noise": adaptive((1.0, 10.0)),
 }
+
+
+# Of few particles the factor is singular and its directions are chance: enough of them here.
+CLOUDS = {
+    "of the state": (particle(10, 3, regularise=0.1), DATA),
+    "of some components": (particle(16, 3, sampled=[0, 2]), Y),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_clouds_of_particles(name):
+    filter_, y = CLOUDS[name]
+    runs_the_same(filter_, MODEL, START, {"y": y}, unroll=200)
 
 
 @pytest.mark.parametrize("name", MADE)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.extend.random import threefry_2x32
 from machines import in_c, same_in_c
 
 import robins.program.primitives  # noqa: F401
@@ -59,6 +60,37 @@ EXACT = {
         lambda i, j: (i + j, i * j, lax.div(i, j), lax.rem(i, j), jnp.sign(i), abs(i), i // 3),
         COUNTS,
         OTHERS,
+    ),
+    "whole, of 32 bits": (
+        lambda i, j: (
+            *(i + j, i - j, i * j, -i, abs(i), i << 3, i**3, lax.shift_right_logical(i, 3 + 0 * i)),
+            *(lax.shift_right_arithmetic(i, 3 + 0 * i), jnp.sum(i, dtype=np.int32), jnp.cumsum(i)),
+            *(j.astype(np.uint32), j.astype(int).astype(np.uint32).astype(np.int32), i @ j),
+            lax.shift_right_logical(i.astype(int), 3),
+        ),
+        np.array([2**31 - 1, -(2**31), 2**30, -7, 3], np.int32),
+        np.array([2**31 - 1, -(2**31), 5, -3, 2**31 - 9], np.int32),
+    ),
+    "cut to 32 bits": (
+        lambda a, i: (a.astype(np.int32), a.astype(np.uint32), i.astype(np.int32)),
+        np.array([1e12, -1e12, -0.5, 2.9, np.nan, np.inf]),
+        np.array([2**40 + 5, -(2**40) - 5, 2**31, 7, -1]),
+    ),
+    "random numbers": (
+        lambda words, seed: [
+            jax.random.uniform(key, (3,))
+            for key in (
+                jax.random.wrap_key_data(words, impl="threefry2x32"),
+                jax.random.fold_in(jax.random.key(seed), 3),
+                *jax.random.split(jax.random.wrap_key_data(jax.random.key_data(jax.random.key(5)))),
+            )
+        ],
+        U[1:3],
+        3,
+    ),
+    "random words": (
+        lambda words: threefry_2x32(words[:2], words),
+        U,
     ),
     "whole, compared": (
         lambda i, j: (i < j, jnp.maximum(i, j), i == j, i & j, i | j, i ^ j),
@@ -267,7 +299,14 @@ ROUNDED = {
         POSITIVE,
     ),
     "special": (
-        lambda a: (lax.erf(a), lax.erfc(a), lax.lgamma(a), lax.logistic(a), jnp.cbrt(a)),
+        lambda a: (
+            lax.erf_inv(a / 9.0),
+            lax.erf(a),
+            lax.erfc(a),
+            lax.lgamma(a),
+            lax.logistic(a),
+            jnp.cbrt(a),
+        ),
         POSITIVE,
     ),
     "sums of many": (

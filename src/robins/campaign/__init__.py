@@ -1,11 +1,13 @@
 """Campaigns: many runs of a problem, in chunks, with statistics and their confidence."""
 
+from robins.campaign.machine import MACHINES
 from robins.campaign.monte_carlo import CHUNK, record, worlds
 from robins.campaign.outcome import campaign_solution, simulate
 from robins.campaign.statistics import Statistics, mean_with_bounds, rms_with_bounds
 
 __all__ = [
     "CHUNK",
+    "MACHINES",
     "Statistics",
     "campaign_solution",
     "mean_with_bounds",

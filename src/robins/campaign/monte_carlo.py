@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
-from robins.filters.analysis.consistency import nees, normalised_sq
+from robins.filters.analysis.consistency import normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
 from robins.systems.study import Case, Contender, Problem
@@ -36,10 +36,22 @@ def _kept(step: Step) -> Any:
     return step.posterior, info, step.prediction.code == int(Code.DONE)
 
 
-def _reported(belief: Belief, truth: State, rows: Array | None) -> tuple[Array, Array]:
-    """Error and factor of what the filters of a problem report alike."""
-    error, factor = local(belief.mean, truth), belief.factor
-    return (error, factor) if rows is None else (rows @ error, rows @ factor)
+def _judged(
+    blocks: _Blocks, belief: Belief, truth: State, rows: Array | None, lost: Array
+) -> dict[str, Any]:
+    """Of one epoch the error of what the filters of a problem report alike, and what was stated."""
+    whole, factor = local(belief.mean, truth), belief.factor
+    error = whole if rows is None else rows @ whole
+    stated = factor if rows is None else rows @ factor
+    # A filter that could not predict is no longer at the time of the truth: it has diverged.
+    error = jnp.where(lost, jnp.nan, error)
+    parts = {name: (error[first:last], stated[first:last]) for name, first, last in blocks}
+    return {
+        "error": error,
+        "sigma": jnp.sqrt(jnp.sum(stated * stated, -1)),
+        "nees": normalised_sq(whole, factor),
+        "block_nees": {name: normalised_sq(*part) for name, part in parts.items()},
+    }
 
 
 def reported_rows(reported: Any, case: Case) -> tuple[Array | None, int | None]:
@@ -67,21 +79,30 @@ def solved(filter_, model, case: Case, keep: Callable[[Step], Any]) -> tuple[Any
     return done.steps, case, done.tally
 
 
-def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]:
+Over = Callable[[Callable[..., Any], Any], Any]  # a function of a row, on all rows of some arrays
+
+
+def at_once(function: Callable[..., Any], rows: Any) -> Any:
+    """All rows in one batch."""
+    return jax.vmap(function)(rows)
+
+
+def one_record(
+    blocks: _Blocks, contender: Contender, world: Any, over: Over = at_once
+) -> dict[str, Any]:
     """One run of one filter, to what statistics need."""
     steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
     posterior, info, moved = steps
     rows, along = reported_rows(contender.reported, case)
-    error, factor = jax.vmap(_reported, (0, 0, along))(posterior, case.truth, rows)
-    # A filter that could not predict is no longer at the time of the truth: it has diverged.
-    error = jnp.where((jnp.cumsum(~moved) > 0)[:, None], jnp.nan, error)
-    of = {name: (slice(None), slice(first, last)) for name, first, last in blocks}
+    lost = jnp.cumsum(~moved) > 0
+
+    def judged(row: Any) -> dict[str, Any]:
+        belief, truth, turned, lost = row
+        return _judged(blocks, belief, truth, rows if along is None else turned, lost)
+
     return {
-        "error": error,
-        "sigma": jnp.sqrt(jnp.sum(factor * factor, -1)),
-        "nees": jax.vmap(nees)(posterior, case.truth),
+        **over(judged, (posterior, case.truth, None if along is None else rows, lost)),
         "dim": jnp.asarray(posterior.factor.shape[-1]),
-        "block_nees": {k: jax.vmap(normalised_sq)(error[at], factor[at]) for k, at in of.items()},
         "mean": posterior.mean,
         "updates": info,
         "outputs": dict(case.outputs),
@@ -92,7 +113,7 @@ def _record(blocks: _Blocks, contender: Contender, world: Any) -> dict[str, Any]
 @partial(jax.jit, static_argnames=("filter_", "blocks"))
 def _records(filter_, blocks: _Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
     contender = Contender(filter_, model, case, reported)
-    return _each(partial(_record, blocks, contender), worlds)
+    return _each(partial(one_record, blocks, contender), worlds)
 
 
 def _each(one: Callable[[Any], Any], many: Any) -> Any:
@@ -155,4 +176,9 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     c = contender(problem, name)
     blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
     found = _records(c.filter, blocks, c.model, c.case, c.reported, worlds)
-    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], found)
+    return cut(found, count)
+
+
+def cut(records: Any, count: int) -> Any:
+    """Of records with a leading axis of runs the first so many, as NumPy."""
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[:count], records)

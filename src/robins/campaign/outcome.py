@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,7 +11,8 @@ import numpy as np
 import xarray as xr
 
 from robins.campaign.bound import bound_sigma
-from robins.campaign.monte_carlo import CHUNK, record, worlds
+from robins.campaign.machine import machine_for
+from robins.campaign.monte_carlo import CHUNK
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
 from robins.results import Outcome, Progress, array, keeping, silent, variable
@@ -19,7 +21,11 @@ from robins.systems.tables import block_array, innovation_tables
 
 
 def simulate(
-    problem: Problem, runs: int, chunk: int = CHUNK, progress: Progress = silent
+    problem: Problem,
+    runs: int,
+    chunk: int = CHUNK,
+    progress: Progress = silent,
+    machine: str = "",
 ) -> Outcome:
     """Run every filter of a problem over the same runs and compare them.
 
@@ -28,6 +34,10 @@ def simulate(
         runs: how many runs of each filter.
         chunk: runs per batch.
         progress: called with the share done in 0..1 and what is being done.
+        machine: one of `robins.campaign.MACHINES`; not given, what is faster.
+
+    Raises:
+        RobinsError: the machine asked for is not there.
 
     An error while something is made of the statistics takes their arrays along, by filter, for
     `robins.results.rescued` to write.
@@ -48,7 +58,8 @@ def simulate(
         progress(share, f"{what}: {verb}runs {done + 1} to {last} of {runs}")
 
     stage("simulation", 0)
-    for batch, count in worlds(problem, runs, chunk):
+    by = machine_for(problem, runs, machine)
+    for batch, count, recorded in by.chunks(runs, chunk):
         of = problem.bound_of
         if bound is None and of is not None and of in problem.contenders:
             stage("covariance bound", 1)
@@ -56,12 +67,13 @@ def simulate(
             bound = bound_sigma(problem, of, first)
         for step, name in enumerate(names, 1):
             stage(name, step)
-            found[name].add(record(problem, name, batch, count))
+            found[name].add(recorded(name))
         done += count
         if done < runs:
             stage("simulation", 0)
     with keeping({name: vars(s) for name, s in found.items()}):
-        return _outcome(problem, found, bound)
+        outcome = _outcome(problem, found, bound)
+    return replace(outcome, machine=by.name, notes=[*outcome.notes, *by.notes])
 
 
 def _outcome(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:

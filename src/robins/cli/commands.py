@@ -119,6 +119,12 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
 @option("--master", type=LOGS, metavar="LOG", help="What a master INS reported, with --slave.")
 @option("--slave", type=LOGS, metavar="LOG", help="Samples of the IMU to be aligned to it.")
 @COLUMNS
+@option(
+    "--machine",
+    type=click.Choice(["jax", "c", "cuda"]),
+    callback=lambda _context, _given, name: name or "",
+    help="What computes. [default: c where that pays, else jax]",
+)
 @choices
 @publishes
 def run(
@@ -146,6 +152,8 @@ def run(
     if master is None or slave is None:
         raise InputError("--master and --slave belong together", fix="give both files, or neither.")
     one_run(options.pop("runs"), "pair")
+    if options.pop("machine"):
+        raise InputError("a recorded pair runs by jax", "--machine", "omit the option.")
     out = out or RESULTS / slave.name.split(".")[0]
     options |= {"columns": columns, "findings": warn}
     carry_out("align", scenario, master, slave, out=out, **options)

@@ -55,7 +55,7 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
         first = way.observation(prior, sensor, y, aux)
         if iterations == 1:
             return first
-        unit = linalg.identity(prior.factor.shape[0])
+        unit = jnp.eye(prior.factor.shape[0])
         by_slope = first.excess.shape[1] == 0  # how uncertain the state is does not matter
 
         def look(t, M):
@@ -72,7 +72,7 @@ def iterated(linearise: Linearisation | None = None, iterations: int = 4) -> Lin
             S_y, cross, M = linalg.block_factor(spread, (excess, noise), unit, deficit)
             t = cross @ whiten(S_y, used, o.residual).white
             narrow = by_slope | jnp.any(jnp.diagonal(M) < _NARROW)
-            return t, linalg.where(narrow, unit, M)
+            return t, jnp.where(narrow, unit, M)
 
         t, M = jax.lax.fori_loop(
             0, iterations - 2, lambda _, state: update(look(*state)), update(first)

@@ -129,7 +129,7 @@ def _outcome(o: Observation, wrong: Array) -> Array:
 
 def _aside(sound: Array, S_y: Array) -> Array:
     """The factor to divide by; NaN in a step that is not taken would make all gradients NaN."""
-    return jnp.where(sound, S_y, linalg.identity(S_y.shape[0]))
+    return jnp.where(sound, S_y, jnp.eye(S_y.shape[0]))
 
 
 def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo]:

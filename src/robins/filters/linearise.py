@@ -141,7 +141,7 @@ def taylor() -> Linearisation:
         else:
             mean, F = _jacobian(lambda x: motion.moved(x, u), belief.mean)
             noise = motion.noise_factor(belief.mean, u)
-        return Transition(mean, F @ belief.factor, linalg.zeros(F.shape[0], 0), noise)
+        return Transition(mean, F @ belief.factor, jnp.zeros((F.shape[0], 0)), noise)
 
     def observation(prior: Belief, sensor: Sensor, y, aux) -> Observation:
         if sensor.linear is not None:
@@ -149,7 +149,7 @@ def taylor() -> Linearisation:
         else:
             z, H = _jacobian(lambda x: sensor.reading(x, aux), prior.mean)
         size = jnp.abs(H) @ (prior.sigma + _magnitude(prior.mean))
-        nothing = linalg.zeros(sensor.dim, 0)
+        nothing = jnp.zeros((sensor.dim, 0))
         return _observe(sensor, prior, z, y, aux, H @ prior.factor, nothing, size)
 
     return Linearisation(transition, observation)
@@ -276,7 +276,7 @@ def unscented(
     def draw(belief: Belief) -> Points:
         n = belief.factor.shape[0]
         reach = sigma_weights(n, alpha, beta, kappa).reach
-        return Points(sigma_points(belief, reach), linalg.zeros(n, n))
+        return Points(sigma_points(belief, reach), jnp.zeros((n, n)))
 
     def observe_again(points: Points, prior: Belief, sensor: Sensor, y, aux) -> Observation:
         n = prior.factor.shape[0]
@@ -292,7 +292,7 @@ def unscented(
         # motion aside: state = S T with T T' = I, so what of the reading lies along T is its
         # spread and what lies across is left over.
         wide = jnp.concatenate([*state, points.noise], axis=1)
-        deviation = jnp.concatenate([*reading, linalg.zeros(sensor.dim, n)], axis=1)
+        deviation = jnp.concatenate([*reading, jnp.zeros((sensor.dim, n))], axis=1)
         solid, independent = linalg.guard(prior.factor)
         T = jnp.where(independent[:, None], linalg.solve_lower(solid, wide), 0.0)
         spread = deviation @ T.T
@@ -309,7 +309,7 @@ def _square(noise: Array) -> Array:
     n, q = noise.shape
     if q > n:
         return linalg.tria(noise)
-    return jnp.concatenate([noise, linalg.zeros(n, n - q)], axis=1)
+    return jnp.concatenate([noise, jnp.zeros((n, n - q))], axis=1)
 
 
 def cubature() -> Linearisation:

@@ -72,7 +72,7 @@ def _back(later: Belief, row: tuple[Belief, Prediction]) -> tuple[Belief, Belief
     # The state that followed in units of P-: mean and factor of e in x' = m- + S e, e ~ N(0, 1).
     ahead = linalg.solve_lower(S, manifold.local(prediction.belief.mean, later.mean)[:, None])[:, 0]
     M = linalg.solve_lower(S, later.factor)
-    info = jnp.maximum(jnp.max(jnp.abs(M @ M.T - linalg.identity(len(M))), axis=1), jnp.abs(ahead))
+    info = jnp.maximum(jnp.max(jnp.abs(M @ M.T - jnp.eye(len(M))), axis=1), jnp.abs(ahead))
     length = jnp.sqrt(jnp.sum(S**2, axis=1))
     known = used & (info > _ROUNDING * length / jnp.abs(jnp.diagonal(S)))
     step = cross @ jnp.where(known, ahead, 0.0)

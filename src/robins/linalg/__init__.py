@@ -1,8 +1,8 @@
 """Small-matrix algebra on square-root factors.
 
-A *factor* of a covariance P is any matrix S with ``S @ S.T == P``. Filters are written against the
-names of this room plus the operators ``@ + - * .T``, and never call ``jnp.linalg`` themselves, so
-that another matrix layout can take the place of `robins.linalg.dense` without touching a filter.
+A *factor* of a covariance P is any matrix S with ``S @ S.T == P``. Filters take their algebra of
+matrices from this room and never call ``jnp.linalg`` themselves, so that what is hard about it
+(singular factors, gradients, signs) is solved in one place.
 """
 
 from robins.linalg.dense import (
@@ -14,7 +14,6 @@ from robins.linalg.dense import (
     eigenvalue_bounds,
     factor,
     guard,
-    identity,
     independent_rows,
     log_diagonal,
     lost_in_rounding,
@@ -25,8 +24,6 @@ from robins.linalg.dense import (
     symmetric_root,
     tria,
     van_loan,
-    where,
-    zeros,
 )
 
 __all__ = [
@@ -38,7 +35,6 @@ __all__ = [
     "eigenvalue_bounds",
     "factor",
     "guard",
-    "identity",
     "independent_rows",
     "log_diagonal",
     "lost_in_rounding",
@@ -49,6 +45,4 @@ __all__ = [
     "symmetric_root",
     "tria",
     "van_loan",
-    "where",
-    "zeros",
 ]

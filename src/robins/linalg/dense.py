@@ -20,21 +20,6 @@ DEPENDENT = 1e-14
 UNROLLED = 4
 
 
-def identity(n: int) -> Float[Array, "n n"]:
-    """The n x n identity."""
-    return jnp.eye(n)
-
-
-def zeros(m: int, n: int) -> Float[Array, "m n"]:
-    """An m x n matrix of zeros."""
-    return jnp.zeros((m, n))
-
-
-def where(condition, a, b):
-    """Choose a or b by one scalar condition."""
-    return jnp.where(condition, a, b)
-
-
 def block_diagonal(a: Float[Array, "m k"], b: Float[Array, "n l"]) -> Float[Array, "m+n k+l"]:
     """Two matrices as one: a factor of what is independent, or a transition of what moves alone."""
     right, left = jnp.zeros((a.shape[0], b.shape[1])), jnp.zeros((b.shape[0], a.shape[1]))

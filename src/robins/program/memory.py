@@ -17,9 +17,10 @@ import jax
 import numpy as np
 
 from robins.program.c import to_c
+from robins.program.kinds import kind_of
 from robins.program.native import FLAGS, build, compiler
 from robins.program.refusal import ProgramError
-from robins.program.trace import Leaf, Program, kind_of, trace
+from robins.program.trace import Leaf, Program, trace
 
 LIVE_UNROLL = 300  # of 15 states as fast as written out, and compiled in two thirds of the time
 _MOST = 128  # programs remembered; the least recently used are forgotten

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 from robins.program.c import to_c
+from robins.program.kinds import array_of, numbers_of
 from robins.program.refusal import BuildError, ProgramError
 from robins.program.trace import UNROLL, Leaf, Program, trace
 
@@ -148,7 +149,7 @@ class Native:
                 raise ProgramError(
                     f"{np.shape(value)} was given where {leaf.shape} was traced", leaf.path
                 )
-            view[...] = value
+            view[...] = numbers_of(value) if leaf.kind == "word64" else value
         for view, mask, path in self._zeros:
             if np.any(view[mask]):
                 raise ProgramError(
@@ -158,7 +159,7 @@ class Native:
                 )
         self._step(*self._buffers)
         made = [
-            view.astype(leaf.dtype)
+            array_of(view, leaf.dtype) if leaf.kind == "word64" else view.astype(leaf.dtype)
             for leaf, view in zip(self.program.results, self._made, strict=True)
         ]
         return jax.tree_util.tree_unflatten(self.program.structure[1], made)

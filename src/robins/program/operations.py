@@ -10,8 +10,10 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import scipy.special
+from jax.extend.random import threefry_2x32
 
 KINDS: dict[str, type[np.generic]] = {
     "real": np.float64,
@@ -56,6 +58,18 @@ def _total(a: Any) -> tuple[bool, Any, bool]:
 
 def _away(a: Any) -> Any:
     return np.copysign(np.floor(np.abs(a) + 0.5), a)
+
+
+def _wrap(a: Any, half: Any) -> Any:
+    """A whole number between -half and half that is the same but for whole rounds of both."""
+    a, half = int(a), int(half)
+    return np.int64((a + half) % (2 * half) - half)
+
+
+def _threefry(key: Any, number: Any) -> Any:
+    four = np.array([key >> 32, key, number >> 32, number], np.uint64).astype(np.uint32)
+    high, low = np.asarray(threefry_2x32(four[:2], four[2:])).astype(np.uint64)
+    return high << np.uint64(32) | low
 
 
 OPERATIONS: dict[str, Operation] = {
@@ -109,7 +123,9 @@ OPERATIONS: dict[str, Operation] = {
     "log1p": Operation(np.log1p),
     "erf": Operation(scipy.special.erf),
     "erfc": Operation(scipy.special.erfc),
-    "erf_inv": Operation(scipy.special.erfinv),
+    "erf_inv": Operation(lambda a: np.float64(jax.lax.erf_inv(a))),
     "lgamma": Operation(scipy.special.gammaln),
     "nextafter": Operation(np.nextafter),
+    "wrap": Operation(_wrap),
+    "threefry": Operation(_threefry),
 }

@@ -1,5 +1,6 @@
-/* What is made of scalars: the same text for one number and for lanes. No branch on data but two:
-   beyond a million radians the sine is the C library's, and eigenvalues end when they are found. */
+/* What is made of scalars: the same text for one number and for lanes. No branch on data but three:
+   beyond a million radians the sine is the C library's, eigenvalues end when they are found, and
+   what is far out in the tail of an error function has polynomials of its own. */
 
 static inline real real_div(real a, real b) { return a / b; }
 
@@ -83,6 +84,125 @@ static inline real real_cos(real x)
     c = real_select(whole_ne((k + 1) & 2, WHOLE(0)), -c, c);
     if (ANY(far)) { c = real_select(far, real_far_cos(x), c); }
     return c;
+}
+
+/* The same whole number but for whole rounds of 2 half, from -half to half - 1. */
+static inline whole whole_wrap(whole a, whole half)
+{
+    return ((a + half) & (half + half - 1)) - half;
+}
+
+/* Four rounds of Threefry 2x32, which turn the second word by so many bits. */
+static inline void four_rounds(word *x, word *y, int a, int b, int c, int d)
+{
+    *x = *x + *y;
+    *y = ((*y << a) | (*y >> (32 - a))) ^ *x;
+    *x = *x + *y;
+    *y = ((*y << b) | (*y >> (32 - b))) ^ *x;
+    *x = *x + *y;
+    *y = ((*y << c) | (*y >> (32 - c))) ^ *x;
+    *x = *x + *y;
+    *y = ((*y << d) | (*y >> (32 - d))) ^ *x;
+}
+
+/* Threefry 2x32 in 20 rounds (Salmon et al., SC 2011): of a key and a number, the first of their
+   two words above the second, 64 bits that look like chance. */
+static inline word64 word64_threefry(word64 key, word64 number)
+{
+    const word a = word_of_word64(key >> 32), b = word_of_word64(key);
+    const word c = a ^ b ^ WORD(0x1BD11BDAu);
+    word x = word_of_word64(number >> 32) + a, y = word_of_word64(number) + b;
+    four_rounds(&x, &y, 13, 15, 26, 6);
+    x = x + b;
+    y = y + c + WORD(1u);
+    four_rounds(&x, &y, 17, 29, 16, 24);
+    x = x + c;
+    y = y + a + WORD(2u);
+    four_rounds(&x, &y, 13, 15, 26, 6);
+    x = x + a;
+    y = y + b + WORD(3u);
+    four_rounds(&x, &y, 17, 29, 16, 24);
+    x = x + b;
+    y = y + c + WORD(4u);
+    four_rounds(&x, &y, 13, 15, 26, 6);
+    x = x + c;
+    y = y + a + WORD(5u);
+    return (word64_of_word(x) << 32) | word64_of_word(y);
+}
+
+/* The logarithm of a positive normal number: 2^k m with m about 1, and 2 artanh((m - 1)/(m + 1)) by
+   its series, to 0.03^11 / 23 of it. */
+static inline real logarithm(real a)
+{
+    const word64 bits = word64_bits_real(a);
+    real m = real_bits_word64((bits & 0xFFFFFFFFFFFFFu) | 0x3FE0000000000000u);
+    real k = real_of_whole(whole_of_word64(bits >> 52)) - 1022.0;
+    const flag low = real_lt(m, REAL(0.7071067811865476));
+    m = real_select(low, m + m, m);
+    k = real_select(low, k - 1.0, k);
+    const real f = m - 1.0, s = f / (m + 1.0), z = s * s;
+    real p = z * 0.09523809523809523 + 0.10526315789473684;
+    p = ((p * z + 0.11764705882352941) * z + 0.13333333333333333) * z + 0.15384615384615385;
+    p = ((p * z + 0.18181818181818182) * z + 0.2222222222222222) * z + 0.2857142857142857;
+    p = (p * z + 0.4) * z + 0.6666666666666666;
+    /* 2 s = f - s f, and ln 2 in two parts, of which the first times k is exact. */
+    return k * 0.6931471803691238 + (f + (s * (z * p - f) + k * 1.9082149292705877e-10));
+}
+
+/* The inverse of the error function as XLA computes it: polynomials in w = -log(1 - x^2) (Giles
+   2012), and w for w < 0.53 by the rational function of Cephes (Moshier 1989), which is meant for
+   w < 0.35 and is off by 1e-14 at the end; numbers equal to JAX's are wanted. */
+static inline real real_erf_inv(real x)
+{
+    const real y = -(x * x), yy = y * y, size = real_abs(x);
+    real top = y * 4.52700008624452e-05 + 0.49854102823193375;
+    top = ((top * y + 6.578732594206104) * y + 29.911919328553072) * y + 60.94966798098779;
+    top = (top * y + 57.11296359058554) * y + 20.039553499201283;
+    real low = y * 1.0 + 15.062909083469192;
+    low = ((low * y + 83.04756596796722) * y + 221.76239823732857) * y + 309.09872225312057;
+    low = (low * y + 216.42788614495947) * y + 60.11866049760384;
+    const real near = y + (yy * -0.5 + (y * yy) * (top / low));
+    const flag is_near = real_lt(real_abs(y), REAL(0.4142135623730951));
+    const real w = -real_select(is_near, near, logarithm(y + 1.0));
+    const real z = w - 3.125;
+    real p = z * -3.64441206401782e-21 - 1.6850591381820166e-19;
+    p = ((p * z + 1.28584807152564e-18) * z + 1.1157877678025181e-17) * z - 1.333171662854621e-16;
+    p = ((p * z + 2.0972767875968562e-17) * z + 6.637638134358324e-15) * z - 4.054566272975207e-14;
+    p = ((p * z - 8.151934197605472e-14) * z + 2.6335093153082323e-12) * z - 1.2975133253453532e-11;
+    p = ((p * z - 5.415412054294628e-11) * z + 1.0512122733215323e-09) * z - 4.112633980346984e-09;
+    p = ((p * z - 2.9070369957882005e-08) * z + 4.2347877827932404e-07)
+        * z - 1.3654692000834679e-06;
+    p = ((p * z - 1.3882523362786469e-05) * z + 0.00018673420803405714) * z - 0.000740702534166267;
+    p = ((p * z - 0.006033670871430149) * z + 0.24015818242558962) * z + 1.6536545626831027;
+    const flag tail = real_le(REAL(6.25), w);
+    if (ANY(tail)) {
+        const flag middle = real_lt(w, REAL(16.0));
+        const real root = real_sqrt(w), t = root - 3.25, u = root - 5.0;
+        real q = t * 2.2137376921775787e-09 + 9.075656193888539e-08;
+        q = ((q * t - 2.7517406297064545e-07) * t + 1.8239629214389228e-08)
+            * t + 1.5027403968909828e-06;
+        q = ((q * t - 4.013867526981546e-06) * t + 2.9234449089955446e-06)
+            * t + 1.2475304481671779e-05;
+        q = ((q * t - 4.7318229009055734e-05) * t + 6.828485145957318e-05)
+            * t + 2.4031110387097894e-05;
+        q = ((q * t - 0.0003550375203628475) * t + 0.0009532893797373805)
+            * t - 0.0016882755560235047;
+        q = ((q * t + 0.002491442096107851) * t - 0.003751208507569241) * t + 0.005370914553590064;
+        q = (q * t + 1.0052589676941592) * t + 3.0838856104922208;
+        real r = u * -2.7109920616438573e-11 - 2.555641816996525e-10;
+        r = ((r * u + 1.5076572693500548e-09) * u - 3.789465440126737e-09)
+            * u + 7.61570120807834e-09;
+        r = ((r * u - 1.496002662714924e-08) * u + 2.914795345090108e-08)
+            * u - 6.771199775845234e-08;
+        r = ((r * u + 2.2900482228026655e-07) * u - 9.9298272942317e-07)
+            * u + 4.526062597223154e-06;
+        r = ((r * u - 1.968177810553167e-05) * u + 7.599527703001776e-05)
+            * u - 0.00021503011930044477;
+        r = ((r * u - 0.00013871931833623122) * u + 1.0103004648645344) * u + 4.849906401408584;
+        p = real_select(tail, real_select(middle, q, r), p);
+    }
+    p = real_select(real_eq(size, REAL(1.0)), REAL(INFINITY), p);
+    return real_select(real_lt(REAL(1.0), size), REAL(NAN), p * x);
 }
 
 /* A B' of A (m, depth) and B (n, depth), which lie one after the other. */

@@ -15,6 +15,7 @@ import numpy as np
 from jax.extend import core as jex
 
 from robins import _float64  # noqa: F401
+from robins.program.kinds import kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
 from robins.program.roll import FEWEST
@@ -22,6 +23,12 @@ from robins.program.roll import FEWEST
 # Scalar operations up to which a loop or a factorisation is written out: all of a filter of nine
 # states, not the thirty samples of an IMU between two fixes.
 UNROLL = 10_000
+
+# What may leave the range of its type, with whole numbers of fewer than 64 bits.
+OVERFLOWING = {
+    *("add", "sub", "mul", "neg", "abs", "shift_left", "integer_pow", "square", "dot_general"),
+    *("reduce_sum", "reduce_prod", "cumsum", "cumprod"),
+}
 
 Nodes = np.ndarray  # of nodes, in the shape of the array that they stand for
 
@@ -80,21 +87,6 @@ class Program:
         return self.graph.live([n for nodes in self.outputs for n in nodes.ravel().tolist()])
 
 
-def kind_of(dtype: Any, where: str = "") -> str:
-    """The kind of scalar that holds numbers of a type.
-
-    Raises:
-        ProgramError: none does: single precision, complex numbers.
-    """
-    dtype = np.dtype(dtype)
-    known = {"f8": "real", "b1": "flag", "u4": "word", "u8": "word64"}
-    if (found := known.get(f"{dtype.kind}{dtype.itemsize}")) is not None:
-        return found
-    if dtype.kind == "i":
-        return "whole"
-    raise ProgramError(f"numbers of type {dtype} have no place in a program", where, "use float64")
-
-
 def line_of(equation: Any) -> str:
     """File and line of the user's code that an equation comes from."""
     from jax._src import source_info_util
@@ -116,7 +108,7 @@ class Walk:
 
     def constants(self, value: Any) -> Nodes:
         """Nodes of known numbers."""
-        array = np.asarray(value)
+        array = numbers_of(value)
         kind = kind_of(array.dtype)
         return self.each(lambda x: self.graph.constant(x, kind), array)
 
@@ -131,6 +123,14 @@ class Walk:
     def apply(self, op: str, *arrays: Nodes) -> Nodes:
         """An operation on all entries."""
         return self.each(lambda *nodes: self.graph.apply(op, *nodes), *arrays)
+
+    def wrapped(self, nodes: Nodes, dtype: Any) -> Nodes:
+        """Whole numbers as a type of fewer than 64 bits holds them; all others as they are."""
+        bits = 8 * np.dtype(dtype).itemsize
+        if np.dtype(dtype).kind != "i" or bits == 64:
+            return nodes
+        half = self.graph.constant(2 ** (bits - 1), "whole")
+        return self.each(lambda n: self.graph.apply("wrap", n, half), nodes)
 
     def select(self, condition: Nodes, new: Nodes, old: Nodes) -> Nodes:
         """``new`` where a condition holds, else ``old``."""
@@ -181,6 +181,8 @@ class Walk:
                 raise
             raise ProgramError(error.what, line_of(equation), error.fix) from None
         found = list(found) if isinstance(found, (list, tuple)) else [found]
+        if name in OVERFLOWING:
+            found = [self.wrapped(found[0], equation.outvars[0].aval.dtype)]
         if self.unroll is not None:
             for array in found:
                 for axis, size in enumerate(array.shape):
@@ -250,12 +252,30 @@ def trace_step(
             "the first result of a step has another structure than its state",
             fix="return (state, ...)",
         )
-    zeros = {}
-    for k, leaf in enumerate(map(np.asarray, leaves)):
-        if leaf.dtype == np.float64:
-            zeros[k] = (leaf == 0.0) & ~np.signbit(leaf)
+    zeros = {k: positive_zeros(numbers_of(leaf)) for k, leaf in enumerate(leaves)}
+    return lasting(lambda zeros: _program(jaxpr, given, results, unroll, zeros), zeros)
+
+
+def positive_zeros(a: np.ndarray) -> np.ndarray:
+    """Which entries of an array are reals, and zero."""
+    if a.dtype != np.float64:
+        return np.zeros(a.shape, bool)
+    return np.asarray((a == 0.0) & ~np.signbit(a))
+
+
+Zeros = dict[int, np.ndarray]  # of an argument, by its number, entries that are zero
+
+
+def lasting(made: Callable[[Zeros], Program], zeros: Zeros) -> Program:
+    """The program of a step, with those of some zeros of its state that last.
+
+    Args:
+        made: the program that takes some entries of its first arguments for zero, whose next values
+            its first results are.
+        zeros: the entries to try.
+    """
     while True:
-        program = _program(jaxpr, given, results, unroll, zeros)
+        program = made(zeros)
         zero = program.graph.constant(0, "real")
         kept = {k: mask & (program.outputs[k] == zero) for k, mask in zeros.items()}
         if all(np.array_equal(kept[k], zeros[k]) for k in zeros):

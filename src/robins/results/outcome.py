@@ -38,6 +38,7 @@ class Outcome:
     runs: int = 1
     parameters: str = ""  # TOML, with what the command line changed
     device: str = "cpu"
+    machine: str = ""  # of a campaign: batches of JAX ("jax"), or programs in lanes ("c")
 
     # how it is told
     title: str = ""
@@ -53,6 +54,7 @@ class Outcome:
             "scenario": self.scenario,
             "seed": self.seed,
             "runs": self.runs,
+            **({"machine": self.machine} if self.machine else {}),
             "filters": self.metrics,
             "claims": self.claims,
             "counts": self.counts,

@@ -24,7 +24,8 @@ _GIVEN = {
 }
 _CLAIM = ("id", "text", "verdict", "value", "band")
 _ORDER = (
-    *("scenario", "seed", "runs", "filters", "claims", "counts", "warnings", "files", "seconds"),
+    *("scenario", "seed", "runs", "machine", "filters", "claims", "counts", "warnings", "files"),
+    "seconds",
 )
 
 

@@ -22,6 +22,7 @@ def run(
     seed: int = 0,
     filters: Sequence[str] = (),
     settings: Sequence[str] = (),
+    machine: str = "",
     progress: Progress = silent,
 ) -> Outcome:
     """Simulate a scenario with several filters on the same random numbers.
@@ -33,10 +34,12 @@ def run(
         filters: names; by default those of the scenario, on which its claims are judged, and beside
             them the default of its system.
         settings: "path=value" texts that change the scenario.
+        machine: "jax", "c" or "cuda"; not given, what is faster.
         progress: called with the share done and what is being done.
 
     Raises:
         InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+        robins.errors.RobinsError: the machine asked for is not there.
     """
     _float64.require()
     system, label, text = find_scenario(name)
@@ -51,7 +54,7 @@ def run(
     if not filters:  # the default was not there when the claims were stated
         problem = replace(problem, claims=about(own, problem.claims))
     return replace(
-        simulate(problem, parameters.runs, progress=progress),
+        simulate(problem, parameters.runs, progress=progress, machine=machine),
         scenario=label,
         seed=seed,
         runs=parameters.runs,

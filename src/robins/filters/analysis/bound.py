@@ -60,7 +60,7 @@ class Sight(NamedTuple):
             present=self.present,
             accepted=self.present & use,
             spread=self.H @ factor,
-            excess=linalg.zeros(m, 0),
+            excess=jnp.zeros((m, 0)),
             noise=self.noise,
             size=self.size + jnp.abs(self.H) @ belief.sigma,
         )
@@ -110,7 +110,7 @@ def linearised(
         raise ValueError(
             f"truth, inputs and measurements must have one length, got {sorted(lengths)}"
         )
-    way, unit = taylor(), linalg.identity(manifold.dim(start.mean))
+    way, unit = taylor(), jnp.eye(manifold.dim(start.mean))
 
     def at(row: Any) -> Linearised:
         before, now, u, y, aux = row
@@ -199,6 +199,6 @@ def _given(factor: Array, known: tuple[int, ...]) -> Array:
         return factor
     rows = jnp.eye(factor.shape[0])[np.array(known)]
     m = len(known)
-    exact = Sight(rows, linalg.zeros(m, 0), jnp.ones(m, bool), jnp.zeros(m))
+    exact = Sight(rows, jnp.zeros((m, 0)), jnp.ones(m, bool), jnp.zeros(m))
     seen = exact.seen_with(factor, jnp.ones((), bool))
     return updated(seen.prior, seen, "sqrt")[0].factor

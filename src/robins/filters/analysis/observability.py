@@ -84,7 +84,7 @@ def observability_along(
         ValueError: a window is shorter than a step.
     """
     require(window is None or window >= 1, f"a window of {window} steps: at least one is wanted")
-    unit, D = linalg.identity(sigma.shape[0]), jnp.diag(sigma)
+    unit, D = jnp.eye(sigma.shape[0]), jnp.diag(sigma)
     use = jnp.ones(len(line.sights), bool) if use is None else jnp.asarray(use, bool)
 
     def step(carry: tuple[Array, Array], item: tuple[Array, Linearised]):

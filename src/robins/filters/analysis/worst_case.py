@@ -49,7 +49,7 @@ def existence_margin(belief: Belief, weight: Any, gamma: Any) -> Float[Array, ""
         In units of P^-1; NaN where P is singular.
     """
     L = as_weight(weight, "existence_margin")(belief.mean) / jnp.asarray(gamma, float)
-    root = linalg.solve_lower(belief.factor, linalg.identity(belief.factor.shape[0]))
+    root = linalg.solve_lower(belief.factor, jnp.eye(belief.factor.shape[0]))
     return linalg.eigenvalue_bounds(root.T @ root - L.T @ L)[0]
 
 
@@ -234,7 +234,7 @@ def worst_case_gain(
 def _linearised(model: Model, start: Belief, steps: Any, weight: Any, u: Any, aux: dict[str, Any]):
     """Everything the recursion of the error needs, along a run."""
     n, way, rows = manifold.dim(start.mean), taylor(), as_weight(weight, "worst_case_gain")
-    unit = partial(Belief, factor=linalg.identity(n))  # so that a spread is the Jacobian
+    unit = partial(Belief, factor=jnp.eye(n))  # so that a spread is the Jacobian
     prediction = steps.prediction
     if prediction.origin is not None:
         before = prediction.origin.mean

@@ -120,7 +120,7 @@ def observability_shares(
     n = manifold.dim(belief.mean)
     count = n if steps is None else steps
     require(count >= 1, f"observability over {count} steps: at least one is wanted")
-    way, unit = taylor(), Belief(belief.mean, linalg.identity(n))
+    way, unit = taylor(), Belief(belief.mean, jnp.eye(n))
     F = np.asarray(way.transition(unit, model.motion, u).spread)  # F times the identity
     D = np.asarray(belief.sigma)
     sees = np.zeros((len(channels), n))

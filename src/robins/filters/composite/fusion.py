@@ -131,14 +131,14 @@ def _summed(
     n = factors[0].shape[0]
     columns = []
     for i, (factor, away) in enumerate(zip(factors, aways, strict=True)):
-        wide = jnp.concatenate([linalg.identity(n), away[:, None]], axis=1)
+        wide = jnp.concatenate([jnp.eye(n), away[:, None]], axis=1)
         rows = linalg.solve_lower(factor, wide)  # S^-1 and S^-1 times the deviation
         if weights is not None:
             rows = rows * jnp.sqrt(weights[i])
         # States in reverse, so that the triangle's inverse, turned back, is lower again.
         columns.append(jnp.concatenate([rows[:, n - 1 :: -1], rows[:, n:]], axis=1).T)
     triangle = linalg.tria(*columns)
-    wide = jnp.concatenate([linalg.identity(n), triangle[n, :n, None]], axis=1)
+    wide = jnp.concatenate([jnp.eye(n), triangle[n, :n, None]], axis=1)
     solved = linalg.solve_lower_transposed(triangle[:n, :n], wide)
     return solved[::-1, n], solved[::-1, n - 1 :: -1]
 
@@ -234,7 +234,7 @@ def _to_symmetric(factor: Array) -> Array:
 
     def step(X: Array, weights: Array) -> tuple[Array, None]:
         a, b, c = weights
-        lower = linalg.cholesky(linalg.identity(n) + c * (X.T @ X))
+        lower = linalg.cholesky(jnp.eye(n) + c * (X.T @ X))
         return (b / c) * X + (a - b / c) * linalg.solve_spd(lower, X.T).T, None
 
     return jax.lax.scan(step, X, jnp.asarray(_WEIGHTS))[0]
@@ -280,7 +280,7 @@ def _best_weights(beliefs: list[Belief], criterion: Criterion) -> Array:
     slopes = _SLOPES[criterion]
     count, n = len(beliefs), beliefs[0].factor.shape[0]
     unit = jnp.min(jnp.stack([b.sigma for b in beliefs]), axis=0)
-    inverse = [linalg.solve_lower(b.factor / unit[:, None], linalg.identity(n)) for b in beliefs]
+    inverse = [linalg.solve_lower(b.factor / unit[:, None], jnp.eye(n)) for b in beliefs]
     Y = jnp.stack([one.T @ one for one in inverse])
 
     def newton(w: Array, barrier: Array) -> Array:
@@ -324,7 +324,7 @@ def _det_slopes(X: Array, lower: Array) -> tuple[Array, Array]:
 
 def _trace_slopes(X: Array, lower: Array) -> tuple[Array, Array]:
     """The same of trace P over its value, held constant."""
-    inverse = linalg.solve_lower(lower, linalg.identity(lower.shape[0]))
+    inverse = linalg.solve_lower(lower, jnp.eye(lower.shape[0]))
     K = inverse @ inverse.T
     size = jnp.trace(K)
     slope = -jnp.einsum("ijk,jk->i", X, K) / size

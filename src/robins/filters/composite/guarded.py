@@ -294,7 +294,7 @@ def _not_believed(info: StepInfo) -> StepInfo:
     """What is said of a measurement that did not touch the belief given out."""
     missing = info.code == int(Code.MISSING)
     return info._replace(
-        factor=linalg.identity(len(info.used)),
+        factor=jnp.eye(len(info.used)),
         gain=jnp.zeros_like(info.gain),
         used=jnp.zeros_like(info.used),
         nis=jnp.zeros_like(info.nis),

@@ -96,7 +96,7 @@ def constrain(
         posterior, info = updated(belief, seen, "sqrt")
         used = info.used
     else:
-        exact = Sensor(sensor.read, linalg.zeros(sensor.dim, 0), sensor.dim, "", sensor.linear)
+        exact = Sensor(sensor.read, jnp.zeros((sensor.dim, 0)), sensor.dim, "", sensor.linear)
         seen = way.observation(metric, exact, target, None)
         mean, G, used = nearest(metric, seen)
         S = belief.factor
@@ -106,7 +106,7 @@ def constrain(
             factor = jnp.where(linalg.lost_in_rounding(factor, belief.sigma), 0.0, factor)
         else:
             factor = linalg.tria(rest, G @ sensor.noise)
-        posterior = Belief(mean, linalg.where(jnp.any(used), factor, S))
+        posterior = Belief(mean, jnp.where(jnp.any(used), factor, S))
     nis = jnp.where(jnp.any(contradicted(before, judged)), jnp.inf, judged.nis)
     return Constrained(posterior, before.residual, used, nis, judged.dof)
 
@@ -132,7 +132,7 @@ def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[
         raise ValueError("a constraint on angles or rotations needs d, its value")
     else:
         target = jax.tree_util.tree_map(jnp.zeros_like, value)
-    root = linalg.zeros(c, 0) if noise is None else as_noise(noise, c, "the constraint")
+    root = jnp.zeros((c, 0)) if noise is None else as_noise(noise, c, "the constraint")
     return Sensor(lambda x, aux: read(x), root, c, "constraint", linear), target
 
 
@@ -163,12 +163,12 @@ def metric_of(belief: Belief, weight: Weight) -> tuple[Belief, Array | None]:
             return belief, None
         if weight != "identity":
             raise ValueError(f"weight must be 'covariance', 'identity' or a matrix, got {weight!r}")
-        unit = linalg.identity(n)
+        unit = jnp.eye(n)
         return Belief(belief.mean, unit), unit
     W = jnp.asarray(weight, float)
     require(W.shape == (n, n), f"weight is {W.shape}, the state needs ({n}, {n})")
     root = linalg.cholesky(W)
-    return Belief(belief.mean, linalg.solve_lower_transposed(root, linalg.identity(n))), root
+    return Belief(belief.mean, linalg.solve_lower_transposed(root, jnp.eye(n))), root
 
 
 def check_rows(D: np.ndarray, d: np.ndarray, exact: np.ndarray) -> None:

@@ -163,7 +163,7 @@ def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bou
         return (t + alpha * column, M - (1.0 - root) * jnp.outer(column, a)), None
 
     n = belief.factor.shape[0]
-    start = jnp.zeros(n), linalg.identity(n)
+    start = jnp.zeros(n), jnp.eye(n)
     (t, M), _ = jax.lax.scan(cut, start, (o.spread, o.size, low, high))
     S = belief.factor
     cut_belief = Belief(manifold.retract(belief.mean, S @ t), linalg.tria(S @ M))

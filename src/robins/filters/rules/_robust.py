@@ -83,7 +83,7 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
 
     def at(s):
         """Of the unit innovation: (I + (s-1) B)^-1 u, g and -g'."""
-        L = linalg.cholesky(linalg.identity(len(unit_)) + (s - 1.0) * B_)
+        L = linalg.cholesky(jnp.eye(len(unit_)) + (s - 1.0) * B_)
         v = linalg.solve_spd(L, unit_[:, None])[:, 0]
         return v, unit_ @ v, v @ (B_ @ v)
 

@@ -57,7 +57,7 @@ def consider(states: Sequence[Any] | ArrayLike) -> Rule:
         some = jnp.any(info.used)
         column = jnp.asarray(held)[:, None]
         told = jnp.where(column, info.gain @ info.factor, 0.0)
-        factor = linalg.where(some, linalg.tria(posterior.factor, told), posterior.factor)
+        factor = jnp.where(some, linalg.tria(posterior.factor, told), posterior.factor)
         move = manifold.local(o.prior.mean, posterior.mean)
         mean = manifold.retract(o.prior.mean, jnp.where(held, 0.0, move))
         sigma = o.prior.sigma

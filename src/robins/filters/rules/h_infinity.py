@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins import linalg, manifold
+from robins import manifold
 from robins.errors import RobinsError, require
 from robins.filters import trees
 from robins.filters.audit import Again
@@ -78,7 +78,7 @@ def first_infeasible(final: HInfinityMemory, whole: bool = True) -> tuple[int, A
     if int(final.events) > 0:
         return int(final.first), final.weighted_first
     n = final.weighted.shape[1]
-    exists = inflated(linalg.identity(n), final.inverse * final.weighted)[1]
+    exists = inflated(jnp.eye(n), final.inverse * final.weighted)[1]
     if whole and bool(final.measured) and not bool(exists):
         return int(final.steps) - 1, final.weighted
     return None

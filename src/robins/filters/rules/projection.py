@@ -79,7 +79,7 @@ def projected(
     prior, S = o.prior, o.prior.factor
     metric, root = metric_of(prior, weight)
     spread = o.spread if root is None else _slope(o) @ metric.factor
-    nothing = linalg.zeros(len(o.residual), 0)
+    nothing = jnp.zeros((len(o.residual), 0))
     exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
     mean, G, used = nearest(metric, exact)
     factor = S
@@ -91,7 +91,7 @@ def projected(
         lost = linalg.lost_in_rounding(factor, prior.sigma)
         factor = jnp.where(clean & lost, 0.0, factor)
     some = jnp.any(used)
-    return Belief(mean, linalg.where(some, factor, S)), G, used
+    return Belief(mean, jnp.where(some, factor, S)), G, used
 
 
 def _slope(o: Observation) -> Array:

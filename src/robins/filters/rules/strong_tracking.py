@@ -101,8 +101,8 @@ def strong_tracking(
         return _Memory(
             power={name: jnp.ones(m) for name, m in dims.items()},
             begun={name: jnp.full(m, not classic) for name, m in dims.items()},
-            moved=linalg.zeros(n, 2 * n + 1),
-            noise=linalg.zeros(n, n),
+            moved=jnp.zeros((n, 2 * n + 1)),
+            noise=jnp.zeros((n, n)),
             fresh=jnp.array(False),
         )
 
@@ -140,7 +140,7 @@ def strong_tracking(
 def _faded_outside(memory: _Memory, S: Array, white: _fading.White, N: Array, limit: Number):
     """P + (lambda - 1) F P F', which is lambda F P F' + Q; P itself instead of F P F' once used."""
     n = len(S)
-    whole = jnp.concatenate([S, linalg.zeros(n, memory.moved.shape[1] - n)], axis=1)
+    whole = jnp.concatenate([S, jnp.zeros((n, memory.moved.shape[1] - n))], axis=1)
     moved = jnp.where(memory.fresh, memory.moved, whole)
     noise = jnp.where(memory.fresh, memory.noise, 0.0)
     H = _fading.seen_by(white.spread, S)
@@ -156,4 +156,4 @@ def _fitted(columns: Array, width: int) -> Array:
     n, k = columns.shape
     if k > width:
         columns, k = linalg.tria(columns), n
-    return jnp.concatenate([columns, linalg.zeros(n, width - k)], axis=1)
+    return jnp.concatenate([columns, jnp.zeros((n, width - k))], axis=1)

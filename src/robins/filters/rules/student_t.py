@@ -56,7 +56,7 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
         noisy = jnp.any(of.noise != 0.0, axis=1)
         m = jnp.sum(noisy).astype(float)
         exact = jnp.sum(of.seen.used & ~noisy).astype(float)
-        W, one = of.white_noise, linalg.identity(len(noisy))
+        W, one = of.white_noise, jnp.eye(len(noisy))
         R = W @ W.T
         columns = jnp.concatenate([of.seen.white[:, None], W, one], axis=1)
 

@@ -6,7 +6,8 @@ from robins.program.primitives import (
     control,
     indexing,
     movement,
+    random,
     reductions,
 )
 
-__all__ = ["algebra", "arithmetic", "control", "indexing", "movement", "reductions"]
+__all__ = ["algebra", "arithmetic", "control", "indexing", "movement", "random", "reductions"]

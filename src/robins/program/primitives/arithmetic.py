@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from robins.program.kinds import kind_of
 from robins.program.nodes import Node
 from robins.program.refusal import ProgramError
-from robins.program.trace import RULES, Nodes, Walk, kind_of, rule
+from robins.program.trace import RULES, Nodes, Walk, rule
 
 # Primitives that are one operation of `OPERATIONS`, by their names in JAX.
 SAME = {
@@ -20,7 +21,8 @@ SAME = {
     **{n: n for n in ("erf", "erfc")},
     "add_any": "add",
     "shift_left": "shift_left",
-    "shift_right_logical": "shift_right",
+    "shift_right_arithmetic": "shift_right",
+    "erf_inv": "erf_inv",
 }
 
 
@@ -101,8 +103,31 @@ def _select_n(walk: Walk, equation: Any, which: Nodes, *cases: Nodes) -> Nodes:
 
 @rule("convert_element_type")
 def _convert(walk: Walk, equation: Any, a: Nodes) -> Nodes:
-    kind = kind_of(equation.params["new_dtype"])
-    return walk.each(lambda n: walk.graph.convert(n, kind), a)
+    """What is no whole number is cut, at the ends of its new type too; whole numbers wrap round."""
+    graph, given = walk.graph, equation.invars[0].aval.dtype
+    dtype = np.dtype(equation.params["new_dtype"])
+    kind = kind_of(dtype)
+    if given.kind == "f" and dtype.kind in "iu" and dtype.itemsize < 8:
+        ends = np.iinfo(dtype)
+        low, high = graph.constant(ends.min, "whole"), graph.constant(ends.max, "whole")
+        a = walk.each(lambda n: graph.convert(n, "whole"), a)
+        a = walk.each(lambda n: graph.apply("min", graph.apply("max", n, low), high), a)
+    found = walk.each(lambda n: graph.convert(n, kind), a)
+    fits = given.kind in "fb" or (given.kind == "i" and given.itemsize <= dtype.itemsize)
+    return found if fits else walk.wrapped(found, dtype)
+
+
+@rule("shift_right_logical")
+def _shift_right(walk: Walk, equation: Any, a: Nodes, by: Nodes) -> Nodes:
+    """Zeros come in from the left: of a signed number its bits are moved, as those of a word."""
+    graph, dtype = walk.graph, equation.invars[0].aval.dtype
+    if dtype.kind == "u":
+        return walk.apply("shift_right", a, by)
+    word = "word64" if dtype.itemsize == 8 else "word"
+    moved = walk.apply(
+        "shift_right", *(walk.each(lambda n: graph.convert(n, word), x) for x in (a, by))
+    )
+    return walk.wrapped(walk.each(lambda n: graph.convert(n, "whole"), moved), dtype)
 
 
 @rule("bitcast_convert_type")

@@ -13,6 +13,18 @@ from robins.program.trace import Nodes, Walk, rule
 LONGEST = 100_000  # rounds of a loop that are written out
 
 
+CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"}
+
+
+def called(equation: Any) -> Any:
+    """The closed jaxpr that an equation calls, if it is a plain call."""
+    if equation.primitive.name not in CALLS:
+        return None
+    p = equation.params
+    inner = next((p[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in p), None)
+    return inner if hasattr(inner, "consts") else None
+
+
 @rule("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat")
 @rule("checkpoint", "custom_vjp_call_jaxpr", "custom_vmap_call", "custom_lin", "remat2")
 def _call(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from robins.program.kinds import kind_of
 from robins.program.nodes import Node
-from robins.program.trace import RULES, Nodes, Walk, kind_of, rule
+from robins.program.trace import RULES, Nodes, Walk, rule
 
 REDUCED = {
     "reduce_sum": ("add", 0),

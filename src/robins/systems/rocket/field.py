@@ -37,7 +37,6 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins import linalg
 from robins.errors import require
 from robins.filters import Motion, Sensor
 from robins.manifold import dim
@@ -145,7 +144,7 @@ def read_field(x: Any, field_n: Array) -> Array:
 def observed(x: Any, field_n: Array):
     """`read_field` with its Jacobian: R(q)' exp(-phi) B = R(q)' (B + B x phi)."""
     C_bn = to_dcm(x.q_nb.wxyz).T
-    H = jnp.concatenate([C_bn @ skew(field_n), linalg.zeros(3, dim(x) - 3)], axis=1)
+    H = jnp.concatenate([C_bn @ skew(field_n), jnp.zeros((3, dim(x) - 3))], axis=1)
     return C_bn @ field_n, H
 
 

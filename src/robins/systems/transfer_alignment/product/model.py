@@ -128,7 +128,7 @@ def _step_linear(drive: _Drive, x: ProductState, block: Block):
     """(1): the state after a block of samples, Phi and a factor of Q."""
     ins, Phi, L = propagate_linear(x.ins, block.increments, drive.noise, segments=1)
     new = x._replace(ins=ins)
-    Phis, Ls = [Phi, linalg.identity(3)], [L, jnp.zeros((3, 3))]
+    Phis, Ls = [Phi, jnp.eye(3)], [L, jnp.zeros((3, 3))]
     if drive.flexure is not None:
         Phi, L = _swing(drive.flexure, block)
         new = new._replace(flexure=Phi @ x.flexure)

@@ -1,0 +1,55 @@
+"""Types of arrays and the kinds of scalars that hold their numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from robins.program.refusal import ProgramError
+
+KEY = "key<fry>"  # of Threefry 2x32, JAX's generator
+
+KNOWN = {"f8": "real", "b1": "flag", "u4": "word", "u8": "word64"}
+
+
+def is_key(dtype: Any) -> bool:
+    """Whether a type is one of JAX's keys of random numbers."""
+    return bool(jax.numpy.issubdtype(dtype, jax.dtypes.prng_key))
+
+
+def kind_of(dtype: Any, where: str = "") -> str:
+    """The kind of scalar that holds numbers of a type.
+
+    Raises:
+        ProgramError: none does: single precision, complex numbers, keys of another generator.
+    """
+    if is_key(dtype):
+        if str(dtype) == KEY:
+            return "word64"
+        raise ProgramError(
+            f"keys of type {dtype} have no place in a program", where, "use those of threefry2x32"
+        )
+    dtype = np.dtype(dtype)
+    if (found := KNOWN.get(f"{dtype.kind}{dtype.itemsize}")) is not None:
+        return found
+    if dtype.kind == "i":
+        return "whole"
+    raise ProgramError(f"numbers of type {dtype} have no place in a program", where, "use float64")
+
+
+def numbers_of(value: Any) -> np.ndarray:
+    """An array as one of NumPy; of a key one number, its first word above its second."""
+    if not is_key(getattr(value, "dtype", np.float64)):
+        return np.asarray(value)
+    words = np.asarray(jax.random.key_data(value)).astype(np.uint64)
+    return np.asarray(words[..., 0] << np.uint64(32) | words[..., 1])
+
+
+def array_of(numbers: np.ndarray, dtype: Any) -> Any:
+    """Numbers as an array of a type: what `numbers_of` made of it."""
+    if not is_key(dtype):
+        return numbers.astype(dtype)
+    words = numbers.astype(np.uint64)[..., None] >> np.array([32, 0], np.uint64)
+    return jax.random.wrap_key_data(jax.numpy.asarray(words.astype(np.uint32)), impl="threefry2x32")

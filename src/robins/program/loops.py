@@ -1,0 +1,301 @@
+"""Equations of a jaxpr that go along one axis, as rounds of one loop.
+
+A scan goes along its axis; so does an operation on arrays whose first axis is as long, if it does
+to each row the same by itself; and so do random numbers, as the generator can be told the number of
+an entry. What goes along the same axis is one loop: a row that the next equation needs is never
+written to memory. What a round leaves for the next is carried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.extend import core as jex
+
+from robins.program.kinds import is_key, kind_of
+from robins.program.nodes import Graph
+from robins.program.primitives.control import size_of
+from robins.program.primitives.random import bits_of, numbered
+from robins.program.trace import Leaf, Nodes, Program, Walk
+
+ROUNDS = 200  # of a loop of rows that is worth it; a scan is from SHORTEST on
+SHORTEST = 30
+WIDEST = 64  # entries of a row
+DRAW = 150  # operations of a scan that cost JAX as much as one random number
+
+ENTRYWISE = {
+    *("add", "sub", "mul", "div", "rem", "neg", "max", "min", "abs", "sign", "sqrt", "cbrt"),
+    *("and", "or", "xor", "not", "shift_right_logical", "shift_left", "eq", "ne", "lt", "le"),
+    *("gt", "ge", "select_n", "clamp", "is_finite", "floor", "ceil", "round", "integer_pow"),
+    *("square", "rsqrt", "pow", "exp", "exp2", "expm1", "log", "log1p", "sin", "cos", "tan"),
+    *("asin", "acos", "atan", "atan2", "tanh", "erf_inv", "convert_element_type", "copy"),
+    *("bitcast_convert_type", "random_fold_in", "random_wrap", "random_unwrap", "stop_gradient"),
+}
+# What a primitive calls the axes that it works on; it goes along the first if that is not one.
+AXES = {
+    **dict.fromkeys(("squeeze", "expand_dims", "rev"), "dimensions"),
+    **dict.fromkeys(("reduce_sum", "reduce_max", "reduce_min", "reduce_and", "reduce_or"), "axes"),
+    **dict.fromkeys(("reduce_prod", "argmax", "argmin"), "axes"),
+    **dict.fromkeys(("split", "stack", "cumsum"), "axis"),
+    **dict.fromkeys(("concatenate", "sort"), "dimension"),
+}
+RANDOM = {"random_bits", "random_split"}
+
+
+class Along(NamedTuple):
+    """The axis along which an equation goes."""
+
+    length: int
+    backwards: bool = False
+
+
+def along(e: Any) -> Along | None:
+    """The axis along which an equation goes, if it does and can be part of a loop."""
+    name, p = e.primitive.name, e.params
+    if name == "scan":
+        return Along(p["length"], p["reverse"]) if p["length"] >= SHORTEST else None
+    shapes = [v.aval.shape for v in e.outvars]
+    if not all(shapes) or len({s[0] for s in shapes}) > 1 or e.effects:
+        return None
+    length = shapes[0][0]
+    if length < ROUNDS or any(np.prod(s[1:]) > WIDEST for s in shapes):
+        return None
+    return Along(length) if _by_rows(e, name, p, length) else None
+
+
+def _by_rows(e: Any, name: str, p: Any, length: int) -> bool:
+    """Whether an equation does to each row of its arrays the same."""
+    given = [v.aval.shape for v in e.invars]
+    rank = len(e.outvars[0].aval.shape)
+    if name in RANDOM and not any(s and s[0] == length for s in given):
+        return not given[0] and p["shape"][0] == length
+    if name == "iota":
+        return p["dimension"] == 0
+    if name == "broadcast_in_dim":
+        dims, shape = p["broadcast_dimensions"], given[0]
+        return 0 not in dims or (dims[0] == 0 and shape[0] == length)
+    rows = [bool(s) and s[0] == length for s in given]
+    if name in ENTRYWISE or name == "random_bits":
+        same = (
+            r or not s or (len(s) == rank and s[0] == 1) for r, s in zip(rows, given, strict=True)
+        )
+        return any(rows) and all(same)
+    if not rows or not all(rows):
+        return False
+    if name in AXES:
+        axes = p[AXES[name]]
+        return 0 not in (axes if isinstance(axes, (tuple, list)) else (axes,))
+    match name:
+        case "transpose":
+            return p["permutation"][0] == 0
+        case "reshape":
+            return p["new_sizes"][0] == length and p["dimensions"] is None
+        case "slice":
+            strides = p["strides"] or (1,)
+            return (
+                p["start_indices"][0] == 0
+                and p["limit_indices"][0] == length == length * strides[0]
+            )
+        case "dot_general":
+            (_, _), (left, right) = p["dimension_numbers"]
+            return bool(left) and left[0] == 0 == right[0]
+        case "triangular_solve" | "cholesky" | "qr":
+            return min(map(len, given)) >= 3
+    return False
+
+
+def operations(e: Any) -> int:
+    """About how many scalar operations of a scan an equation is worth to JAX."""
+    name = e.primitive.name
+    if name == "scan":
+        return e.params["length"] * size_of(e.params["jaxpr"].jaxpr)
+    entries = int(np.prod(e.outvars[0].aval.shape))
+    return DRAW * entries if name == "random_bits" else 0
+
+
+class Uses(NamedTuple):
+    """What an equation needs of others: as a whole before its loop, or row by row."""
+
+    whole: list[Any]
+    rows: list[Any]
+
+
+def uses(e: Any, length: int) -> Uses:
+    """The variables that an equation of a loop needs, by how it needs them."""
+    if e.primitive.name == "scan":
+        before = e.params["num_consts"] + e.params["num_carry"]
+        whole, rows = e.invars[:before], e.invars[before:]
+    else:
+        rows = [v for v in e.invars if v.aval.shape and v.aval.shape[0] == length]
+        if e.primitive.name == "broadcast_in_dim" and 0 not in e.params["broadcast_dimensions"]:
+            rows = []
+        whole = [v for v in e.invars if v not in rows] if rows else e.invars
+    return Uses(*([v for v in some if not isinstance(v, jex.Literal)] for some in (whole, rows)))
+
+
+def makes_rows(e: Any) -> list[Any]:
+    """The variables that an equation makes row by row; a scan also leaves what it carried."""
+    return e.outvars[e.params["num_carry"] :] if e.primitive.name == "scan" else e.outvars
+
+
+class Body:
+    """The body of a loop over some equations, ready to be made a program.
+
+    Attributes:
+        begin: what scans begin with, variables or literals; carried behind the number of the round.
+        stays: variables that are needed as they are.
+        rows: variables of which each round takes a row.
+        after: variables of what scans leave.
+        made: variables of which each round gives a row.
+    """
+
+    def __init__(self, equations: Sequence[Any], axis: Along, wanted: Callable[[Any], bool]):
+        """Find what goes in and out.
+
+        Args:
+            equations: in an order of computation.
+            axis: along which all go.
+            wanted: whether anything outside needs a variable.
+        """
+        self.equations, self.axis = equations, axis
+        inside = {v for e in equations for v in makes_rows(e)}
+        stays: dict[Any, None] = {}
+        rows: dict[Any, None] = {}
+        self.begin: list[Any] = []
+        self.after: list[Any] = []
+        for e in equations:
+            whole, by_row = uses(e, axis.length)
+            if e.primitive.name == "scan":
+                fixed, carried = e.params["num_consts"], e.params["num_carry"]
+                whole = [v for v in e.invars[:fixed] if not isinstance(v, jex.Literal)]
+                self.begin += e.invars[fixed : fixed + carried]
+                self.after += e.outvars[:carried]
+            stays.update(dict.fromkeys(whole))
+            rows.update(dict.fromkeys(v for v in by_row if v not in inside))
+        self.stays, self.rows = list(stays), list(rows)
+        self.made = [v for e in equations for v in makes_rows(e) if wanted(v)]
+
+    def program(
+        self, known: dict[Any, np.ndarray], zeros: dict[int, np.ndarray], unroll: int | None
+    ) -> Program:
+        """One round as a program: number of the round, carried, staying, rows; to carried and rows.
+
+        Args:
+            known: numbers of some that stay, which become part of the program.
+            zeros: of what is carried, by its number, the entries that are zero.
+            unroll: as in `robins.program.trace`.
+
+        Raises:
+            ProgramError: an equation has no place in a program.
+        """
+        graph = Graph()
+        walk = Walk(graph, unroll)
+        inputs: list[Leaf] = []
+        counted = {"real": 0, "other": 0}
+
+        def taken(shape: tuple[int, ...], dtype: Any) -> Nodes:
+            kind = kind_of(dtype)
+            pool = "real" if kind == "real" else "other"
+            size = int(np.prod(shape))
+            ids = [graph.input(counted[pool] + k, kind) for k in range(size)]
+            counted[pool] += size
+            inputs.append(Leaf(shape, dtype, kind, f"arguments[{len(inputs)}]"))
+            nodes = np.array(ids, dtype=np.int64).reshape(shape)
+            zero = zeros.get(len(inputs) - 1)
+            return nodes if zero is None else np.where(zero, graph.constant(0, "real"), nodes)
+
+        index = taken((), np.dtype(np.int64))
+        begin = [taken(v.aval.shape, v.aval.dtype) for v in self.begin]
+        whole = {v: walk.constants(value) for v, value in known.items()}
+        whole |= {v: taken(v.aval.shape, v.aval.dtype) for v in self.stays if v not in known}
+        rows = {v: taken(v.aval.shape[1:], v.aval.dtype) for v in self.rows}
+        after: list[Nodes] = []
+        for e in self.equations:
+            if e.primitive.name == "scan":
+                count = e.params["num_carry"]
+                now = begin[len(after) : len(after) + count]
+                found = self._scanned(walk, e, now, whole, rows)
+                after += found[:count]
+                rows.update(zip(makes_rows(e), found[count:], strict=True))
+            else:
+                rows.update(zip(e.outvars, self._row(walk, e, whole, rows, index), strict=True))
+        next_ = graph.apply("add", index.item(), graph.constant(1, "whole"))
+        outputs = [np.array(next_), *after, *(rows[v] for v in self.made)]
+        results = [Leaf((), np.dtype(np.int64), "whole", "results[0]")]
+        for v in self.after:
+            results.append(Leaf(v.aval.shape, v.aval.dtype, kind_of(v.aval.dtype), "carried"))
+        for v in self.made:
+            results.append(Leaf(v.aval.shape[1:], v.aval.dtype, kind_of(v.aval.dtype), "row"))
+        return Program(
+            graph, inputs, outputs, results, (None, None), walk.alike, unroll, dict(zeros)
+        )
+
+    def _scanned(
+        self, walk: Walk, e: Any, now: list[Nodes], whole: dict[Any, Nodes], rows: dict[Any, Nodes]
+    ) -> list[Nodes]:
+        fixed, carried = e.params["num_consts"], e.params["num_carry"]
+
+        def read(v: Any, of: dict[Any, Nodes]) -> Nodes:
+            if isinstance(v, jex.Literal):
+                return walk.constants(number_of(v))
+            return of[v]
+
+        consts = [read(v, whole) for v in e.invars[:fixed]]
+        taken = [read(v, rows) for v in e.invars[fixed + carried :]]
+        return walk.closed(e.params["jaxpr"], *consts, *now, *taken)
+
+    def _row(
+        self, walk: Walk, e: Any, whole: dict[Any, Nodes], rows: dict[Any, Nodes], index: Nodes
+    ) -> list[Nodes]:
+        """What an equation makes of rows: the same equation on arrays of one row."""
+        name, p, length = e.primitive.name, dict(e.params), self.axis.length
+        by_row = uses(e, length).rows
+        if name == "iota":
+            kind = kind_of(e.outvars[0].aval.dtype)
+            at = walk.graph.convert(index.item(), kind)
+            return [np.full(e.outvars[0].aval.shape[1:], at)]
+        if name in RANDOM and not by_row:
+            (key,) = e.invars
+            keys = whole[key]
+            shape, at = tuple(p["shape"][1:]), index.item()
+            if name == "random_split":
+                return [numbered(walk, keys, shape, at)]
+            return [bits_of(walk, keys, shape, e.outvars[0].aval.dtype, at)]
+        if name == "broadcast_in_dim":
+            p["shape"] = (1, *p["shape"][1:])
+        elif name == "reshape":
+            p["new_sizes"] = (1, *p["new_sizes"][1:])
+        elif name == "slice":
+            p["limit_indices"] = (1, *p["limit_indices"][1:])
+
+        def one(v: Any, row: bool) -> Any:
+            if not row:
+                return v
+            return jex.Var(v.aval.update(shape=(1, *v.aval.shape[1:])))
+
+        flags = [not isinstance(v, jex.Literal) and v in by_row for v in e.invars]
+        same = e.replace(
+            params=p,
+            invars=[one(v, f) for v, f in zip(e.invars, flags, strict=True)],
+            outvars=[one(v, True) for v in e.outvars],
+        )
+
+        def read(v: Any, row: bool) -> Nodes:
+            if isinstance(v, jex.Literal):
+                return walk.constants(number_of(v))
+            return rows[v][None] if row else whole[v]
+
+        found = walk.equation(same, *(read(v, f) for v, f in zip(e.invars, flags, strict=True)))
+        return [np.asarray(a)[0] for a in found]
+
+
+def number_of(literal: Any) -> np.ndarray:
+    """The number of a literal, in its type."""
+    return np.asarray(literal.val, literal.aval.dtype)
+
+
+def foldable(value: Any, most: int) -> bool:
+    """Whether a known array may become part of a program."""
+    return not is_key(value.dtype) and value.size <= most
