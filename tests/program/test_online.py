@@ -55,6 +55,20 @@ def test_it_gives_what_jax_gives(way):
     assert {"DONE", "MISSING", "PARTLY_MISSING", "NOT_FINITE"} <= set(c.counts)
 
 
+def test_the_memory_grows_to_what_its_programs_need_and_stays():
+    _, c = both(EKF, MODEL)
+    for _ in range(2):
+        c.predict()
+        c.update(Y[0])
+    memory = c._machine._memory
+    there = dict(memory._calls)
+    assert len(there) == 2
+    for _ in range(3):
+        c.predict()
+        c.update(Y[0])
+    assert all(memory._calls[name] is call for name, call in there.items())
+
+
 def moved(step):
     return step.posterior.mean, step.info["a"].nis
 

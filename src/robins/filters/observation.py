@@ -50,17 +50,23 @@ class Normalised(NamedTuple):
 
 def as_measurement(sensor: str, data: Any) -> Any:
     """Measurements as 64-bit floats of JAX, from arrays of any real kind or lists of numbers."""
-    return jax.tree_util.tree_map(jnp.asarray, as_real(sensor, data))
+
+    def of_jax(x: Any) -> jax.Array:
+        # a copy: what JAX computes later must not change with the array that was given
+        return x if isinstance(x, jax.Array) else jnp.array(x)
+
+    return jax.tree_util.tree_map(of_jax, as_real(sensor, data))
 
 
 def as_real(sensor: str, data: Any) -> Any:
-    """Measurements as 64-bit floats, of NumPy where they are not of JAX.
+    """Measurements as 64-bit floats, of NumPy where they are not of JAX; no copy where they are.
 
     Raises:
         TypeError: they are not real numbers.
     """
-    if type(data) is np.ndarray and data.dtype == float:
-        return data
+
+    def is_list(leaf):
+        return isinstance(leaf, list)
 
     def as_numbers(leaf):
         array = leaf if isinstance(leaf, jax.Array) else np.asarray(leaf)
@@ -71,7 +77,13 @@ def as_real(sensor: str, data: Any) -> Any:
             )
         return array.astype(float)
 
-    return jax.tree_util.tree_map(as_numbers, data, is_leaf=lambda x: isinstance(x, list))
+    if all(map(_is_real, jax.tree_util.tree_leaves(data, is_leaf=is_list))):
+        return data
+    return jax.tree_util.tree_map(as_numbers, data, is_leaf=is_list)
+
+
+def _is_real(leaf: Any) -> bool:
+    return type(leaf) in (np.ndarray, np.float64) and leaf.dtype == float
 
 
 def innovation(z: Any, y: Any) -> tuple[Array, Array]:

@@ -137,7 +137,7 @@ class _Call(NamedTuple):
 
 
 def _alike(x: Any, known: Form) -> bool:
-    if type(x) is np.ndarray:
+    if type(x) in (np.ndarray, np.float64):
         return x.shape == known[0] and x.dtype == known[1] and not known[2]
     return form(x) == known
 
@@ -271,11 +271,12 @@ class Memory:
         begin = self._reals, self._others
         given, *after = slots(program.inputs[count:], begin)
         told, *end = slots(program.results[count:])
-        behind = [max(a, b + e) for a, b, e in zip(after, begin, end, strict=True)]
-        if behind[0] > len(self._x) or behind[1] > len(self._k):
+        wanted = [max(a, b + e) for a, b, e in zip(after, begin, end, strict=True)]
+        if wanted[0] > len(self._x) or wanted[1] > len(self._k):
             self._calls.clear()  # they point to the memory that was
-            self._x = np.concatenate([self._x[: begin[0]], np.zeros(behind[0] - begin[0])])
-            self._k = np.append(self._k[: begin[1]], np.zeros(behind[1] - begin[1], np.int64))
+            self._x = np.append(self._x, np.zeros(max(0, wanted[0] - len(self._x))))
+            more = np.zeros(max(0, wanted[1] - len(self._k)), np.int64)
+            self._k = np.append(self._k, more)
         x, k = (ctypes.c_void_p(a.ctypes.data) for a in (self._x, self._k))
         return _Call(
             tree,
