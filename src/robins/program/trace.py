@@ -227,11 +227,7 @@ def trace_step(
 ) -> Program:
     """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
 
-    Zeros of the state that every step leaves zero are structural, such as those above the diagonal
-    of a factor. Which they are follows by induction: those are tried that are zero in the state
-    given; those are dropped for which the next state has anything but a known zero; and so on until
-    none is dropped. The program is for states that have them, as the one given and all that follow
-    from it; `Native` refuses others.
+    Zeros of the state that every step leaves zero are structural, as in `trace_steps`.
 
     Args:
         function: the step; the first of its results has the structure of the state.
@@ -242,24 +238,52 @@ def trace_step(
     Raises:
         ProgramError: as in `trace`; or the first result is no state.
     """
-    jaxpr, given, results = _jaxpr(function, (state, *args))
+    return trace_steps([(function, args)], state, unroll=unroll)[0]
+
+
+def trace_steps(
+    steps: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]],
+    state: Any,
+    unroll: int | None = UNROLL,
+) -> list[Program]:
+    """Steps that change one state, each ``(state, *args) -> (state, ...)``, as programs.
+
+    Zeros of the state that all steps leave zero are structural, such as those above the diagonal
+    of a factor. Which they are follows by induction: those are tried that are zero in the state
+    given; those are dropped for which any step leaves anything but a known zero; and so on until
+    none is dropped. The programs are for states that have them, as the one given and all that
+    follow from it; `Native` refuses others.
+
+    Args:
+        steps: functions, and their arguments after the state.
+        state: as in `trace_step`.
+        unroll: as in `trace`.
+
+    Raises:
+        ProgramError: as in `trace_step`.
+    """
     leaves, tree = jax.tree_util.tree_flatten(state)
-    first = results[0] if isinstance(results, tuple) and results else None
-    if jax.tree_util.tree_structure(first) != tree:
-        raise ProgramError(
-            "the first result of a step has another structure than its state",
-            fix="return (state, ...)",
-        )
+    jaxprs = [_jaxpr(function, (state, *args)) for function, args in steps]
+    for _, _, results in jaxprs:
+        first = results[0] if isinstance(results, tuple) and results else None
+        if jax.tree_util.tree_structure(first) != tree:
+            raise ProgramError(
+                "the first result of a step has another structure than its state",
+                fix="return (state, ...)",
+            )
     zeros = {}
     for k, leaf in enumerate(map(np.asarray, leaves)):
         if leaf.dtype == np.float64:
             zeros[k] = (leaf == 0.0) & ~np.signbit(leaf)
     while True:
-        program = _program(jaxpr, given, results, unroll, zeros)
-        zero = program.graph.constant(0, "real")
-        kept = {k: mask & (program.outputs[k] == zero) for k, mask in zeros.items()}
+        programs, kept = [], zeros
+        for jaxpr in jaxprs:
+            program = _program(*jaxpr, unroll, zeros)
+            zero = program.graph.constant(0, "real")
+            kept = {k: mask & (program.outputs[k] == zero) for k, mask in kept.items()}
+            programs.append(program)
         if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
-            return program
+            return programs
         zeros = kept
 
 
