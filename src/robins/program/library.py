@@ -191,7 +191,9 @@ class Library(NamedTuple):
         kept = [leaf for leaf in leaves if leaf.size]
         for f, value in zip(self.state, kept, strict=True):
             kind = "real" if f.is_real else C_TYPES[f.leaf.kind]
-            entries = ", ".join(number(x, f.is_real, self.precision) for x in value.ravel().tolist())
+            entries = ", ".join(
+                number(x, f.is_real, self.precision) for x in value.ravel().tolist()
+            )
             lines.append(f"    static const {kind} {f.name}[{f.size}] = {{{entries}}};")
             copies.append(f"    memcpy({f.first('state')}, {f.name}, sizeof {f.name});")
         return [*lines, *copies, "}", ""]
