@@ -274,13 +274,13 @@ def trace_steps(
     zeros = {}
     for k, leaf in enumerate(map(np.asarray, leaves)):
         if leaf.dtype == np.float64:
-            zeros[k] = (leaf == 0.0) & ~np.signbit(leaf)
+            zeros[k] = np.asarray((leaf == 0.0) & ~np.signbit(leaf))
     while True:
         programs, kept = [], zeros
         for jaxpr in jaxprs:
             program = _program(*jaxpr, unroll, zeros)
             zero = program.graph.constant(0, "real")
-            kept = {k: mask & (program.outputs[k] == zero) for k, mask in kept.items()}
+            kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in kept.items()}
             programs.append(program)
         if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
             return programs

@@ -1,0 +1,184 @@
+"""Exported filters on two boards: size, stack, and whether their bits are those of this machine.
+
+Each filter is exported, cross-compiled for a Cortex-M4F and a Cortex-M7, and its recorded steps are
+run on QEMU's boards of these processors. The same is done by the compiler of this machine, and by
+that of `ziglang` (clang) where it is named. QEMU computes as the processor does and says nothing of
+its time.
+
+    python benchmarks/boards.py [SCENARIO:FILTER ...] [--zig "PYTHON -m ziglang cc"]
+
+Needs gcc-arm-none-eabi, libnewlib-arm-none-eabi, qemu-system-arm (Debian).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+HERE = Path(__file__).parent / "boards"
+GCC, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
+CASES = (
+    "transfer-alignment/s0:kf-flexure",
+    "rocket/a1:ukf",
+    "satellite/s1:adaptive",
+    "ins-gnss/drive:ekf",
+)
+
+
+class Board(NamedTuple):
+    """A processor, and a machine of QEMU that has it."""
+
+    name: str
+    cpu: str
+    fpu: str
+    machine: str
+
+    @property
+    def flags(self) -> list[str]:
+        """For the compiler."""
+        return [f"-mcpu={self.cpu}", "-mthumb", "-mfloat-abi=hard", f"-mfpu={self.fpu}", *FLAGS]
+
+
+M4F = Board("Cortex-M4F", "cortex-m4", "fpv4-sp-d16", "mps2-an386")
+M7 = Board("Cortex-M7", "cortex-m7", "fpv5-d16", "mps2-an500")
+
+
+class Ran(NamedTuple):
+    """What a test of a library printed."""
+
+    said: str  # its line on codes and numbers
+    bits: str  # checksum of the bits of all states
+    ulps: list[int]  # all numbers of all states, counted in units in the last place
+
+
+class Built(NamedTuple):
+    """What a library takes on a board, in bytes."""
+
+    flash: int  # code and constants of the library, without libm
+    stack: int  # of its deepest entry point: sums of frames by -fstack-usage
+
+
+def missing() -> str:
+    """What is not here of all that is needed; nothing if all is."""
+    absent = [name for name in (GCC, QEMU) if shutil.which(name) is None]
+    if not absent:
+        told = [GCC, "-mcpu=cortex-m4", "-mthumb", "-print-file-name=rdimon.specs"]
+        specs = subprocess.run(told, capture_output=True, text=True).stdout.strip()
+        absent = [] if os.path.isabs(specs) else ["newlib for arm-none-eabi"]
+    return f"needs {' and '.join(absent)}" if absent else ""
+
+
+def on_board(folder: Path, board: Board) -> Ran:
+    """Compile an exported folder for a board, and run its recorded steps there."""
+    with tempfile.TemporaryDirectory() as own:
+        elf = str(Path(own) / "test.elf")
+        sources = [HERE / "start.c", *sorted(folder.glob("*.c"))]
+        script = ["--specs=rdimon.specs", "-T", HERE / "board.ld", "-DPRINT_BITS"]
+        line = [GCC, *board.flags, *script, *sources, "-lm", "-o", elf]
+        subprocess.run(list(map(str, line)), check=True)
+        quiet = ["-nographic", "-monitor", "none", "-serial", "none"]
+        host = ["-semihosting-config", "enable=on,target=native"]
+        return _ran([QEMU, "-machine", board.machine, *quiet, *host, "-kernel", elf])
+
+
+def on_host(folder: Path, compiler: str = "cc") -> Ran:
+    """The same by a compiler of this machine."""
+    with tempfile.TemporaryDirectory() as own:
+        program = str(Path(own) / "test")
+        line = [*shlex.split(compiler), *FLAGS, "-DPRINT_BITS"]
+        sources = map(str, sorted(folder.glob("*.c")))
+        subprocess.run([*line, *sources, "-lm", "-o", program], check=True)
+        return _ran([program])
+
+
+def _ran(command: list[str]) -> Ran:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    lines = done.stdout.split("\n")
+    words = [line for line in lines if len(line) in (8, 16) and " " not in line]
+    said = [line for line in lines if " steps: " in line]
+    bits = [line.rpartition(" ")[2] for line in lines if line.startswith("bits of all")]
+    if not said or not bits:
+        raise RuntimeError(f"{command[0]} ended with {done.returncode}: {done.stdout[-300:]}")
+    numbers = [int(word, 16) for word in words]
+    half = 8 << 4 * (len(words[0]) - 1)  # the sign
+    return Ran(said[0], bits[0], [half - n if n >= half else n for n in numbers])
+
+
+def apart(one: Ran, other: Ran) -> str:
+    """How far the states of two runs are apart."""
+    if one.bits == other.bits:
+        return "to the bit"
+    moved = [abs(a - b) for a, b in zip(one.ulps, other.ulps, strict=True)]
+    return f"{max(moved)} ulp at most, {sum(m > 0 for m in moved)} of {len(moved)} numbers"
+
+
+def built(folder: Path, board: Board) -> Built:
+    """The size and the stack of a library on a board."""
+    (source,) = (path for path in folder.glob("*.c") if path.name != "test.c")
+    prefix = f"{source.stem}_"
+    with tempfile.TemporaryDirectory() as own:
+        made = ["-fstack-usage", "-c", str(source), "-o", "library.o"]
+        subprocess.run([GCC, *board.flags, *made], check=True, cwd=own)
+        told = subprocess.check_output(["arm-none-eabi-size", "library.o"], cwd=own, text=True)
+        frames = {}
+        for line in (Path(own) / "library.su").read_text().splitlines():
+            where, size, _ = line.split("\t")
+            frames[where.rpartition(":")[2].partition(".")[0]] = int(size)
+    calls = {name: size for name, size in frames.items() if name.startswith(prefix)}
+    inner = [size for name, size in frames.items() if not name.startswith((prefix, "of_"))]
+    deepest = max(
+        size + frames.get(f"of_{name.removeprefix(prefix)}", 0) for name, size in calls.items()
+    )
+    return Built(int(told.splitlines()[1].split()[0]), deepest + max(inner, default=0))
+
+
+def row(folder: Path, case: str, real: str, board: Board, host: Ran) -> str:
+    """A line of the table."""
+    there, size = on_board(folder, board), built(folder, board)
+    codes = there.said.partition(" steps: ")[2].partition(",")[0]
+    return (
+        f"| {case} | {board.name} | {real} | {size.flash / 1000:.1f} | {size.stack / 1000:.1f} "
+        f"| {codes} | {apart(host, there)} |"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("cases", nargs="*", default=CASES)
+    parser.add_argument("--zig", default="")
+    told = parser.parse_args()
+    if reason := missing():
+        print(reason, file=sys.stderr)
+        return 1
+    from robins.workbench import export_filter
+
+    print(
+        "| filter | processor | reals | flash, kB | stack, kB | codes | bits beside this machine |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for case in told.cases:
+        scenario, _, name = case.partition(":")
+        for float32 in (False, True):
+            with tempfile.TemporaryDirectory() as own:
+                folder = Path(own) / "made"
+                made = export_filter(scenario, folder, filter_name=name, float32=float32)
+                host = on_host(folder)
+                label = f"`{scenario}` `{made.filter}`"
+                for board in (M4F, M7):
+                    print(row(folder, label, made.real, board, host), flush=True)
+                if told.zig:
+                    zig = on_host(folder, told.zig)
+                    print(f"|  | this machine, clang | {made.real} | | | | {apart(host, zig)} |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
