@@ -46,6 +46,11 @@ class BoardRun(NamedTuple):
     start: Any
     given: dict[str, tuple[Any, ...]]
 
+    @property
+    def steps(self) -> int:
+        """How many steps it has."""
+        return len(jax.tree_util.tree_leaves(self.given)[0])
+
     def cut(self, steps: int) -> BoardRun:
         """Its first steps."""
         given = jax.tree_util.tree_map(lambda a: a[:steps], self.given)

@@ -151,7 +151,7 @@ def in_floats(library: Library, runs: Sequence[BoardRun]) -> list[tuple[Any, np.
 def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.ndarray]:
     dtype, calls = library.precision.dtype, []
     leaves, tree = jax.tree_util.tree_flatten(run.start)
-    begin = _flat(leaves, dtype, lead=False)
+    begin = [rows[0] for rows in _flat([np.asarray(x)[None] for x in leaves], dtype, 1)]
     own = [a.size for a in begin]
     for entry in library.entries:
         x, k = (
@@ -165,14 +165,13 @@ def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.
         function = getattr(loaded, f"of_{entry.name}")
         function.restype = None
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in (x, k, x, k)]
-        rows = _flat(jax.tree_util.tree_leaves(run.given[entry.name]), dtype, lead=True)
+        rows = _flat(jax.tree_util.tree_leaves(run.given[entry.name]), dtype, run.steps)
         code = next(f.at for f in library.result(entry) if f.name == "code")
         calls.append((function, pointers, (x, k), rows, code))
-    steps = len(calls[0][3][0])
-    kept = [np.zeros((steps, size), a.dtype) for size, a in zip(own, begin, strict=True)]
-    codes = np.zeros((steps, len(calls)), np.int64)
+    kept = [np.zeros((run.steps, size), a.dtype) for size, a in zip(own, begin, strict=True)]
+    codes = np.zeros((run.steps, len(calls)), np.int64)
     state = begin
-    for t in range(steps):
+    for t in range(run.steps):
         for j, (function, pointers, memory, rows, code) in enumerate(calls):
             for space, carried, row, size in zip(memory, state, rows, own, strict=True):
                 space[:size] = carried
@@ -185,16 +184,15 @@ def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.
     return _as_tree(kept, leaves, tree), codes
 
 
-def _flat(leaves: Sequence[Any], dtype: Any, lead: bool) -> list[np.ndarray]:
-    """Reals, and all else, one after the other; behind the axis of steps where there is one."""
+def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
+    """Reals, and all else, one after the other, behind an axis of steps."""
     arrays = [np.asarray(x) for x in leaves]
     parts = []
     for real, kind in ((True, dtype), (False, np.int64)):
         mine = [a for a in arrays if (a.dtype == np.float64) == real]
         with np.errstate(over="ignore"):
-            flat = [(a.reshape(len(a), -1) if lead else a.ravel()).astype(kind) for a in mine]
-        steps = (len(arrays[0]) if arrays else 0, 0) if lead else 0
-        parts.append(np.concatenate(flat, axis=-1) if flat else np.zeros(steps, kind))
+            flat = [a.reshape(steps, -1).astype(kind) for a in mine]
+        parts.append(np.concatenate([np.zeros((steps, 0), kind), *flat], axis=1))
     return parts
 
 
