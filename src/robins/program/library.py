@@ -17,7 +17,7 @@ import numpy as np
 from robins.program.c import function, header
 from robins.program.precision import DOUBLE, Precision
 from robins.program.trace import Leaf, Program
-from robins.program.wrap import wrapped
+from robins.program.wrap import COLUMNS, wrapped
 
 C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
 CODE = "code"  # of a result: what the entry point returns
@@ -69,7 +69,7 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
         root = re.match(r"[a-z]+\[(\d+)\]", leaf.path)
         assert root is not None
         if int(root[1]) == which and size > 0:
-            name = base = _identifier(leaf.path[root.end() :])
+            name = base = identifier(leaf.path[root.end() :])
             k = 2
             while name in taken:
                 name, k = f"{base}_{k}", k + 1
@@ -79,7 +79,7 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
     return found
 
 
-def _identifier(path: str) -> str:
+def identifier(path: str) -> str:
     """A path in a pytree as a name in C: attributes and indices, the belief's own left out."""
     words = re.findall(r"[A-Za-z_]\w*|\d+", path)
     words = words[1:] if words[:1] == ["belief"] else words
@@ -150,8 +150,9 @@ class Library(NamedTuple):
             for f in fields:
                 kind = f"{self.name}_real" if f.is_real else C_TYPES[f.leaf.kind]
                 sizes = "".join(f"[{n}]" for n in f.leaf.shape)
-                note = self.notes.get((name, f.name), "")
-                lines.append(f"    {kind} {f.name}{sizes};" + (f" /* {note} */" if note else ""))
+                lines += _declared(
+                    f"    {kind} {f.name}{sizes};", self.notes.get((name, f.name), "")
+                )
             lines += [f"}} {self.name}_{name};", ""]
         lines += [
             "/* The state to begin with. */",
@@ -213,6 +214,14 @@ class Library(NamedTuple):
         lines += _copied(result, "result", "x", "k", inwards=False)
         code = next(f for f in result if f.name == CODE)
         return [*lines, f"    return (int)k[{code.at}];", "}", ""]
+
+
+def _declared(text: str, note: str) -> list[str]:
+    """A field and its note: behind it where there is room, else before it."""
+    if not note:
+        return [text]
+    both = f"{text} /* {note} */"
+    return [both] if len(both) <= COLUMNS else [f"    /* {note} */", text]
 
 
 def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:

@@ -12,7 +12,8 @@ def wrapped(line: str) -> list[str]:
     while len(line) > COLUMNS and not line.startswith("#"):
         least = len(begin) + 24  # a piece shorter than that is no line
         comma, space = line.rfind(", ", least, COLUMNS), line.rfind(" ", least, COLUMNS)
-        at = comma + 1 if comma > 0 else space
+        is_code = "/*" not in line and "*/" not in line
+        at = comma + 1 if comma > 0 and is_code else space
         if at <= 0:
             break
         lines.append(line[:at])

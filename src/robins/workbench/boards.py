@@ -19,6 +19,7 @@ from robins.program.harness import Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library
 from robins.systems.study import Problem
 from robins.workbench.board_runs import BoardRun, board_runs, by_jax, entry_functions
+from robins.workbench.board_words import components, field_notes, tangent_axes
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.scenarios import check_filters, find_scenario, study_of
 from robins.workbench.single_precision import Cost, Made, cost, differences, in_floats
@@ -118,13 +119,16 @@ def _library(
         )
         for entry, program in zip(functions, programs, strict=True)
     ]
-    library = Library("robins", entries, run.start, (), _notes(problem, run.given), precision)
+    belief = run.start.belief
+    axes = tangent_axes(problem, contender.reported, len(belief.factor))
+    notes = field_notes(problem, axes, belief.mean, run.given)
+    library = Library("robins", entries, run.start, (), notes, precision)
     identity = hashlib.sha256((library.header() + library.source()).encode()).hexdigest()
     about = (
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",
         "SI units and radians. NaN is missing, for each component of a reading.",
         *(["Single precision: README.md says what that costs."] if single else []),
-        *_components(problem, contender.reported),
+        *components(axes),
     )
     library = library._replace(about=about)
     if not single:
@@ -156,31 +160,6 @@ def _record(library: Library, run: BoardRun, doubles: Made, singles: Made) -> Re
     parts = differences(library, wide, narrow)
     tolerances = {f: max(MARGIN * part, LEAST) for f, part in parts.items() if np.isfinite(part)}
     return Recorded(short, wide, codes, tolerances, int(np.sum(codes != others)))
-
-
-def _components(problem: Problem, reported: Any) -> list[str]:
-    """What the components of a factor are, where they are those that are reported."""
-    lines = ["factor is lower triangular, covariance P = factor factor' of the error."]
-    if reported is None:
-        for block in problem.blocks:
-            first, last = block.where.start, block.where.stop - 1
-            axes = ", ".join(block.axes)
-            lines.append(
-                f"  {first} to {last}: {block.name} [{block.units}], {block.frame}: {axes}"
-            )
-    return lines
-
-
-def _notes(problem: Problem, given: Mapping[str, Any]) -> dict[tuple[str, str], str]:
-    """Units and axes of readings and innovations."""
-    notes = {("state", "current"): "the last prediction was taken"}
-    for entry in given:
-        axes = problem.sensors.get(entry.removeprefix("update_"))
-        if axes is not None:
-            told = f"{axes.units}, {axes.frame}: {', '.join(axes.axes)}"
-            notes[f"{entry}_reading", "value"] = told
-            notes[f"{entry}_result", "innovation"] = told
-    return notes
 
 
 def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
