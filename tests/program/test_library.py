@@ -61,6 +61,16 @@ def test_its_test_sees_what_is_wrong(folders, tmp_path, kind, file, old, new):
     assert (done.returncode == 0) == (new == "real const r"), done.stdout
 
 
+def test_a_library_that_single_precision_ruins_fails(tmp_path):
+    write_boat(tmp_path)
+    record = tmp_path / "recorded.h"
+    record.write_text(record.read_text().replace('RUINED ""', 'RUINED "It drifts."'))
+    done = check(tmp_path)
+    assert done.returncode != 0
+    assert "FAILED: It drifts." in done.stdout
+    assert "0 codes differ" in done.stdout
+
+
 def test_fields_have_the_names_of_the_model(folder):
     text = (folder / "boat.h").read_text()
     assert "boat_real mean_heading_rad;" in text

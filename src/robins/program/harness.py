@@ -46,8 +46,9 @@ BITS = {
     DOUBLE: {
         "word": "uint64_t",
         "nan": "0x7ff8000000000000u",
-        "printed": """\"%08lx%08lx\\n", (unsigned long)(word >> 32),
-               (unsigned long)(word & 0xffffffffu)""",
+        "printed": '"%08lx%08lx\\n", (unsigned long)(word >> 32),\n'
+        + " " * 15
+        + "(unsigned long)(word & 0xffffffffu)",
     },
     SINGLE: {
         "word": "uint32_t",
@@ -100,7 +101,10 @@ END = """\
            STEPS, wrong, worst, good ? "passed" : "FAILED");
     printf("bits of all states: %08lx%08lx\\n", (unsigned long)(bits >> 32),
            (unsigned long)(bits & 0xffffffffu));
-    return good ? 0 : 1;
+    if (sizeof RUINED > 1) {
+        printf("FAILED: %s\\n", RUINED);
+    }
+    return good && sizeof RUINED == 1 ? 0 : 1;
 }
 """
 
@@ -116,6 +120,8 @@ class Recorded(NamedTuple):
         tolerances: of fields of the state, in parts of the largest number that a field has;
             `TOLERANCE` of the others.
         codes_off: how many codes may differ.
+        ruined: why the library is not to be used, however well it was compiled; its test says so
+            and fails.
     """
 
     given: Mapping[str, Sequence[Any]]
@@ -123,6 +129,7 @@ class Recorded(NamedTuple):
     codes: np.ndarray
     tolerances: Mapping[str, float] = {}
     codes_off: int = 0
+    ruined: str = ""
 
 
 def makefile(library: Library) -> str:
@@ -133,7 +140,12 @@ def makefile(library: Library) -> str:
 def recorded_h(library: Library, record: Recorded) -> str:
     """The record as C."""
     steps = len(record.codes)
-    lines = [f"#define STEPS {steps}", f"#define CODES_OFF {record.codes_off}", ""]
+    lines = [
+        f"#define STEPS {steps}",
+        f"#define CODES_OFF {record.codes_off} /* that may differ */",
+        f'#define RUINED "{record.ruined}" /* why the library is not to be used */',
+        "",
+    ]
     for entry, name, fields, leaves in _tables(library, record):
         for f, leaf in zip(fields, leaves, strict=True):
             lines += _table(f"{entry.name}_{name}_{f.name}", f, leaf, library.precision)

@@ -137,7 +137,8 @@ def _library(
     doubles = [by_jax(functions, one) for one in runs]
     singles = in_floats(library, runs)
     found = cost(problem, contender, library, runs, doubles, singles)
-    return library, _record(library, run, doubles[0], singles[0]), found
+    record = _record(library, run, doubles[0], singles[0])
+    return library, record._replace(ruined="" if found.bearable else found.verdict), found
 
 
 def _any_start(runs: Sequence[BoardRun]) -> Any:
@@ -209,7 +210,7 @@ machine that exported it, given the same readings rounded to floats; in double p
 
 `make check` compares with double precision. What it allows is {MARGIN:.0f} times what single
 precision was found to cost in the recorded steps, and at least {LEAST:.0e} of a field: see
-`recorded.h`.
+`recorded.h`.{" It fails, since the filter is ruined." if not found.bearable else ""}
 """
 
 

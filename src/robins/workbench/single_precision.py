@@ -26,8 +26,8 @@ from robins.workbench.board_runs import BoardRun
 LITTLE, MUCH = 1.01, 1.1  # growth of an error: below the one it does not show, above the other ...
 SEVERAL = 0.01  # ... or with this share of other codes, or of the NEES, the filter is another one
 
-# Most of the text is called a few thousand times: bits are the same without optimisation.
-QUICK = tuple("-O1" if flag == "-O2" else flag for flag in FLAGS)
+# What is called some thousand times is not worth optimising; the bits are the same without.
+QUICK = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
 
 
 class BlockCost(NamedTuple):
