@@ -5,8 +5,9 @@ run on QEMU's boards of these processors. The same is done by the compiler of th
 that of `ziglang` (clang) where it is named. QEMU computes as the processor does and says nothing of
 its time.
 
-    python benchmarks/boards.py [SCENARIO:FILTER ...] [--zig "PYTHON -m ziglang cc"]
+    python benchmarks/boards.py [SCENARIO:FILTER | FOLDER ...] [--zig "PYTHON -m ziglang cc"]
 
+A folder is one that `robins export` wrote.
 Needs gcc-arm-none-eabi, libnewlib-arm-none-eabi, qemu-system-arm (Debian).
 """
 
@@ -21,6 +22,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 HERE = Path(__file__).parent / "boards"
 GCC, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
@@ -56,7 +59,7 @@ class Ran(NamedTuple):
 
     said: str  # its line on codes and numbers
     bits: str  # checksum of the bits of all states
-    ulps: list[int]  # all numbers of all states, counted in units in the last place
+    reals: np.ndarray  # (steps, numbers) all states
 
 
 class Built(NamedTuple):
@@ -107,17 +110,21 @@ def _ran(command: list[str]) -> Ran:
     bits = [line.rpartition(" ")[2] for line in lines if line.startswith("bits of all")]
     if not said or not bits:
         raise RuntimeError(f"{command[0]} ended with {done.returncode}: {done.stdout[-300:]}")
-    numbers = [int(word, 16) for word in words]
-    half = 8 << 4 * (len(words[0]) - 1)  # the sign
-    return Ran(said[0], bits[0], [half - n if n >= half else n for n in numbers])
+    steps = int(said[0].partition(" ")[0])
+    kinds = (np.uint32, np.float32) if len(words[0]) == 8 else (np.uint64, np.float64)
+    reals = np.array([int(word, 16) for word in words], kinds[0]).view(kinds[1])
+    return Ran(said[0], bits[0], reals.reshape(steps, -1))
 
 
 def apart(one: Ran, other: Ran) -> str:
-    """How far the states of two runs are apart."""
+    """How far the states of two runs are apart, in roundings of what each number grows to."""
     if one.bits == other.bits:
         return "to the bit"
-    moved = [abs(a - b) for a, b in zip(one.ulps, other.ulps, strict=True)]
-    return f"{max(moved)} ulp at most, {sum(m > 0 for m in moved)} of {len(moved)} numbers"
+    a, b = one.reals, other.reals
+    off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b))
+    largest = np.max(np.abs(a), axis=0, initial=0.0, where=np.isfinite(a))
+    parts = off / np.where(largest > 0.0, largest, 1.0) / np.finfo(a.dtype).eps
+    return f"{np.max(parts):.0f} roundings; {np.count_nonzero(off)} of {a.size} numbers differ"
 
 
 def built(folder: Path, board: Board) -> Built:
@@ -150,6 +157,16 @@ def row(folder: Path, case: str, real: str, board: Board, host: Ran) -> str:
     )
 
 
+def compared(folder: Path, label: str, real: str, zig: str) -> None:
+    """Print the lines of an exported folder."""
+    host = on_host(folder)
+    for board in (M4F, M7):
+        print(row(folder, label, real, board, host), flush=True)
+    if zig:
+        bits = apart(host, on_host(folder, zig))
+        print(f"| {label} | this machine, clang | {real} | | | | {bits} |", flush=True)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("cases", nargs="*", default=CASES)
@@ -165,18 +182,17 @@ def main() -> int:
     )
     print("|---|---|---|---|---|---|---|")
     for case in told.cases:
+        if Path(case).is_dir():
+            header = (Path(case) / "robins.h").read_text()
+            real = "float" if "typedef float " in header else "double"
+            compared(Path(case), case, real, told.zig)
+            continue
         scenario, _, name = case.partition(":")
         for float32 in (False, True):
             with tempfile.TemporaryDirectory() as own:
                 folder = Path(own) / "made"
                 made = export_filter(scenario, folder, filter_name=name, float32=float32)
-                host = on_host(folder)
-                label = f"`{scenario}` `{made.filter}`"
-                for board in (M4F, M7):
-                    print(row(folder, label, made.real, board, host), flush=True)
-                if told.zig:
-                    zig = on_host(folder, told.zig)
-                    print(f"|  | this machine, clang | {made.real} | | | | {apart(host, zig)} |")
+                compared(folder, f"`{scenario}` `{made.filter}`", made.real, told.zig)
     return 0
 
 

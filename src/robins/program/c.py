@@ -235,12 +235,14 @@ class _Writer:
         self.lines += [f"{pad}    {line.rstrip(' ,')}", f"{pad}}};"]
 
     def _block(self, node: Node, depth: int) -> None:
+        """A call of a routine; its arguments are in braces, so that their memory serves again."""
         routine, sizes, count = self.graph.value[node]
         entries = [self._read(a) for a in self.graph.args[node]]
-        self._listed(f"real in{node}[{len(entries)}]", entries, depth)
         told = ", ".join([*map(str, sizes), f"in{node}", f"b{node}"])
         pad = "    " * depth
-        self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{routine}({told});"]
+        self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{{"]
+        self._listed(f"real in{node}[{len(entries)}]", entries, depth + 1)
+        self.lines += [f"{pad}    {routine}({told});", f"{pad}}}"]
         self.names[node] = f"b{node}"
 
     def _loop(self, loop: Loop, node: Node, depth: int) -> None:
