@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -116,15 +117,21 @@ def _ran(command: list[str]) -> Ran:
     return Ran(said[0], bits[0], reals.reshape(steps, -1))
 
 
-def apart(one: Ran, other: Ran) -> str:
-    """How far the states of two runs are apart, in roundings of what each number grows to."""
+def sizes(folder: Path) -> np.ndarray:
+    """The largest number in its field, of each number of a state."""
+    fields = re.findall(r"state_(\w+)\[t\], (\d+), size_", (folder / "test.c").read_text())
+    told = re.findall(r"double size_(\w+) = (\S+);", (folder / "recorded.h").read_text())
+    known = {name: float(size) for name, size in told}
+    return np.concatenate([np.full(int(count), known[name] or 1.0) for name, count in fields])
+
+
+def apart(one: Ran, other: Ran, size: np.ndarray) -> str:
+    """How far the states of two runs are apart, in parts of a field."""
     if one.bits == other.bits:
         return "to the bit"
     a, b = one.reals, other.reals
-    off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b))
-    largest = np.max(np.abs(a), axis=0, initial=0.0, where=np.isfinite(a))
-    parts = off / np.where(largest > 0.0, largest, 1.0) / np.finfo(a.dtype).eps
-    return f"{np.max(parts):.0f} roundings; {np.count_nonzero(off)} of {a.size} numbers differ"
+    off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b)) / size
+    return f"within {np.max(off):.1e} of a field"
 
 
 def built(folder: Path, board: Board) -> Built:
@@ -153,7 +160,7 @@ def row(folder: Path, case: str, real: str, board: Board, host: Ran) -> str:
     codes = there.said.partition(" steps: ")[2].partition(",")[0]
     return (
         f"| {case} | {board.name} | {real} | {size.flash / 1000:.1f} | {size.stack / 1000:.1f} "
-        f"| {codes} | {apart(host, there)} |"
+        f"| {codes} | {apart(host, there, sizes(folder))} |"
     )
 
 
@@ -163,7 +170,7 @@ def compared(folder: Path, label: str, real: str, zig: str) -> None:
     for board in (M4F, M7):
         print(row(folder, label, real, board, host), flush=True)
     if zig:
-        bits = apart(host, on_host(folder, zig))
+        bits = apart(host, on_host(folder, zig), sizes(folder))
         print(f"| {label} | this machine, clang | {real} | | | | {bits} |", flush=True)
 
 
