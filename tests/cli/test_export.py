@@ -17,6 +17,8 @@ def test_the_folder_compiles_and_agrees_with_jax(made):
     answer, folder = made
     assert answer.status == 0, answer.err
     said = json.loads(answer.out)
+    assert said["real"] == "double"
+    assert said["cost"] is None
     assert said["folder"] == "alignment"
     assert sorted(said["files"]) == sorted(p.name for p in folder.iterdir())
     done = subprocess.run(["make", "-C", str(folder), "check"], capture_output=True, text=True)
@@ -25,6 +27,31 @@ def test_the_folder_compiles_and_agrees_with_jax(made):
     header = (folder / "robins.h").read_text()
     assert "int robins_update_attitude_matching(robins_state *state," in header
     assert "rad" in header
+
+
+def test_single_precision_tells_what_it_costs(robins, tmp_path):
+    answer = robins("export", *SCENARIO, "--to", "single", "--float32", "--json")
+    assert answer.status == 0, answer.err
+    said, folder = json.loads(answer.out), tmp_path / "single"
+    cost = said["cost"]
+    assert said["real"] == "float"
+    assert cost["bearable"]
+    assert cost["codes_off"] == 0
+    assert cost["codes"] == 2 * cost["runs"] * cost["steps"] > 2 * 60
+    assert [block["name"] for block in cost["blocks"]] == ["attitude", "gyro_bias", "mounting"]
+    for block in cost["blocks"]:  # doubles are not floats, and floats are near
+        assert block["rms"] != block["rms_single"]
+        assert block["rms_single"] == pytest.approx(block["rms"], rel=0.01)
+    assert all(1e-8 < part < 1e-4 for part in cost["fields"].values())
+    page = (folder / "README.md").read_text()
+    assert f"**{cost['verdict']}**" in page
+    assert f"0 of {cost['codes']} codes differ" in page
+    assert "typedef float robins_real;" in (folder / "robins.h").read_text()
+    done = subprocess.run(
+        ["make", "-C", str(folder), "check", "CC=cc -Werror"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "60 steps: 0 codes differ" in done.stdout
 
 
 def test_what_is_there_is_not_written_over(robins, tmp_path):

@@ -1,82 +1,27 @@
 """An exported library, compiled and run as its user does."""
 
 import subprocess
-from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from boat import STEPS, write_boat
 
-from robins.filters import Belief, Model, Motion, Sensor, kalman
-from robins.filters.rules import huber, sage_husa
-from robins.manifold import Angle
-from robins.program import trace
-from robins.program.harness import Recorded, check_c, makefile, recorded_h
-from robins.program.library import Entry, Library, fields_of, number
+from robins.program import DOUBLE, SINGLE, trace
+from robins.program.library import fields_of, number
 
-STEPS = 12
-
-
-class State(NamedTuple):
-    heading: Angle
-    rate: Any
-
-
-class Told(NamedTuple):
-    code: Any
-    used: Any
-
-
-MODEL = Model(
-    Motion(lambda x, u: x._replace(heading=x.heading.retract(u * x.rate)), np.array([0.01, 0.02])),
-    (Sensor(lambda x, aux: x.heading, np.array([0.1]), 1, "compass"),),
-)
-FILTER = kalman(rules=[huber(0.95), sage_husa(0.98)])
-
-
-def predict(state, u):
-    state, prediction = FILTER.predict(state, MODEL.motion, u)
-    return state, Told(prediction.code, jnp.ones(0, dtype=bool))
-
-
-def update(state, y, aux):
-    state, info = FILTER.update(state, MODEL.sensors[0], y, aux)
-    return state, Told(info.code, info.used)
+PRECISIONS = {"double": DOUBLE, "float": SINGLE}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A library with its test, of a filter with memories, an angle that wraps, and a gap."""
-    start = Belief.of(State(Angle(jnp.array(3.1)), jnp.array([0.4])), np.diag([0.1, 0.2]))
-    state = FILTER.init(start, MODEL.dims)
-    u = np.full((STEPS, 1), 0.1)
-    y = Angle(3.1 + 0.05 * np.arange(STEPS) + np.where(np.arange(STEPS) == 5, np.nan, 0.0))
-    entries = [
-        Entry("predict", trace(predict, state, u[0]), ("input",), "Moves on by one step."),
-        Entry(
-            "update_compass", trace(update, state, Angle(y.rad[0]), None), ("reading", "about"), ""
-        ),
-    ]
-    library = Library("boat", entries, state, ("A boat.",), {("state", "mean_rate"): "rad/s"})
-    states, codes = [], []
-    for k in range(STEPS):
-        state, moved = predict(state, u[k])
-        state, seen = update(state, Angle(jnp.asarray(y.rad[k])), None)
-        states.append(state)
-        codes.append([int(moved.code), int(seen.code)])
-    stacked = jax.tree_util.tree_map(lambda *a: np.stack([np.asarray(x) for x in a]), *states)
-    record = Recorded({"predict": (u,), "update_compass": (y, None)}, stacked, np.array(codes))
-    made = tmp_path_factory.mktemp("boat")
-    for name, text in {
-        "boat.h": library.header(),
-        "boat.c": library.source(),
-        "recorded.h": recorded_h(library, record),
-        "test.c": check_c(library, record),
-        "Makefile": makefile(library),
-    }.items():
-        (made / name).write_text(text)
-    return made
+def folders(tmp_path_factory):
+    """The same library in each precision."""
+    return {k: write_boat(tmp_path_factory.mktemp(k), one) for k, one in PRECISIONS.items()}
+
+
+@pytest.fixture
+def folder(folders):
+    return folders["double"]
 
 
 def check(folder, *settings):
@@ -85,7 +30,9 @@ def check(folder, *settings):
     )
 
 
-def test_it_is_what_jax_computes_and_no_compiler_warns(folder):
+@pytest.mark.parametrize("kind", PRECISIONS)
+def test_it_is_what_jax_computes_and_no_compiler_warns(folders, kind):
+    folder = folders[kind]
     done = check(folder, "CC=cc -Werror")
     assert done.returncode == 0, done.stderr
     assert f"{STEPS} steps: 0 codes differ" in done.stdout
@@ -95,15 +42,16 @@ def test_it_is_what_jax_computes_and_no_compiler_warns(folder):
 
 
 @pytest.mark.parametrize(
-    ("file", "old", "new"),
+    ("kind", "file", "old", "new"),
     [
-        ("boat.c", "const real r", "real const r"),  # nothing changes
-        ("boat.c", "{0.4}", "{0.4000001}"),  # the rate to begin with
-        ("recorded.h", "{0, 1}", "{0, 0}"),  # a code
+        ("double", "boat.c", "const real r", "real const r"),  # nothing changes
+        ("double", "boat.c", "{0.4}", "{0.4000001}"),  # the rate to begin with
+        ("double", "recorded.h", "{0, 1}", "{0, 0}"),  # a code
+        ("float", "boat.c", "{0.4f}", "{0.40002f}"),
     ],
 )
-def test_its_test_sees_what_is_wrong(folder, tmp_path, file, old, new):
-    for one in folder.iterdir():
+def test_its_test_sees_what_is_wrong(folders, tmp_path, kind, file, old, new):
+    for one in folders[kind].iterdir():
         if one.suffix in (".c", ".h") or one.name == "Makefile":
             (tmp_path / one.name).write_text(one.read_text())
     text = (tmp_path / file).read_text()
@@ -111,6 +59,16 @@ def test_its_test_sees_what_is_wrong(folder, tmp_path, file, old, new):
     (tmp_path / file).write_text(text.replace(old, new, 1 if file == "recorded.h" else -1))
     done = check(tmp_path)
     assert (done.returncode == 0) == (new == "real const r"), done.stdout
+
+
+def test_a_library_that_single_precision_ruins_fails(tmp_path):
+    write_boat(tmp_path)
+    record = tmp_path / "recorded.h"
+    record.write_text(record.read_text().replace('RUINED ""', 'RUINED "It drifts."'))
+    done = check(tmp_path)
+    assert done.returncode != 0
+    assert "FAILED: It drifts." in done.stdout
+    assert "0 codes differ" in done.stdout
 
 
 def test_fields_have_the_names_of_the_model(folder):
@@ -136,6 +94,40 @@ def test_fields_lie_where_the_program_has_them():
         ("a", 2, True),
         ("b", 3, False),
     ]
+
+
+def test_the_header_is_one_for_its_precision_and_fits_a_page(folders):
+    for kind, folder in folders.items():
+        header, source = ((folder / f"boat.{end}").read_text() for end in "hc")
+        assert f"typedef {kind} boat_real;" in header
+        assert f"typedef {kind} real;" in source
+        assert max(map(len, f"{header}{source}".split("\n"))) <= 100
+
+
+def test_zeros_that_all_calls_keep_are_neither_read_nor_computed(folder):
+    """The factor's upper triangle: x[0] is the heading, x[1] the rate, x[2:6] the factor."""
+    source = (folder / "boat.c").read_text()
+    assert "x[4]" in source
+    assert "x[3]" not in source
+    assert "static const real factor[4] = {" in source
+
+
+def test_bits_are_those_of_the_states(folders, tmp_path):
+    """The checksum is FNV-1a over the words that -DPRINT_BITS prints."""
+    for kind, folder in folders.items():
+        out = tmp_path / kind
+        line = ["cc", "-DPRINT_BITS", "test.c", "boat.c", "-lm", "-o", str(out)]
+        subprocess.run(line, cwd=folder, check=True)
+        lines = subprocess.run([out], capture_output=True, text=True, check=True).stdout.split("\n")
+        bits = 14695981039346656037
+        words = [int(one, 16) for one in lines if len(one) in (8, 16)]
+        for word in words:
+            bits = (bits ^ word) * 1099511628211 % 2**64
+        assert f"bits of all states: {bits:016x}" in lines
+        dtype = np.float64 if kind == "double" else np.float32
+        last = np.array(words[-1], np.uint64 if kind == "double" else np.uint32).view(dtype)
+        assert np.isfinite(last)
+        assert len(words) % STEPS == 0
 
 
 def test_numbers_are_written_to_the_bit():

@@ -331,6 +331,7 @@ app.add_command(bench)
 )
 @option("--to", type=click.Path(path_type=Path), required=True, metavar="DIR", help="A new folder.")
 @option("--small/--fast", "small", default=True, help="Keep loops, or write them out.")
+@option("--float32", is_flag=True, help="Single precision, and what it costs.")
 @option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of the recorded run.")
 @SETTINGS
 @answers
@@ -339,7 +340,8 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
 
     DIR gets one file of C that needs math.h alone, a header that names all fields with their units,
     a page that says how to call it, and `make check`: it replays recorded steps and compares each
-    state and each code with those of this program.
+    state and each code with those of this program. With --float32 it runs the scenario in single
+    precision too, and tells what that costs against the simulated truth.
     """
     write(scenario, to, fast=not small, as_json=as_json, **options)
 

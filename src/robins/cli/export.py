@@ -16,11 +16,20 @@ def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
     workbench = importlib.import_module("robins.workbench")
     made = workbench.export_filter(scenario, to, **options)
     scalars = ", ".join(f"{name} {count}" for name, count in made.scalars.items())
+    costs = (
+        f"{made.cost.table()}\n\n{made.cost.codes_off} of {made.cost.codes} codes differ. "
+        f"{made.cost.verdict}\n\n"
+        if made.cost
+        else ""
+    )
     text = (
         f"Filter {made.filter} of {scenario} as C: {made.bytes / 1000.0:.0f} kB of text; "
         f"scalars of each call: {scalars}.\n\n"
+        f"{costs}"
         f"Wrote:  {to}/  {', '.join(made.files)}\n"
         f"Next:   make -C {to} check   compiles it here and replays recorded steps\n"
         f"        {to}/README.md says how to call it"
     )
-    say({**made._asdict(), "folder": str(to), "scenario": scenario}, text, as_json)
+    cost = made.cost and made.cost.as_data()
+    data = {**made._asdict(), "folder": str(to), "scenario": scenario, "cost": cost}
+    say(data, text, as_json)

@@ -6,6 +6,7 @@ is left out. What remains is emitted as C99, compiled, and called from Python; o
 
     trace        function -> `Program`
     trace_step   the same of a step from state to state, whose lasting zeros are structural
+    trace_steps  the same of several steps of one state
     to_c         `Program` -> text
     native       function -> the same function, compiled
     Memory       a state that stays in the memory of C, and compiled functions that step it
@@ -17,18 +18,22 @@ from robins.program.c import function, header, to_c
 from robins.program.memory import Memory
 from robins.program.native import CPP, FLAGS, LANE_FLAGS, Native, build, compiler, native
 from robins.program.nodes import Graph
+from robins.program.precision import DOUBLE, SINGLE, Precision
 from robins.program.refusal import BuildError, ProgramError
-from robins.program.trace import Leaf, Program, trace, trace_step
+from robins.program.trace import Leaf, Program, trace, trace_step, trace_steps
 
 __all__ = [
     "CPP",
+    "DOUBLE",
     "FLAGS",
     "LANE_FLAGS",
+    "SINGLE",
     "BuildError",
     "Graph",
     "Leaf",
     "Memory",
     "Native",
+    "Precision",
     "Program",
     "ProgramError",
     "build",
@@ -39,4 +44,5 @@ __all__ = [
     "to_c",
     "trace",
     "trace_step",
+    "trace_steps",
 ]

@@ -10,31 +10,38 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from importlib.resources import files
 
-import numpy as np
-
 from robins.program.nodes import Loop, Node
 from robins.program.operations import OPERATIONS
+from robins.program.precision import DOUBLE, Precision
 from robins.program.roll import Pack, Packing, Roll, stride
 from robins.program.trace import Program
+from robins.program.wrap import wrapped
 
 PREFIX = {"real": "r", "flag": "f", "whole": "i", "word": "u", "word64": "v"}
 POOL = {"real": "x", "flag": "k", "whole": "k", "word": "k", "word64": "k"}
 WIDEST = 60  # characters of a scalar that is written where it is used
 
 
-def header(name: str = "scalars.h") -> str:
-    """The text that a program stands on, for single numbers or for lanes."""
+def header(name: str = "scalars.h", precision: Precision = DOUBLE) -> str:
+    """The text that a program stands on, for one number at a time or, in doubles, for lanes."""
     folder = files("robins.program")
-    return "\n".join((folder / part).read_text("utf-8") for part in (name, "routines.h"))
+    parts = name, precision.sine, "routines.h"
+    return precision.text("\n".join((folder / part).read_text("utf-8") for part in parts))
 
 
-def function(program: Program, name: str = "robins_step", linkage: str = "") -> str:
+def function(
+    program: Program,
+    name: str = "robins_step",
+    linkage: str = "",
+    precision: Precision = DOUBLE,
+) -> str:
     """The function of a program: ``void name(const real *x, const whole *k, real *y, whole *m)``.
 
     x and y hold the reals of arguments and results, k and m all else, in the order of the leaves.
     The results may lie where the arguments do: they are written last.
     """
-    return "\n".join(_Writer(program).function(name, linkage)) + "\n"
+    lines = _Writer(program, precision).function(name, linkage)
+    return "\n".join(part for line in lines for part in wrapped(line)) + "\n"
 
 
 def to_c(program: Program, name: str = "robins_step") -> str:
@@ -45,8 +52,8 @@ def to_c(program: Program, name: str = "robins_step") -> str:
 class _Writer:
     """Writes one program, scope by scope."""
 
-    def __init__(self, program: Program):
-        self.program, self.graph = program, program.graph
+    def __init__(self, program: Program, precision: Precision):
+        self.program, self.graph, self.precision = program, program.graph, precision
         self.lines: list[str] = []
         self.names: dict[Node, str] = {}  # how a node is read
         self.inlined: set[Node] = set()
@@ -163,7 +170,7 @@ class _Writer:
         graph = self.graph
         match graph.op[node]:
             case "constant":
-                return literal(graph.value[node], graph.kind[node], bare)
+                return literal(graph.value[node], graph.kind[node], bare, self.precision)
             case "leaf":
                 scope, k = graph.value[node]
                 return f"WHOLE(n{scope})" if k < 0 else f"l{scope}_{k}"
@@ -228,12 +235,14 @@ class _Writer:
         self.lines += [f"{pad}    {line.rstrip(' ,')}", f"{pad}}};"]
 
     def _block(self, node: Node, depth: int) -> None:
+        """A call of a routine; its arguments are in braces, so that their memory serves again."""
         routine, sizes, count = self.graph.value[node]
         entries = [self._read(a) for a in self.graph.args[node]]
-        self._listed(f"real in{node}[{len(entries)}]", entries, depth)
         told = ", ".join([*map(str, sizes), f"in{node}", f"b{node}"])
         pad = "    " * depth
-        self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{routine}({told});"]
+        self.lines += [f"{pad}real b{node}[{count}];", f"{pad}{{"]
+        self._listed(f"real in{node}[{len(entries)}]", entries, depth + 1)
+        self.lines += [f"{pad}    {routine}({told});", f"{pad}}}"]
         self.names[node] = f"b{node}"
 
     def _loop(self, loop: Loop, node: Node, depth: int) -> None:
@@ -330,16 +339,10 @@ def live_inputs(program: Program) -> list[Node]:
     return [n for n in program.live if program.graph.op[n] == "input"]
 
 
-def literal(value: object, kind: str, bare: bool = False) -> str:
+def literal(value: object, kind: str, bare: bool = False, precision: Precision = DOUBLE) -> str:
     """A number in C; bare beside an operator, else in the macro of its kind."""
     if kind == "real":
-        number = float(value)  # type: ignore[arg-type]
-        if np.isnan(number):
-            text = "NAN"
-        elif np.isinf(number):
-            text = "INFINITY" if number > 0 else "-INFINITY"
-        else:
-            text = repr(number)
+        text = precision.number(value)
         return (f"({text})" if text.startswith("-") else text) if bare else f"REAL({text})"
     number = int(value)  # type: ignore[call-overload]
     if kind == "whole" and number == -(2**63):

@@ -1,7 +1,8 @@
 """A test of an exported library with the user's own compiler: recorded steps, replayed.
 
 `make check` in the folder compiles library and test, replays the recorded inputs, and compares the
-state after each step and every code with those of JAX.
+state after each step and every code with those of JAX. It also prints a checksum of the bits of all
+states, by which two compilers or two machines are compared.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ import jax
 import numpy as np
 
 from robins.program.library import C_TYPES, Entry, Field, Library, fields_of, number
+from robins.program.precision import DOUBLE, SINGLE, Precision
 
-TOLERANCE = 1e-9  # of the largest number that a field has in the record
+TOLERANCE = 1e-9  # of the largest number that a field has in the record; of a library of doubles
 
 MAKEFILE = """\
 # make check   compiles {name}.c and a test of it, and runs the test on recorded steps
 # make stack   says how much stack each function uses (gcc, clang)
 CC ?= cc
-CFLAGS ?= -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wpedantic
+CFLAGS ?= -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wpedantic -Wdouble-promotion
 
 .PHONY: check stack clean
 
@@ -38,6 +40,74 @@ clean:
 \trm -f test {name}.o {name}.su
 """
 
+# The word that holds the bits of a real, that of any NaN, and how it is printed: newlib's small
+# printf knows nothing wider than a long.
+BITS = {
+    DOUBLE: {
+        "word": "uint64_t",
+        "nan": "0x7ff8000000000000u",
+        "printed": '"%08lx%08lx\\n", (unsigned long)(word >> 32),\n'
+        + " " * 15
+        + "(unsigned long)(word & 0xffffffffu)",
+    },
+    SINGLE: {
+        "word": "uint32_t",
+        "nan": "0x7fc00000u",
+        "printed": '"%08lx\\n", (unsigned long)word',
+    },
+}
+
+BEGIN = """\
+#include "{name}.h"
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+#include "recorded.h"
+
+static double worst = 0.0; /* difference, in parts of a field */
+static int beyond = 0;     /* numbers that differ by more than they may */
+static uint64_t bits = 14695981039346656037u;
+
+static void compare(const {name}_real *found, const double *expected, int n, double size,
+                    double tolerance)
+{{
+    for (int i = 0; i < n; ++i) {{
+        const double here = (double)found[i];
+        const double off = fabs(here - expected[i]);
+        const double part = size > 0.0 ? off / size : off;
+        const int same = isnan(here) && isnan(expected[i]);
+        {word} word = {nan};
+        if (!isnan(here)) {{ memcpy(&word, &found[i], sizeof word); }}
+        bits = (bits ^ word) * 1099511628211u;
+#ifdef PRINT_BITS
+        printf({printed});
+#endif
+        if (!same && !(part <= worst)) {{ worst = isnan(part) ? (double)INFINITY : part; }}
+        if (!same && !(part <= tolerance)) {{ ++beyond; }}
+    }}
+}}
+
+int main(void)
+{{
+    static {name}_state state;
+    int wrong = 0;
+    {name}_init(&state);
+    for (int t = 0; t < STEPS; ++t) {{"""
+
+END = """\
+    }
+    const int good = wrong <= CODES_OFF && beyond == 0;
+    printf("%d steps: %d codes differ, numbers differ by %.1e of a field at most: %s\\n",
+           STEPS, wrong, worst, good ? "passed" : "FAILED");
+    printf("bits of all states: %08lx%08lx\\n", (unsigned long)(bits >> 32),
+           (unsigned long)(bits & 0xffffffffu));
+    if (sizeof RUINED > 1) {
+        printf("FAILED: %s\\n", RUINED);
+    }
+    return good && sizeof RUINED == 1 ? 0 : 1;
+}
+"""
+
 
 class Recorded(NamedTuple):
     """Steps of a filter.
@@ -47,11 +117,19 @@ class Recorded(NamedTuple):
             state, with a leading axis of steps.
         states: after each step.
         codes: (steps, entry points).
+        tolerances: of fields of the state, in parts of the largest number that a field has;
+            `TOLERANCE` of the others.
+        codes_off: how many codes may differ.
+        ruined: why the library is not to be used, however well it was compiled; its test says so
+            and fails.
     """
 
     given: Mapping[str, Sequence[Any]]
     states: Any
     codes: np.ndarray
+    tolerances: Mapping[str, float] = {}
+    codes_off: int = 0
+    ruined: str = ""
 
 
 def makefile(library: Library) -> str:
@@ -62,17 +140,24 @@ def makefile(library: Library) -> str:
 def recorded_h(library: Library, record: Recorded) -> str:
     """The record as C."""
     steps = len(record.codes)
-    lines = [f"#define STEPS {steps}", f"#define TOLERANCE {TOLERANCE!r}", ""]
+    lines = [
+        f"#define STEPS {steps}",
+        f"#define CODES_OFF {record.codes_off} /* that may differ */",
+        f'#define RUINED "{record.ruined}" /* why the library is not to be used */',
+        "",
+    ]
     for entry, name, fields, leaves in _tables(library, record):
         for f, leaf in zip(fields, leaves, strict=True):
-            lines += _table(f"{entry.name}_{name}_{f.name}", f, leaf)
+            lines += _table(f"{entry.name}_{name}_{f.name}", f, leaf, library.precision)
     kept = [f for f in library.state if f.is_real]
     states = [np.asarray(x) for x in jax.tree_util.tree_leaves(record.states)]
     reals = [x for x in states if x.dtype == np.float64 and x[0].size]
     for f, leaf in zip(kept, reals, strict=True):
-        lines += _table(f"state_{f.name}", f, leaf)
+        lines += _table(f"state_{f.name}", f, leaf, DOUBLE)
         size = np.max(np.abs(leaf), initial=0.0, where=np.isfinite(leaf))
         lines.append(f"static const double size_{f.name} = {float(size)!r};")
+        allowed = record.tolerances.get(f.name, TOLERANCE)
+        lines.append(f"static const double tolerance_{f.name} = {float(allowed)!r};")
     rows = ", ".join("{" + ", ".join(map(str, map(int, row))) + "}" for row in record.codes)
     lines.append(f"static const int codes[STEPS][{record.codes.shape[1]}] = {{{rows}}};")
     return "\n".join([*lines, ""])
@@ -89,10 +174,10 @@ def _tables(library: Library, record: Recorded):
             yield entry, name, fields_of(entry.program.inputs, j), some
 
 
-def _table(name: str, f: Field, leaf: np.ndarray) -> list[str]:
-    kind = "double" if f.is_real else C_TYPES[f.leaf.kind]
+def _table(name: str, f: Field, leaf: np.ndarray, precision: Precision) -> list[str]:
+    kind = precision.kind if f.is_real else C_TYPES[f.leaf.kind]
     rows = [
-        "    {" + ", ".join(number(x, f.is_real) for x in row.ravel().tolist()) + "}"
+        "    {" + ", ".join(number(x, f.is_real, precision) for x in row.ravel().tolist()) + "}"
         for row in leaf
     ]
     head = f"static const {kind} {name}[STEPS][{f.size}] = {{"
@@ -102,47 +187,15 @@ def _table(name: str, f: Field, leaf: np.ndarray) -> list[str]:
 def check_c(library: Library, record: Recorded) -> str:
     """The test."""
     name = library.name
-    lines = [
-        f'#include "{name}.h"',
-        *("#include <math.h>", "#include <stdio.h>", "#include <string.h>"),
-        *('#include "recorded.h"', ""),
-        "static double worst = 0.0;",
-        "",
-        "static void compare(const double *found, const double *expected, int n, double size)",
-        "{",
-        "    for (int i = 0; i < n; ++i) {",
-        "        const double off = fabs(found[i] - expected[i]);",
-        "        const double part = size > 0.0 ? off / size : off;",
-        "        if (!(part <= worst) && !(isnan(found[i]) && isnan(expected[i]))) {",
-        "            worst = isnan(part) ? INFINITY : part;",
-        "        }",
-        "    }",
-        "}",
-        "",
-        "int main(void)",
-        "{",
-        f"    static {name}_state state;",
-        "    int wrong = 0;",
-        f"    {name}_init(&state);",
-        "    for (int t = 0; t < STEPS; ++t) {",
-    ]
+    lines = [BEGIN.format(name=name, **BITS[library.precision])]
     for k, entry in enumerate(library.entries):
         lines += _called(library, entry, k)
     for f in library.state:
         if f.is_real:
             first = f.first("(&state)").replace("(&state)->", "state.")
-            told = f"{first}, state_{f.name}[t], {f.size}, size_{f.name}"
+            told = f"{first}, state_{f.name}[t], {f.size}, size_{f.name}, tolerance_{f.name}"
             lines.append(f"        compare({told});")
-    lines += [
-        "    }",
-        "    const int good = wrong == 0 && worst <= TOLERANCE;",
-        '    printf("%d steps: %d codes differ, numbers differ by %.1e of a field at most: %s\\n",',
-        '           STEPS, wrong, worst, good ? "passed" : "FAILED");',
-        "    return good ? 0 : 1;",
-        "}",
-        "",
-    ]
-    return "\n".join(lines)
+    return "\n".join([*lines, END])
 
 
 def _called(library: Library, entry: Entry, k: int) -> list[str]:

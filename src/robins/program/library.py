@@ -15,7 +15,9 @@ import jax
 import numpy as np
 
 from robins.program.c import function, header
+from robins.program.precision import DOUBLE, Precision
 from robins.program.trace import Leaf, Program
+from robins.program.wrap import COLUMNS, wrapped
 
 C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
 CODE = "code"  # of a result: what the entry point returns
@@ -67,7 +69,7 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
         root = re.match(r"[a-z]+\[(\d+)\]", leaf.path)
         assert root is not None
         if int(root[1]) == which and size > 0:
-            name = base = _identifier(leaf.path[root.end() :])
+            name = base = identifier(leaf.path[root.end() :])
             k = 2
             while name in taken:
                 name, k = f"{base}_{k}", k + 1
@@ -77,7 +79,7 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
     return found
 
 
-def _identifier(path: str) -> str:
+def identifier(path: str) -> str:
     """A path in a pytree as a name in C: attributes and indices, the belief's own left out."""
     words = re.findall(r"[A-Za-z_]\w*|\d+", path)
     words = words[1:] if words[:1] == ["belief"] else words
@@ -94,6 +96,7 @@ class Library(NamedTuple):
         start: the state to begin with.
         about: lines of comment for the head of both files.
         notes: what more to say of a field, by struct and name.
+        precision: of its reals.
     """
 
     name: str
@@ -101,6 +104,7 @@ class Library(NamedTuple):
     start: Any
     about: Sequence[str] = ()
     notes: dict[tuple[str, str], str] = {}  # noqa: RUF012 a default that nobody changes
+    precision: Precision = DOUBLE
 
     @property
     def state(self) -> list[Field]:
@@ -140,14 +144,15 @@ class Library(NamedTuple):
         """The header: types, structs, entry points."""
         guard = f"{self.name.upper()}_H"
         lines = [*self._head(), f"#ifndef {guard}", f"#define {guard}", "", "#include <stdint.h>"]
-        lines += ["", f"typedef double {self.name}_real;", ""]
+        lines += ["", f"typedef {self.precision.kind} {self.name}_real;", ""]
         for name, fields, about in self.structs():
             lines += [f"/* {about} */", "typedef struct {"]
             for f in fields:
                 kind = f"{self.name}_real" if f.is_real else C_TYPES[f.leaf.kind]
                 sizes = "".join(f"[{n}]" for n in f.leaf.shape)
-                note = self.notes.get((name, f.name), "")
-                lines.append(f"    {kind} {f.name}{sizes};" + (f" /* {note} */" if note else ""))
+                lines += _declared(
+                    f"    {kind} {f.name}{sizes};", self.notes.get((name, f.name), "")
+                )
             lines += [f"}} {self.name}_{name};", ""]
         lines += [
             "/* The state to begin with. */",
@@ -155,7 +160,7 @@ class Library(NamedTuple):
         ]
         for entry in self.entries:
             lines += ["", f"/* {entry.about} Returns its code. */", f"{self.signature(entry)};"]
-        return "\n".join([*lines, "", "#endif", ""])
+        return _text([*lines, "", "#endif", ""])
 
     def _head(self) -> list[str]:
         return ["/*", *(f" * {line}".rstrip() for line in self.about), " */"] if self.about else []
@@ -164,13 +169,21 @@ class Library(NamedTuple):
 
     def source(self) -> str:
         """The file: the scalars, the start, and each entry point around its program."""
-        lines = [*self._head(), f'#include "{self.name}.h"', "", header()]
-        for entry in self.entries:
-            lines.append(function(entry.program, f"of_{entry.name}", "static "))
+        lines = [*self._head(), f'#include "{self.name}.h"', "", self.programs("static ")]
         lines += self._init()
         for entry in self.entries:
             lines += self._entry(entry)
-        return "\n".join(lines) + "\n"
+        return _text(lines) + "\n"
+
+    def programs(self, linkage: str = "") -> str:
+        """The scalars, and the program of each entry point on bare arrays: a file of C by itself.
+
+        Its functions are ``of_ENTRY``, as `robins.program.function` writes them.
+        """
+        texts = [header(precision=self.precision)]
+        for entry in self.entries:
+            texts.append(function(entry.program, f"of_{entry.name}", linkage, self.precision))
+        return "\n".join(texts)
 
     def _init(self) -> list[str]:
         lines = [f"void {self.name}_init({self.name}_state *state)", "{"]
@@ -179,25 +192,36 @@ class Library(NamedTuple):
         kept = [leaf for leaf in leaves if leaf.size]
         for f, value in zip(self.state, kept, strict=True):
             kind = "real" if f.is_real else C_TYPES[f.leaf.kind]
-            entries = ", ".join(number(x, f.is_real) for x in value.ravel().tolist())
+            entries = ", ".join(
+                number(x, f.is_real, self.precision) for x in value.ravel().tolist()
+            )
             lines.append(f"    static const {kind} {f.name}[{f.size}] = {{{entries}}};")
             copies.append(f"    memcpy({f.first('state')}, {f.name}, sizeof {f.name});")
         return [*lines, *copies, "}", ""]
 
     def _entry(self, entry: Entry) -> list[str]:
         program, lines = entry.program, [self.signature(entry), "{"]
-        reals, others = counts(program.inputs)
-        made, told = counts(program.results)
-        lines += [f"    real x[{reals}], y[{made}];", f"    whole k[{others}], m[{told}];"]
+        # The program writes its results last, so that they may lie where the arguments do.
+        sizes = zip(counts(program.inputs), counts(program.results), strict=True)
+        reals, others = (max(pair) for pair in sizes)
+        lines += [f"    real x[{reals}];", f"    whole k[{others}];"]
         lines += _copied(self.state, "state", "x", "k", inwards=True)
         for j, name in enumerate(entry.takes):
             lines += _copied(fields_of(program.inputs, j + 1), name, "x", "k", inwards=True)
-        lines.append(f"    of_{entry.name}(x, k, y, m);")
-        lines += _copied(fields_of(program.results, 0), "state", "y", "m", inwards=False)
+        lines.append(f"    of_{entry.name}(x, k, x, k);")
+        lines += _copied(fields_of(program.results, 0), "state", "x", "k", inwards=False)
         result = self.result(entry)
-        lines += _copied(result, "result", "y", "m", inwards=False)
+        lines += _copied(result, "result", "x", "k", inwards=False)
         code = next(f for f in result if f.name == CODE)
-        return [*lines, f"    return (int)m[{code.at}];", "}", ""]
+        return [*lines, f"    return (int)k[{code.at}];", "}", ""]
+
+
+def _declared(text: str, note: str) -> list[str]:
+    """A field and its note: behind it where there is room, else before it."""
+    if not note:
+        return [text]
+    both = f"{text} /* {note} */"
+    return [both] if len(both) <= COLUMNS else [f"    /* {note} */", text]
 
 
 def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
@@ -208,15 +232,15 @@ def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:
     return max(sizes[True], 1), max(sizes[False], 1)
 
 
-def number(value: Any, real: bool) -> str:
+def number(value: Any, real: bool, precision: Precision = DOUBLE) -> str:
     """A number in C, to the bit."""
-    if not real:
-        return str(int(value))
-    if np.isnan(value):
-        return "NAN"
-    if np.isinf(value):
-        return "INFINITY" if value > 0 else "-INFINITY"
-    return repr(float(value))
+    return precision.number(value) if real else str(int(value))
+
+
+def _text(lines: Sequence[str]) -> str:
+    """Lines as a text; those that are too long are broken."""
+    split = (one for line in lines for one in line.split("\n"))
+    return "\n".join(part for one in split for part in wrapped(one))
 
 
 def _copied(

@@ -1,6 +1,6 @@
 /* What is made of scalars: the same text for one number and for lanes. No branch on data but three:
-   beyond a million radians the sine is the C library's, eigenvalues end when they are found, and
-   what is far out in the tail of an error function has polynomials of its own. */
+   beyond FAR radians the sine is the C library's, eigenvalues end when they are found, and what is
+   far out in the tail of an error function has polynomials of its own. */
 
 static inline real real_div(real a, real b) { return a / b; }
 
@@ -39,34 +39,12 @@ static inline flag real_lt_to(real a, real b)
 
 static inline flag real_le_to(real a, real b) { return real_le(a, b) | real_ne(b, b); }
 
-/* Sine and cosine: x = k pi/2 + r, |r| <= pi/4, with pi/2 in three parts of which the first two
-   have 33 bits, so that k times them is exact; then near-minimax polynomials of degree 13 and 14
-   (errors below 2e-17, so that rounding decides). Within 1.7e-16 of the sine for |x| <= 1e6: r is
-   rounded twice, the polynomial once, at numbers below one. */
-static inline void real_turned(real x, real *sine, real *cosine, whole *quarter)
-{
-    const real k = real_round_even(x * 0.6366197723675814);
-    const real r = ((x - k * 1.5707963267341256) - k * 6.077100506303966e-11)
-                   - k * 2.0222662487959506e-21;
-    const real z = r * r;
-    const real s = ((((z * 1.5917988979397432e-10 - 2.5051129896450185e-08) * z
-                      + 2.7557316093198404e-06) * z - 1.9841269836740532e-04) * z
-                    + 8.333333333330936e-03) * z - 0.16666666666666666;
-    const real c = ((((z * -1.138254464534925e-11 + 2.087614504941318e-09) * z
-                      - 2.755731726587808e-07) * z + 2.48015872987544e-05) * z
-                    - 1.3888888888887389e-03) * z + 0.041666666666666664;
-    const real half = z * 0.5;
-    const real w = REAL(1.0) - half;
-    *sine = r + r * (z * s);
-    *cosine = w + (((REAL(1.0) - w) - half) + (z * z) * c);
-    *quarter = whole_of_real(k);
-}
-
+/* Sine and cosine of any angle, by `real_turned`, in whose file they are said to err how far. */
 static inline real real_sin(real x)
 {
     real s, c;
     whole k;
-    const flag far = real_lt(REAL(1e6), real_abs(x));
+    const flag far = real_lt(FAR, real_abs(x));
     real_turned(x, &s, &c, &k);
     s = real_select(whole_ne(k & 1, WHOLE(0)), c, s);
     s = real_select(whole_ne(k & 2, WHOLE(0)), -s, s);
@@ -78,7 +56,7 @@ static inline real real_cos(real x)
 {
     real s, c;
     whole k;
-    const flag far = real_lt(REAL(1e6), real_abs(x));
+    const flag far = real_lt(FAR, real_abs(x));
     real_turned(x, &s, &c, &k);
     c = real_select(whole_ne(k & 1, WHOLE(0)), s, c);
     c = real_select(whole_ne((k + 1) & 2, WHOLE(0)), -c, c);
@@ -373,17 +351,17 @@ static inline void lu(int m, int n, real *in, real *out)
     const int steps = m < n ? m : n;
     real *pivot = out + m * n, *order = pivot + steps;
     for (int i = 0; i < m * n; ++i) { out[i] = in[i]; }
-    for (int i = 0; i < m; ++i) { order[i] = REAL((double)i); }
+    for (int i = 0; i < m; ++i) { order[i] = real_of_whole(WHOLE(i)); }
     for (int k = 0; k < steps; ++k) {
         real most = real_abs(out[k * n + k]);
-        pivot[k] = REAL((double)k);
+        pivot[k] = real_of_whole(WHOLE(k));
         for (int i = k + 1; i < m; ++i) {
             const flag more = real_lt(most, real_abs(out[i * n + k]));
             most = real_select(more, real_abs(out[i * n + k]), most);
-            pivot[k] = real_select(more, REAL((double)i), pivot[k]);
+            pivot[k] = real_select(more, real_of_whole(WHOLE(i)), pivot[k]);
         }
         for (int i = k + 1; i < m; ++i) {
-            const flag here = real_eq(pivot[k], REAL((double)i));
+            const flag here = real_eq(pivot[k], real_of_whole(WHOLE(i)));
             for (int j = 0; j < n; ++j) {
                 const real up = out[k * n + j], low = out[i * n + j];
                 out[k * n + j] = real_select(here, low, up);

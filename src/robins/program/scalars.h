@@ -67,22 +67,24 @@ CONVERTED(word64, word)
 /* Towards zero; what is beyond all whole numbers is the last of them, and NaN is 0. */
 static inline whole whole_of_real(real a)
 {
-    if (a >= 9223372036854775807.0) { return INT64_MAX; }
+    if (a >= 9223372036854775808.0) { return INT64_MAX; }
     if (a <= -9223372036854775808.0) { return INT64_MIN; }
     return a == a ? (whole)a : 0;
 }
 
+/* The bits are those of double precision, whatever a real is. */
 static inline real real_bits_word64(word64 a)
 {
-    real x;
+    double x;
     memcpy(&x, &a, sizeof x);
-    return x;
+    return (real)x;
 }
 
 static inline word64 word64_bits_real(real a)
 {
+    const double given = (double)a;
     word64 x;
-    memcpy(&x, &a, sizeof x);
+    memcpy(&x, &given, sizeof x);
     return x;
 }
 
@@ -116,7 +118,10 @@ FROM_C(far_sin, sin)
 FROM_C(far_cos, cos)
 #undef FROM_C
 
-static inline real real_atan2(real a, real b) { return atan2(a, b); }
-static inline real real_pow(real a, real b) { return pow(a, b); }
-static inline real real_rem(real a, real b) { return fmod(a, b); }
-static inline real real_nextafter(real a, real b) { return nextafter(a, b); }
+#define FROM_C2(name, function) \
+    static inline real real_##name(real a, real b) { return function(a, b); }
+FROM_C2(atan2, atan2)
+FROM_C2(pow, pow)
+FROM_C2(rem, fmod)
+FROM_C2(nextafter, nextafter)
+#undef FROM_C2

@@ -203,7 +203,7 @@ class Loop:
             return
         body, zeros = self.body, {k: zero_in_all(g) for k, g in enumerate(begin) if k}
         try:
-            program = lasting(lambda some: body.program(known, some, self._unroll), zeros)
+            (program,) = lasting(lambda some: [body.program(known, some, self._unroll)], zeros)
             stays = len(body.stays) - len(known)
             axis = self.axis
             self.rounds = Rounds(program, axis.length, len(begin), stays, axis.backwards)

@@ -229,11 +229,7 @@ def trace_step(
 ) -> Program:
     """A step from a state to the next, ``(state, *args) -> (state, ...)``, as a program.
 
-    Zeros of the state that every step leaves zero are structural, such as those above the diagonal
-    of a factor. Which they are follows by induction: those are tried that are zero in the state
-    given; those are dropped for which the next state has anything but a known zero; and so on until
-    none is dropped. The program is for states that have them, as the one given and all that follow
-    from it; `Native` refuses others.
+    Zeros of the state that every step leaves zero are structural, as in `trace_steps`.
 
     Args:
         function: the step; the first of its results has the structure of the state.
@@ -244,16 +240,41 @@ def trace_step(
     Raises:
         ProgramError: as in `trace`; or the first result is no state.
     """
-    jaxpr, given, results = _jaxpr(function, (state, *args))
+    return trace_steps([(function, args)], state, unroll=unroll)[0]
+
+
+def trace_steps(
+    steps: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]],
+    state: Any,
+    unroll: int | None = UNROLL,
+) -> list[Program]:
+    """Steps that change one state, each ``(state, *args) -> (state, ...)``, as programs.
+
+    Zeros of the state that all steps leave zero are structural, such as those above the diagonal
+    of a factor. Which they are follows by induction: those are tried that are zero in the state
+    given; those are dropped for which any step leaves anything but a known zero; and so on until
+    none is dropped. The programs are for states that have them, as the one given and all that
+    follow from it; `Native` refuses others.
+
+    Args:
+        steps: functions, and their arguments after the state.
+        state: as in `trace_step`.
+        unroll: as in `trace`.
+
+    Raises:
+        ProgramError: as in `trace_step`.
+    """
     leaves, tree = jax.tree_util.tree_flatten(state)
-    first = results[0] if isinstance(results, tuple) and results else None
-    if jax.tree_util.tree_structure(first) != tree:
-        raise ProgramError(
-            "the first result of a step has another structure than its state",
-            fix="return (state, ...)",
-        )
+    jaxprs = [_jaxpr(function, (state, *args)) for function, args in steps]
+    for _, _, results in jaxprs:
+        first = results[0] if isinstance(results, tuple) and results else None
+        if jax.tree_util.tree_structure(first) != tree:
+            raise ProgramError(
+                "the first result of a step has another structure than its state",
+                fix="return (state, ...)",
+            )
     zeros = {k: positive_zeros(numbers_of(leaf)) for k, leaf in enumerate(leaves)}
-    return lasting(lambda zeros: _program(jaxpr, given, results, unroll, zeros), zeros)
+    return lasting(lambda zeros: [_program(*jaxpr, unroll, zeros) for jaxpr in jaxprs], zeros)
 
 
 def positive_zeros(a: np.ndarray) -> np.ndarray:
@@ -266,20 +287,21 @@ def positive_zeros(a: np.ndarray) -> np.ndarray:
 Zeros = dict[int, np.ndarray]  # of an argument, by its number, entries that are zero
 
 
-def lasting(made: Callable[[Zeros], Program], zeros: Zeros) -> Program:
-    """The program of a step, with those of some zeros of its state that last.
+def lasting(made: Callable[[Zeros], list[Program]], zeros: Zeros) -> list[Program]:
+    """The programs of steps that change one state, with those of some zeros of it that last.
 
     Args:
-        made: the program that takes some entries of its first arguments for zero, whose next values
-            its first results are.
+        made: the programs that take some entries of their first arguments for zero, whose next
+            values their first results are.
         zeros: the entries to try.
     """
     while True:
-        program = made(zeros)
-        zero = program.graph.constant(0, "real")
-        kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in zeros.items()}
+        programs, kept = made(zeros), zeros
+        for program in programs:
+            zero = program.graph.constant(0, "real")
+            kept = {k: np.asarray(m & (program.outputs[k] == zero)) for k, m in kept.items()}
         if all(np.array_equal(kept[k], zeros[k]) for k in zeros):
-            return program
+            return programs
         zeros = kept
 
 

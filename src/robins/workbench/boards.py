@@ -11,36 +11,23 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 from robins import __version__, _float64, scenario
-from robins.campaign.monte_carlo import solved, worlds
-from robins.filters import SENTENCES, Belief, Filter, Model, StepInfo
-from robins.program import trace
+from robins.filters import SENTENCES
+from robins.program import DOUBLE, SINGLE, Precision, trace_steps
 from robins.program.harness import Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library
-from robins.systems.study import Case, Problem
+from robins.systems.study import Problem
+from robins.workbench.board_runs import BoardRun, board_runs, by_jax, entry_functions
+from robins.workbench.board_words import components, field_notes, tangent_axes
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.scenarios import check_filters, find_scenario, study_of
+from robins.workbench.single_precision import Cost, Made, cost, differences, in_floats
 
 STEPS = 60  # of a run, recorded for the test
+RUNS = 3  # by which the cost of single precision is told
+MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
-
-
-class Told(NamedTuple):
-    """What a prediction tells on a board."""
-
-    code: Array
-
-
-class Used(NamedTuple):
-    """What an update tells on a board."""
-
-    code: Array
-    nis: Array
-    dof: Array
-    innovation: Array
-    used: Array
 
 
 class Exported(NamedTuple):
@@ -51,6 +38,8 @@ class Exported(NamedTuple):
     filter: str
     scalars: Mapping[str, int]  # of each entry point, nodes of its program
     bytes: int  # of the C
+    real: str  # the type of its reals
+    cost: Cost | None  # of single precision
 
 
 def export_filter(
@@ -59,6 +48,7 @@ def export_filter(
     *,
     filter_name: str = "",
     fast: bool = False,
+    float32: bool = False,
     seed: int = 0,
     settings: Sequence[str] = (),
 ) -> Exported:
@@ -69,6 +59,7 @@ def export_filter(
         to: a folder that is not there yet, or is empty.
         filter_name: by default that of the system, else the first of the scenario.
         fast: write loops out; larger, and faster where the code fits into the cache.
+        float32: reals in single precision, with a report of what that costs.
         seed: of the run that is recorded for the test.
         settings: "path=value" texts that change the scenario.
 
@@ -76,6 +67,8 @@ def export_filter(
         InputError: there is no such scenario or filter, or the folder holds something.
         robins.program.ProgramError: the filter does what has no place in C yet; the message names
             the line of the model or the rule.
+        robins.program.BuildError: single precision is asked for, and there is no compiler here by
+            which to tell what it costs.
     """
     _float64.require()
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
@@ -88,7 +81,9 @@ def export_filter(
     check_filters(label, study.filters, [wanted])
     with refusing(name):
         problem = study.problem(parameters, (wanted,), seed)
-    library, record = _library(problem, wanted, label, None if fast else SMALL)
+    precision = SINGLE if float32 else DOUBLE
+    unroll = None if fast else SMALL
+    library, record, found = _library(problem, wanted, label, unroll, precision)
     c = library.source()
     files = {
         f"{library.name}.h": library.header(),
@@ -96,125 +91,79 @@ def export_filter(
         "recorded.h": recorded_h(library, record),
         "test.c": check_c(library, record),
         "Makefile": makefile(library),
-        "README.md": _readme(library, wanted, label),
+        "README.md": _readme(library, wanted, label, found),
     }
     _write(to, files)
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
-    return Exported(to, tuple(files), wanted, scalars, len(c))
+    return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found)
 
 
 def _library(
-    problem: Problem, name: str, label: str, unroll: int | None
-) -> tuple[Library, Recorded]:
-    """The filter as a library, and some steps of it by JAX."""
+    problem: Problem, name: str, label: str, unroll: int | None, precision: Precision
+) -> tuple[Library, Recorded, Cost | None]:
+    """The filter as a library, some steps of it by JAX, and what single precision costs."""
     contender = problem.contenders[name]
-    filter_, model = contender.filter, contender.model
-    batch, _ = next(iter(worlds(problem, 1, 1)))
-    world = jax.tree_util.tree_map(lambda a: a[0], batch)
-    _, case, _ = solved(filter_, model, contender.case(world), lambda step: ())
-    start = case.start
-    state = filter_.init(start, model.dims) if isinstance(start, Belief) else start
-    given = _given(case, model)
-    functions = _functions(filter_, model, given)
-    first = jax.tree_util.tree_map(lambda a: a[0], given)
+    single = precision is SINGLE
+    runs = board_runs(problem, name, RUNS if single else 1)
+    run = runs[0]
+    functions = entry_functions(contender.filter, contender.model, run.given)
+    first = run.row(0)
+    state = _any_start(runs)
+    programs = trace_steps([(functions[e], first[e]) for e in functions], state, unroll=unroll)
     entries = [
         Entry(
             entry,
-            trace(functions[entry], state, *first[entry], unroll=unroll),
+            program,
             ("input",) if entry == "predict" else ("reading", "about"),
             "Moves on by one step." if entry == "predict" else f"Uses a reading of {entry[7:]}.",
         )
-        for entry in given
+        for entry, program in zip(functions, programs, strict=True)
     ]
-    record = _recorded(functions, state, given)
-    identity = hashlib.sha256(repr([e.program.graph.op for e in entries]).encode()).hexdigest()
+    belief = run.start.belief
+    axes = tangent_axes(problem, contender.reported, len(belief.factor))
+    notes = field_notes(problem, axes, belief.mean, run.given)
+    library = Library("robins", entries, run.start, (), notes, precision)
+    identity = hashlib.sha256((library.header() + library.source()).encode()).hexdigest()
     about = (
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",
         "SI units and radians. NaN is missing, for each component of a reading.",
-        *_components(problem, contender.reported),
+        *(["Single precision: README.md says what that costs."] if single else []),
+        *components(axes),
     )
-    return Library("robins", entries, state, about, _notes(problem, given)), record
+    library = library._replace(about=about)
+    if not single:
+        short = run.cut(STEPS)
+        return library, Recorded(short.given, *by_jax(functions, short)), None
+    doubles = [by_jax(functions, one) for one in runs]
+    singles = in_floats(library, runs)
+    found = cost(problem, contender, library, runs, doubles, singles)
+    record = _record(library, run, doubles[0], singles[0])
+    return library, record._replace(ruined="" if found.bearable else found.verdict), found
 
 
-def _given(case: Case, model: Model) -> dict[str, tuple[Any, ...]]:
-    """What each entry point takes after the state, with a leading axis of steps."""
+def _any_start(runs: Sequence[BoardRun]) -> Any:
+    """A state that is zero only where the starts of all runs are."""
 
-    def cut(tree: Any) -> Any:
-        return jax.tree_util.tree_map(lambda a: np.asarray(a)[:STEPS], tree)
+    def either(first: Any, *others: Any) -> Any:
+        for other in others:
+            first = np.where(np.asarray(first) == 0, other, first)
+        return first
 
-    given: dict[str, tuple[Any, ...]] = {"predict": (cut(case.u),)}
-    for sensor in model.sensors:
-        if sensor.name in case.y:
-            row = cut(case.y[sensor.name]), cut(case.aux.get(sensor.name))
-            given[f"update_{sensor.name}"] = row
-    return given
+    return jax.tree_util.tree_map(either, *(run.start for run in runs))
 
 
-def _functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry points as functions of JAX."""
-
-    def predict(state: Any, u: Any):
-        state, prediction = filter_.predict(state, model.motion, u)
-        return state, Told(prediction.code)
-
-    def update(name: str) -> Any:
-        sensor = model.sensor(name)
-
-        def use(state: Any, y: Any, aux: Any):
-            state, info = filter_.update(state, sensor, y, aux)
-            return state, _told(info)
-
-        return use
-
-    return {n: predict if n == "predict" else update(n.removeprefix("update_")) for n in names}
+def _record(library: Library, run: BoardRun, doubles: Made, singles: Made) -> Recorded:
+    """The first steps in doubles, and how far off floats may be: a margin beside what they are."""
+    short = run.cut(STEPS).given
+    (wide, codes), (narrow, others) = (
+        jax.tree_util.tree_map(lambda a: a[:STEPS], made) for made in (doubles, singles)
+    )
+    parts = differences(library, wide, narrow)
+    tolerances = {f: max(MARGIN * part, LEAST) for f, part in parts.items() if np.isfinite(part)}
+    return Recorded(short, wide, codes, tolerances, int(np.sum(codes != others)))
 
 
-def _told(info: StepInfo) -> Used:
-    return Used(info.code, info.nis, info.dof, info.innovation, info.used)
-
-
-def _recorded(functions: Mapping[str, Any], state: Any, given: Mapping[str, Any]) -> Recorded:
-    """The steps by JAX."""
-    compiled = {name: jax.jit(function) for name, function in functions.items()}
-    count = min(len(a) for a in jax.tree_util.tree_leaves(given))
-    states, codes = [], []
-    for k in range(count):
-        row = []
-        for name, step in compiled.items():
-            state, told = step(state, *jax.tree_util.tree_map(lambda a, k=k: a[k], given[name]))
-            row.append(int(told.code))
-        states.append(state)
-        codes.append(row)
-    stacked = jax.tree_util.tree_map(lambda *a: np.stack([np.asarray(x) for x in a]), *states)
-    return Recorded(given, stacked, np.array(codes))
-
-
-def _components(problem: Problem, reported: Any) -> list[str]:
-    """What the components of a factor are, where they are those that are reported."""
-    lines = ["factor is lower triangular, covariance P = factor factor' of the error."]
-    if reported is None:
-        for block in problem.blocks:
-            first, last = block.where.start, block.where.stop - 1
-            axes = ", ".join(block.axes)
-            lines.append(
-                f"  {first} to {last}: {block.name} [{block.units}], {block.frame}: {axes}"
-            )
-    return lines
-
-
-def _notes(problem: Problem, given: Mapping[str, Any]) -> dict[tuple[str, str], str]:
-    """Units and axes of readings and innovations."""
-    notes = {("state", "current"): "the last prediction was taken"}
-    for entry in given:
-        axes = problem.sensors.get(entry.removeprefix("update_"))
-        if axes is not None:
-            told = f"{axes.units}, {axes.frame}: {', '.join(axes.axes)}"
-            notes[f"{entry}_reading", "value"] = told
-            notes[f"{entry}_result", "innovation"] = told
-    return notes
-
-
-def _readme(library: Library, name: str, label: str) -> str:
+def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
     """One page for who compiles it."""
     n, calls = library.name, "\n".join(f"    {library.signature(e)};" for e in library.entries)
     codes = "\n".join(f"| {int(code)} | {sentence} |" for code, sentence in SENTENCES.items())
@@ -241,6 +190,27 @@ is missing is NaN. Each call returns a code:
 
 The state belongs to these functions: read it, copy it, but change it by `{n}_init` and the calls
 only.
+{_costs(found)}"""
+
+
+def _costs(found: Cost | None) -> str:
+    """The part of the page on single precision."""
+    if found is None:
+        return ""
+    return f"""
+## Single precision
+
+**{found.verdict}**
+
+{found.runs} runs of the scenario, {found.steps} steps each, by this library as compiled on the
+machine that exported it, given the same readings rounded to floats; in double precision by JAX.
+{found.codes_off} of {found.codes} codes differ.
+
+{found.table()}
+
+`make check` compares with double precision. What it allows is {MARGIN:.0f} times what single
+precision was found to cost in the recorded steps, and at least {LEAST:.0e} of a field: see
+`recorded.h`.{" It fails, since the filter is ruined." if not found.bearable else ""}
 """
 
 

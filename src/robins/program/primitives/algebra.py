@@ -162,9 +162,10 @@ def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes,
     m, n = A.shape
     zero, one = constant(0, "real"), constant(1, "real")
     width = m if full else min(m, n)
+    upper = np.arange(width)[:, None] <= np.arange(n)
     if walk.stays_whole(2 * m * n * n):
         Q, R = call(walk, "householder", [m, n, width], [A], [(m, width), (width, n)])
-        return Q, R
+        return Q, np.where(upper, R, zero)
     R = A.copy()
     reflections = []
     for k in range(min(m - 1, n)):
@@ -191,7 +192,7 @@ def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes,
         for k, v, g in reversed(reflections):
             for j in range(k, width):
                 _reflect(walk, Q, j, v, g)
-    return Q, np.where(np.arange(width)[:, None] <= np.arange(n), R[:width], zero)
+    return Q, np.where(upper, R[:width], zero)
 
 
 def _reflect(walk: Walk, A: Nodes, j: int, v: list[tuple[int, Node]], g: Node) -> None:

@@ -1,0 +1,21 @@
+"""Lines of C that fit a page."""
+
+from __future__ import annotations
+
+COLUMNS = 100
+
+
+def wrapped(line: str) -> list[str]:
+    """A line as several of at most 100 columns, broken at spaces, after commas if there are any."""
+    begin = line[: len(line) - len(line.lstrip())]
+    lines = []
+    while len(line) > COLUMNS and not line.startswith("#"):
+        least = len(begin) + 24  # a piece shorter than that is no line
+        comma, space = line.rfind(", ", least, COLUMNS), line.rfind(" ", least, COLUMNS)
+        is_code = "/*" not in line and "*/" not in line
+        at = comma + 1 if comma > 0 and is_code else space
+        if at <= 0:
+            break
+        lines.append(line[:at])
+        line = f"{begin}    {line[at + 1 :]}"
+    return [*lines, line]

@@ -1,0 +1,124 @@
+"""Runs of a filter by its entry points: what a board is given, and what JAX makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins.campaign.monte_carlo import solved, worlds
+from robins.filters import Belief, Filter, Model, StepInfo
+from robins.systems.study import Case, Problem
+
+
+class Told(NamedTuple):
+    """What a prediction tells on a board."""
+
+    code: Array
+
+
+class Used(NamedTuple):
+    """What an update tells on a board."""
+
+    code: Array
+    nis: Array
+    dof: Array
+    innovation: Array
+    used: Array
+
+
+class BoardRun(NamedTuple):
+    """A simulated run.
+
+    Attributes:
+        case: with the truth and all that the filter is given, also where it ran in closed loop.
+        start: the state of the filter that it begins with.
+        given: of each entry point, in the order in which a step calls them, its arguments after the
+            state, with a leading axis of steps.
+    """
+
+    case: Case
+    start: Any
+    given: dict[str, tuple[Any, ...]]
+
+    @property
+    def steps(self) -> int:
+        """How many steps it has."""
+        return len(jax.tree_util.tree_leaves(self.given)[0])
+
+    def cut(self, steps: int) -> BoardRun:
+        """Its first steps."""
+        given = jax.tree_util.tree_map(lambda a: a[:steps], self.given)
+        return self._replace(given=given)
+
+    def row(self, k: int) -> dict[str, tuple[Any, ...]]:
+        """What is given in one step."""
+        return jax.tree_util.tree_map(lambda a: a[k], self.given)
+
+
+def board_runs(problem: Problem, name: str, count: int) -> list[BoardRun]:
+    """The first runs of a problem as one of its filters is given them."""
+    contender = problem.contenders[name]
+    model, found = contender.model, []
+    for batch, _ in worlds(problem, count, 1):
+        world = jax.tree_util.tree_map(lambda a: a[0], batch)
+        _, case, _ = solved(contender.filter, model, contender.case(world), lambda step: ())
+        start = case.start
+        state = contender.filter.init(start, model.dims) if isinstance(start, Belief) else start
+        state = jax.tree_util.tree_map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), state)
+        found.append(BoardRun(case, state, _given(case, model)))
+    return found
+
+
+def _given(case: Case, model: Model) -> dict[str, tuple[Any, ...]]:
+    arrays = partial(jax.tree_util.tree_map, np.asarray)
+    given: dict[str, tuple[Any, ...]] = {"predict": (arrays(case.u),)}
+    for sensor in model.sensors:
+        if sensor.name in case.y:
+            row = arrays(case.y[sensor.name]), arrays(case.aux.get(sensor.name))
+            given[f"update_{sensor.name}"] = row
+    return given
+
+
+def entry_functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry points as functions of JAX, ``(state, *args) -> (state, what it tells)``."""
+
+    def predict(state: Any, u: Any):
+        state, prediction = filter_.predict(state, model.motion, u)
+        return state, Told(prediction.code)
+
+    def update(name: str) -> Any:
+        sensor = model.sensor(name)
+
+        def use(state: Any, y: Any, aux: Any):
+            state, info = filter_.update(state, sensor, y, aux)
+            return state, _told(info)
+
+        return use
+
+    return {n: predict if n == "predict" else update(n.removeprefix("update_")) for n in names}
+
+
+def _told(info: StepInfo) -> Used:
+    return Used(info.code, info.nis, info.dof, info.innovation, info.used)
+
+
+def by_jax(functions: Mapping[str, Any], run: BoardRun) -> tuple[Any, np.ndarray]:
+    """States after each step, and codes (steps, entry points)."""
+
+    def step(state: Any, row: Any):
+        codes = []
+        for name, function in functions.items():
+            state, told = function(state, *row[name])
+            codes.append(told.code)
+        return state, (state, jnp.stack(codes))
+
+    states, codes = jax.jit(lambda state, rows: jax.lax.scan(step, state, rows)[1])(
+        run.start, run.given
+    )
+    return jax.tree_util.tree_map(np.asarray, states), np.asarray(codes)

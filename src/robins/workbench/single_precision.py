@@ -1,0 +1,286 @@
+"""What single precision costs a filter: its own runs in floats, beside doubles and the truth.
+
+The library is compiled on this machine and given what the filter was given, rounded to floats. What
+comes out is compared with double precision number by number, and both with the simulated truth.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins import units
+from robins.campaign.monte_carlo import reported_rows
+from robins.filters.analysis.consistency import normalised_sq
+from robins.manifold import local
+from robins.program import FLAGS, build
+from robins.program.library import Library, counts
+from robins.systems.study import Contender, Problem
+from robins.workbench.board_runs import BoardRun
+
+LITTLE, MUCH = 1.01, 1.1  # growth of an error: below the one it does not show, above the other ...
+SEVERAL = 0.01  # ... or with this share of other codes, or of the NEES, the filter is another one
+
+# What is called some thousand times is not worth optimising; the bits are the same without.
+QUICK = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
+
+
+class BlockCost(NamedTuple):
+    """A block of the error against the truth, over the steps that count.
+
+    Attributes:
+        name: of the block.
+        unit: of the RMS.
+        rms: root mean square of the components, in double precision.
+        rms_single: the same in single precision.
+        nees: normalised error squared over the number of components; one is right.
+        nees_single: the same in single precision.
+    """
+
+    name: str
+    unit: str
+    rms: float
+    rms_single: float
+    nees: float
+    nees_single: float
+
+    @property
+    def growth(self) -> float:
+        """By what single precision multiplies the RMS, or the NEES if that moves further."""
+        with np.errstate(all="ignore"):
+            factor = np.divide(self.rms_single, self.rms)
+            ratio = np.divide(self.nees_single, self.nees)
+            found = float(max(factor, ratio, 1.0 / ratio)) if np.isfinite(self.nees) else factor
+        return float(found) if np.isfinite(self.rms_single) else math.inf
+
+
+class Cost(NamedTuple):
+    """What single precision costs.
+
+    Attributes:
+        runs: how many runs were compared.
+        steps: of each.
+        fields: of each field of the state, the largest difference over the largest number.
+        blocks: errors against the truth.
+        codes: how many codes were compared.
+        codes_off: how many of them differ.
+        finite: whether the state is finite wherever that of double precision is.
+    """
+
+    runs: int
+    steps: int
+    fields: Mapping[str, float]
+    blocks: Sequence[BlockCost]
+    codes: int
+    codes_off: int
+    finite: bool
+
+    @property
+    def bearable(self) -> bool:
+        """Whether the filter is still the one that was judged."""
+        grows = max((b.growth for b in self.blocks), default=1.0)
+        return self.finite and grows <= MUCH and self.codes_off <= SEVERAL * self.codes
+
+    @property
+    def verdict(self) -> str:
+        """A sentence for who decides."""
+        if not self.finite:
+            return "Single precision RUINS this filter: its state does not stay finite."
+        worst = max(self.blocks, key=lambda b: b.growth)
+        moved = (
+            f"{worst.name}: RMS {worst.rms:.4g} becomes {worst.rms_single:.4g} {worst.unit}, "
+            f"NEES {worst.nees:.3g} becomes {worst.nees_single:.3g}"
+        )
+        if worst.growth > MUCH:
+            return f"Single precision RUINS this filter: {moved}."
+        if not self.bearable:
+            share = self.codes_off / self.codes
+            return f"Single precision RUINS this filter: {share:.1%} of its codes are others."
+        if worst.growth > LITTLE:
+            return f"Single precision costs something: {moved}."
+        return "Single precision costs nothing that shows in the errors."
+
+    def as_data(self) -> dict[str, Any]:
+        """For scripts; what is not finite is None."""
+
+        def sound(x: float) -> float | None:
+            return x if math.isfinite(x) else None
+
+        return {
+            **{k: getattr(self, k) for k in ("runs", "steps", "codes", "codes_off", "finite")},
+            "bearable": self.bearable,
+            "verdict": self.verdict,
+            "fields": {name: sound(x) for name, x in self.fields.items()},
+            "blocks": [
+                {k: sound(v) if isinstance(v, float) else v for k, v in b._asdict().items()}
+                for b in self.blocks
+            ],
+        }
+
+    def table(self) -> str:
+        """The blocks and the fields as tables in Markdown."""
+        rows = [
+            "| error | unit | RMS, double | RMS, single | NEES, double | NEES, single |",
+            "|---|---|---|---|---|---|",
+        ]
+        rows += [
+            f"| {b.name} | {b.unit} | {b.rms:.4g} | {b.rms_single:.4g} | {b.nees:.4g} "
+            f"| {b.nees_single:.4g} |"
+            for b in self.blocks
+        ]
+        rows += ["", "| field of the state | largest difference, parts of the field |", "|---|---|"]
+        rows += [f"| {name} | {part:.1e} |" for name, part in self.fields.items()]
+        return "\n".join(rows)
+
+
+def in_floats(library: Library, runs: Sequence[BoardRun]) -> list[tuple[Any, np.ndarray]]:
+    """States after each step, and codes (steps, entry points), by the library compiled here.
+
+    Raises:
+        BuildError: there is no compiler.
+    """
+    loaded = ctypes.CDLL(str(build(library.programs(), QUICK)))
+    return [_one(loaded, library, run) for run in runs]
+
+
+def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.ndarray]:
+    dtype, calls = library.precision.dtype, []
+    leaves, tree = jax.tree_util.tree_flatten(run.start)
+    begin = [rows[0] for rows in _flat([np.asarray(x)[None] for x in leaves], dtype, 1)]
+    own = [a.size for a in begin]
+    for entry in library.entries:
+        x, k = (
+            np.zeros(max(sizes), kind)
+            for sizes, kind in zip(
+                zip(counts(entry.program.inputs), counts(entry.program.results), strict=True),
+                (dtype, np.int64),
+                strict=True,
+            )
+        )
+        function = getattr(loaded, f"of_{entry.name}")
+        function.restype = None
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (x, k, x, k)]
+        rows = _flat(jax.tree_util.tree_leaves(run.given[entry.name]), dtype, run.steps)
+        code = next(f.at for f in library.result(entry) if f.name == "code")
+        calls.append((function, pointers, (x, k), rows, code))
+    kept = [np.zeros((run.steps, size), a.dtype) for size, a in zip(own, begin, strict=True)]
+    codes = np.zeros((run.steps, len(calls)), np.int64)
+    state = begin
+    for t in range(run.steps):
+        for j, (function, pointers, memory, rows, code) in enumerate(calls):
+            for space, carried, row, size in zip(memory, state, rows, own, strict=True):
+                space[:size] = carried
+                space[size : size + row.shape[1]] = row[t]
+            function(*pointers)
+            state = [space[:size].copy() for space, size in zip(memory, own, strict=True)]
+            codes[t, j] = memory[1][code]
+        for whole, carried in zip(kept, state, strict=True):
+            whole[t] = carried
+    return _as_tree(kept, leaves, tree), codes
+
+
+def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
+    """Reals, and all else, one after the other, behind an axis of steps."""
+    arrays = [np.asarray(x) for x in leaves]
+    parts = []
+    for real, kind in ((True, dtype), (False, np.int64)):
+        mine = [a for a in arrays if (a.dtype == np.float64) == real]
+        with np.errstate(over="ignore"):
+            flat = [a.reshape(steps, -1).astype(kind) for a in mine]
+        parts.append(np.concatenate([np.zeros((steps, 0), kind), *flat], axis=1))
+    return parts
+
+
+def _as_tree(kept: Sequence[np.ndarray], leaves: Sequence[Any], tree: Any) -> Any:
+    """States of a run as the filter has them, in doubles."""
+    at, found = [0, 0], []
+    for leaf in map(np.asarray, leaves):
+        pool = int(leaf.dtype != np.float64)
+        part = kept[pool][:, at[pool] : at[pool] + leaf.size]
+        at[pool] += leaf.size
+        found.append(part.reshape(len(part), *leaf.shape).astype(leaf.dtype))
+    return jax.tree_util.tree_unflatten(tree, found)
+
+
+Made = tuple[Any, np.ndarray]  # states and codes of a run
+
+
+def differences(library: Library, doubles: Any, singles: Any) -> dict[str, float]:
+    """Of each field of reals in the states of a run, the largest difference over its size."""
+    pairs = zip(*map(jax.tree_util.tree_leaves, (doubles, singles)), strict=True)
+    some = [(a, b) for a, b in pairs if a[0].size]
+    found = {}
+    for f, (a, b) in zip(library.state, some, strict=True):
+        if f.is_real:
+            size = np.max(np.abs(a), initial=0.0, where=np.isfinite(a))
+            with np.errstate(invalid="ignore"):
+                off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b))
+            part = np.max(np.where(np.isnan(off), np.inf, off), initial=0.0)
+            found[f.name] = float(part / size if size > 0.0 else part)
+    return found
+
+
+def cost(
+    problem: Problem,
+    contender: Contender,
+    library: Library,
+    runs: Sequence[BoardRun],
+    doubles: Sequence[Made],
+    singles: Sequence[Made],
+) -> Cost:
+    """What single precision costs in some runs."""
+    fields: dict[str, float] = {}
+    for (wide, _), (narrow, _) in zip(doubles, singles, strict=True):
+        for name, part in differences(library, wide, narrow).items():
+            fields[name] = max(part, fields.get(name, 0.0))
+    errors = [
+        [
+            _errors(problem, contender, run, states)
+            for run, (states, _) in zip(runs, made, strict=True)
+        ]
+        for made in (doubles, singles)
+    ]
+    blocks = []
+    for block in problem.blocks:
+        figures = []
+        for made in errors:
+            error = np.concatenate([e[:, block.where] for e, _ in made])
+            nees = np.concatenate([n[block.name] for _, n in made]) / error.shape[1]
+            rms = units.convert(np.sqrt(np.mean(error**2)), block.units, block.display_unit)
+            figures.append((float(rms), float(np.mean(nees))))
+        (rms, nees), (rms_single, nees_single) = figures
+        told = block.name, block.display_unit, rms, rms_single, nees, nees_single
+        blocks.append(BlockCost(*told))
+    codes = [np.array([c for _, c in made]) for made in (doubles, singles)]
+    return Cost(
+        runs=len(runs),
+        steps=codes[0].shape[1],
+        fields=fields,
+        blocks=blocks,
+        codes=codes[0].size,
+        codes_off=int(np.sum(codes[0] != codes[1])),
+        finite=all(map(math.isfinite, fields.values())),
+    )
+
+
+def _errors(
+    problem: Problem, contender: Contender, run: BoardRun, states: Any
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """(E, r) reported error over the steps that count, and of each block its (E,) NEES."""
+    rows, along = reported_rows(contender.reported, run.case)
+
+    def one(belief: Any, truth: Any, rows: Any):
+        error, factor = local(belief.mean, truth), belief.factor
+        error, factor = (error, factor) if rows is None else (rows @ error, rows @ factor)
+        at = {b.name: b.where for b in problem.blocks}
+        return error, {name: normalised_sq(error[w], factor[w]) for name, w in at.items()}
+
+    every = jax.jit(jax.vmap(one, (0, 0, along)))
+    error, nees = every(states.belief, run.case.truth, rows)
+    counted = slice(problem.count_from, problem.count_to)
+    return np.asarray(error)[counted], {k: np.asarray(v)[counted] for k, v in nees.items()}

@@ -1,0 +1,68 @@
+"""What a header says of its fields."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from robins.manifold import Angle
+from robins.rotation import Rotation
+from robins.systems.study import Problem, SensorAxes, StateBlock
+from robins.workbench.board_words import components, field_notes, tangent_axes
+
+
+class Mean(NamedTuple):
+    attitude: Rotation
+    course: Angle
+    place: Any  # three of position, one of clock
+
+
+MEAN = Mean(Rotation.identity(), Angle(jnp.zeros(())), jnp.zeros(4))
+PROBLEM = Problem(
+    epoch_s=np.zeros(1),
+    blocks=[
+        StateBlock("turn", slice(0, 3), "rad", "deg", "NED", ("north", "east", "down")),
+        StateBlock("course", slice(3, 4), "rad", "deg", "NED", ("yaw",)),
+        StateBlock("position", slice(4, 7), "m", "m", "ENU", ("east", "north", "up")),
+    ],
+    sensors={"fix": SensorAxes("m", "ENU", ("east", "north", "up"))},
+    simulate=lambda run: None,
+    contenders={},
+    claims=lambda metrics: [],
+    context=xr.Dataset(),
+)
+# The place has north, east, down inside; attitude and course are reported as they are.
+REPORTED = np.zeros((7, 8))
+REPORTED[range(4), range(4)] = 1.0
+REPORTED[4, 5] = REPORTED[5, 4] = 1.0
+REPORTED[6, 6] = -1.0
+
+
+def test_the_mean_has_units_and_axes_in_its_own_order():
+    axes = tangent_axes(PROBLEM, REPORTED, 8)
+    notes = field_notes(PROBLEM, axes, MEAN, {"predict": (), "update_fix": ()})
+    assert notes["state", "mean_attitude_wxyz"] == (
+        "unit quaternion, scalar first; error: turn [rad], NED: north, east, down"
+    )
+    assert notes["state", "mean_course_rad"] == "course [rad], NED: yaw"
+    assert notes["state", "mean_place"] == "0 to 2: position [m], ENU: north, east, minus up"
+    assert notes["update_fix_reading", "value"] == "m, ENU: east, north, up"
+    assert components(axes)[1:] == [
+        "  0 to 2: turn [rad], NED: north, east, down",
+        "  3: course [rad], NED: yaw",
+        "  4 to 6: position [m], ENU: north, east, minus up",
+        "  the others: what the model adds to them",
+    ]
+
+
+def test_what_is_reported_as_a_mixture_is_not_told():
+    mixed = REPORTED.copy()
+    mixed[4:7, 4:7] = np.full((3, 3), 0.5)
+    axes = tangent_axes(PROBLEM, mixed, 8)
+    assert axes[4:] == [None] * 4
+    assert ("state", "mean_place") not in field_notes(PROBLEM, axes, MEAN, {})
+    none = tangent_axes(PROBLEM, 0.5 * REPORTED, 8)
+    assert components(none) == [
+        "factor is lower triangular, covariance P = factor factor' of the error"
+    ]
