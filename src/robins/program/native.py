@@ -33,7 +33,10 @@ FASTER = ("-fno-gcse", "-fno-tree-pre")
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
 # Lanes are as wide as the processor that compiles them.
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
-NO_COMPILER = "install one (Debian: `apt install gcc`; anywhere: `pip install 'robins[native]'`), or name it in CC"
+NO_COMPILER = (
+    "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[native]'`), "
+    "or name it in CC"
+)
 
 
 class Language(NamedTuple):
