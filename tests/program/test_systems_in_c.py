@@ -23,6 +23,7 @@ UNROLL = 300
 STUDIES: dict[str, dict[str, str]] = {
     "airship/s1": {
         "ekf": "the gain of the star sensor is 1.8e-11 of its size off, by a cause not yet found",
+        "ukf": "the gain of the radar's height is 9e-10 off, ten roundings of its data 8.5e-10",
     },
     "gnss/city": {},
     "ins-gnss/drive": {},
