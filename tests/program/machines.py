@@ -74,17 +74,16 @@ def run_in_both(filter_, model, start, y, u=None, aux=None, unroll=None):
 
     want = jax.jit(jax.vmap(one))(jnp.array([0.0, NUDGE]))
 
-    row = [jax.tree.map(lambda x, k=k: np.asarray(x)[k], rows) for k in range(len(y_of(y)))]
+    row = [
+        jax.tree.map(lambda x, k=k: np.asarray(x)[k], rows)
+        for k in range(len(jax.tree.leaves((y, u))[0]))
+    ]
     program, state, made = in_c(step, first, *row[0], unroll=unroll), first, []
     for one in row:
         state, kept = program(state, *one)
         made.append(kept)
     got = jax.tree.map(lambda *x: np.stack(x), *made)
     return *(jax.tree.map(lambda x, k=k: np.asarray(x)[k], want) for k in (0, 1)), got, program
-
-
-def y_of(y):
-    return jax.tree.leaves(y)[0]
 
 
 def runs_the_same(filter_, model, start, y, u=None, aux=None, unroll=None, within=1e-12):
