@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-SCENARIO = "transfer-alignment/s0", "--filter", "kf-flexure"
+SCENARIO = "transfer-alignment/s0", "--filter", "kf"
 
 
 @pytest.fixture
