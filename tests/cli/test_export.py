@@ -42,7 +42,7 @@ def test_single_precision_tells_what_it_costs(robins, tmp_path):
     for block in cost["blocks"]:  # doubles are not floats, and floats are near
         assert block["rms"] != block["rms_single"]
         assert block["rms_single"] == pytest.approx(block["rms"], rel=0.01)
-    assert all(1e-8 < part < 0.01 for part in cost["fields"].values())
+    assert all(1e-8 < part < 1e-3 for part in cost["fields"].values())
     page = (folder / "README.md").read_text()
     assert f"**{cost['verdict']}**" in page
     assert f"0 of {cost['codes']} codes differ" in page

@@ -92,16 +92,16 @@ class InLanes:
         width = min(chunk, max(LEAST, -(-runs // cores)))
         before = threading.stack_size(STACK)
         pool = ThreadPoolExecutor(cores)
-        begins = range(width, runs, width)
+        begins, ahead_by = range(width, runs, width), cores + 1
         try:
             # The first chunk compiles: each filter on a core of its own.
             world = pool.submit(self._worlds, 0, width).result()
             first = {name: pool.submit(one, world) for name, one in self._filters.items()}
             yield world, min(width, runs), lambda name: cut(first[name].result(), runs)
-            ahead = deque(pool.submit(self._chunk, begin, width) for begin in begins[: 2 * cores])
+            ahead = deque(pool.submit(self._chunk, begin, width) for begin in begins[:ahead_by])
             for k, begin in enumerate(begins):
                 world, found = ahead.popleft().result()
-                for later in begins[k + 2 * cores : k + 2 * cores + 1]:
+                for later in begins[k + ahead_by : k + ahead_by + 1]:
                     ahead.append(pool.submit(self._chunk, later, width))
                 yield world, min(width, runs - begin), partial(_of, found, runs - begin)
         finally:
