@@ -326,7 +326,9 @@ def test_the_example_compiles_as_c_plus_plus_too(tmp_path):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", "-x", "c++"]
-    command = ["g++", *flags, *(name for name in files if name.endswith(".c"))]
+    # The board of an exported filter needs that filter; `test_adm_board.py` compiles it.
+    sources = [name for name in files if name.endswith(".c") and name != "adm_board.c"]
+    command = ["g++", *flags, *sources]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
 

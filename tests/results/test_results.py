@@ -111,6 +111,7 @@ A_CLAIM = {"id": "c", "text": "t", "verdict": "not", "value": 1.0, "band": [0, 1
     [
         ({"seed": 1.5}, "summary.seed: 1.5 is not a whole number"),
         ({"runs": True}, "summary.runs: True is not a whole number"),
+        ({"machine": 1}, "summary.machine: 1 is not text"),
         ({"scenario": None}, "summary.scenario: None is not text"),
         ({"extra": 1}, "unknown key 'extra'"),
         ({"filters": {"k": 3.0}}, "summary.filters.k: 3.0 does not map"),

@@ -91,7 +91,10 @@ def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
     for i, sentence in enumerate(flat.setdefault("warnings", [])):
         if not isinstance(sentence, str):
             raise TypeError(f"summary.warnings[{i}]: {sentence!r} is not a sentence")
-    return {key: flat.get(key, {}) for key in _ORDER}
+    if not isinstance(flat.get("machine", ""), str):
+        raise TypeError(f"summary.machine: {flat['machine']!r} is not text")
+    # Only a campaign has a machine; `files` are the writer's.
+    return {key: flat.get(key, {}) for key in _ORDER if key in flat or key != "machine"}
 
 
 def _name(kind: type) -> str:
