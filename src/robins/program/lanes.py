@@ -15,6 +15,7 @@ import numpy as np
 
 from robins.program.c import function, header
 from robins.program.kinds import array_of, is_key, numbers_of
+from robins.program.library import counts
 from robins.program.native import CPP, LANE_FLAGS, build
 from robins.program.trace import Leaf, Program, positive_zeros
 
@@ -98,10 +99,10 @@ class Rounds:
             _rows(a, True, k >= self.carried, leaf)
             for k, (a, leaf) in enumerate(zip(made, results, strict=True))
         ]
-        counts = self.backwards, self.carried, self.stays, len(taken) - first
+        numbers = self.backwards, self.carried, self.stays, len(taken) - first
         failed = self._library.robins_scan(
             *map(ctypes.c_int64, (runs, self.length)),
-            *map(ctypes.c_int32, (*counts, len(out) - self.carried)),
+            *map(ctypes.c_int32, (*numbers, len(out) - self.carried)),
             (Rows * max(len(taken), 1))(*taken),
             (Rows * max(len(out), 1))(*out),
         )
@@ -133,13 +134,9 @@ def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> Rows:
 
 def _text(program: Program) -> str:
     """The program for lanes, and the rounds around it."""
-    sizes = []
-    for leaves in (program.inputs, program.results):
-        for real in (True, False):
-            count = sum(int(np.prod(a.shape)) for a in leaves if (a.kind == "real") == real)
-            sizes.append(max(count, 1))
+    sizes = *counts(program.inputs), *counts(program.results)
     names = ("NX", "NK", "NY", "NM")
-    counts = "\n".join(f"#define {n} {size}" for n, size in zip(names, sizes, strict=True))
+    defined = "\n".join(f"#define {n} {size}" for n, size in zip(names, sizes, strict=True))
     rounds = (files("robins.program") / "scan.h").read_text("utf-8")
     step = function(program, linkage="static ")
-    return f"#include <stdlib.h>\n{header('lanes.h')}\n{step}\n{counts}\n{rounds}"
+    return f"#include <stdlib.h>\n{header('lanes.h')}\n{step}\n{defined}\n{rounds}"

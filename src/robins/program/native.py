@@ -35,7 +35,7 @@ FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
 NO_COMPILER = (
     "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[native]'`), "
-    "or name it in CC"
+    "or name it in CC (of C++: CXX)"
 )
 
 

@@ -54,12 +54,16 @@ def run(
         problem = study.problem(parameters, chosen, seed)
     if not filters:  # the default was not there when the claims were stated
         problem = replace(problem, claims=about(own, problem.claims))
+    found = simulate(problem, parameters.runs, progress=progress, machine=machine)
     return replace(
-        simulate(problem, parameters.runs, progress=progress, machine=machine),
+        found,
         scenario=label,
         seed=seed,
         runs=parameters.runs,
-        last_lines=[f"Next:   robins run {name} --seed {seed + 1}   repeats it with other noise"],
+        last_lines=[
+            f"Machine: {found.machine}   --machine chooses another",
+            f"Next:   robins run {name} --seed {seed + 1}   repeats it with other noise",
+        ],
         **asked(text, settings),
     )
 
