@@ -93,35 +93,33 @@ def run_in_both(filter_, model, start, y, u=None, aux=None, unroll=None):
     first = jax.tree.map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), first)
     steps = len(jax.tree.leaves((y, u))[0])
     keys = jax.random.split(jax.random.key(0), (1 + NUDGES, steps))
-    nudges = jnp.where(jnp.arange(1 + NUDGES) > 0, NUDGE, 0.0)
+    nudges = np.where(np.arange(1 + NUDGES) > 0, NUDGE, 0.0)
 
     def nudged(nudge, state, keyed):
         return step(*_off((state, *keyed[1]), nudge, keyed[0]))
 
+    @jax.jit  # not batched, so that its branches stay branches
     def one(nudge, keys):
         return jax.lax.scan(lambda s, row: nudged(nudge, s, row), first, (keys, rows))[1]
 
-    ran = jax.device_get(jax.jit(jax.vmap(one))(nudges, keys))
-    want = jax.tree.map(lambda x: x[0], ran)
+    want, *near = (jax.device_get(one(*each)) for each in zip(nudges, keys, strict=True))
     before = jax.tree.map(lambda x, y: np.concatenate([x[None], y[:-1]]), first, want[0])
     program = in_c(step, first, *_row(rows, 0), unroll=unroll)
 
-    def each(nudge, keys):
-        return jax.vmap(lambda s, row: nudged(nudge, s, row)[1])(before, (keys, rows))
+    @jax.jit
+    def alone(nudge, keys):
+        return jax.lax.map(lambda each: nudged(nudge, *each)[1], (before, (keys, rows)))
 
     def by_steps():
-        near = jax.device_get(jax.jit(jax.vmap(each))(nudges[1:], keys[1:]))
-        return (
-            want,
-            near,
-            _stacked(program(_row(before, k), *_row(rows, k))[1] for k in range(steps)),
-        )
+        near = [jax.device_get(alone(*each)) for each in zip(nudges[1:], keys[1:], strict=True)]
+        made = [program(_row(before, k), *_row(rows, k))[1] for k in range(steps)]
+        return want, _stacked(near), _stacked(made)
 
     state, made = first, []
     for k in range(steps):
         state, kept = program(state, *_row(rows, k))
         made.append(kept)
-    return (want, jax.tree.map(lambda x: x[1:], ran), _stacked(made)), by_steps, program
+    return (want, _stacked(near), _stacked(made)), by_steps, program
 
 
 def _row(rows, k):
