@@ -26,7 +26,20 @@ def test_the_folder_compiles_and_agrees_with_jax(made):
     assert "60 steps: 0 codes differ" in done.stdout
     header = (folder / "robins.h").read_text()
     assert "int robins_update_attitude_matching(robins_state *state," in header
-    assert "rad" in header
+    assert "robins_real sigma[3]; /* rad, ENU: east, north, up; of the innovation" in header
+    assert "int robins_reset(robins_state *state, const robins_reset_belief *belief," in header
+
+
+def test_its_test_sees_another_new_start(made):
+    answer, folder = made
+    assert answer.status == 0, answer.err
+    record, said = (folder / "recorded.h").read_text(), "reset_belief_mean[1][9] = {\n    {"
+    assert said in record
+    (folder / "recorded.h").write_text(record.replace(said, f"{said}1.0 + "))
+    done = subprocess.run(["make", "-C", str(folder), "check"], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "60 steps: 0 codes differ" in done.stdout
+    assert "FAILED" in done.stdout
 
 
 def test_single_precision_tells_what_it_costs(robins, tmp_path):

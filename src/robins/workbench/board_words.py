@@ -57,7 +57,10 @@ def field_notes(
     problem: Problem, axes: list[Axis | None], mean: Any, given: Mapping[str, Any]
 ) -> dict[tuple[str, str], str]:
     """Units and axes of the mean, of readings and of innovations, by struct and field."""
-    notes = {("state", "current"): "the last prediction was taken"}
+    notes = {
+        ("state", "current"): "the last prediction was taken",
+        ("reset_belief", "factor"): "above the diagonal not looked at",
+    }
     at = 0
     flat = jax.tree_util.tree_flatten_with_path(mean, is_leaf=manifold.is_element)[0]
     for path, leaf in flat:
@@ -67,7 +70,7 @@ def field_notes(
             name = identifier(f".belief.mean{jax.tree_util.keystr((*path, *inner))}")
             whole = "unit quaternion, scalar first; error: " if name.endswith("wxyz") else ""
             if told:
-                notes["state", name] = whole + told
+                notes["state", name] = notes["reset_belief", name] = whole + told
         at += size
     for entry in given:
         sensor = problem.sensors.get(entry.removeprefix("update_"))
@@ -75,6 +78,7 @@ def field_notes(
             told = f"{sensor.units}, {sensor.frame}: {', '.join(sensor.axes)}"
             notes[f"{entry}_reading", "value"] = told
             notes[f"{entry}_result", "innovation"] = told
+            notes[f"{entry}_result", "sigma"] = f"{told}; of the innovation, NaN where not used"
     return notes
 
 

@@ -13,12 +13,18 @@ import jax
 import numpy as np
 
 from robins import __version__, _float64, scenario
-from robins.filters import SENTENCES
-from robins.program import DOUBLE, SINGLE, Precision, trace_steps
+from robins.filters import SENTENCES, Code
+from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
 from robins.program.harness import Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library
 from robins.systems.study import Problem
-from robins.workbench.board_runs import BoardRun, board_runs, by_jax, entry_functions
+from robins.workbench.board_runs import (
+    BoardRun,
+    board_runs,
+    by_jax,
+    entry_functions,
+    reset_function,
+)
 from robins.workbench.board_words import components, field_notes, tangent_axes
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.scenarios import check_filters, find_scenario, study_of
@@ -27,6 +33,7 @@ from robins.workbench.single_precision import Cost, Made, cost, differences, in_
 STEPS = 60  # of a run, recorded for the test
 RUNS = 3  # by which the cost of single precision is told
 MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
+RESET = "reset"  # the entry point that begins anew
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
 
 
@@ -107,19 +114,11 @@ def _library(
     runs = board_runs(problem, name, RUNS if single else 1)
     run = runs[0]
     functions = entry_functions(contender.filter, contender.model, run.given)
-    first = run.row(0)
-    state = _any_start(runs)
-    programs = trace_steps([(functions[e], first[e]) for e in functions], state, unroll=unroll)
-    entries = [
-        Entry(
-            entry,
-            program,
-            ("input",) if entry == "predict" else ("reading", "about"),
-            "Moves on by one step." if entry == "predict" else f"Uses a reading of {entry[7:]}.",
-        )
-        for entry, program in zip(functions, programs, strict=True)
-    ]
+    anew = reset_function(contender.filter, run.start)
     belief = run.start.belief
+    steps = [(functions[e], row) for e, row in run.row(0).items()]
+    programs = trace_steps([*steps, (anew, (belief,))], _any_start(runs), unroll=unroll)
+    entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
     axes = tangent_axes(problem, contender.reported, len(belief.factor))
     notes = field_notes(problem, axes, belief.mean, run.given)
     library = Library("robins", entries, run.start, (), notes, precision)
@@ -132,13 +131,21 @@ def _library(
     )
     library = library._replace(about=about)
     if not single:
-        short = run.cut(STEPS)
-        return library, Recorded(short.given, *by_jax(functions, short)), None
+        return library, _record(run, by_jax(functions, run.cut(STEPS)), anew), None
     doubles = [by_jax(functions, one) for one in runs]
     singles = in_floats(library, runs)
     found = cost(problem, contender, library, runs, doubles, singles)
-    record = _record(library, run, doubles[0], singles[0])
+    record = _compared(library, _record(run, doubles[0], anew), singles[0])
     return library, record._replace(ruined="" if found.bearable else found.verdict), found
+
+
+def _entry(name: str, program: Program) -> Entry:
+    """An entry point with its words."""
+    if name == "predict":
+        return Entry(name, program, ("input",), "Moves on by one step.")
+    if name == RESET:
+        return Entry(name, program, ("belief",), "Begins anew from a belief, all else as by init.")
+    return Entry(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
 
 
 def _any_start(runs: Sequence[BoardRun]) -> Any:
@@ -152,15 +159,22 @@ def _any_start(runs: Sequence[BoardRun]) -> Any:
     return jax.tree_util.tree_map(either, *(run.start for run in runs))
 
 
-def _record(library: Library, run: BoardRun, doubles: Made, singles: Made) -> Recorded:
-    """The first steps in doubles, and how far off floats may be: a margin beside what they are."""
-    short = run.cut(STEPS).given
-    (wide, codes), (narrow, others) = (
-        jax.tree_util.tree_map(lambda a: a[:STEPS], made) for made in (doubles, singles)
-    )
+def _record(run: BoardRun, made: Made, anew: Any) -> Recorded:
+    """The first steps by JAX, and then a new start from what was believed after the first."""
+    states, codes = jax.tree_util.tree_map(lambda a: a[:STEPS], made)
+    first, last = (jax.tree_util.tree_map(lambda a, k=k: a[k], states) for k in (0, -1))
+    state, _ = jax.jit(anew)(last, first.belief)
+    states = jax.tree_util.tree_map(lambda a, b: np.append(a, b[None], axis=0), states, state)
+    return Recorded(run.cut(STEPS).given, states, codes, ends={RESET: (first.belief,)})
+
+
+def _compared(library: Library, record: Recorded, singles: Made) -> Recorded:
+    """With how far off floats may be: a margin beside what they are."""
+    narrow, others = jax.tree_util.tree_map(lambda a: a[: len(record.codes)], singles)
+    wide = jax.tree_util.tree_map(lambda a: a[: len(record.codes)], record.states)
     parts = differences(library, wide, narrow)
     tolerances = {f: max(MARGIN * part, LEAST) for f, part in parts.items() if np.isfinite(part)}
-    return Recorded(short, wide, codes, tolerances, int(np.sum(codes != others)))
+    return record._replace(tolerances=tolerances, codes_off=int(np.sum(record.codes != others)))
 
 
 def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
@@ -188,8 +202,12 @@ is missing is NaN. Each call returns a code:
 |---|---|
 {codes}
 
-The state belongs to these functions: read it, copy it, but change it by `{n}_init` and the calls
-only.
+Where a reading was used, `sigma` of the result is the standard deviation of each component of the
+innovation: a reading is suspicious where the innovation exceeds three of them.
+
+`{n}_reset` begins anew from a mean and the factor of a covariance, in any state: whatever else the
+filter has learned is then as after `{n}_init`. A belief that is not finite is not taken (code
+{int(Code.NOT_FINITE)}). Read the state, copy it, but change it by `{n}_init` and the calls only.
 {_costs(found)}"""
 
 

@@ -154,6 +154,8 @@ def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.
     begin = [rows[0] for rows in _flat([np.asarray(x)[None] for x in leaves], dtype, 1)]
     own = [a.size for a in begin]
     for entry in library.entries:
+        if entry.name not in run.given:
+            continue  # it is no part of a step
         x, k = (
             np.zeros(max(sizes), kind)
             for sizes, kind in zip(
