@@ -17,7 +17,7 @@ import numpy as np
 from robins.program.library import C_TYPES, Entry, Field, Library, fields_of, number
 from robins.program.precision import DOUBLE, SINGLE, Precision
 
-TOLERANCE = 1e-9  # of the largest number that a field has in the record; of a library of doubles
+TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
 
 MAKEFILE = """\
 # make check   compiles {name}.c and a test of it, and runs the test on recorded steps
@@ -118,9 +118,11 @@ class Recorded(NamedTuple):
             state, with a leading axis of steps.
         states: after each step, and after each call of `ends`.
         codes: (steps, entry points).
-        tolerances: of fields of the state, in parts of the largest number that a field has;
+        tolerances: of fields of the state, in parts of its size, the largest number that it has;
             `TOLERANCE` of the others.
         codes_off: how many codes may differ.
+        sizes: of fields of the state, the least size by which a difference is judged, where the
+            numbers of the field may be nothing but rounding.
         ends: of each entry point that is called once after the last step, its arguments after the
             state; its code is 0.
         ruined: why the library is not to be used, however well it was compiled; its test says so
@@ -132,6 +134,7 @@ class Recorded(NamedTuple):
     codes: np.ndarray
     tolerances: Mapping[str, float] = {}
     codes_off: int = 0
+    sizes: Mapping[str, float] = {}
     ends: Mapping[str, Sequence[Any]] = {}
     ruined: str = ""
 
@@ -159,7 +162,8 @@ def recorded_h(library: Library, record: Recorded) -> str:
     reals = [x for x in states if x.dtype == np.float64 and x[0].size]
     for f, leaf in zip(kept, reals, strict=True):
         lines += _table(f"state_{f.name}", f, leaf, DOUBLE)
-        size = np.max(np.abs(leaf), initial=0.0, where=np.isfinite(leaf))
+        least = record.sizes.get(f.name, 0.0)
+        size = np.max(np.abs(leaf), initial=least, where=np.isfinite(leaf))
         lines.append(f"static const double size_{f.name} = {float(size)!r};")
         allowed = record.tolerances.get(f.name, TOLERANCE)
         lines.append(f"static const double tolerance_{f.name} = {float(allowed)!r};")
