@@ -92,7 +92,8 @@ def all_of(rows, field):
 def test_it_says_what_the_part_says_whatever_is_missing(program, of):
     reached, loop = flown(of, meddled=True)
     told = answers(program, of, reached)
-    for name, fields in (("estimate", ("q_ib", "gyro_bias", "sigma")), ("innovation", ("ratio",))):
+    fields_of = {"estimate": ("q_ib", "gyro_bias", "sigma"), "innovation": ("ratio", "sigma")}
+    for name, fields in fields_of.items():
         for field in fields:
             want, got = loop.all(name, field), all_of(told[name], field)
             np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-15, err_msg=field)

@@ -159,14 +159,14 @@ def case_of(parameters: Replay, of: Hand) -> Case:
     u = Given(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
     y, aux, u = jax.tree_util.tree_map(lambda a: np.asarray(a)[:count], (world.y, world.aux, u))
     truth = model.MargState(
-        q_nb=Rotation(jnp.asarray(np.roll(of.q_nb[made.rows].as_quat(), 1, axis=-1))),
-        v_n=of.v_n[made.rows],
-        p_n=of.p_n[made.rows],
-        gyro_bias=np.tile(of.gyro_bias, (count, 1)),
-        gyro_gain=np.tile(of.gyro_gain, (count, 1, 1)),
-        accel_bias=np.tile(of.accel_bias, (count, 1)),
-        declination=np.zeros(count),
-        field=np.tile(FIELD_N[[0, 2]], (count, 1)),
+        q_nb=Rotation(jnp.asarray(np.roll(of.q_nb.as_quat()[made.rows], 1, axis=-1))),
+        v_n=jnp.asarray(of.v_n[made.rows]),
+        p_n=jnp.asarray(of.p_n[made.rows]),
+        gyro_bias=jnp.tile(of.gyro_bias, (count, 1)),
+        gyro_gain=jnp.tile(of.gyro_gain, (count, 1, 1)),
+        accel_bias=jnp.tile(of.accel_bias, (count, 1)),
+        declination=jnp.zeros(count),
+        field=jnp.tile(FIELD_N[[0, 2]], (count, 1)),
     )
     return Case(world.start, u, y, aux, truth)
 

@@ -72,11 +72,13 @@ static int predicts(uint64_t time_ns) {
 
 /* The attitude of a frame, with the bias that was known and all else as at the start. */
 static void restart(const double *q_ib, double squared) {
-  double bias[3];
-  memcpy(bias, filter.mean_gyro_bias, sizeof bias);
+  static robins_reset_belief belief;
+  robins_reset_result told;
+  memcpy(belief.mean_gyro_bias, filter.mean_gyro_bias, sizeof belief.mean_gyro_bias);
+  for (int k = 0; k < 4; k++) belief.mean_attitude_wxyz[k] = q_ib[k] / sqrt(squared);
   robins_init(&filter);
-  memcpy(filter.mean_gyro_bias, bias, sizeof bias);
-  for (int k = 0; k < 4; k++) filter.mean_attitude_wxyz[k] = q_ib[k] / sqrt(squared);
+  memcpy(belief.factor, filter.factor, sizeof belief.factor);
+  robins_reset(&filter, &belief, &told); /* all modes of a bank */
   lost = 0;
 }
 
@@ -98,7 +100,7 @@ static int updates(void) {
   for (int k = 0; k < 4; k++) reading.wxyz[k] = heard ? q_ib[k] : NAN;
   int code = robins_update_star(&filter, &reading, &seen);
   memcpy(innovation.innovation, seen.innovation, sizeof innovation.innovation);
-  for (int k = 0; k < 3; k++) innovation.sigma[k] = NAN; /* the library does not tell it */
+  memcpy(innovation.sigma, seen.sigma, sizeof innovation.sigma);
   innovation.ratio = seen.dof ? seen.nis / LIMIT : NAN;
   return flags | (code == 0 ? USED : 0) | (code == 3 ? REFUSED : 0);
 }
