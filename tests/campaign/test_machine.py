@@ -62,7 +62,7 @@ def test_chunks_in_lanes_come_in_order_and_without_what_fills_them(problem):
 def test_a_failure_in_a_chunk_comes_out(problem, monkeypatch):
     lanes = InLanes(problem)
 
-    def failing(begin, width):
+    def failing(*_):
         raise RuntimeError("no more")
 
     monkeypatch.setattr(lanes, "_chunk", failing)

@@ -68,7 +68,7 @@ def test_statistics_that_nothing_can_be_made_of_are_kept(tmp_path):
     assert str(kept / "arrays.npz") in str(error.value)
     assert "a metric that a study forgot" in str(error.value)
     with np.load(kept / "arrays.npz") as found:
-        rms = np.sqrt(found["kf._square"] / found["kf.runs"])
+        rms = np.sqrt(found["kf.sums.square"] / found["kf.runs"])
     whole = simulate(a_problem(), 3).solution
     np.testing.assert_array_equal(rms, whole["rms_line"][0])
 

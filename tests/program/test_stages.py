@@ -89,6 +89,50 @@ def test_a_run_has_the_bits_of_a_run_alone(staged):
         np.testing.assert_array_equal(np.asarray(a)[7], np.asarray(b)[0])
 
 
+def some_of_one_run(number):
+    """All of a world, and some of it that is wanted of one run only."""
+    made = world(number)
+    alone = ("above", "tail", "back", "mean", "outer", "const", "keys", "time", "walk")
+    return {k: v for k, v in made.items() if k not in alone[:5]}, {k: made[k] for k in alone}
+
+
+def test_what_is_wanted_of_one_run_is_kept_of_the_first():
+    runs = jnp.arange(5, 5 + N)
+    many, one = Staged(some_of_one_run, NUMBER, named=True)(runs)
+    want, first = some_of_one_run(5)
+    close(jax.tree.map(lambda x: np.asarray(x)[None], first), one)
+    close(want, jax.tree.map(lambda x: np.asarray(x)[0], many))
+    assert {x.shape[0] for x in jax.tree.leaves(many)} == {N}
+    held = [
+        x if x.base is None else x.base for x in jax.tree.leaves(one) if isinstance(x, np.ndarray)
+    ]
+    assert all(x.nbytes <= 8 * 9 * T for x in held)  # "outer" of one run is the largest
+
+
+def test_values_are_dropped_after_their_last_use(monkeypatch):
+    """The bytes of a run are those that are held at the fullest stage, counted there."""
+    staged, runs = Staged(world, NUMBER), jnp.arange(N)
+    staged(runs)
+    held = []
+
+    def watching(kind):
+        call = kind.__call__
+
+        def called(self, count, values):
+            made = call(self, count, values)
+            mine = [x for v, x in (values | made).items() if v in staged._batched]
+            held.append(sum(x.nbytes for x in mine))
+            return made
+
+        monkeypatch.setattr(kind, "__call__", called)
+
+    for kind in {type(one) for one in staged._stages}:
+        watching(kind)
+    staged(runs)
+    within = max(one.touched.within for one in staged._stages)
+    assert max(held) / N <= staged.bytes_of_run <= max(held) / N + within
+
+
 def test_what_goes_along_one_axis_is_one_loop():
     def function(x):
         rows = jnp.sin(x) * jnp.arange(T, dtype=float)[:, None] / T

@@ -11,14 +11,27 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from robins.campaign.monte_carlo import CHUNK, contender, cut, one_record, record, worlds
+from robins.campaign.memory import CHUNK_BYTES, LEAST, MEMORY, at_once, said, width_of
+from robins.campaign.monte_carlo import (
+    CHUNK,
+    batch_of,
+    blocks_of,
+    bytes_of_batch,
+    contender,
+    cut,
+    joined,
+    one_record,
+    parted,
+    record,
+    worlds,
+)
 from robins.errors import RobinsError
 from robins.program import CPP, BuildError, compiler
 from robins.program.stages import Staged
@@ -26,34 +39,69 @@ from robins.systems.study import Problem
 
 MACHINES = ("jax", "c", "cuda")
 PAYS = 60.0  # seconds of JAX on one core for which it pays to compile lanes
-LEAST = 8  # runs of a chunk in lanes
 FEWEST = 100  # runs of which this is asked
 NS = 0.5  # of JAX, for a scalar operation in a scan (measured: 0.4 to 0.8)
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
 
-Chunk = tuple[Any, int, Callable[[str], Any]]  # worlds, how many count, the record of a filter
+Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chunk: what is kept
+
+# The world of the first run, with the first chunk; how many runs count; what is kept of a filter.
+Chunk = tuple[Any, int, Callable[[str], Any]]
+
+
+def whole(name: str, record: Any) -> Any:
+    """All of a record."""
+    return record
 
 
 class ByJax:
     """Chunks as batches of JAX, one after the other."""
 
     name = "jax"
-    notes: tuple[str, ...] = ()
 
     def __init__(self, problem: Problem):
         self.problem = problem
+        self.notes: list[str] = []
+        self._batch = batch_of(problem)
 
-    def chunks(self, runs: int, chunk: int = CHUNK) -> Iterator[Chunk]:
-        """Simulate a chunk; its filters run when their records are asked for."""
-        for batch, count in worlds(self.problem, runs, chunk):
-            yield batch, count, partial(self._record, batch, count)
+    def width(self, runs: int) -> int:
+        """Runs of a chunk in a campaign of so many, by the memory that JAX needs for them."""
+        width = min(runs, CHUNK)
+        each = -(-bytes_of_batch(self.problem, self._batch, width) // width)
+        width = min(width, width_of(each, MEMORY))
+        self.notes = said(each, width)
+        return width
 
-    def _record(self, batch: Any, count: int, name: str) -> Any:
-        return record(self.problem, name, batch, count)
+    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Chunk]:
+        """Simulate a chunk; its filters run when they are asked for.
+
+        Args:
+            runs: how many.
+            chunk: runs at a time; not given, by the memory that they need.
+            taken: what is kept of the record of a filter.
+        """
+        first, width = True, chunk or self.width(runs)
+        for batch, count in worlds(self.problem, runs, width, batch=self._batch):
+            held = [batch]
+            del batch
+            yield (
+                first_run(held[0]) if first else None,
+                count,
+                partial(self._of, held, count, taken),
+            )
+            held.clear()  # before the next is simulated
+            first = False
+
+    def _of(self, held: list[Any], count: int, taken: Taken, name: str) -> Any:
+        return taken(name, record(self.problem, name, held[0], count))
 
 
 class InLanes:
-    """Chunks as programs in lanes, one on each core."""
+    """Chunks as programs in lanes, one on each core.
+
+    Attributes:
+        bytes_of_run: about the most memory that the histories of a run take at once.
+    """
 
     name = "c"
 
@@ -62,13 +110,14 @@ class InLanes:
         number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
         self._simulate = Staged(problem.simulate, number)
         world = jax.eval_shape(problem.simulate, number)
-        blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
-        self._filters = {
-            name: Staged(
-                partial(one_record, blocks, contender(problem, name), over=one_by_one), world
-            )
-            for name in problem.contenders
-        }
+
+        def of(name: str) -> Callable[[Any], Any]:
+            one = partial(one_record, blocks_of(problem), contender(problem, name), over=one_by_one)
+            return lambda world: parted(one(world))
+
+        self._filters = {name: Staged(of(name), world, named=True) for name in problem.contenders}
+        stages = (self._simulate, *self._filters.values())
+        self.bytes_of_run = max(one.bytes_of_run for one in stages)
 
     @property
     def operations(self) -> int:
@@ -84,26 +133,45 @@ class InLanes:
             for name, staged in of.items()
             for one in staged.loops
             if one.refused
-        ]
+        ] + said(self.bytes_of_run, LEAST)
 
-    def chunks(self, runs: int, chunk: int = CHUNK) -> Iterator[Chunk]:
-        """Simulate chunks and run their filters, on all cores, ahead of what is asked for."""
-        cores = available_cores()
-        width = min(chunk, max(LEAST, -(-runs // cores)))
+    def width(self, runs: int) -> int:
+        """Runs of a chunk in a campaign of so many, by the memory that they need."""
+        return min(width_of(self.bytes_of_run, CHUNK_BYTES), -(-runs // LEAST) * LEAST)
+
+    def chunks(self, runs: int, chunk: int = 0, taken: Taken = whole) -> Iterator[Chunk]:
+        """Simulate chunks and run their filters, on all cores, ahead of what is asked for.
+
+        Args:
+            runs: how many.
+            chunk: runs at a time; not given, by the memory that they need.
+            taken: what is kept of the record of a filter, found in the thread that computed it.
+                What figures show of one run has a leading axis of one there.
+        """
+        width = chunk or self.width(runs)
+        workers = at_once(self.bytes_of_run, width, available_cores())
         before = threading.stack_size(STACK)
-        pool = ThreadPoolExecutor(cores)
-        begins, ahead_by = range(width, runs, width), cores + 1
+        pool = ThreadPoolExecutor(workers)
+        begins, ahead_by = range(width, runs, width), workers + 1
         try:
             # The first chunk compiles: each filter on a core of its own.
             world = pool.submit(self._worlds, 0, width).result()
-            first = {name: pool.submit(one, world) for name, one in self._filters.items()}
-            yield world, min(width, runs), lambda name: cut(first[name].result(), runs)
-            ahead = deque(pool.submit(self._chunk, begin, width) for begin in begins[:ahead_by])
+            count = min(width, runs)
+            first = {n: pool.submit(self._of, n, world, count, taken) for n in self._filters}
+            named = first_run(world)
+            del world
+            yield named, count, lambda name: first[name].result()
+            wait(first.values())
+            ahead = deque(
+                pool.submit(self._chunk, begin, width, min(width, runs - begin), taken)
+                for begin in begins[:ahead_by]
+            )
             for k, begin in enumerate(begins):
-                world, found = ahead.popleft().result()
+                found = ahead.popleft().result()
                 for later in begins[k + ahead_by : k + ahead_by + 1]:
-                    ahead.append(pool.submit(self._chunk, later, width))
-                yield world, min(width, runs - begin), partial(_of, found, runs - begin)
+                    count = min(width, runs - later)
+                    ahead.append(pool.submit(self._chunk, later, width, count, taken))
+                yield None, min(width, runs - begin), found.__getitem__
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             threading.stack_size(before)
@@ -111,14 +179,18 @@ class InLanes:
     def _worlds(self, begin: int, width: int) -> Any:
         return self._simulate(jnp.arange(begin, begin + width))
 
-    def _chunk(self, begin: int, width: int) -> tuple[Any, dict[str, Any]]:
+    def _of(self, name: str, world: Any, count: int, taken: Taken) -> Any:
+        """What is kept of a filter, without the runs that only fill a chunk."""
+        return taken(name, joined(*cut(self._filters[name](world), count)))
+
+    def _chunk(self, begin: int, width: int, count: int, taken: Taken) -> dict[str, Any]:
         world = self._worlds(begin, width)
-        return world, {name: staged(world) for name, staged in self._filters.items()}
+        return {name: self._of(name, world, count, taken) for name in self._filters}
 
 
-def _of(found: dict[str, Any], count: int, name: str) -> Any:
-    """The record of a filter, without the runs that only fill a chunk."""
-    return cut(found[name], count)
+def first_run(world: Any) -> Any:
+    """Of worlds with a leading axis of runs the first, holding none of the others."""
+    return jax.tree_util.tree_map(lambda x: jnp.array(x[0]), world)
 
 
 def one_by_one(function: Callable[..., Any], rows: Any) -> Any:

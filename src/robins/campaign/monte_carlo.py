@@ -18,16 +18,16 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
+from robins.campaign.memory import CHUNK
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.analysis.consistency import normalised_sq
 from robins.filters.sameness import same, same_model
 from robins.manifold import State, local
+from robins.program.liveness import bytes_of_jaxpr
 from robins.systems.study import Case, Contender, Problem
 from robins.systems.tables import updates
 
-CHUNK = 64  # runs; large enough to fill a core's vectors, small enough for the cache
-
-_Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reported components
+Blocks = tuple[tuple[str, int, int], ...]  # name, first and last of the reported components
 
 
 def _kept(step: Step) -> Any:
@@ -37,7 +37,7 @@ def _kept(step: Step) -> Any:
 
 
 def _judged(
-    blocks: _Blocks, belief: Belief, truth: State, rows: Array | None, lost: Array
+    blocks: Blocks, belief: Belief, truth: State, rows: Array | None, lost: Array
 ) -> dict[str, Any]:
     """Of one epoch the error of what the filters of a problem report alike, and what was stated."""
     whole, factor = local(belief.mean, truth), belief.factor
@@ -88,7 +88,7 @@ def at_once(function: Callable[..., Any], rows: Any) -> Any:
 
 
 def one_record(
-    blocks: _Blocks, contender: Contender, world: Any, over: Over = at_once
+    blocks: Blocks, contender: Contender, world: Any, over: Over = at_once
 ) -> dict[str, Any]:
     """One run of one filter, to what statistics need."""
     steps, case, tally = solved(contender.filter, contender.model, contender.case(world), _kept)
@@ -111,7 +111,7 @@ def one_record(
 
 
 @partial(jax.jit, static_argnames=("filter_", "blocks"))
-def _records(filter_, blocks: _Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
+def _records(filter_, blocks: Blocks, model, case: Partial, reported, worlds) -> dict[str, Any]:
     contender = Contender(filter_, model, case, reported)
     return _each(partial(one_record, blocks, contender), worlds)
 
@@ -130,9 +130,9 @@ def _each(one: Callable[[Any], Any], many: Any) -> Any:
 
 
 def worlds(
-    problem: Problem, runs: int, chunk: int = CHUNK, first: int = 0
+    problem: Problem, runs: int, chunk: int = CHUNK, first: int = 0, batch: Any = None
 ) -> Iterator[tuple[Any, int]]:
-    """Simulate runs first .. first + runs - 1, a chunk at a time.
+    """Simulate runs first .. first + runs - 1, a chunk at a time, by `batch_of` the problem.
 
     Yields:
         What `Problem.simulate` returns, with a leading axis of ``min(chunk, runs)``, and how many
@@ -143,10 +143,34 @@ def worlds(
     """
     if runs < 1 or chunk < 1:
         raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
-    width = min(chunk, runs)
-    batch = jax.jit(partial(_each, problem.simulate))
+    width, batch = min(chunk, runs), batch or batch_of(problem)
     for begin in range(first, first + runs, width):
         yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
+
+
+def batch_of(problem: Problem) -> Any:
+    """The simulation of a problem for many runs, compiled for each shape once."""
+    return jax.jit(partial(_each, problem.simulate))
+
+
+def bytes_of_batch(problem: Problem, batch: Any, width: int) -> int:
+    """About the most memory that JAX needs at once for a chunk of so many runs.
+
+    What is traced for it serves again when a chunk of this width is computed.
+
+    Args:
+        problem: to be simulated.
+        batch: its simulation, as `batch_of` gives it.
+        width: runs of the chunk.
+    """
+    numbers = jax.ShapeDtypeStruct((width,), jnp.arange(1).dtype)
+    many = jax.eval_shape(batch, numbers)
+    most = bytes_of_jaxpr(batch.trace(numbers).jaxpr.jaxpr)
+    for name in problem.contenders:
+        c, blocks = contender(problem, name), blocks_of(problem)
+        traced = _records.trace(c.filter, blocks, c.model, c.case, c.reported, many)
+        most = max(most, bytes_of_jaxpr(traced.jaxpr.jaxpr))
+    return most
 
 
 def contender(problem: Problem, name: str) -> Contender:
@@ -174,9 +198,29 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
         ValueError: there is no such contender.
     """
     c = contender(problem, name)
-    blocks = tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
-    found = _records(c.filter, blocks, c.model, c.case, c.reported, worlds)
+    found = _records(c.filter, blocks_of(problem), c.model, c.case, c.reported, worlds)
     return cut(found, count)
+
+
+def blocks_of(problem: Problem) -> Blocks:
+    """The blocks of a problem as what is compiled takes them."""
+    return tuple((b.name, b.where.start, b.where.stop) for b in problem.blocks)
+
+
+def parted(record: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Of a record what statistics need of each run, and what is shown of the first one only."""
+    named = {"mean": record["mean"], "updates": record["updates"]}
+    needed = {name: (u.nis, u.dof) for name, u in record["updates"].items()}
+    return record | {"mean": None, "updates": needed}, named
+
+
+def joined(needed: dict[str, Any], named: dict[str, Any]) -> dict[str, Any]:
+    """The record of `parted`; the leading axis of what is shown of one run is one."""
+    updates = {
+        name: u._replace(nis=needed["updates"][name][0], dof=needed["updates"][name][1])
+        for name, u in named["updates"].items()
+    }
+    return needed | {"mean": named["mean"], "updates": updates}
 
 
 def cut(records: Any, count: int) -> Any:

@@ -6,13 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import jax
 import numpy as np
 import xarray as xr
 
 from robins.campaign.bound import bound_sigma
 from robins.campaign.machine import machine_for
-from robins.campaign.monte_carlo import CHUNK
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
 from robins.results import Outcome, Progress, array, keeping, silent, variable
@@ -23,7 +21,7 @@ from robins.systems.tables import block_array, innovation_tables
 def simulate(
     problem: Problem,
     runs: int,
-    chunk: int = CHUNK,
+    chunk: int = 0,
     progress: Progress = silent,
     machine: str = "",
 ) -> Outcome:
@@ -32,7 +30,7 @@ def simulate(
     Args:
         problem: what to simulate.
         runs: how many runs of each filter.
-        chunk: runs per batch.
+        chunk: runs at a time; not given, by the memory that they need.
         progress: called with the share done in 0..1 and what is being done.
         machine: one of `robins.campaign.MACHINES`; not given, what is faster.
 
@@ -49,6 +47,14 @@ def simulate(
         for n in names
     }
     done, bound = 0, None
+    by = machine_for(problem, runs, machine)
+    chunk = chunk or by.width(runs)
+
+    def taken(name: str, record: dict[str, Any]) -> Statistics:
+        """The statistics of a chunk, in the thread that computed it."""
+        of_chunk = found[name].blank()
+        of_chunk.add(record)
+        return of_chunk
 
     def stage(what: str, step: int) -> None:
         """Tell of a step of a chunk: its worlds are simulated first, then every filter is run."""
@@ -58,16 +64,14 @@ def simulate(
         progress(share, f"{what}: {verb}runs {done + 1} to {last} of {runs}")
 
     stage("simulation", 0)
-    by = machine_for(problem, runs, machine)
-    for batch, count, recorded in by.chunks(runs, chunk):
+    for first, count, statistics in by.chunks(runs, chunk, taken):
         of = problem.bound_of
         if bound is None and of is not None and of in problem.contenders:
             stage("covariance bound", 1)
-            first = jax.tree_util.tree_map(lambda x: x[0], batch)
             bound = bound_sigma(problem, of, first)
         for step, name in enumerate(names, 1):
             stage(name, step)
-            found[name].add(recorded(name))
+            found[name].merge(statistics(name))
         done += count
         if done < runs:
             stage("simulation", 0)

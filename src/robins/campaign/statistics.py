@@ -1,6 +1,8 @@
 """Statistics of many runs, with their confidence.
 
-Sums are taken chunk by chunk, so a campaign of any size needs the memory of one chunk.
+A chunk of runs becomes sums over its runs and a few numbers of each; `Statistics.merge` joins
+chunks, so that a campaign of any size needs the memory of the chunks at work. All that is joined
+are plain arrays by name.
 """
 
 from __future__ import annotations
@@ -21,14 +23,16 @@ from robins.systems.study import Limit, Norm, StateBlock
 
 @dataclass
 class Statistics:
-    """Running sums over the runs of one filter; `add` a chunk at a time.
+    """Of the runs of one filter: `add` chunks, or `merge` those of each chunk in their order.
 
     Attributes:
         runs: added so far.
         diverged: runs whose error or covariance stopped being finite; they stay in the count, and
             every statistic that they touch is infinite rather than flattered.
-        run_rms: (runs, r) root mean square of the error of each run over the epochs counted.
+        n: tangent dimension of the filter's state, which may have more than is reported.
         example: the record of the first run, for figures.
+        sums: over the runs, arrays by name.
+        each: of every run, by name arrays with a leading axis of runs, one a chunk.
     """
 
     blocks: Sequence[StateBlock]
@@ -39,73 +43,98 @@ class Statistics:
     windows: Sequence[slice] = ()  # spans of epochs whose largest errors are kept
     runs: int = 0
     diverged: int = 0
-    n: int = 0  # tangent dimension of the filter's state, which may have more than is reported
+    n: int = 0
     example: dict[str, Any] | None = None
-    _square: Any = 0.0
-    _variance: Any = 0.0
-    _nees: Any = 0.0
-    _block_nees: dict[str, Any] = field(default_factory=dict)
-    _nis: dict[str, Any] = field(default_factory=dict)
-    _dof: dict[str, Any] = field(default_factory=dict)
-    _tallies: list[Tally] = field(default_factory=list)
-    _run_rms: list[np.ndarray] = field(default_factory=list)
-    _within: dict[str, Any] = field(default_factory=dict)
-    _settled: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    _norms: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    _peaks: list[np.ndarray] = field(default_factory=list)
-    _norm_peaks: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    _output_square: dict[str, Any] = field(default_factory=dict)
-    _run_output_rms: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    _run_output_worst: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    sums: dict[str, Any] = field(default_factory=dict)
+    each: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.record` gives it."""
         error, sigma = record["error"], record["sigma"]
         if self.example is None:
-            self.example = jax.tree_util.tree_map(lambda x: x[0], record)
+            self.example = jax.tree_util.tree_map(lambda x: np.array(x[0]), record)
         bad = ~np.all(np.isfinite(error) & np.isfinite(sigma), axis=(1, 2))
-        error = np.where(bad[:, None, None], np.inf, error)
         self.runs += len(error)
         self.diverged += int(np.sum(bad))
-        self._square = self._square + np.sum(error**2, axis=0)
-        self._variance = self._variance + np.sum(sigma**2, axis=0)
-        self._nees = self._nees + np.sum(np.where(bad[:, None], np.inf, record["nees"]), axis=0)
-        for name, value in record["block_nees"].items():
-            total = np.sum(np.where(bad[:, None], np.inf, value), axis=0)
-            self._block_nees[name] = self._block_nees.get(name, 0.0) + total
-        for name, update in record["updates"].items():
-            self._nis[name] = self._nis.get(name, 0.0) + np.sum(update.nis, axis=0)
-            self._dof[name] = self._dof.get(name, 0) + np.sum(update.dof, axis=0)
-        self._tallies.append(record.get("tally", Tally.blank(())))
-        for name, value in record.get("outputs", {}).items():
-            value = np.where(bad[:, None, None], np.inf, value)
-            self._output_square[name] = self._output_square.get(name, 0.0) + np.sum(value**2, 0)
-            squares = np.mean(value[:, self.counted] ** 2, axis=1)
-            self._run_output_rms.setdefault(name, []).append(np.sqrt(squares))
-            worst = np.max(np.linalg.norm(value[:, self.counted], axis=2), axis=1)
-            self._run_output_worst.setdefault(name, []).append(worst)
         self.n = int(record["dim"][0])
-        counted = error[:, self.counted]
+        error = _infinite(error, bad)
+        self._sum("square", error**2)
+        self._sum("variance", sigma**2)
+        self._sum("nees", _infinite(record["nees"], bad))
+        for name, value in record["block_nees"].items():
+            self._sum(f"nees of {name}", _infinite(value, bad))
+        for name, update in record["updates"].items():
+            self._sum(f"nis of {name}", update.nis)
+            self._sum(f"dof of {name}", update.dof)
+        self._outputs(record.get("outputs", {}), bad)
+        self._lengths(error)
+        self._within(error)
+        self._each("rms", np.sqrt(np.mean(error[:, self.counted] ** 2, axis=1)))
+        if self.windows:
+            worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
+            self._each("peaks", np.stack(worst, axis=1))
+        if "tally" in record:
+            for name, value in _by_name(record["tally"]).items():
+                self._each(name, value)
+
+    def merge(self, other: Statistics) -> None:
+        """Join the statistics of the runs that follow, as if their records had been added here.
+
+        Chunks that are joined in one order give the same bits, whoever computed them and when.
+        """
+        self.runs += other.runs
+        self.diverged += other.diverged
+        self.n = other.n or self.n
+        if self.example is None:
+            self.example = other.example
+        for name, value in other.sums.items():
+            self.sums[name] = self.sums[name] + value if name in self.sums else value
+        for name, values in other.each.items():
+            self.each.setdefault(name, []).extend(values)
+
+    def blank(self) -> Statistics:
+        """Of no runs yet, with the settings of these: for a chunk, to be merged."""
+        return Statistics(
+            self.blocks, self.count_from, self.limits, self.count_to, self.norms, self.windows
+        )
+
+    def _sum(self, name: str, values: np.ndarray) -> None:
+        total = np.sum(values, axis=0)
+        self.sums[name] = self.sums[name] + total if name in self.sums else total
+
+    def _each(self, name: str, values: Any) -> None:
+        self.each.setdefault(name, []).append(np.array(values))
+
+    def _all(self, name: str) -> np.ndarray:
+        return np.concatenate(self.each[name])
+
+    def _outputs(self, outputs: dict[str, np.ndarray], bad: np.ndarray) -> None:
+        for name, value in outputs.items():
+            value = _infinite(value, bad)
+            self._sum(f"square of {name}", value**2)
+            squares = np.mean(value[:, self.counted] ** 2, axis=1)
+            self._each(f"rms of {name}", np.sqrt(squares))
+            worst = np.max(np.linalg.norm(value[:, self.counted], axis=2), axis=1)
+            self._each(f"worst of {name}", worst)
+
+    def _lengths(self, error: np.ndarray) -> None:
         for norm in self.norms:
             whole = np.sqrt(np.sum(error[:, :, list(norm.components)] ** 2, axis=2))
             length = whole[:, self.counted]
             with np.errstate(invalid="ignore"):  # the spread of an infinite error
                 pair = np.stack([np.mean(length, axis=1), np.std(length, axis=1)], axis=1)
-            self._norms.setdefault(norm.name, []).append(pair)
+            self._each(f"norm {norm.name}", pair)
             if self.windows:
                 worst = [np.max(whole[:, span], axis=1) for span in self.windows]
-                self._norm_peaks.setdefault(norm.name, []).append(np.stack(worst, axis=1))
-        self._run_rms.append(np.sqrt(np.mean(counted**2, axis=1)))
-        if self.windows:
-            worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
-            self._peaks.append(np.stack(worst, axis=1))
+                self._each(f"peaks of {norm.name}", np.stack(worst, axis=1))
+
+    def _within(self, error: np.ndarray) -> None:
         for limit in self.limits:
             where = next(b.where for b in self.blocks if b.name == limit.block)
             over = np.max(np.abs(error[:, :, where]), axis=2) > limit.value
-            self._within[limit.name] = self._within.get(limit.name, 0) + np.sum(~over, axis=0)
+            self._sum(f"within {limit.name}", ~over)
             last = over.shape[1] - np.argmax(over[:, ::-1], axis=1)
-            settled = np.where(np.any(over, axis=1), last, 0)
-            self._settled.setdefault(limit.name, []).append(settled)
+            self._each(f"settled {limit.name}", np.where(np.any(over, axis=1), last, 0))
 
     @property
     def first_run(self) -> dict[str, Any]:
@@ -121,12 +150,12 @@ class Statistics:
     @property
     def rms(self) -> np.ndarray:
         """(E, r) root mean square error over the runs."""
-        return np.sqrt(self._square / self.runs)
+        return np.sqrt(self.sums["square"] / self.runs)
 
     @property
     def sigma(self) -> np.ndarray:
         """(E, r) root of the mean variance that the filter states."""
-        return np.sqrt(self._variance / self.runs)
+        return np.sqrt(self.sums["variance"] / self.runs)
 
     @property
     def counted(self) -> slice:
@@ -135,51 +164,58 @@ class Statistics:
 
     def norm(self, name: str) -> np.ndarray:
         """(runs, 2) mean and standard deviation over time of a norm of the error, by run."""
-        return np.concatenate(self._norms[name])
+        return self._all(f"norm {name}")
 
     @property
     def peaks(self) -> np.ndarray:
         """(runs, windows, r) largest error of each run in each window."""
-        return np.concatenate(self._peaks)
+        return self._all("peaks")
 
     def norm_peaks(self, name: str) -> np.ndarray:
         """(runs, windows) the same of a norm."""
-        return np.concatenate(self._norm_peaks[name])
+        return self._all(f"peaks of {name}")
 
     def output_rms(self, name: str) -> np.ndarray:
         """(E, k) root mean square of an output over the runs."""
-        return np.sqrt(self._output_square[name] / self.runs)
+        return np.sqrt(self.sums[f"square of {name}"] / self.runs)
 
     def run_output_rms(self, name: str) -> np.ndarray:
         """(runs, k) root mean square of an output over the epochs counted."""
-        return np.concatenate(self._run_output_rms[name])
+        return self._all(f"rms of {name}")
 
     def run_output_worst(self, name: str) -> np.ndarray:
         """(runs,) greatest length of an output over the epochs counted."""
-        return np.concatenate(self._run_output_worst[name])
+        return self._all(f"worst of {name}")
 
     @property
     def run_rms(self) -> np.ndarray:
         """(runs, r)."""
-        return np.concatenate(self._run_rms)
+        return self._all("rms")
 
     def share_within(self, limit: str) -> np.ndarray:
         """(E,) share of the runs whose largest error in the block is within a limit."""
-        return self._within[limit] / self.runs
+        return self.sums[f"within {limit}"] / self.runs
 
     def settled(self, limit: str) -> np.ndarray:
         """(runs,) number of the epoch from which on a run is within a limit; E: never."""
-        return np.concatenate(self._settled[limit])
+        return self._all(f"settled {limit}")
 
     @property
     def tally(self) -> Tally:
         """How the steps went; leading axis of runs."""
-        return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *self._tallies)
+        found: dict[str, dict[str, np.ndarray]] = {field: {} for field in Tally._fields}
+        for name in self.each:
+            what, _, sensor = name.partition(TALLY)
+            if what in found:
+                found[what][sensor] = self._all(name)
+        if not found["predictions"]:
+            return Tally.blank(())
+        return Tally(found.pop("predictions")[""], **found)
 
     def overall_ratio(self) -> np.ndarray:
         """(r,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
         at = self.counted
-        return np.sqrt(np.sum(self._square[at], 0) / np.sum(self._variance[at], 0))
+        return np.sqrt(np.sum(self.sums["square"][at], 0) / np.sum(self.sums["variance"][at], 0))
 
     def ratio_bounds(self, level: float = 0.99) -> np.ndarray:
         """(r, 2) bounds of `overall_ratio` that hold for all states at once at this level.
@@ -187,19 +223,19 @@ class Statistics:
         Runs are independent, the epochs of one are not, so the spread between runs is what counts;
         the level is shared out over the states (Bonferroni).
         """
-        variance = np.mean(self._variance[self.counted] / self.runs, axis=0)
+        variance = np.mean(self.sums["variance"][self.counted] / self.runs, axis=0)
         squares = self.run_rms**2 / variance
         each = 1.0 - (1.0 - level) / squares.shape[1]
         return np.array([rms_with_bounds(column, each)[1:] for column in squares.T])
 
     def anees(self) -> np.ndarray:
         """(E,) average NEES over n."""
-        return self._nees / (self.runs * self.n)
+        return self.sums["nees"] / (self.runs * self.n)
 
     def block_anees(self) -> dict[str, np.ndarray]:
         """(E,) average NEES of each block over its size."""
-        size = {b.name: len(b.axes) for b in self.blocks}
-        return {k: v / (self.runs * size[k]) for k, v in self._block_nees.items()}
+        there = (b for b in self.blocks if f"nees of {b.name}" in self.sums)
+        return {b.name: self.sums[f"nees of {b.name}"] / (self.runs * len(b.axes)) for b in there}
 
     def anees_band(self, level: float = 0.95) -> np.ndarray:
         """(2,) band of `anees`."""
@@ -213,12 +249,33 @@ class Statistics:
 
     def nis(self, sensor: str, level: float = 0.95) -> Verdict:
         """Grand mean NIS of a sensor per degree of freedom, all runs and epochs, and its band."""
-        return grand_mean_nis(self._nis[sensor], self._dof[sensor], level)
+        return grand_mean_nis(self.sums[f"nis of {sensor}"], self.sums[f"dof of {sensor}"], level)
 
     @property
     def sensors(self) -> list[str]:
         """Sensors that were used at all."""
-        return [k for k, v in self._dof.items() if np.sum(v) > 0]
+        return [
+            k[len("dof of ") :]
+            for k, v in self.sums.items()
+            if k.startswith("dof of ") and np.sum(v) > 0
+        ]
+
+
+TALLY = " counted of "
+
+
+def _by_name(tally: Tally) -> dict[str, Any]:
+    """The arrays of a tally by names of their own."""
+    of = {name: getattr(tally, name) for name in Tally._fields[1:]}
+    by = {f"{what}{TALLY}{sensor}": v for what, some in of.items() for sensor, v in some.items()}
+    return {"predictions": tally.predictions, **by}
+
+
+def _infinite(values: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Values whose bad runs are infinite throughout."""
+    if not np.any(bad):
+        return values
+    return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), np.inf, values)
 
 
 def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ carried on, and a row of each array that is made. The body of a `scan` is one.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -23,10 +23,11 @@ KINDS = {"f8": 0, "b1": 1, "i4": 2, "i8": 3, "u4": 4, "u8": 5}  # of arrays, as 
 
 
 class Rows(ctypes.Structure):
-    """An array of all runs, as `scan.h` takes and gives it."""
+    """An array of all runs, or of the first, as `scan.h` takes and gives it."""
 
     _fields_ = (
         ("data", ctypes.c_void_p),
+        ("runs", ctypes.c_int64),
         ("run", ctypes.c_int64),
         ("round", ctypes.c_int64),
         ("size", ctypes.c_int32),
@@ -72,8 +73,15 @@ class Rounds:
         zeros = self.program.zeros
         return all(bool(np.all(zero_in_all(begin[k])[mask])) for k, mask in zeros.items())
 
-    def __call__(self, runs: int, given: Sequence[Given]) -> list[np.ndarray]:
+    def __call__(
+        self, runs: int, given: Sequence[Given], named: Collection[int] = ()
+    ) -> list[np.ndarray]:
         """What is carried in the end, and the rows made, with a leading axis of runs.
+
+        Args:
+            runs: how many.
+            given: what is carried, what stays, rows.
+            named: numbers of the results that are kept of the first run only.
 
         Raises:
             MemoryError: there is none for the rows of some rounds.
@@ -85,7 +93,11 @@ class Rounds:
         ]
         made = [
             np.empty(
-                (runs, *((self.length,) if k >= self.carried else ()), *leaf.shape),
+                (
+                    1 if k in named else runs,
+                    *((self.length,) if k >= self.carried else ()),
+                    *leaf.shape,
+                ),
                 _dtype(leaf.dtype),
             )
             for k, leaf in enumerate(results)
@@ -129,7 +141,14 @@ def _rows(a: np.ndarray, batched: bool, by_round: bool, leaf: Leaf) -> Rows:
     size = int(np.prod(leaf.shape))
     run = a.strides[0] if batched and a.size else 0
     kind = KINDS[f"{a.dtype.kind}{a.dtype.itemsize}"]
-    return Rows(a.ctypes.data, run, size * a.itemsize if by_round else 0, size, kind)
+    return Rows(
+        a.ctypes.data,
+        len(a) if batched else 1,
+        run,
+        size * a.itemsize if by_round else 0,
+        size,
+        kind,
+    )
 
 
 def _text(program: Program) -> str:

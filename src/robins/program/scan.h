@@ -3,6 +3,7 @@
 
 typedef struct {
     char *data;      /* of the first run and round */
+    int64_t runs;    /* how many are there: what others give is not kept */
     int64_t run;     /* bytes from one run to the next, 0 where all share one */
     int64_t round;   /* bytes from one round to the next */
     int32_t size;    /* numbers in a round */
@@ -22,7 +23,7 @@ typedef struct {
         }                                                                              \
     }
 #define GIVEN(type)                                                                    \
-    for (int l = 0; l < active; ++l) {                                                 \
+    for (int l = 0; l < active && run + l < a->runs; ++l) {                            \
         char *into = a->data + (run + l) * a->run;                                     \
         for (int64_t t = 0; t < count; ++t) {                                          \
             type *at = (type *)(into + (first + t * step) * a->round);                 \

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import jax
@@ -17,7 +17,16 @@ import numpy as np
 from jax import lax
 from jax.extend import core as jex
 
+from robins.program.kinds import is_key
 from robins.program.lanes import Given, Rounds, zero_in_all
+from robins.program.liveness import (
+    Touched,
+    bytes_of,
+    bytes_of_jaxpr,
+    last_uses,
+    most_bytes,
+    variables,
+)
 from robins.program.loops import (
     Along,
     Body,
@@ -128,21 +137,27 @@ class Batch:
         self.makes: list[Any] = []
         self._compiled: Callable[..., Any] | None = None
         self._alone = False
+        self._most = 0
+
+    @property
+    def touched(self) -> Touched:
+        """What goes in and out, and what it needs in between."""
+        outside = sum(map(bytes_of, {*self.takes, *self.makes}))
+        return Touched(self.takes, self.makes, max(self._most - outside, 0))
 
     def compile(self, batched: set[Any], wanted: Callable[[Any], bool]) -> None:
         """Find what goes in and out, and let JAX compile it."""
-        made = {v for e in self.equations for v in e.outvars}
-        free = (v for e in self.equations for v in e.invars if not isinstance(v, jex.Literal))
-        self.takes = list(dict.fromkeys(v for v in free if v not in made))
+        self.takes = list(dict.fromkeys(taken(self)))
         self.makes = [v for e in self.equations for v in e.outvars if wanted(v)]
         about = jex.DebugInfo("jit", "stage", None, None)
         jaxpr = jex.Jaxpr([], self.takes, self.makes, self.equations, debug_info=about)
         function = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, []))
         axes = tuple(0 if v in batched else None for v in self.takes)
+        self._most = bytes_of_jaxpr(jaxpr)
         self._alone = any(name in str(jaxpr) for name in FACTORISED)
         self._compiled = jax.jit(jax.vmap(function, axes) if 0 in axes else function)
 
-    def __call__(self, values: dict[Any, Any]) -> dict[Any, Any]:
+    def __call__(self, runs: int, values: dict[Any, Any]) -> dict[Any, Any]:
         """What it makes of what is there."""
         assert self._compiled is not None
         given = [values[v] for v in self.takes]
@@ -169,10 +184,19 @@ class Loop:
         self.rounds: Rounds | None = None
         self._lock = threading.Lock()
 
-    def connect(self, batched: set[Any], wanted: Callable[[Any], bool], unroll: int | None) -> None:
-        """Find what goes in and out."""
+    def connect(
+        self,
+        batched: set[Any],
+        wanted: Callable[[Any], bool],
+        named: Collection[Any],
+        unroll: int | None,
+    ) -> None:
+        """Find what goes in and out; of some variables that are made the first run is enough."""
         self._batched, self._wanted, self._unroll = batched, wanted, unroll
-        self.body = Body(self.equations, self.axis, wanted)
+        self.body = body = Body(self.equations, self.axis, wanted)
+        made = [*body.after, *body.made]
+        self._named = {k for k, v in enumerate(made, 1) if v in named}
+        self.touched = Touched([*body.begin, *body.stays, *body.rows], made)
 
     def __call__(self, runs: int, values: dict[Any, Any]) -> dict[Any, Any]:
         """What it makes of what is there."""
@@ -193,9 +217,9 @@ class Loop:
             self._compile(known, begin)
             rounds = self.rounds
         if rounds is None:
-            return self._by_jax(values)
+            return self._by_jax(runs, values)
         free = [v for v in body.stays if v not in known]
-        found = rounds(runs, [*begin, *map(given, free), *map(given, body.rows)])
+        found = rounds(runs, [*begin, *map(given, free), *map(given, body.rows)], self._named)
         return dict(zip([*body.after, *body.made], found[1:], strict=True))
 
     def _compile(self, known: dict[Any, np.ndarray], begin: Sequence[Given]) -> None:
@@ -220,17 +244,27 @@ class Staged:
 
     Attributes:
         loops: that are worth a program.
+        bytes_of_run: about the most that the values of a run take at once, its arguments included.
     """
 
-    def __init__(self, function: Callable[..., Any], *shapes: Any, unroll: int | None = UNROLL):
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        *shapes: Any,
+        unroll: int | None = UNROLL,
+        named: bool = False,
+    ):
         """Cut a function into stages; they are compiled when it is called.
 
         Args:
             function: pure, of the arguments of one run.
             shapes: of these, pytrees of `jax.ShapeDtypeStruct`.
             unroll: as in `robins.program.trace`.
+            named: the function returns a pair, and the second is kept of the first run only: its
+                leading axis is one.
         """
         self._flat = flat = Flat(function, *shapes)
+        self._of_all = flat.tree.children()[0].num_leaves if named else flat.tree.num_leaves
         axes = {id(e): axis for e in flat.equations if (axis := along(e)) is not None}
         worth: Counter[Along] = Counter()
         for e in flat.equations:
@@ -269,30 +303,37 @@ class Staged:
         batched = self._batched = set(level)
         parts = [known, *batches.values(), *loops.values()]
         wanted = self._wanted(parts)
+        self._named = set(variables(flat.makes)) - set(variables(flat.makes[: self._of_all]))
+        between = {v for p in parts for v in taken(p)}
         for one in (known, *batches.values()):
             one.compile(batched, wanted)
         for one in loops.values():
-            one.connect(batched, wanted, unroll)
-        self._levels = [
-            (batches.get(k), [one for (at, _), one in loops.items() if at == k])
-            for k in range(max(level.values(), default=0) + 1)
-        ]
-        self._known = flat.known | known(flat.known)
+            one.connect(batched, wanted, self._named - between, unroll)
+        self._stages: list[Batch | Loop] = []
+        for k in range(max(level.values(), default=0) + 1):
+            self._stages += [batches[k]] if k in batches else []
+            self._stages += [one for (at, _), one in loops.items() if at == k]
+        self._known = flat.known | known(1, flat.known)
+        touched = [self._of_runs(one.touched, between) for one in self._stages]
+        kept = set(variables(flat.makes)) - self._named
+        self._dropped = last_uses(touched, kept | set(flat.takes))
+        self.bytes_of_run = most_bytes(touched, flat.takes, kept)
+
+    def _of_runs(self, one: Touched, between: set[Any]) -> Touched:
+        """What a stage takes and makes by run: not of what is known or of the first run alone."""
+        here = self._batched - (self._named - between)
+        takes, makes = ([v for v in variables(some) if v in here] for some in one[:2])
+        return Touched(takes, makes, one.within)
 
     def _wanted(self, parts: Sequence[Batch | Loop]) -> Callable[[Any], bool]:
         """Whether a variable is needed outside of the part that makes it."""
-        home = {v: id(p) for p in parts for e in p.equations for v in e.outvars}
-        out = {v for v in self._flat.makes if not isinstance(v, jex.Literal)}
-        for p in parts:
-            for e in p.equations:
-                free = (v for v in e.invars if not isinstance(v, jex.Literal))
-                out.update(v for v in free if home.get(v, id(p)) != id(p))
+        out = {*variables(self._flat.makes), *(v for p in parts for v in taken(p))}
         return out.__contains__
 
     @property
     def loops(self) -> list[Loop]:
         """The loops, in an order of computation."""
-        return [one for _, some in self._levels for one in some]
+        return [one for one in self._stages if isinstance(one, Loop)]
 
     @property
     def operations(self) -> int:
@@ -305,16 +346,33 @@ class Staged:
         runs = leaves[0].shape[0]
         values = dict(self._known)
         values.update(zip(self._flat.takes, leaves, strict=True))
-        for batch, loops in self._levels:
-            if batch is not None:
-                values.update(batch(values))
-            for loop in loops:
-                values.update(loop(runs, values))
+        for stage, dropped in zip(self._stages, self._dropped, strict=True):
+            values.update(stage(runs, values))
+            for v in dropped:
+                value = values.pop(v, None)  # JAX makes less than a loop
+                if value is not None and v in self._named:
+                    values[v] = first_of(value)
+                del value
 
-        def of_all(v: Any) -> Any:
+        def found(v: Any, count: int) -> Any:
             if not isinstance(v, jex.Literal) and v in self._batched:
-                return values[v]
+                return values[v] if count > 1 else first_of(values[v])
             alone = np.asarray(v.val if isinstance(v, jex.Literal) else values[v])
-            return np.broadcast_to(alone, (runs, *alone.shape))
+            return np.broadcast_to(alone, (count, *alone.shape))
 
-        return jax.tree_util.tree_unflatten(self._flat.tree, map(of_all, self._flat.makes))
+        many, few = self._flat.makes[: self._of_all], self._flat.makes[self._of_all :]
+        leaves = [*(found(v, runs) for v in many), *(found(v, 1) for v in few)]
+        return jax.tree_util.tree_unflatten(self._flat.tree, leaves)
+
+
+def first_of(value: Any) -> Any:
+    """The first run of an array of runs, without holding the others."""
+    if value.shape[0] == 1:
+        return value
+    return value[:1] if is_key(value.dtype) else np.array(np.asarray(value)[:1])
+
+
+def taken(part: Batch | Loop) -> list[Any]:
+    """The variables that a part takes from others."""
+    made = {v for e in part.equations for v in e.outvars}
+    return [v for e in part.equations for v in variables(e.invars) if v not in made]

@@ -1,0 +1,36 @@
+"""How many runs a chunk has and how many chunks are computed at once, so that memory has a bound.
+
+A chunk is as wide as the histories of its runs allow, by what the stages of a run hold at once. The
+width depends on the problem and not on the machine's cores: results that JAX sums in batches have
+the same bits on any number of threads.
+"""
+
+from __future__ import annotations
+
+LEAST = 8  # runs of a chunk: the lanes of a processor
+CHUNK = 64  # runs of a chunk at most: they fill a core's vectors, and more would not fit its cache
+CHUNK_BYTES = 128 << 20  # of a chunk in lanes, of which several are computed at once
+MEMORY = 768 << 20  # bytes of all chunks at once
+
+
+def width_of(bytes_of_run: int, most: int) -> int:
+    """Runs of a chunk that takes so many bytes at most; a multiple of `LEAST`, up to `CHUNK`."""
+    fitting = most // max(bytes_of_run, 1) // LEAST * LEAST
+    return min(max(fitting, LEAST), CHUNK)
+
+
+def at_once(bytes_of_run: int, width: int, cores: int) -> int:
+    """How many chunks are computed at once: one a core, as long as memory is left."""
+    return max(1, min(cores, MEMORY // max(width * bytes_of_run, 1)))
+
+
+def said(bytes_of_run: int, width: int) -> list[str]:
+    """A note, where a chunk alone is more than the bound."""
+    needed = width * bytes_of_run
+    if needed <= MEMORY:
+        return []
+    return [
+        f"{width} runs at a time need about {needed / 1e6:.0f} MB of memory, more than the "
+        f"{MEMORY / 1e6:.0f} MB that a campaign keeps to, since their histories are so long. "
+        "Where that is too much, shorten the run or lengthen its step"
+    ]

@@ -1,0 +1,90 @@
+"""Which values are last used where, and so how much memory a function takes.
+
+A stage is told by the variables of a jaxpr that it takes and makes. The equations of a jaxpr are
+stages too, so what JAX computes is counted by the same function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.extend import core as jex
+
+from robins.program.kinds import is_key
+from robins.program.primitives.control import called
+
+KEY_BYTES = 8
+
+
+class Touched(NamedTuple):
+    """What a stage takes and makes, and the bytes that it needs for itself beside these."""
+
+    takes: Sequence[Any]
+    makes: Sequence[Any]
+    within: int = 0
+
+
+def last_uses(stages: Sequence[Touched], kept: Collection[Any]) -> list[list[Any]]:
+    """By stage, the variables that nothing needs once it is done.
+
+    Args:
+        stages: in an order of computation.
+        kept: what is needed in the end.
+    """
+    last: dict[Any, int] = {}
+    for k, one in enumerate(stages):
+        last.update(dict.fromkeys(variables([*one.takes, *one.makes]), k))
+    found: list[list[Any]] = [[] for _ in stages]
+    for v, k in last.items():
+        if v not in kept:
+            found[k].append(v)
+    return found
+
+
+def most_bytes(stages: Sequence[Touched], given: Iterable[Any], kept: Collection[Any]) -> int:
+    """The most bytes that all values take at once, if each is dropped after its last use.
+
+    Args:
+        stages: in an order of computation.
+        given: what is there before and stays.
+        kept: what is needed in the end.
+    """
+    stay = set(variables(given))
+    most = here = sum(map(bytes_of, stay))
+    for one, dropped in zip(stages, last_uses(stages, {*variables(kept), *stay}), strict=True):
+        made = sum(map(bytes_of, variables(one.makes)))
+        most = max(most, here + made + one.within)
+        here += made - sum(map(bytes_of, dropped))
+    return most
+
+
+def bytes_of_jaxpr(jaxpr: Any) -> int:
+    """The most bytes that the values of a jaxpr take at once, one equation after the other.
+
+    Rather too much: XLA makes one of several equations, and what they hand on is never in memory.
+    """
+
+    def touched(e: Any) -> Touched:
+        inner = called(e)
+        if inner is None:
+            return Touched(e.invars, e.outvars)
+        there = {*variables(e.invars), *e.outvars}
+        within = bytes_of_jaxpr(inner.jaxpr) - sum(map(bytes_of, there))
+        return Touched(e.invars, e.outvars, max(within, 0))
+
+    given = [*jaxpr.invars, *jaxpr.constvars]
+    return most_bytes([touched(e) for e in jaxpr.eqns], given, jaxpr.outvars)
+
+
+def bytes_of(v: Any) -> int:
+    """The bytes of a variable of a jaxpr, or of the shape of an array."""
+    aval = getattr(v, "aval", v)
+    size = KEY_BYTES if is_key(aval.dtype) else np.dtype(aval.dtype).itemsize
+    return int(np.prod(aval.shape)) * size
+
+
+def variables(some: Iterable[Any]) -> list[Any]:
+    """Those that are not literals."""
+    return [v for v in some if not isinstance(v, jex.Literal)]

@@ -1,0 +1,42 @@
+"""Bytes of values by their last uses, against counts by hand."""
+
+import jax
+import jax.numpy as jnp
+
+from robins.program.liveness import Touched, bytes_of_jaxpr, last_uses, most_bytes
+from robins.program.stages import Flat
+
+ROW = jax.ShapeDtypeStruct((1000,), float)  # 8000 bytes
+
+
+def chain(x):
+    y = jnp.sin(x)
+    z = jnp.cos(y)  # y is no longer needed
+    return jnp.sum(z)
+
+
+def test_a_value_is_dropped_after_its_last_use():
+    flat = Flat(chain, ROW)
+    stages = [Touched(e.invars, e.outvars) for e in flat.equations]
+    y, z = (e.outvars[0] for e in flat.equations[:2])
+    dropped = last_uses(stages, {*flat.takes, *flat.makes})
+    assert dropped == [[], [y], [z]]
+    assert most_bytes(stages, flat.takes, flat.makes) == 3 * 8000  # x, y and z
+    assert most_bytes(stages, flat.takes, [y, *flat.makes]) == 3 * 8000 + 8  # y stays
+
+
+def test_what_nothing_needs_is_dropped_where_it_is_made():
+    flat = Flat(lambda x: (jnp.sin(x), jnp.cos(x)), ROW)
+    stages = [Touched(e.invars, e.outvars) for e in flat.equations]
+    sine, cosine = flat.makes
+    assert last_uses(stages, {cosine}) == [[sine], [*flat.takes]]
+    assert most_bytes(stages, flat.takes, [cosine]) == 2 * 8000  # x and one of both
+
+
+def test_calls_and_keys_are_counted():
+    inner = jax.jit(lambda x: jnp.sum(chain(2.0 * x) * x))
+    made = jax.make_jaxpr(lambda x: inner(x) + 1.0)(ROW)
+    # within the call: x, 2 x, its sine, the cosine of that; never more than three rows at once
+    assert bytes_of_jaxpr(made.jaxpr) == 3 * 8000
+    keys = jax.make_jaxpr(lambda k: jax.random.fold_in(k, 1))(jax.random.key(0))
+    assert 16 <= bytes_of_jaxpr(keys.jaxpr) <= 64
