@@ -14,8 +14,10 @@ from pathlib import PurePosixPath
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
+import jax
+
 from robins.campaign.gather import blank
-from robins.campaign.machine import ByJax, InLanes
+from robins.campaign.machine import ByJax, InLanes, Part
 from robins.campaign.plan import Chunk, Plan, Shard
 from robins.campaign.shards import pack
 from robins.campaign.statistics import Statistics
@@ -91,7 +93,20 @@ class Worker:
                 of_chunk.example = None  # figures show the first run of all
             return of_chunk
 
-        return self.machine.compute(chunk.begin, self.plan.width, chunk.count, names, taken)
+        part = Part(chunk.begin, chunk.count, self.plan.width)
+        return self.machine.compute(part, names, taken)
+
+    def run_of(self, chunk: Chunk, index: int) -> dict[str, Statistics]:
+        """Of all filters the statistics of one run of a chunk, with its histories.
+
+        The chunk is computed as it was, so that the run has the same bits.
+        """
+        part = Part(chunk.begin, chunk.count, self.plan.width)
+        found = {}
+        for name, record in self.machine.histories(part, list(self.problem.contenders)).items():
+            found[name] = blank(self.problem)
+            found[name].add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
+        return found
 
     def packed(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> bytes:
         """A shard as it is stored: equal ones are equal files, since none tells who made it."""

@@ -235,7 +235,7 @@ def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Out
     chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.count)
     progress(0.0, f"runs {chunk.begin} to {chunk.begin + chunk.count - 1}, of which {run} is shown")
     worker = Worker(store, plan, problem)
-    alone = worker.run_of(chunk, run - chunk.begin, plan.filters)
+    alone = worker.run_of(chunk, run - chunk.begin)
     outcome = outcome_of(problem, alone, None)
     return replace(
         outcome,
