@@ -71,7 +71,7 @@ def test_a_full_disk_leaves_what_is_there(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(stores.os, "fsync", full)
-    with pytest.raises(RobinsError, match="No space left.*make room") as caught:
+    with pytest.raises(RobinsError, match=r"No space left.*make room") as caught:
         folder.put("shards/b", b"two")
     assert not caught.value.bad_input
     assert folder.names("shards") == {"a"}

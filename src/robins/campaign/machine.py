@@ -126,8 +126,6 @@ class InLanes:
         self.problem = problem
         number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
         self._simulate = Staged(problem.simulate, number)
-        world = jax.eval_shape(problem.simulate, number)
-
         self._world = jax.eval_shape(problem.simulate, number)
         self._filters = {name: self._staged(name, named=True) for name in problem.contenders}
         stages = (self._simulate, *self._filters.values())

@@ -79,9 +79,7 @@ class Worker:
         names = [s.filter for s in one.shards]
         found = self.found(one.chunk, names)
         for shard in one.shards:
-            self.store.put(
-                shard.name, self.packed(shard, one.chunk, found[shard.filter]), anew=anew
-            )
+            self.store.put(shard.name, self.packed(shard, one.chunk, found[shard.filter]))
 
     def found(self, chunk: Chunk, names: list[str]) -> dict[str, Statistics]:
         """The statistics of filters over a chunk."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -54,7 +53,8 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
         return
 
     def wait() -> None:
-        sys.stdin.buffer.read()
+        while os.read(0, 1024):
+            pass
         os._exit(Status.INTERRUPTED)
 
     threading.Thread(target=wait, daemon=True).start()
