@@ -7,6 +7,7 @@ import pytest
 from machines import QUICK
 
 from robins.program import BuildError, ProgramError, build, native
+from robins.program.native import FASTER_IN_GCC
 
 
 @pytest.fixture
@@ -31,6 +32,29 @@ def test_a_compiler_that_is_not_there_is_named_with_what_to_do(kept, monkeypatch
     monkeypatch.setenv("CC", "no-such-compiler -O9")
     with pytest.raises(BuildError, match=r"CC: there is no program 'no-such-compiler'; install"):
         build("int one;\n")
+
+
+@pytest.mark.parametrize(
+    ("says", "own"),
+    [
+        ("cc (Debian 12.2.0-14) 12.2.0 Copyright (C) 2022 Free Software Foundation, Inc.", True),
+        ("clang version 17.0.1 Target: x86_64-unknown-linux-gnu", False),
+    ],
+)
+def test_flags_of_gcc_are_given_to_gcc_only(kept, tmp_path, monkeypatch, says, own):
+    cc, told = tmp_path / "cc", tmp_path / "told"
+    cc.write_text(f"""#!/bin/sh
+case "$1" in --version) printf '%s' "{says}"; exit;; esac
+echo "$@" >> {told}
+while [ "$1" != -o ]; do shift; done
+: > "$2"
+""")
+    cc.chmod(0o755)
+    monkeypatch.setenv("CC", str(cc))
+    build("int one;\n", QUICK)
+    build("int one;\n", ("-O2",))
+    compiled = [set(FASTER_IN_GCC) <= set(line.split()) for line in told.read_text().splitlines()]
+    assert compiled == [own, False]
 
 
 def test_without_any_compiler_it_says_how_to_get_one(kept, monkeypatch):

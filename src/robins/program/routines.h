@@ -183,15 +183,34 @@ static inline real real_erf_inv(real x)
     return real_select(real_lt(REAL(1.0), size), REAL(NAN), p * x);
 }
 
-/* A B' of A (m, depth) and B (n, depth), which lie one after the other. */
+/* A B' of A (m, depth) and B (n, depth), which lie one after the other. Here and in `reflect` four
+   sums go side by side, so that each need not wait for its last addition; each is in order. */
 static inline void product(int m, int depth, int n, real *in, real *out)
 {
-    const real *a = in, *b = in + m * depth;
-    for (int i = 0; i < m; ++i) {
-        for (int j = 0; j < n; ++j) {
-            real sum = a[i * depth] * b[j * depth];
-            for (int k = 1; k < depth; ++k) { sum = sum + a[i * depth + k] * b[j * depth + k]; }
-            out[i * n + j] = sum;
+    const real *a = in;
+    for (int i = 0; i < m; ++i, a += depth) {
+        const real *b = in + m * depth;
+        for (int left = n; left > 0; --left, b += depth) {
+            if (left >= 4) {
+                const real *p = b + depth, *q = p + depth, *r = q + depth;
+                real s0 = a[0] * b[0], s1 = a[0] * p[0], s2 = a[0] * q[0], s3 = a[0] * r[0];
+                for (int k = 1; k < depth; ++k) {
+                    s0 = s0 + a[k] * b[k];
+                    s1 = s1 + a[k] * p[k];
+                    s2 = s2 + a[k] * q[k];
+                    s3 = s3 + a[k] * r[k];
+                }
+                *out++ = s0;
+                *out++ = s1;
+                *out++ = s2;
+                *out++ = s3;
+                left -= 3;
+                b = r;
+            } else {
+                real sum = a[0] * b[0];
+                for (int k = 1; k < depth; ++k) { sum = sum + a[k] * b[k]; }
+                *out++ = sum;
+            }
         }
     }
 }
@@ -229,24 +248,50 @@ static inline void solve_lower(int n, int width, real *in, real *out)
     }
 }
 
-/* Add g v v' a to column j of a (rows from k to m, so many columns); v is column k of in. */
+/* Add g v v' a to the columns of a from j on (rows from k to m); v is column k of in (m, n). */
 static inline void reflect(int m, int n, int columns, int k, int j, real g, const real *in, real *a)
 {
-    real along = in[k * n + k] * a[k * columns + j];
-    for (int i = k + 1; i < m; ++i) { along = along + in[i * n + k] * a[i * columns + j]; }
-    along = along * g;
-    for (int i = k; i < m; ++i) {
-        a[i * columns + j] = a[i * columns + j] + along * in[i * n + k];
+    const real head = in[k * n + k];
+    for (; j + 4 <= columns; j += 4) {
+        real *row = a + k * columns + j;
+        real s0 = head * row[0], s1 = head * row[1], s2 = head * row[2], s3 = head * row[3];
+        for (int i = k + 1; i < m; ++i) {
+            const real v = in[i * n + k];
+            row += columns;
+            s0 = s0 + v * row[0];
+            s1 = s1 + v * row[1];
+            s2 = s2 + v * row[2];
+            s3 = s3 + v * row[3];
+        }
+        s0 = s0 * g;
+        s1 = s1 * g;
+        s2 = s2 * g;
+        s3 = s3 * g;
+        row = a + k * columns + j;
+        for (int i = k; i < m; ++i, row += columns) {
+            const real v = in[i * n + k];
+            row[0] = row[0] + s0 * v;
+            row[1] = row[1] + s1 * v;
+            row[2] = row[2] + s2 * v;
+            row[3] = row[3] + s3 * v;
+        }
+    }
+    for (; j < columns; ++j) {
+        real along = head * a[k * columns + j];
+        for (int i = k + 1; i < m; ++i) { along = along + in[i * n + k] * a[i * columns + j]; }
+        along = along * g;
+        for (int i = k; i < m; ++i) {
+            a[i * columns + j] = a[i * columns + j] + along * in[i * n + k];
+        }
     }
 }
 
-/* Q (m, width) and R (width, n) of a matrix (m, n), by reflections I + g v v', v = (alpha - beta,
-   tail), g = -1 / (beta (beta - alpha)); the signs are LAPACK's. R is made in the place of the
-   matrix, with the v in its lower triangle and its diagonal beside it. */
-static inline void householder(int m, int n, int width, real *in, real *out)
+/* R (width, n) of the QR of a matrix (m, n), by reflections I + g v v', v = (alpha - beta, tail),
+   g = -1 / (beta (beta - alpha)); the signs are LAPACK's. R is made in the place of the matrix,
+   with the v in its lower triangle and its diagonal beside it. */
+static inline void triangle(int m, int n, int width, real *in, real *r)
 {
     const int last = m - 1 < n ? m - 1 : n;
-    real *q = out, *r = out + m * width;
     for (int i = 0; i < width * n; ++i) { r[i] = REAL(0.0); }
     for (int k = 0; k < last; ++k) {
         const real alpha = in[k * n + k];
@@ -260,11 +305,19 @@ static inline void householder(int m, int n, int width, real *in, real *out)
                                    REAL(1.0) / real_select(nothing, REAL(1.0), beta * head));
         r[k * n + k] = real_select(nothing, alpha, beta);
         in[k * n + k] = head;
-        for (int j = k + 1; j < n; ++j) { reflect(m, n, n, k, j, g, in, in); }
+        reflect(m, n, n, k, k + 1, g, in, in);
     }
     for (int i = 0; i < width; ++i) {
         for (int j = i < last ? i + 1 : i; j < n; ++j) { r[i * n + j] = in[i * n + j]; }
     }
+}
+
+/* Q (m, width) and R (width, n) of a matrix (m, n), by the reflections of `triangle`. */
+static inline void householder(int m, int n, int width, real *in, real *out)
+{
+    const int last = m - 1 < n ? m - 1 : n;
+    real *q = out, *r = out + m * width;
+    triangle(m, n, width, in, r);
     for (int i = 0; i < m; ++i) {
         for (int j = 0; j < width; ++j) { q[i * width + j] = REAL(i == j ? 1.0 : 0.0); }
     }
@@ -275,7 +328,7 @@ static inline void householder(int m, int n, int width, real *in, real *out)
         const real h = r[k * n + k] * in[k * n + k];
         const real g = real_select(nothing, REAL(0.0),
                                    REAL(1.0) / real_select(nothing, REAL(1.0), h));
-        for (int j = k; j < width; ++j) { reflect(m, n, width, k, j, g, in, q); }
+        reflect(m, n, width, k, k, g, in, q);
     }
 }
 

@@ -164,7 +164,9 @@ def _householder(walk: Walk, A: Nodes, wanted: bool, full: bool) -> tuple[Nodes,
     width = m if full else min(m, n)
     upper = np.arange(width)[:, None] <= np.arange(n)
     if walk.stays_whole(2 * m * n * n):
-        Q, R = call(walk, "householder", [m, n, width], [A], [(m, width), (width, n)])
+        # In calls of their own: what nothing reads is not called, and that is Q in most filters.
+        (R,) = call(walk, "triangle", [m, n, width], [A], [(width, n)])
+        Q, _ = call(walk, "householder", [m, n, width], [A], [(m, width), (width, n)])
         return Q, np.where(upper, R, zero)
     R = A.copy()
     reflections = []
