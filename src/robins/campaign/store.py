@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from time import time
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from robins.errors import RobinsError
 
@@ -23,6 +23,7 @@ _PARTIAL = ".partial"  # what is being written
 _OLD_S = 3600.0  # what is older was left by a writer that died
 
 
+@runtime_checkable
 class Store(Protocol):
     """Objects by name; a slash in a name parts a group from what is in it."""
 
@@ -51,6 +52,10 @@ class Store(Protocol):
 
     def drop(self, name: str) -> None:
         """Remove an object, if it is there."""
+        ...
+
+    def sweep(self) -> None:
+        """Remove what writers that died have left half-written."""
         ...
 
 
