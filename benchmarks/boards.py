@@ -60,7 +60,7 @@ class Ran(NamedTuple):
 
     said: str  # its line on codes and numbers
     bits: str  # checksum of the bits of all states
-    reals: np.ndarray  # (steps, numbers) all states
+    reals: np.ndarray  # all states, one after the other
 
 
 class Built(NamedTuple):
@@ -111,10 +111,9 @@ def _ran(command: list[str]) -> Ran:
     bits = [line.rpartition(" ")[2] for line in lines if line.startswith("bits of all")]
     if not said or not bits:
         raise RuntimeError(f"{command[0]} ended with {done.returncode}: {done.stdout[-300:]}")
-    steps = int(said[0].partition(" ")[0])
     kinds = (np.uint32, np.float32) if len(words[0]) == 8 else (np.uint64, np.float64)
     reals = np.array([int(word, 16) for word in words], kinds[0]).view(kinds[1])
-    return Ran(said[0], bits[0], reals.reshape(steps, -1))
+    return Ran(said[0], bits[0], reals)
 
 
 def sizes(folder: Path) -> np.ndarray:
@@ -129,7 +128,7 @@ def apart(one: Ran, other: Ran, size: np.ndarray) -> str:
     """How far the states of two runs are apart, in parts of a field."""
     if one.bits == other.bits:
         return "to the bit"
-    a, b = one.reals, other.reals
+    a, b = (ran.reals.reshape(-1, len(size)) for ran in (one, other))
     off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b)) / size
     return f"within {np.max(off):.1e} of a field"
 

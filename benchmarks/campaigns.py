@@ -4,17 +4,23 @@ Both are timed after they have compiled, over all that a campaign does but its r
 says how long compiling took, how far their RMS errors are apart, and the most memory in use.
 
     python benchmarks/campaigns.py [RUNS [SYSTEM ...]]
+    python benchmarks/campaigns.py --memory
+
+The second measures the most memory in use by a campaign of an alignment, over truth steps and
+runs, and of the drive, each in a process of its own: of its set-up, and of all.
 """
 
 import resource
+import subprocess
 import sys
 import time
 import tomllib
+from functools import partial
 
 import numpy as np
 
 from robins import scenario
-from robins.campaign import Statistics
+from robins.campaign import Statistics, simulate
 from robins.campaign.machine import ByJax, InLanes, available_cores
 from robins.systems.finding import find_system
 
@@ -26,11 +32,25 @@ CAMPAIGNS = (
 WARM = 64  # runs that compile
 
 
-def problem_of(system, name, filter_):
+ALIGNMENT, DRIVE = CAMPAIGNS[0], CAMPAIGNS[2]
+MEMORY = (  # machine, truth steps, runs
+    ("c", 1_000, 100), ("c", 1_000, 1_000), ("c", 10_000, 100), ("c", 100_000, 32),
+    ("jax", 1_000, 100), ("jax", 10_000, 100), ("c", "drive", 128),
+)  # fmt: skip
+
+
+def problem_of(system, name, filter_, *settings):
     found = find_system(system)
     text = found.scenarios[name].read_text()
     study = found.studies[tomllib.loads(text).get("study", next(iter(found.studies)))]
-    return study.problem(scenario.parse(study.parameters, text, []), (filter_,), 0)
+    return study.problem(scenario.parse(study.parameters, text, settings), (filter_,), 0)
+
+
+def added(blank, name, record):
+    """The statistics of a chunk."""
+    found = blank()
+    found.add(record)
+    return found
 
 
 def timed(machine, runs):
@@ -41,13 +61,40 @@ def timed(machine, runs):
         record(name)
     compiled = time.perf_counter()
     found = Statistics(machine.problem.blocks)
-    for _, _, record in machine.chunks(runs):
-        found.add(record(name))
+    for _, _, statistics in machine.chunks(runs, taken=partial(added, found.blank)):
+        found.merge(statistics(name))
     done = time.perf_counter()
     return compiled - begun, done - compiled, found.rms
 
 
+def used():
+    """The most memory that this process had, in MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+
+
+def one_campaign(machine, steps, runs):
+    """Megabytes of the set-up, and of a whole campaign, of so many truth steps of 0.01 s."""
+    if steps == "drive":
+        problem = problem_of(*DRIVE)
+    else:
+        duration = f"manoeuvre.duration={0.01 * int(steps)} s"
+        problem = problem_of(*ALIGNMENT, duration, "settle=5 s")
+    before = used()
+    simulate(problem, int(runs), machine=machine)
+    print(f"{machine:>8s}{steps:>10s}{runs:>8s}{before:>10.0f}{used():>10.0f}")
+
+
+def memory():
+    print(f"{'machine':>8s}{'steps':>10s}{'runs':>8s}{'set-up':>10s}{'all':>10s}  [MB]", flush=True)
+    for row in MEMORY:
+        subprocess.run([sys.executable, __file__, "--one", *map(str, row)], check=True)
+
+
 def main():
+    if sys.argv[1:2] == ["--one"]:
+        return one_campaign(*sys.argv[2:])
+    if sys.argv[1:] == ["--memory"]:
+        return memory()
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     print(f"{runs} runs; lanes on {available_cores()} cores")
     head = ("campaign", "JAX ms", "lanes ms", "ratio", "JAX s", "C++ s", "apart", "MB")
@@ -58,12 +105,11 @@ def main():
         fast_first, fast, got = timed(InLanes(problem), runs)
         size = np.max(np.abs(want), axis=0)
         apart = np.max(np.abs(got - want) / np.where(size > 0.0, size, 1.0))
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
         numbers = (slow / runs * 1e3, fast / runs * 1e3, slow / fast, slow_first, fast_first)
         print(
             f"{'/'.join(campaign):34s}"
             + "".join(f"{x:10.2f}" for x in numbers)
-            + f"{apart:10.1e}{memory:10.0f}",
+            + f"{apart:10.1e}{used():10.0f}",
             flush=True,
         )
 

@@ -129,6 +129,21 @@ def test_a_gyro_that_stays_away_leads_to_safe_mode_and_back(of):
     assert off[-1] < 60.0 * ARCSEC
 
 
+def test_a_bank_begins_anew_with_all_its_modes():
+    """A mode that kept its attitude of the start would pull the mixture back to it."""
+    of = kit("satellite/s1", "adaptive", *SHORT)
+    loop = Loop(of, without("gyro", "adm acm", range(50, 60))).run(120)
+    safe = np.flatnonzero(bit(loop.flags(), FLAGS[3]))
+    again = int(safe[-1]) + 1
+    found, true = loop.all("estimate", "q_ib"), loop.all("motion", "q_ib")
+    moved = turn(true[again:], np.broadcast_to(true[0], true[again:].shape))
+    assert np.min(np.linalg.norm(moved, axis=1)) > 600.0 * ARCSEC  # away from where it began
+    off = np.linalg.norm(turn(found[again:], true[again:]), axis=1)
+    sigma = np.linalg.norm(loop.all("estimate", "sigma")[again:, :3], axis=1)
+    assert np.all(off < 5.0 * sigma)
+    assert np.all(off < 120.0 * ARCSEC)
+
+
 def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
     # In real time a step that waits for the compiler misses its deadline, and some after it.
     of = kit("satellite/s1", "mekf-gate", *SHORT)

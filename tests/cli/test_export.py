@@ -26,7 +26,20 @@ def test_the_folder_compiles_and_agrees_with_jax(made):
     assert "60 steps: 0 codes differ" in done.stdout
     header = (folder / "robins.h").read_text()
     assert "int robins_update_attitude_matching(robins_state *state," in header
-    assert "rad" in header
+    assert "robins_real sigma[3]; /* rad: its standard deviation;" in header
+    assert "int robins_reset(robins_state *state, const robins_reset_belief *belief," in header
+
+
+def test_its_test_sees_another_new_start(made):
+    answer, folder = made
+    assert answer.status == 0, answer.err
+    record, said = (folder / "recorded.h").read_text(), "reset_belief_mean[1][9] = {\n    {"
+    assert said in record
+    (folder / "recorded.h").write_text(record.replace(said, f"{said}1.0 + "))
+    done = subprocess.run(["make", "-C", str(folder), "check"], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "60 steps: 0 codes differ" in done.stdout
+    assert "FAILED" in done.stdout
 
 
 def test_single_precision_tells_what_it_costs(robins, tmp_path):
@@ -52,6 +65,41 @@ def test_single_precision_tells_what_it_costs(robins, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "60 steps: 0 codes differ" in done.stdout
+
+
+def test_a_filter_of_logs_compiles_and_agrees_with_jax(robins, tmp_path):
+    """A configuration of the user's own, of a unit without a magnetometer."""
+    (tmp_path / "unit.toml").write_text('system = "marg"\nuse_magnetometer = "never"\n')
+    answer = robins("export", "unit.toml", "--to", "unit", "--set", "update.block=20 ms", "--json")
+    assert answer.status == 0, answer.err
+    assert json.loads(answer.out)["filter"] == "marg"
+    folder = tmp_path / "unit"
+    header = (folder / "robins.h").read_text()
+    assert "Filter 'marg' of unit" in header
+    assert "robins_real theta_b[2][3]; /* rad, body: rotation vector of each interval" in header
+    assert "magnetometer" not in header
+    assert "6 to 8: place [m], NED: north, east, down" in header
+    quick = "CFLAGS=-std=c99 -O0 -Wall -Wextra -Wconversion -Wpedantic -Werror"
+    done = subprocess.run(
+        ["make", "-C", str(folder), "check", quick], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "60 steps: 0 codes differ" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (("marg/replay", "--filter", "marg-smoothed"), "no filter 'marg-smoothed' in marg/replay"),
+        (("ins-gnss/replay",), "ins-gnss/replay describes what is recorded and simulates nothing"),
+        (("marg/replay", "--set", "gyro.bia=1 deg/s"), "gyro.bia"),
+    ],
+)
+def test_what_cannot_be_tried_is_refused(robins, tmp_path, name, message):
+    answer = robins("export", *name, "--to", "x")
+    assert answer.status == 2
+    assert message in answer.err
+    assert not (tmp_path / "x").exists()
 
 
 def test_what_is_there_is_not_written_over(robins, tmp_path):

@@ -1,8 +1,9 @@
 """A test of an exported library with the user's own compiler: recorded steps, replayed.
 
 `make check` in the folder compiles library and test, replays the recorded inputs, and compares the
-state after each step and every code with those of JAX. It also prints a checksum of the bits of all
-states, by which two compilers or two machines are compared.
+state after each step and every code with those of JAX. Entry points that are no part of a step are
+called once, after the last one. It also prints a checksum of the bits of all states, by which two
+compilers or two machines are compared.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from robins.program.library import C_TYPES, Entry, Field, Library, fields_of, number
 from robins.program.precision import DOUBLE, SINGLE, Precision
 
-TOLERANCE = 1e-9  # of the largest number that a field has in the record; of a library of doubles
+TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
 
 MAKEFILE = """\
 # make check   compiles {name}.c and a test of it, and runs the test on recorded steps
@@ -92,7 +93,7 @@ int main(void)
     static {name}_state state;
     int wrong = 0;
     {name}_init(&state);
-    for (int t = 0; t < STEPS; ++t) {{"""
+    for (int t = 0; t < STEPS + ENDS; ++t) {{"""
 
 END = """\
     }
@@ -115,11 +116,15 @@ class Recorded(NamedTuple):
     Attributes:
         given: of each entry point, in the order in which a step calls them, its arguments after the
             state, with a leading axis of steps.
-        states: after each step.
+        states: after each step, and after each call of `ends`.
         codes: (steps, entry points).
-        tolerances: of fields of the state, in parts of the largest number that a field has;
+        tolerances: of fields of the state, in parts of its size, the largest number that it has;
             `TOLERANCE` of the others.
         codes_off: how many codes may differ.
+        sizes: of fields of the state, the least size by which a difference is judged, where the
+            numbers of the field may be nothing but rounding.
+        ends: of each entry point that is called once after the last step, its arguments after the
+            state; its code is 0.
         ruined: why the library is not to be used, however well it was compiled; its test says so
             and fails.
     """
@@ -129,6 +134,8 @@ class Recorded(NamedTuple):
     codes: np.ndarray
     tolerances: Mapping[str, float] = {}
     codes_off: int = 0
+    sizes: Mapping[str, float] = {}
+    ends: Mapping[str, Sequence[Any]] = {}
     ruined: str = ""
 
 
@@ -142,6 +149,7 @@ def recorded_h(library: Library, record: Recorded) -> str:
     steps = len(record.codes)
     lines = [
         f"#define STEPS {steps}",
+        f"#define ENDS {len(record.ends)} /* calls after the last step */",
         f"#define CODES_OFF {record.codes_off} /* that may differ */",
         f'#define RUINED "{record.ruined}" /* why the library is not to be used */',
         "",
@@ -154,7 +162,8 @@ def recorded_h(library: Library, record: Recorded) -> str:
     reals = [x for x in states if x.dtype == np.float64 and x[0].size]
     for f, leaf in zip(kept, reals, strict=True):
         lines += _table(f"state_{f.name}", f, leaf, DOUBLE)
-        size = np.max(np.abs(leaf), initial=0.0, where=np.isfinite(leaf))
+        least = record.sizes.get(f.name, 0.0)
+        size = np.max(np.abs(leaf), initial=least, where=np.isfinite(leaf))
         lines.append(f"static const double size_{f.name} = {float(size)!r};")
         allowed = record.tolerances.get(f.name, TOLERANCE)
         lines.append(f"static const double tolerance_{f.name} = {float(allowed)!r};")
@@ -164,10 +173,12 @@ def recorded_h(library: Library, record: Recorded) -> str:
 
 
 def _tables(library: Library, record: Recorded):
-    """Entry, argument, fields and arrays of all that is given."""
+    """Entry, argument, fields and arrays of all that is given; leading axis of calls."""
+    once = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], dict(record.ends))
+    all_given = {**record.given, **once}
     for entry in library.entries:
         for j, (name, given) in enumerate(
-            zip(entry.takes, record.given[entry.name], strict=True), start=1
+            zip(entry.takes, all_given[entry.name], strict=True), start=1
         ):
             leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(given)]
             some = [x for x in leaves if x[0].size]
@@ -180,7 +191,7 @@ def _table(name: str, f: Field, leaf: np.ndarray, precision: Precision) -> list[
         "    {" + ", ".join(number(x, f.is_real, precision) for x in row.ravel().tolist()) + "}"
         for row in leaf
     ]
-    head = f"static const {kind} {name}[STEPS][{f.size}] = {{"
+    head = f"static const {kind} {name}[{len(leaf)}][{f.size}] = {{"
     return [head, ",\n".join(rows), "};"]
 
 
@@ -188,8 +199,12 @@ def check_c(library: Library, record: Recorded) -> str:
     """The test."""
     name = library.name
     lines = [BEGIN.format(name=name, **BITS[library.precision])]
-    for k, entry in enumerate(library.entries):
-        lines += _called(library, entry, k)
+    steps = [entry for entry in library.entries if entry.name in record.given]
+    ends = [entry for entry in library.entries if entry.name in record.ends]
+    for k, entry in enumerate(steps):
+        lines += _called(library, entry, "t < STEPS", "t", f"codes[t][{k}]")
+    for k, entry in enumerate(ends):
+        lines += _called(library, entry, f"t == STEPS + {k}", "0", "0")
     for f in library.state:
         if f.is_real:
             first = f.first("(&state)").replace("(&state)->", "state.")
@@ -198,18 +213,18 @@ def check_c(library: Library, record: Recorded) -> str:
     return "\n".join([*lines, END])
 
 
-def _called(library: Library, entry: Entry, k: int) -> list[str]:
-    """One call of an entry point on the row of a step."""
-    name, lines, given = library.name, ["        {"], []
+def _called(library: Library, entry: Entry, when: str, row: str, code: str) -> list[str]:
+    """One call of an entry point on a row of what is given, and the code that it should give."""
+    name, lines, given = library.name, [f"        if ({when}) {{"], []
     for j, argument in enumerate(entry.takes, start=1):
         if fields := fields_of(entry.program.inputs, j):
             given.append(argument)
             lines.append(f"            {name}_{library.argument(entry, argument)} {argument};")
             for f in fields:
                 first = f.first("it").replace("it->", f"{argument}.")
-                table = f"{entry.name}_{argument}_{f.name}[t]"
+                table = f"{entry.name}_{argument}_{f.name}[{row}]"
                 lines.append(f"            memcpy({first}, {table}, sizeof {table});")
     lines.append(f"            {name}_{entry.name}_result result;")
     told = ", ".join(["&state", *(f"&{a}" for a in given), "&result"])
-    lines.append(f"            wrong += {name}_{entry.name}({told}) != codes[t][{k}];")
+    lines.append(f"            wrong += {name}_{entry.name}({told}) != {code};")
     return [*lines, "        }"]

@@ -175,6 +175,8 @@ class Problem(View):
     simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it batches
     contenders: Mapping[str, Contender]
     claims: Callable[[Metrics], list[dict[str, Any]]]
+    # what inputs are in an exported library, by struct and field, where no axes are declared
+    fields: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that all names fit each other."""
@@ -282,6 +284,9 @@ class System(NamedTuple):
     # roll, pitch, yaw [rad] of the body axes as seen from the sensor's, from replay parameters
     orientation: Callable[[Any], tuple[float, float, float]] = lambda parameters: (0.0, 0.0, 0.0)
     alignment: Alignment | None = None
+    # of a system without a scenario, (replay parameters, seed) -> simulated runs that try a filter
+    # which is exported
+    aboard: Callable[[Any, int], Problem] | None = None
 
     @property
     def scenarios(self) -> dict[str, Path]:

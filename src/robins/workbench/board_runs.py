@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array
 
 from robins.campaign.monte_carlo import solved, worlds
-from robins.filters import Belief, Filter, Model, StepInfo
+from robins.filters import Belief, Code, Filter, Model, StepInfo
+from robins.filters.trees import select
 from robins.systems.study import Case, Problem
 
 
@@ -29,6 +30,7 @@ class Used(NamedTuple):
     nis: Array
     dof: Array
     innovation: Array
+    sigma: Array
     used: Array
 
 
@@ -105,7 +107,25 @@ def entry_functions(filter_: Filter, model: Model, names: Mapping[str, Any]) -> 
 
 
 def _told(info: StepInfo) -> Used:
-    return Used(info.code, info.nis, info.dof, info.innovation, info.used)
+    return Used(info.code, info.nis, info.dof, info.innovation, info.sigma, info.used)
+
+
+def reset_function(filter_: Filter, start: Any) -> Any:
+    """The entry point `reset`, ``(state, belief) -> (state, what it tells)``.
+
+    The filter is `reset` as it was at the start, so that nothing is left of what it learned since,
+    not even of a state that is no longer finite. Of the factor what stands above the diagonal is
+    not looked at. A belief that is not finite is not taken.
+    """
+
+    def begin_anew(state: Any, belief: Belief):
+        given = belief._replace(factor=jnp.tril(belief.factor))
+        whole = jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree_util.tree_leaves(given)])
+        taken = jnp.all(whole)
+        code = jnp.where(taken, int(Code.DONE), int(Code.NOT_FINITE))
+        return select(taken, filter_.reset(start, given), state), Told(code)
+
+    return begin_anew
 
 
 def by_jax(functions: Mapping[str, Any], run: BoardRun) -> tuple[Any, np.ndarray]:

@@ -57,25 +57,34 @@ def field_notes(
     problem: Problem, axes: list[Axis | None], mean: Any, given: Mapping[str, Any]
 ) -> dict[tuple[str, str], str]:
     """Units and axes of the mean, of readings and of innovations, by struct and field."""
-    notes = {("state", "current"): "the last prediction was taken"}
-    at = 0
-    flat = jax.tree_util.tree_flatten_with_path(mean, is_leaf=manifold.is_element)[0]
-    for path, leaf in flat:
-        size = manifold.dim(leaf)
-        told = _told(axes[at : at + size], at)
-        for inner, _ in jax.tree_util.tree_flatten_with_path(leaf)[0]:
-            name = identifier(f".belief.mean{jax.tree_util.keystr((*path, *inner))}")
-            whole = "unit quaternion, scalar first; error: " if name.endswith("wxyz") else ""
-            if told:
-                notes["state", name] = whole + told
-        at += size
+    notes = {
+        ("state", "current"): "the last prediction was taken",
+        ("reset_belief", "factor"): "above the diagonal not looked at",
+    }
+    for name, first, last in mean_fields(mean):
+        whole = "unit quaternion, scalar first; error: " if name.endswith("wxyz") else ""
+        if told := _told(axes[first:last], first):
+            notes["state", name] = notes["reset_belief", name] = whole + told
     for entry in given:
         sensor = problem.sensors.get(entry.removeprefix("update_"))
         if sensor is not None:
             told = f"{sensor.units}, {sensor.frame}: {', '.join(sensor.axes)}"
             notes[f"{entry}_reading", "value"] = told
             notes[f"{entry}_result", "innovation"] = told
-    return notes
+            deviation = f"{sensor.units}: its standard deviation; NaN where not used"
+            notes[f"{entry}_result", "sigma"] = deviation
+    return {**notes, **problem.fields}
+
+
+def mean_fields(mean: Any) -> Iterator[tuple[str, int, int]]:
+    """Fields of a mean, and the first and the end of their components of the error."""
+    at = 0
+    flat = jax.tree_util.tree_flatten_with_path(mean, is_leaf=manifold.is_element)[0]
+    for path, leaf in flat:
+        end = at + manifold.dim(leaf)
+        for inner, _ in jax.tree_util.tree_flatten_with_path(leaf)[0]:
+            yield identifier(f".belief.mean{jax.tree_util.keystr((*path, *inner))}"), at, end
+        at = end
 
 
 def _told(axes: list[Axis | None], at: int) -> str:

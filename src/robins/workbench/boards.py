@@ -13,13 +13,19 @@ import jax
 import numpy as np
 
 from robins import __version__, _float64, scenario
-from robins.filters import SENTENCES
-from robins.program import DOUBLE, SINGLE, Precision, trace_steps
+from robins.filters import SENTENCES, Code
+from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
 from robins.program.harness import Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library
 from robins.systems.study import Problem
-from robins.workbench.board_runs import BoardRun, board_runs, by_jax, entry_functions
-from robins.workbench.board_words import components, field_notes, tangent_axes
+from robins.workbench.board_runs import (
+    BoardRun,
+    board_runs,
+    by_jax,
+    entry_functions,
+    reset_function,
+)
+from robins.workbench.board_words import components, field_notes, mean_fields, tangent_axes
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.scenarios import check_filters, find_scenario, study_of
 from robins.workbench.single_precision import Cost, Made, cost, differences, in_floats
@@ -27,6 +33,7 @@ from robins.workbench.single_precision import Cost, Made, cost, differences, in_
 STEPS = 60  # of a run, recorded for the test
 RUNS = 3  # by which the cost of single precision is told
 MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
+RESET = "reset"  # the entry point that begins anew
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
 
 
@@ -55,7 +62,8 @@ def export_filter(
     """Write a filter of a scenario as C99, with a test for the user's own compiler.
 
     Args:
-        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
+        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own; or
+            what configures a replay, where the system has no scenario: "marg/replay", or a copy.
         to: a folder that is not there yet, or is empty.
         filter_name: by default that of the system, else the first of the scenario.
         fast: write loops out; larger, and faster where the code fits into the cache.
@@ -73,14 +81,7 @@ def export_filter(
     _float64.require()
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
-    system, label, text = find_scenario(name)
-    study = study_of(system, text, name)
-    parameters = scenario.parse(study.parameters, text, (*settings, "runs=1"), source=name)
-    own = parameters.filters or tuple(study.filters)
-    wanted = filter_name or (system.default if system.default in study.filters else own[0])
-    check_filters(label, study.filters, [wanted])
-    with refusing(name):
-        problem = study.problem(parameters, (wanted,), seed)
+    problem, wanted, label = _asked(name, filter_name, seed, settings)
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
     library, record, found = _library(problem, wanted, label, unroll, precision)
@@ -98,6 +99,27 @@ def export_filter(
     return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found)
 
 
+def _asked(
+    name: str, filter_name: str, seed: int, settings: Sequence[str]
+) -> tuple[Problem, str, str]:
+    """The problem by which a filter is tried, the filter's name, and how the problem is called."""
+    system, label, text = find_scenario(name, recorded=True)
+    if system.aboard is not None and system.replay_parameters is not None:
+        given = scenario.parse(system.replay_parameters, text, settings, source=name)
+        wanted = filter_name or system.default
+        check_filters(label, [system.default], [wanted])
+        with refusing(name):
+            return system.aboard(given, seed), wanted, label
+    system, label, text = find_scenario(name)  # which refuses what simulates nothing
+    study = study_of(system, text, name)
+    parameters = scenario.parse(study.parameters, text, (*settings, "runs=1"), source=name)
+    own = parameters.filters or tuple(study.filters)
+    wanted = filter_name or (system.default if system.default in study.filters else own[0])
+    check_filters(label, study.filters, [wanted])
+    with refusing(name):
+        return study.problem(parameters, (wanted,), seed), wanted, label
+
+
 def _library(
     problem: Problem, name: str, label: str, unroll: int | None, precision: Precision
 ) -> tuple[Library, Recorded, Cost | None]:
@@ -107,19 +129,12 @@ def _library(
     runs = board_runs(problem, name, RUNS if single else 1)
     run = runs[0]
     functions = entry_functions(contender.filter, contender.model, run.given)
-    first = run.row(0)
-    state = _any_start(runs)
-    programs = trace_steps([(functions[e], first[e]) for e in functions], state, unroll=unroll)
-    entries = [
-        Entry(
-            entry,
-            program,
-            ("input",) if entry == "predict" else ("reading", "about"),
-            "Moves on by one step." if entry == "predict" else f"Uses a reading of {entry[7:]}.",
-        )
-        for entry, program in zip(functions, programs, strict=True)
-    ]
+    anew = reset_function(contender.filter, run.start)
     belief = run.start.belief
+    first = run.row(0)
+    steps = [(functions[e], first[e]) for e in functions]
+    programs = trace_steps([*steps, (anew, (belief,))], _any_start(runs), unroll=unroll)
+    entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
     axes = tangent_axes(problem, contender.reported, len(belief.factor))
     notes = field_notes(problem, axes, belief.mean, run.given)
     library = Library("robins", entries, run.start, (), notes, precision)
@@ -132,13 +147,21 @@ def _library(
     )
     library = library._replace(about=about)
     if not single:
-        short = run.cut(STEPS)
-        return library, Recorded(short.given, *by_jax(functions, short)), None
+        return library, _record(run, by_jax(functions, run.cut(STEPS)), anew), None
     doubles = [by_jax(functions, one) for one in runs]
     singles = in_floats(library, runs)
     found = cost(problem, contender, library, runs, doubles, singles)
-    record = _record(library, run, doubles[0], singles[0])
+    record = _compared(library, _record(run, doubles[0], anew), singles[0])
     return library, record._replace(ruined="" if found.bearable else found.verdict), found
+
+
+def _entry(name: str, program: Program) -> Entry:
+    """An entry point with its words."""
+    if name == "predict":
+        return Entry(name, program, ("input",), "Moves on by one step.")
+    if name == RESET:
+        return Entry(name, program, ("belief",), "Begins anew from a belief, all else as by init.")
+    return Entry(name, program, ("reading", "about"), f"Uses a reading of {name[7:]}.")
 
 
 def _any_start(runs: Sequence[BoardRun]) -> Any:
@@ -152,15 +175,36 @@ def _any_start(runs: Sequence[BoardRun]) -> Any:
     return jax.tree_util.tree_map(either, *(run.start for run in runs))
 
 
-def _record(library: Library, run: BoardRun, doubles: Made, singles: Made) -> Recorded:
-    """The first steps in doubles, and how far off floats may be: a margin beside what they are."""
-    short = run.cut(STEPS).given
-    (wide, codes), (narrow, others) = (
-        jax.tree_util.tree_map(lambda a: a[:STEPS], made) for made in (doubles, singles)
-    )
-    parts = differences(library, wide, narrow)
+def _record(run: BoardRun, made: Made, anew: Any) -> Recorded:
+    """The first steps by JAX, and then a new start from what was believed after the first."""
+    states, codes = jax.tree_util.tree_map(lambda a: a[:STEPS], made)
+    first, last = (jax.tree_util.tree_map(lambda a, k=k: a[k], states) for k in (0, -1))
+    state, _ = jax.jit(anew)(last, first.belief)
+    states = jax.tree_util.tree_map(lambda a, b: np.append(a, b[None], axis=0), states, state)
+    given, ends = run.cut(STEPS).given, {RESET: (first.belief,)}
+    return Recorded(given, states, codes, sizes=_sigmas(states), ends=ends)
+
+
+def _sigmas(states: Any) -> dict[str, float]:
+    """Of each field of the mean the largest sigma: less than a billionth of it is no difference."""
+    belief = states.belief
+    sigma = np.sqrt(np.sum(np.square(belief.factor), axis=-1))
+    mean = jax.tree_util.tree_map(lambda a: a[0], belief.mean)
+    return {
+        name: float(
+            np.max(sigma[:, first:end], initial=0.0, where=np.isfinite(sigma[:, first:end]))
+        )
+        for name, first, end in mean_fields(mean)
+    }
+
+
+def _compared(library: Library, record: Recorded, singles: Made) -> Recorded:
+    """With how far off floats may be: a margin beside what they are."""
+    narrow, others = jax.tree_util.tree_map(lambda a: a[: len(record.codes)], singles)
+    wide = jax.tree_util.tree_map(lambda a: a[: len(record.codes)], record.states)
+    parts = differences(library, wide, narrow, record.sizes)
     tolerances = {f: max(MARGIN * part, LEAST) for f, part in parts.items() if np.isfinite(part)}
-    return Recorded(short, wide, codes, tolerances, int(np.sum(codes != others)))
+    return record._replace(tolerances=tolerances, codes_off=int(np.sum(record.codes != others)))
 
 
 def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
@@ -188,8 +232,13 @@ is missing is NaN. Each call returns a code:
 |---|---|
 {codes}
 
-The state belongs to these functions: read it, copy it, but change it by `{n}_init` and the calls
-only.
+Where a reading was used, `sigma` of the result is the standard deviation of each component of the
+innovation: a reading is suspicious where the innovation exceeds three of them.
+
+`{n}_init` begins where the recorded run does. `{n}_reset` begins anew from a mean and the factor of
+a covariance, in any state: whatever else the filter has learned is then as after `{n}_init`. A
+belief that is not finite is not taken (code {int(Code.NOT_FINITE)}). Read the state, copy it, but
+change it by `{n}_init` and the calls only.
 {_costs(found)}"""
 
 

@@ -23,6 +23,7 @@ from robins.program.library import Library, counts
 from robins.systems.study import Contender, Problem
 from robins.workbench.board_runs import BoardRun
 
+NONE: Mapping[str, float] = {}
 LITTLE, MUCH = 1.01, 1.1  # growth of an error: below the one it does not show, above the other ...
 SEVERAL = 0.01  # ... or with this share of other codes, or of the NEES, the filter is another one
 
@@ -154,6 +155,8 @@ def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.
     begin = [rows[0] for rows in _flat([np.asarray(x)[None] for x in leaves], dtype, 1)]
     own = [a.size for a in begin]
     for entry in library.entries:
+        if entry.name not in run.given:
+            continue  # it is no part of a step
         x, k = (
             np.zeros(max(sizes), kind)
             for sizes, kind in zip(
@@ -210,14 +213,19 @@ def _as_tree(kept: Sequence[np.ndarray], leaves: Sequence[Any], tree: Any) -> An
 Made = tuple[Any, np.ndarray]  # states and codes of a run
 
 
-def differences(library: Library, doubles: Any, singles: Any) -> dict[str, float]:
-    """Of each field of reals in the states of a run, the largest difference over its size."""
+def differences(
+    library: Library, doubles: Any, singles: Any, least: Mapping[str, float] = NONE
+) -> dict[str, float]:
+    """Of each field of reals in the states of a run, the largest difference over its size.
+
+    Its size is its largest number, or what is the ``least``.
+    """
     pairs = zip(*map(jax.tree_util.tree_leaves, (doubles, singles)), strict=True)
     some = [(a, b) for a, b in pairs if a[0].size]
     found = {}
     for f, (a, b) in zip(library.state, some, strict=True):
         if f.is_real:
-            size = np.max(np.abs(a), initial=0.0, where=np.isfinite(a))
+            size = np.max(np.abs(a), initial=least.get(f.name, 0.0), where=np.isfinite(a))
             with np.errstate(invalid="ignore"):
                 off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b))
             part = np.max(np.where(np.isnan(off), np.inf, off), initial=0.0)

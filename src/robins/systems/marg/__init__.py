@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from robins.systems.marg.aboard import aboard
 from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import first_belief, first_look, prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
@@ -19,6 +20,7 @@ SYSTEM = System(
     replay=replay,
     replay_finds=("attitude",),
     orientation=lambda parameters: parameters.orientation,
+    aboard=aboard,
 )
 
 __all__ = [

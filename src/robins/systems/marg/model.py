@@ -315,8 +315,8 @@ class Samples(NamedTuple):
     field_b: Any  # (K, n, 3) T at the end of each interval; NaN where there is none
 
 
-def _of_block(samples: Samples) -> tuple[Integrals, Array]:
-    """Of one block: leading axis n."""
+def of_block(samples: Samples) -> tuple[Integrals, Array]:
+    """What one block integrates to, leading axis n, and its mean field as in `integrate`."""
 
     def add(q, row):
         dt, theta, dv, field_b = row
@@ -344,7 +344,7 @@ def integrate(samples: Samples) -> tuple[Integrals, Array]:
 
     The field is in body axes at the end of the block, (K, 3) T; NaN where there is none.
     """
-    return jax.vmap(_of_block)(samples)
+    return jax.vmap(of_block)(samples)
 
 
 def _turns(bias: Array, gain: Array, dt: Array, theta: Array) -> Array:

@@ -81,7 +81,7 @@ def adm(kit: Kit) -> Part:
         mean = form.state(q, bias)
         block = believed.factor.shape[-1] - 3
         factor = believed.factor.at[block:, :].set(old.factor[block:, :])
-        return state._replace(belief=Belief(mean, factor))
+        return kit.filter.reset(state, Belief(mean, factor))  # all modes of a bank, too
 
     def act(state: Determined, k: int, inputs: Inputs):
         frame = inputs["star"]

@@ -1,0 +1,197 @@
+"""The filter "marg" for a board: its step takes increments, and a simulated hand tries it.
+
+A log has no scenario, so what `robins export` records and judges is simulated here: a unit that
+lies still for two seconds and is then turned and swung by a hand, read with the errors that the
+parameters of the unit allow, in a field that a magnet disturbs twice. From its samples to the first
+belief all goes the way of a log (`prepare`).
+
+On the board a step takes the increments of a block as they come, and the code integrates them by
+`model.of_block`, as a replay does beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array
+from scipy.spatial.transform import Rotation as SciRotation
+
+from robins.dataset import Dataset, ImuTable, MagTable
+from robins.filters import Model, Motion
+from robins.rotation import Rotation
+from robins.systems.marg import model
+from robins.systems.marg.log import Prepared, prepare
+from robins.systems.marg.parameters import Replay
+from robins.systems.marg.replay import CAUSAL, filter_of
+from robins.systems.parts import NED
+from robins.systems.study import Case, Contender, Problem, StateBlock
+
+RATE_HZ, SECONDS, RUNS = 100.0, 40.0, 3
+STILL_S, BEGUN_S, COUNTED_S = 2.0, 3.0, 10.0  # at rest until; moves fully; errors count from
+MAGNET_S = ((4.0, 5.0), (20.0, 24.0))  # a magnet is near
+MAGNET_N = np.array([12e-6, -20e-6, 8e-6])  # T
+FIELD_N = np.array([18e-6, 0.0, 44e-6])  # T, north is where it points
+SHAKE = 0.1  # of what is believed of the field, noise of a reading
+
+PLACE = StateBlock("place", slice(6, 9), "m", "m", "NED", NED)  # from the middle of its places
+_GATE = {"refused": "readings refused in a row", "ratio": "of the last one, 1 at the gate"}
+
+FIELDS = {
+    ("predict_input", "dt_s"): "s, length of each interval; 0 for those that are not there",
+    ("predict_input", "theta_b"): "rad, body: rotation vector of each interval, as the gyros read",
+    ("predict_input", "dv_b"): "m/s, body: specific force times time",
+    ("predict_input", "still"): "1 where the unit lies still, else 0",
+    ("predict_input", "lost_turn"): "rad, body: spread of the turn that was not sampled, else 0",
+    ("predict_input", "lost_dv"): "m/s: spread of the velocity that was not sampled, else 0",
+    ("update_travel_reading", "value"): "zeros; NaN where nothing is claimed",
+    ("update_travel_about", "value"): "1 where the unit lies still, else 0",
+    ("update_rest_rate_reading", "value"): "zeros at rest, else NaN",
+    ("update_rest_rate_about", "value"): "rad/s, body: mean rate read at rest; its sigma",
+    ("update_magnetometer_reading", "at_0_rad"): "0 to use the field, else NaN",
+    ("update_magnetometer_reading", "at_1"): "likewise",
+    ("update_magnetometer_about", "value"): "T, body at the end of the step: calibrated field",
+    **{("state", f"memory_1_rest_rate_{k}"): text for k, text in _GATE.items()},
+    **{("state", f"memory_2_magnetometer_{k}"): text for k, text in _GATE.items()},
+    ("state", "memory_2_magnetometer_residual"): "innovations of the last ones",
+    ("state", "memory_2_magnetometer_known"): "which of them are there",
+}
+"""What the fields of the exported library are, beside those that the model declares."""
+
+
+class Given(NamedTuple):
+    """Input of a step: n increments, and what is known of them."""
+
+    dt_s: Any  # (n,)
+    theta_b: Any  # (n, 3) rad, rotation vector of each interval
+    dv_b: Any  # (n, 3) m/s
+    still: Any  # () as in `model.Block`
+    lost_turn: Any  # (3,) rad
+    lost_dv: Any  # () m/s
+
+
+def block_of(u: Given) -> model.Block:
+    """The increments, integrated."""
+    field = jnp.full(jnp.shape(u.theta_b), jnp.nan)
+    integrals, _ = model.of_block(model.Samples(u.dt_s, u.theta_b, u.dv_b, field))
+    return model.Block(integrals, u.still, u.lost_turn, u.lost_dv)
+
+
+def _of_increments(inner: Callable[..., Any], x: model.MargState, u: Given) -> Any:
+    return inner(x, block_of(u))
+
+
+def model_on_board(parameters: Replay) -> Model:
+    """`model_of`, whose motion takes `Given`."""
+    known = model.model_of(parameters)
+    step, noise, linear = (
+        Partial(_of_increments, part)
+        for part in (known.motion.step, known.motion.noise, known.motion.linear)
+    )
+    return Model(Motion(step, noise, linear), known.sensors)
+
+
+# --------------------------------------------------------------------------------------- the hand
+
+
+class Hand(NamedTuple):
+    """A simulated log and its truth; N samples behind the first."""
+
+    log: Dataset
+    q_nb: SciRotation  # N + 1
+    v_n: np.ndarray  # (N + 1, 3) m/s
+    p_n: np.ndarray  # (N + 1, 3) m
+    gyro_bias: np.ndarray  # (3,) rad/s
+    gyro_gain: np.ndarray  # (3, 3)
+    accel_bias: np.ndarray  # (3,) m/s^2
+
+
+def hand(parameters: Replay, seed: int, run: int) -> Hand:
+    """A hand that turns and swings the unit; each run in another way, with other errors.
+
+    Samples are means over the intervals that they end. What is believed of the unit is the size of
+    its errors: biases within their spreads, gains and noises as normal numbers.
+    """
+    p, rng, dt = parameters, np.random.default_rng((seed, run)), 1.0 / RATE_HZ
+    time = np.arange(round(SECONDS * RATE_HZ) + 1) * dt
+    moving = 0.5 - 0.5 * np.cos(np.pi * np.clip((time - STILL_S) / (BEGUN_S - STILL_S), 0.0, 1.0))
+    hertz, phase = rng.uniform(0.05, 0.5, (3, 3)), rng.uniform(0.0, 2.0 * np.pi, (3, 3))
+    angle = np.sum(np.sin(2.0 * np.pi * hertz * time[:, None, None] + phase), axis=1)
+    q_nb = SciRotation.from_euler("ZYX", 0.5 * moving[:, None] * angle)
+    p_n = 0.1 * moving[:, None] * np.sin(2.0 * np.pi * rng.uniform(0.3, 1.0, 3) * time[:, None])
+    v_n = np.gradient(p_n, dt, axis=0)
+
+    bias = rng.uniform(-1.0, 1.0, 3) * p.gyro.bias
+    accel_bias = rng.uniform(-1.0, 1.0, 3) * p.accelerometer.bias
+    gain = p.gyro.gain * rng.standard_normal((3, 3))
+
+    def noise(size: float) -> np.ndarray:
+        return size * rng.standard_normal((len(time) - 1, 3))
+
+    true = (q_nb[:-1].inv() * q_nb[1:]).as_rotvec() / dt
+    read = (true + bias) @ np.linalg.inv(np.eye(3) + gain).T
+    push = np.diff(v_n, axis=0) / dt - np.array([0.0, 0.0, p.accelerometer.gravity])
+    middle = q_nb[:-1] * SciRotation.from_rotvec(0.5 * true * dt)
+    near = sum((time[1:] >= a) & (time[1:] < b) for a, b in MAGNET_S)
+    around = FIELD_N + np.asarray(near)[:, None] * MAGNET_N
+    field = q_nb[1:].inv().apply(around) + noise(SHAKE * p.magnetometer.noise)
+    raw = field @ np.linalg.inv(np.array(p.magnetometer.matrix)).T + p.magnetometer.offset
+    gyro = read + noise(p.gyro.noise / np.sqrt(dt))
+    accel = middle.inv().apply(push) + accel_bias + noise(p.accelerometer.noise / np.sqrt(dt))
+    time_ns = np.round(time * 1e9).astype(np.int64)
+
+    def rows(values: np.ndarray) -> np.ndarray:  # nothing is made of the first
+        return np.concatenate([values[:1], values])
+
+    imu = ImuTable(time_ns, rows(gyro), rows(accel), "rate")
+    log = Dataset(name="hand", imu=imu, mag=MagTable(time_ns, rows(raw)))
+    return Hand(log, q_nb, v_n, p_n, bias, gain, accel_bias)
+
+
+def case_of(parameters: Replay, of: Hand) -> Case:
+    """What a filter on a board is given of a hand, and the truth at the ends of its steps."""
+    made: Prepared = prepare(of.log, parameters)
+    world, samples, count = made.world, made.samples, len(made.rows)
+    u = Given(samples.dt_s, samples.theta, samples.dv, *world.u[1:])
+    y, aux, u = jax.tree_util.tree_map(lambda a: np.asarray(a)[:count], (world.y, world.aux, u))
+    truth = model.MargState(
+        q_nb=Rotation(jnp.asarray(np.roll(of.q_nb[made.rows].as_quat(), 1, axis=-1))),
+        v_n=of.v_n[made.rows],
+        p_n=of.p_n[made.rows],
+        gyro_bias=np.tile(of.gyro_bias, (count, 1)),
+        gyro_gain=np.tile(of.gyro_gain, (count, 1, 1)),
+        accel_bias=np.tile(of.accel_bias, (count, 1)),
+        declination=np.zeros(count),
+        field=np.tile(FIELD_N[[0, 2]], (count, 1)),
+    )
+    return Case(world.start, u, y, aux, truth)
+
+
+def aboard(parameters: Replay, seed: int) -> Problem:
+    """The filter on some simulated hands, as `robins export` takes it.
+
+    Raises:
+        ValueError: the parameters allow no log of such a hand.
+    """
+    cases = [case_of(parameters, hand(parameters, seed, run)) for run in range(RUNS)]
+    every = jax.tree_util.tree_map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *cases)
+    known = model_on_board(parameters)
+
+    def simulate(run: Array) -> Case:
+        return jax.tree_util.tree_map(lambda a: a[run], every)
+
+    end_s = np.cumsum(np.sum(np.asarray(every.u.dt_s)[0], axis=1))
+    return Problem(
+        epoch_s=end_s,
+        blocks=(*model.BLOCKS[:2], PLACE, *model.BLOCKS[2:]),
+        sensors={name: model.SENSORS[name] for name in known.dims},
+        simulate=simulate,
+        contenders={CAUSAL: Contender(filter_of(parameters), known)},
+        claims=lambda metrics: [],
+        count_from=int(np.searchsorted(end_s, COUNTED_S - 1e-9)),
+        fields=FIELDS,
+    )

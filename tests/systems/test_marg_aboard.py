@@ -1,0 +1,129 @@
+"""The filter "marg" for a board, and the simulated hand by which it is tried."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robins.filters import Code, run
+from robins.systems.marg import Replay, filter_of, model, model_of, prepare
+from robins.systems.marg.aboard import (
+    COUNTED_S,
+    FIELD_N,
+    MAGNET_S,
+    RUNS,
+    STILL_S,
+    aboard,
+    case_of,
+    hand,
+    model_on_board,
+)
+
+PARAMETERS = Replay()
+BLOCK_S = PARAMETERS.update.block
+
+
+def of(seed=0, number=0):
+    made = hand(PARAMETERS, seed, number)
+    return made, case_of(PARAMETERS, made)
+
+
+@pytest.fixture(scope="module")
+def ran():
+    """A hand, its case, and the run of the filter that takes increments."""
+    made, case = of()
+    filter_, known = filter_of(PARAMETERS), model_on_board(PARAMETERS)
+    return made, case, run(filter_, known, case.start, case.y, case.u, case.aux)
+
+
+def test_it_is_the_filter_of_a_replay(ran):
+    """Which is given blocks that were integrated before."""
+    made, _, found = ran
+    prepared = prepare(made.log, PARAMETERS)
+    count, world = len(prepared.rows), prepared.world
+    y, u, aux = jax.tree_util.tree_map(lambda a: a[:count], (world.y, world.u, world.aux))
+    expected = run(filter_of(PARAMETERS), model_of(PARAMETERS), world.start, y, u, aux)
+    for got, want in zip(
+        jax.tree_util.tree_leaves(found.steps.posterior),
+        jax.tree_util.tree_leaves(expected.steps.posterior),
+        strict=True,
+    ):
+        size = np.max(np.abs(want))
+        np.testing.assert_allclose(got, want, rtol=0.0, atol=1e-10 * max(size, 1e-9))
+
+
+def test_its_samples_are_of_its_truth():
+    """Without the errors that the truth tells, gyros turn and accelerometers push as they must."""
+    made, case = of(seed=3)
+    u, truth = case.u, case.truth
+    turn = np.einsum("ij,knj->kni", np.eye(3) + made.gyro_gain, u.theta_b)
+    turn = turn - made.gyro_bias * u.dt_s[..., None]
+    noise = PARAMETERS.gyro.noise * np.sqrt(BLOCK_S)
+    before, v = made.q_nb[0], made.v_n[0]
+    attitude = Rotation.from_quat(np.roll(truth.q_nb.wxyz, -1, axis=-1))
+    for k in range(len(turn)):
+        here, pushed = before, np.zeros(3)
+        for one, dv, dt in zip(turn[k], u.dv_b[k], u.dt_s[k], strict=True):
+            middle = here * Rotation.from_rotvec(0.5 * one)
+            here = here * Rotation.from_rotvec(one)
+            pushed += middle.apply(dv - made.accel_bias * dt)
+        assert (here.inv() * attitude[k]).magnitude() < 6.0 * noise
+        pushed[2] += PARAMETERS.accelerometer.gravity * np.sum(u.dt_s[k])
+        # the noise, and the turn of a sample that is itself noise
+        spread = 6.0 * (PARAMETERS.accelerometer.noise * np.sqrt(BLOCK_S) + 9.81 * BLOCK_S * noise)
+        assert np.linalg.norm(truth.v_n[k] - v - pushed) < spread
+        before, v = attitude[k], truth.v_n[k]
+
+
+def test_the_magnet_is_seen_and_nothing_else(ran):
+    _, case, _ = ran
+    field = np.asarray(case.aux[model.MAGNETOMETER])
+    attitude = Rotation.from_quat(np.roll(case.truth.q_nb.wxyz, -1, axis=-1))
+    off = np.linalg.norm(attitude.apply(field) - FIELD_N, axis=1)
+    end = BLOCK_S * (1 + np.arange(len(off)))
+    near = np.any([(end > a + BLOCK_S) & (end < b) for a, b in MAGNET_S], axis=0)
+    far = np.all([(end < a) | (end > b + 2 * BLOCK_S) for a, b in MAGNET_S], axis=0)
+    assert np.min(off[near]) > 20e-6
+    assert np.max(off[far]) < 4e-6
+
+
+def test_the_recorded_steps_rest_move_and_refuse(ran):
+    """The first sixty, by which `make check` tries a compiler."""
+    _, case, found = ran
+    moves = np.asarray(case.u.still)[:60] == 0.0
+    rest = np.flatnonzero(~moves)  # known after 1.5 s of it
+    assert len(rest) >= 3
+    assert PARAMETERS.rest.after - 2 * BLOCK_S < BLOCK_S * rest[0]
+    assert BLOCK_S * rest[-1] < STILL_S + 0.5
+    told = {
+        name: set(np.asarray(info.code)[:60].tolist()) for name, info in found.steps.info.items()
+    }
+    assert told[model.REST_RATE] >= {Code.DONE, Code.MISSING}
+    assert told[model.MAGNETOMETER] >= {Code.DONE, Code.MISSING, Code.REFUSED}
+    assert Code.PARTLY_MISSING in told[model.TRAVEL]
+
+
+def test_the_attitude_is_found_as_well_as_the_filter_says():
+    problem = aboard(PARAMETERS, 0)
+    contender = problem.contenders["marg"]
+    ratios = []
+    for k in jnp.arange(RUNS):
+        case = problem.simulate(k)
+        found = run(contender.filter, contender.model, case.start, case.y, case.u, case.aux)
+        belief = found.steps.posterior
+        q = Rotation.from_quat(np.roll(belief.mean.q_nb.wxyz, -1, axis=-1))
+        true = Rotation.from_quat(np.roll(case.truth.q_nb.wxyz, -1, axis=-1))
+        error = (true * q.inv()).as_rotvec()[problem.count_from :]
+        sigma = np.sqrt(np.sum(np.asarray(belief.factor) ** 2, axis=-1))[problem.count_from :, :3]
+        assert np.degrees(np.sqrt(np.mean(error**2))) < 3.0
+        ratios.append(np.mean((error / sigma) ** 2))
+    assert problem.epoch_s[problem.count_from] == pytest.approx(COUNTED_S)
+    assert np.mean(ratios) < 4.0  # errors last, so a few runs tell little
+
+
+def test_each_run_is_its_own_and_comes_again():
+    one, again, other = hand(PARAMETERS, 0, 0), hand(PARAMETERS, 0, 0), hand(PARAMETERS, 0, 1)
+    np.testing.assert_array_equal(one.log.imu.gyro, again.log.imu.gyro)
+    assert not np.allclose(one.gyro_bias, other.gyro_bias)
+    assert not np.allclose(one.gyro_bias, hand(PARAMETERS, 1, 0).gyro_bias)
