@@ -10,10 +10,10 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +47,14 @@ Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chun
 
 # The world of the first run, with the first chunk; how many runs count; what is kept of a filter.
 Chunk = tuple[Any, int, Callable[[str], Any]]
+
+
+class Part(NamedTuple):
+    """A chunk of a campaign: runs begin to begin + count - 1, filled up to its width."""
+
+    begin: int
+    count: int
+    width: int
 
 
 def whole(name: str, record: Any) -> Any:
@@ -95,6 +103,15 @@ class ByJax:
     def _of(self, held: list[Any], count: int, taken: Taken, name: str) -> Any:
         return taken(name, record(self.problem, name, held[0], count))
 
+    def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
+        """What is kept of some filters over one chunk."""
+        batch, _ = next(worlds(self.problem, part.width, part.width, part.begin, self._batch))
+        return {name: taken(name, record(self.problem, name, batch, part.count)) for name in names}
+
+    def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
+        """All that was recorded of some filters over one chunk."""
+        return self.compute(part, names)
+
 
 class InLanes:
     """Chunks as programs in lanes, one on each core.
@@ -109,15 +126,18 @@ class InLanes:
         self.problem = problem
         number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
         self._simulate = Staged(problem.simulate, number)
-        world = jax.eval_shape(problem.simulate, number)
-
-        def of(name: str) -> Callable[[Any], Any]:
-            one = partial(one_record, blocks_of(problem), contender(problem, name), over=one_by_one)
-            return lambda world: parted(one(world))
-
-        self._filters = {name: Staged(of(name), world, named=True) for name in problem.contenders}
+        self._world = jax.eval_shape(problem.simulate, number)
+        self._filters = {name: self._staged(name, named=True) for name in problem.contenders}
         stages = (self._simulate, *self._filters.values())
         self.bytes_of_run = max(one.bytes_of_run for one in stages)
+
+    def _staged(self, name: str, named: bool = False) -> Staged:
+        """The record of a filter; named: in two parts, of which the second is that of one run."""
+        problem = self.problem
+        one = partial(one_record, blocks_of(problem), contender(problem, name), over=one_by_one)
+        return Staged(
+            (lambda world: parted(one(world))) if named else one, self._world, named=named
+        )
 
     @property
     def operations(self) -> int:
@@ -176,6 +196,24 @@ class InLanes:
             pool.shutdown(wait=False, cancel_futures=True)
             threading.stack_size(before)
 
+    def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
+        """What is kept of some filters over one chunk, on one core."""
+
+        def computed() -> dict[str, Any]:
+            world = self._worlds(part.begin, part.width)
+            return {name: self._of(name, world, part.count, taken) for name in names}
+
+        return with_stack(computed)
+
+    def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
+        """All that was recorded of some filters over one chunk."""
+
+        def computed() -> dict[str, Any]:
+            world = self._worlds(part.begin, part.width)
+            return {name: cut(self._staged(name)(world), part.count) for name in names}
+
+        return with_stack(computed)
+
     def _worlds(self, begin: int, width: int) -> Any:
         return self._simulate(jnp.arange(begin, begin + width))
 
@@ -186,6 +224,16 @@ class InLanes:
     def _chunk(self, begin: int, width: int, count: int, taken: Taken) -> dict[str, Any]:
         world = self._worlds(begin, width)
         return {name: self._of(name, world, count, taken) for name in self._filters}
+
+
+def with_stack(function: Callable[[], Any]) -> Any:
+    """Call a function on a stack that is large enough for lanes."""
+    before = threading.stack_size(STACK)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(function).result()
+    finally:
+        threading.stack_size(before)
 
 
 def first_run(world: Any) -> Any:

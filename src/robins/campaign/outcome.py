@@ -76,12 +76,12 @@ def simulate(
         if done < runs:
             stage("simulation", 0)
     with keeping({name: vars(s) for name, s in found.items()}):
-        outcome = _outcome(problem, found, bound)
+        outcome = outcome_of(problem, found, bound)
     return replace(outcome, machine=by.name, notes=[*outcome.notes, *by.notes])
 
 
-def _outcome(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
-    """What the statistics say."""
+def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
+    """What the statistics of all filters say; bound: (E, r) covariance bound, if there is one."""
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
     metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
     if bound is not None:

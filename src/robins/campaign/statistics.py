@@ -69,6 +69,7 @@ class Statistics:
         self._outputs(record.get("outputs", {}), bad)
         self._lengths(error)
         self._within(error)
+        self._each("lost", bad)
         self._each("rms", np.sqrt(np.mean(error[:, self.counted] ** 2, axis=1)))
         if self.windows:
             worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
@@ -146,6 +147,11 @@ class Statistics:
         if self.example is None:
             raise ValueError("there is no run yet: add the records of a campaign first")
         return self.example
+
+    @property
+    def lost(self) -> np.ndarray:
+        """(runs,) which of them diverged."""
+        return self._all("lost")
 
     @property
     def rms(self) -> np.ndarray:

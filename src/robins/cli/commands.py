@@ -11,6 +11,7 @@ from click import option
 
 from robins import __version__
 from robins.cli.bench import bench
+from robins.cli.campaign import campaign
 from robins.cli.doctor import judge
 from robins.cli.export import write
 from robins.cli.frame import Status
@@ -40,6 +41,7 @@ Examples:
   robins list                                    what there is to run
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
+  robins campaign run ins-gnss/drive --runs 500 --out drive
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it
@@ -315,6 +317,7 @@ def design(problem: str, out: Path | None, **options: Any) -> None:
 
 
 app.add_command(bench)
+app.add_command(campaign)
 
 
 @app.command(

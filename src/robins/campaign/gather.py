@@ -1,0 +1,84 @@
+"""A campaign's shards joined: how far it is, and the statistics of all its runs."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from robins.campaign.monte_carlo import blocks_of, contender, one_record
+from robins.campaign.plan import Plan, Shard
+from robins.campaign.shards import Damaged, digest, unpack
+from robins.campaign.statistics import Statistics
+from robins.campaign.store import Store
+from robins.systems.study import Problem
+
+
+class State(NamedTuple):
+    """How far a campaign is.
+
+    Attributes:
+        found: statistics by filter of all shards that are there and whole, joined in the order of
+            the runs: sums have the same bits whoever computed them, and when.
+        done: how many runs of each filter these are.
+        damaged: shards whose checksum does not fit.
+        lacking: how many shards are not there or damaged.
+    """
+
+    found: dict[str, Statistics]
+    done: dict[str, int]
+    damaged: list[Shard]
+    lacking: int
+
+    @property
+    def digest(self) -> str | None:
+        """SHA-256 of the final table; None as long as it is not final."""
+        return None if self.lacking else digest(self.found)
+
+
+def blank(problem: Problem | None) -> Statistics:
+    """Statistics of no runs; without a problem such as can be joined, not asked."""
+    if problem is None:
+        return Statistics(())
+    p = problem
+    return Statistics(p.blocks, p.count_from, p.limits, p.count_to, p.norms, p.windows)
+
+
+def gather(store: Store, plan: Plan, problem: Problem | None = None) -> State:
+    """Read all shards, check and join them.
+
+    Args:
+        store: where they are.
+        plan: of the campaign.
+        problem: whose figures are wanted; without it sums and counts only.
+    """
+    there = store.names("shards")
+    found = {name: blank(problem) for name in plan.filters}
+    examples = {name: problem and example_of(problem, name) for name in plan.filters}
+    damaged, lacking = [], 0
+    for shards in plan.shards.values():
+        for shard in shards:
+            of_chunk = blank(problem)
+            content = None
+            if PurePosixPath(shard.name).name in there:
+                content = store.get(shard.name)
+            if content is None:
+                lacking += 1
+                continue
+            try:
+                unpack(content, of_chunk, examples[shard.filter])
+            except Damaged:
+                damaged.append(shard)
+                lacking += 1
+                continue
+            found[shard.filter].merge(of_chunk)
+    return State(found, {name: s.runs for name, s in found.items()}, damaged, lacking)
+
+
+def example_of(problem: Problem, name: str) -> Any:
+    """The tree of the record of a run, without its numbers."""
+    one, blocks = contender(problem, name), blocks_of(problem)
+    number = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
+    return jax.eval_shape(lambda k: one_record(blocks, one, problem.simulate(k)), number)

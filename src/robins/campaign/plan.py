@@ -1,0 +1,186 @@
+"""What a campaign computes: a scenario, its filters and runs, cut into shards under fixed names."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import robins
+from robins import scenario
+from robins.campaign.store import Store
+from robins.errors import RobinsError
+
+NAME = "campaign.json"
+SCHEMA = 1
+_WANTED = ("runs", "filters", "claims", "title")  # change no run of a filter
+_SOURCES = {".py", ".h", ".cc", ".toml", ".csv", ".json"}
+
+
+class Shard(NamedTuple):
+    """A filter over a chunk of runs."""
+
+    name: str  # of its object
+    filter: str
+    chunk: int
+
+
+class Chunk(NamedTuple):
+    """Runs begin to begin + count - 1."""
+
+    number: int
+    begin: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign, as `campaign.json` says it.
+
+    Attributes:
+        asked: how its system is found: a name of `robins list`, or a file.
+        scenario: its name.
+        text: TOML, with what the command line changed.
+        seed: of all noise.
+        runs: how many.
+        filters: their names.
+        machine: what computes it, "jax" or "c".
+        width: runs of a chunk; what JAX sums in batches depends on it.
+        code: hash of robins, of a user's own system, and of the packages that compute.
+    """
+
+    asked: str
+    scenario: str
+    text: str
+    seed: int
+    runs: int
+    filters: tuple[str, ...]
+    machine: str
+    width: int
+    code: str
+
+    @property
+    def chunks(self) -> Iterator[Chunk]:
+        """All chunks, in the order in which they are joined."""
+        for k, begin in enumerate(range(0, self.runs, self.width)):
+            yield Chunk(k, begin, min(self.width, self.runs - begin))
+
+    def shard(self, chunk: Chunk, name: str) -> Shard:
+        """The shard of a filter, whose name is a hash of all that its content depends on."""
+        said = scenario.mapping_of(self.text)
+        of = {k: v for k, v in said.items() if k not in _WANTED}
+        key = [of, self.seed, self.machine, self.width, self.code, name, chunk.begin, chunk.count]
+        return Shard(f"shards/{_hash(key)}.npz", name, chunk.number)
+
+    @property
+    def shards(self) -> dict[Chunk, list[Shard]]:
+        """Of each chunk the shards of all filters."""
+        return {c: [self.shard(c, name) for name in self.filters] for c in self.chunks}
+
+    def with_more(self, runs: int, filters: tuple[str, ...]) -> Plan:
+        """The plan of as many runs and of these filters too."""
+        both = tuple(dict.fromkeys((*self.filters, *filters)))
+        return replace(self, runs=max(runs, self.runs), filters=both)
+
+
+def _hash(data: Any) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:40]
+
+
+def write(store: Store, plan: Plan) -> None:
+    """Put a plan in the place of that which is there."""
+    data = {"schema": SCHEMA} | asdict(plan)
+    store.put(NAME, f"{json.dumps(data, indent=2)}\n".encode(), anew=True)
+
+
+def read(store: Store) -> Plan | None:
+    """The plan of a campaign; None where there is none.
+
+    Raises:
+        RobinsError: it is damaged, or of another version.
+    """
+    content = store.get(NAME)
+    if content is None:
+        return None
+    try:
+        data = json.loads(content)
+        schema = data.pop("schema")
+        plan = Plan(**data | {"filters": tuple(data["filters"])})
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise RobinsError(
+            f"{NAME} is damaged ({error})",
+            store.where,
+            "begin the campaign again in another folder; shards are found by their names.",
+        ) from None
+    if schema != SCHEMA:
+        raise RobinsError(
+            f"{NAME} has schema {schema}, this robins reads {SCHEMA}",
+            store.where,
+            "use the version of robins that wrote it.",
+        )
+    return plan
+
+
+def needed(store: Store) -> Plan:
+    """The plan of a campaign that is there.
+
+    Raises:
+        RobinsError: there is none.
+    """
+    plan = read(store)
+    if plan is None:
+        raise RobinsError(
+            f"is no campaign: it has no {NAME}",
+            store.where,
+            "`robins campaign run SCENARIO --out DIR --runs N` begins one.",
+        )
+    return plan
+
+
+@cache
+def _of_package() -> str:
+    root = Path(next(iter(robins.__path__)))
+    sha = hashlib.sha256()
+    for path in sorted(p for p in root.rglob("*") if p.suffix in _SOURCES):
+        sha.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    for package in ("jax", "jaxlib", "numpy"):
+        sha.update(f"{package} {metadata.version(package)}".encode())
+    return sha.hexdigest()
+
+
+def code_of(asked: str, text: str) -> str:
+    """Hash of all code that a shard depends on.
+
+    Args:
+        asked: how the system is found; a file of a user's own counts with its content.
+        text: of the scenario, which may name such a file.
+    """
+    sha = hashlib.sha256(_of_package().encode())
+    sha.update(os.environ.get("XLA_FLAGS", "").encode())  # by which JAX rounds
+    named: Mapping[str, Any] = scenario.mapping_of(text)
+    for one in dict.fromkeys((asked, str(named.get("system", "")))):
+        path = Path(one.rpartition(":")[0])
+        if ".py:" in one and path.is_file():
+            sha.update(path.read_bytes())
+    return sha.hexdigest()[:16]
+
+
+def check_code(store: Store, plan: Plan) -> None:
+    """Refuse to go on with other code: half of the runs would be of one version, half of another.
+
+    Raises:
+        RobinsError: the campaign was begun by other code.
+    """
+    here = code_of(plan.asked, plan.text)
+    if here != plan.code:
+        raise RobinsError(
+            f"was begun by code {plan.code}, this is {here}",
+            store.where,
+            "use the same robins, packages and system, or begin in another folder.",
+        )

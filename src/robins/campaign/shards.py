@@ -1,0 +1,112 @@
+"""One shard: the statistics of a filter over a chunk of runs, as one sealed file.
+
+It is an `.npz` that NumPy opens, with a SHA-256 of all that it holds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from robins.campaign.statistics import Statistics
+
+_ABOUT = "about"
+_COUNTS = ("runs", "diverged", "n")
+
+
+class Damaged(Exception):
+    """What was read is not what was written."""
+
+
+def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:
+    """A shard as bytes.
+
+    Args:
+        about: what it is of, plain data.
+        statistics: of a chunk; the record of its first run goes along where it is there.
+    """
+    arrays = dict(tables(statistics))
+    arrays |= {
+        f"example {k:04}": np.asarray(x)
+        for k, x in enumerate(jax.tree_util.tree_leaves(statistics.example))
+    }
+    told = {
+        **about,
+        **{name: int(getattr(statistics, name)) for name in _COUNTS},
+    }
+    told["sha256"] = _seal(told, arrays)
+    file = io.BytesIO()
+    np.savez(file, **{_ABOUT: np.array(json.dumps(told, sort_keys=True))}, **arrays)
+    return file.getvalue()
+
+
+def tables(statistics: Statistics) -> dict[str, np.ndarray]:
+    """All arrays of statistics, by name."""
+    found = {f"sum {name}": np.asarray(x) for name, x in statistics.sums.items()}
+    return found | {f"each {name}": np.concatenate(x) for name, x in statistics.each.items()}
+
+
+def unpack(content: bytes, into: Statistics, example: Any = None) -> dict[str, Any]:
+    """Read a shard.
+
+    Args:
+        content: as `pack` made it.
+        into: statistics of no runs, which are filled.
+        example: the tree of the record of a run, to be filled with its leaves; None: leave them.
+
+    Returns:
+        What it is of.
+
+    Raises:
+        Damaged: the content is cut or changed.
+    """
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        told = json.loads(str(arrays.pop(_ABOUT)))
+        sealed = told.pop("sha256")
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise Damaged(str(error)) from error
+    if sealed != _seal(told, arrays):
+        raise Damaged("its checksum does not fit")
+    for name in _COUNTS:
+        setattr(into, name, told[name])
+    leaves = []
+    for name in sorted(arrays):
+        kind, _, what = name.partition(" ")
+        if kind == "sum":
+            into.sums[what] = arrays[name]
+        elif kind == "each":
+            into.each[what] = [arrays[name]]
+        else:
+            leaves.append(arrays[name])
+    if leaves and example is not None:
+        into.example = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(example), leaves)
+    return told
+
+
+def digest(found: Mapping[str, Statistics]) -> str:
+    """SHA-256 of the statistics of all filters: equal if and only if all bits are."""
+    sha = hashlib.sha256()
+    for name in sorted(found):
+        one = found[name]
+        sha.update(
+            _seal({"filter": name} | {k: getattr(one, k) for k in _COUNTS}, tables(one)).encode()
+        )
+    return sha.hexdigest()
+
+
+def _seal(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    sha = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name in sorted(arrays):
+        x = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {x.dtype.str} {x.shape}\n".encode())
+        sha.update(x.tobytes())
+    return sha.hexdigest()

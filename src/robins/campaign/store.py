@@ -1,0 +1,230 @@
+"""Where a campaign keeps what it has computed: objects that are put once and read by anybody.
+
+An object appears whole or not at all, and the first one under a name stays. So workers need no
+agreement: what two of them compute is the same, and the second is thrown away.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from time import time
+from typing import Any, Protocol, runtime_checkable
+
+from robins.errors import RobinsError
+
+_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
+_PARTIAL = ".partial"  # what is being written
+_OLD_S = 3600.0  # what is older was left by a writer that died
+
+
+@runtime_checkable
+class Store(Protocol):
+    """Objects by name; a slash in a name parts a group from what is in it."""
+
+    where: str
+
+    def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
+        """Put an object in place whole, or leave the one that is there; True if it was put.
+
+        Args:
+            name: of the object.
+            content: all of it.
+            anew: take the place of what is there.
+
+        Raises:
+            RobinsError: the disk is full, or it cannot be written.
+        """
+        ...
+
+    def get(self, name: str) -> bytes | None:
+        """All of an object; None where there is none."""
+        ...
+
+    def names(self, group: str) -> set[str]:
+        """Names of what is in a group, without that of the group."""
+        ...
+
+    def drop(self, name: str) -> None:
+        """Remove an object, if it is there."""
+        ...
+
+    def sweep(self) -> None:
+        """Remove what writers that died have left half-written."""
+        ...
+
+
+class Folder:
+    """Objects as files of a folder: written under another name, synced, linked into place."""
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = Path(path)
+        self.where = str(path)
+
+    def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
+        """Put an object; see `Store`."""
+        target = self.path / name
+        if not anew and target.exists():
+            return False
+        partial = self.path / _PARTIAL / f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex}"
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            partial.parent.mkdir(exist_ok=True)
+            try:
+                with open(partial, "wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                placed = _replace(partial, target) if anew else _link(partial, target)
+                _sync(target.parent)
+            finally:
+                partial.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._cannot(f"write {name}", error) from error
+        return placed
+
+    def get(self, name: str) -> bytes | None:
+        """Read an object; see `Store`."""
+        try:
+            return (self.path / name).read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise self._cannot(f"read {name}", error) from error
+
+    def names(self, group: str) -> set[str]:
+        """List a group; see `Store`."""
+        try:
+            return {entry.name for entry in os.scandir(self.path / group)}
+        except FileNotFoundError:
+            return set()
+        except OSError as error:
+            raise self._cannot(f"list {group}", error) from error
+
+    def drop(self, name: str) -> None:
+        """Remove an object; see `Store`."""
+        (self.path / name).unlink(missing_ok=True)
+
+    def sweep(self) -> None:
+        """Remove what writers that died have left half-written."""
+        for left in self.names(_PARTIAL):
+            path = self.path / _PARTIAL / left
+            with suppress(OSError):
+                if time() - path.stat().st_mtime > _OLD_S:
+                    path.unlink()
+
+    def _cannot(self, what: str, error: OSError) -> RobinsError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        fix = "make room" if full else "make the folder readable and writable"
+        failure = RobinsError(
+            f"cannot {what}: {error.strerror or error}",
+            self.where,
+            f"{fix}; what is there is whole, and the same command goes on.",
+        )
+        failure.bad_input = False
+        return failure
+
+
+def _link(partial: Path, target: Path) -> bool:
+    """Give a whole file its name unless that is taken."""
+    try:
+        os.link(partial, target)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        return _replace(partial, target)  # by what has the same content, if it is there
+    return True
+
+
+def _replace(partial: Path, target: Path) -> bool:
+    os.replace(partial, target)
+    return True
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class Objects:
+    """Objects of a store of the S3 kind, Azure's or Google's, by `obstore` (extra ``objects``)."""
+
+    def __init__(self, url: str):
+        try:
+            import obstore
+        except ModuleNotFoundError:
+            raise RobinsError(
+                "object storage needs the extra 'objects'", url, "pip install 'robins[objects]'."
+            ) from None
+        self.where, self._obstore = url, obstore
+        self._store = self._tried("open it", lambda: obstore.store.from_url(url))
+
+    def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
+        """Put an object; see `Store`."""
+        mode = "overwrite" if anew else "create"
+        try:
+            self._obstore.put(self._store, name, content, mode=mode)
+        except self._obstore.exceptions.AlreadyExistsError:
+            return False
+        except self._obstore.exceptions.BaseError as error:
+            raise self._cannot(f"write {name}", error) from error
+        return True
+
+    def get(self, name: str) -> bytes | None:
+        """Read an object; see `Store`."""
+        try:
+            return bytes(self._obstore.get(self._store, name).bytes())
+        except FileNotFoundError:
+            return None
+        except self._obstore.exceptions.BaseError as error:
+            raise self._cannot(f"read {name}", error) from error
+
+    def names(self, group: str) -> set[str]:
+        """List a group; see `Store`."""
+
+        def listed() -> set[str]:
+            found = (one for some in self._obstore.list(self._store, group) for one in some)
+            return {one["path"].removeprefix(f"{group}/") for one in found}
+
+        return self._tried(f"list {group}", listed)
+
+    def drop(self, name: str) -> None:
+        """Remove an object; see `Store`."""
+        with suppress(FileNotFoundError):
+            self._tried(f"remove {name}", lambda: self._obstore.delete(self._store, name))
+
+    def sweep(self) -> None:
+        """Nothing half-written is ever seen here."""
+
+    def _tried(self, what: str, function: Callable[[], Any]) -> Any:
+        try:
+            return function()
+        except FileNotFoundError:
+            raise
+        except self._obstore.exceptions.BaseError as error:
+            raise self._cannot(what, error) from error
+
+    def _cannot(self, what: str, error: Exception) -> RobinsError:
+        first = (str(error).strip().splitlines() or [""])[0]
+        failure = RobinsError(f"cannot {what}: {first}", self.where, "check address and rights.")
+        failure.bad_input = False
+        return failure
+
+
+def open_store(where: str | os.PathLike[str]) -> Folder | Objects:
+    """A folder, or for an address such as ``s3://bucket/campaign`` object storage.
+
+    Raises:
+        RobinsError: the storage cannot be opened, or the package for it is missing.
+    """
+    return Objects(str(where)) if "://" in str(where) else Folder(where)

@@ -1,0 +1,129 @@
+"""A worker of a campaign: it takes the next shards that are missing, computes them, puts them.
+
+Workers agree on nothing. A claim only tells others what somebody is at; what is claimed for long,
+since its worker died, is computed by another, and if both end, one of two equal shards is kept.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Iterator, Mapping
+from pathlib import PurePosixPath
+from time import monotonic, sleep
+from typing import Any, NamedTuple
+
+import jax
+
+from robins.campaign.gather import blank
+from robins.campaign.machine import ByJax, InLanes, Part
+from robins.campaign.plan import Chunk, Plan, Shard
+from robins.campaign.shards import pack
+from robins.campaign.statistics import Statistics
+from robins.campaign.store import Store
+from robins.systems.study import Problem
+
+PATIENCE = 3.0  # times what a chunk took: so long a claim of somebody else is believed
+LEAST_S = 5.0  # before this worker has computed one
+POLL_S = 0.2
+
+
+class Missing(NamedTuple):
+    """A chunk, and its shards that nobody has put yet."""
+
+    chunk: Chunk
+    shards: list[Shard]
+
+    @property
+    def claim(self) -> str:
+        """The name of the object that claims it."""
+        return f"claims/{PurePosixPath(self.shards[0].name).stem}"
+
+
+def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[Missing]:
+    """All that is not there yet, in the order of the runs."""
+    there = store.names("shards")
+    lack = (
+        Missing(chunk, [s for s in some if PurePosixPath(s.name).name not in there])
+        for chunk, some in shards.items()
+    )
+    return [one for one in lack if one.shards]
+
+
+class Worker:
+    """Computes shards of one campaign."""
+
+    def __init__(self, store: Store, plan: Plan, problem: Problem):
+        self.store, self.plan, self.problem = store, plan, problem
+        self.machine = InLanes(problem) if plan.machine == "c" else ByJax(problem)
+        self._shards = plan.shards
+        self._seen: dict[str, float] = {}  # when a claim was first seen
+        self._took = 0.0
+
+    def work(self) -> Iterator[int]:
+        """Compute until nothing is missing; yields how many shards are, before each chunk."""
+        while lack := missing(self.store, self._shards):
+            yield sum(len(one.shards) for one in lack)
+            taken = self._next(lack)
+            if taken is None:
+                sleep(POLL_S)
+                continue
+            began = monotonic()
+            self.compute(taken)
+            self._took = monotonic() - began
+            self.store.drop(taken.claim)
+
+    def compute(self, one: Missing) -> None:
+        """Compute shards of a chunk and put them."""
+        names = [s.filter for s in one.shards]
+        found = self.found(one.chunk, names)
+        for shard in one.shards:
+            self.store.put(shard.name, self.packed(shard, one.chunk, found[shard.filter]))
+
+    def found(self, chunk: Chunk, names: list[str]) -> dict[str, Statistics]:
+        """The statistics of filters over a chunk."""
+
+        def taken(name: str, record: dict[str, Any]) -> Statistics:
+            of_chunk = blank(self.problem)
+            of_chunk.add(record)
+            if chunk.number:
+                of_chunk.example = None  # figures show the first run of all
+            return of_chunk
+
+        part = Part(chunk.begin, chunk.count, self.plan.width)
+        return self.machine.compute(part, names, taken)
+
+    def run_of(self, chunk: Chunk, index: int) -> dict[str, Statistics]:
+        """Of all filters the statistics of one run of a chunk, with its histories.
+
+        The chunk is computed as it was, so that the run has the same bits.
+        """
+        part = Part(chunk.begin, chunk.count, self.plan.width)
+        found = {}
+        for name, record in self.machine.histories(part, list(self.problem.contenders)).items():
+            found[name] = blank(self.problem)
+            found[name].add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
+        return found
+
+    def packed(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> bytes:
+        """A shard as it is stored: equal ones are equal files, since none tells who made it."""
+        about = {"filter": shard.filter, "begin": chunk.begin, "code": self.plan.code}
+        return pack(about, statistics)
+
+    def _next(self, lack: list[Missing]) -> Missing | None:
+        """What nobody claims; else what was claimed for long; else nothing for now."""
+        claimed = self.store.names("claims")
+        who = {"host": socket.gethostname(), "process": os.getpid()}
+        for one in lack:
+            if PurePosixPath(one.claim).name not in claimed:
+                if self.store.put(one.claim, json.dumps(who).encode()):
+                    return one
+                claimed = self.store.names("claims")
+        now = monotonic()
+        for one in lack:
+            since = self._seen.setdefault(one.claim, now)
+            if now - since > max(PATIENCE * self._took, LEAST_S):
+                self._seen[one.claim] = now  # others in their turn
+                return one
+        return None

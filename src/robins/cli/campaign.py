@@ -1,0 +1,205 @@
+"""The commands of campaigns and their options."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import click
+from click import option
+
+from robins.cli import cache
+from robins.cli.frame import Status, command_line, only_json
+from robins.cli.options import OUT, answers, choices, examples
+from robins.cli.progress import Progress
+from robins.cli.tell import carry_out, say, tell
+
+_COMPUTING = 0.9  # share of the time after which the report is made
+
+
+@click.group(
+    short_help="Run a scenario many times, on all cores or machines; nothing is lost.",
+    epilog=examples(
+        "robins campaign run airship/s1 --runs 1000 --out airship   begin, or go on",
+        "robins campaign status airship                             how far is it?",
+        "robins campaign work airship                               one more worker",
+        "robins campaign report airship                             figures of all runs",
+        "robins campaign show airship --run 137                     that run alone",
+        "robins campaign verify airship                             is all as it was?",
+    ),
+)
+def campaign() -> None:
+    """Campaigns: thousands of runs, kept in a folder that any number of workers fill.
+
+    The folder is the truth. Each chunk of runs is one sealed file, put in place whole; what is
+    interrupted or killed goes on with the same command.
+    """
+
+
+def _workbench() -> Any:
+    cache.enable()
+    return importlib.import_module("robins.workbench")
+
+
+_WHERE = click.argument("where", metavar="DIR")
+
+
+def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
+    """End this process when who started it closes its standard input, or is gone."""
+    if not held:
+        return
+
+    def wait() -> None:
+        while os.read(0, 1024):
+            pass
+        os._exit(Status.INTERRUPTED)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+@campaign.command(
+    short_help="Begin a campaign, or go on with it.",
+    epilog=examples(
+        "robins campaign run transfer-alignment/s0 --runs 200 --out s0",
+        "robins campaign run airship/s1 --runs 10000 --filters ukf,ekf --out airship --workers 8",
+    ),
+)
+@click.argument("scenario")
+@option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
+@option("--runs", type=click.IntRange(min=1), help="How many. [default: as given]")
+@option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
+@option(
+    "--machine",
+    type=click.Choice(["jax", "c"]),
+    callback=lambda _context, _given, name: name or "",
+    help="What computes. [default: c where that pays, else jax]",
+)
+@choices
+@answers
+def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: Any) -> None:
+    """Run SCENARIO many times, with as many processes as there are cores.
+
+    The same command on the same DIR goes on: what is there is not computed again, more runs or
+    filters are added. It ends with the figures of all runs, in the folder DIR/report.
+    """
+    bench = _workbench()
+    with only_json(as_json), Progress() as progress:
+        computing = bench.part(progress, 0.0, _COMPUTING)
+        outcome = bench.campaign_run(out, scenario, workers=workers, progress=computing, **options)
+        result = _published(bench, out, outcome, bench.part(progress, _COMPUTING, 1.0))
+    tell(outcome, result, as_json)
+
+
+def _published(bench: Any, where: str, outcome: Any, progress: Any, to: Path | None = None) -> Any:
+    to = to or (Path("results") / "campaign" if "://" in where else Path(where) / "report")
+    return bench.publish(outcome, to, command=command_line(), progress=progress)
+
+
+@campaign.command(
+    short_help="Compute what is missing, as one more worker.",
+    epilog=examples("robins campaign work airship"),
+)
+@_WHERE
+@option("--held", is_flag=True, hidden=True, expose_value=False, callback=_held)
+@answers
+def work(where: str, as_json: bool) -> None:
+    """Take the next missing chunk of the campaign in DIR, compute it, put it; until all are there.
+
+    Any number of workers may do this at once, here and on other machines that see the folder.
+    """
+    bench = _workbench()
+    done = total = 0
+    with only_json(as_json), Progress() as progress:
+        for done, total in bench.campaign_work(where):
+            progress(done / total, f"{done} of {total} shards")
+    data = {"done": done, "shards": total}
+    say(
+        data,
+        f"{done} of {total} shards are there.\nNext:   robins campaign report {where}",
+        as_json,
+    )
+
+
+@campaign.command(
+    short_help="How far a campaign is.", epilog=examples("robins campaign status airship --json")
+)
+@_WHERE
+@answers
+def status(where: str, as_json: bool) -> None:
+    """Read and check every shard of the campaign in DIR, and say what is done, missing, damaged."""
+    with only_json(as_json):
+        found = _workbench().campaign_status(where)
+    lines = [f"{found.scenario}, seed {found.seed}, by {found.machine}: {found.wanted} runs wanted"]
+    for name in found.filters:
+        lost = found.diverged[name]
+        numbers = ", ".join(map(str, lost[:10])) + (" ..." if len(lost) > 10 else "")
+        told = f"   diverged: {numbers}" if lost else ""
+        lines.append(f"  {name:<20} {found.done[name]:>8} done{told}")
+    lines.append(
+        f"{found.shards} shards, {found.missing} missing, {len(found.damaged)} damaged"
+        + "".join(f"\n  damaged: {name}" for name in found.damaged)
+    )
+    if found.digest:
+        lines += [f"digest {found.digest}", f"Next:   robins campaign report {where}"]
+    else:
+        lines.append(f"Next:   robins campaign work {where}   computes what is missing")
+    say(found._asdict(), "\n".join(lines), as_json)
+
+
+@campaign.command(
+    short_help="Compute a share of a campaign again, and compare the bits.",
+    epilog=examples("robins campaign verify airship", "robins campaign verify airship --share 0.1"),
+)
+@_WHERE
+@option("--share", type=click.FloatRange(0.0, 1.0, min_open=True), default=0.01, show_default=True)
+@answers
+def verify(where: str, share: float, as_json: bool) -> int:
+    """Check all shards of DIR, compute some again, drawn by chance, and compare them bit by bit.
+
+    The exit status is 1 if a shard is damaged or differs.
+    """
+    with only_json(as_json), Progress() as progress:
+        found = _workbench().campaign_verify(where, share, progress=progress)
+    text = (
+        f"{found.shards} shards, {len(found.damaged)} damaged; "
+        f"{len(found.recomputed)} computed again, {len(found.different)} different"
+        + "".join(f"\n  damaged: {name}" for name in found.damaged)
+        + "".join(f"\n  different: {name}" for name in found.different)
+    )
+    say(found._asdict(), text, as_json)
+    return Status.FAILED if found.damaged or found.different else Status.DONE
+
+
+@campaign.command(
+    short_help="One run of a campaign alone, with all its histories.",
+    epilog=examples("robins campaign show airship --run 137"),
+)
+@_WHERE
+@option("--run", "number", type=click.IntRange(min=0), required=True, help="Its number.")
+@OUT
+@answers
+def show(where: str, number: int, out: Path | None, as_json: bool) -> None:
+    """Compute one run of DIR again and write its histories and figures; it has the same bits."""
+    folder = where.rstrip("/").rpartition("/")[2]
+    out = out or Path("results") / f"{folder}-run-{number}"
+    carry_out("campaign_show", where, number, out=out, as_json=as_json)
+
+
+@campaign.command(
+    short_help="Figures of all runs that are there.",
+    epilog=examples("robins campaign report airship --out airship-report"),
+)
+@_WHERE
+@OUT
+@answers
+def report(where: str, out: Path | None, as_json: bool) -> None:
+    """Join the shards of DIR and write a result with figures and a page; by default DIR/report."""
+    bench = _workbench()
+    with only_json(as_json), Progress() as progress:
+        progress(0.0, "joining shards")
+        outcome = bench.campaign_report(where)
+        result = _published(bench, where, outcome, progress, out)
+    tell(outcome, result, as_json)

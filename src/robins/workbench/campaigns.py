@@ -1,0 +1,297 @@
+"""The commands of `robins campaign`: many runs, kept in a store that any number of workers fill."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import _float64, scenario
+from robins.campaign import check_machine
+from robins.campaign.bound import bound_sigma
+from robins.campaign.gather import State, gather
+from robins.campaign.machine import machine_for
+from robins.campaign.outcome import outcome_of
+from robins.campaign.plan import Chunk, Plan, Shard, check_code, code_of, needed, read, write
+from robins.campaign.statistics import Statistics
+from robins.campaign.store import Store, open_store
+from robins.campaign.work import Worker
+from robins.results import Outcome, Progress, silent
+from robins.systems.judgement import about
+from robins.systems.study import Problem
+from robins.workbench.errors import InputError, refusing
+from robins.workbench.scenarios import beside, check_filters, find_scenario, study_of
+
+Where = str | os.PathLike[str]
+
+
+def plan_campaign(
+    where: Where,
+    name: str,
+    *,
+    runs: int | None = None,
+    seed: int = 0,
+    filters: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    machine: str = "",
+) -> Plan:
+    """Begin a campaign in a store, or widen the one that is there by more runs or filters.
+
+    Args:
+        where: a folder, or an address such as "s3://bucket/campaign".
+        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
+        runs: how many; by default what the scenario says.
+        seed: of the random streams.
+        filters: names; by default those of the scenario and the default of its system.
+        settings: "path=value" texts that change the scenario.
+        machine: "jax" or "c"; not given, what is faster.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: what was asked for cannot be run, or another
+            campaign is there.
+        robins.errors.RobinsError: the machine is not there, or the store cannot be used.
+    """
+    _float64.require()
+    check_machine(machine)
+    store = open_store(where)
+    system, label, text = find_scenario(name)
+    study = study_of(system, text, name)
+    text = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
+    more = () if runs is None else (f"runs={runs}",)
+    parameters = scenario.parse(study.parameters, text, more, source=name)
+    own = parameters.filters or study.filters
+    chosen = check_filters(label, study.filters, filters or beside(own, system, study))
+    before = read(store)
+    if before is None:
+        with refusing(name):
+            problem = study.problem(parameters, chosen, seed)
+        by = machine_for(problem, parameters.runs, machine)
+        plan = Plan(
+            asked=name,
+            scenario=label,
+            text=text,
+            seed=seed,
+            runs=parameters.runs,
+            filters=chosen,
+            machine=by.name,
+            width=by.width(parameters.runs),
+            code=code_of(name, text),
+        )
+    else:
+        check_code(store, before)
+        for what, was, now in (
+            ("scenario", before.text, text),
+            ("seed", before.seed, seed),
+            ("machine", before.machine, machine or before.machine),
+        ):
+            if was != now:
+                shown = "" if what == "scenario" else f": {was} there, {now} asked for"
+                raise InputError(
+                    f"holds a campaign of another {what}{shown}",
+                    where,
+                    "ask for the same to go on with it, or choose another folder.",
+                )
+        plan = before.with_more(parameters.runs, chosen)
+    if plan != before:
+        write(store, plan)
+    store.sweep()
+    return plan
+
+
+def problem_of(plan: Plan, filters: Sequence[str] = ()) -> Problem:
+    """The problem of a campaign, with its filters or some of them."""
+    system, _, _ = find_scenario(plan.asked)
+    study = study_of(system, plan.text, plan.asked)
+    parameters = scenario.parse(study.parameters, plan.text, source=plan.asked)
+    own = parameters.filters or study.filters
+    with refusing(plan.asked):
+        problem = study.problem(parameters, filters or plan.filters, plan.seed)
+    return replace(problem, claims=about(own, problem.claims))
+
+
+def ready(where: Where) -> tuple[Store, Plan]:
+    """A campaign that this code may go on with.
+
+    Raises:
+        robins.errors.RobinsError: there is none, or other code began it.
+    """
+    _float64.require()
+    store = open_store(where)
+    plan = needed(store)
+    check_code(store, plan)
+    return store, plan
+
+
+def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
+    """Compute until nothing is missing; yields how many shards are done, and of how many."""
+    store, plan = ready(where)
+    total = sum(map(len, plan.shards.values()))
+    for lacking in Worker(store, plan, problem_of(plan)).work():
+        yield total - lacking, total
+    yield total, total
+
+
+class Status(NamedTuple):
+    """How far a campaign is; runs are counted by filter."""
+
+    scenario: str
+    seed: int
+    machine: str
+    filters: list[str]
+    wanted: int
+    done: dict[str, int]
+    shards: int
+    missing: int
+    damaged: list[str]
+    diverged: dict[str, list[int]]
+    digest: str | None
+
+
+def campaign_status(where: Where) -> Status:
+    """Read and check all shards of a campaign, and say how far it is."""
+    store = open_store(where)
+    plan = needed(store)
+    found = gather(store, plan)
+    return Status(
+        plan.scenario,
+        plan.seed,
+        plan.machine,
+        list(plan.filters),
+        plan.runs,
+        found.done,
+        sum(map(len, plan.shards.values())),
+        found.lacking - len(found.damaged),
+        [shard.name for shard in found.damaged],
+        {name: diverged_of(found, name) for name in plan.filters},
+        found.digest,
+    )
+
+
+def diverged_of(found: State, name: str) -> list[int]:
+    """Numbers of the runs in which a filter diverged, of a campaign without gaps."""
+    one = found.found[name]
+    if found.lacking or not one.runs:
+        return []
+    return np.flatnonzero(one.lost).tolist()
+
+
+def campaign_report(where: Where) -> Outcome:
+    """What all runs say that are there; fewer than wanted are told.
+
+    Raises:
+        InputError: there is no run of some filter.
+    """
+    store, plan = ready(where)
+    problem = problem_of(plan)
+    found = gather(store, plan, problem)
+    if not all(found.done.values()):
+        raise InputError(
+            "has no run of every filter yet",
+            where,
+            f"`robins campaign work {where}` computes them.",
+        )
+    outcome = outcome_of(problem, found.found, _bound(problem))
+    short = {name: n for name, n in found.done.items() if n < plan.runs}
+    warnings = [f"{name}: {n} of {plan.runs} runs are done" for name, n in short.items()]
+    return replace(
+        outcome,
+        machine=plan.machine,
+        scenario=plan.scenario,
+        seed=plan.seed,
+        runs=plan.runs,
+        parameters=plan.text,
+        device=jax.devices()[0].device_kind,
+        warnings=[*outcome.warnings, *warnings],
+        last_lines=[
+            f"Digest: {found.digest or 'none, as long as runs are missing'}",
+            f"Next:   robins campaign show {where} --run 0   one run with all its histories",
+        ],
+    )
+
+
+def _bound(problem: Problem) -> np.ndarray | None:
+    of = problem.bound_of
+    if of is None or of not in problem.contenders:
+        return None
+    return bound_sigma(problem, of, jax.jit(problem.simulate)(jnp.asarray(0)))
+
+
+def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Outcome:
+    """One run alone with all its histories, computed again; its bits are those of the campaign.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    store, plan = ready(where)
+    if not 0 <= run < plan.runs:
+        raise InputError(f"has runs 0 to {plan.runs - 1}", where, f"--run {run} is none of them.")
+    problem = problem_of(plan)
+    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.count)
+    progress(0.0, f"runs {chunk.begin} to {chunk.begin + chunk.count - 1}, of which {run} is shown")
+    worker = Worker(store, plan, problem)
+    alone = worker.run_of(chunk, run - chunk.begin)
+    outcome = outcome_of(problem, alone, None)
+    return replace(
+        outcome,
+        claims=[],  # of one run there is nothing to be claimed
+        machine=plan.machine,
+        scenario=plan.scenario,
+        seed=plan.seed,
+        runs=1,
+        parameters=plan.text,
+        device=jax.devices()[0].device_kind,
+        notes=[f"Run {run} of {plan.runs}, alone.", *outcome.notes],
+        last_lines=[f"Next:   robins campaign report {where}   all runs"],
+    )
+
+
+class Verified(NamedTuple):
+    """What a campaign was found to be."""
+
+    shards: int
+    damaged: list[str]
+    recomputed: list[str]
+    different: list[str]
+
+
+def campaign_verify(where: Where, share: float = 0.01, *, progress: Progress = silent) -> Verified:
+    """Check all shards, compute a share of them again by chance, and compare the bits.
+
+    Raises:
+        InputError: there is nothing to compare.
+    """
+    store, plan = ready(where)
+    damaged = [shard.name for shard in gather(store, plan).damaged]
+    there = store.names("shards")
+    whole: list[tuple[Chunk, Shard]] = [
+        (chunk, shard)
+        for chunk, shards in plan.shards.items()
+        for shard in shards
+        if shard.name.partition("/")[2] in there and shard.name not in damaged
+    ]
+    if not whole:
+        raise InputError("has no shard to verify yet", where, "compute some first.")
+    drawn = random.sample(whole, max(1, round(share * len(whole))))
+    problem = problem_of(plan, tuple(dict.fromkeys(shard.filter for _, shard in drawn)))
+    worker, different = Worker(store, plan, problem), []
+    for k, (chunk, shard) in enumerate(drawn):
+        progress(k / len(drawn), f"{shard.filter}: runs from {chunk.begin} again")
+        statistics: Statistics = worker.found(chunk, [shard.filter])[shard.filter]
+        if worker.packed(shard, chunk, statistics) != store.get(shard.name):
+            different.append(shard.name)
+    return Verified(len(whole) + len(damaged), damaged, [s.name for _, s in drawn], different)
+
+
+def mend(where: Where) -> int:
+    """Remove damaged shards, to be computed again; how many."""
+    store, plan = ready(where)
+    damaged = gather(store, plan).damaged
+    for shard in damaged:
+        store.drop(shard.name)
+    return len(damaged)

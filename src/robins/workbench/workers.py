@@ -1,0 +1,139 @@
+"""Workers of a campaign as processes of this machine, watched until nothing is missing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from time import monotonic, sleep
+from typing import IO, Any
+
+from robins.campaign.machine import available_cores
+from robins.campaign.plan import Plan
+from robins.campaign.store import open_store
+from robins.campaign.work import missing
+from robins.errors import RobinsError
+from robins.results import Outcome, Progress, silent
+from robins.workbench.campaigns import campaign_report, mend, plan_campaign
+
+POLL_S = 0.2
+DEATHS = 3  # of workers, without a shard between them, after which a campaign fails
+_COMMAND = "from robins.cli import main; raise SystemExit(main())"
+
+
+class _Process:
+    """A worker: `robins campaign work`, which ends when its standard input is closed."""
+
+    def __init__(self, where: str):
+        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by `close`)
+        command = [sys.executable, "-c", _COMMAND, "campaign", "work", where, "--json", "--held"]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            start_new_session=True,  # Ctrl-C is for the campaign, which ends its workers
+        )
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status, negative if it was killed; None as long as it runs."""
+        return self._process.poll()
+
+    @property
+    def said(self) -> str:
+        """What it told of its errors."""
+        self._errors.seek(0)
+        return self._errors.read().decode("utf-8", "replace").strip()
+
+    def close(self) -> None:
+        """End it at once: what it puts, it puts whole."""
+        self._process.kill()
+        self._process.wait()
+        if self._process.stdin:
+            self._process.stdin.close()
+        self._errors.close()
+
+
+def campaign_run(
+    where: str | os.PathLike[str],
+    name: str,
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+    **options: Any,
+) -> Outcome:
+    """Begin a campaign or go on with it, until all its runs are there; see `plan_campaign`.
+
+    Args:
+        where: a folder, or an address of object storage.
+        name: of the scenario.
+        workers: processes; by default one a core.
+        progress: called with the share done and what is being done.
+        **options: of `plan_campaign`.
+    """
+    progress(0.0, "looking what is there")
+    plan = plan_campaign(where, name, **options)
+    mend(where)
+    fill(where, plan, workers or available_cores(), progress)
+    return campaign_report(where)
+
+
+def fill(
+    where: str | os.PathLike[str], plan: Plan, workers: int, progress: Progress = silent
+) -> None:
+    """Have workers compute what is missing of a campaign.
+
+    A worker that is killed is replaced. All are ended if this is interrupted.
+
+    Raises:
+        RobinsError: a worker failed, or one after the other was killed.
+    """
+    store, shards = open_store(where), plan.shards
+    total = sum(map(len, shards.values()))
+    lacking, deaths, began = total, 0, monotonic()
+    with ExitStack() as stack:
+
+        def started() -> _Process:
+            process = _Process(str(where))
+            stack.callback(process.close)
+            return process
+
+        running: list[_Process] = []
+        while lack := missing(store, shards):
+            now = sum(len(one.shards) for one in lack)
+            if now < lacking:
+                lacking, deaths = now, 0
+            for process in [p for p in running if p.status is not None]:
+                running.remove(process)
+                deaths += _judged(process, str(where))
+            if deaths >= DEATHS:
+                raise _failed("its workers are killed, one after the other", str(where))
+            # a worker for each chunk at most
+            running += [started() for _ in range(min(workers, len(lack)) - len(running))]
+            verb = "starting, " if monotonic() - began < 5.0 else ""
+            runs = round(plan.runs * (1.0 - lacking / total))
+            progress(1.0 - lacking / total, f"{verb}{runs} of {plan.runs} runs, {workers} workers")
+            sleep(POLL_S)
+
+
+def _judged(process: _Process, where: str) -> int:
+    """One for a worker that was killed; nothing for one that found nothing to do.
+
+    Raises:
+        RobinsError: it failed by itself.
+    """
+    status = process.status or 0
+    if status > 0:
+        said: Sequence[str] = process.said.removeprefix("robins: ").splitlines()
+        raise _failed(said[-1] if said else f"it ended with {status}", where)
+    return int(status < 0)
+
+
+def _failed(why: str, where: str) -> RobinsError:
+    error = RobinsError(f"a worker failed: {why}", where, "the same command goes on.")
+    error.bad_input = False
+    return error

@@ -1,0 +1,254 @@
+"""A campaign in a folder: the same table whoever fills it, whatever is killed, damaged or added."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from robins.campaign import plan as plans
+from robins.campaign import simulate
+from robins.campaign.gather import gather
+from robins.campaign.machine import Part
+from robins.campaign.plan import needed, write
+from robins.campaign.store import open_store
+from robins.campaign.work import Worker, missing
+from robins.errors import RobinsError
+from robins.program import CPP, LANE_FLAGS
+from robins.workbench.campaigns import (
+    campaign_report,
+    campaign_show,
+    campaign_status,
+    campaign_verify,
+    campaign_work,
+    mend,
+    plan_campaign,
+    problem_of,
+)
+
+BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
+SHORT = ("duration=20 s",)
+RUNS = 53
+
+
+def begun(where, *, runs=RUNS, width=8, filters=("gated", "kf"), machine="jax"):
+    """A campaign of narrow chunks."""
+    plan = plan_campaign(
+        where, BALLOON, runs=runs, filters=filters, settings=SHORT, machine=machine
+    )
+    plan = plans.replace(plan, width=width)
+    write(open_store(where), plan)
+    return plan
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    where = tmp_path_factory.mktemp("campaign") / "serial"
+    begun(where)
+    *_, last = campaign_work(where)
+    assert last == (14, 14)
+    return where
+
+
+def test_it_is_the_campaign_that_is_run_at_once(undisturbed):
+    _, plan = open_store(undisturbed), needed(open_store(undisturbed))
+    want = simulate(problem_of(plan), RUNS, 8, machine="jax")
+    mine = campaign_report(undisturbed)
+    assert mine.summary["filters"] == want.summary["filters"]
+    assert mine.counts == want.counts
+    for name, variable in want.solution.variables.items():
+        np.testing.assert_array_equal(mine.solution[name], variable)
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_any_number_of_workers_make_one_table(undisturbed, tmp_path, workers):
+    plan = begun(tmp_path)
+    store, problem = open_store(tmp_path), problem_of(plan)
+    turns = [Worker(store, plan, problem).work() for _ in range(workers)]
+    while missing(store, plan.shards):
+        for one in turns:
+            next(one, None)
+    assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+def test_what_was_claimed_by_the_dead_is_computed(undisturbed, tmp_path, monkeypatch):
+    plan = begun(tmp_path)
+    store = open_store(tmp_path)
+    for one in missing(store, plan.shards)[::2]:
+        store.put(one.claim, b"")
+    monkeypatch.setattr("robins.campaign.work.LEAST_S", 0.0)
+    monkeypatch.setattr("robins.campaign.work.PATIENCE", 0.0)
+    *_, last = campaign_work(tmp_path)
+    assert last == (14, 14)
+    assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+def test_damage_is_told_and_mended(undisturbed, tmp_path):
+    begun(tmp_path)
+    list(campaign_work(tmp_path))
+    path = sorted((tmp_path / "shards").iterdir())[3]
+    path.write_bytes(path.read_bytes()[:-1000])
+    found = campaign_status(tmp_path)
+    assert found.damaged == [f"shards/{path.name}"]
+    assert (found.missing, found.digest) == (0, None)
+    assert sum(found.done.values()) in (2 * RUNS - 8, 2 * RUNS - 5)
+    assert campaign_verify(tmp_path).damaged == found.damaged
+    assert "kf" in " ".join(campaign_report(tmp_path).warnings) or found.done["kf"] == RUNS
+    assert mend(tmp_path) == 1
+    list(campaign_work(tmp_path))
+    assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+def test_a_shard_that_another_code_made_is_told(undisturbed, tmp_path):
+    plan = begun(tmp_path, runs=8)
+    store = open_store(tmp_path)
+    list(campaign_work(tmp_path))
+    chunk, shards = next(iter(plan.shards.items()))
+    worker = Worker(store, plan, problem_of(plan))
+    wrong = worker.found(chunk, [shards[0].filter])[shards[0].filter]
+    wrong.sums["square"] = np.nextafter(wrong.sums["square"], 1e9)
+    store.put(shards[0].name, worker.packed(shards[0], chunk, wrong), anew=True)
+    found = campaign_verify(tmp_path, share=1.0)
+    assert (found.shards, found.damaged, found.different) == (2, [], [shards[0].name])
+    assert len(found.recomputed) == 2
+
+
+def test_more_runs_and_filters_compute_what_is_new(undisturbed, tmp_path):
+    begun(tmp_path, runs=24, filters=("gated",))
+    list(campaign_work(tmp_path))
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "shards").iterdir()}
+    assert len(before) == 3
+    plan = plan_campaign(tmp_path, BALLOON, runs=RUNS, filters=("kf",), settings=SHORT)
+    assert (plan.runs, plan.filters) == (RUNS, ("gated", "kf"))
+    list(campaign_work(tmp_path))
+    after = {path: path.stat().st_mtime_ns for path in (tmp_path / "shards").iterdir()}
+    assert len(after) == 14
+    assert before.items() <= after.items()
+    assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+@pytest.mark.parametrize("run", [0, 37, RUNS - 1])
+def test_a_run_shown_alone_is_that_of_the_campaign(undisturbed, run):
+    store = open_store(undisturbed)
+    plan = needed(store)
+    problem = problem_of(plan)
+    whole = gather(store, plan, problem).found
+    shown = campaign_show(undisturbed, run)
+    assert shown.runs == 1
+    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.count)
+    alone = Worker(store, plan, problem).run_of(chunk, run - chunk.begin)
+    for name, one in alone.items():
+        np.testing.assert_array_equal(one.run_rms[0], whole[name].run_rms[run])
+        first = one.first_run["error"]
+        np.testing.assert_array_equal(np.sqrt(np.mean(first**2, axis=0)), one.run_rms[0])
+        if run == 0:
+            for x, y in zip(*map(jax.tree.leaves, (one.example, whole[name].example)), strict=True):
+                np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, CPP.names)), reason="lanes need a C++ compiler")
+def test_a_run_in_lanes_is_that_of_the_campaign(tmp_path, monkeypatch):
+    flags = tuple("-O0" if flag == "-O2" else flag for flag in LANE_FLAGS)
+    monkeypatch.setattr("robins.program.lanes.LANE_FLAGS", flags)
+    plan = begun(tmp_path, runs=21, filters=("kf",), machine="c")
+    store, problem = open_store(tmp_path), problem_of(plan)
+    worker = Worker(store, plan, problem)
+    list(worker.work())
+    whole = gather(store, plan, problem).found["kf"]
+    chunks = list(plan.chunks)
+    for run in (0, 13, 20):
+        alone = worker.run_of(chunks[run // 8], run % 8)["kf"]
+        np.testing.assert_array_equal(alone.run_rms[0], whole.run_rms[run])
+    again = Worker(store, plan, problem).found(chunks[1], ["kf"])["kf"]
+    shard = plan.shard(chunks[1], "kf")
+    assert worker.packed(shard, chunks[1], again) == store.get(shard.name)
+
+
+def test_runs_that_diverge_are_named(tmp_path):
+    plan = begun(tmp_path, runs=8, filters=("kf",))
+    store = open_store(tmp_path)
+    worker = Worker(store, plan, problem_of(plan))
+    chunk, (shard,) = next(iter(plan.shards.items()))
+    part = Part(chunk.begin, chunk.count, plan.width)
+    record = worker.machine.histories(part, ["kf"])["kf"]
+    record["error"] = record["error"].copy()
+    record["error"][5, 3] = np.nan
+    found = worker.found(chunk, ["kf"])["kf"].blank()
+    found.add(record)
+    store.put(shard.name, worker.packed(shard, chunk, found))
+    status = campaign_status(tmp_path)
+    assert status.diverged == {"kf": [5]}
+    assert status.done == {"kf": 8}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"settings": ("duration=21 s",)}, "another scenario"),
+        ({"seed": 3}, "another seed: 0 there, 3 asked for"),
+        ({"machine": "c"}, "another machine: jax there, c asked for"),
+    ],
+)
+def test_another_campaign_is_refused(undisturbed, change, sentence):
+    asked = {"runs": RUNS, "settings": SHORT} | change
+    with pytest.raises(RobinsError, match=sentence):
+        plan_campaign(undisturbed, BALLOON, **asked)
+    assert needed(open_store(undisturbed)).runs == RUNS
+
+
+def test_other_code_is_refused(tmp_path, monkeypatch):
+    begun(tmp_path, runs=8)
+    monkeypatch.setattr(plans, "_of_package", lambda: "other")
+    with pytest.raises(RobinsError, match="was begun by code"):
+        list(campaign_work(tmp_path))
+    assert campaign_status(tmp_path).missing == 2  # reading needs no code
+
+
+def test_what_is_no_campaign_is_told(tmp_path):
+    with pytest.raises(RobinsError, match="is no campaign"):
+        campaign_status(tmp_path)
+    (tmp_path / "campaign.json").write_text("{")
+    with pytest.raises(RobinsError, match="is damaged"):
+        campaign_status(tmp_path)
+
+
+ROBINS = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())", "campaign"]
+
+
+@pytest.mark.parametrize("kills", [1, 20])
+def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
+    """Workers and the whole are killed; two campaigns are started on one folder at once."""
+    settings = [word for one in SHORT for word in ("--set", one)]
+    run = [*ROBINS, "run", BALLOON, "--runs", str(RUNS), "--filters", "gated,kf", *settings]
+    run += ["--machine", "jax", "--json"]
+    rng = np.random.default_rng(0)
+    where = tmp_path / "killed"
+    begun(where)
+    for _ in range(kills):
+        process = subprocess.Popen(
+            [*run, "--out", str(where)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        time.sleep(rng.uniform(0.5, 12.0))
+        if process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+        process.wait()
+    both = [
+        subprocess.Popen(
+            [*run, "--out", str(where)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        for _ in range(2)
+    ]
+    told = [one.communicate() for one in both]
+    assert {one.returncode for one in both} <= {0, 2}, told  # the report is written by one of them
+    assert 0 in {one.returncode for one in both}, told
+    serial = tmp_path / "serial"
+    begun(serial)
+    command = [*ROBINS, "work", str(serial), "--json"]
+    assert json.loads(subprocess.run(command, capture_output=True, check=True).stdout)["done"] == 14
+    assert campaign_status(where).digest == campaign_status(serial).digest

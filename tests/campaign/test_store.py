@@ -1,0 +1,137 @@
+"""Objects that are put once: whole or not at all, by several writers, on a full disk, damaged."""
+
+import errno
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robins.campaign import store as stores
+from robins.campaign.shards import Damaged, digest, pack, tables, unpack
+from robins.campaign.statistics import Statistics
+from robins.campaign.store import Folder, open_store
+from robins.errors import RobinsError
+
+
+@pytest.fixture(params=["folder", "objects"])
+def store(request, tmp_path):
+    if request.param == "folder":
+        return open_store(tmp_path / "store")
+    pytest.importorskip("obstore", reason="object storage is an extra")
+    (tmp_path / "bucket").mkdir()
+    return open_store(f"file://{tmp_path}/bucket")
+
+
+def test_the_first_object_under_a_name_stays(store):
+    assert store.get("shards/a") is None
+    assert store.put("shards/a", b"one")
+    assert not store.put("shards/a", b"two")
+    assert store.get("shards/a") == b"one"
+    assert store.put("shards/a", b"three", anew=True)
+    assert store.get("shards/a") == b"three"
+    assert store.names("shards") == {"a"}
+    store.drop("shards/a")
+    store.drop("shards/a")
+    assert store.names("shards") == set() == store.names("nothing")
+
+
+def test_of_many_writers_one_puts(store):
+    with ThreadPoolExecutor(8) as pool:
+        put = list(pool.map(lambda k: store.put("claims/x", bytes([k])), range(32)))
+    assert sum(put) == 1
+    assert store.get("claims/x") == bytes([put.index(True)])
+
+
+def test_a_writer_that_is_killed_leaves_no_object(tmp_path):
+    code = (
+        "import os, sys; from robins.campaign import store\n"
+        "os.fsync = lambda _: os.kill(os.getpid(), 9)\n"
+        f"store.Folder({str(tmp_path)!r}).put('shards/a', b'content')"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -9
+    folder = Folder(tmp_path)
+    assert folder.names("shards") == set()
+    left = next((tmp_path / ".partial").iterdir())
+    folder.sweep()
+    assert left.exists()  # its writer may be alive
+    os.utime(left, (0, 0))
+    folder.sweep()
+    assert not left.exists()
+
+
+def test_a_full_disk_leaves_what_is_there(tmp_path, monkeypatch):
+    folder = Folder(tmp_path)
+    folder.put("shards/a", b"one")
+
+    def full(_descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(stores.os, "fsync", full)
+    with pytest.raises(RobinsError, match=r"No space left.*make room") as caught:
+        folder.put("shards/b", b"two")
+    assert not caught.value.bad_input
+    assert folder.names("shards") == {"a"}
+    assert not list((tmp_path / ".partial").iterdir())
+
+
+def test_where_files_have_one_name_only(tmp_path, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(stores.os, "link", refused)
+    folder = Folder(tmp_path)
+    assert folder.put("shards/a", b"one")
+    assert folder.get("shards/a") == b"one"
+
+
+def statistics(seed: int) -> Statistics:
+    rng = np.random.default_rng(seed)
+    found = Statistics((), runs=4, diverged=1, n=6)
+    found.sums = {"square": rng.normal(size=(5, 3)), "dof of y": rng.integers(0, 9, 5)}
+    found.each = {"rms": [rng.normal(size=(3, 2)), rng.normal(size=(1, 2))]}
+    return found
+
+
+def test_a_shard_is_read_as_it_was_written():
+    told = statistics(0)
+    told.example = {"error": np.arange(6.0).reshape(2, 3), "mean": (np.float64(1.0),)}
+    content = pack({"filter": "kf", "begin": 4}, told)
+    read = Statistics(())
+    about = unpack(content, read, {"error": 0, "mean": (0,)})
+    assert (about["filter"], about["begin"]) == ("kf", 4)
+    assert (read.runs, read.diverged, read.n) == (4, 1, 6)
+    assert tables(read).keys() == tables(told).keys()
+    for name, x in tables(told).items():
+        assert x.dtype == tables(read)[name].dtype
+        np.testing.assert_array_equal(x, tables(read)[name])
+    np.testing.assert_array_equal(read.example["error"], told.example["error"])
+    assert read.example["mean"] == (1.0,)
+    assert digest({"kf": read}) == digest({"kf": told})
+    assert digest({"kf": read}) != digest({"kf": statistics(1)}) != digest({"ukf": read})
+
+
+@pytest.mark.parametrize("part", np.linspace(0.0, 0.999, 40))
+def test_a_flipped_bit_or_a_cut_is_seen(part):
+    content = bytearray(pack({"filter": "kf"}, statistics(0)))
+    at = int(part * len(content))
+    with pytest.raises(Damaged):
+        unpack(bytes(content[:at]), Statistics(()))
+    content[at] ^= 4
+    try:
+        read = Statistics(())
+        unpack(bytes(content), read)
+    except Damaged:
+        return
+    # A bit of the archive that says nothing of the numbers, such as a date, may be flipped unseen.
+    assert digest({"kf": read}) == digest({"kf": statistics(0)})
+
+
+def test_paths_are_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RobinsError, match="cannot write shards/a"):
+        Folder(tmp_path / "file").put("shards/a", b"")
+    assert isinstance(open_store(Path("a")), Folder)
