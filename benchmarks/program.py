@@ -47,7 +47,7 @@ from robins.program.nvrtc import compile_cuda, found
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import SYSTEM, Drive
 
-N, M, BATCH, STEPS, LANES = 9, 3, 256, 200, 8
+N, M, BATCH, STEPS = 9, 3, 256, 200
 EPOCHS, SAMPLES, RATE = 20, 1000, 100  # of the drive; of strapdown; samples in an epoch
 GPU_RUNS, LARGEST = 131_072, 20_000  # nodes of a program that NVRTC is given
 SPILLS = (
@@ -206,6 +206,15 @@ class Pools(NamedTuple):
             np.concatenate([*reals, np.zeros((*front, 0, runs))], axis=-2),
             np.concatenate([*counts, np.zeros((*front, 0, runs), np.int64)], axis=-2),
         )
+
+
+def lanes_here() -> int:
+    """How many runs at a time the processor takes."""
+    text = header("lanes.h") + 'extern "C" int lanes(void) { return LANES; }\n'
+    return ctypes.CDLL(str(build(text, LANE_FLAGS, CPP))).lanes()
+
+
+LANES = lanes_here()
 
 
 def in_c(program, case: Case, runs: int) -> Callable[[], np.ndarray]:
