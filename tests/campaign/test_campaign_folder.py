@@ -141,7 +141,7 @@ def test_a_run_shown_alone_is_that_of_the_campaign(undisturbed, run):
     whole = gather(store, plan, problem).found
     shown = campaign_show(undisturbed, run)
     assert shown.runs == 1
-    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.count)
+    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.runs)
     alone = Worker(store, plan, problem).run_of(chunk, run - chunk.begin)
     for name, one in alone.items():
         np.testing.assert_array_equal(one.run_rms[0], whole[name].run_rms[run])
@@ -175,7 +175,7 @@ def test_runs_that_diverge_are_named(tmp_path):
     store = open_store(tmp_path)
     worker = Worker(store, plan, problem_of(plan))
     chunk, (shard,) = next(iter(plan.shards.items()))
-    part = Part(chunk.begin, chunk.count, plan.width)
+    part = Part(chunk.begin, chunk.runs, plan.width)
     record = worker.machine.histories(part, ["kf"])["kf"]
     record["error"] = record["error"].copy()
     record["error"][5, 3] = np.nan

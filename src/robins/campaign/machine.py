@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from robins.campaign.memory import CHUNK_BYTES, LEAST, MEMORY, at_once, said, width_of
+from robins.campaign.memory import CHUNK, CHUNK_BYTES, LEAST, MEMORY, at_once, said, width_of
 from robins.campaign.monte_carlo import (
-    CHUNK,
     batch_of,
     blocks_of,
     bytes_of_batch,
@@ -50,10 +49,10 @@ Chunk = tuple[Any, int, Callable[[str], Any]]
 
 
 class Part(NamedTuple):
-    """A chunk of a campaign: runs begin to begin + count - 1, filled up to its width."""
+    """A chunk of a campaign: some runs from `begin` on, filled up to its width."""
 
     begin: int
-    count: int
+    runs: int
     width: int
 
 
@@ -106,7 +105,7 @@ class ByJax:
     def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
         """What is kept of some filters over one chunk."""
         batch, _ = next(worlds(self.problem, part.width, part.width, part.begin, self._batch))
-        return {name: taken(name, record(self.problem, name, batch, part.count)) for name in names}
+        return {name: taken(name, record(self.problem, name, batch, part.runs)) for name in names}
 
     def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
         """All that was recorded of some filters over one chunk."""
@@ -201,7 +200,7 @@ class InLanes:
 
         def computed() -> dict[str, Any]:
             world = self._worlds(part.begin, part.width)
-            return {name: self._of(name, world, part.count, taken) for name in names}
+            return {name: self._of(name, world, part.runs, taken) for name in names}
 
         return with_stack(computed)
 
@@ -210,7 +209,7 @@ class InLanes:
 
         def computed() -> dict[str, Any]:
             world = self._worlds(part.begin, part.width)
-            return {name: cut(self._staged(name)(world), part.count) for name in names}
+            return {name: cut(self._staged(name)(world), part.runs) for name in names}
 
         return with_stack(computed)
 

@@ -32,11 +32,11 @@ class Shard(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Runs begin to begin + count - 1."""
+    """Some runs, from `begin` on."""
 
     number: int
     begin: int
-    count: int
+    runs: int
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Plan:
         """The shard of a filter, whose name is a hash of all that its content depends on."""
         said = scenario.mapping_of(self.text)
         of = {k: v for k, v in said.items() if k not in _WANTED}
-        key = [of, self.seed, self.machine, self.width, self.code, name, chunk.begin, chunk.count]
+        key = [of, self.seed, self.machine, self.width, self.code, name, chunk.begin, chunk.runs]
         return Shard(f"shards/{_hash(key)}.npz", name, chunk.number)
 
     @property

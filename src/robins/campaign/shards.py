@@ -32,7 +32,7 @@ def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:
         about: what it is of, plain data.
         statistics: of a chunk; the record of its first run goes along where it is there.
     """
-    arrays = dict(tables(statistics))
+    arrays: dict[str, Any] = dict(tables(statistics))
     arrays |= {
         f"example {k:04}": np.asarray(x)
         for k, x in enumerate(jax.tree_util.tree_leaves(statistics.example))

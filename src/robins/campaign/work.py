@@ -91,7 +91,7 @@ class Worker:
                 of_chunk.example = None  # figures show the first run of all
             return of_chunk
 
-        part = Part(chunk.begin, chunk.count, self.plan.width)
+        part = Part(chunk.begin, chunk.runs, self.plan.width)
         return self.machine.compute(part, names, taken)
 
     def run_of(self, chunk: Chunk, index: int) -> dict[str, Statistics]:
@@ -99,7 +99,7 @@ class Worker:
 
         The chunk is computed as it was, so that the run has the same bits.
         """
-        part = Part(chunk.begin, chunk.count, self.plan.width)
+        part = Part(chunk.begin, chunk.runs, self.plan.width)
         found = {}
         for name, record in self.machine.histories(part, list(self.problem.contenders)).items():
             found[name] = blank(self.problem)

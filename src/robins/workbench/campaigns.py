@@ -232,8 +232,8 @@ def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Out
     if not 0 <= run < plan.runs:
         raise InputError(f"has runs 0 to {plan.runs - 1}", where, f"--run {run} is none of them.")
     problem = problem_of(plan)
-    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.count)
-    progress(0.0, f"runs {chunk.begin} to {chunk.begin + chunk.count - 1}, of which {run} is shown")
+    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.runs)
+    progress(0.0, f"runs {chunk.begin} to {chunk.begin + chunk.runs - 1}, of which {run} is shown")
     worker = Worker(store, plan, problem)
     alone = worker.run_of(chunk, run - chunk.begin)
     outcome = outcome_of(problem, alone, None)
