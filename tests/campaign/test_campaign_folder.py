@@ -234,7 +234,7 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
         process = subprocess.Popen(
             [*run, "--out", str(where)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
-        time.sleep(rng.uniform(0.5, 12.0))
+        time.sleep(rng.uniform(0.5, 8.0))
         if process.poll() is None:
             process.send_signal(signal.SIGKILL)
         process.wait()
