@@ -31,6 +31,7 @@ from robins.workbench.campaigns import (
     plan_campaign,
     problem_of,
 )
+from robins.workbench.workers import work_here
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
 SHORT = ("duration=20 s",)
@@ -252,3 +253,24 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
     command = [*ROBINS, "work", str(serial), "--json"]
     assert json.loads(subprocess.run(command, capture_output=True, check=True).stdout)["done"] == 14
     assert campaign_status(where).digest == campaign_status(serial).digest
+
+
+def test_dask_makes_the_same_table(undisturbed, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="Dask is an extra")
+    begun(tmp_path)
+    settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(**settings) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        jobs = [
+            client.submit(work_here, str(tmp_path), workers=[one], pure=False) for one in workers
+        ]
+        assert client.gather(jobs) == [14, 14]
+    assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+def test_what_a_worker_complains_of_comes_out(tmp_path):
+    with pytest.raises(RobinsError, match="is no campaign"):
+        work_here(tmp_path)

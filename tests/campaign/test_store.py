@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,13 +18,33 @@ from robins.campaign.store import Folder, open_store
 from robins.errors import RobinsError
 
 
-@pytest.fixture(params=["folder", "objects"])
-def store(request, tmp_path):
+@pytest.fixture(scope="module")
+def server():
+    """A store of the S3 kind on this machine."""
+    pytest.importorskip("obstore", reason="object storage is an extra")
+    moto = pytest.importorskip("moto.server", reason="moto is for development")
+    running = moto.ThreadedMotoServer(port=0, verbose=False)
+    running.start()
+    yield "http://{}:{}".format(*running.get_host_and_port())
+    running.stop()
+
+
+@pytest.fixture(params=["folder", "objects", "s3"])
+def store(request, tmp_path, monkeypatch):
     if request.param == "folder":
         return open_store(tmp_path / "store")
-    pytest.importorskip("obstore", reason="object storage is an extra")
-    (tmp_path / "bucket").mkdir()
-    return open_store(f"file://{tmp_path}/bucket")
+    if request.param == "objects":
+        pytest.importorskip("obstore", reason="object storage is an extra")
+        (tmp_path / "bucket").mkdir()
+        return open_store(f"file://{tmp_path}/bucket")
+    address = request.getfixturevalue("server")
+    about = {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "REGION": "us-east-1"}
+    about |= {"ENDPOINT_URL": address, "ALLOW_HTTP": "true"}
+    for name, value in about.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    bucket = tmp_path.name.replace("_", "-")
+    urllib.request.urlopen(urllib.request.Request(f"{address}/{bucket}", method="PUT")).close()
+    return open_store(f"s3://{bucket}/campaign")
 
 
 def test_the_first_object_under_a_name_stays(store):

@@ -70,7 +70,7 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
 @click.argument("scenario")
 @option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
 @option("--runs", type=click.IntRange(min=1), help="How many. [default: as given]")
-@option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
+@option("--workers", type=click.IntRange(min=0), help="Processes. [default: one a core]")
 @option(
     "--machine",
     type=click.Choice(["jax", "c"]),
@@ -84,8 +84,16 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
 
     The same command on the same DIR goes on: what is there is not computed again, more runs or
     filters are added. It ends with the figures of all runs, in the folder DIR/report.
+
+    With --workers 0 it computes nothing: workers are started elsewhere.
     """
     bench = _workbench()
+    if workers == 0:
+        with only_json(as_json):
+            bench.plan_campaign(out, scenario, **options)
+            found = bench.campaign_status(out)
+        say(found._asdict(), _progress_text(out, found), as_json)
+        return
     with only_json(as_json), Progress() as progress:
         computing = bench.part(progress, 0.0, _COMPUTING)
         outcome = bench.campaign_run(out, scenario, workers=workers, progress=computing, **options)
@@ -132,6 +140,10 @@ def status(where: str, as_json: bool) -> None:
     """Read and check every shard of the campaign in DIR, and say what is done, missing, damaged."""
     with only_json(as_json):
         found = _workbench().campaign_status(where)
+    say(found._asdict(), _progress_text(where, found), as_json)
+
+
+def _progress_text(where: str, found: Any) -> str:
     lines = [f"{found.scenario}, seed {found.seed}, by {found.machine}: {found.wanted} runs wanted"]
     for name in found.filters:
         lost = found.diverged[name]
@@ -146,7 +158,7 @@ def status(where: str, as_json: bool) -> None:
         lines += [f"digest {found.digest}", f"Next:   robins campaign report {where}"]
     else:
         lines.append(f"Next:   robins campaign work {where}   computes what is missing")
-    say(found._asdict(), "\n".join(lines), as_json)
+    return "\n".join(lines)
 
 
 @campaign.command(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from robins.cli.options import (
     log_name,
     publishes,
 )
-from robins.cli.tell import carry_out
+from robins.cli.tell import carry_out, say
 from robins.workbench import InputError
 
 DEMO = "ins-gnss/drive"
@@ -347,6 +348,35 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
     precision too, and tells what that costs against the simulated truth.
     """
     write(scenario, to, fast=not small, as_json=as_json, **options)
+
+
+@app.command(
+    short_help="Compare two results: what was asked, what was found.",
+    epilog=examples("robins compare results/drive results/drive-other"),
+)
+@click.argument("first", type=LOGS)
+@click.argument("second", type=LOGS)
+@answers
+def compare(first: Path, second: Path, as_json: bool) -> None:
+    """Compare the result folders FIRST and SECOND: parameters, versions, metrics and verdicts.
+
+    A metric that differs is shown with the ratio of the second to the first, by component.
+    """
+    comparison = importlib.import_module("robins.workbench.comparison")
+    found = comparison.compare(first, second)
+    say(found._asdict(), "\n".join(comparison.lines(found)), as_json)
+
+
+@app.command(
+    short_help="Check that a result is whole and unchanged.",
+    epilog=examples("robins verify results/drive"),
+)
+@click.argument("folder", type=LOGS)
+@answers
+def verify(folder: Path, as_json: bool) -> None:
+    """Check every file of the result FOLDER against its checksum; bad input if one is damaged."""
+    found = importlib.import_module("robins.workbench.comparison").verify(folder)
+    say(found, f"{folder}: whole, {found['files']} files of {found['scenario']}", as_json)
 
 
 @app.command(

@@ -32,6 +32,7 @@ _WHERE = {
     "campaign_status": "campaigns",
     "campaign_verify": "campaigns",
     "campaign_work": "campaigns",
+    "compare": "comparison",
     "design": "gains",
     "examine": "examination",
     "export": "exporting",
@@ -39,10 +40,13 @@ _WHERE = {
     "inventory": "contents",
     "overview": "contents",
     "part": "publication",
+    "plan_campaign": "campaigns",
     "publish": "publication",
     "publishing": "publication",
     "replay": "recorded",
     "run": "simulated",
+    "verify": "comparison",
+    "work_here": "workers",
 }
 
 __all__ = list(_WHERE)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -21,7 +22,27 @@ from robins.workbench.campaigns import campaign_report, mend, plan_campaign
 
 POLL_S = 0.2
 DEATHS = 3  # of workers, without a shard between them, after which a campaign fails
-_COMMAND = "from robins.cli import main; raise SystemExit(main())"
+_ROBINS = "from robins.cli import main; raise SystemExit(main())"
+
+
+def command(where: str | os.PathLike[str]) -> list[str]:
+    """The command line of a worker of a campaign, with this Python."""
+    return [sys.executable, "-c", _ROBINS, "campaign", "work", str(where), "--json"]
+
+
+def work_here(where: str | os.PathLike[str]) -> int:
+    """Run a worker as a process of its own until nothing is missing; for engines that call Python.
+
+    Returns:
+        How many shards are there then.
+
+    Raises:
+        RobinsError: the worker failed.
+    """
+    done = subprocess.run(command(where), capture_output=True, text=True)
+    if done.returncode:
+        raise _failed(done.stderr.removeprefix("robins: ").strip(), str(where))
+    return json.loads(done.stdout)["done"]
 
 
 class _Process:
@@ -29,9 +50,8 @@ class _Process:
 
     def __init__(self, where: str):
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by `close`)
-        command = [sys.executable, "-c", _COMMAND, "campaign", "work", where, "--json", "--held"]
         self._process = subprocess.Popen(
-            command,
+            [*command(where), "--held"],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,

@@ -1,0 +1,150 @@
+"""The commands `compare` and `verify`: two results side by side, and whether one is whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins import results, scenario
+
+Where = str | os.PathLike[str]
+Pair = tuple[Any, Any]  # of the first result and of the second; None where it has none
+
+
+class Comparison(NamedTuple):
+    """What differs between two results.
+
+    Attributes:
+        scenarios: their names.
+        asked: seed, runs, machine and parameters that differ, by name.
+        versions: of packages that differ.
+        metrics: by filter and name, of the filters and metrics that both have.
+        missing: filters that only one of them has: those of the first, those of the second.
+        claims: verdicts that differ, by id.
+    """
+
+    scenarios: Pair
+    asked: dict[str, Pair]
+    versions: dict[str, Pair]
+    metrics: dict[str, dict[str, Pair]]
+    missing: tuple[list[str], list[str]]
+    claims: dict[str, Pair]
+
+    @property
+    def changed(self) -> dict[str, dict[str, Pair]]:
+        """The metrics that differ."""
+        return {
+            name: differ
+            for name, some in self.metrics.items()
+            if (differ := {k: pair for k, pair in some.items() if pair[0] != pair[1]})
+        }
+
+
+def compare(first: Where, second: Where) -> Comparison:
+    """Compare two results: what was asked, what was found.
+
+    Raises:
+        robins.results.ResultError: one of them is none, or damaged.
+    """
+    a, b = results.read(first), results.read(second)
+    told = [
+        {k: r.summary.get(k) for k in ("seed", "runs", "machine")}
+        | _flat(scenario.mapping_of(r.manifest["scenario"]["text"]))
+        for r in (a, b)
+    ]
+    one, other = a.summary["filters"], b.summary["filters"]
+    verdicts = [{c["id"]: c["verdict"] for c in r.summary["claims"]} for r in (a, b)]
+    return Comparison(
+        (a.summary["scenario"], b.summary["scenario"]),
+        _differing(*told),
+        _differing(a.manifest["versions"], b.manifest["versions"]),
+        {
+            name: {k: (one[name][k], other[name][k]) for k in one[name] if k in other[name]}
+            for name in one
+            if name in other
+        },
+        ([name for name in one if name not in other], [name for name in other if name not in one]),
+        _differing(*verdicts),
+    )
+
+
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Pair]:
+    return {k: (a.get(k), b.get(k)) for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)}
+
+
+def _flat(mapping: Mapping[str, Any], under: str = "") -> dict[str, Any]:
+    """Of tables in tables one, with dotted names as `--set` takes them."""
+    found: dict[str, Any] = {}
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{under}{key}.")
+        else:
+            found[f"{under}{key}"] = value
+    return found
+
+
+def ratios(pair: Pair) -> list[float]:
+    """The second over the first, of each component; NaN where one is no number."""
+    a, b = (np.atleast_1d(np.array(x, dtype=object)) for x in pair)
+    if a.shape != b.shape:
+        return [float("nan")]
+    numbers = [
+        (float(x), float(y)) if _is_number(x) and _is_number(y) else (np.nan, np.nan)
+        for x, y in zip(a, b, strict=True)
+    ]
+    return [y / x if x else (1.0 if y == x else float("nan")) for x, y in numbers]
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, int | float) and not isinstance(x, bool)
+
+
+def lines(found: Comparison) -> list[str]:
+    """A comparison for people."""
+    told = [f"{found.scenarios[0]} and {found.scenarios[1]}"]
+    for title, pairs in (
+        ("Asked for", found.asked),
+        ("Versions", found.versions),
+        ("Verdicts", found.claims),
+    ):
+        told += [f"{title}:"] if pairs else []
+        told += [f"  {name}: {a} -> {b}" for name, (a, b) in pairs.items()]
+    for name, which in zip(found.missing, ("first", "second"), strict=True):
+        told += [f"Only the {which} has {', '.join(name)}."] if name else []
+    count = sum(map(len, found.metrics.values()))
+    changed = found.changed
+    for name, some in changed.items():
+        told.append(f"{name}:")
+        width = max(map(len, some))
+        for key, pair in some.items():
+            a, b = (_shown(x) for x in pair)
+            by = ", ".join(f"{r:.3g}" for r in ratios(pair))
+            told.append(f"  {key:<{width}}  {a} -> {b}   ({by} times)")
+    differ = sum(map(len, changed.values()))
+    return [*told, f"{differ} of {count} metrics differ."]
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_shown, value))}]"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def verify(where: Where) -> dict[str, Any]:
+    """Check every file of a result against its checksum.
+
+    Returns:
+        ``scenario``, ``files`` (how many), ``whole``.
+
+    Raises:
+        robins.results.ResultError: it is none, incomplete or damaged; the message names the file.
+    """
+    found = results.read(where)
+    return {
+        "scenario": found.summary["scenario"],
+        "files": len(found.manifest["files"]),
+        "whole": True,
+    }
