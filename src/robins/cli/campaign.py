@@ -215,3 +215,34 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
         outcome = bench.campaign_report(where)
         result = _published(bench, where, outcome, progress, out)
     tell(outcome, result, as_json)
+
+
+@click.command(
+    short_help="Run a scenario over the values of one parameter, or of two.",
+    epilog=examples(
+        'robins sweep ins-gnss/drive --vary "gnss.sigma=0.5 m,1 m,2 m" --runs 20 --out sigmas',
+        "robins sweep transfer-alignment/s0 --vary h_infinity.gamma=20,50,100 "
+        '--vary "flexure.sigma=1 arcmin,3 arcmin,9 arcmin" --runs 20 --out gammas',
+    ),
+)
+@click.argument("scenario")
+@option("--vary", multiple=True, required=True, metavar="key=a,b,c", help="Once, or twice.")
+@option("--out", required=True, metavar="DIR", help="Folder, or an address such as s3://name/dir.")
+@option("--runs", type=click.IntRange(min=1), help="At each point. [default: as given]")
+@option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
+@option("--machine", type=click.Choice(["jax", "c"]), default="jax", show_default=True)
+@choices
+@answers
+def sweep(scenario: str, out: str, as_json: bool, **options: Any) -> None:
+    """Run SCENARIO for each value of one parameter or of two, with the same random numbers.
+
+    One parameter gives curves with their bounds, two give a map for each filter; the result is in
+    DIR/report, all numbers in its sweep.csv. Each point is a campaign in DIR/points: the same
+    command goes on, and `robins campaign work DIR` is one more worker.
+    """
+    bench = _workbench()
+    with only_json(as_json), Progress() as progress:
+        computing = bench.part(progress, 0.0, _COMPUTING)
+        outcome = bench.sweep(scenario, out, progress=computing, **options)
+        result = _published(bench, out, outcome, bench.part(progress, _COMPUTING, 1.0))
+    tell(outcome, result, as_json)

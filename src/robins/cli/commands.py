@@ -12,7 +12,7 @@ from click import option
 
 from robins import __version__
 from robins.cli.bench import bench
-from robins.cli.campaign import campaign
+from robins.cli.campaign import campaign, sweep
 from robins.cli.doctor import judge
 from robins.cli.export import write
 from robins.cli.frame import Status
@@ -319,6 +319,7 @@ def design(problem: str, out: Path | None, **options: Any) -> None:
 
 app.add_command(bench)
 app.add_command(campaign)
+app.add_command(sweep)
 
 
 @app.command(

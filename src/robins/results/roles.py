@@ -56,6 +56,7 @@ class Role(NamedTuple):
 
 _FT, _FTA = "filter time", "filter time axis_{of}"
 _AT, _ATA = "filter {of}_time", "filter {of}_time axis_{of}"
+_SWEEP = "filter sweep_1 sweep_2"
 _TA, _TAU = "time axis_{of}", "tau axis_{of}"
 
 ROLES = (
@@ -150,6 +151,15 @@ ROLES = (
     Role("trade_off_bound", "design gamma", "bound on the H2 norm"),
     Role("kalman_h2", "", "H2 norm of the Kalman filter"),
     Role("kalman_hinf", "", "H-infinity norm of the Kalman filter"),
+    Role(
+        "sweep_rms_{block}",
+        _SWEEP,
+        "RMS error of {of}; length over its components, over runs and epochs that count",
+        attrs=("runs",),
+    ),
+    Role("sweep_low_{block}", _SWEEP, "lower bound; of 95 % confidence, by the spread of the runs"),
+    Role("sweep_high_{block}", _SWEEP, "upper bound; likewise"),
+    Role("sweep_stated_{block}", _SWEEP, "stated sigma of {of}; root of the mean stated variance"),
     Role("{name}", f"time {_MORE}", "{of}; what else is known of a run", named="context"),
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ from robins.campaign.outcome import outcome_of
 from robins.campaign.plan import Chunk, Plan, Shard, check_code, code_of, needed, read, write
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store, open_store
-from robins.campaign.work import Worker
+from robins.campaign.work import Worker, missing
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.systems.study import Problem
@@ -29,6 +30,7 @@ from robins.workbench.errors import InputError, refusing
 from robins.workbench.scenarios import beside, check_filters, find_scenario, study_of
 
 Where = str | os.PathLike[str]
+SWEEP = "sweep.json"  # in the folder of several campaigns
 
 
 def plan_campaign(
@@ -130,11 +132,21 @@ def ready(where: Where) -> tuple[Store, Plan]:
 
 def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
     """Compute until nothing is missing; yields how many shards are done, and of how many."""
-    store, plan = ready(where)
-    total = sum(map(len, plan.shards.values()))
-    for lacking in Worker(store, plan, problem_of(plan)).work():
-        yield total - lacking, total
+    every = [ready(one) for one in campaigns_of(where)]
+    total, done = sum(len(some) for _, plan in every for some in plan.shards.values()), 0
+    for store, plan in every:
+        mine = sum(map(len, plan.shards.values()))
+        if missing(store, plan.shards):
+            for lacking in Worker(store, plan, problem_of(plan)).work():
+                yield done + mine - lacking, total
+        done += mine
     yield total, total
+
+
+def campaigns_of(where: Where) -> list[str]:
+    """The campaigns of a sweep, or the one that is there."""
+    content = open_store(where).get(SWEEP)
+    return [str(where)] if content is None else json.loads(content)["points"]
 
 
 class Status(NamedTuple):

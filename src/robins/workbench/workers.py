@@ -98,22 +98,26 @@ def campaign_run(
     progress(0.0, "looking what is there")
     plan = plan_campaign(where, name, **options)
     mend(where)
-    fill(where, plan, workers or available_cores(), progress)
+    fill(where, [(str(where), plan)], workers or available_cores(), progress)
     return campaign_report(where)
 
 
 def fill(
-    where: str | os.PathLike[str], plan: Plan, workers: int, progress: Progress = silent
+    where: str | os.PathLike[str],
+    campaigns: Sequence[tuple[str, Plan]],
+    workers: int,
+    progress: Progress = silent,
 ) -> None:
-    """Have workers compute what is missing of a campaign.
+    """Have workers compute what is missing of a campaign, or of those of a sweep.
 
     A worker that is killed is replaced. All are ended if this is interrupted.
 
     Raises:
         RobinsError: a worker failed, or one after the other was killed.
     """
-    store, shards = open_store(where), plan.shards
-    total = sum(map(len, shards.values()))
+    all_shards = [(open_store(one), plan.shards) for one, plan in campaigns]
+    total = sum(len(some) for _, shards in all_shards for some in shards.values())
+    runs = sum(plan.runs for _, plan in campaigns)
     lacking, deaths, began = total, 0, monotonic()
     with ExitStack() as stack:
 
@@ -123,7 +127,7 @@ def fill(
             return process
 
         running: list[_Process] = []
-        while lack := missing(store, shards):
+        while lack := [one for store, shards in all_shards for one in missing(store, shards)]:
             now = sum(len(one.shards) for one in lack)
             if now < lacking:
                 lacking, deaths = now, 0
@@ -135,8 +139,8 @@ def fill(
             # a worker for each chunk at most
             running += [started() for _ in range(min(workers, len(lack)) - len(running))]
             verb = "starting, " if monotonic() - began < 5.0 else ""
-            runs = round(plan.runs * (1.0 - lacking / total))
-            progress(1.0 - lacking / total, f"{verb}{runs} of {plan.runs} runs, {workers} workers")
+            share = 1.0 - lacking / total
+            progress(share, f"{verb}{round(runs * share)} of {runs} runs, {workers} workers")
             sleep(POLL_S)
 
 

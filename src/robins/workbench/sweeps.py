@@ -1,0 +1,236 @@
+"""The command `sweep`: a campaign for each value of a parameter, or of two, as one result."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import xarray as xr
+
+from robins import units
+from robins.campaign.gather import gather
+from robins.campaign.machine import available_cores
+from robins.campaign.plan import Plan, needed
+from robins.campaign.statistics import Statistics, rms_with_bounds
+from robins.campaign.store import Store, open_store
+from robins.results import Outcome, Progress, array, silent
+from robins.systems.study import StateBlock
+from robins.workbench.campaigns import SWEEP, Where, plan_campaign, problem_of
+from robins.workbench.errors import InputError
+from robins.workbench.scenarios import asked
+from robins.workbench.workers import fill
+
+MOST = 400  # points; more are a campaign of another kind
+_QUANTITY = re.compile(r"\s*([-+0-9.eE]+)\s*(.*?)\s*")
+
+
+class Varied(NamedTuple):
+    """A parameter, and the values that it is given."""
+
+    key: str
+    values: tuple[str, ...]
+
+    @property
+    def coordinate(self) -> tuple[list[float] | list[str], str]:
+        """Numbers and their common unit; or the texts, and no unit."""
+        parts = [_QUANTITY.fullmatch(value) for value in self.values]
+        try:
+            found = [(float(p[1]), p[2]) for p in parts if p]
+        except ValueError:
+            found = []
+        shared = {unit for _, unit in found}
+        if len(found) < len(parts) or len(shared) > 1:
+            return list(self.values), ""
+        return [number for number, _ in found], shared.pop() or "1"
+
+
+def varied(text: str) -> Varied:
+    """What ``key=a,b,c`` says.
+
+    Raises:
+        InputError: it is not of this form, or names a value twice.
+    """
+    key, equals, rest = text.partition("=")
+    values = tuple(value.strip() for value in rest.split(","))
+    if not equals or not key.strip() or not all(values):
+        raise InputError(
+            "is not key=a,b,c",
+            f"--vary {text}",
+            'such as --vary "slave.gyro_bias=1 deg/h,10 deg/h".',
+        )
+    if len(set(values)) < len(values):
+        raise InputError("has a value twice", f"--vary {text}", "name each once.")
+    return Varied(key.strip(), values)
+
+
+class Point(NamedTuple):
+    """One choice of values, and the folder of its campaign."""
+
+    place: tuple[int, ...]
+    settings: tuple[str, ...]
+    where: str
+
+
+def points(where: Where, vary: Sequence[Varied]) -> Iterator[Point]:
+    """All choices, the last parameter first to change."""
+    for place in itertools.product(*(range(len(v.values)) for v in vary)):
+        settings = tuple(f"{v.key}={v.values[k]}" for v, k in zip(vary, place, strict=True))
+        yield Point(place, settings, f"{where}/points/{'-'.join(map(str, place))}")
+
+
+def sweep(
+    name: str,
+    where: Where,
+    *,
+    vary: Sequence[str],
+    workers: int | None = None,
+    machine: str = "jax",
+    settings: Sequence[str] = (),
+    progress: Progress = silent,
+    **options: Any,
+) -> Outcome:
+    """Run a scenario for each value of one or two parameters, with the same random numbers.
+
+    Each point is a campaign in a folder of its own, so that a sweep goes on where it was stopped,
+    and more runs compute only what is new.
+
+    Args:
+        name: "system/name", the path of a TOML file, or "file.py:study" of the user's own.
+        where: a folder, or an address of object storage.
+        vary: one or two texts ``key=a,b,c``.
+        workers: processes; by default one a core.
+        machine: "jax" or "c", which compiles a program for each point.
+        settings: "path=value" texts that change the scenario at all points.
+        progress: called with the share done and what is being done.
+        **options: runs, seed and filters, as for `plan_campaign`.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: what was asked for cannot be run.
+        robins.errors.RobinsError: a worker failed, or the store cannot be used.
+    """
+    chosen = [varied(text) for text in vary]
+    every = list(points(where, chosen))
+    if len(chosen) not in (1, 2) or len({v.key for v in chosen}) < len(chosen):
+        raise InputError("a sweep is over one parameter or two", "--vary", "give it once or twice.")
+    if len(every) > MOST:
+        raise InputError(f"has {len(every)} points, more than {MOST}", "--vary", "name fewer.")
+    campaigns: list[tuple[str, Plan]] = []
+    for k, point in enumerate(every):
+        progress(0.1 * k / len(every), f"planning {', '.join(point.settings)}")
+        more = (*settings, *point.settings)
+        plan = plan_campaign(point.where, name, settings=more, machine=machine, **options)
+        campaigns.append((point.where, plan))
+    open_store(where).put(
+        SWEEP, json.dumps({"points": [point.where for point in every]}).encode(), anew=True
+    )
+
+    def filling(share: float, what: str) -> None:
+        progress(0.1 + 0.9 * share, what)
+
+    fill(where, campaigns, workers or available_cores(), filling)
+    return _outcome(name, chosen, every, settings)
+
+
+class Figure(NamedTuple):
+    """Of a filter and a block at one point: RMS error over runs and epochs, with 95 % bounds."""
+
+    rms: float
+    low: float
+    high: float
+    stated: float  # root of the mean variance that the filter states
+
+    @classmethod
+    def of(cls, found: Statistics, block: StateBlock) -> Figure:
+        """In SI; the length of the error over the components of the block."""
+        squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
+        stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
+        return cls(*rms_with_bounds(squares), float(np.sqrt(np.mean(stated))))
+
+
+def _outcome(
+    name: str, vary: Sequence[Varied], every: Sequence[Point], settings: Sequence[str]
+) -> Outcome:
+    """The errors of all filters at all points."""
+    plans = {point: needed(open_store(point.where)) for point in every}
+    plan = plans[every[0]]
+    blocks = problem_of(plan).blocks
+    sizes = (*(len(v.values) for v in vary), 1)[:2]
+    shape = (len(plan.filters), *sizes)
+    figures = {b.name: np.full((*shape, len(Figure._fields)), np.nan) for b in blocks}
+    rows: list[list[Any]] = []
+    lost: dict[str, int] = dict.fromkeys(plan.filters, 0)
+    for point in every:
+        store: Store = open_store(point.where)
+        found = gather(store, plans[point], problem_of(plans[point])).found
+        for f, filter_ in enumerate(plan.filters):
+            one = found[filter_]
+            lost[filter_] += one.diverged
+            for b in blocks:
+                figure = Figure.of(one, b)
+                figures[b.name][(f, *(*point.place, 0)[:2])] = figure
+                shown = [units.convert(x, b.units, b.display_unit) for x in figure]
+                values = [v.values[k] for v, k in zip(vary, point.place, strict=True)]
+                rows.append([filter_, *values, b.name, b.display_unit, *shown, one.runs])
+    head = ["filter", *(v.key for v in vary), "block", "unit", *Figure._fields, "runs"]
+    first = problem_of(plan)
+    told = asked(plan.text, ())
+    return Outcome(
+        solution=_solution(plan, vary, blocks, figures),
+        metrics={
+            filter_: {
+                f"{b.name}_rms_{units.as_ending(b.display_unit)}": [
+                    float(units.convert(x, b.units, b.display_unit))
+                    for x in figures[b.name][f, ..., 0].ravel()
+                ]
+                for b in blocks
+            }
+            | {"diverged_runs": lost[filter_]}
+            for f, filter_ in enumerate(plan.filters)
+        },
+        files={"sweep.csv": _csv([head, *rows])},
+        notes=[
+            f"{len(every)} points of {plan.runs} runs; lists of metrics go through "
+            f"{' and '.join(v.key for v in vary)}, the last first.",
+            *first.notes,
+        ],
+        scenario=plan.scenario,
+        seed=plan.seed,
+        runs=plan.runs,
+        machine=plan.machine,
+        parameters=told["parameters"],
+        device=jax.devices()[0].device_kind,
+        last_lines=["Table:  {out}/sweep.csv   all points, with 95 % bounds"],
+    )
+
+
+def _csv(rows: Sequence[Sequence[Any]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def _solution(
+    plan: Plan,
+    vary: Sequence[Varied],
+    blocks: Sequence[StateBlock],
+    figures: dict[str, np.ndarray],
+) -> xr.Dataset:
+    data: dict[str, Any] = {"filter": ("filter", list(plan.filters))}
+    for k, one in enumerate([*vary, Varied("", ("",))][:2], 1):
+        numbers, unit = one.coordinate
+        about = {"units": unit, "long_name": one.key} if unit else {"long_name": one.key}
+        data[f"sweep_{k}"] = xr.Variable(f"sweep_{k}", numbers, about)
+    for b in blocks:
+        about = {"unit": b.units, "display_unit": b.display_unit}
+        for place, role in enumerate(("rms", "low", "high", "stated")):
+            more = {"runs": plan.runs} if role == "rms" else {}
+            values = figures[b.name][..., place]
+            data |= array(f"sweep_{role}", values, b.name, **about, **more)
+    return xr.Dataset(data)
