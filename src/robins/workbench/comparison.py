@@ -11,11 +11,10 @@ import numpy as np
 from robins import results, scenario
 
 Where = str | os.PathLike[str]
-Pair = tuple[Any, Any]  # of the first result and of the second; None where it has none
 
 
 class Comparison(NamedTuple):
-    """What differs between two results.
+    """What differs between two results; where one has nothing it has None.
 
     Attributes:
         scenarios: their names.
@@ -26,15 +25,15 @@ class Comparison(NamedTuple):
         claims: verdicts that differ, by id.
     """
 
-    scenarios: Pair
-    asked: dict[str, Pair]
-    versions: dict[str, Pair]
-    metrics: dict[str, dict[str, Pair]]
+    scenarios: tuple[Any, Any]
+    asked: dict[str, tuple[Any, Any]]
+    versions: dict[str, tuple[Any, Any]]
+    metrics: dict[str, dict[str, tuple[Any, Any]]]
     missing: tuple[list[str], list[str]]
-    claims: dict[str, Pair]
+    claims: dict[str, tuple[Any, Any]]
 
     @property
-    def changed(self) -> dict[str, dict[str, Pair]]:
+    def changed(self) -> dict[str, dict[str, tuple[Any, Any]]]:
         """The metrics that differ."""
         return {
             name: differ
@@ -71,7 +70,7 @@ def compare(first: Where, second: Where) -> Comparison:
     )
 
 
-def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Pair]:
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     return {k: (a.get(k), b.get(k)) for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)}
 
 
@@ -86,7 +85,7 @@ def _flat(mapping: Mapping[str, Any], under: str = "") -> dict[str, Any]:
     return found
 
 
-def ratios(pair: Pair) -> list[float]:
+def ratios(pair: tuple[Any, Any]) -> list[float]:
     """The second over the first, of each component; NaN where one is no number."""
     a, b = (np.atleast_1d(np.array(x, dtype=object)) for x in pair)
     if a.shape != b.shape:
