@@ -43,6 +43,7 @@ Examples:
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
   robins campaign run ins-gnss/drive --runs 500 --out drive
+  robins sweep ins-gnss/drive --vary "gnss.sigma=1 m,3 m" --runs 20 --out sigmas
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it

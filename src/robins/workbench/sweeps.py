@@ -171,6 +171,8 @@ def _outcome(
         found = gather(store, plans[point], problem_of(plans[point])).found
         for f, filter_ in enumerate(plan.filters):
             one = found[filter_]
+            if not one.runs:
+                raise InputError(f"has no run of '{filter_}' yet", point.where, "run it again.")
             lost[filter_] += one.diverged
             for b in blocks:
                 figure = Figure.of(one, b)

@@ -1,0 +1,105 @@
+"""A scenario over one parameter and over two: points, figures with their bounds, going on."""
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robins.campaign import simulate
+from robins.campaign.store import open_store
+from robins.errors import RobinsError
+from robins.report import figures
+from robins.results import find, read
+from robins.workbench import publish, sweeps
+from robins.workbench.campaigns import campaign_work, needed, problem_of
+from robins.workbench.sweeps import Varied, sweep, varied
+
+BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
+SHORT = ("duration=20 s",)
+SIGMAS = "barometer=1 m,4 m"
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch):
+    """Points are computed in this process."""
+
+    def fill(where, campaigns, workers, progress):
+        for folder, _ in campaigns:
+            list(campaign_work(folder))
+
+    monkeypatch.setattr(sweeps, "fill", fill)
+
+
+def test_a_parameter_has_numbers_with_a_unit_or_names():
+    assert varied("a.b = 1 m , 2.5 m") == Varied("a.b", ("1 m", "2.5 m"))
+    assert varied("a=1 m,2.5 m").coordinate == ([1.0, 2.5], "m")
+    assert varied("a=0.1,-2e3").coordinate == ([0.1, -2000.0], "1")
+    assert varied("a=1 m,1 km").coordinate == (["1 m", "1 km"], "")
+    assert varied("a=up,down").coordinate == (["up", "down"], "")
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ([], "one parameter or two"),
+        (["a"], "is not key=a,b,c"),
+        (["=1"], "is not key=a,b,c"),
+        (["a=1,,2"], "is not key=a,b,c"),
+        (["a=1,1"], "has a value twice"),
+        (["a=1", "a=2"], "one parameter or two"),
+        (["a=1", "b=2", "c=3"], "one parameter or two"),
+        ([f"a={','.join(map(str, range(401)))}"], "has 401 points"),
+        (["nothing=1"], "nothing: unknown key"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused(tmp_path, vary, message):
+    with pytest.raises(RobinsError, match=message):
+        sweep(BALLOON, tmp_path, vary=vary)
+    assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_each_point_is_the_campaign_of_its_values(tmp_path):
+    found = sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=12, filters=("kf",), settings=SHORT)
+    rms = find(found.solution, "sweep_rms")["height"]
+    low, high = (find(found.solution, f"sweep_{k}")["height"] for k in ("low", "high"))
+    assert rms.shape == (1, 2, 1)
+    assert found.solution["sweep_1"].attrs == {"units": "m", "long_name": "barometer"}
+    np.testing.assert_array_equal(found.solution["sweep_1"], [1.0, 4.0])
+    for k in range(2):
+        problem = problem_of(needed(open_store(tmp_path / "points" / str(k))))
+        alone = simulate(problem, 12, machine="jax")
+        assert float(rms[0, k, 0]) == pytest.approx(alone.metrics["kf"]["height_rms_m"], rel=1e-12)
+        assert low[0, k, 0] < rms[0, k, 0] < high[0, k, 0]
+    assert found.metrics["kf"]["height_rms_m"] == [float(x) for x in rms[0, :, 0]]
+    rows = list(csv.DictReader(io.StringIO(found.files["sweep.csv"].decode())))
+    assert [(r["barometer"], r["block"]) for r in rows[::2]] == [
+        ("1 m", "height"),
+        ("4 m", "height"),
+    ]
+    assert float(rows[0]["rms"]) == float(rms[0, 0, 0])
+    assert rows[0]["runs"] == "12"
+
+
+def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):
+    two = [SIGMAS, "outlier_share=0,0.2"]
+    asked = {"vary": two, "filters": ("kf",), "settings": SHORT}
+    sweep(BALLOON, tmp_path / "s", runs=8, **asked)
+    before = set((tmp_path / "s").rglob("*.npz"))
+    assert len(before) == 4
+    found = sweep(BALLOON, tmp_path / "s", runs=16, **asked)
+    assert before < set((tmp_path / "s").rglob("*.npz"))
+    assert find(found.solution, "sweep_rms")["height"].shape == (1, 2, 2)
+    result = publish(found, tmp_path / "r")
+    assert {"sweep_height", "sweep_climb"} <= set(result.figures)
+    drawn = [draw() for draw in figures.drawings(read(tmp_path / "r").solution, found.summary)]
+    titles = [picture.title for picture in drawn if picture]
+    assert "height over barometer [m] and outlier_share" in titles
+
+
+def test_a_worker_finds_all_points(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "fill", lambda *_: None)
+    with pytest.raises(RobinsError, match="points/0: has no run of 'kf' yet"):
+        sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=4, filters=("kf",), settings=SHORT)
+    assert list(campaign_work(tmp_path)) == [(0, 2), (1, 2), (2, 2)]
