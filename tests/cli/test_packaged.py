@@ -27,10 +27,12 @@ from robins.campaign.monte_carlo import _each, _records, contender
 from robins.cli import Status, app, main
 from robins.dataset import ImuTable
 from robins.report import numbers
+from robins.results import Outcome
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import configurations
 from robins.systems.ins_gnss import Drive, drive_dataset
 from robins.systems.transfer_alignment.product.parameters import Replay
+from robins.workbench import campaign_work, plan_campaign, publish
 from robins.workbench.scenarios import beside
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -279,6 +281,11 @@ def folder(tmp_path_factory):
     (here / "my_system.py").write_bytes((ROOT / "docs/examples/balloon.py").read_bytes())
     problem = ROOT / "src/robins/workbench/problems/baro-height.toml"
     (here / "my-problem.toml").write_text(problem.read_text())
+    balloon = f"{here}/my_system.py:study"
+    plan_campaign(here / "small-campaign", balloon, runs=2, settings=["duration=10 s"])
+    list(campaign_work(here / "small-campaign"))
+    for name in ("before", "after"):
+        publish(Outcome(metrics={"kf": {"nees": 1.0}}, scenario="x"), here / "results" / name)
     return here
 
 
@@ -322,7 +329,17 @@ def words_of(line):
         words = [word.replace("my.toml", "my-problem.toml") for word in words]
     if "--master" in words:
         words = [word.replace("my.toml", "my-pair.toml") for word in words]
+    if words[0] == "campaign" and words[1] != "run":
+        words[2] = "small-campaign"
     return words
+
+
+# Filters of campaigns, where a line names none.
+CHEAP = {
+    "airship/s1": ("--filters", "ekf"),
+    "ins-gnss/drive": ("--filters", "ekf"),
+    "transfer-alignment/s0": ("--filters", "kf"),
+}
 
 
 def as_short_as_can_be(words):
@@ -334,6 +351,12 @@ def as_short_as_can_be(words):
             return [*words, "--runs", "1", "--filters", "ekf"]
         case ["run", *_]:
             return [*words, "--runs", "1"]
+        case ["campaign", "show", *_]:
+            return [*words, "--run", "1"]
+        case ["campaign", "run", name, *more]:
+            return ["campaign", "run", *CHEAP[name], "--workers", "1", name, *more, "--runs", "1"]
+        case ["sweep", name, *more]:
+            return ["sweep", *CHEAP[name], "--workers", "1", name, *more, "--runs", "1"]
         case ["design", *_] if "--methods" not in words:
             return [*words, "--methods", "riccati"]
         case ["replay", *_] if "gnss" in words:
@@ -355,6 +378,11 @@ BEGINS = {
     ("replay",): "robins.workbench.recorded.part",
     ("run", "--master"): "robins.workbench.recorded.part",
     ("replay", "--system"): "robins.workbench.recorded.part",
+    ("campaign", "run"): "robins.workbench.workers.plan_campaign",
+    ("campaign", "report"): "robins.workbench.campaigns.ready",
+    ("campaign", "show"): "robins.workbench.campaigns.ready",
+    ("campaign", "verify"): "robins.workbench.campaigns.ready",
+    ("sweep",): "robins.workbench.sweeps.plan_campaign",
     ("bench", "up"): "robins.bench.run.session.Session.run",
     ("bench", "replay"): "robins.workbench.benches.kit_of",
 }
@@ -362,7 +390,7 @@ BEGINS = {
 
 def kind_of(words):
     """The command, and the option that makes it compute something else."""
-    command = words[: 2 if words[0] == "bench" else 1]
+    command = words[: 2 if words[0] in ("bench", "campaign") else 1]
     return (*command, *(o for o in ("--master", "--system", "--diff") if o in words))
 
 

@@ -63,8 +63,8 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
 @campaign.command(
     short_help="Begin a campaign, or go on with it.",
     epilog=examples(
-        "robins campaign run transfer-alignment/s0 --runs 200 --out s0",
-        "robins campaign run airship/s1 --runs 10000 --filters ukf,ekf --out airship --workers 8",
+        "robins campaign run transfer-alignment/s0 --runs 200 --out s0 --machine c",
+        "robins campaign run airship/s1 --runs 10000 --filters ekf --out airship --workers 8",
     ),
 )
 @click.argument("scenario")
@@ -220,7 +220,7 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
 @click.command(
     short_help="Run a scenario over the values of one parameter, or of two.",
     epilog=examples(
-        'robins sweep ins-gnss/drive --vary "gnss.sigma=0.5 m,1 m,2 m" --runs 20 --out sigmas',
+        'robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases',
         "robins sweep transfer-alignment/s0 --vary h_infinity.gamma=20,50,100 "
         '--vary "flexure.sigma=1 arcmin,3 arcmin,9 arcmin" --runs 20 --out gammas',
     ),

@@ -42,8 +42,8 @@ Examples:
   robins list                                    what there is to run
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
-  robins campaign run ins-gnss/drive --runs 500 --out drive
-  robins sweep ins-gnss/drive --vary "gnss.sigma=1 m,3 m" --runs 20 --out sigmas
+  robins campaign run ins-gnss/drive --runs 500 --out drive   many runs; goes on if stopped
+  robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it
@@ -354,7 +354,7 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
 
 @app.command(
     short_help="Compare two results: what was asked, what was found.",
-    epilog=examples("robins compare results/drive results/drive-other"),
+    epilog=examples("robins compare results/before results/after"),
 )
 @click.argument("first", type=LOGS)
 @click.argument("second", type=LOGS)
@@ -371,7 +371,7 @@ def compare(first: Path, second: Path, as_json: bool) -> None:
 
 @app.command(
     short_help="Check that a result is whole and unchanged.",
-    epilog=examples("robins verify results/drive"),
+    epilog=examples("robins verify results/before"),
 )
 @click.argument("folder", type=LOGS)
 @answers
