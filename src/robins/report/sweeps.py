@@ -125,7 +125,11 @@ def maps(solution: xr.Dataset, block: str) -> Picture:
             axes.set_xlabel(label)
             axes.tick_params(labelbottom=True)
     if image is not None:
-        figure.colorbar(image, ax=grid, label=_unit(block, unit), shrink=0.9, pad=0.02)
+        bar = figure.colorbar(image, ax=grid, label=_unit(block, unit), shrink=0.9, pad=0.02)
+        if wide:  # else the numbers between powers of ten are written as products
+            ticks = np.geomspace(low, high, 5).tolist()
+            bar.set_ticks(ticks, labels=[f"{x:.3g}" for x in ticks])
+            bar.minorticks_off()
     caption = (
         "Length of the error over its components, RMS over the epochs that count of "
         f"{int(array.attrs['runs'])} runs; one scale for all filters. All points have the same "

@@ -232,7 +232,7 @@ def _solution(
     for b in blocks:
         about = {"unit": b.units, "display_unit": b.display_unit}
         for place, role in enumerate(("rms", "low", "high", "stated")):
-            more = {"runs": plan.runs} if role == "rms" else {}
+            more: dict[str, Any] = {"runs": plan.runs} if role == "rms" else {}
             values = figures[b.name][..., place]
             data |= array(f"sweep_{role}", values, b.name, **about, **more)
     return xr.Dataset(data)
