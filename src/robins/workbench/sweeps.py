@@ -138,7 +138,7 @@ def sweep(
     return _outcome(name, chosen, every, settings)
 
 
-class Figure(NamedTuple):
+class Rms(NamedTuple):
     """Of a filter and a block at one point: RMS error over runs and epochs, with 95 % bounds."""
 
     rms: float
@@ -147,7 +147,7 @@ class Figure(NamedTuple):
     stated: float  # root of the mean variance that the filter states
 
     @classmethod
-    def of(cls, found: Statistics, block: StateBlock) -> Figure:
+    def of(cls, found: Statistics, block: StateBlock) -> Rms:
         """In SI; the length of the error over the components of the block."""
         squares = np.sum(found.run_rms[:, block.where] ** 2, axis=1)
         stated = np.sum(found.sigma[found.counted, block.where] ** 2, axis=1)
@@ -163,7 +163,7 @@ def _outcome(
     blocks = problem_of(plan).blocks
     sizes = (*(len(v.values) for v in vary), 1)[:2]
     shape = (len(plan.filters), *sizes)
-    figures = {b.name: np.full((*shape, len(Figure._fields)), np.nan) for b in blocks}
+    figures = {b.name: np.full((*shape, len(Rms._fields)), np.nan) for b in blocks}
     rows: list[list[Any]] = []
     lost: dict[str, int] = dict.fromkeys(plan.filters, 0)
     for point in every:
@@ -175,12 +175,12 @@ def _outcome(
                 raise InputError(f"has no run of '{filter_}' yet", point.where, "run it again.")
             lost[filter_] += one.diverged
             for b in blocks:
-                figure = Figure.of(one, b)
+                figure = Rms.of(one, b)
                 figures[b.name][(f, *(*point.place, 0)[:2])] = figure
                 shown = [units.convert(x, b.units, b.display_unit) for x in figure]
                 values = [v.values[k] for v, k in zip(vary, point.place, strict=True)]
                 rows.append([filter_, *values, b.name, b.display_unit, *shown, one.runs])
-    head = ["filter", *(v.key for v in vary), "block", "unit", *Figure._fields, "runs"]
+    head = ["filter", *(v.key for v in vary), "block", "unit", *Rms._fields, "runs"]
     first = problem_of(plan)
     told = asked(plan.text, ())
     return Outcome(
