@@ -125,10 +125,10 @@ def test_each_thread_gives_its_run_the_bits_of_c(unroll):
     step, state, states, rows = filtered(runs)
     first = jax.tree.map(lambda x: x[0, 0], rows)
     program = trace_step(step, state, *first, unroll=unroll)
-    _, (belief, _, info, _) = check(program, states, rows, runs, len(Y))
+    _, (after, info, _) = check(program, states, rows, runs, len(Y))
     codes = np.asarray(info["y"].code)
     assert len(np.unique(codes)) >= 3  # done, missing, refused
-    assert not np.array_equal(belief.mean[-1, 0], belief.mean[-1, 1])
+    assert not np.array_equal(after.belief.mean[-1, 0], after.belief.mean[-1, 1])
 
 
 def on_a_gpu():

@@ -16,12 +16,13 @@ import jax
 import numpy as np
 
 from robins.campaign.statistics import Statistics
+from robins.errors import RobinsError
 
 _ABOUT = "about"
 _COUNTS = ("runs", "diverged", "n")
 
 
-class Damaged(Exception):
+class Damaged(RobinsError):
     """What was read is not what was written."""
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,8 +26,12 @@ SUMMARIES = {
 
 
 @cache
-def installed() -> dict[str, EntryPoint]:
-    """Systems of other packages by name; a name that robins has is that of robins."""
+def installed() -> dict[str, Any]:
+    """Systems of other packages by name; a name that robins has is that of robins.
+
+    Each is an `EntryPoint`: that of the standard library, or of its backport where a package has
+    brought that.
+    """
     found = entry_points(group="robins.systems")
     return {point.name: point for point in found if point.name not in SUMMARIES}
 
@@ -35,7 +39,7 @@ def installed() -> dict[str, EntryPoint]:
 def summaries() -> dict[str, str]:
     """A sentence on each system; of an installed package it is that of the package."""
 
-    def sentence(point: EntryPoint) -> str:
+    def sentence(point: Any) -> str:
         return "" if point.dist is None else str(point.dist.metadata["Summary"])
 
     return SUMMARIES | {name: sentence(point) for name, point in installed().items()}

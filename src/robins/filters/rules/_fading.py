@@ -31,7 +31,7 @@ class White(NamedTuple):
     left_over: Array  # () trace of what the linearisation leaves over
     counts: Array  # (m,) bool: used, and with noise of its own; the others are zero
     seen: Array  # (m, n) H S in the sensor's units
-    size: Array  # (m,) of what those were summed from
+    size: Array  # (m,) of what those may have been summed from
 
     @property
     def predicted(self) -> Array:
@@ -56,7 +56,12 @@ def whitened(o: Observation) -> White:
     white = linalg.solve_lower(root, jnp.concatenate(columns, axis=1))
     left_over = jnp.sum(white[:, n + 2 :] ** 2) - jnp.sum(white[:, 1] ** 2)
     seen = jnp.where(counts[:, None], o.spread, 0.0)
-    return White(white[:, 0], white[:, 2 : n + 2], left_over, counts, seen, o.size)
+    # A component may be made of what others read, as of a vector that is turned: in units of the
+    # noise it has the rounding of the largest.
+    deviation = jnp.where(counts, jnp.sqrt(jnp.sum(o.noise**2, axis=1)), 1.0)
+    largest = jnp.max(jnp.where(counts, o.size / deviation, 0.0))
+    size = jnp.where(counts, jnp.maximum(o.size, largest * deviation), o.size)
+    return White(white[:, 0], white[:, 2 : n + 2], left_over, counts, seen, size)
 
 
 def _root(noise: Array, taken: Array) -> tuple[Array, Array]:
