@@ -98,6 +98,15 @@ def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):
     assert "height over barometer [m] and outlier_share" in titles
 
 
+def test_damage_at_a_point_is_computed_again(tmp_path, monkeypatch):
+    monkeypatch.undo()  # by processes
+    asked = {"vary": [SIGMAS], "runs": 4, "filters": ("kf",), "settings": SHORT, "workers": 1}
+    want = sweep(BALLOON, tmp_path, **asked)
+    path = next((tmp_path / "points" / "1" / "shards").iterdir())
+    path.write_bytes(path.read_bytes()[:-200])
+    assert sweep(BALLOON, tmp_path, **asked).metrics == want.metrics
+
+
 def test_a_worker_finds_all_points(tmp_path, monkeypatch):
     monkeypatch.setattr(sweeps, "fill", lambda *_: None)
     with pytest.raises(RobinsError, match="points/0: has no run of 'kf' yet"):

@@ -151,7 +151,7 @@ def _progress_text(where: str, found: Any) -> str:
         told = f"   diverged: {numbers}" if lost else ""
         lines.append(f"  {name:<20} {found.done[name]:>8} done{told}")
     lines.append(
-        f"{found.shards} shards, {found.missing} missing, {len(found.damaged)} damaged"
+        f"shards: {found.shards}, {found.missing} missing, {len(found.damaged)} damaged"
         + "".join(f"\n  damaged: {name}" for name in found.damaged)
     )
     if found.digest:

@@ -204,7 +204,7 @@ def campaign_report(where: Where) -> Outcome:
     found = gather(store, plan, problem)
     if not all(found.done.values()):
         raise InputError(
-            "has no run of every filter yet",
+            "some filter has no run yet",
             where,
             f"`robins campaign work {where}` computes them.",
         )

@@ -63,7 +63,7 @@ def varied(text: str) -> Varied:
         raise InputError(
             "is not key=a,b,c",
             f"--vary {text}",
-            'such as --vary "slave.gyro_bias=1 deg/h,10 deg/h".',
+            'write --vary "slave.gyro_bias=1 deg/h,10 deg/h" or the like.',
         )
     if len(set(values)) < len(values):
         raise InputError("has a value twice", f"--vary {text}", "name each once.")

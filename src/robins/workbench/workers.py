@@ -97,7 +97,6 @@ def campaign_run(
     """
     progress(0.0, "looking what is there")
     plan = plan_campaign(where, name, **options)
-    mend(where)
     fill(where, [(str(where), plan)], workers or available_cores(), progress)
     return campaign_report(where)
 
@@ -108,13 +107,15 @@ def fill(
     workers: int,
     progress: Progress = silent,
 ) -> None:
-    """Have workers compute what is missing of a campaign, or of those of a sweep.
+    """Have workers compute what is missing or damaged of a campaign, or of those of a sweep.
 
     A worker that is killed is replaced. All are ended if this is interrupted.
 
     Raises:
         RobinsError: a worker failed, or one after the other was killed.
     """
+    for one, _ in campaigns:
+        mend(one)
     all_shards = [(open_store(one), plan.shards) for one, plan in campaigns]
     total = sum(len(some) for _, shards in all_shards for some in shards.values())
     runs = sum(plan.runs for _, plan in campaigns)
