@@ -33,7 +33,7 @@ from robins.systems.catalogue import configurations
 from robins.systems.ins_gnss import Drive, drive_dataset
 from robins.systems.transfer_alignment.product.parameters import Replay
 from robins.workbench import campaign_work, plan_campaign, publish
-from robins.workbench.scenarios import beside
+from robins.workbench.scenarios import beside, read_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -106,10 +106,9 @@ def test_every_system_has_a_default_that_runs_beside_what_a_scenario_names(name)
     system = SYSTEMS[name]
     assert system.default in system.filters
     for one in (one for one in PACKAGED if one.startswith(f"{name}/")):
-        _, study, _ = study_of(one)
-        given = scenario.parse(study.parameters, system.scenarios[one.split("/")[1]].read_text())
-        own, default = given.filters or study.filters, {system.default} & set(study.filters)
-        assert set(beside(own, system, study)) == {*own, *default}
+        read = read_scenario(one, ())
+        default = {system.default} & set(read.study.filters)
+        assert set(beside(read)) == {*read.own, *default}
 
 
 def test_a_configuration_of_what_is_recorded_is_not_simulated(robins):
@@ -357,6 +356,8 @@ def as_short_as_can_be(words):
             return ["campaign", "run", *CHEAP[name], "--workers", "1", name, *more, "--runs", "1"]
         case ["sweep", name, *more]:
             return ["sweep", *CHEAP[name], "--workers", "1", name, *more, "--runs", "1"]
+        case ["tune", *_]:
+            return [*words, "--runs", "6"]
         case ["design", *_] if "--methods" not in words:
             return [*words, "--methods", "riccati"]
         case ["replay", *_] if "gnss" in words:
@@ -383,6 +384,7 @@ BEGINS = {
     ("campaign", "show"): "robins.workbench.campaigns.ready",
     ("campaign", "verify"): "robins.workbench.campaigns.ready",
     ("sweep",): "robins.workbench.sweeps.plan_campaign",
+    ("tune",): "robins.workbench.tuning.choose",
     ("bench", "up"): "robins.bench.run.session.Session.run",
     ("bench", "replay"): "robins.workbench.benches.kit_of",
 }

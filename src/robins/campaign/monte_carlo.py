@@ -181,7 +181,11 @@ def contender(problem: Problem, name: str) -> Contender:
     """
     if name not in problem.contenders:
         raise ValueError(f"no filter '{name}'; this problem has {sorted(problem.contenders)}")
-    c = problem.contenders[name]
+    return settled(problem.contenders[name])
+
+
+def settled(c: Contender) -> Contender:
+    """A contender of whose functions those stand for it that were made first of their content."""
     case = c.case if isinstance(c.case, Partial) else Partial(c.case)  # whose numbers are data
     return c._replace(filter=same(c.filter), model=same_model(c.model), case=same(case))
 

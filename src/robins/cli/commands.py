@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from click import option
 from robins import __version__
 from robins.cli.bench import bench
 from robins.cli.campaign import campaign, sweep
-from robins.cli.doctor import judge
+from robins.cli.doctor import judge, warn
 from robins.cli.export import write
 from robins.cli.frame import Status
 from robins.cli.listing import listing
@@ -31,6 +30,7 @@ from robins.cli.options import (
     publishes,
 )
 from robins.cli.tell import carry_out, say
+from robins.cli.tune import tune
 from robins.workbench import InputError
 
 DEMO = "ins-gnss/drive"
@@ -44,6 +44,7 @@ Examples:
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
   robins campaign run ins-gnss/drive --runs 500 --out drive   many runs; goes on if stopped
   robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
+  robins tune imu.csv gnss.pos --filter ekf --vary imu.accel_noise --out tuned
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it
@@ -73,13 +74,6 @@ class _Group(click.Group):
 @click.option("--debug", is_flag=True, expose_value=False, help="Show tracebacks.")
 def app() -> None:
     """Robust inertial navigation: simulate, navigate real logs, compare filters, check claims."""
-
-
-def warn(findings: Sequence[Any]) -> None:
-    """Tell what the doctor says of a log at once; errors end the command and are told there."""
-    for finding in findings:
-        if finding.severity != "error":
-            click.echo(f"robins: {finding}", err=True)
 
 
 def one_run(runs: int | None, what: str) -> None:
@@ -321,6 +315,7 @@ def design(problem: str, out: Path | None, **options: Any) -> None:
 app.add_command(bench)
 app.add_command(campaign)
 app.add_command(sweep)
+app.add_command(tune)
 
 
 @app.command(

@@ -22,6 +22,13 @@ _KINDS = {
 }
 
 
+def warn(findings: Sequence[Any]) -> None:
+    """Tell what the doctor says of a log at once; errors end the command and are told there."""
+    for finding in findings:
+        if finding.severity != "error":
+            click.echo(f"robins: {finding}", err=True)
+
+
 def judge(
     log: Sequence[Path], columns: Sequence[Path], as_json: bool, write: Path | None = None
 ) -> Status:

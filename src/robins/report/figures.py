@@ -11,6 +11,7 @@ import xarray as xr
 from robins.report import bounds, comparing, curves, instruments, maps, sweeps, updates
 from robins.report.lateness import lateness
 from robins.report.style import Picture
+from robins.report.tuning import tuning
 from robins.results import find
 
 
@@ -58,6 +59,7 @@ FIGURES = (
     Figure(instruments.allan, "allan allan_low allan_high allan_fit allan_slope", EACH),
     Figure(sweeps.curves, "sweep_rms sweep_low sweep_high sweep_stated", EACH, sweeps.one_key),
     Figure(sweeps.maps, "sweep_rms sweep_stated", EACH, sweeps.two_keys),
+    Figure(tuning, "tuned_factor tuned_low tuned_high judged_before judged_after"),
     Figure(comparing.trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
     Figure(lateness, "lateness_steps lateness_edge"),
     Figure(instruments.planes, "field_calibrated field_measured"),

@@ -160,6 +160,17 @@ ROLES = (
     Role("sweep_low_{block}", _SWEEP, "lower bound; of 95 % confidence, by the spread of the runs"),
     Role("sweep_high_{block}", _SWEEP, "upper bound; likewise"),
     Role("sweep_stated_{block}", _SWEEP, "stated sigma of {of}; root of the mean stated variance"),
+    Role("tuned_factor", "parameter", "factor on a parameter; what was found", "1"),
+    Role("tuned_low", "parameter", "lower bound; of 95 % confidence", "1"),
+    Role("tuned_high", "parameter", "upper bound; likewise", "1"),
+    Role(
+        "judged_before",
+        "part",
+        "objective as written; of each run or segment held out; less is better",
+        "1",
+        ("comment", "parts"),
+    ),
+    Role("judged_after", "part", "objective tuned; likewise", "1"),
     Role("{name}", f"time {_MORE}", "{of}; what else is known of a run", named="context"),
 )
 

@@ -29,6 +29,7 @@ from robins.scenario.parameters import (
     default,
 )
 from robins.scenario.reading import load, parse, validate
+from robins.scenario.scaling import scaled, setting, written
 from robins.scenario.text import ScenarioError, mapping_of, override, read_text, text_of
 
 __all__ = [
@@ -46,6 +47,9 @@ __all__ = [
     "override",
     "parse",
     "read_text",
+    "scaled",
+    "setting",
     "text_of",
     "validate",
+    "written",
 ]

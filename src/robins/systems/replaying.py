@@ -49,6 +49,13 @@ class Piece:
     noise_scale: np.ndarray | float = 1.0  # (E,) of the process noise factor
 
 
+class Recorded(NamedTuple):
+    """A log as its filters take it."""
+
+    pieces: Sequence[Piece]
+    contender: Callable[[str], Contender]  # by name; raises a ValueError where there is none
+
+
 PROBABILITY = "imm.probability"  # note of a bank: (modes,), kept of every step
 
 PieceT = TypeVar("PieceT", bound=Piece)

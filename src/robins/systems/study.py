@@ -278,6 +278,9 @@ class System(NamedTuple):
     # of a log that was examined and cleaned by `robins.logs`: (dataset, parameters, what the files
     # do not say, names of filters, where there are none those of the parameters, progress)
     replay: Callable[..., Outcome] | None = None
+    # the same log before it is replayed, as its filters take it: (dataset, parameters) -> what
+    # `replaying.Recorded` says; a system without it cannot be tuned on logs
+    recorded: Callable[..., Any] | None = None
     reads: Literal["dataset", "ranges"] = "dataset"  # what its logs are: `Dataset` or `RangeLog`
     # roles of arrays that a replay finds, of which exports are made
     replay_finds: tuple[str, ...] = ("attitude", "track")

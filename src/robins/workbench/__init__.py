@@ -46,6 +46,7 @@ _WHERE = {
     "replay": "recorded",
     "run": "simulated",
     "sweep": "sweeps",
+    "tune": "tuning",
     "verify": "comparison",
     "work_here": "workers",
 }

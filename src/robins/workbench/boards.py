@@ -27,7 +27,7 @@ from robins.workbench.board_runs import (
 )
 from robins.workbench.board_words import components, field_notes, mean_fields, tangent_axes
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.scenarios import check_filters, find_scenario, study_of
+from robins.workbench.scenarios import check_filters, find_scenario, read_scenario
 from robins.workbench.single_precision import Cost, Made, cost, differences, in_floats
 
 STEPS = 60  # of a run, recorded for the test
@@ -110,14 +110,11 @@ def _asked(
         check_filters(label, [system.default], [wanted])
         with refusing(name):
             return system.aboard(given, seed), wanted, label
-    system, label, text = find_scenario(name)  # which refuses what simulates nothing
-    study = study_of(system, text, name)
-    parameters = scenario.parse(study.parameters, text, (*settings, "runs=1"), source=name)
-    own = parameters.filters or tuple(study.filters)
-    wanted = filter_name or (system.default if system.default in study.filters else own[0])
-    check_filters(label, study.filters, [wanted])
-    with refusing(name):
-        return study.problem(parameters, (wanted,), seed), wanted, label
+    one = read_scenario(name, (*settings, "runs=1"))  # which refuses what simulates nothing
+    filters = one.study.filters
+    wanted = filter_name or (system.default if system.default in filters else one.own[0])
+    check_filters(label, filters, [wanted])
+    return one.problem((wanted,), seed), wanted, label
 
 
 def _library(

@@ -26,8 +26,8 @@ from robins.campaign.work import Worker, missing
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.systems.study import Problem
-from robins.workbench.errors import InputError, refusing
-from robins.workbench.scenarios import beside, check_filters, find_scenario, study_of
+from robins.workbench.errors import InputError
+from robins.workbench.scenarios import beside, check_filters, read_scenario
 
 Where = str | os.PathLike[str]
 SWEEP = "sweep.json"  # in the folder of several campaigns
@@ -62,27 +62,22 @@ def plan_campaign(
     _float64.require()
     check_machine(machine)
     store = open_store(where)
-    system, label, text = find_scenario(name)
-    study = study_of(system, text, name)
-    text = scenario.text_of(scenario.override(scenario.mapping_of(text), settings))
-    more = () if runs is None else (f"runs={runs}",)
-    parameters = scenario.parse(study.parameters, text, more, source=name)
-    own = parameters.filters or study.filters
-    chosen = check_filters(label, study.filters, filters or beside(own, system, study))
+    one = read_scenario(name, settings if runs is None else (*settings, f"runs={runs}"))
+    text = scenario.text_of(scenario.override(scenario.mapping_of(one.text), settings))
+    chosen = check_filters(one.label, one.study.filters, filters or beside(one))
+    wanted: int = one.parameters.runs
     before = read(store)
     if before is None:
-        with refusing(name):
-            problem = study.problem(parameters, chosen, seed)
-        by = machine_for(problem, parameters.runs, machine)
+        by = machine_for(one.problem(chosen, seed), wanted, machine)
         plan = Plan(
             asked=name,
-            scenario=label,
+            scenario=one.label,
             text=text,
             seed=seed,
-            runs=parameters.runs,
+            runs=wanted,
             filters=chosen,
             machine=by.name,
-            width=by.width(parameters.runs),
+            width=by.width(wanted),
             code=code_of(name, text),
         )
     else:
@@ -99,7 +94,7 @@ def plan_campaign(
                     where,
                     "ask for the same to go on with it, or choose another folder.",
                 )
-        plan = before.with_more(parameters.runs, chosen)
+        plan = before.with_more(wanted, chosen)
     if plan != before:
         write(store, plan)
     store.sweep()
@@ -108,13 +103,9 @@ def plan_campaign(
 
 def problem_of(plan: Plan, filters: Sequence[str] = ()) -> Problem:
     """The problem of a campaign, with its filters or some of them."""
-    system, _, _ = find_scenario(plan.asked)
-    study = study_of(system, plan.text, plan.asked)
-    parameters = scenario.parse(study.parameters, plan.text, source=plan.asked)
-    own = parameters.filters or study.filters
-    with refusing(plan.asked):
-        problem = study.problem(parameters, filters or plan.filters, plan.seed)
-    return replace(problem, claims=about(own, problem.claims))
+    one = read_scenario(plan.asked, (), plan.text)
+    problem = one.problem(filters or plan.filters, plan.seed)
+    return replace(problem, claims=about(one.own, problem.claims))
 
 
 def ready(where: Where) -> tuple[Store, Plan]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,36 +59,74 @@ def replay(
         robins.logs.LogError, robins.scenario.ScenarioError: a file cannot be used.
     """
     _float64.require()
-    chosen_system = find_system(system)
-    if chosen_system.replay is None or chosen_system.replay_parameters is None:
-        raise InputError(f"{system} does not replay logs")
-    files, configuration = parted(paths)
-    path = configuration or chosen_system.replay_default
-    text = scenario.read_text(path) if path is not None else ""
-    source = os.fspath(configuration or "the default configuration")
-    parameters = scenario.parse(chosen_system.replay_parameters, text, settings, source=source)
-    chosen = check_filters(system, chosen_system.replay_filters, filters)
-    require_formats(exports, chosen_system.replay_finds, f"a replay with {system}")
+    opened = open_log(paths, system=system, settings=settings, columns=columns)
+    chosen = check_filters(system, opened.system.replay_filters, filters)
+    require_formats(exports, opened.system.replay_finds, f"a replay with {system}")
     progress(0.0, "reading")
-    dataset: Any
-    if chosen_system.reads == "ranges":
-        if columns:
-            raise InputError(f"{system} reads text of libRSF: --columns declares other logs")
-        dataset = logs.load_ranges(files)
-        findings(dataset.findings)
+    dataset = opened.read(findings)
+    then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
+    if opened.system.reads == "ranges":
         then = f"robins list {system}   tells what can be simulated of it"
-    else:
-        angles = np.degrees(chosen_system.orientation(parameters))
-        formats = logs.formats_of(files, columns)
-        dataset = logs.load_dataset(files, mounting=logs.Mounting(*angles), formats=formats)
-        _examine(dataset, findings)
-        dataset = logs.clean(dataset)
-        then = "robins allan STILL_LOG   finds the noise of your unit, if it is not set"
     with refusing(dataset.name):
-        found = chosen_system.replay(dataset, parameters, chosen, part(progress, 0.1, 1.0))
+        found = opened.system.replay(dataset, opened.parameters, chosen, part(progress, 0.1, 1.0))
     label = f"{system}/{dataset.name}"
     told = {"scenario": label, "seed": seed, "last_lines": [f"Next:   {then}"]}
-    return with_exports(replace(found, **told, **asked(text, settings)), exports, label)
+    return with_exports(replace(found, **told, **asked(opened.text, settings)), exports, label)
+
+
+class OpenLog(NamedTuple):
+    """A log of which all is known that is not in its files, ready to be read."""
+
+    system: Any  # a `System` that replays logs
+    files: Sequence[str | os.PathLike[str]]
+    columns: Sequence[str | os.PathLike[str]]
+    text: str  # TOML of the configuration
+    source: str  # its file
+    parameters: Any  # as read, with the settings
+
+    def read(self, findings: Findings = unheard) -> Any:
+        """What its files hold, examined and cleaned.
+
+        Raises:
+            InputError: the doctor finds errors, or the files are of another kind.
+            robins.logs.LogError: a file cannot be read.
+        """
+        if self.system.reads == "ranges":
+            if self.columns:
+                name = self.system.name
+                raise InputError(f"{name} reads text of libRSF: --columns declares other logs")
+            ranges = logs.load_ranges(self.files)
+            findings(ranges.findings)
+            return ranges
+        angles = np.degrees(self.system.orientation(self.parameters))
+        formats = logs.formats_of(self.files, self.columns)
+        dataset = logs.load_dataset(self.files, mounting=logs.Mounting(*angles), formats=formats)
+        _examine(dataset, findings)
+        return logs.clean(dataset)
+
+
+def open_log(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    system: str,
+    settings: Sequence[str] = (),
+    columns: Sequence[str | os.PathLike[str]] = (),
+) -> OpenLog:
+    """Part a log's files from their configuration and read this; as of `replay`.
+
+    Raises:
+        InputError: the system replays no logs.
+        robins.scenario.ScenarioError: the configuration cannot be used.
+    """
+    found = find_system(system)
+    if found.replay is None or found.replay_parameters is None:
+        raise InputError(f"{system} does not replay logs")
+    files, configuration = parted(paths)
+    path = configuration or found.replay_default
+    text = scenario.read_text(path) if path is not None else ""
+    source = os.fspath(configuration or "the default configuration")
+    parameters = scenario.parse(found.replay_parameters, text, settings, source=source)
+    return OpenLog(found, files, columns, text, source, parameters)
 
 
 def align(

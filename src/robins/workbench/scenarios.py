@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -13,6 +13,7 @@ from robins.errors import hint, require_known
 from robins.systems import Study, System
 from robins.systems.catalogue import configurations, installed, is_file, listed
 from robins.systems.finding import find_system
+from robins.systems.study import Problem
 from robins.workbench.errors import InputError, refusing
 
 
@@ -79,6 +80,52 @@ def study_of(system: System, text: str, source: str) -> Study:
     return system.studies[chosen]
 
 
+class Simulated(NamedTuple):
+    """A scenario that can be simulated, read."""
+
+    system: System
+    label: str  # its name
+    text: str  # TOML, as it stands
+    study: Study
+    parameters: Any  # with the settings
+    source: str  # how it was asked for
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """The filters that it names; else all of the study."""
+        return self.parameters.filters or self.study.filters
+
+    def problem(self, filters: Sequence[str], seed: int) -> Problem:
+        """The problem of some of its filters.
+
+        Raises:
+            InputError: the parameters do not fit together.
+        """
+        with refusing(self.source):
+            return self.study.problem(self.parameters, filters, seed)
+
+    def parsed(self, settings: Sequence[str]) -> Any:
+        """Its parameters with other settings.
+
+        Raises:
+            robins.scenario.ScenarioError: they do not fit.
+        """
+        return scenario.parse(self.study.parameters, self.text, settings, source=self.source)
+
+
+def read_scenario(name: str, settings: Sequence[str], text: str = "") -> Simulated:
+    """A scenario by name, as `find_scenario`, or of another text.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: there is none, or it cannot be run.
+    """
+    system, label, found = find_scenario(name)
+    text = text or found
+    study = study_of(system, text, name)
+    parameters = scenario.parse(study.parameters, text, settings, source=name)
+    return Simulated(system, label, text, study, parameters, name)
+
+
 def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tuple[str, ...]:
     """The filters wanted, each once.
 
@@ -91,9 +138,9 @@ def check_filters(where: str, known: Sequence[str], wanted: Sequence[str]) -> tu
     return tuple(dict.fromkeys(wanted))
 
 
-def beside(own: Sequence[str], system: System, study: Study) -> tuple[str, ...]:
+def beside(one: Simulated) -> tuple[str, ...]:
     """Filters of a scenario and, where the study has it, the default of the system."""
-    return (*own, *(name for name in (system.default,) if name in study.filters))
+    return (*one.own, *(name for name in (one.system.default,) if name in one.study.filters))
 
 
 def asked(text: str, settings: Sequence[str]) -> dict[str, Any]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from robins import _float64, scenario, units
+from robins import _float64, units
 from robins.campaign import check_machine, simulate
 from robins.campaign.bound import bound as bound_of
 from robins.report import bounds
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.workbench.errors import refusing
-from robins.workbench.scenarios import asked, beside, check_filters, find_scenario, study_of
+from robins.workbench.scenarios import asked, beside, check_filters, read_scenario
 
 
 def run(
@@ -43,28 +43,23 @@ def run(
     """
     _float64.require()
     check_machine(machine)
-    system, label, text = find_scenario(name)
-    study = study_of(system, text, name)
-    more = settings if runs is None else (*settings, f"runs={runs}")
-    parameters = scenario.parse(study.parameters, text, more, source=name)
-    own = parameters.filters or study.filters
-    chosen = check_filters(label, study.filters, filters or beside(own, system, study))
+    one = read_scenario(name, settings if runs is None else (*settings, f"runs={runs}"))
+    chosen = check_filters(one.label, one.study.filters, filters or beside(one))
     progress(0.0, "setting up the simulation")
-    with refusing(name):
-        problem = study.problem(parameters, chosen, seed)
+    problem = one.problem(chosen, seed)
     if not filters:  # the default was not there when the claims were stated
-        problem = replace(problem, claims=about(own, problem.claims))
-    found = simulate(problem, parameters.runs, progress=progress, machine=machine)
+        problem = replace(problem, claims=about(one.own, problem.claims))
+    found = simulate(problem, one.parameters.runs, progress=progress, machine=machine)
     return replace(
         found,
-        scenario=label,
+        scenario=one.label,
         seed=seed,
-        runs=parameters.runs,
+        runs=one.parameters.runs,
         last_lines=[
             f"Machine: {found.machine}   --machine chooses another",
             f"Next:   robins run {name} --seed {seed + 1}   repeats it with other noise",
         ],
-        **asked(text, settings),
+        **asked(one.text, settings),
     )
 
 
@@ -96,25 +91,23 @@ def bound(
             be computed.
     """
     _float64.require()
-    system, label, text = find_scenario(name)
-    study = study_of(system, text, name)
-    parameters = scenario.parse(study.parameters, text, (*settings, f"runs={runs}"), source=name)
-    wanted = filter_name or next(iter(parameters.filters or study.filters))
-    chosen = check_filters(label, study.filters, [wanted])
+    one = read_scenario(name, (*settings, f"runs={runs}"))
+    wanted = filter_name or one.own[0]
+    chosen = check_filters(one.label, one.study.filters, [wanted])
     times = [units.parse(time, "time") for time in at]
     progress(0.0, "linearising along the truth")
     with refusing(name):
-        solution = bound_of(study.problem(parameters, chosen, seed), wanted, runs, without)
+        solution = bound_of(one.problem(chosen, seed), wanted, runs, without)
         epochs = bounds.epochs(solution, times)
     return Outcome(
         solution,
         {wanted: bounds.metrics(solution)},
         files={"bound.csv": bounds.csv(solution).encode()},
         notes=bounds.sentences(solution),
-        scenario=label,
+        scenario=one.label,
         seed=seed,
         runs=runs,
         tables=[bounds.table(solution, epochs)],
         last_lines=[f"Next:   robins run {name}   shows how near the filters come"],
-        **asked(text, settings),
+        **asked(one.text, settings),
     )

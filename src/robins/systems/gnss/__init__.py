@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from robins.systems.gnss.filters import NAMES
-from robins.systems.gnss.log import replay
+from robins.systems.gnss.log import recorded, replay
 from robins.systems.gnss.model import gnss_model
 from robins.systems.gnss.parameters import City, Replay
 from robins.systems.gnss.study import CITY
@@ -17,6 +17,7 @@ SYSTEM = System(
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
+    recorded=recorded,
     reads="ranges",
     replay_finds=("track",),
 )

@@ -26,7 +26,7 @@ from robins.systems.gnss.model import (
 )
 from robins.systems.gnss.parameters import Believed, Replay
 from robins.systems.gnss.world import length_once
-from robins.systems.replaying import Answer, Piece, Reported
+from robins.systems.replaying import Answer, Piece, Recorded, Reported
 from robins.systems.study import StateBlock
 from robins.systems.tables import block_array, place_arrays, track_arrays
 
@@ -159,6 +159,20 @@ def _travel(odometry: OdometryTable, time_ns: np.ndarray) -> tuple[Travel, np.nd
 # ---------------------------------------------------------------------------------------- replay
 
 
+def recorded(log: RangeLog, parameters: Replay) -> Recorded:
+    """The log as its filters take it, as `System.recorded` says.
+
+    Raises:
+        ValueError: the log cannot be navigated; the sentence says why.
+    """
+    return _recorded(arrange(log, parameters), parameters)
+
+
+def _recorded(given: Arranged, parameters: Replay) -> Recorded:
+    piece = Piece(world=given.world, begin_s=0.0, epoch_s=given.epoch_s)
+    return Recorded([piece], partial(contender, parameters, given.place, given.member))
+
+
 def replay(
     log: RangeLog,
     parameters: Replay,
@@ -177,10 +191,9 @@ def replay(
         ValueError: the log cannot be navigated; the sentence says why.
     """
     given = arrange(log, parameters)
-    piece = Piece(world=given.world, begin_s=0.0, epoch_s=given.epoch_s)
-    make = partial(contender, parameters, given.place, given.member)
+    pieces, make = _recorded(given, parameters)
     wanted = filters or parameters.filters
-    answers = replaying.navigated([piece], wanted, make, SMOOTHERS, progress)
+    answers = replaying.navigated(pieces, wanted, make, SMOOTHERS, progress)
     places = {name: given.place.geodetic(a.mean.position) for name, a in answers.items()}
     variables = track_arrays(places.values())
     true = None if log.truth is None else truth_at(log.truth, given)

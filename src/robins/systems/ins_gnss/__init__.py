@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from robins.systems.ins_gnss.live import LiveInsGnss
-from robins.systems.ins_gnss.log import NAMES, replay
+from robins.systems.ins_gnss.log import NAMES, recorded, replay
 from robins.systems.ins_gnss.model import ins_gnss_model
 from robins.systems.ins_gnss.parameters import Drive, Replay
 from robins.systems.ins_gnss.study import DRIVE
@@ -18,6 +18,7 @@ SYSTEM = System(
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
+    recorded=recorded,
     orientation=lambda parameters: parameters.imu.orientation,
 )
 

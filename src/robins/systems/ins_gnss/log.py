@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ from robins.systems.ins_gnss.start import StartPoint, Usual, at_rest, find_start
 from robins.systems.ins_gnss.study import NAMES as STUDIED
 from robins.systems.ins_gnss.study import SMOOTHERS, make_filter
 from robins.systems.parts import Block
-from robins.systems.replaying import PROBABILITY, Answer, Piece, Reported
+from robins.systems.replaying import PROBABILITY, Answer, Piece, Recorded, Reported
 from robins.systems.study import Case, Contender
 from robins.systems.tables import place_arrays, track_arrays
 
@@ -298,6 +298,39 @@ def _share_note(answer: Answer, parameters: Replay, fix_step_s: float) -> list[s
     ]
 
 
+class _Opened(NamedTuple):
+    """A log on one clock, cut into what can be navigated, and sentences on what cannot."""
+
+    parameters: Replay
+    log: Log
+    pieces: list[Stretch]
+    problems: list[str]
+    fix_step_s: float  # between fixes, in the median
+
+
+def _opened(dataset: Dataset, parameters: Replay) -> _Opened:
+    parameters = with_lever_arm(parameters, dataset.lever_arm_b_m)
+    log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
+    pieces, problems = replaying.prepared(
+        log.time_s,
+        log.increments.dt,
+        parameters.update.longest_gap,
+        partial(prepare, log, parameters),
+    )
+    fix_step_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
+    return _Opened(parameters, log, pieces, problems, fix_step_s)
+
+
+def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
+    """The log as its filters take it, as `System.recorded` says.
+
+    Raises:
+        ValueError: the log cannot be navigated; the sentence says why and what to do.
+    """
+    opened = _opened(dataset, parameters)
+    return Recorded(opened.pieces, partial(contender, opened.parameters, opened.fix_step_s))
+
+
 def replay(
     dataset: Dataset,
     parameters: Replay,
@@ -312,18 +345,10 @@ def replay(
     Raises:
         ValueError: the log cannot be navigated; the sentence says why and what to do.
     """
-    parameters = with_lever_arm(parameters, dataset.lever_arm_b_m)
-    log = on_one_clock(in_body_axes(dataset, parameters.imu.orientation), parameters)
-    pieces, problems = replaying.prepared(
-        log.time_s,
-        log.increments.dt,
-        parameters.update.longest_gap,
-        partial(prepare, log, parameters),
-    )
+    parameters, log, pieces, problems, fix_step_s = _opened(dataset, parameters)
     wanted = filters or parameters.filters
     for name in wanted:
         require_known("filter", name, NAMES, "this system")
-    fix_step_s = float(np.median(np.diff(log.gnss_s))) if len(log.gnss_s) > 1 else 1.0
     answers, found, doubts = _answers(pieces, parameters, fix_step_s, wanted, progress)
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])

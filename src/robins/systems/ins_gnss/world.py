@@ -192,16 +192,15 @@ def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
         return jnp.where(mask, x[course.fix], jnp.nan)
 
     shape = (len(course.fix), 3)
-    r = np.sqrt(drive.believed.r_factor)
     rate = jnp.asarray(course.rate_b) + errors.gyro.bias[at]
     y: dict[str, Any] = {POSITION: Geodetic(*(at_epochs(x) for x in fixes[:3]))}
     aux: dict[str, Any] = {
-        POSITION: Fix(jnp.broadcast_to(r * jnp.asarray(drive.gnss.sigma), shape), rate)
+        POSITION: Fix(jnp.broadcast_to(jnp.asarray(drive.gnss.sigma), shape), rate)
     }
     if drive.gnss.use_velocity:
         y[VELOCITY] = at_epochs(fixes.v_n)
         aux[VELOCITY] = Velocity(
-            jnp.broadcast_to(r * jnp.asarray(drive.gnss.velocity_sigma), shape),
+            jnp.broadcast_to(jnp.asarray(drive.gnss.velocity_sigma), shape),
             rate,
             jnp.zeros(shape),
             jnp.zeros(shape[0]),

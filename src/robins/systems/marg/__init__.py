@@ -7,7 +7,7 @@ from robins.systems.marg.live import LiveMarg
 from robins.systems.marg.log import first_belief, first_look, prepare
 from robins.systems.marg.model import Block, Samples, integrate, model_of
 from robins.systems.marg.parameters import Replay
-from robins.systems.marg.replay import FILTERS, filter_of, replay
+from robins.systems.marg.replay import FILTERS, filter_of, recorded, replay
 from robins.systems.study import System
 
 SYSTEM = System(
@@ -18,6 +18,7 @@ SYSTEM = System(
     replay_parameters=Replay,
     replay_default=Path(__file__).parent / "scenarios" / "replay.toml",
     replay=replay,
+    recorded=recorded,
     replay_finds=("attitude",),
     orientation=lambda parameters: parameters.orientation,
     aboard=aboard,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from robins import linalg, rotation
 from robins.dataset import AttitudeTable, Dataset
 from robins.earth.magnetic import MagneticModelError, decimal_year, elements, field_n, wmm_for
+from robins.errors import require_known
 from robins.filters import Belief, Code, Filter, kalman, rules
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
@@ -27,7 +29,7 @@ from robins.systems import replaying
 from robins.systems.marg import model, monitor
 from robins.systems.marg.log import Prepared, prepare
 from robins.systems.marg.parameters import Replay
-from robins.systems.replaying import Answer, Reported
+from robins.systems.replaying import Answer, Recorded, Reported
 from robins.systems.study import Contender, StateBlock
 from robins.systems.tables import EULER, attitude_array, block_array
 
@@ -171,6 +173,25 @@ class Errors(NamedTuple):
     counts: np.ndarray  # (B,) bool
 
 
+def contender(parameters: Replay, name: str) -> Contender:
+    """The filter with the model it believes in.
+
+    Raises:
+        ValueError: another is asked for.
+    """
+    require_known("filter", name, (CAUSAL,), "this system, which smooths replays only")
+    return Contender(filter_of(parameters), model.model_of(parameters))
+
+
+def recorded(dataset: Dataset, parameters: Replay) -> Recorded:
+    """The log as its filter takes it, as `System.recorded` says.
+
+    Raises:
+        ValueError: the log cannot be used; the sentence says why.
+    """
+    return Recorded([prepare(dataset, parameters)], partial(contender, parameters))
+
+
 def replay(
     dataset: Dataset,
     parameters: Replay,
@@ -183,13 +204,11 @@ def replay(
         ValueError: the log cannot be used; the sentence says why.
     """
     progress(0.0, "integrating blocks")
-    log = prepare(dataset, parameters)
-    believed = Contender(filter_of(parameters), model.model_of(parameters))
+    log, smoothers = prepare(dataset, parameters), {SMOOTHED: CAUSAL}
     wanted = filters or parameters.filters
-    contenders, smoothers = {CAUSAL: believed}, {SMOOTHED: CAUSAL}
     # the run that is smoothed is told too: its innovations are what the smoother can be doubted by
     told = tuple(dict.fromkeys([*wanted, CAUSAL]))
-    answers = replaying.navigated([log], told, contenders.__getitem__, smoothers, progress)
+    answers = replaying.navigated([log], told, partial(contender, parameters), smoothers, progress)
     seen = _without_padding(log, answers[CAUSAL], parameters).updates
     answers = {name: answers[name] for name in wanted}
     q_nb = {name: _by_sample(log, answer) for name, answer in answers.items()}

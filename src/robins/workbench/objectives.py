@@ -1,0 +1,285 @@
+"""What tuning makes small: the errors of simulated runs, or how badly a log is predicted.
+
+Both are measured of independent parts, runs or segments, in the columns `DENSITY` (log density of
+all measurements), `COMPONENTS` (how many were measured), and of simulated runs by block the mean
+square of the error's length and of what the filter states of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array
+
+from robins import scenario
+from robins.campaign.monte_carlo import batch_of, blocks_of, one_record, settled
+from robins.campaign.tuning import Data, Objective, TooLittle, Trial
+from robins.filters import run
+from robins.filters.analysis.predictive import predicted, scored
+from robins.filters.sameness import content, same
+from robins.results import Progress
+from robins.systems.study import Contender, Problem, StateBlock
+from robins.workbench.errors import InputError, refusing
+from robins.workbench.recorded import Findings, OpenLog
+from robins.workbench.scenarios import check_filters, read_scenario
+
+ERROR, INNOVATIONS = "error", "innovations"
+SEGMENTS = 24  # of a log; every third is held out
+_FEWEST = 10  # components measured in a segment of a log, in the mean
+DENSITY, COMPONENTS = 0, 1
+FIRST_BLOCK = 2
+
+
+class Varied(NamedTuple):
+    """A parameter to be tuned, and where it begins, as a scenario writes it."""
+
+    key: str
+    start: Any
+
+    def setting(self, factor: float) -> str:
+        """The text that sets it to so many times its start."""
+        return scenario.setting(self.key, scenario.scaled(self.key, self.start, factor))
+
+
+def varied(texts: Sequence[str], parameters: Any, text: str) -> list[Varied]:
+    """What ``key`` or ``key=value`` says.
+
+    Raises:
+        InputError: none is named, or one twice.
+        robins.scenario.ScenarioError: there is none, or it is no number.
+    """
+    if not texts:
+        raise InputError("nothing to tune", "--vary", "name a parameter, as --vary imu.gyro_noise.")
+    found = []
+    for one in texts:
+        key, equals, value = (part.strip() for part in one.partition("="))
+        here = scenario.override({}, [f"at={value}"])["at"] if equals else None
+        start = here if equals else scenario.written(parameters, scenario.mapping_of(text), key)
+        scenario.scaled(key, start, 2.0)  # it must be a number
+        found.append(Varied(key, start))
+    if len({v.key for v in found}) < len(found):
+        raise InputError("names a parameter twice", "--vary", "name each once.")
+    return found
+
+
+class Asked(NamedTuple):
+    """What is to be tuned, on what data: the same for simulated runs and for a log."""
+
+    filter: str
+    vary: list[Varied]
+    objective: Objective
+    chosen_on: Data
+    judged_on: Data
+    parts: str  # what the parts are called
+    blocks: Sequence[StateBlock]  # whose errors are known
+    by: str  # what is to be small, in words
+    text: str  # TOML of the scenario or configuration
+    settings: Sequence[str]
+    label: str
+    told: str  # a sentence on the data
+    checked: Callable[[Sequence[str]], Any]  # settings -> parameters; raises where they do not fit
+
+
+def total_of(by: str, names: Sequence[str]) -> Callable[[np.ndarray], float]:
+    """The objective, of the mean over parts."""
+    if by == INNOVATIONS:
+        return lambda mean: -float(mean[DENSITY] / mean[COMPONENTS])
+    which = [k for k, name in enumerate(names) if by in (ERROR, name)]
+    return lambda mean: 0.5 * float(np.mean(np.log(mean[FIRST_BLOCK:][which])))
+
+
+def worded(by: str) -> str:
+    """What is made small, in words."""
+    if by == INNOVATIONS:
+        return "log density of a measured component"
+    return "geometric mean of the RMS errors of all blocks" if by == ERROR else f"RMS error of {by}"
+
+
+# --------------------------------------------------------------------------------- simulated runs
+
+
+def on_runs(
+    name: str,
+    filter_name: str,
+    vary: Sequence[str],
+    runs: int,
+    seed: int,
+    by: str,
+    settings: Sequence[str],
+    progress: Progress,
+) -> Asked:
+    """What is asked of simulated runs; arguments as of `robins.workbench.tune`.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: it cannot be done.
+    """
+    read = read_scenario(name, settings)
+    wanted = filter_name or read.own[0]
+    (chosen,) = check_filters(read.label, read.study.filters, [wanted])
+    tuned = varied(vary, read.parameters, scenario.text_of(overridden(read.text, settings)))
+    problem = read.problem((chosen,), seed)
+    names = [b.name for b in problem.blocks]
+    by = by or ERROR
+    if by not in (ERROR, INNOVATIONS, *names):
+        known = ", ".join([ERROR, INNOVATIONS, *names])
+        raise InputError(f"is none of {known}", f"--by {by}", "choose one of these.")
+    progress(0.0, "simulating")
+    batch = batch_of(problem)
+    worlds = batch(jnp.arange(runs)), batch(jnp.arange(runs, 2 * runs))
+
+    def parsed(more: Sequence[str]) -> Any:
+        return read.parsed((*settings, *more))
+
+    lay_out = read.study.lay_out
+    course = lay_out(parsed(settings_at(tuned, np.zeros(len(tuned)))))
+    # what a filter believes of the course, such as its process noise, is what it is told
+    moves = content(course) != content(lay_out(parsed(settings_at(tuned, np.ones(len(tuned))))))
+
+    def trial(x: np.ndarray) -> Trial:
+        given = parsed(settings_at(tuned, x))
+        c = read.study.contender(given, lay_out(given) if moves else course, chosen)
+        c = settled(c._replace(filter=scored(c.filter)))
+        return Trial(c.filter, (c.model, c.case, c.reported))
+
+    return Asked(
+        filter=chosen,
+        vary=tuned,
+        objective=Objective(trial, same(_of_runs(problem)), total_of(by, names)),
+        chosen_on=Data(worlds[0]),
+        judged_on=Data(worlds[1]),
+        parts="runs",
+        blocks=problem.blocks,
+        by=worded(by),
+        text=read.text,
+        settings=settings,
+        label=read.label,
+        told=f"Chosen on runs 0 to {runs - 1}, judged on runs {runs} to {2 * runs - 1}, which "
+        "tuning did not see. The simulated world stays as the scenario says it; only what the "
+        "filter believes is tuned.",
+        checked=parsed,
+    )
+
+
+def overridden(text: str, settings: Sequence[str]) -> dict[str, Any]:
+    """The tables of a scenario with its settings."""
+    return scenario.override(scenario.mapping_of(text), settings)
+
+
+def settings_at(tuned: Sequence[Varied], x: np.ndarray) -> list[str]:
+    """The texts that set the parameters to what they are at some log factors."""
+    return [v.setting(math.exp(one)) for v, one in zip(tuned, x, strict=True)]
+
+
+def _of_runs(problem: Problem) -> Callable[..., Array]:
+    """What is measured of each run: see above."""
+    blocks, where = blocks_of(problem), [b.where for b in problem.blocks]
+    counted = slice(problem.count_from, problem.count_to)
+
+    def measure(filter_: Any, numbers: Any, worlds: Any) -> Array:
+        def one(world: Any) -> Array:
+            found = one_record(blocks, Contender(filter_, *numbers), world)
+            notes = [update.notes for update in found["updates"].values()]
+            density = sum(jnp.sum(n["predicted.log_density"]) for n in notes)
+            count = sum(jnp.sum(n["predicted.components"]) for n in notes)
+            rows = [jnp.asarray([density, count], float)]
+            for what in ("error", "sigma"):
+                square = found[what][counted] ** 2
+                mean = [jnp.mean(jnp.sum(square[:, one], axis=1)) for one in where]
+                rows.append(jnp.stack(mean))
+            return jnp.concatenate(rows)
+
+        return jax.vmap(one)(worlds)
+
+    return measure
+
+
+# ------------------------------------------------------------------------------------ recorded log
+
+
+def on_log(
+    opened: OpenLog,
+    filter_name: str,
+    vary: Sequence[str],
+    by: str,
+    settings: Sequence[str],
+    findings: Findings,
+) -> Asked:
+    """What is asked of a recorded log; arguments as of `robins.workbench.tune`.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: it cannot be done.
+        TooLittle: there are too few measurements to hold some out.
+    """
+    system = opened.system
+    if system.recorded is None:
+        raise InputError(f"{system.name} cannot be tuned on a log")
+    if by not in ("", INNOVATIONS):
+        raise InputError("a log has no truth", f"--by {by}", f"leave it out, or say {INNOVATIONS}.")
+    wanted = filter_name or opened.parameters.filters[0]
+    (chosen,) = check_filters(system.name, system.replay_filters, [wanted])
+    tuned = varied(vary, opened.parameters, scenario.text_of(overridden(opened.text, settings)))
+    dataset = opened.read(findings)
+
+    def parsed(more: Sequence[str]) -> Any:
+        of, text, source = system.replay_parameters, opened.text, opened.source
+        return scenario.parse(of, text, (*settings, *more), source=source)
+
+    def trial(x: np.ndarray) -> Trial:
+        taken = system.recorded(dataset, parsed(settings_at(tuned, x)))
+        c = taken.contender(chosen)
+        c = settled(c._replace(filter=scored(c.filter)))
+        cases = [c.case(piece.world) for piece in taken.pieces]
+        given = [(case.start, case.y, case.u, case.aux) for case in cases]
+        return Trial(c.filter, (c.model, given))
+
+    with refusing(opened.source):
+        first = trial(np.zeros(len(tuned)))
+    of_steps = np.asarray(jax.jit(_steps, static_argnums=0)(first.kind, *first.numbers))
+    count = int(np.sum(of_steps[:, COMPONENTS]))
+    segments = min(SEGMENTS, count // _FEWEST)
+    held = np.arange(segments) % 3 == 2
+    if np.sum(held) < 3:
+        raise TooLittle(
+            f"the log says too little: {count} components are measured, and {9 * _FEWEST} are the "
+            "least that can be parted into what is chosen on and what is held out"
+        )
+    label = f"{system.name}/{dataset.name}"
+    return Asked(
+        filter=chosen,
+        vary=tuned,
+        objective=Objective(trial, Partial(_of_segments, segments), total_of(INNOVATIONS, ())),
+        chosen_on=Data((), np.flatnonzero(~held)),
+        judged_on=Data((), np.flatnonzero(held)),
+        parts="segments",
+        blocks=(),
+        by=worded(INNOVATIONS),
+        text=opened.text,
+        settings=settings,
+        label=label,
+        told=f"The log is cut into {segments} segments of equally many steps. The filter runs "
+        "through all; every third is held out: its innovations say nothing for tuning and alone "
+        "judge.",
+        checked=parsed,
+    )
+
+
+def _steps(filter_: Any, model: Any, given: Sequence[Any]) -> Array:
+    """(E, 2) log density of the measurements of each step of all pieces, and their components."""
+    rows = []
+    for start, y, u, aux in given:
+        of = run(filter_, model, start, y, u, aux, keep=predicted).steps
+        rows.append(jnp.stack([of.log_density, of.components.astype(float)], axis=1))
+    return jnp.concatenate(rows)
+
+
+def _of_segments(segments: int, filter_: Any, numbers: Any, _: Any) -> Array:
+    """(segments, 2) the same of segments of equally many steps."""
+    steps = _steps(filter_, *numbers)
+    place = jnp.arange(len(steps)) * segments // len(steps)
+    return jax.ops.segment_sum(steps, place, segments)

@@ -1,0 +1,201 @@
+"""The command `tune`: what a filter should be told, by simulated runs or by a recorded log."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from robins import _float64, scenario, units
+from robins.campaign.tuning import Tuned, choose
+from robins.results import Outcome, Progress, array, silent
+from robins.workbench.errors import refusing
+from robins.workbench.objectives import (
+    COMPONENTS,
+    DENSITY,
+    FIRST_BLOCK,
+    INNOVATIONS,
+    Asked,
+    on_log,
+    on_runs,
+    overridden,
+    settings_at,
+    total_of,
+    worded,
+)
+from robins.workbench.publication import part
+from robins.workbench.recorded import Findings, open_log, unheard
+from robins.workbench.scenarios import asked
+
+RUNS = 16  # of either half, where nothing is said
+
+
+def tune(
+    names: Sequence[str | os.PathLike[str]],
+    *,
+    vary: Sequence[str],
+    filter_name: str = "",
+    runs: int = RUNS,
+    seed: int = 0,
+    by: str = "",
+    system: str = "ins-gnss",
+    settings: Sequence[str] = (),
+    columns: Sequence[str | os.PathLike[str]] = (),
+    progress: Progress = silent,
+    findings: Findings = unheard,
+) -> Outcome:
+    """Find values of parameters with which a filter is best, and judge them on other data.
+
+    The world stays as the scenario, or the log, says it; only what the filter believes is tuned. If
+    the values found are not better on the data held out, beyond chance, those written stay.
+
+    Args:
+        names: a scenario, "system/name", a TOML file or "file.py:study"; or the files of a log.
+        vary: texts ``key``, or ``key=value`` to begin elsewhere, one a parameter.
+        filter_name: which filter; by default the first of the scenario or system.
+        runs: simulated runs to choose on; as many others to judge on.
+        seed: of the random streams.
+        by: "error", the geometric mean of the RMS errors of all blocks, or the name of one block;
+            "innovations", the log density of the measurements. By default the error of simulated
+            runs; a log has no truth.
+        system: of a log.
+        settings: "path=value" texts that change scenario and filter before.
+        columns: TOML files that declare formats of the log's files.
+        progress: called with the share done and what is being done.
+        findings: called with what the doctor says of a log.
+
+    Raises:
+        InputError, robins.scenario.ScenarioError: what was asked for cannot be done.
+        TooLittle: the data do not say what a parameter should be.
+    """
+    _float64.require()
+    if _is_log(names):
+        opened = open_log(names, system=system, settings=settings, columns=columns)
+        progress(0.0, "reading")
+        of = on_log(opened, filter_name, vary, by, settings, findings)
+    else:
+        of = on_runs(os.fspath(names[0]), filter_name, vary, runs, seed, by, settings, progress)
+    keys = [v.key for v in of.vary]
+    tuning = part(progress, 0.1, 1.0)
+    with refusing(of.label):
+        found = choose(of.objective, keys, of.chosen_on, of.judged_on, tuning)
+    return _outcome(of, found, seed)
+
+
+def _is_log(names: Sequence[str | os.PathLike[str]]) -> bool:
+    """Whether these are files of a log, and no scenario."""
+    if len(names) > 1:
+        return True
+    name = os.fspath(names[0])
+    return os.path.isfile(name) and not name.endswith(".toml")
+
+
+def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
+    stays = not found.better
+    x = np.zeros(len(found.x)) if stays else found.x
+    now = settings_at(of.vary, x)
+    with refusing(of.label):
+        of.checked(now)
+    text = scenario.text_of(overridden(of.text, (*of.settings, *now)))
+    z = float(stats.norm.ppf(0.975))
+    bands = [
+        (math.exp(a), math.exp(a - z * s), math.exp(a + z * s))
+        for a, s in zip(found.x, found.sigma, strict=True)
+    ]
+    change = _change(of, found)
+    warnings = []
+    if stays:
+        warnings.append(
+            f"{of.filter}: what was found is not better on the data held out, beyond chance "
+            f"({change}): the values as written stay"
+        )
+    rows = {
+        f"{of.filter} as written": _metrics(of, found.before),
+        f"{of.filter} tuned": _metrics(of, found.before if stays else found.after)
+        | {f"{v.key} times": band[0] for v, band in zip(of.vary, bands, strict=True) if not stays},
+    }
+    told = [
+        f"{v.key}: {scenario.setting(v.key, v.start).partition('=')[2]} times {band[0]:.3g} "
+        f"({band[1]:.3g} to {band[2]:.3g} at 95 %)"
+        for v, band in zip(of.vary, bands, strict=True)
+    ]
+    how = "gradient" if found.gradient else "search"
+    return Outcome(
+        solution=_solution(of, found, np.array(bands)),
+        metrics=rows,
+        files={"tuned.toml": text.encode(), "tuning.csv": _csv(of, bands, now)},
+        notes=[
+            *told,
+            f"Held out: {change}.",
+            of.told,
+            f"Small is made: {of.by}; by {how}, {found.evaluations} evaluations.",
+        ],
+        warnings=warnings,
+        scenario=of.label,
+        seed=seed,
+        runs=len(found.before),
+        title=f"{of.filter} tuned",
+        last_lines=["Tuned:  {out}/tuned.toml   with these values"],
+        **asked(of.text, of.settings),
+    )
+
+
+def _change(of: Asked, found: Tuned) -> str:
+    """What became of the objective on the data held out, in words."""
+    if of.by == worded(INNOVATIONS):
+        total = total_of(INNOVATIONS, ())
+        was, now = (-total(m.mean(axis=0)) for m in (found.before, found.after))
+        return (
+            f"{of.by} {was:.4f} -> {now:.4f}, {found.gain:+.4f} (at least {found.gain_low:+.4f} at "
+            f"95 %), over {len(found.before)} {of.parts}"
+        )
+    less, least = (100.0 * math.expm1(-one) for one in (found.gain, found.gain_low))
+    over = f"over {len(found.before)} {of.parts}"
+    return f"{of.by} {less:+.2f} % (at most {least:+.2f} % at 95 %), {over}"
+
+
+def _metrics(of: Asked, parts: np.ndarray) -> dict[str, Any]:
+    """Of the data held out: the log density, and by block RMS error and what is stated over it."""
+    mean = np.mean(parts, axis=0)
+    out: dict[str, Any] = {"log_density": float(mean[DENSITY] / mean[COMPONENTS])}
+    n = len(of.blocks)
+    for b, square, variance in zip(
+        of.blocks, mean[FIRST_BLOCK:][:n], mean[FIRST_BLOCK:][n:], strict=True
+    ):
+        rms = float(units.convert(math.sqrt(square), b.units, b.display_unit))
+        out[f"{b.name}_rms_{units.as_ending(b.display_unit)}"] = rms
+        if square > 0.0:
+            out[f"{b.name}_stated_over_rms"] = math.sqrt(variance / square)
+    return out
+
+
+def _csv(of: Asked, bands: Sequence[tuple[float, float, float]], now: Sequence[str]) -> bytes:
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(["parameter", "as written", "factor", "low", "high", "now"])
+    for v, band, line in zip(of.vary, bands, now, strict=True):
+        was = scenario.setting(v.key, v.start).partition("=")[2]
+        out.writerow([v.key, was, *band, line.partition("=")[2]])
+    return text.getvalue().encode()
+
+
+def _solution(of: Asked, found: Tuned, bands: np.ndarray) -> xr.Dataset:
+    """Factors with their intervals, and the objective of each part that was held out."""
+    total = of.objective.total
+    label = "minus log density" if of.by == worded(INNOVATIONS) else "ln of the RMS error"
+    data: dict[str, Any] = {"parameter": ("parameter", [v.key for v in of.vary])}
+    for name, values in zip(("factor", "low", "high"), bands.T, strict=True):
+        data |= array(f"tuned_{name}", values)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for name, parts in (("before", found.before), ("after", found.after)):
+            values = np.array([total(one) for one in parts])
+            about = {"comment": of.by, "parts": of.parts, "label": label}
+            data |= array(f"judged_{name}", values, **about)
+    return xr.Dataset(data)

@@ -1,0 +1,109 @@
+"""The choice of parameters against closed forms: a variance has a maximum likelihood of its own."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from robins.campaign.tuning import Data, Objective, TooLittle, Trial, choose
+
+KEYS = ["a", "b"]
+
+
+def spread(count, sigma, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, 50)) * sigma
+
+
+def likelihood(kind, numbers, z):
+    """Minus the log density of normal numbers (parts, N) of a standard deviation, mean by part."""
+    (sigma,) = numbers
+    return jnp.mean(jnp.log(sigma) + 0.5 * (z / sigma) ** 2, axis=1)[:, None]
+
+
+def first(mean):
+    return float(mean[0])
+
+
+def of_one(x):
+    return Trial("one", (jnp.exp(x[0]),))
+
+
+ONE = Objective(of_one, likelihood, first)
+
+
+def test_a_standard_deviation_is_that_of_the_sample():
+    z, held = spread(30, 4.0), spread(30, 4.0, seed=1)
+    found = choose(ONE, ["a"], Data(z), Data(held))
+    assert found.gradient
+    assert np.exp(found.x[0]) == pytest.approx(np.sqrt(np.mean(z**2)), rel=1e-4)
+    # of ln sigma by maximum likelihood: 1 / sqrt(2 N)
+    assert found.sigma[0] == pytest.approx(1.0 / np.sqrt(2.0 * z.size), rel=0.35)
+    was, now = (
+        np.mean(np.log(s) + 0.5 * (held / s) ** 2) for s in (1.0, float(np.exp(found.x[0])))
+    )
+    assert found.gain == pytest.approx(was - now, rel=1e-9)
+    assert 0.0 < found.gain_low < found.gain
+    assert found.better
+
+
+def test_the_interval_holds_as_often_as_it_says():
+    inside = []
+    for seed in range(60):
+        found = choose(ONE, ["a"], Data(spread(12, 1.5, seed)), Data(spread(12, 1.5, seed + 100)))
+        inside.append(abs(found.x[0] - np.log(1.5)) < 1.96 * found.sigma[0])
+    assert np.mean(inside) > 0.85
+
+
+def test_what_is_right_is_left_alone():
+    z = spread(30, 1.0)
+    held = spread(30, 1.0, seed=3)
+    assert not choose(ONE, ["a"], Data(z), Data(held)).better
+
+
+def test_rows_part_what_is_measured_at_once():
+    z = np.concatenate([spread(20, 4.0), spread(20, 2.0)])
+    found = choose(ONE, ["a"], Data(z, np.arange(20)), Data(z, np.arange(20, 40)))
+    assert np.exp(found.x[0]) == pytest.approx(np.sqrt(np.mean(z[:20] ** 2)), rel=1e-4)
+    assert len(found.before) == 20
+
+
+def test_what_is_compiled_is_searched():
+    def trial(x):
+        return Trial(round(float(np.exp(x[0])), 6), ())
+
+    def measure(kind, numbers, z):
+        return likelihood(kind, (jnp.asarray(kind),), z)
+
+    z = spread(30, 3.0)
+    found = choose(Objective(trial, measure, first), ["a"], Data(z), Data(spread(30, 3.0, 1)))
+    assert not found.gradient
+    assert np.exp(found.x[0]) == pytest.approx(np.sqrt(np.mean(z**2)), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("trial", "says"),
+    [
+        (lambda x: Trial("one", (jnp.exp(x[0] + x[1]),)), "too little: .*some act alike"),
+        (lambda x: Trial("one", (jnp.exp(x[0]),)), "^b changes nothing"),
+    ],
+    ids=["a product", "an idle one"],
+)
+def test_it_refuses_what_the_data_do_not_tell(trial, says):
+    with pytest.raises(TooLittle, match=says):
+        choose(
+            Objective(trial, likelihood, first), KEYS, Data(spread(30, 2.0)), Data(spread(30, 2.0))
+        )
+
+
+def test_it_refuses_a_parameter_that_runs_away():
+    z = np.zeros((10, 50))
+    with pytest.raises(TooLittle, match="a would become small without end"):
+        choose(ONE, ["a"], Data(z), Data(z))
+
+
+def test_it_refuses_few_parts_and_a_lost_filter():
+    with pytest.raises(TooLittle, match="3 runs or segments"):
+        choose(ONE, ["a"], Data(spread(3, 2.0)), Data(spread(3, 2.0)))
+    z = spread(10, 2.0)
+    z[0, 0] = np.inf
+    with pytest.raises(TooLittle, match="lost as it is written"):
+        choose(ONE, ["a"], Data(z), Data(spread(10, 2.0)))
