@@ -16,10 +16,10 @@ from robins.filters.rules import gate
 from robins.results import array
 from robins.systems.ins_gnss.model import SENSORS, ins_gnss_model, state_blocks
 from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.ins_gnss.world import Course, lay_out, simulate
+from robins.systems.ins_gnss.world import Course, as_told, lay_out, simulate, told_of
 from robins.systems.judgement import consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
-from robins.systems.study import Contender, StateBlock, Study, View
+from robins.systems.study import Contender, StateBlock, Study, View, recipe
 from robins.systems.tables import place_arrays, track_arrays
 
 FILTERS = {
@@ -77,7 +77,8 @@ def contender(drive: Drive, course: Course, name: str) -> Contender:
     if name in SMOOTHERS:
         raise ValueError(f"{name}: campaigns compare causal filters; `robins replay` smooths a log")
     model = ins_gnss_model(believed_imu(drive), drive.gnss, drive.aids)
-    return Contender(make_filter(name, drive.update.gate), model)
+    case = recipe(as_told, numbers=told_of(drive, course))
+    return Contender(make_filter(name, drive.update.gate), model, case)
 
 
 def view(drive: Drive, course: Course) -> View:
