@@ -28,6 +28,7 @@ from scipy.stats import qmc, sobol_indices
 from robins.campaign.memory import CHUNK, MEMORY, width_of
 from robins.campaign.monte_carlo import one_record
 from robins.filters import Belief
+from robins.filters.sameness import content
 from robins.program.liveness import bytes_of_jaxpr
 from robins.scenario import Parameters
 from robins.systems.study import Contender, Study, View
@@ -43,7 +44,7 @@ Path = tuple[str | int, ...]  # names of fields and numbers of items, from the p
 # -------------------------------------------------------------------------- numbers that vary
 
 
-class Interval(NamedTuple):
+class Between(NamedTuple):
     """The numbers of the parameters that one key stands for, such as three axes, and their ends."""
 
     paths: tuple[Path, ...]
@@ -59,14 +60,14 @@ class Interval(NamedTuple):
     def at(self, share: Any) -> dict[Path, Any]:
         """The numbers at a share from 0 to 1 of the way from the low ends to the high ones."""
 
-        def between(a: float, b: float) -> Any:
+        def number(a: float, b: float) -> Any:
             return a * (b / a) ** share if self.by_logarithm else a + (b - a) * share
 
         ends = zip(self.paths, self.low, self.high, strict=True)
-        return {path: between(a, b) for path, a, b in ends}
+        return {path: number(a, b) for path, a, b in ends}
 
 
-def interval(low: Any, high: Any) -> Interval:
+def between(low: Any, high: Any) -> Between:
     """What differs between two sets of parameters.
 
     Raises:
@@ -75,7 +76,7 @@ def interval(low: Any, high: Any) -> Interval:
     found = list(_differing(low, high, ()))
     if not found:
         raise ValueError("its two ends are the same")
-    return Interval(*(tuple(one) for one in zip(*found, strict=True)))
+    return Between(*(tuple(one) for one in zip(*found, strict=True)))
 
 
 def _differing(low: Any, high: Any, path: Path) -> Iterator[tuple[Path, float, float]]:
@@ -118,7 +119,7 @@ class Budget(NamedTuple):
     view: View
     contender: Contender
     seed: int
-    intervals: tuple[Interval, ...]
+    ranges: tuple[Between, ...]
 
     def run(self, shares: Array, index: Array) -> tuple[Array, Array]:
         """One run at one point; pure.
@@ -133,7 +134,7 @@ class Budget(NamedTuple):
             changes with what the filter believes at the start.
         """
         numbers: dict[Path, Any] = {}
-        for k, one in enumerate(self.intervals):
+        for k, one in enumerate(self.ranges):
             numbers |= one.at(shares[k])
         world = self.study.simulate(placed(self.given, numbers), self.course, self.seed, index)
         blocks = tuple((b.name, b.where.start, b.where.stop) for b in self.view.blocks)
@@ -154,18 +155,39 @@ def _believed(start: Any) -> Array:
     return jnp.sum(jnp.where(size > 0.0, jnp.log(jnp.where(size > 0.0, size, 1.0)), 0.0))
 
 
+def depends(before: Any, course: Any, after: Any) -> bool:
+    """Whether a course differs from another, by all that can be compared of it.
+
+    Args:
+        before: a course.
+        course: of the same parameters, laid out again: what differs here tells nothing.
+        after: of other parameters.
+    """
+    first, again, other = (jax.tree_util.tree_leaves(x) for x in (before, course, after))
+    if len(first) != len(other):
+        return True
+
+    def alike(a: Any, b: Any) -> bool:
+        if isinstance(a, np.ndarray | np.generic | jax.Array | float | int):
+            return bool(np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"))
+        return content(a) == content(b)
+
+    each = zip(first, again, other, strict=True)
+    return any(alike(a, b) and not alike(a, c) for a, b, c in each)
+
+
 def untraceable(budget: Budget) -> list[int]:
     """Numbers of the parameters whose worlds JAX cannot trace, each varied alone."""
 
-    def fails(one: Interval) -> bool:
-        alone = budget._replace(intervals=(one,))
+    def fails(one: Between) -> bool:
+        alone = budget._replace(ranges=(one,))
         try:
             jax.eval_shape(alone.run, jax.ShapeDtypeStruct((1,), float), jnp.asarray(0))
         except jax.errors.JAXTypeError:
             return True
         return False
 
-    return [k for k, one in enumerate(budget.intervals) if fails(one)]
+    return [k for k, one in enumerate(budget.ranges) if fails(one)]
 
 
 def simulate_points(

@@ -30,6 +30,7 @@ from robins.cli.options import (
     log_name,
     publishes,
 )
+from robins.cli.sensitivity import sensitivity
 from robins.cli.tell import carry_out, say
 from robins.workbench import InputError
 
@@ -44,6 +45,7 @@ Examples:
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
   robins campaign run ins-gnss/drive --runs 500 --out drive   many runs; goes on if stopped
   robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
+  robins sensitivity ins-gnss/drive --vary "gnss.sigma=1 m to 5 m"   what the error comes from
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it
@@ -321,6 +323,7 @@ def design(problem: str, out: Path | None, **options: Any) -> None:
 app.add_command(bench)
 app.add_command(campaign)
 app.add_command(sweep)
+app.add_command(sensitivity)
 
 
 @app.command(

@@ -160,6 +160,20 @@ ROLES = (
     Role("sweep_low_{block}", _SWEEP, "lower bound; of 95 % confidence, by the spread of the runs"),
     Role("sweep_high_{block}", _SWEEP, "upper bound; likewise"),
     Role("sweep_stated_{block}", _SWEEP, "stated sigma of {of}; root of the mean stated variance"),
+    Role(
+        "sobol_first_{block}",
+        "parameter",
+        "first-order Sobol index of {of}; share of the variance of its RMS error",
+        "1",
+        ("of_filter", "samples", "runs"),
+    ),
+    Role("sobol_first_low_{block}", "parameter", "lower bound; of 95 % confidence", "1"),
+    Role("sobol_first_high_{block}", "parameter", "upper bound; likewise", "1"),
+    Role("sobol_total_{block}", "parameter", "total Sobol index of {of}; with interactions", "1"),
+    Role("sobol_total_low_{block}", "parameter", "lower bound; of 95 % confidence", "1"),
+    Role("sobol_total_high_{block}", "parameter", "upper bound; likewise", "1"),
+    Role("sobol_rms_{block}", "point", "RMS error of {of}; over runs and epochs that count"),
+    Role("sobol_share", "point parameter", "place between the ends of a parameter, 0 to 1", "1"),
     Role("{name}", f"time {_MORE}", "{of}; what else is known of a run", named="context"),
 )
 

@@ -45,6 +45,7 @@ _WHERE = {
     "publishing": "publication",
     "replay": "recorded",
     "run": "simulated",
+    "sensitivity": "sensitivity",
     "sweep": "sweeps",
     "verify": "comparison",
     "work_here": "workers",

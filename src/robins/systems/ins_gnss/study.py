@@ -16,7 +16,7 @@ from robins.filters.rules import gate
 from robins.results import array
 from robins.systems.ins_gnss.model import SENSORS, ins_gnss_model, state_blocks
 from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.ins_gnss.world import Course, as_told, lay_out, simulate, told_of
+from robins.systems.ins_gnss.world import Course, as_believed, belief_of, lay_out, simulate
 from robins.systems.judgement import consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
 from robins.systems.study import Contender, StateBlock, Study, View, recipe
@@ -77,7 +77,7 @@ def contender(drive: Drive, course: Course, name: str) -> Contender:
     if name in SMOOTHERS:
         raise ValueError(f"{name}: campaigns compare causal filters; `robins replay` smooths a log")
     model = ins_gnss_model(believed_imu(drive), drive.gnss, drive.aids)
-    case = recipe(as_told, numbers=told_of(drive, course))
+    case = recipe(as_believed, numbers=belief_of(drive, course))
     return Contender(make_filter(name, drive.update.gate), model, case)
 
 

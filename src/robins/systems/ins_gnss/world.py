@@ -209,23 +209,23 @@ def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
     return Case(start, u, y, aux, truth)
 
 
-class Told(NamedTuple):
+class DriveBelief(NamedTuple):
     """What filters are told of a drive, whatever it is like."""
 
     factor: Array  # of the covariance at the start
     sigma: dict[str, Any]  # by sensor
 
 
-def told_of(drive: Drive, course: Course) -> Told:
+def belief_of(drive: Drive, course: Course) -> DriveBelief:
     """What the parameters tell them."""
     begin = drive.start
     known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
     r, g = np.sqrt(drive.believed.r_factor), drive.gnss
     sigma = {POSITION: g.sigma} | ({VELOCITY: g.velocity_sigma} if g.use_velocity else {})
-    return Told(jnp.asarray(known.factor), {k: r * jnp.asarray(v) for k, v in sigma.items()})
+    return DriveBelief(jnp.asarray(known.factor), {k: r * jnp.asarray(v) for k, v in sigma.items()})
 
 
-def as_told(told: Told, world: Case) -> Case:
+def as_believed(told: DriveBelief, world: Case) -> Case:
     """The case of a drive, which may have been drawn with other numbers than filters are told."""
     aux = {
         name: fix._replace(sigma=jnp.broadcast_to(told.sigma[name], fix.sigma.shape))
