@@ -49,9 +49,9 @@ def simulate(given: Any, course: Course, seed: int, run: Any) -> Case:
     sigma = jnp.stack([jnp.asarray(x, float) for x in (given.noise.left, given.noise.right)])
     sigma = sigma * jnp.stack([jnp.asarray(x, float) for x in given.noise.both])
     z = sigma[None] * jax.random.normal(key, (COUNT, 2))
-    z = jnp.where(given.explode > 0.5, jnp.inf, z)
+    truth = jnp.broadcast_to(jnp.where(given.explode > 0.5, jnp.nan, 0.0), (COUNT, 2))
     start = Belief(jnp.zeros(2), jnp.eye(2) * given.begin)
-    return Case(start, None, {"pair": z}, {}, jnp.zeros((COUNT, 2)))
+    return Case(start, None, {"pair": z}, {}, truth)
 
 
 def contender(given: Any, course: Course, name: str) -> Contender:

@@ -296,7 +296,8 @@ def indices(squares: np.ndarray, seed: int, resamples: int = RESAMPLES) -> Indic
 
 def _estimate(f: np.ndarray) -> np.ndarray:
     """(2, s, d) first and total order, of outputs (d + 2, n, s)."""
-    of = {"f_A": f[0].T, "f_B": f[1].T, "f_AB": np.moveaxis(f[2:], -1, 1)}
+    twice = np.concatenate([f, f], axis=2)  # scipy drops axes of one, and fails with two of them
+    of = {"f_A": twice[0].T, "f_B": twice[1].T, "f_AB": np.moveaxis(twice[2:], -1, 1)}
     found = sobol_indices(func=of, n=f.shape[1])
-    shape = f.shape[2], len(f) - 2  # scipy drops axes of one
-    return np.stack([np.reshape(x, shape) for x in (found.first_order, found.total_order)])
+    both = (np.reshape(x, (-1, len(f) - 2)) for x in (found.first_order, found.total_order))
+    return np.stack([x[: f.shape[2]] for x in both])

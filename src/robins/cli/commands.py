@@ -45,7 +45,7 @@ Examples:
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
   robins campaign run ins-gnss/drive --runs 500 --out drive   many runs; goes on if stopped
   robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
-  robins sensitivity ins-gnss/drive --vary "gnss.sigma=1 m to 5 m"   what the error comes from
+  robins sensitivity my.toml --vary "gnss.sigma=1 m to 5 m" --vary "start.tilt=1 deg to 5 deg"
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it

@@ -17,8 +17,8 @@ from robins.cli.tell import carry_out
     epilog=examples(
         "robins sensitivity transfer-alignment/s0 --filter kf-flexure "
         '--vary "slave.gyro_bias=1 deg/h to 10 deg/h" --vary "flexure.sigma=1 arcmin to 5 arcmin"',
-        'robins sensitivity ins-gnss/drive --filter ekf --vary "imu.gyro_bias=1 deg/h to 50 deg/h" '
-        '--vary "gnss.sigma=1 m to 5 m" --runs 8 --samples 128 --out budget',
+        'robins sensitivity airship/s1 --filter product --vary "sar.position=10 m to 50 m" '
+        '--vary "barometer.height=5 m to 30 m" --samples 128 --out budget',
     ),
 )
 @click.argument("scenario")

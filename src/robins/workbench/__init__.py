@@ -45,7 +45,7 @@ _WHERE = {
     "publishing": "publication",
     "replay": "recorded",
     "run": "simulated",
-    "sensitivity": "sensitivity",
+    "sensitivity": "sensitivities",
     "sweep": "sweeps",
     "verify": "comparison",
     "work_here": "workers",

@@ -222,7 +222,7 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
 
 
 def start_belief(
-    nav: Nav, imu: Imu, start: Start, tilt_rad: float, heading_rad: float, gyro_bias: Any = None
+    nav: Nav, imu: Imu, start: Start, tilt_rad: Any, heading_rad: Any, gyro_bias: Any = None
 ) -> Belief:
     """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
 

@@ -49,7 +49,7 @@ class Uncertain(NamedTuple):
 
     def text(self, number: float) -> str:
         """A value as `--set` takes it."""
-        return f"{number!r} {self.unit}".strip()
+        return f"{repr(number).removesuffix('.0')} {self.unit}".strip()
 
     @property
     def ends(self) -> tuple[str, str]:
@@ -350,15 +350,14 @@ def _warnings(
 ) -> list[str]:
     told = []
     lost = np.sum(~np.all(np.isfinite(squares), axis=(2, 3)))
+    still = [b.name for k, b in enumerate(blocks) if np.all(np.isnan(found.total[k]))]
     if lost:
         told.append(
             f"at {lost} of {squares.shape[0] * squares.shape[1]} points '{name}' diverged in a "
             "run: their RMS is infinite and there are no indices; bring the ends nearer together "
             "or name another filter"
         )
-        return told
-    still = [b.name for k, b in enumerate(blocks) if np.all(np.isnan(found.total[k]))]
-    if still:
+    elif still:
         told.append(f"the RMS error of {', '.join(still)} does not vary, so it has no indices")
     for j, one in enumerate(every):
         if not np.allclose(believed[2 + j], believed[0], rtol=1e-9, atol=1e-12):
@@ -366,9 +365,8 @@ def _warnings(
                 f"{one.key}: what '{name}' believes at the start follows it, since the world of "
                 "this study brings the start along; its index is that of both"
             )
-        with np.errstate(invalid="ignore"):
-            acts = np.any(found.total[:, j] > NOTHING)
-        if not acts and len(still) < len(blocks):
+        acts = np.nan_to_num(found.total[:, j]) > NOTHING
+        if len(still) < len(blocks) and not np.any(acts):
             told.append(f"{one.key}: changes no error; the simulated world does not depend on it")
     for k, b in enumerate(blocks):
         low, high = found.total_low[k], found.total_high[k]
