@@ -244,7 +244,9 @@ def sobol_points(d: int, samples: int, seed: int) -> np.ndarray:
         samples: a power of two, which the sequence is balanced for.
         seed: of the scrambling.
     """
-    drawn = qmc.Sobol(2 * d, seed=np.random.default_rng(seed)).random(samples)
+    # scipy 1.14 has no `rng` yet; later ones take either name
+    rng = np.random.default_rng(seed)
+    drawn = qmc.Sobol(2 * d, seed=rng).random(samples)  # pyright: ignore[reportCallIssue]
     A, B = drawn[:, :d], drawn[:, d:]
     mixed = np.repeat(A[None], d, axis=0)
     for i in range(d):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -36,7 +38,9 @@ def budget(solution: xr.Dataset) -> Picture:
             axes.tick_params(labelbottom=True)
     grid[0, 0].set_yticks(range(len(names)), names)
     grid[0, 0].invert_yaxis()
-    keys = [Patch(color=style.colour(k), label=text) for k, text in enumerate(_ORDERS.values())]
+    keys: list[Any] = [
+        Patch(color=style.colour(k), label=text) for k, text in enumerate(_ORDERS.values())
+    ]
     keys.append(style.key("95 % bounds", color=style.TRUTH, linewidth=1.2))
     style.legend(figure, keys)
     about = next(iter(blocks.values())).attrs

@@ -7,6 +7,7 @@ be scaled, and a disturbance that is switched off leaves the numbers of the rest
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from robins.sim import _given
 
 
 def outlier_factor(
-    key: Array, shape: Sequence[int], share: ArrayLike, factor: ArrayLike
+    key: Array, shape: Sequence[int], share: Any, factor: Any
 ) -> Float[Array, "..."]:
     """``factor`` for a share of the samples, drawn one by one, and 1 for the rest.
 
