@@ -358,6 +358,9 @@ def as_short_as_can_be(words):
             return ["sweep", *CHEAP[name], "--workers", "1", name, *more, "--runs", "1"]
         case ["tune", *_]:
             return [*words, "--runs", "6"]
+        case ["sensitivity", name, *_]:
+            cheap = ("--filter", CHEAP[name][1]) if name in CHEAP else ()
+            return [*words, *cheap, "--runs", "1", "--samples", "2"]
         case ["design", *_] if "--methods" not in words:
             return [*words, "--methods", "riccati"]
         case ["replay", *_] if "gnss" in words:
@@ -385,6 +388,7 @@ BEGINS = {
     ("campaign", "verify"): "robins.workbench.campaigns.ready",
     ("sweep",): "robins.workbench.sweeps.plan_campaign",
     ("tune",): "robins.workbench.tuning.choose",
+    ("sensitivity",): "robins.workbench.sensitivities.simulate_points",
     ("bench", "up"): "robins.bench.run.session.Session.run",
     ("bench", "replay"): "robins.workbench.benches.kit_of",
 }

@@ -29,6 +29,7 @@ from robins.cli.options import (
     log_name,
     publishes,
 )
+from robins.cli.sensitivity import sensitivity
 from robins.cli.tell import carry_out, say
 from robins.cli.tune import tune
 from robins.workbench import InputError
@@ -45,6 +46,7 @@ Examples:
   robins campaign run ins-gnss/drive --runs 500 --out drive   many runs; goes on if stopped
   robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
   robins tune imu.csv gnss.pos --filter ekf --vary imu.accel_noise --out tuned
+  robins sensitivity my.toml --vary "gnss.sigma=1 m to 5 m" --vary "start.tilt=1 deg to 5 deg"
   robins bound ins-gnss/drive                    how accurate can these sensors be at best?
   robins doctor imu.csv gnss.pos                 can my log be navigated?
   robins replay imu.csv gnss.pos --out walk      navigate it
@@ -316,6 +318,7 @@ app.add_command(bench)
 app.add_command(campaign)
 app.add_command(sweep)
 app.add_command(tune)
+app.add_command(sensitivity)
 
 
 @app.command(

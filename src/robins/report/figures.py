@@ -8,7 +8,16 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from robins.report import bounds, comparing, curves, instruments, maps, sweeps, updates
+from robins.report import (
+    bounds,
+    comparing,
+    curves,
+    instruments,
+    maps,
+    sensitivity,
+    sweeps,
+    updates,
+)
 from robins.report.lateness import lateness
 from robins.report.style import Picture
 from robins.report.tuning import tuning
@@ -60,6 +69,7 @@ FIGURES = (
     Figure(sweeps.curves, "sweep_rms sweep_low sweep_high sweep_stated", EACH, sweeps.one_key),
     Figure(sweeps.maps, "sweep_rms sweep_stated", EACH, sweeps.two_keys),
     Figure(tuning, "tuned_factor tuned_low tuned_high judged_before judged_after"),
+    Figure(sensitivity.budget, "sobol_first sobol_first_low sobol_first_high sobol_total"),
     Figure(comparing.trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
     Figure(lateness, "lateness_steps lateness_edge"),
     Figure(instruments.planes, "field_calibrated field_measured"),

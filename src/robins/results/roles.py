@@ -171,6 +171,20 @@ ROLES = (
         ("comment", "parts"),
     ),
     Role("judged_after", "part", "objective tuned; likewise", "1"),
+    Role(
+        "sobol_first_{block}",
+        "parameter",
+        "first-order Sobol index of {of}; share of the variance of its RMS error",
+        "1",
+        ("of_filter", "samples", "runs"),
+    ),
+    Role("sobol_first_low_{block}", "parameter", "lower bound; of 95 % confidence", "1"),
+    Role("sobol_first_high_{block}", "parameter", "upper bound; likewise", "1"),
+    Role("sobol_total_{block}", "parameter", "total Sobol index of {of}; with interactions", "1"),
+    Role("sobol_total_low_{block}", "parameter", "lower bound; of 95 % confidence", "1"),
+    Role("sobol_total_high_{block}", "parameter", "upper bound; likewise", "1"),
+    Role("sobol_rms_{block}", "point", "RMS error of {of}; over runs and epochs that count"),
+    Role("sobol_share", "point parameter", "place between the ends of a parameter, 0 to 1", "1"),
     Role("{name}", f"time {_MORE}", "{of}; what else is known of a run", named="context"),
 )
 

@@ -7,6 +7,7 @@ be scaled, and a disturbance that is switched off leaves the numbers of the rest
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,11 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.errors import require
+from robins.sim import _given
 
 
 def outlier_factor(
-    key: Array, shape: Sequence[int], share: float, factor: float
+    key: Array, shape: Sequence[int], share: Any, factor: Any
 ) -> Float[Array, "..."]:
     """``factor`` for a share of the samples, drawn one by one, and 1 for the rest.
 
@@ -28,10 +30,12 @@ def outlier_factor(
     Raises:
         ValueError: a share beyond 0 to 1, or a negative factor.
     """
-    require(0.0 <= share <= 1.0, f"share is {share}; it must be from 0 to 1")
-    require(factor >= 0.0, f"factor is {factor}; it must not be negative")
+    if _given.known(share):
+        require(0.0 <= share <= 1.0, f"share is {share}; it must be from 0 to 1")
+    if _given.known(factor):
+        require(factor >= 0.0, f"factor is {factor}; it must not be negative")
     struck = jax.random.uniform(key, tuple(shape)) < share
-    return jnp.where(struck, float(factor), 1.0)
+    return jnp.where(struck, jnp.asarray(factor, float), 1.0)
 
 
 def student_t(key: Array, shape: Sequence[int], dof: float) -> Float[Array, "..."]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike
 from robins.filters import Motion
 from robins.ins.increments import Increments
 from robins.scenario import Parameters, Quantity, Span, default
+from robins.sim import _given
 from robins.sim.commands import Command, accelerate, climb, stop, straight, turn
 from robins.systems import quantities as q
 
@@ -60,6 +61,16 @@ def refuse_unsettled(name: str, from_s: float, lasts_s: float) -> None:
 def outside(spans: Sequence[Span], time_s: np.ndarray) -> np.ndarray:
     """Which times (N,) lie in none of some spans, (N,) bool."""
     return ~np.any([np.zeros(len(time_s), bool), *(span.holds(time_s) for span in spans)], axis=0)
+
+
+def as_array(numbers: Any) -> Any:
+    """Numbers of parameters as an array: NumPy's, which can be checked; JAX's if one is traced."""
+    return (np if _given.known(numbers) else jnp).asarray(numbers, float)
+
+
+def any_there(numbers: Sequence[Any]) -> bool:
+    """Whether one of some sizes is not zero, or may not be, for it is traced."""
+    return not _given.known(numbers) or any(numbers)
 
 
 Draw = Literal["normal", "plus-sigma", "random-sign"]

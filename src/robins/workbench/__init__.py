@@ -45,6 +45,7 @@ _WHERE = {
     "publishing": "publication",
     "replay": "recorded",
     "run": "simulated",
+    "sensitivity": "sensitivities",
     "sweep": "sweeps",
     "tune": "tuning",
     "verify": "comparison",

@@ -34,7 +34,7 @@ from robins.sim.imu_sensor import corrupt
 from robins.sim.random import Component, stream
 from robins.sim.wind import Carried, carried_at, carry, dryden, gusts, von_karman, wind_at
 from robins.systems.airship.parameters import Airship, Readings
-from robins.systems.parts import outside, signed
+from robins.systems.parts import as_array, outside, signed
 from robins.systems.study import Instrument
 
 PARTS = 2  # increments between two star sights that a filter with states for biases takes
@@ -205,8 +205,8 @@ def simulate(
     gyro_bias = signed(bias[0], imu.gyro_bias, imu.draw)
     accel_bias = signed(bias[1], imu.accel_bias, imu.draw)
     errors = ImuErrorModel(
-        TriadErrors(bias=gyro_bias, white=np.asarray(imu.gyro_noise)),
-        TriadErrors(bias=accel_bias, white=np.asarray(imu.accel_noise)),
+        TriadErrors(bias=gyro_bias, white=as_array(imu.gyro_noise)),
+        TriadErrors(bias=accel_bias, white=as_array(imu.accel_noise)),
     )
     dt = jnp.full(n, 1.0 / imu.rate)
     noise = jax.random.fold_in(unit, _SAMPLES)
@@ -268,7 +268,7 @@ def _turned_since(single: Increments) -> Array:
     return jnp.stack(rest, 1) if rest else jnp.zeros((single.dt.shape[0], 0, 3))
 
 
-def start_sigma(given: Airship) -> np.ndarray:
+def start_sigma(given: Airship) -> Any:
     """(9,) of attitude, velocity and position."""
     s = given.start
-    return np.array([*s.attitude, *s.velocity, *s.position])
+    return as_array([*s.attitude, *s.velocity, *s.position])

@@ -25,7 +25,6 @@ import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
@@ -34,7 +33,7 @@ from robins.filters import Belief, Model, Sensor
 from robins.ins.mechanise import Nav
 from robins.ins.state import InsNoise, InsState, propagate, propagate_linear
 from robins.systems.ins_gnss.parameters import Aids, Gnss, Imu, Start
-from robins.systems.parts import FRD, NED, Block, moved_by
+from robins.systems.parts import FRD, NED, Block, as_array, moved_by
 from robins.systems.study import SensorAxes, StateBlock
 
 POSITION, VELOCITY, STANDSTILL, STILL_RATE, ROAD = (
@@ -223,7 +222,7 @@ def ins_gnss_model(imu: Imu, gnss: Gnss, aids: Aids) -> Model:
 
 
 def start_belief(
-    nav: Nav, imu: Imu, start: Start, tilt_rad: float, heading_rad: float, gyro_bias: Any = None
+    nav: Nav, imu: Imu, start: Start, tilt_rad: Any, heading_rad: Any, gyro_bias: Any = None
 ) -> Belief:
     """The belief at the start, uncorrelated, about attitude, velocity and position of the IMU.
 
@@ -236,4 +235,4 @@ def start_belief(
     mean = InsState.start(nav, imu.scale_states)
     if gyro_bias is not None:
         mean = mean._replace(gyro_bias=jnp.asarray(gyro_bias))
-    return Belief(mean, jnp.diag(jnp.asarray(np.concatenate(sigma))))
+    return Belief(mean, jnp.diag(jnp.asarray(as_array([x for part in sigma for x in part]))))

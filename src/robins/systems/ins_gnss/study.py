@@ -16,10 +16,10 @@ from robins.filters.rules import gate
 from robins.results import array
 from robins.systems.ins_gnss.model import SENSORS, ins_gnss_model, state_blocks
 from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.ins_gnss.world import Course, lay_out, simulate
+from robins.systems.ins_gnss.world import Course, as_believed, belief_of, lay_out, simulate
 from robins.systems.judgement import consistency, consistency_claims
 from robins.systems.parts import refuse_unsettled
-from robins.systems.study import Case, Contender, StateBlock, Study, View, recipe
+from robins.systems.study import Contender, StateBlock, Study, View, recipe
 from robins.systems.tables import place_arrays, track_arrays
 
 FILTERS = {
@@ -68,12 +68,6 @@ def believed_imu(drive: Drive) -> Imu:
     )
 
 
-def _believing(factor: Any, world: Case) -> Case:
-    """The case of a filter that takes the fixes' sigmas for so many times what they are."""
-    aux = {name: of._replace(sigma=factor * of.sigma) for name, of in world.aux.items()}
-    return world._replace(aux=aux)
-
-
 def contender(drive: Drive, course: Course, name: str) -> Contender:
     """A filter with the model it believes in.
 
@@ -83,8 +77,8 @@ def contender(drive: Drive, course: Course, name: str) -> Contender:
     if name in SMOOTHERS:
         raise ValueError(f"{name}: campaigns compare causal filters; `robins replay` smooths a log")
     model = ins_gnss_model(believed_imu(drive), drive.gnss, drive.aids)
-    believed = recipe(_believing, numbers=np.sqrt(drive.believed.r_factor))
-    return Contender(make_filter(name, drive.update.gate), model, believed)
+    case = recipe(as_believed, numbers=belief_of(drive, course))
+    return Contender(make_filter(name, drive.update.gate), model, case)
 
 
 def view(drive: Drive, course: Course) -> View:

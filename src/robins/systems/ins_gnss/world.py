@@ -32,7 +32,7 @@ from robins.sim.random import Component, stream
 from robins.sim.trajectory import Motion
 from robins.systems.ins_gnss.model import POSITION, VELOCITY, Fix, Velocity, start_belief
 from robins.systems.ins_gnss.parameters import Drive, Imu
-from robins.systems.parts import Block
+from robins.systems.parts import Block, any_there, as_array
 from robins.systems.study import Case
 
 
@@ -66,13 +66,13 @@ def error_model(imu: Imu) -> ImuErrorModel:
     """The sensors whose errors the filter's parameters describe."""
 
     def triad(bias, noise, walk, time, scale) -> TriadErrors:
-        given: dict[str, Any] = {"white": np.asarray(noise)}
+        given: dict[str, Any] = {"white": as_array(noise)}
         if time is None:
-            given |= {"bias_sigma": np.asarray(bias), "walk": np.asarray(walk)}
+            given |= {"bias_sigma": as_array(bias), "walk": as_array(walk)}
         else:
-            given |= {"markov_sigma": np.asarray(bias), "markov_tau_s": np.full(3, time)}
+            given |= {"markov_sigma": as_array(bias), "markov_tau_s": as_array([time] * 3)}
         if imu.scale_states:
-            given["scale_sigma"] = np.asarray(scale)
+            given["scale_sigma"] = as_array(scale)
         return TriadErrors(**given)
 
     i = imu
@@ -86,9 +86,9 @@ def receiver_model(drive: Drive) -> GnssErrorModel:
     """The receiver; outages are left to the epochs."""
     g = drive.gnss
     return GnssErrorModel(
-        sigma_m=np.asarray(g.sigma),
-        sigma_v=np.asarray(g.velocity_sigma),
-        lever_b_m=np.asarray(g.lever_arm) if any(g.lever_arm) else None,
+        sigma_m=as_array(g.sigma),
+        sigma_v=as_array(g.velocity_sigma),
+        lever_b_m=as_array(g.lever_arm) if any_there(g.lever_arm) else None,
         rate_hz=g.rate,
         time_offset_s=g.latency,
     )
@@ -206,6 +206,31 @@ def simulate(drive: Drive, course: Course, seed: int, index: Array) -> Case:
             jnp.zeros(shape[0]),
         )
     return Case(start, u, y, aux, truth)
+
+
+class DriveBelief(NamedTuple):
+    """What filters are told of a drive, whatever it is like."""
+
+    factor: Array  # of the covariance at the start
+    sigma: dict[str, Any]  # by sensor
+
+
+def belief_of(drive: Drive, course: Course) -> DriveBelief:
+    """What the parameters tell them."""
+    begin = drive.start
+    known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
+    r, g = np.sqrt(drive.believed.r_factor), drive.gnss
+    sigma = {POSITION: g.sigma} | ({VELOCITY: g.velocity_sigma} if g.use_velocity else {})
+    return DriveBelief(jnp.asarray(known.factor), {k: r * jnp.asarray(v) for k, v in sigma.items()})
+
+
+def as_believed(told: DriveBelief, world: Case) -> Case:
+    """The case of a drive, which may have been drawn with other numbers than filters are told."""
+    aux = {
+        name: fix._replace(sigma=jnp.broadcast_to(told.sigma[name], fix.sigma.shape))
+        for name, fix in world.aux.items()
+    }
+    return world._replace(start=world.start._replace(factor=told.factor), aux=aux)
 
 
 def drive_dataset(drive: Drive, seed: int, run: int = 0) -> Dataset:

@@ -6,7 +6,7 @@ along the body are forward, right, down; along the Earth north, east, down.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
@@ -20,6 +20,7 @@ from robins.systems.parts import (
     Draw,
     Leg,
     Names,
+    as_array,
     refuse_too_long,
     refuse_unsettled,
 )
@@ -120,16 +121,16 @@ class Slave(Parameters):
     accel_calibration: q.AccelSizes | None = None
 
     @property
-    def gyro_left(self) -> np.ndarray:
+    def gyro_left(self) -> Any:
         """(3,) sigma of what is left of the constant drift [rad/s]."""
         calibrated = self.gyro_calibration
-        return np.asarray(self.gyro_bias if calibrated is None else calibrated)
+        return as_array(self.gyro_bias if calibrated is None else calibrated)
 
     @property
-    def accel_left(self) -> np.ndarray:
+    def accel_left(self) -> Any:
         """(3,) sigma of what is left of the constant bias [m/s^2]."""
         calibrated = self.accel_calibration
-        return np.asarray(self.accel_bias if calibrated is None else calibrated)
+        return as_array(self.accel_bias if calibrated is None else calibrated)
 
     @property
     def gyro_sigma(self) -> np.ndarray:
@@ -174,7 +175,7 @@ class Structure(Parameters):
     @property
     def flexure(self) -> Flexure:
         """The same as simulator and filters take it."""
-        sigma, time, bending = (np.asarray(x) for x in (self.sigma, self.time, self.bending))
+        sigma, time, bending = (as_array(x) for x in (self.sigma, self.time, self.bending))
         return Flexure(sigma, time, self.damping, self.tail_dof, bending)
 
 

@@ -43,7 +43,7 @@ from robins.sim.imu_sensor import corrupt
 from robins.sim.manoeuvres import MODERATE_SEA, Bank, Sea, Wave, fly, roughen, sail
 from robins.sim.random import Component, stream, unit
 from robins.sim.trajectory import Motion, at_lever_arm
-from robins.systems.parts import outside, signed
+from robins.systems.parts import any_there, as_array, outside, signed
 from robins.systems.transfer_alignment.product.model import RECORDS, ProductState, Record
 from robins.systems.transfer_alignment.product.parameters import (
     Aircraft,
@@ -264,7 +264,7 @@ def start_estimate(run: PairRun) -> Nav:
 
 def _flexure(pair: PairParameters, course: Course, key: Array) -> tuple[Array, Array]:
     f = pair.flexure
-    if not any((*f.sigma, *f.bending)):
+    if not any_there((*f.sigma, *f.bending)):
         stiff = jnp.zeros((len(course.dt) + 1, 3))
         return stiff, stiff
     load = jnp.asarray(course.load_factor)
@@ -285,11 +285,13 @@ def _slave_errors(pair: PairParameters, course: Course, key: Array) -> tuple[Arr
     """
     s, dt, still = pair.slave, jnp.asarray(course.dt), jnp.zeros((len(course.dt), 3))
     slow = (
-        {"markov_sigma": s.gyro_slow, "markov_tau_s": s.gyro_slow_time} if any(s.gyro_slow) else {}
+        {"markov_sigma": as_array(s.gyro_slow), "markov_tau_s": as_array(s.gyro_slow_time)}
+        if any_there(s.gyro_slow)
+        else {}
     )
     unit = ImuErrorModel(
-        TriadErrors(bias_sigma=s.gyro_left, white=np.asarray(s.gyro_noise), **slow),
-        TriadErrors(bias_sigma=s.accel_left, white=np.asarray(s.accel_noise)),
+        TriadErrors(bias_sigma=s.gyro_left, white=as_array(s.gyro_noise), **slow),
+        TriadErrors(bias_sigma=s.accel_left, white=as_array(s.accel_noise)),
     )
     theta, dv, seen = corrupt(dt, still, still, unit, key)
     bias = seen.gyro.bias

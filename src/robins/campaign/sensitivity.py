@@ -1,0 +1,305 @@
+"""Which share of the variance of an error comes from which uncertain parameter.
+
+Let Y = f(p_1 .. p_d) be an error and the parameters independent. With X ~ p_i all of them but one,
+
+    first order  S_i  = Var(E(Y | p_i)) / Var(Y)        what would go if p_i were known
+    total        ST_i = E(Var(Y | X ~ p_i)) / Var(Y)    what would stay if all others were known
+
+(Sobol 2001, Math. Comput. Simulation 55). S_i <= ST_i; the total has the interactions with other
+parameters too. Both are estimated by Saltelli et al. (2010, Comput. Phys. Commun. 181), as scipy
+has it, from two samples A and B of n points and for each parameter A with its column of B.
+
+Here the world varies and the filter does not: it believes the scenario as written. The numbers that
+vary are data of one compiled program, which is possible because parameters are records that take
+what JAX traces in the place of a number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.stats import qmc, sobol_indices
+
+from robins.campaign.memory import CHUNK, MEMORY, width_of
+from robins.campaign.monte_carlo import one_record
+from robins.filters import Belief
+from robins.filters.sameness import content
+from robins.program.liveness import bytes_of_jaxpr
+from robins.scenario import Parameters
+from robins.systems.study import Contender, Study, View
+
+RESAMPLES = 999  # of the bootstrap
+LEVEL = 0.95  # of its bounds
+ROUNDING = 1e-9  # an RMS that varies by less, relative, does not vary
+DECADE = 10.0  # ends that differ by more than this factor are drawn by their logarithm
+
+Path = tuple[str | int, ...]  # names of fields and numbers of items, from the parameters down
+
+
+# -------------------------------------------------------------------------- numbers that vary
+
+
+class Between(NamedTuple):
+    """The numbers of the parameters that one key stands for, such as three axes, and their ends."""
+
+    paths: tuple[Path, ...]
+    low: tuple[float, ...]  # SI
+    high: tuple[float, ...]
+
+    @property
+    def by_logarithm(self) -> bool:
+        """Whether the logarithm is uniform: the ends have one sign and are more than 10 apart."""
+        pairs = zip(self.low, self.high, strict=True)
+        return all(a * b > 0.0 and max(a / b, b / a) > DECADE * (1.0 + 1e-9) for a, b in pairs)
+
+    def at(self, share: Any) -> dict[Path, Any]:
+        """The numbers at a share from 0 to 1 of the way from the low ends to the high ones."""
+
+        def number(a: float, b: float) -> Any:
+            return a * (b / a) ** share if self.by_logarithm else a + (b - a) * share
+
+        ends = zip(self.paths, self.low, self.high, strict=True)
+        return {path: number(a, b) for path, a, b in ends}
+
+
+def between(low: Any, high: Any) -> Between:
+    """What differs between two sets of parameters.
+
+    Raises:
+        ValueError: nothing differs, or something that is not a number.
+    """
+    found = list(_differing(low, high, ()))
+    if not found:
+        raise ValueError("its two ends are the same")
+    return Between(*(tuple(one) for one in zip(*found, strict=True)))
+
+
+def _differing(low: Any, high: Any, path: Path) -> Iterator[tuple[Path, float, float]]:
+    if isinstance(low, Parameters) and type(low) is type(high):
+        for name in type(low).model_fields:
+            yield from _differing(getattr(low, name), getattr(high, name), (*path, name))
+    elif isinstance(low, tuple) and isinstance(high, tuple) and len(low) == len(high):
+        for k, pair in enumerate(zip(low, high, strict=True)):
+            yield from _differing(*pair, (*path, k))
+    elif isinstance(low, float) and isinstance(high, float):
+        if low != high:
+            yield path, low, high
+    elif low != high:
+        raise ValueError("is no quantity that can take any value between its ends")
+
+
+def placed(given: Any, numbers: Mapping[Path, Any]) -> Any:
+    """Parameters with other numbers, which may be traced and are not checked."""
+    if () in numbers:
+        return numbers[()]
+    inner: dict[str | int, dict[Path, Any]] = {}
+    for (head, *rest), value in numbers.items():
+        inner.setdefault(head, {})[tuple(rest)] = value
+    if isinstance(given, tuple):
+        return tuple(placed(x, inner[k]) if k in inner else x for k, x in enumerate(given))
+    return given.model_copy(
+        update={str(name): placed(getattr(given, str(name)), rest) for name, rest in inner.items()}
+    )
+
+
+# ----------------------------------------------------------------------------- points and runs
+
+
+class Budget(NamedTuple):
+    """A filter in worlds whose numbers vary between their ends."""
+
+    study: Study
+    given: Any  # the parameters as written: what the filter believes
+    course: Any  # laid out by these
+    view: View
+    contender: Contender
+    seed: int
+    ranges: tuple[Between, ...]
+
+    def run(self, shares: Array, index: Array) -> tuple[Array, Array]:
+        """One run at one point; pure.
+
+        Args:
+            shares: (d,) of each parameter, from 0 to 1.
+            index: number of the run.
+
+        Returns:
+            (blocks,) mean over the epochs that count of the squared length of the error, infinite
+            where the filter diverged, as `robins.campaign.Statistics` has it; and a number that
+            changes with what the filter believes at the start.
+        """
+        numbers: dict[Path, Any] = {}
+        for k, one in enumerate(self.ranges):
+            numbers |= one.at(shares[k])
+        world = self.study.simulate(placed(self.given, numbers), self.course, self.seed, index)
+        blocks = tuple((b.name, b.where.start, b.where.stop) for b in self.view.blocks)
+        record = one_record(blocks, self.contender, world)
+        error, sigma = record["error"], record["sigma"]
+        found = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(sigma))
+        counted = error[self.view.count_from : self.view.count_to]
+        squares = [jnp.mean(jnp.sum(counted[:, b.where] ** 2, 1)) for b in self.view.blocks]
+        believed = _believed(self.contender.case(world).start)
+        return jnp.where(found, jnp.stack(squares), jnp.inf), believed
+
+
+def _believed(start: Any) -> Array:
+    """A number of a belief to which each of its standard deviations adds, whatever its unit."""
+    if not isinstance(start, Belief):
+        return jnp.zeros(())
+    size = jnp.sum(jnp.asarray(start.factor, float) ** 2, axis=-1)
+    return jnp.sum(jnp.where(size > 0.0, jnp.log(jnp.where(size > 0.0, size, 1.0)), 0.0))
+
+
+def depends(before: Any, course: Any, after: Any) -> bool:
+    """Whether a course differs from another, by all that can be compared of it.
+
+    Args:
+        before: a course.
+        course: of the same parameters, laid out again: what differs here tells nothing.
+        after: of other parameters.
+    """
+    first, again, other = (jax.tree_util.tree_leaves(x) for x in (before, course, after))
+    if len(first) != len(other):
+        return True
+
+    def alike(a: Any, b: Any) -> bool:
+        if isinstance(a, np.ndarray | np.generic | jax.Array | float | int):
+            return bool(np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f"))
+        return content(a) == content(b)
+
+    each = zip(first, again, other, strict=True)
+    return any(alike(a, b) and not alike(a, c) for a, b, c in each)
+
+
+def untraceable(budget: Budget) -> list[int]:
+    """Numbers of the parameters whose worlds JAX cannot trace, each varied alone."""
+
+    def fails(one: Between) -> bool:
+        alone = budget._replace(ranges=(one,))
+        try:
+            jax.eval_shape(alone.run, jax.ShapeDtypeStruct((1,), float), jnp.asarray(0))
+        except jax.errors.JAXTypeError:
+            return True
+        return False
+
+    return [k for k, one in enumerate(budget.ranges) if fails(one)]
+
+
+def simulate_points(
+    budget: Budget,
+    shares: np.ndarray,
+    runs: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """All runs of all points, in batches of one shape and of bounded memory.
+
+    Args:
+        budget: what is run.
+        shares: (points, d).
+        runs: the same ones, with the same random numbers, at all points.
+        progress: called with the share done.
+
+    Returns:
+        (points, runs, blocks) and (points, runs), as of `Budget.run`.
+
+    Raises:
+        jax.errors.JAXTypeError: a world cannot be traced; see `untraceable`.
+    """
+    total, d = len(shares) * runs, shares.shape[1]
+    batch = jax.jit(jax.vmap(budget.run))
+
+    def shapes(width: int) -> tuple[Any, Any]:
+        number = jnp.asarray(0).dtype
+        return jax.ShapeDtypeStruct((width, d), float), jax.ShapeDtypeStruct((width,), number)
+
+    width = min(total, CHUNK)
+    each = -(-bytes_of_jaxpr(batch.trace(*shapes(width)).jaxpr.jaxpr) // width)
+    width = min(width, width_of(each, MEMORY))
+    squares, believed = [], []
+    for begin in range(0, total, width):
+        at = np.minimum(np.arange(begin, begin + width), total - 1)  # the last is filled up
+        found, told = batch(jnp.asarray(shares[at // runs]), jnp.asarray(at % runs))
+        squares.append(np.asarray(found))
+        believed.append(np.asarray(told))
+        progress(min(begin + width, total) / total)
+    joined = np.concatenate(squares)[:total]
+    return joined.reshape(len(shares), runs, -1), np.concatenate(believed)[:total].reshape(-1, runs)
+
+
+# --------------------------------------------------------------------------------- the indices
+
+
+def sobol_points(d: int, samples: int, seed: int) -> np.ndarray:
+    """(d + 2, samples, d) points in the unit cube: A, B, and A with each column of B.
+
+    A and B are halves of a scrambled Sobol sequence in 2 d dimensions (Saltelli et al. 2010).
+
+    Args:
+        d: parameters.
+        samples: a power of two, which the sequence is balanced for.
+        seed: of the scrambling.
+    """
+    # scipy 1.14 has no `rng` yet; later ones take either name
+    rng = np.random.default_rng(seed)
+    drawn = qmc.Sobol(2 * d, seed=rng).random(samples)  # pyright: ignore[reportCallIssue]
+    A, B = drawn[:, :d], drawn[:, d:]
+    mixed = np.repeat(A[None], d, axis=0)
+    for i in range(d):
+        mixed[i, :, i] = B[:, i]
+    return np.concatenate([A[None], B[None], mixed])
+
+
+class Indices(NamedTuple):
+    """Of each output (s) and parameter (d), with bounds of 95 % confidence; NaN: no variance."""
+
+    first: np.ndarray  # (s, d)
+    first_low: np.ndarray
+    first_high: np.ndarray
+    total: np.ndarray
+    total_low: np.ndarray
+    total_high: np.ndarray
+
+
+def indices(squares: np.ndarray, seed: int, resamples: int = RESAMPLES) -> Indices:
+    """Sobol indices of the RMS over runs, at the points of `sobol_points`.
+
+    The bounds are of a percentile bootstrap that draws points and runs anew, so they tell how far
+    chance in either may have moved an index.
+
+    Args:
+        squares: (d + 2, n, runs, s) mean squares of each run.
+        seed: of the bootstrap.
+        resamples: of it.
+    """
+    _, n, runs, _ = squares.shape
+    rng = np.random.default_rng(seed)
+    rms = np.sqrt(np.mean(squares, axis=2))
+    least, most = np.min(rms, axis=(0, 1)), np.max(rms, axis=(0, 1))
+    known = np.isfinite(most) & (most > (1.0 + ROUNDING) * least)
+    found = np.full((6, squares.shape[3], squares.shape[0] - 2), np.nan)
+    if not np.any(known):
+        return Indices(*found)
+    some = np.ascontiguousarray(np.moveaxis(squares[..., known], 2, -1))  # runs last, to be summed
+    drawn = []
+    for _ in range(resamples):
+        weight = np.bincount(rng.integers(runs, size=runs), minlength=runs) / runs
+        drawn.append(_estimate(np.sqrt(some @ weight)[:, rng.integers(n, size=n)]))
+    tails = 0.5 * (1.0 - LEVEL), 0.5 * (1.0 + LEVEL)
+    bounds = np.quantile(np.array(drawn), tails, axis=0)  # (2, first and total, s, d)
+    for k, value in enumerate(_estimate(rms[..., known])):
+        found[3 * k : 3 * k + 3, known] = value, bounds[0, k], bounds[1, k]
+    return Indices(*found)
+
+
+def _estimate(f: np.ndarray) -> np.ndarray:
+    """(2, s, d) first and total order, of outputs (d + 2, n, s)."""
+    twice = np.concatenate([f, f], axis=2)  # scipy drops axes of one, and fails with two of them
+    of = {"f_A": twice[0].T, "f_B": twice[1].T, "f_AB": np.moveaxis(twice[2:], -1, 1)}
+    found = sobol_indices(func=of, n=f.shape[1])
+    both = (np.reshape(x, (-1, len(f) - 2)) for x in (found.first_order, found.total_order))
+    return np.stack([x[: f.shape[2]] for x in both])
