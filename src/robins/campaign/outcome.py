@@ -13,7 +13,7 @@ from robins.campaign.bound import bound_sigma
 from robins.campaign.machine import machine_for
 from robins.campaign.statistics import Statistics
 from robins.filters import Code, doubts
-from robins.results import Outcome, Progress, array, keeping, silent, variable
+from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
 from robins.systems.study import Problem
 from robins.systems.tables import block_array, innovation_tables
 
@@ -83,7 +83,7 @@ def simulate(
 def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
     """What the statistics of all filters say; bound: (E, r) covariance bound, if there is one."""
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
-    metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
+    metrics = {name: problem.metrics(s) | facts[name] | _chances(s) for name, s in found.items()}
     if bound is not None:
         for name, s in found.items():
             metrics[name] |= _over_bound(problem, s, bound)
@@ -99,6 +99,11 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
             for sentence in doubts(s.tally, problem.contenders[name].bounds)
         ],
     )
+
+
+def _chances(s: Statistics) -> dict[str, Probability]:
+    """How often a filter diverges; one run alone says nothing of that."""
+    return {"diverged_share": Probability.among(s.lost)} if s.runs > 1 else {}
 
 
 def _over_bound(problem: Problem, s: Statistics, bound: np.ndarray) -> dict[str, float]:

@@ -16,6 +16,7 @@ from robins.report.series import Series
 from robins.report.style import Picture
 from robins.report.updates import quantile
 from robins.results import find
+from robins.results.probability import LEVEL, interval
 
 # rule: its local bound, and what that must stay below
 _WORST_CASE = {"h_infinity": "gamma", "adaptive_h_infinity": "xi"}
@@ -27,14 +28,22 @@ def within(solution: xr.Dataset, limit: str) -> Picture:
     data = series.get(solution, "within", limit)
     assert data is not None
     filters = series.filters(solution)
+    runs = int(data.attrs.get("runs", 0))
+    tinted = runs > 1 and len(filters) <= _TINTED
     figure, axes, clock = series.alone(solution, data.x, "share of the runs")
     for i in range(len(filters)):
-        clock.plot(axes, data.x, data.values[i, :, 0], **style.look(i))
+        share = data.values[i, :, 0]
+        clock.plot(axes, data.x, share, **style.look(i))
+        if tinted:
+            low, high = interval(np.rint(share * runs), runs)
+            x, low, high = series.thin(data.x / clock.seconds, low, high)
+            axes.fill_between(x, low, high, color=style.colour(i), alpha=0.15, linewidth=0)
     axes.set(ylim=(-0.02, 1.02))
     style.legend(figure, style.filter_keys(filters))
-    runs = data.attrs.get("runs")
     caption = "Share of the runs whose largest component is within the limit"
-    caption += f", of {int(runs)}." if runs else "."
+    caption += f", of {runs}." if runs else "."
+    if tinted:
+        caption += f" Tint: {100 * LEVEL:.0f}\u00a0% interval of the probability (Clopper-Pearson)."
     title = data.attrs["long_name"]
     return Picture(f"within_{limit}", title[:1].upper() + title[1:], caption, figure)
 
