@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from robins.report import bounds, comparing, curves, instruments, maps, sweeps, updates
+from robins.report import bounds, comparing, curves, instruments, maps, scatter, sweeps, updates
 from robins.report.lateness import lateness
 from robins.report.style import Picture
 from robins.results import find
@@ -47,7 +47,8 @@ FIGURES = (
     Figure(bounds.sigmas, "bound_prior bound bound_unaided bound_without", EACH),
     Figure(bounds.information, "information gramian_rank"),
     Figure(curves.errors, "error sigma bound bounds", EACH),
-    Figure(curves.campaign, "rms mean_sigma bound bounds", EACH, _scatters),
+    Figure(curves.campaign, "rms mean_sigma mean_error bound bounds", EACH, _scatters),
+    Figure(scatter.percentiles, "percentile", EACH),
     Figure(curves.within, "within", EACH),
     Figure(curves.worst_case, "note"),
     Figure(curves.estimates, "estimate sigma", EACH, _tells_more),
