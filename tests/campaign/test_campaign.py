@@ -12,6 +12,7 @@ from scipy import stats
 from robins.campaign import Statistics, monte_carlo, record, rms_with_bounds, simulate, worlds
 from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
 from robins.filters.rules import h_infinity
+from robins.results import Probability
 from robins.sim.random import Component, stream
 from robins.systems.study import Case, Contender, Limit, Problem, SensorAxes, StateBlock
 
@@ -151,6 +152,7 @@ def test_a_filter_that_cannot_predict_has_no_error_to_show(problem):
     assert np.all(np.isfinite(record["error"][:, : first[0]]))
     assert collect([record], problem.blocks).diverged == 3
     outcome = simulate(none, 3, chunk=4)
+    assert outcome.metrics["hinf"]["diverged_share"] == Probability.among(np.ones(3, bool))
     assert outcome.counts["hinf_prediction_infeasible"] == outcome.counts["hinf_y_not_predicted"]
     assert outcome.counts["hinf_prediction_infeasible"] >= np.sum(STEPS - 1 - first)
     assert outcome.warnings[0].startswith("hinf: ")
@@ -160,6 +162,7 @@ def test_a_filter_that_cannot_predict_has_no_error_to_show(problem):
 def test_all_filters_see_the_same_numbers(problem):
     outcome = simulate(problem, 5, chunk=4)
     assert list(outcome.metrics) == ["right", "sure", "wrong R"]
+    assert outcome.metrics["sure"]["diverged_share"] == Probability.among(np.zeros(5, bool))
     assert not outcome.warnings  # R = 0.2^2 for 0.4^2 is not yet worth a word
     y = outcome.solution["innovation_y"].values[:, 0, 0]
     # the first innovation is y - F m0 whatever R is believed

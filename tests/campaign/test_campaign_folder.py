@@ -142,9 +142,8 @@ def test_a_run_shown_alone_is_that_of_the_campaign(undisturbed, run):
     whole = gather(store, plan, problem).found
     shown = campaign_show(undisturbed, run)
     assert shown.runs == 1
-    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.runs)
-    alone = Worker(store, plan, problem).run_of(chunk, run - chunk.begin)
-    for name, one in alone.items():
+    again = Worker(store, plan, problem).runs_of(plan.chunk_of(run), list(plan.filters), [run])
+    for name, (one,) in ((name, of.values()) for name, of in again.items()):
         np.testing.assert_array_equal(one.run_rms[0], whole[name].run_rms[run])
         first = one.first_run["error"]
         np.testing.assert_array_equal(np.sqrt(np.mean(first**2, axis=0)), one.run_rms[0])
@@ -164,7 +163,7 @@ def test_a_run_in_lanes_is_that_of_the_campaign(tmp_path, monkeypatch):
     whole = gather(store, plan, problem).found["kf"]
     chunks = list(plan.chunks)
     for run in (0, 13, 20):
-        alone = worker.run_of(chunks[run // 8], run % 8)["kf"]
+        alone = worker.runs_of(chunks[run // 8], ["kf"], [run])["kf"][run]
         np.testing.assert_array_equal(alone.run_rms[0], whole.run_rms[run])
     again = Worker(store, plan, problem).found(chunks[1], ["kf"])["kf"]
     shard = plan.shard(chunks[1], "kf")

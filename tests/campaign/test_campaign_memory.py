@@ -50,6 +50,9 @@ def equal(a, b):
     assert list(a.each) == list(b.each)
     for name in a.each:
         np.testing.assert_array_equal(a._all(name), b._all(name), err_msg=name)
+    assert list(a.bins) == list(b.bins)
+    for name in a.bins:
+        np.testing.assert_array_equal(a.bins[name], b.bins[name], err_msg=name)
     for x, y in zip(jax.tree.leaves(a.example), jax.tree.leaves(b.example), strict=True):
         np.testing.assert_array_equal(x, y)
 

@@ -114,6 +114,7 @@ def statistics(seed: int) -> Statistics:
     found = Statistics((), runs=4, diverged=1, n=6)
     found.sums = {"square": rng.normal(size=(5, 3)), "dof of y": rng.integers(0, 9, 5)}
     found.each = {"rms": [rng.normal(size=(3, 2)), rng.normal(size=(1, 2))]}
+    found.bins = {"attitude": np.arange(6, dtype=np.int32).reshape(2, 3) + np.int32(seed)}
     return found
 
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from robins import report
 from robins.report import comparing, curves, instruments, series, style, updates
-from robins.results import array
+from robins.results import Probability, array
 
 
 def test_errors_are_drawn_in_their_unit_with_three_sigma(drive):
@@ -197,6 +197,18 @@ def test_bars_are_as_long_as_their_numbers(town):
     assert [bar.get_width() for bar in axes.patches] == pytest.approx([0.0213, 0.0213 * 1.7])
     assert [text.get_text() for text in axes.texts] == ["0.0213", "0.03621"]
     assert axes.get_xlim()[0] == 0.0
+
+
+def test_a_probability_is_a_bar_with_its_interval_on_it():
+    few, none = (Probability.among(np.arange(50) < n) for n in (10, 0))
+    filters = {"a": {"diverged_share": few}, "b": {"diverged_share": none}}
+    picture = comparing.comparison(a_summary() | {"filters": filters})
+    axes = picture.figure.axes[0]
+    assert [bar.get_width() for bar in axes.patches] == [0.2, 0.0]
+    assert [list(line.get_xdata()) for line in axes.lines] == [[*few[1:3]], [*none[1:3]]]
+    assert [text.get_text() for text in axes.texts] == ["0.2", "0"]
+    assert axes.texts[0].xy[0] == few.high  # behind the line
+    assert "interval" in picture.caption
 
 
 def test_one_filter_is_compared_with_nothing():

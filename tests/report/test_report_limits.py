@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from figure_reading import collisions, lines_of
+from scipy import stats
 
 from robins import report
 from robins.report import curves, style, updates
@@ -48,6 +49,22 @@ def test_shares_are_drawn_as_they_are(aligned):
     assert "50" in picture.caption
     picture.figure.canvas.draw()
     assert not collisions(picture.figure)
+
+
+def test_shares_stand_in_the_interval_of_their_probability(aligned):
+    axes = curves.within(aligned, "5_arcmin").figure.axes[0]
+    assert len(axes.collections) == 3
+    for i, tint in enumerate(axes.collections):
+        corners = tint.get_paths()[0].vertices
+        for k in (0, 17, 39):
+            hits = round(50 * float(aligned["within_5_arcmin"][i, k]))
+            at = corners[np.isclose(corners[:, 0], TIME[k]), 1]
+            want = stats.binomtest(hits, 50).proportion_ci(method="exact")
+            np.testing.assert_allclose((at.min(), at.max()), (want.low, want.high), atol=1e-9)
+    many = xr.concat([aligned, aligned], "filter", data_vars="minimal")
+    picture = curves.within(many, "5_arcmin")
+    assert not picture.figure.axes[0].collections  # six tints could not be told apart
+    assert "Tint" not in picture.caption
 
 
 def test_worst_case_curves_are_of_the_filters_that_have_a_gamma(aligned):

@@ -25,6 +25,7 @@ from robins.report import numbers
         ("nis_inside_percent", "NIS inside", "%"),
         ("anees", "ANEES", ""),
         ("share_below_5_arcmin", "Share below 5 arcmin", ""),
+        ("settled_share_5_arcmin", "Settled share 5 arcmin", ""),
         ("euler", "Euler angles", ""),
         ("accel_bias_rms_mg", "Accelerometer bias RMS", "mg"),
         ("step_us", "Step", "µs"),

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from robins.results import Outcome, ResultError
+from robins.results import Outcome, Probability, ResultError
 from robins.workbench import publish
 from robins.workbench.comparison import compare, lines, ratios, verify
 
@@ -53,6 +53,13 @@ def test_a_result_is_equal_to_itself(tmp_path):
     assert not found.asked
     assert not found.changed
     assert lines(found) == ["x/y and x/y", "0 of 3 metrics differ."]
+
+
+def test_probabilities_are_compared_by_their_shares(tmp_path):
+    few, more = (Probability.among(np.arange(50) < n) for n in (10, 15))
+    found = compare(made(tmp_path / "a", few), made(tmp_path / "b", more))
+    text = "\n".join(lines(found))
+    assert "rms_m  0.2 (0.1 to 0.34) -> 0.3 (0.18 to 0.45)   (1.5 times)" in text
 
 
 def test_ratios_of_what_is_no_number_are_none():

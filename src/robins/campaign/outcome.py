@@ -10,11 +10,12 @@ import numpy as np
 import xarray as xr
 
 from robins.campaign.bound import bound_sigma
+from robins.campaign.histogram import WORST
 from robins.campaign.machine import machine_for
-from robins.campaign.statistics import Statistics
+from robins.campaign.statistics import PERCENTS, Statistics, thinned
 from robins.filters import Code, doubts
-from robins.results import Outcome, Progress, array, keeping, silent, variable
-from robins.systems.study import Problem
+from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
+from robins.systems.study import Problem, StateBlock
 from robins.systems.tables import block_array, innovation_tables
 
 
@@ -83,7 +84,7 @@ def simulate(
 def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
     """What the statistics of all filters say; bound: (E, r) covariance bound, if there is one."""
     facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
-    metrics = {name: problem.metrics(s) | facts[name] for name, s in found.items()}
+    metrics = {name: problem.metrics(s) | facts[name] | _chances(s) for name, s in found.items()}
     if bound is not None:
         for name, s in found.items():
             metrics[name] |= _over_bound(problem, s, bound)
@@ -99,6 +100,11 @@ def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray
             for sentence in doubts(s.tally, problem.contenders[name].bounds)
         ],
     )
+
+
+def _chances(s: Statistics) -> dict[str, Probability]:
+    """How often a filter diverges; one run alone says nothing of that."""
+    return {"diverged_share": Probability.among(s.lost)} if s.runs > 1 else {}
 
 
 def _over_bound(problem: Problem, s: Statistics, bound: np.ndarray) -> dict[str, float]:
@@ -143,6 +149,9 @@ def campaign_solution(
     data: dict[str, Any] = {str(k): v for k, v in problem.context.variables.items()}
     data["filter"] = ("filter", list(found))
     data["time"] = variable("time", problem.epoch_s, "s", "time since the start")
+    if runs > 1:
+        some = problem.epoch_s[thinned(len(problem.epoch_s))]
+        data["thinned_time"] = variable("thinned_time", some, "s", "time since the start")
     for b in problem.blocks:
         words = b.name.replace("_", " ")
         for role, text, pick, about in (
@@ -155,6 +164,8 @@ def campaign_solution(
             data |= block_array(role, b, values, text, **about)
         if bound is not None:
             data |= block_array("bound", b, bound[:, b.where])
+        if runs > 1:
+            data |= _scatter(b, found)
     # what an H-infinity filter states is no covariance, so no chi-square test applies to it
     bound = np.array([problem.contenders[name].bounds for name in found])
     data |= array("bounds", bound.astype(np.int8), long_name="states bounds, not sigmas")
@@ -178,6 +189,21 @@ def campaign_solution(
     data |= problem.shown({name: s.first_run["mean"] for name, s in found.items()})
     seen = [s.first_run["updates"] for s in found.values()]
     return xr.Dataset(data | innovation_tables(seen, problem.sensors, problem.epoch_s))
+
+
+def _scatter(b: StateBlock, found: dict[str, Statistics]) -> dict[str, Any]:
+    """How the errors of a block are spread over the runs: their mean, covariance, percentiles."""
+    runs = next(iter(found.values())).runs
+    mean = _stack(found, lambda s: s.mean)[:, :, b.where]
+    covariance = _stack(found, lambda s: s.covariance(b))
+    whole = {"unit": f"({b.units})^2", "frame": b.frame, "axes": b.axes, "runs": runs}
+    lengths = _stack(found, lambda s: s.percentiles(b))
+    shown = {"unit": b.units, "display_unit": b.display_unit, "runs": runs, "bins": WORST}
+    return (
+        block_array("mean_error", b, mean, runs=runs)
+        | array("covariance", covariance, b.name, **whole)
+        | array("percentile", lengths, b.name, axes=[f"{p} %" for p in PERCENTS], **shown)
+    )
 
 
 def _notes(found: dict[str, Statistics]) -> dict[str, Any]:

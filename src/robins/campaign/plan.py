@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import metadata
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import robins
@@ -19,7 +19,8 @@ from robins.errors import RobinsError
 
 NAME = "campaign.json"
 SCHEMA = 1
-_WANTED = ("runs", "filters", "claims", "title")  # change no run of a filter
+KEPT = ("keep", "keep_diverged")  # say what is kept of the runs
+_WANTED = ("runs", "filters", "claims", "title", *KEPT)  # change no run of a filter
 _SOURCES = {".py", ".h", ".cc", ".toml", ".csv", ".json"}
 
 
@@ -29,6 +30,11 @@ class Shard(NamedTuple):
     name: str  # of its object
     filter: str
     chunk: int
+
+    @property
+    def stem(self) -> str:
+        """Its name without group and ending."""
+        return PurePosixPath(self.name).stem
 
 
 class Chunk(NamedTuple):
@@ -68,8 +74,7 @@ class Plan:
     @property
     def chunks(self) -> Iterator[Chunk]:
         """All chunks, in the order in which they are joined."""
-        for k, begin in enumerate(range(0, self.runs, self.width)):
-            yield Chunk(k, begin, min(self.width, self.runs - begin))
+        yield from map(self.chunk_of, range(0, self.runs, self.width))
 
     def shard(self, chunk: Chunk, name: str) -> Shard:
         """The shard of a filter, whose name is a hash of all that its content depends on."""
@@ -82,6 +87,22 @@ class Plan:
     def shards(self) -> dict[Chunk, list[Shard]]:
         """Of each chunk the shards of all filters."""
         return {c: [self.shard(c, name) for name in self.filters] for c in self.chunks}
+
+    @property
+    def keep(self) -> tuple[int, ...]:
+        """Runs whose histories are kept."""
+        return tuple(scenario.mapping_of(self.text).get("keep", ()))
+
+    @property
+    def keep_diverged(self) -> int | None:
+        """Of how many diverged runs of each filter the histories are kept; None: of all."""
+        most = scenario.mapping_of(self.text).get("keep_diverged", 0)
+        return None if most == "all" else most
+
+    def chunk_of(self, run: int) -> Chunk:
+        """The chunk that holds a run."""
+        begin = run // self.width * self.width
+        return Chunk(run // self.width, begin, min(self.width, self.runs - begin))
 
     def with_more(self, runs: int, filters: tuple[str, ...]) -> Plan:
         """The plan of as many runs and of these filters too."""

@@ -51,6 +51,7 @@ def pack(about: Mapping[str, Any], statistics: Statistics) -> bytes:
 def tables(statistics: Statistics) -> dict[str, np.ndarray]:
     """All arrays of statistics, by name."""
     found = {f"sum {name}": np.asarray(x) for name, x in statistics.sums.items()}
+    found |= {f"bins {name}": x for name, x in statistics.bins.items()}
     return found | {f"each {name}": np.concatenate(x) for name, x in statistics.each.items()}
 
 
@@ -86,6 +87,8 @@ def unpack(content: bytes, into: Statistics, example: Any = None) -> dict[str, A
             into.sums[what] = arrays[name]
         elif kind == "each":
             into.each[what] = [arrays[name]]
+        elif kind == "bins":
+            into.bins[what] = arrays[name]
         else:
             leaves.append(arrays[name])
     if leaves and example is not None:

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from scipy import stats
 
+from robins.campaign.histogram import counted, joined, percentiles
 from robins.filters import Tally
 from robins.filters.analysis.consistency import Verdict, grand_mean_nis
 from robins.filters.chi_square import chi2_band
@@ -33,6 +34,8 @@ class Statistics:
         example: the record of the first run, for figures.
         sums: over the runs, arrays by name.
         each: of every run, by name arrays with a leading axis of runs, one a chunk.
+        bins: by block, tables of `robins.campaign.histogram`: lengths of the error at the epochs of
+            `thinned`.
     """
 
     blocks: Sequence[StateBlock]
@@ -47,6 +50,7 @@ class Statistics:
     example: dict[str, Any] | None = None
     sums: dict[str, Any] = field(default_factory=dict)
     each: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    bins: dict[str, np.ndarray] = field(default_factory=dict)
 
     def add(self, record: dict[str, Any]) -> None:
         """Take in a chunk as `robins.campaign.record` gives it."""
@@ -58,6 +62,7 @@ class Statistics:
         self.diverged += int(np.sum(bad))
         self.n = int(record["dim"][0])
         error = _infinite(error, bad)
+        self._sum("error", error)
         self._sum("square", error**2)
         self._sum("variance", sigma**2)
         self._sum("nees", _infinite(record["nees"], bad))
@@ -67,6 +72,7 @@ class Statistics:
             self._sum(f"nis of {name}", update.nis)
             self._sum(f"dof of {name}", update.dof)
         self._outputs(record.get("outputs", {}), bad)
+        self._scatter(error)
         self._lengths(error)
         self._within(error)
         self._each("lost", bad)
@@ -92,6 +98,8 @@ class Statistics:
             self.sums[name] = self.sums[name] + value if name in self.sums else value
         for name, values in other.each.items():
             self.each.setdefault(name, []).extend(values)
+        for name, table in other.bins.items():
+            self._count(name, table)
 
     def blank(self) -> Statistics:
         """Of no runs yet, with the settings of these: for a chunk, to be merged."""
@@ -106,6 +114,9 @@ class Statistics:
     def _each(self, name: str, values: Any) -> None:
         self.each.setdefault(name, []).append(np.array(values))
 
+    def _count(self, name: str, table: np.ndarray) -> None:
+        self.bins[name] = joined(self.bins[name], table) if name in self.bins else table
+
     def _all(self, name: str) -> np.ndarray:
         return np.concatenate(self.each[name])
 
@@ -117,6 +128,15 @@ class Statistics:
             self._each(f"rms of {name}", np.sqrt(squares))
             worst = np.max(np.linalg.norm(value[:, self.counted], axis=2), axis=1)
             self._each(f"worst of {name}", worst)
+
+    def _scatter(self, error: np.ndarray) -> None:
+        """How the errors of each block lie together, and how long they are, at some epochs."""
+        some = error[:, thinned(error.shape[1])]
+        for block in self.blocks:
+            of = some[:, :, block.where]
+            i, j = np.tril_indices(of.shape[2], -1)
+            self._sum(f"product of {block.name}", of[:, :, i] * of[:, :, j])
+            self._count(block.name, counted(np.linalg.norm(of, axis=2)))
 
     def _lengths(self, error: np.ndarray) -> None:
         for norm in self.norms:
@@ -157,6 +177,39 @@ class Statistics:
     def rms(self) -> np.ndarray:
         """(E, r) root mean square error over the runs."""
         return np.sqrt(self.sums["square"] / self.runs)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(E, r) mean error over the runs: what a filter errs in all of them alike."""
+        return self.sums["error"] / self.runs
+
+    @property
+    def thinned(self) -> np.ndarray:
+        """(T,) numbers of the epochs of `covariance` and `percentiles`."""
+        return thinned(len(self.sums["error"]))
+
+    def covariance(self, block: StateBlock) -> np.ndarray:
+        """(T, k, k) covariance of the errors of a block; NaN of one run, infinite if one diverged.
+
+        From sums of products, so that it has lost digits where the mean is far beyond the scatter.
+        """
+        k, at = len(block.axes), self.thinned
+        if self.diverged or self.runs < 2:
+            return np.full((len(at), k, k), np.inf if self.diverged else np.nan)
+        i, j = np.tril_indices(k, -1)
+        mean = self.mean[at, block.where]
+        products = np.zeros((len(at), k, k))
+        products[:, i, j] = products[:, j, i] = self.sums[f"product of {block.name}"]
+        products[:, range(k), range(k)] = self.sums["square"][at, block.where]
+        mean_products = mean[:, :, None] * mean[:, None, :]
+        return (products - self.runs * mean_products) / (self.runs - 1)
+
+    def percentiles(self, block: StateBlock) -> np.ndarray:
+        """(T, 4) lengths of the error of a block that `PERCENTS` of the runs do not exceed.
+
+        To the width of a bin, see `robins.campaign.histogram`; a diverged run is beyond all.
+        """
+        return percentiles(self.bins[block.name], len(self.thinned), PERCENTS)
 
     @property
     def sigma(self) -> np.ndarray:
@@ -268,6 +321,13 @@ class Statistics:
 
 
 TALLY = " counted of "
+PERCENTS = (5, 50, 95, 99)
+THIN = 128  # epochs at which the scatter is kept: its memory does not grow with the steps
+
+
+def thinned(epochs: int) -> np.ndarray:
+    """Numbers of at most `THIN` epochs from the first to the last, evenly."""
+    return np.unique(np.rint(np.linspace(0, epochs - 1, min(THIN, epochs))).astype(int))
 
 
 def _by_name(tally: Tally) -> dict[str, Any]:

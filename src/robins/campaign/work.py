@@ -9,16 +9,18 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePosixPath
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from robins.campaign.gather import blank
 from robins.campaign.machine import ByJax, InLanes, Part
 from robins.campaign.plan import Chunk, Plan, Shard
+from robins.campaign.retention import DIVERGED, NAMED, by_stem, histories, name_of, trim
 from robins.campaign.shards import pack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
@@ -38,7 +40,7 @@ class Missing(NamedTuple):
     @property
     def claim(self) -> str:
         """The name of the object that claims it."""
-        return f"claims/{PurePosixPath(self.shards[0].name).stem}"
+        return f"claims/{self.shards[0].stem}"
 
 
 def missing(store: Store, shards: Mapping[Chunk, list[Shard]]) -> list[Missing]:
@@ -58,6 +60,7 @@ class Worker:
         self.store, self.plan, self.problem = store, plan, problem
         self.machine = InLanes(problem) if plan.machine == "c" else ByJax(problem)
         self._shards = plan.shards
+        self._stems = by_stem(self._shards)
         self._seen: dict[str, float] = {}  # when a claim was first seen
         self._took = 0.0
 
@@ -75,9 +78,11 @@ class Worker:
             self.store.drop(taken.claim)
 
     def compute(self, one: Missing) -> None:
-        """Compute shards of a chunk and put them."""
+        """Compute shards of a chunk and put them, after the histories that are kept of its runs."""
         names = [s.filter for s in one.shards]
         found = self.found(one.chunk, names)
+        for shard in one.shards:
+            self._keep(shard, one.chunk, found[shard.filter])
         for shard in one.shards:
             self.store.put(shard.name, self.packed(shard, one.chunk, found[shard.filter]))
 
@@ -94,22 +99,45 @@ class Worker:
         part = Part(chunk.begin, chunk.runs, self.plan.width)
         return self.machine.compute(part, names, taken)
 
-    def run_of(self, chunk: Chunk, index: int) -> dict[str, Statistics]:
-        """Of all filters the statistics of one run of a chunk, with its histories.
+    def runs_of(
+        self, chunk: Chunk, names: list[str], runs: Sequence[int]
+    ) -> dict[str, dict[int, Statistics]]:
+        """Of filters the statistics of some runs of a chunk, each alone with its histories.
 
-        The chunk is computed as it was, so that the run has the same bits.
+        The chunk is computed as it was, so that the runs have the same bits.
         """
         part = Part(chunk.begin, chunk.runs, self.plan.width)
-        found = {}
-        for name, record in self.machine.histories(part, list(self.problem.contenders)).items():
-            found[name] = blank(self.problem)
-            found[name].add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
-        return found
+        return {
+            name: {run: self._alone(record, run - chunk.begin) for run in runs}
+            for name, record in self.machine.histories(part, names).items()
+        }
+
+    def _alone(self, record: dict[str, Any], index: int) -> Statistics:
+        one = blank(self.problem)
+        one.add(jax.tree_util.tree_map(lambda x: x[index : index + 1], record))
+        return one
 
     def packed(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> bytes:
         """A shard as it is stored: equal ones are equal files, since none tells who made it."""
         about = {"filter": shard.filter, "begin": chunk.begin, "code": self.plan.code}
         return pack(about, statistics)
+
+    def _keep(self, shard: Shard, chunk: Chunk, statistics: Statistics) -> None:
+        """Put the histories of those runs of a chunk that the scenario wants kept."""
+        every, most = range(chunk.begin, chunk.begin + chunk.runs), self.plan.keep_diverged
+        group = {run: NAMED for run in self.plan.keep if run in every}
+        lost = [every[k] for k in np.flatnonzero(statistics.lost)] if most != 0 else []
+        if lost and most is not None:
+            there = histories(self.store, DIVERGED, self._stems).get(shard.filter, [])
+            first = sorted({*lost, *(h.run for h in there)})[:most]
+            lost = [run for run in lost if run in first]
+        group = dict.fromkeys(lost, DIVERGED) | group
+        if not group:
+            return
+        for run, one in self.runs_of(chunk, [shard.filter], list(group))[shard.filter].items():
+            self.store.put(name_of(group[run], shard, run), self.packed(shard, chunk, one))
+        if lost and most is not None:
+            trim(self.store, self._stems, shard.filter, most)
 
     def _next(self, lack: list[Missing]) -> Missing | None:
         """What nobody claims; else what was claimed for long; else nothing for now."""

@@ -146,9 +146,11 @@ def status(where: str, as_json: bool) -> None:
 def _progress_text(where: str, found: Any) -> str:
     lines = [f"{found.scenario}, seed {found.seed}, by {found.machine}: {found.wanted} runs wanted"]
     for name in found.filters:
-        lost = found.diverged[name]
-        numbers = ", ".join(map(str, lost[:10])) + (" ..." if len(lost) > 10 else "")
-        told = f"   diverged: {numbers}" if lost else ""
+        told = "".join(
+            f"   {what}: {', '.join(map(str, runs[:10]))}{' ...' if len(runs) > 10 else ''}"
+            for what, runs in (("diverged", found.diverged[name]), ("kept", found.kept[name]))
+            if runs
+        )
         lines.append(f"  {name:<20} {found.done[name]:>8} done{told}")
     lines.append(
         f"shards: {found.shards}, {found.missing} missing, {len(found.damaged)} damaged"

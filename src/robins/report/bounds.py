@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -116,12 +115,7 @@ def _scale(axes: Axes, every: np.ndarray, without: np.ndarray, unaided: np.ndarr
     if not np.isfinite(low):
         return  # known exactly all the time
     top = min(float(np.max(both)), _BEYOND * max(float(np.max(every)), low))
-    axes.set_yscale("log")
-    axes.set_ylim(min(0.8 * low, top / 10.0), 1.25 * top)
-    few = top < 100.0 * low
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    style.decades(axes, low, top)
 
 
 @style.styled

@@ -10,7 +10,7 @@ import xarray as xr
 
 from robins.report import numbers, series, style
 from robins.report.style import Picture
-from robins.results import find
+from robins.results import Probability, find
 
 _MOST = 12  # charts of one figure
 _COLUMNS = 3
@@ -22,7 +22,7 @@ def metrics(filters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float | 
     found = {}
     for name in names:
         row = [values.get(name) for values in filters.values()]
-        plain = [v if _is_number(v) else None for v in row]
+        plain = [v if _is_number(v) else None for v in map(Probability.share_of, row)]
         if sum(v is not None for v in plain) >= 2:
             found[name] = plain
     return found
@@ -44,20 +44,24 @@ def comparison(summary: Mapping[str, Any]) -> Picture | None:
     figure, grid = style.new(rows, columns, 0.5 + rows * (0.5 + 0.24 * len(filters)))
     engine: Any = figure.get_layout_engine()
     engine.set(wspace=0.07, hspace=0.06)  # else the last number of one touches the first of another
-    places = range(len(filters))
+    places, uncertain = range(len(filters)), False
     for axes, (name, values) in zip(grid.flat, found.items(), strict=False):
+        chances = [Probability.read(of.get(name)) for of in summary["filters"].values()]
+        ends = [value or 0.0 for value in values]
         for i, value in enumerate(values):
-            axes.barh(i, value or 0.0, 0.66, color=style.colour(i))
+            axes.barh(i, ends[i], 0.66, color=style.colour(i))
+            if (chance := chances[i]) is not None:
+                axes.plot([chance.low, chance.high], [i, i], color=style.TRUTH, linewidth=1.0)
+                ends[i], uncertain = chance.high, True
             axes.annotate(
                 numbers.show(value),
-                (max(value or 0.0, 0.0), i),
+                (max(ends[i], 0.0), i),
                 (4, 0),
                 textcoords="offset points",
                 va="center",
                 fontsize=8.0,
             )
-        present = [v for v in values if v is not None]
-        low, high = min(0.0, *present), max(0.0, *present)
+        low, high = min(0.0, *ends), max(0.0, *ends)
         axes.set_xlim(low * 1.1, (high or 1.0) * 1.45)  # room for the numbers behind the bars
         axes.set_ylim(len(filters) - 0.5, -0.5)
         axes.set_yticks(list(places), filters)
@@ -72,6 +76,8 @@ def comparison(summary: Mapping[str, Any]) -> Picture | None:
         if number >= len(found):
             axes.set_visible(False)
     caption = "The filters on the same data. Each chart has its own scale, which begins at zero."
+    if uncertain:
+        caption += " A line over a bar is the 95\u00a0% interval of a probability."
     return Picture("comparison", "Comparison of the filters", caption, figure)
 
 

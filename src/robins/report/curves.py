@@ -16,6 +16,7 @@ from robins.report.series import Series
 from robins.report.style import Picture
 from robins.report.updates import quantile
 from robins.results import find
+from robins.results.probability import LEVEL, interval
 
 # rule: its local bound, and what that must stay below
 _WORST_CASE = {"h_infinity": "gamma", "adaptive_h_infinity": "xi"}
@@ -27,14 +28,22 @@ def within(solution: xr.Dataset, limit: str) -> Picture:
     data = series.get(solution, "within", limit)
     assert data is not None
     filters = series.filters(solution)
+    runs = int(data.attrs.get("runs", 0))
+    tinted = runs > 1 and len(filters) <= style.TINTED
     figure, axes, clock = series.alone(solution, data.x, "share of the runs")
     for i in range(len(filters)):
-        clock.plot(axes, data.x, data.values[i, :, 0], **style.look(i))
+        share = data.values[i, :, 0]
+        clock.plot(axes, data.x, share, **style.look(i))
+        if tinted:
+            low, high = interval(np.rint(share * runs), runs)
+            x, low, high = series.thin(data.x / clock.seconds, low, high)
+            axes.fill_between(x, low, high, color=style.colour(i), alpha=0.15, linewidth=0)
     axes.set(ylim=(-0.02, 1.02))
     style.legend(figure, style.filter_keys(filters))
-    runs = data.attrs.get("runs")
     caption = "Share of the runs whose largest component is within the limit"
-    caption += f", of {int(runs)}." if runs else "."
+    caption += f", of {runs}." if runs else "."
+    if tinted:
+        caption += f" Tint: {100 * LEVEL:.0f}\u00a0% interval of the probability (Clopper-Pearson)."
     title = data.attrs["long_name"]
     return Picture(f"within_{limit}", title[:1].upper() + title[1:], caption, figure)
 
@@ -98,7 +107,6 @@ def bound_note(solution: xr.Dataset) -> str:
 
 
 _START = 0.2  # of the time axis
-_TINTED = 4  # filters whose tints can be told apart
 _BEYOND = 4.0  # a stated sigma this many times any error does not set the scale
 _STEEP = 3.0  # a start this much higher than all that follows is cut off, and said so
 
@@ -276,6 +284,8 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
     stated = series.get(solution, "mean_sigma", block)
     best = bounds.beside(solution, block)
     filters = series.filters(solution)
+    few = len(filters) <= style.TINTED
+    mean = series.get(solution, "mean_error", block) if few else None
     runs = int(rms.attrs.get("runs", 0))
     figure, stack, clock = series.stacked(solution, rms.x, rms.axes, rms.unit)
     for k, axes in enumerate(stack):
@@ -286,12 +296,15 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
             if stated is not None:
                 x, y = series.thin(stated.x / clock.seconds, stated.values[i, :, k], points=600)
                 axes.plot(x, y, color=style.dark(i), linewidth=0.9, zorder=3)
-                if runs and len(filters) <= _TINTED:
+                if runs and few:
                     # The mean square of N errors of variance sigma^2 is sigma^2 chi2(N)/N.
                     low, high = (np.sqrt(quantile(p, runs) / runs) for p in (0.025, 0.975))
                     band = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
                     axes.fill_between(x, low * y, high * y, **band)
                 lines.append(stated.values[i, :, k])
+            if mean is not None:
+                x, y = series.thin(mean.x / clock.seconds, np.abs(mean.values[i, :, k]), points=600)
+                axes.plot(x, y, color=style.colour(i), linestyle=":", linewidth=0.8, zorder=2)
         if best is not None:
             lines.append(bounds.draw(axes, best, k, clock.seconds))
         kept = _in_scale(lines, rms.values[:, :, k])
@@ -299,17 +312,23 @@ def campaign(solution: xr.Dataset, block: str) -> Picture:
             axes.set_ylim(0.0, None if len(kept) == len(lines) else _top(kept))
     label = f"σ stated{_or_bound(solution)}"
     more = [style.key(label, color=style.GREY, linewidth=0.8)] if stated is not None else []
+    dots = {"color": style.GREY, "linestyle": ":", "linewidth": 0.8}
+    more += [style.key("|mean error|", **dots)] if mean is not None else []
     more += [bounds.key()] if best is not None else []
     style.legend(figure, _keys(filters, solution, *more))
     name = words(block)
     caption = f"Root mean square error of the {name} over {runs or 'all'} runs."
     if stated is not None and runs:
-        if len(filters) <= _TINTED:
+        if few:
             caption += " If the stated sigma (thin) is true, the line stays in the tint"
             caption += " 95\u00a0% of the time."
         else:
             caption += " Thin lines: the stated sigma."
         caption += bound_note(solution)
+    if mean is not None and runs:
+        share = 100.0 * 1.96 / np.sqrt(runs)
+        caption += f" Of a filter without bias the mean error (dotted) is below {share:.0f}\u00a0%"
+        caption += " of the line 95\u00a0% of the time."
     if best is not None:
         caption += " No filter with this model can come below the covariance bound."
     caption += rms.frame

@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from robins.results import Probability
+
 # What the unit at the end of a metric's name is made of, and how that is printed.
 _PARTS = {
     **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
@@ -38,7 +40,7 @@ class Label(NamedTuple):
 
 def label(metric: str) -> Label:
     """Words and unit of a metric's name; of a share the unit at its end is that of its limit."""
-    unit = None if metric.startswith("share_") else _UNIT.search(metric)
+    unit = None if "share" in metric.split("_") else _UNIT.search(metric)
     text = words(metric[: unit.start()] if unit else metric) or metric
     told = "/".join(_PARTS[part] for part in unit[1].split("_per_")) if unit else ""
     return Label(text[:1].upper() + text[1:], told)
@@ -54,6 +56,8 @@ def show(value: Any) -> str:
     """A number to four significant digits; lists are joined; nothing is an en dash."""
     if value is None:
         return "–"
+    if (probability := Probability.read(value)) is not None:
+        return _probability(probability)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -77,6 +81,13 @@ def _many(values: Sequence[Any]) -> str:
     if not known:
         return f"{len(values)} values"
     return f"{show(min(known))} to {show(max(known))} ({len(values)} values)"
+
+
+def _probability(found: Probability) -> str:
+    """A share with its interval, to as many digits as that leaves to it."""
+    digits = max(2, 1 - math.floor(math.log10(found.high - found.low)))
+    told = (f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in found[:3])
+    return "{} ({} to {})".format(*told)
 
 
 def _float(value: float) -> str:

@@ -15,6 +15,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of the page around it
 
@@ -22,6 +23,7 @@ WIDTH = 7.2  # inches; at 9 points the text of a figure is as large as that of t
 # distinction onto paper without colours.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES = ("-", "--", "-.", (0, (1, 1)))
+TINTED = 4  # filters whose tints can be told apart
 _ROWS = 2  # of a legend that every figure has room for
 _REMARK = 100  # characters of small words in a line
 TRUTH = "#222222"
@@ -156,6 +158,16 @@ def legend(figure: Figure, keys: Sequence[Any]) -> None:
 def _width(widths: np.ndarray, columns: int) -> float:
     """Width of a legend of so many columns, each as wide as its widest entry."""
     return sum(widths[column::columns].max() for column in range(columns))
+
+
+def decades(axes: Axes, low: float, top: float) -> None:
+    """A logarithmic axis upwards of one decade or more, in plain numbers, that holds low to top."""
+    axes.set_yscale("log")
+    axes.set_ylim(min(0.8 * low, top / 10.0), 1.25 * top)
+    few = top < 100.0 * low
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def shade(axes: Axes, x: np.ndarray, mask: np.ndarray | None) -> None:

@@ -21,7 +21,8 @@ Summary
 ``claims`` [{id, text, verdict, value, band}] with the verdicts "reproduced", "partly", "not",
 ``counts`` {reason: number of samples refused}, ``files`` {summary, manifest, solution, report:
 path; figures, other: [paths]}, relative to the folder and filled in by the writer, ``seconds``.
-Metric names end in their unit (``horizontal_rms_m``). NaN and infinity become null.
+Metric names end in their unit (``horizontal_rms_m``). NaN and infinity become null. A share of the
+runs is a `Probability`: {share, low, high, of, level}.
 
 Solution
 --------
@@ -45,6 +46,7 @@ from robins.results.dataframe import clocks, to_dataframe
 from robins.results.errors import ResultError
 from robins.results.manifest import SCHEMA_VERSION, versions
 from robins.results.outcome import Outcome, Progress, silent
+from robins.results.probability import Probability
 from robins.results.reader import Result, read
 from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
@@ -58,6 +60,7 @@ __all__ = [
     "VERDICTS",
     "NotWritten",
     "Outcome",
+    "Probability",
     "Progress",
     "Result",
     "ResultError",

@@ -103,6 +103,20 @@ ROLES = (
     Role("{nees|anees}_dof", _FT, "state dimension", "1", named="consistency_dof"),
     Role("rms_{block}", _FTA, "RMS error of {of}", attrs=("runs",)),
     Role("mean_sigma_{block}", _FTA, "stated sigma of {of}; root of the mean stated variance"),
+    Role("mean_error_{block}", _FTA, "mean error of {of}; over the `runs`", attrs=("runs",)),
+    Role(
+        "covariance_{block}",
+        "filter thinned_time axis_{of} other_{of}",
+        "covariance of the errors of {of}; over the `runs`; infinite if one diverged",
+        attrs=("runs",),
+    ),
+    Role(
+        "percentile_{block}",
+        "filter thinned_time percentile",
+        "length of the error of {of}; that so many percent of the `runs` do not exceed; at some "
+        "epochs; to the share `bins` of it",
+        attrs=("runs", "bins"),
+    ),
     Role("within_{limit}", _FT, "runs within {of}; share of the `runs`", "1", ("runs",)),
     Role("bounds", "filter", "states bounds, not standard deviations; nonzero where it does", "1"),
     Role("note_{note}", _FT, "{of}, first run; what a rule noted", "1"),

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from robins.results.probability import Probability
+
 VERDICTS = ("reproduced", "partly", "not")
 
 _GIVEN = {
@@ -46,6 +48,8 @@ def plain(value: Any, where: str = "value") -> Any:
         return float(value) if math.isfinite(value) else None
     if isinstance(value, os.PathLike):
         return plain(os.fsdecode(value), where)
+    if isinstance(value, Probability):
+        value = value._asdict()
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):

@@ -29,6 +29,9 @@ MOST_SAMPLES = 10_000_000  # of one run: a day at 100 Hz; six axes of them are h
 Runs = Annotated[int, pydantic.Field(ge=1, le=MOST_RUNS)]
 """Monte Carlo runs."""
 
+RunNumber = Annotated[int, pydantic.Field(ge=0, le=MOST_RUNS)]
+"""Number of a run, from 0; or how many."""
+
 Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
 """Filters by name, one at least."""
 

@@ -16,10 +16,12 @@ import numpy as np
 from robins import _float64, scenario
 from robins.campaign import check_machine
 from robins.campaign.bound import bound_sigma
-from robins.campaign.gather import State, gather
+from robins.campaign.gather import State, blank, example_of, gather
 from robins.campaign.machine import machine_for
 from robins.campaign.outcome import outcome_of
-from robins.campaign.plan import Chunk, Plan, Shard, check_code, code_of, needed, read, write
+from robins.campaign.plan import KEPT, Chunk, Plan, Shard, check_code, code_of, needed, read, write
+from robins.campaign.retention import by_stem, content_of, kept
+from robins.campaign.shards import Damaged, unpack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store, open_store
 from robins.campaign.work import Worker, missing
@@ -83,7 +85,7 @@ def plan_campaign(
     else:
         check_code(store, before)
         for what, was, now in (
-            ("scenario", before.text, text),
+            ("scenario", _of_runs(before.text), _of_runs(text)),
             ("seed", before.seed, seed),
             ("machine", before.machine, machine or before.machine),
         ):
@@ -94,11 +96,21 @@ def plan_campaign(
                     where,
                     "ask for the same to go on with it, or choose another folder.",
                 )
-        plan = before.with_more(wanted, chosen)
+        plan = replace(before.with_more(wanted, chosen), text=text)
+    if beyond := [run for run in plan.keep if run >= plan.runs]:
+        raise InputError(
+            f"has runs 0 to {plan.runs - 1}", where, f"keep = {beyond} names none of them."
+        )
     if plan != before:
         write(store, plan)
     store.sweep()
     return plan
+
+
+def _of_runs(text: str) -> str:
+    """Of a scenario what any run depends on, and its title: what is kept may change at any time."""
+    said = scenario.mapping_of(text)
+    return scenario.text_of({k: v for k, v in said.items() if k not in KEPT})
 
 
 def problem_of(plan: Plan, filters: Sequence[str] = ()) -> Problem:
@@ -153,6 +165,7 @@ class Status(NamedTuple):
     missing: int
     damaged: list[str]
     diverged: dict[str, list[int]]
+    kept: dict[str, list[int]]  # runs whose histories are there
     digest: str | None
 
 
@@ -160,7 +173,7 @@ def campaign_status(where: Where) -> Status:
     """Read and check all shards of a campaign, and say how far it is."""
     store = open_store(where)
     plan = needed(store)
-    found = gather(store, plan)
+    found, there = gather(store, plan), kept(store, by_stem(plan.shards))
     return Status(
         plan.scenario,
         plan.seed,
@@ -172,6 +185,7 @@ def campaign_status(where: Where) -> Status:
         found.lacking - len(found.damaged),
         [shard.name for shard in found.damaged],
         {name: diverged_of(found, name) for name in plan.filters},
+        {name: there.get(name, []) for name in plan.filters},
         found.digest,
     )
 
@@ -226,7 +240,7 @@ def _bound(problem: Problem) -> np.ndarray | None:
 
 
 def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Outcome:
-    """One run alone with all its histories, computed again; its bits are those of the campaign.
+    """One run alone with its histories, as they were kept or computed again, with the same bits.
 
     Raises:
         InputError: there is no such run.
@@ -234,12 +248,13 @@ def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Out
     store, plan = ready(where)
     if not 0 <= run < plan.runs:
         raise InputError(f"has runs 0 to {plan.runs - 1}", where, f"--run {run} is none of them.")
-    problem = problem_of(plan)
-    chunk = next(c for c in plan.chunks if c.begin <= run < c.begin + c.runs)
+    problem, chunk = problem_of(plan), plan.chunk_of(run)
     progress(0.0, f"runs {chunk.begin} to {chunk.begin + chunk.runs - 1}, of which {run} is shown")
-    worker = Worker(store, plan, problem)
-    alone = worker.run_of(chunk, run - chunk.begin)
-    outcome = outcome_of(problem, alone, None)
+    alone = {name: _kept(store, plan.shard(chunk, name), run, problem) for name in plan.filters}
+    if lacking := [name for name, one in alone.items() if one is None]:
+        again = Worker(store, plan, problem).runs_of(chunk, lacking, [run])
+        alone |= {name: of[run] for name, of in again.items()}
+    outcome = outcome_of(problem, {name: one for name, one in alone.items() if one}, None)
     return replace(
         outcome,
         claims=[],  # of one run there is nothing to be claimed
@@ -252,6 +267,18 @@ def campaign_show(where: Where, run: int, *, progress: Progress = silent) -> Out
         notes=[f"Run {run} of {plan.runs}, alone.", *outcome.notes],
         last_lines=[f"Next:   robins campaign report {where}   all runs"],
     )
+
+
+def _kept(store: Store, shard: Shard, run: int, problem: Problem) -> Statistics | None:
+    """A run with its histories as they were kept; None where they are not, or are damaged."""
+    content, one = content_of(store, shard, run), blank(problem)
+    if content is None:
+        return None
+    try:
+        unpack(content, one, example_of(problem, shard.filter))
+    except Damaged:
+        return None
+    return one
 
 
 class Verified(NamedTuple):

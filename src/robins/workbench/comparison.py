@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins import results, scenario
+from robins.results import Probability
 
 Where = str | os.PathLike[str]
 
@@ -87,7 +88,7 @@ def _flat(mapping: Mapping[str, Any], under: str = "") -> dict[str, Any]:
 
 def ratios(pair: tuple[Any, Any]) -> list[float]:
     """The second over the first, of each component; NaN where one is no number."""
-    a, b = (np.atleast_1d(np.array(x, dtype=object)) for x in pair)
+    a, b = (np.atleast_1d(np.array(Probability.share_of(x), dtype=object)) for x in pair)
     if a.shape != b.shape:
         return [float("nan")]
     numbers = [
@@ -127,6 +128,8 @@ def lines(found: Comparison) -> list[str]:
 
 
 def _shown(value: Any) -> str:
+    if (found := Probability.read(value)) is not None:
+        return "{:.5g} ({:.2g} to {:.2g})".format(*found[:3])
     if isinstance(value, list):
         return f"[{', '.join(map(_shown, value))}]"
     return f"{value:.5g}" if isinstance(value, float) else str(value)

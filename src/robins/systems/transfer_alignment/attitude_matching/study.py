@@ -20,7 +20,7 @@ from jax.tree_util import Partial
 from robins import units
 from robins.filters import Filter, Step, kalman, run
 from robins.filters.rules.h_infinity import Infeasible, h_infinity, with_gamma
-from robins.results import array
+from robins.results import Probability, array
 from robins.sim.flexure import Flexure
 from robins.systems.judgement import Claim, Metrics, graded, ratio, rms_by_axis
 from robins.systems.parts import ENU, RFU
@@ -228,7 +228,7 @@ def metrics_of(statistics: Any) -> dict[str, Any]:
     """Metrics of one filter from its campaign statistics, over the epochs that count."""
     settled = statistics.settled(FIVE_ARCMIN.name)
     return rms_by_axis(statistics, all_axes=("attitude",)) | {
-        "share_below_5_arcmin": float(np.mean(settled <= statistics.count_from)),
+        "share_below_5_arcmin": Probability.among(settled <= statistics.count_from),
         "diverged_runs": statistics.diverged,
     }
 

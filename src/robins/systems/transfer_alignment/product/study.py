@@ -19,6 +19,7 @@ from robins.errors import require_known
 from robins.filters import Belief, Model
 from robins.ins.frames import swap
 from robins.ins.state import InsNoise, InsState
+from robins.results import Probability
 from robins.rotation import Rotation
 from robins.sim.flexure import Flexure, transition
 from robins.systems.judgement import (
@@ -227,7 +228,7 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
                 north, east, down = out[key]
                 out[key] = [east, north, down]  # sizes, which have no sign
     settled = statistics.settled(FIVE_ARCMIN)
-    out["share_below_5_arcmin"] = float(np.mean(settled <= statistics.count_from))
+    out["share_below_5_arcmin"] = Probability.among(settled <= statistics.count_from)
     return out | consistency(statistics) | {"diverged_runs": statistics.diverged}
 
 

@@ -35,7 +35,7 @@ from robins.filters import Belief, Filter, gamma_min, kalman
 from robins.filters.rules import adaptive_h_infinity, h_infinity
 from robins.ins.frames import swap, swap_q
 from robins.ins.increments import Increments
-from robins.results import array
+from robins.results import Probability, array
 from robins.rotation import Rotation, multiply, to_euler
 from robins.scenario import Parameters, Quantity, default
 from robins.systems.judgement import ratio_claims, rms_by_axis
@@ -347,8 +347,8 @@ def metrics_of(epoch_s: np.ndarray, statistics: Any) -> dict[str, Any]:
         settled = statistics.settled(limit.name)
         # E stands for never, and a run that is out at the last epoch but one has shown nothing
         times = np.append(np.insert(epoch_s[:-1], 0, 0.0), np.inf)[settled]
-        out[f"share_below_{limit.name}"] = float(np.mean(settled <= statistics.count_from))
-        out[f"settled_share_{limit.name}"] = float(np.mean(times < epoch_s[-1] - 1.0))
+        out[f"share_below_{limit.name}"] = Probability.among(settled <= statistics.count_from)
+        out[f"settled_share_{limit.name}"] = Probability.among(times < epoch_s[-1] - 1.0)
         out[f"settled_median_{limit.name}_s"] = float(np.median(times))
     out["error_over_sigma"] = statistics.overall_ratio().tolist()
     for sensor in statistics.sensors:

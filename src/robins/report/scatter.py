@@ -1,0 +1,45 @@
+"""How large the errors of a campaign's runs are, by percentiles."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from robins.report import series, style
+from robins.report.numbers import words
+from robins.report.style import Picture
+
+
+@style.styled
+def percentiles(solution: xr.Dataset, block: str) -> Picture:
+    """Median, the middle nine tenths, and the highest percentile of the length of an error."""
+    data = series.get(solution, "percentile", block)
+    assert data is not None
+    filters = series.filters(solution)
+    tinted = len(filters) <= style.TINTED
+    label = f"length of the error [{data.unit}]" if data.unit else "length of the error"
+    figure, axes, clock = series.alone(solution, data.x, label, 3.2)
+    low, middle, high, highest = range(4)
+    # No logarithm has what is zero or infinite: a line ends where a percentile diverged.
+    told = np.where(np.isfinite(data.values) & (data.values > 0.0), data.values, np.nan)
+    for i, of in enumerate(told):
+        clock.plot(axes, data.x, of[:, middle], **style.look(i))
+        clock.plot(axes, data.x, of[:, highest], **style.look(i, linewidth=0.7))
+        if tinted:
+            tint = {"color": style.colour(i), "alpha": 0.15, "linewidth": 0}
+            axes.fill_between(data.x / clock.seconds, of[:, low], of[:, high], **tint)
+    if np.any(np.isfinite(told)):
+        style.decades(axes, float(np.nanmin(told)), float(np.nanmax(told)))
+    more = [style.key(f"{data.axes[highest]} of the runs", color=style.GREY, linewidth=0.7)]
+    style.legend(figure, [*style.filter_keys(filters), *more])
+    caption = (
+        f"Length of the error over all components: the median of {int(data.attrs['runs'])} runs "
+        f"(line) and what {data.axes[highest]} of them do not exceed (thin)."
+    )
+    if tinted:
+        caption += f" Tint: from {data.axes[low]} to {data.axes[high]} of the runs."
+    caption += f" Read from a histogram, to {100 * data.attrs['bins']:.1f}\u00a0%."
+    if np.any(np.isinf(data.values)):
+        caption += " A line ends where so many runs have diverged."
+    name = words(block)
+    return Picture(f"percentile_{block}", f"Size of the error of the {name}", caption, figure)

@@ -1,0 +1,81 @@
+"""A probability that was found by counting: with the interval in which it lies, and never without.
+
+The interval is that of Clopper and Pearson (1934), "The use of confidence or fiducial limits
+illustrated in the case of the binomial": whatever the true probability, it is inside at least as
+often as the level says, also of few runs and of rare events. None of 50 runs that diverged means
+that up to 7 % may.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import betaincinv
+
+LEVEL = 0.95
+
+
+class Probability(NamedTuple):
+    """The share of some independent runs of which something holds.
+
+    Attributes:
+        share: of the runs, 0..1.
+        low: lower end of the interval.
+        high: upper end.
+        of: how many runs.
+        level: of the interval.
+    """
+
+    share: float
+    low: float
+    high: float
+    of: int
+    level: float
+
+    @classmethod
+    def among(cls, holds: np.ndarray, level: float = LEVEL) -> Probability:
+        """Of (runs,) answers, one of each run.
+
+        Raises:
+            ValueError: there are none.
+        """
+        if not len(holds):
+            raise ValueError("a share needs a run at least")
+        hits, of = int(np.sum(holds)), len(holds)
+        low, high = interval(np.array(hits), of, level)
+        return cls(hits / of, float(low), float(high), of, level)
+
+    @classmethod
+    def read(cls, value: Any) -> Probability | None:
+        """One as it is, or as `summary.json` holds it; None if the value is something else."""
+        if isinstance(value, cls):
+            return value
+        if not isinstance(value, Mapping) or set(value) != set(cls._fields):
+            return None
+        return cls(**value)
+
+    @classmethod
+    def share_of(cls, value: Any) -> Any:
+        """The share of a probability; any other value as it is."""
+        found = cls.read(value)
+        return value if found is None else found.share
+
+
+def interval(hits: np.ndarray, of: int, level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends of the interval of Clopper and Pearson.
+
+    Args:
+        hits: (...) of so many runs it held, 0..of.
+        of: number of runs, at least one.
+        level: probability that the interval holds the true one, at least.
+
+    Returns:
+        (...) lower and upper ends, as quantiles of the beta distribution.
+    """
+    hits = np.asarray(hits)
+    tail, some, all_ = 0.5 * (1.0 - level), np.maximum(hits, 1), np.minimum(hits, of - 1)
+    low = np.where(hits > 0, betaincinv(some, of - some + 1, tail), 0.0)
+    high = np.where(hits < of, betaincinv(all_ + 1, of - all_, 1.0 - tail), 1.0)
+    return low, high
