@@ -8,6 +8,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
+from rich.table import Table
+from rich.text import Text
 
 from robins.report import series, style
 from robins.report.numbers import words
@@ -53,14 +55,39 @@ def budget(solution: xr.Dataset) -> Picture:
     return Picture("sensitivity", "What the variance of the error comes from", caption, figure)
 
 
+def table(solution: xr.Dataset) -> Table:
+    """A row for each block and parameter, the greatest total first, as rich can print it."""
+    made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for head in ("share of the variance", "parameter"):
+        made.add_column(head, no_wrap=True)
+    for head in ("first order", "95 % bounds", "total", "95 % bounds"):
+        made.add_column(head, justify="right")
+    names = series.coordinate(solution, "parameter")
+    for block in find(solution, "sobol_first"):
+        values = {order: _of(solution, order, block) for order in _ORDERS}
+        for place, k in enumerate(np.argsort(-np.nan_to_num(values["total"][0]), kind="stable")):
+            cells = [words(block) if place == 0 else "", names[k]]
+            for value, low, high in (values[order][:, k] for order in _ORDERS):
+                none = np.isnan(value)
+                cells += [
+                    "–" if none else f"{value:.3f}",
+                    "" if none else f"{low:.3f} to {high:.3f}",
+                ]
+            made.add_row(*map(Text, cells))
+    return made
+
+
+def _of(solution: xr.Dataset, order: str, block: str) -> np.ndarray:
+    """(3, parameters) index with its lower and its upper bound."""
+    ends = ("", "_low", "_high")
+    return np.stack([np.asarray(find(solution, f"sobol_{order}{e}")[block], float) for e in ends])
+
+
 def _bars(axes: Axes, solution: xr.Dataset, block: str) -> None:
     """Two bars for each parameter."""
     farthest = 1.0
     for k, order in enumerate(_ORDERS):
-        value, low, high = (
-            np.asarray(find(solution, f"sobol_{order}{end}")[block], float)
-            for end in ("", "_low", "_high")
-        )
+        value, low, high = _of(solution, order, block)
         at = np.arange(len(value)) + (k - 0.5) * _THICK
         axes.barh(at, np.nan_to_num(value), _THICK, color=style.colour(k))
         axes.hlines(at, low, high, color=style.TRUTH, linewidth=1.2)
