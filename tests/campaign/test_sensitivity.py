@@ -13,7 +13,7 @@ from robins import results, scenario
 from robins.campaign import sensitivity as sobol
 from robins.errors import RobinsError
 from robins.filters import Belief
-from robins.report.sensitivity import budget, table
+from robins.report.sensitivity import budget, scatter, table
 from robins.systems import Case
 from robins.systems.ins_gnss.model import POSITION, Fix
 from robins.systems.ins_gnss.world import DriveBelief, as_believed
@@ -246,7 +246,8 @@ def test_what_is_told_of_it(found, tmp_path):
     both = 100.0 * np.sqrt(A * drawn[:, 0] ** 2 + B * drawn[:, 1] ** 2)
     np.testing.assert_allclose(drawn[:, 5], both, rtol=1e-9)
     result = publish(found, tmp_path / "r")
-    assert set(result.figures) == {"sensitivity"}
+    blocks = ("left", "right", "both")
+    assert set(result.figures) == {"sensitivity", *(f"sensitivity_{b}" for b in blocks)}
 
 
 def test_bars_are_the_indices(found):
@@ -258,6 +259,19 @@ def test_bars_are_the_indices(found):
     ends = [[x for x, _ in line] for one in axes.collections for line in one.get_segments()]
     low, high = (index(found, f"first_{end}", "both") for end in ("low", "high"))
     np.testing.assert_allclose(ends[:3], np.stack([low, high], 1))
+
+
+def test_points_are_drawn_over_their_parameter(found):
+    left, right, _ = scatter(found.solution, "both").figure.axes
+    points, mean = right.lines
+    drawn = np.loadtxt(io.BytesIO(found.files["points.csv"]), delimiter=",", skiprows=1)
+    np.testing.assert_allclose(0.1 * 30.0 ** points.get_xdata(), drawn[:, 1], rtol=1e-12)
+    np.testing.assert_allclose(points.get_ydata(), drawn[:, 5], rtol=1e-12)
+    first = points.get_xdata() < 0.1
+    assert mean.get_xdata()[0] == pytest.approx(0.05)
+    assert mean.get_ydata()[0] == pytest.approx(np.mean(drawn[first, 5]), rel=1e-12)
+    assert [label.get_text() for label in right.get_xticklabels()] == ["0.1 m", "3 m"]
+    assert left.get_ylabel() == "both RMS [cm]"
 
 
 def test_the_greatest_share_stands_first(found):

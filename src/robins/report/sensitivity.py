@@ -18,6 +18,7 @@ from robins.results import find
 
 _COLUMNS = 3  # blocks beside each other
 _ORDERS = {"first": "first order: alone", "total": "total: with others"}
+_SLICES, _FEW = 10, 8  # of the means over a parameter: how many, and points in each at least
 _THICK = 0.36  # of a bar; two of them to a parameter
 
 
@@ -53,6 +54,47 @@ def budget(solution: xr.Dataset) -> Picture:
         "all the others were. Lines: 95 % bounds by a bootstrap over points and runs."
     )
     return Picture("sensitivity", "What the variance of the error comes from", caption, figure)
+
+
+@style.styled
+def scatter(solution: xr.Dataset, block: str) -> Picture:
+    """RMS error of the independent points over each parameter, and its mean in slices."""
+    count = 2 * int(find(solution, "sobol_first")[block].attrs["samples"])
+    rms, unit = series.shown(find(solution, "sobol_rms")[block])
+    share = find(solution, "sobol_share")[""]
+    names = series.coordinate(solution, "parameter")
+    ends = [text.split(" to ") for text in share.attrs["ends"].split("; ")]
+    columns = min(_COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    figure, grid = style.new(rows, columns, 0.3 + 2.2 * rows, sharey=True)
+    for number, axes in enumerate(grid.flat):
+        axes.set_visible(number < len(names))
+        if number % columns == 0:
+            axes.set_ylabel(f"{words(block)} RMS [{unit}]" if unit else f"{words(block)} RMS")
+    slices = max(2, min(_SLICES, count // _FEW))
+    for k, (axes, name) in enumerate(zip(grid.flat, names, strict=False)):
+        x, y = np.asarray(share, float)[:count, k], rms[:count]
+        axes.plot(x, y, ".", markersize=2.5, color=style.colour(0), alpha=0.5)
+        slice_ = np.minimum((x * slices).astype(int), slices - 1)
+        there = np.unique(slice_)
+        means = [np.mean(y[slice_ == s]) for s in there]
+        axes.plot((there + 0.5) / slices, means, color=style.colour(1), linewidth=1.8)
+        axes.set_xticks([0.0, 1.0], ends[k])
+        axes.set_xlabel(name)
+    style.legend(
+        figure,
+        [
+            style.key("point", color=style.colour(0), marker=".", linestyle=""),
+            style.key("mean of a slice", color=style.colour(1), linewidth=1.8),
+        ],
+    )
+    caption = (
+        "Each point is the RMS error over the runs, with all parameters drawn at once. How far the "
+        "line goes up and down is the first order of a parameter; how far points scatter about it "
+        "is what the others bring."
+    )
+    title = f"{words(block)} over each parameter"
+    return Picture(f"sensitivity_{block}", title, caption, figure)
 
 
 def table(solution: xr.Dataset) -> Table:

@@ -264,7 +264,8 @@ def _solution(
             data |= array(f"sobol_{field}", getattr(found, field)[k], b.name, **more)
         shown = {"unit": b.units, "display_unit": b.display_unit}
         data |= array("sobol_rms", rms[:, k], b.name, **shown)
-    return xr.Dataset(data | array("sobol_share", points.reshape(len(rms), -1)))
+    ends = "; ".join(f"{one.text(one.low)} to {one.text(one.high)}" for one in every)
+    return xr.Dataset(data | array("sobol_share", points.reshape(len(rms), -1), ends=ends))
 
 
 def _table(
