@@ -278,10 +278,10 @@ def test_the_greatest_share_stands_first(found):
     block, name, first, _, total, bounds = (list(c.cells) for c in table(found.solution).columns)
     assert [str(x) for x in block] == ["left", "", "", "right", "", "", "both", "", ""]
     assert [str(x) for x in name[6:8]] == ["noise.right", "noise.left"]
-    assert str(first[6]) == f"{index(found, 'first', 'both')[1]:.3f}"
-    assert str(total[7]) == f"{index(found, 'total', 'both')[0]:.3f}"
+    assert str(first[6]) == f"{index(found, 'first', 'both')[1]:.2f}"
+    assert str(total[7]) == f"{index(found, 'total', 'both')[0]:.2f}"
     low, high = (index(found, f"total_{end}", "both")[0] for end in ("low", "high"))
-    assert str(bounds[7]) == f"{low:.3f} to {high:.3f}"
+    assert str(bounds[7]) == f"{low:.2f} to {high:.2f}"
 
 
 # ------------------------------------------------------------------------------- warnings

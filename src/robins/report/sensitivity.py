@@ -80,6 +80,8 @@ def scatter(solution: xr.Dataset, block: str) -> Picture:
         means = [np.mean(y[slice_ == s]) for s in there]
         axes.plot((there + 0.5) / slices, means, color=style.colour(1), linewidth=1.8)
         axes.set_xticks([0.0, 1.0], ends[k])
+        for label, side in zip(axes.get_xticklabels(), ("left", "right"), strict=True):
+            label.set_horizontalalignment(side)  # within their axes
         axes.set_xlabel(name)
     style.legend(
         figure,
@@ -100,10 +102,10 @@ def scatter(solution: xr.Dataset, block: str) -> Picture:
 def table(solution: xr.Dataset) -> Table:
     """A row for each block and parameter, the greatest total first, as rich can print it."""
     made = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    for head in ("share of the variance", "parameter"):
+    for head in ("share of", "parameter"):
         made.add_column(head, no_wrap=True)
-    for head in ("first order", "95 % bounds", "total", "95 % bounds"):
-        made.add_column(head, justify="right")
+    for head in ("first order", "95 %", "total", "95 %"):
+        made.add_column(head, justify="right", no_wrap=True)
     names = series.coordinate(solution, "parameter")
     for block in find(solution, "sobol_first"):
         values = {order: _of(solution, order, block) for order in _ORDERS}
@@ -112,8 +114,8 @@ def table(solution: xr.Dataset) -> Table:
             for value, low, high in (values[order][:, k] for order in _ORDERS):
                 none = np.isnan(value)
                 cells += [
-                    "–" if none else f"{value:.3f}",
-                    "" if none else f"{low:.3f} to {high:.3f}",
+                    "–" if none else f"{value:.2f}",
+                    "" if none else f"{low:.2f} to {high:.2f}",
                 ]
             made.add_row(*map(Text, cells))
     return made
