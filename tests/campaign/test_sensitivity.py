@@ -13,7 +13,7 @@ from robins import results, scenario
 from robins.campaign import sensitivity as sobol
 from robins.errors import RobinsError
 from robins.filters import Belief
-from robins.report.sensitivity import budget
+from robins.report.sensitivity import budget, scatter, table
 from robins.systems import Case
 from robins.systems.ins_gnss.model import POSITION, Fix
 from robins.systems.ins_gnss.world import DriveBelief, as_believed
@@ -246,7 +246,8 @@ def test_what_is_told_of_it(found, tmp_path):
     both = 100.0 * np.sqrt(A * drawn[:, 0] ** 2 + B * drawn[:, 1] ** 2)
     np.testing.assert_allclose(drawn[:, 5], both, rtol=1e-9)
     result = publish(found, tmp_path / "r")
-    assert set(result.figures) == {"sensitivity"}
+    blocks = ("left", "right", "both")
+    assert set(result.figures) == {"sensitivity", *(f"sensitivity_{b}" for b in blocks)}
 
 
 def test_bars_are_the_indices(found):
@@ -260,42 +261,62 @@ def test_bars_are_the_indices(found):
     np.testing.assert_allclose(ends[:3], np.stack([low, high], 1))
 
 
+def test_points_are_drawn_over_their_parameter(found):
+    left, right, _ = scatter(found.solution, "both").figure.axes
+    points, mean = right.lines
+    drawn = np.loadtxt(io.BytesIO(found.files["points.csv"]), delimiter=",", skiprows=1)
+    np.testing.assert_allclose(0.1 * 30.0 ** points.get_xdata(), drawn[:, 1], rtol=1e-12)
+    np.testing.assert_allclose(points.get_ydata(), drawn[:, 5], rtol=1e-12)
+    first = points.get_xdata() < 0.1
+    assert mean.get_xdata()[0] == pytest.approx(0.05)
+    assert mean.get_ydata()[0] == pytest.approx(np.mean(drawn[first, 5]), rel=1e-12)
+    assert [label.get_text() for label in right.get_xticklabels()] == ["0.1 m", "3 m"]
+    assert left.get_ylabel() == "both RMS [cm]"
+
+
+def test_the_greatest_share_stands_first(found):
+    block, name, first, _, total, bounds = (list(c.cells) for c in table(found.solution).columns)
+    assert [str(x) for x in block] == ["left", "", "", "right", "", "", "both", "", ""]
+    assert [str(x) for x in name[6:8]] == ["noise.right", "noise.left"]
+    assert str(first[6]) == f"{index(found, 'first', 'both')[1]:.2f}"
+    assert str(total[7]) == f"{index(found, 'total', 'both')[0]:.2f}"
+    low, high = (index(found, f"total_{end}", "both")[0] for end in ("low", "high"))
+    assert str(bounds[7]) == f"{low:.2f} to {high:.2f}"
+
+
 # ------------------------------------------------------------------------------- warnings
 
 
 def test_beliefs_that_follow_the_world_and_runs_that_diverge_are_told(tmp_path):
-    vary = [LEFT, "begin=1 m to 3 m", "explode=0 m to 1 m"]
-    found = sensitivity(PAIR, vary=vary, runs=1, samples=4)
+    vary, told = [LEFT, "begin=1 m to 3 m", "explode=0 m to 1 m"], []
+    found = sensitivity(
+        PAIR, vary=vary, runs=16, samples=4, progress=lambda share, what: told.append((share, what))
+    )
     lost, begin = found.warnings
     assert "of 20 points 'kf' diverged" in lost
     assert begin.startswith("begin: what 'kf' believes at the start follows it")
     assert np.all(np.isnan(index(found, "total", "both")))
     assert len(found.last_lines) == 1
     assert publish(found, tmp_path / "r").summary["filters"]["explode"]["both_total_order"] is None
-
-
-def test_errors_that_do_not_vary_have_no_indices():
-    found = sensitivity(PAIR, vary=["noise.left=1 m to 2 m"], runs=2, samples=4)
-    assert any("RMS error of right does not vary" in one for one in found.warnings)
-    assert np.all(np.isnan(index(found, "first", "right")))
-    assert np.all(np.isfinite(index(found, "first", "left")))
-
-
-def test_wide_bounds_and_progress_are_told(monkeypatch):
-    told = []
-    monkeypatch.setattr(sensitivities, "indices", lambda some, seed: sobol.indices(some, 0, 99))
-    found = sensitivity(
-        PAIR,
-        vary=["noise.left=1 m to 2 m", "noise.right=1 m to 2 m"],
-        runs=32,
-        samples=4,
-        progress=lambda share, what: told.append((share, what)),
-    )
-    assert any(one.startswith("both: the bounds of noise.") for one in found.warnings)
     shares = [share for share, _ in told]
     assert shares == sorted(shares)
-    assert told[-1] == (1.0, "16 of 16 points")
+    assert told[-1] == (1.0, "20 of 20 points")
     assert len(told) > 5
+
+
+def test_errors_that_do_not_vary_and_wide_bounds_are_told(monkeypatch):
+    def simulated(budget, shares, runs, progress):
+        """RMS left: both parameters alike; right: a constant; both: the first alone."""
+        first = shares[:, 0]
+        rms = np.stack([1.0 + first + shares[:, 1], np.ones(len(shares)), 1.0 + first], axis=1)
+        return np.repeat(rms[:, None] ** 2, runs, axis=1), np.zeros((len(shares), runs))
+
+    monkeypatch.setattr(sensitivities, "simulate_points", simulated)
+    found = sensitivity(PAIR, vary=[LEFT, RIGHT], runs=2, samples=64)
+    still, wide = found.warnings
+    assert "RMS error of right does not vary" in still
+    assert np.all(np.isnan(index(found, "first", "right")))
+    assert wide.startswith("left: the bounds of noise.")
 
 
 def test_bounds_are_those_of_chance_in_points_and_in_runs():

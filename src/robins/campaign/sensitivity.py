@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.stats import qmc, sobol_indices
+from scipy import stats
 
 from robins.campaign.memory import CHUNK, MEMORY, width_of
 from robins.campaign.monte_carlo import one_record
@@ -246,7 +246,7 @@ def sobol_points(d: int, samples: int, seed: int) -> np.ndarray:
     """
     # scipy 1.14 has no `rng` yet; later ones take either name
     rng = np.random.default_rng(seed)
-    drawn = qmc.Sobol(2 * d, seed=rng).random(samples)  # pyright: ignore[reportCallIssue]
+    drawn = stats.qmc.Sobol(2 * d, seed=rng).random(samples)  # pyright: ignore[reportCallIssue]
     A, B = drawn[:, :d], drawn[:, d:]
     mixed = np.repeat(A[None], d, axis=0)
     for i in range(d):
@@ -300,6 +300,6 @@ def _estimate(f: np.ndarray) -> np.ndarray:
     """(2, s, d) first and total order, of outputs (d + 2, n, s)."""
     twice = np.concatenate([f, f], axis=2)  # scipy drops axes of one, and fails with two of them
     of = {"f_A": twice[0].T, "f_B": twice[1].T, "f_AB": np.moveaxis(twice[2:], -1, 1)}
-    found = sobol_indices(func=of, n=f.shape[1])
+    found = stats.sobol_indices(func=of, n=f.shape[1])
     both = (np.reshape(x, (-1, len(f) - 2)) for x in (found.first_order, found.total_order))
     return np.stack([x[: f.shape[2]] for x in both])

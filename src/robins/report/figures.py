@@ -71,7 +71,11 @@ FIGURES = (
     Figure(sweeps.curves, "sweep_rms sweep_low sweep_high sweep_stated", EACH, sweeps.one_key),
     Figure(sweeps.maps, "sweep_rms sweep_stated", EACH, sweeps.two_keys),
     Figure(tuning, "tuned_factor tuned_low tuned_high judged_before judged_after"),
-    Figure(sensitivity.budget, "sobol_first sobol_first_low sobol_first_high sobol_total"),
+    Figure(
+        sensitivity.budget,
+        "sobol_first sobol_first_low sobol_first_high sobol_total sobol_total_low sobol_total_high",
+    ),
+    Figure(sensitivity.scatter, "sobol_rms sobol_share", EACH),
     Figure(comparing.trade_off, "trade_off_h2 trade_off_hinf kalman_h2 kalman_hinf"),
     Figure(lateness, "lateness_steps lateness_edge"),
     Figure(instruments.planes, "field_calibrated field_measured"),

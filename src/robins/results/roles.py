@@ -198,7 +198,13 @@ ROLES = (
     Role("sobol_total_low_{block}", "parameter", "lower bound; of 95 % confidence", "1"),
     Role("sobol_total_high_{block}", "parameter", "upper bound; likewise", "1"),
     Role("sobol_rms_{block}", "point", "RMS error of {of}; over runs and epochs that count"),
-    Role("sobol_share", "point parameter", "place between the ends of a parameter, 0 to 1", "1"),
+    Role(
+        "sobol_share",
+        "point parameter",
+        "place between the ends of a parameter; 0 to 1, `ends` of each as texts",
+        "1",
+        ("ends",),
+    ),
     Role("{name}", f"time {_MORE}", "{of}; what else is known of a run", named="context"),
 )
 

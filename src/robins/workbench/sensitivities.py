@@ -25,6 +25,7 @@ from robins.campaign.sensitivity import (
     sobol_points,
     untraceable,
 )
+from robins.report.sensitivity import table
 from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
 from robins.workbench.errors import InputError, refusing
@@ -155,8 +156,9 @@ def sensitivity(
     squares = found.reshape(*points.shape[:2], *found.shape[1:])
     computed = indices(squares, seed)
     told_of = believed.reshape(*points.shape[:2], runs)
+    solution = _solution(wanted, every, points, squares, view.blocks, computed)
     return Outcome(
-        solution=_solution(wanted, every, points, squares, view.blocks, computed),
+        solution=solution,
         metrics=_metrics(every, view.blocks, computed),
         files={
             "sensitivity.csv": _table(wanted, every, ranges, squares, view.blocks, computed),
@@ -168,6 +170,7 @@ def sensitivity(
         seed=seed,
         runs=runs,
         machine="jax",
+        tables=[table(solution)],
         last_lines=[
             "Table:  {out}/sensitivity.csv   all indices with their bounds; points.csv has samples",
             *_next(name, wanted, every, computed),
@@ -261,7 +264,8 @@ def _solution(
             data |= array(f"sobol_{field}", getattr(found, field)[k], b.name, **more)
         shown = {"unit": b.units, "display_unit": b.display_unit}
         data |= array("sobol_rms", rms[:, k], b.name, **shown)
-    return xr.Dataset(data | array("sobol_share", points.reshape(len(rms), -1)))
+    ends = "; ".join(f"{one.text(one.low)} to {one.text(one.high)}" for one in every)
+    return xr.Dataset(data | array("sobol_share", points.reshape(len(rms), -1), ends=ends))
 
 
 def _table(
