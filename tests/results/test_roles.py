@@ -14,7 +14,7 @@ from robins.results import ROLES, array, find, read, roles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 # Tables show these, or nothing does.
-NOT_DRAWN = {"attitude", "bound_left", "gramian", "trade_off_bound", "context"}
+NOT_DRAWN = {"attitude", "bound_left", "covariance", "gramian", "trade_off_bound", "context"}
 
 
 def examples():
