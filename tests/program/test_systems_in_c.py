@@ -3,18 +3,19 @@
 Some are cheap enough to wait for; `make certify` walks all filters of all studies.
 """
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from machines import runs_the_same
 
-from robins import scenario
 from robins.campaign.monte_carlo import contender, solved
 from robins.program import BuildError, ProgramError
 from robins.systems import SYSTEMS
 from robins.systems.catalogue import SUMMARIES
-from robins.workbench.boards import find_scenario, study_of
+from robins.workbench.scenarios import read_scenario
 
 EPOCHS = 40
 UNROLL = 300
@@ -33,20 +34,18 @@ STUDIES = (
 )
 
 
-def parsed(name):
-    """The study of a scenario, and its parameters for one run."""
-    system, _, text = find_scenario(name)
-    study = study_of(system, text, name)
-    return study, scenario.parse(study.parameters, text, ("runs=1",), source=name)
+@cache
+def world_of(name):
+    """What all filters of a scenario are given, simulated once."""
+    problem = read_scenario(name, ("runs=1",)).problem((), 0)
+    return jax.jit(problem.simulate)(jnp.asarray(0))
 
 
 def check(name, filter_):
     """That a filter of a scenario runs in C as by JAX."""
-    study, parameters = parsed(name)
-    problem = study.problem(parameters, (filter_,), 0)
-    world = jax.jit(problem.simulate)(jnp.asarray(0))
+    problem = read_scenario(name, ("runs=1",)).problem((filter_,), 0)
     one = contender(problem, filter_)
-    case = one.case(world)
+    case = one.case(world_of(name))
     if case.loop is not None:  # its readings are known when it has run
         case = solved(one.filter, one.model, case, lambda step: ())[1]
     u, y, aux = jax.tree.map(
@@ -66,7 +65,7 @@ def test_a_filter_of_a_system(name, filter_):
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_filter_of_a_study(name):
     # A smoother runs the filter that it is named after.
-    filters = [f for f in parsed(name)[0].filters if not f.endswith("+rts")]
+    filters = [f for f in read_scenario(name, ()).study.filters if not f.endswith("+rts")]
     differs = {}
     for filter_ in filters:
         try:
@@ -77,7 +76,7 @@ def test_every_filter_of_a_study(name):
 
 
 def test_no_study_is_left_out():
-    walked = [parsed(name)[0] for name in STUDIES]
+    walked = [read_scenario(name, ()).study for name in STUDIES]
     for system in SUMMARIES:
         for study in SYSTEMS[system].studies.values():
             assert any(study is one for one in walked), system
