@@ -81,9 +81,9 @@ def test_named_runs_and_the_first_diverged_are_kept_and_no_shard_changes(plain, 
 def test_which_diverged_runs_are_kept_does_not_depend_on_the_order(tmp_path, kept):
     plan = narrow(tmp_path, *KEPT)
     store = open_store(tmp_path)
-    pair = [Worker(store, plan, problem_of(plan)) for _ in range(2)]
-    for k, one in enumerate(reversed(missing(store, plan.shards))):
-        pair[k % 2].compute(one)
+    worker = Worker(store, plan, problem_of(plan))
+    for one in reversed(missing(store, plan.shards)):
+        worker.compute(one)
         assert len(list((tmp_path / "diverged").glob("*"))) <= 2
     assert campaign_status(tmp_path).kept == campaign_status(kept).kept
     for group in ("histories", "diverged"):
@@ -108,13 +108,12 @@ def test_kept_runs_are_shown_without_computing_them_again(plain, kept, monkeypat
         np.testing.assert_array_equal(mine.solution[name], variable)
     campaign_show(kept, 13)
     assert computed == []
-    campaign_show(kept, 14)
     path = next((kept / "diverged").glob("*-5.npz"))
     whole_ = path.read_bytes()
     path.write_bytes(whole_[:-100])
     campaign_show(kept, 5)  # a damaged one is computed again
     path.write_bytes(whole_)
-    assert computed == [[14], [5]]
+    assert computed == [[5]]
 
 
 def test_what_is_kept_may_change_and_all_may_be(tmp_path):

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import betaincinv
 
 LEVEL = 0.95
 
@@ -74,6 +73,8 @@ def interval(hits: np.ndarray, of: int, level: float = LEVEL) -> tuple[np.ndarra
     Returns:
         (...) lower and upper ends, as quantiles of the beta distribution.
     """
+    from scipy.special import betaincinv  # who writes a result need not wait for SciPy
+
     hits = np.asarray(hits)
     tail, some, all_ = 0.5 * (1.0 - level), np.maximum(hits, 1), np.minimum(hits, of - 1)
     low = np.where(hits > 0, betaincinv(some, of - some + 1, tail), 0.0)
