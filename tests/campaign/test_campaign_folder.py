@@ -254,6 +254,31 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
     assert campaign_status(where).digest == campaign_status(serial).digest
 
 
+def test_ctrl_c_ends_all_at_once_and_it_goes_on(tmp_path):
+    psutil = pytest.importorskip("psutil")
+    where = tmp_path / "stopped"
+    begun(where, runs=4000)
+    settings = [word for one in SHORT for word in ("--set", one)]
+    run = [*ROBINS, "run", BALLOON, "--runs", "4000", "--filters", "gated,kf", *settings]
+    run += ["--machine", "jax", "--workers", "2", "--out", str(where)]
+    process = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 120.0
+    while not open_store(where).names("shards"):  # workers are at it
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    assert len(workers) >= 2
+    process.send_signal(signal.SIGINT)
+    told = process.communicate(timeout=60.0)[1]
+    assert process.returncode == 3
+    assert "interrupted" in told
+    assert not psutil.wait_procs(workers, timeout=10.0)[1]
+    status = campaign_status(where)
+    assert 0 < status.done["kf"] < 4000
+    assert not status.damaged
+
+
 def test_dask_makes_the_same_table(undisturbed, tmp_path):
     distributed = pytest.importorskip("distributed", reason="Dask is an extra")
     begun(tmp_path)

@@ -13,7 +13,7 @@ from robins.errors import RobinsError
 from robins.report import figures
 from robins.results import find, read
 from robins.workbench import publish, sweeps
-from robins.workbench.campaigns import campaign_work, needed, problem_of
+from robins.workbench.campaigns import campaign_status, campaign_work, needed, problem_of
 from robins.workbench.sweeps import Varied, sweep, varied
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
@@ -80,6 +80,8 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
     ]
     assert float(rows[0]["rms"]) == float(rms[0, 0, 0])
     assert rows[0]["runs"] == "12"
+    with pytest.raises(RobinsError, match="holds the 2 campaigns of a sweep"):
+        campaign_status(tmp_path)
 
 
 def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):

@@ -127,10 +127,26 @@ def ready(where: Where) -> tuple[Store, Plan]:
         robins.errors.RobinsError: there is none, or other code began it.
     """
     _float64.require()
-    store = open_store(where)
-    plan = needed(store)
+    store, plan = opened(where)
     check_code(store, plan)
     return store, plan
+
+
+def opened(where: Where) -> tuple[Store, Plan]:
+    """A campaign that is there, whatever code began it.
+
+    Raises:
+        robins.errors.RobinsError: there is none, or there are several.
+    """
+    store = open_store(where)
+    if store.get(SWEEP) is not None:
+        points = campaigns_of(where)
+        raise InputError(
+            f"holds the {len(points)} campaigns of a sweep",
+            where,
+            f"name one, such as {points[0]}.",
+        )
+    return store, needed(store)
 
 
 def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
@@ -171,8 +187,7 @@ class Status(NamedTuple):
 
 def campaign_status(where: Where) -> Status:
     """Read and check all shards of a campaign, and say how far it is."""
-    store = open_store(where)
-    plan = needed(store)
+    store, plan = opened(where)
     found, there = gather(store, plan), kept(store, by_stem(plan.shards))
     return Status(
         plan.scenario,
