@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from robins.campaign import machine as machines
 from robins.campaign import plan as plans
 from robins.campaign import simulate
 from robins.campaign.gather import gather
@@ -21,6 +22,8 @@ from robins.campaign.store import open_store
 from robins.campaign.work import Worker, missing
 from robins.errors import RobinsError
 from robins.program import CPP, LANE_FLAGS
+from robins.workbench import simulated
+from robins.workbench import workers as work
 from robins.workbench.campaigns import (
     campaign_report,
     campaign_show,
@@ -76,6 +79,25 @@ def test_any_number_of_workers_make_one_table(undisturbed, tmp_path, workers):
         for one in turns:
             next(one, None)
     assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+def test_a_long_run_by_jax_has_a_process_for_each_core(monkeypatch):
+    asked = {"runs": 100, "filters": ("kf",), "settings": SHORT, "machine": "jax"}
+    alone = simulated.run(BALLOON, **asked)
+    filled = []
+
+    def fill(where, campaigns, workers, progress):
+        filled.append(workers)
+        work_here(where)
+
+    monkeypatch.setattr(machines, "PAYS", -1.0)  # it is so small that it takes no time
+    monkeypatch.setattr(machines, "available_cores", lambda: 2)
+    monkeypatch.setattr(work, "fill", fill)
+    spread = simulated.run(BALLOON, **asked)
+    assert len(filled) == 1
+    assert spread.metrics == alone.metrics
+    assert spread.claims == alone.claims
+    assert (spread.scenario, spread.runs) == (alone.scenario, alone.runs)
 
 
 def test_what_was_claimed_by_the_dead_is_computed(undisturbed, tmp_path, monkeypatch):

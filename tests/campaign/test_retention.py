@@ -16,6 +16,7 @@ from robins.workbench.campaigns import (
     plan_campaign,
     problem_of,
 )
+from robins.workbench.simulated import run
 
 LOST = (5, 21, 22, 40, 50)
 KEPT = ("keep=[0, 13, 40]", "keep_diverged=2")
@@ -29,9 +30,9 @@ def diverging():
     def broken(self, part, names, taken=whole):
         def taken_of(name, record):
             error = record["error"].copy()
-            for run in LOST:
-                if run - part.begin in range(len(error)):
-                    error[run - part.begin, 3:] = np.nan
+            for lost in LOST:
+                if lost - part.begin in range(len(error)):
+                    error[lost - part.begin, 3:] = np.nan
             return taken(name, record | {"error": error})
 
         return compute(self, part, names, taken_of)
@@ -130,3 +131,8 @@ def test_what_cannot_be_kept_is_refused(plain, setting):
     with pytest.raises(RobinsError, match="keep"):
         asked(plain, setting)
     assert campaign_status(plain).wanted == RUNS
+
+
+def test_a_run_without_a_folder_says_that_it_keeps_nothing():
+    found = run(BALLOON, runs=2, settings=("keep=[1]", "duration=10 s"), machine="jax")
+    assert any("`robins campaign run`" in warning for warning in found.warnings)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins import results, scenario
+from robins import results
 from robins.campaign import sensitivity as sobol
 from robins.errors import RobinsError
 from robins.filters import Belief
@@ -18,7 +18,7 @@ from robins.systems import Case
 from robins.systems.ins_gnss.model import POSITION, Fix
 from robins.systems.ins_gnss.world import DriveBelief, as_believed
 from robins.workbench import publish, run, sensitivities
-from robins.workbench.scenarios import find_scenario, study_of
+from robins.workbench.scenarios import read_scenario
 from robins.workbench.sensitivities import Uncertain, sensitivity, uncertain
 
 HERE = Path(__file__).parent
@@ -29,13 +29,12 @@ LEFT, RIGHT = "noise.left=0.5 m to 2 m", "noise.right=0.1 m to 3 m"
 
 def budget_of(name, filter_, vary, settings=(), seed=0):
     """What the command makes of these words."""
-    system, _, text = find_scenario(name)
-    study = study_of(system, text, name)
-    given = scenario.parse(study.parameters, text, settings)
+    read = read_scenario(name, settings)
+    study, given = read.study, read.parameters
     course = study.lay_out(given)
     ranges = []
     for one in map(uncertain, vary):
-        ends = (scenario.parse(study.parameters, text, (*settings, end)) for end in one.ends)
+        ends = (read.parsed((*settings, end)) for end in one.ends)
         ranges.append(sobol.between(*ends))
     parts = study.view(given, course), study.contender(given, course, filter_)
     return sobol.Budget(study, given, course, *parts, seed, tuple(ranges))
@@ -140,9 +139,8 @@ TRACED = {
 
 @pytest.mark.parametrize("name", TRACED)
 def test_worlds_take_numbers_that_are_traced(name):
-    system, _, text = find_scenario(name)
-    study = study_of(system, text, name)
-    given = scenario.parse(study.parameters, text)
+    read = read_scenario(name, ())
+    study, given = read.study, read.parameters
     course = study.lay_out(given)
 
     def simulated(numbers):

@@ -143,6 +143,10 @@ class InLanes:
         """About how many scalar operations a run is, in what is worth a program."""
         return sum(s.operations for s in (self._simulate, *self._filters.values()))
 
+    def seconds_by_jax(self, runs: int) -> float:
+        """About how long JAX would take for so many runs, on one core."""
+        return runs * self.operations * NS * 1e-9
+
     @property
     def notes(self) -> list[str]:
         """What JAX has to do, and why."""
@@ -290,6 +294,11 @@ def machine_for(problem: Problem, runs: int, name: str = "") -> ByJax | InLanes:
     if name == "jax" or (not name and (runs < FEWEST or not has_compiler())):
         return ByJax(problem)
     lanes = InLanes(problem)
-    if name or runs * lanes.operations * NS * 1e-9 > PAYS:
-        return lanes
-    return ByJax(problem)
+    return lanes if name or lanes.seconds_by_jax(runs) > PAYS else ByJax(problem)
+
+
+def pays_processes(problem: Problem, by: ByJax | InLanes, runs: int) -> bool:
+    """Whether several processes would compute a campaign sooner, each of which compiles it."""
+    if by.name != "jax" or runs < FEWEST or available_cores() < 2:
+        return False
+    return InLanes(problem).seconds_by_jax(runs) > 2.0 * PAYS

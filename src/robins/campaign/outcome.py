@@ -11,7 +11,7 @@ import xarray as xr
 
 from robins.campaign.bound import bound_sigma
 from robins.campaign.histogram import WORST
-from robins.campaign.machine import machine_for
+from robins.campaign.machine import ByJax, InLanes, machine_for
 from robins.campaign.statistics import PERCENTS, Statistics, thinned
 from robins.filters import Code, doubts
 from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
@@ -24,7 +24,7 @@ def simulate(
     runs: int,
     chunk: int = 0,
     progress: Progress = silent,
-    machine: str = "",
+    machine: str | ByJax | InLanes = "",
 ) -> Outcome:
     """Run every filter of a problem over the same runs and compare them.
 
@@ -33,7 +33,7 @@ def simulate(
         runs: how many runs of each filter.
         chunk: runs at a time; not given, by the memory that they need.
         progress: called with the share done in 0..1 and what is being done.
-        machine: one of `robins.campaign.MACHINES`; not given, what is faster.
+        machine: one of `robins.campaign.MACHINES`, or made already; not given, what is faster.
 
     Raises:
         RobinsError: the machine asked for is not there.
@@ -48,7 +48,7 @@ def simulate(
         for n in names
     }
     done, bound = 0, None
-    by = machine_for(problem, runs, machine)
+    by = machine_for(problem, runs, machine) if isinstance(machine, str) else machine
     chunk = chunk or by.width(runs)
 
     def taken(name: str, record: dict[str, Any]) -> Statistics:

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from robins import _float64, scenario, units
+from robins import _float64, units
 from robins.campaign.sensitivity import (
     Between,
     Budget,
@@ -29,7 +29,7 @@ from robins.report.sensitivity import table
 from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
 from robins.workbench.errors import InputError, refusing
-from robins.workbench.scenarios import asked, check_filters, find_scenario, study_of
+from robins.workbench.scenarios import asked, check_filters, read_scenario
 
 RUNS, SAMPLES = 10, 256
 MOST = 1 << 14  # samples
@@ -115,21 +115,17 @@ def sensitivity(
     """
     _float64.require()
     every = _checked(vary, samples)
-    system, label, text = find_scenario(name)
-    study = study_of(system, text, name)
-    given = scenario.parse(study.parameters, text, settings, source=name)
-    wanted = filter_name or next(iter(given.filters or study.filters))
-    check_filters(label, study.filters, [wanted])
+    read = read_scenario(name, settings)
+    study, given = read.study, read.parameters
+    wanted = filter_name or read.own[0]
+    check_filters(read.label, study.filters, [wanted])
     progress(0.0, "setting up the simulation")
     with refusing(name):
         course, again = study.lay_out(given), study.lay_out(given)
         view, contender = study.view(given, course), study.contender(given, course, wanted)
     ranges = []
     for one in every:
-        low, high = (
-            scenario.parse(study.parameters, text, (*settings, end), source=name)
-            for end in one.ends
-        )
+        low, high = (read.parsed((*settings, end)) for end in one.ends)
         with refusing(f"--vary {one.key}"):
             ranges.append(between(low, high))
             laid = [study.lay_out(end) for end in (low, high)]
@@ -166,7 +162,7 @@ def sensitivity(
         },
         notes=[*_notes(wanted, every, ranges, squares, view.blocks), *view.notes],
         warnings=_warnings(wanted, every, squares, told_of, view.blocks, computed),
-        scenario=label,
+        scenario=read.label,
         seed=seed,
         runs=runs,
         machine="jax",
@@ -175,7 +171,7 @@ def sensitivity(
             "Table:  {out}/sensitivity.csv   all indices with their bounds; points.csv has samples",
             *_next(name, wanted, every, computed),
         ],
-        **asked(text, settings),
+        **asked(read.text, settings),
     )
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from tempfile import TemporaryDirectory
 
 from robins import _float64, units
 from robins.campaign import check_machine, simulate
 from robins.campaign.bound import bound as bound_of
+from robins.campaign.machine import machine_for, pays_processes
 from robins.report import bounds
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.workbench.errors import refusing
-from robins.workbench.scenarios import asked, beside, check_filters, read_scenario
+from robins.workbench.scenarios import Simulated, asked, beside, check_filters, read_scenario
+from robins.workbench.workers import campaign_run
 
 
 def run(
@@ -49,18 +52,34 @@ def run(
     problem = one.problem(chosen, seed)
     if not filters:  # the default was not there when the claims were stated
         problem = replace(problem, claims=about(one.own, problem.claims))
-    found = simulate(problem, one.parameters.runs, progress=progress, machine=machine)
+    total = one.parameters.runs
+    by = machine_for(problem, total, machine)
+    if pays_processes(problem, by, total):
+        with TemporaryDirectory(prefix="robins-run-") as folder:
+            asked_for = {"runs": total, "seed": seed, "filters": chosen, "settings": settings}
+            found = campaign_run(folder, name, machine=by.name, progress=progress, **asked_for)
+        found = replace(found, claims=problem.claims(found.metrics))
+    else:
+        found = simulate(problem, total, progress=progress, machine=by)
     return replace(
         found,
         scenario=one.label,
         seed=seed,
-        runs=one.parameters.runs,
+        runs=total,
+        warnings=[*found.warnings, *_not_kept(one)],
         last_lines=[
             f"Machine: {found.machine}   --machine chooses another",
             f"Next:   robins run {name} --seed {seed + 1}   repeats it with other noise",
         ],
         **asked(one.text, settings),
     )
+
+
+def _not_kept(one: Simulated) -> list[str]:
+    """A sentence where a scenario asks for histories that only a campaign in a folder keeps."""
+    if not (one.parameters.keep or one.parameters.keep_diverged):
+        return []
+    return ["keep and keep_diverged are for `robins campaign run`: here run 0 alone has histories"]
 
 
 def bound(
