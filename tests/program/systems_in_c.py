@@ -1,0 +1,63 @@
+"""Filters of real systems in C against JAX, over the first epochs of a simulated run."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from machines import runs_the_same
+
+from robins.campaign.monte_carlo import contender, solved
+from robins.program import BuildError, ProgramError
+from robins.workbench.scenarios import read_scenario
+
+EPOCHS = 40
+UNROLL = 300
+
+AIRSHIP = "airship/s1"
+
+# A scenario of every study.
+STUDIES = (
+    AIRSHIP,
+    "gnss/city",
+    "ins-gnss/drive",
+    "rocket/a1",
+    "rocket/b1",
+    "satellite/s1",
+    "transfer-alignment/s0",
+    "transfer-alignment/a",
+    "transfer-alignment/aircraft",
+)
+
+
+@cache
+def world_of(name):
+    """What all filters of a scenario are given, simulated once."""
+    problem = read_scenario(name, ("runs=1",)).problem((), 0)
+    return jax.jit(problem.simulate)(jnp.asarray(0))
+
+
+def check(name, filter_):
+    """That a filter of a scenario runs in C as by JAX."""
+    problem = read_scenario(name, ("runs=1",)).problem((filter_,), 0)
+    one = contender(problem, filter_)
+    case = one.case(world_of(name))
+    if case.loop is not None:  # its readings are known when it has run
+        case = solved(one.filter, one.model, case, lambda step: ())[1]
+    u, y, aux = jax.tree.map(
+        lambda x: np.asarray(x)[:EPOCHS], (case.u, dict(case.y), dict(case.aux))
+    )
+    runs_the_same(one.filter, one.model, case.start, y, u, aux, unroll=UNROLL)
+
+
+def walk(name):
+    """What differs of all filters of a scenario, by their names."""
+    # A smoother runs the filter that it is named after.
+    filters = [f for f in read_scenario(name, ()).study.filters if not f.endswith("+rts")]
+    differs = {}
+    for filter_ in filters:
+        try:
+            check(name, filter_)
+        except (AssertionError, ProgramError, BuildError) as error:
+            differs[filter_] = str(error)[:200]
+    return differs
