@@ -107,3 +107,15 @@ def test_it_refuses_few_parts_and_a_lost_filter():
     z[0, 0] = np.inf
     with pytest.raises(TooLittle, match="lost as it is written"):
         choose(ONE, ["a"], Data(z), Data(spread(10, 2.0)))
+
+
+@pytest.mark.parametrize(("lost_at", "better"), [(1.0, True), (2.0, False)])
+def test_a_filter_that_is_lost_on_what_was_held_out_is_worse(lost_at, better):
+    def measure(kind, numbers, arrays):
+        z, held_out = arrays
+        found = likelihood(kind, numbers, z)
+        return jnp.where(held_out & (jnp.abs(numbers[0] - lost_at) < 0.2), jnp.inf, found)
+
+    z, no, yes = spread(20, 2.0), np.zeros((20, 1), bool), np.ones((20, 1), bool)
+    found = choose(Objective(of_one, measure, first), ["a"], Data((z, no)), Data((z, yes)))
+    assert found.better is better

@@ -304,6 +304,8 @@ def _gain(
     """By how much the objective fell, and its lower bound of 95 %: the parts left out in turn."""
     if not np.all(np.isfinite(after)):
         return -math.inf, -math.inf
+    if not np.all(np.isfinite(before)):
+        return math.inf, math.inf  # as written it is lost
     n = len(before)
 
     def fell(which: np.ndarray) -> float:
