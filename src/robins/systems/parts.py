@@ -32,6 +32,9 @@ Runs = Annotated[int, pydantic.Field(ge=1, le=MOST_RUNS)]
 RunNumber = Annotated[int, pydantic.Field(ge=0, le=MOST_RUNS)]
 """Number of a run, from 0; or how many."""
 
+HowMany = Annotated[RunNumber, pydantic.BeforeValidator(lambda x: MOST_RUNS if x == "all" else x)]
+"""Number of runs, or "all"."""
+
 Names = Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
 """Filters by name, one at least."""
 

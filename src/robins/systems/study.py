@@ -25,7 +25,7 @@ from robins.results import Outcome
 from robins.scenario import Parameters
 from robins.systems.catalogue import listed
 from robins.systems.judgement import Claim, Metrics, judging, standard_metrics
-from robins.systems.parts import Names, RunNumber, Runs
+from robins.systems.parts import HowMany, Names, RunNumber, Runs
 
 
 class StateBlock(NamedTuple):
@@ -223,7 +223,7 @@ class Scenario(Parameters):
     claims: tuple[str, ...] | None = None  # ids of those it checks; None: all of the study
     # of a campaign in a folder: runs whose histories it keeps, and of how many that diverge
     keep: tuple[RunNumber, ...] = ()
-    keep_diverged: RunNumber | Literal["all"] = 0
+    keep_diverged: HowMany = 0
 
 
 class Study(NamedTuple):
