@@ -1,9 +1,13 @@
 """Chunks by the memory that they need, and their statistics joined in order."""
 
+import os
 import pickle
 import shutil
+import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -152,3 +156,25 @@ def test_more_than_the_bound_is_said(problem, machine, monkeypatch):
     assert note.startswith("9 runs" if machine == "jax" else "8 runs")
     assert "MB of memory" in note
     assert "shorten" in note
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the C library of Linux is meant")
+def test_what_threads_have_freed_is_given_back():
+    pages = Path("/proc/self/statm")
+    page = os.sysconf("SC_PAGE_SIZE")
+
+    def resident():
+        return page * int(pages.read_text().split()[1])
+
+    def hold(block):
+        kept = [bytearray(block) for _ in range(400)]  # too small to be mapped each by itself
+        last = kept[-1]
+        del kept
+        return last  # in front of which all is free
+
+    with ThreadPoolExecutor(1) as pool:
+        last = pool.submit(hold, 120_000).result()
+        before = resident()
+        memory.give_back()
+        assert resident() < before - 20_000_000
+    assert len(last) == 120_000

@@ -19,6 +19,7 @@ import numpy as np
 
 from robins.campaign.gather import blank
 from robins.campaign.machine import ByJax, InLanes, Part
+from robins.campaign.memory import give_back
 from robins.campaign.plan import Chunk, Plan, Shard
 from robins.campaign.retention import DIVERGED, NAMED, by_stem, histories, name_of, trim
 from robins.campaign.shards import pack
@@ -74,6 +75,7 @@ class Worker:
                 continue
             began = monotonic()
             self.compute(taken)
+            give_back()
             self._took = monotonic() - began
             self.store.drop(taken.claim)
 
