@@ -51,6 +51,7 @@ def test_what_is_right_stays():
         (["barometer", "barometer"], "", "twice"),
         (["barometers"], "", "there is no such parameter"),
         (["title"], "", "is no number"),
+        (["barometer=0 m"], "", "no factor changes zero"),
         ([], "", "nothing to tune"),
         (["barometer"], "attitude", "none of error, innovations, height"),
     ],

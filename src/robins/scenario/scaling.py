@@ -55,11 +55,15 @@ def scaled(key: str, value: Any, factor: float) -> Any:
     Raises:
         ScenarioError: it is neither, or it is zero, which no factor changes.
     """
+    of = _scaled(key, value, factor)
+    if factor != 1.0 and of == _scaled(key, value, 1.0):
+        raise ScenarioError([f"{key} = {shown_value(value)}: no factor changes zero"])
+    return of
+
+
+def _scaled(key: str, value: Any, factor: float) -> Any:
     if isinstance(value, list | tuple):
-        of = [scaled(key, one, factor) for one in value]
-        if all(one == was for one, was in zip(of, value, strict=True)) and factor != 1.0:
-            raise ScenarioError([f"{key} = {shown_value(value)}: no factor changes it"])
-        return of
+        return [_scaled(key, one, factor) for one in value]
     found = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if found:
         return f"{float(found[1]) * factor!r} {found[2]}".rstrip()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import re
 from collections.abc import Sequence
@@ -29,6 +27,7 @@ from robins.report.sensitivity import table
 from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
 from robins.workbench.errors import InputError, refusing
+from robins.workbench.publication import csv_of
 from robins.workbench.scenarios import asked, check_filters, read_scenario
 
 RUNS, SAMPLES = 10, 256
@@ -282,7 +281,7 @@ def _table(
             index = [float(x[k, j]) for x in found]
             counts = [squares.shape[1], squares.shape[2]]
             rows.append([name, b.name, b.display_unit, *pair, *ends, *index, *counts])
-    return _csv(rows)
+    return csv_of(rows)
 
 
 def _points(
@@ -300,13 +299,7 @@ def _points(
     named = [(one.key, one.unit) for one in every]
     named += [(f"{b.name} RMS", b.display_unit) for b in blocks]
     head = [f"{name} [{unit}]" if unit not in ("", "1") else name for name, unit in named]
-    return _csv([head, *np.transpose(columns).tolist()])
-
-
-def _csv(rows: Sequence[Sequence[Any]]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    return csv_of([head, *np.transpose(columns).tolist()])
 
 
 def _notes(

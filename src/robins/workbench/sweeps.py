@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import json
 import re
@@ -24,6 +22,7 @@ from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
 from robins.workbench.campaigns import SWEEP, Where, plan_campaign, problem_of
 from robins.workbench.errors import InputError
+from robins.workbench.publication import csv_of
 from robins.workbench.scenarios import asked
 from robins.workbench.workers import fill
 
@@ -196,7 +195,7 @@ def _outcome(
             | {"diverged_runs": lost[filter_]}
             for f, filter_ in enumerate(plan.filters)
         },
-        files={"sweep.csv": _csv([head, *rows])},
+        files={"sweep.csv": csv_of([head, *rows])},
         notes=[
             f"{len(every)} points of {plan.runs} runs; lists of metrics go through "
             f"{' and '.join(v.key for v in vary)}, the last first.",
@@ -210,12 +209,6 @@ def _outcome(
         device=jax.devices()[0].device_kind,
         last_lines=["Table:  {out}/sweep.csv   all points, with 95 % bounds"],
     )
-
-
-def _csv(rows: Sequence[Sequence[Any]]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
 
 
 def _solution(

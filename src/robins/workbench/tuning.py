@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 from collections.abc import Sequence
@@ -30,7 +28,7 @@ from robins.workbench.objectives import (
     total_of,
     worded,
 )
-from robins.workbench.publication import part
+from robins.workbench.publication import csv_of, part
 from robins.workbench.recorded import Findings, open_log, unheard
 from robins.workbench.scenarios import asked
 
@@ -130,7 +128,7 @@ def _outcome(of: Asked, found: Tuned, seed: int) -> Outcome:
     return Outcome(
         solution=_solution(of, found, np.array(bands)),
         metrics=rows,
-        files={"tuned.toml": text.encode(), "tuning.csv": _csv(of, bands, now)},
+        files={"tuned.toml": text.encode(), "tuning.csv": csv_of(_table(of, bands, now))},
         notes=[
             *told,
             f"Held out: {change}.",
@@ -176,14 +174,14 @@ def _metrics(of: Asked, parts: np.ndarray) -> dict[str, Any]:
     return out
 
 
-def _csv(of: Asked, bands: Sequence[tuple[float, float, float]], now: Sequence[str]) -> bytes:
-    text = io.StringIO()
-    out = csv.writer(text, lineterminator="\n")
-    out.writerow(["parameter", "as written", "factor", "low", "high", "now"])
+def _table(
+    of: Asked, bands: Sequence[tuple[float, float, float]], now: Sequence[str]
+) -> Sequence[Sequence[Any]]:
+    rows: list[Sequence[Any]] = [("parameter", "as written", "factor", "low", "high", "now")]
     for v, band, line in zip(of.vary, bands, now, strict=True):
         was = scenario.setting(v.key, v.start).partition("=")[2]
-        out.writerow([v.key, was, *band, line.partition("=")[2]])
-    return text.getvalue().encode()
+        rows.append((v.key, was, *band, line.partition("=")[2]))
+    return rows
 
 
 def _solution(of: Asked, found: Tuned, bands: np.ndarray) -> xr.Dataset:
