@@ -12,7 +12,9 @@ from robins.results.summary import plain as plain_of
 from robins.workbench.campaigns import (
     campaign_show,
     campaign_status,
+    campaign_verify,
     campaign_work,
+    mend,
     plan_campaign,
     problem_of,
 )
@@ -115,6 +117,21 @@ def test_kept_runs_are_shown_without_computing_them_again(plain, kept, monkeypat
     campaign_show(kept, 5)  # a damaged one is computed again
     path.write_bytes(whole_)
     assert computed == [[5]]
+
+
+def test_a_damaged_history_is_told_and_mended(tmp_path):
+    narrow(tmp_path, *KEPT)
+    list(campaign_work(tmp_path))
+    path = next((tmp_path / "diverged").glob("*-21.npz"))
+    whole_ = path.read_bytes()
+    path.write_bytes(whole_[:-100])
+    digest = campaign_status(tmp_path).digest
+    assert campaign_verify(tmp_path).damaged == [f"diverged/{path.name}"]
+    assert mend(tmp_path) == 1
+    list(campaign_work(tmp_path))
+    assert campaign_verify(tmp_path).damaged == []
+    assert campaign_status(tmp_path).digest == digest
+    assert path.read_bytes() == whole_
 
 
 def test_what_is_kept_may_change_and_all_may_be(tmp_path):

@@ -14,7 +14,7 @@ from robins.report import figures
 from robins.results import find, read
 from robins.workbench import publish, sweeps
 from robins.workbench.campaigns import campaign_status, campaign_work, needed, problem_of
-from robins.workbench.sweeps import Varied, sweep, varied
+from robins.workbench.sweeps import Varied, report, status, sweep, varied
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
 SHORT = ("duration=20 s",)
@@ -82,6 +82,13 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
     assert rows[0]["runs"] == "12"
     with pytest.raises(RobinsError, match="holds the 2 campaigns of a sweep"):
         campaign_status(tmp_path)
+    assert status(tmp_path)["barometer=4 m"] == campaign_status(tmp_path / "points" / "1")
+    again = report(tmp_path.rename(tmp_path.with_name("moved")))
+    assert (again.metrics, again.files, again.scenario) == (
+        found.metrics,
+        found.files,
+        found.scenario,
+    )
 
 
 def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):

@@ -15,6 +15,8 @@ from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from robins.campaign.plan import Chunk, Shard
+from robins.campaign.shards import Damaged, unpack
+from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store
 
 NAMED, DIVERGED = "histories", "diverged"  # groups of objects
@@ -72,3 +74,16 @@ def kept(store: Store, shards: Mapping[str, Shard]) -> dict[str, list[int]]:
 def content_of(store: Store, shard: Shard, run: int) -> bytes | None:
     """The histories of a run, as they were packed; None where they are not kept."""
     return store.get(name_of(NAMED, shard, run)) or store.get(name_of(DIVERGED, shard, run))
+
+
+def damaged(store: Store, shards: Mapping[str, Shard]) -> dict[str, Shard]:
+    """Histories whose checksum does not fit, each with the shard that it belongs to."""
+    found = {}
+    for group in (NAMED, DIVERGED):
+        for of in histories(store, group, shards).values():
+            for one in of:
+                try:
+                    unpack(store.get(one.name) or b"", Statistics(()), None)
+                except Damaged:
+                    found[one.name] = shards[PurePosixPath(one.name).stem.partition("-")[0]]
+    return found

@@ -102,7 +102,7 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
 
 
 def _published(bench: Any, where: str, outcome: Any, progress: Any, to: Path | None = None) -> Any:
-    to = to or (Path("results") / "campaign" if "://" in where else Path(where) / "report")
+    to = to or (_result(where, "report") if "://" in where else Path(where) / "report")
     return bench.publish(outcome, to, command=command_line(), progress=progress)
 
 
@@ -137,10 +137,28 @@ def work(where: str, as_json: bool) -> None:
 @_WHERE
 @answers
 def status(where: str, as_json: bool) -> None:
-    """Read and check every shard of the campaign in DIR, and say what is done, missing, damaged."""
+    """Read and check every shard of the campaign in DIR, and say what is done, missing, damaged.
+
+    Of a sweep it says so for the campaign of each point.
+    """
     with only_json(as_json):
-        found = _workbench().campaign_status(where)
-    say(found._asdict(), _progress_text(where, found), as_json)
+        found = _workbench().status(where)
+    if isinstance(found, dict):
+        points = {name: one._asdict() for name, one in found.items()}
+        say({"points": points}, _points_text(where, found), as_json)
+    else:
+        say(found._asdict(), _progress_text(where, found), as_json)
+
+
+def _points_text(where: str, found: dict[str, Any]) -> str:
+    width, lines = max(map(len, found)), []
+    for name, one in found.items():
+        done = ", ".join(f"{filter_} {n}" for filter_, n in one.done.items())
+        damaged = f", {len(one.damaged)} shards damaged" if one.damaged else ""
+        lines.append(f"{name:<{width}}  {one.wanted} runs wanted; done: {done}{damaged}")
+    short = any(one.digest is None for one in found.values())
+    then = ("work", "   computes what is missing") if short else ("report", "")
+    return "\n".join([*lines, f"Next:   robins campaign {then[0]} {where}{then[1]}"])
 
 
 def _progress_text(where: str, found: Any) -> str:
@@ -173,7 +191,7 @@ def _progress_text(where: str, found: Any) -> str:
 def verify(where: str, share: float, as_json: bool) -> int:
     """Check all shards of DIR, compute some again, drawn by chance, and compare them bit by bit.
 
-    The exit status is 1 if a shard is damaged or differs.
+    Kept histories are checked too. The exit status is 1 if something is damaged or differs.
     """
     with only_json(as_json), Progress() as progress:
         found = _workbench().campaign_verify(where, share, progress=progress)
@@ -197,9 +215,13 @@ def verify(where: str, share: float, as_json: bool) -> int:
 @answers
 def show(where: str, number: int, out: Path | None, as_json: bool) -> None:
     """Compute one run of DIR again and write its histories and figures; it has the same bits."""
-    folder = where.rstrip("/").rpartition("/")[2]
-    out = out or Path("results") / f"{folder}-run-{number}"
+    out = out or _result(where, f"run-{number}")
     carry_out("campaign_show", where, number, out=out, as_json=as_json)
+
+
+def _result(where: str, what: str) -> Path:
+    """Where a result goes that is not in the folder of its campaign."""
+    return Path("results") / f"{where.rstrip('/').rpartition('/')[2]}-{what}"
 
 
 @campaign.command(
@@ -210,11 +232,14 @@ def show(where: str, number: int, out: Path | None, as_json: bool) -> None:
 @OUT
 @answers
 def report(where: str, out: Path | None, as_json: bool) -> None:
-    """Join the shards of DIR and write a result with figures and a page; by default DIR/report."""
+    """Join the shards of DIR and write a result with figures and a page; by default DIR/report.
+
+    DIR may be the folder of a sweep.
+    """
     bench = _workbench()
     with only_json(as_json), Progress() as progress:
         progress(0.0, "joining shards")
-        outcome = bench.campaign_report(where)
+        outcome = bench.report(where)
         result = _published(bench, where, outcome, progress, out)
     tell(outcome, result, as_json)
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins import _float64, scenario
-from robins.campaign import check_machine
+from robins.campaign import check_machine, retention
 from robins.campaign.bound import bound_sigma
 from robins.campaign.gather import State, blank, example_of, gather
 from robins.campaign.machine import machine_for
@@ -165,7 +165,9 @@ def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
 def campaigns_of(where: Where) -> list[str]:
     """The campaigns of a sweep, or the one that is there."""
     content = open_store(where).get(SWEEP)
-    return [str(where)] if content is None else json.loads(content)["points"]
+    if content is None:
+        return [str(where)]
+    return [f"{where}/{point}" for point in json.loads(content)["points"]]
 
 
 class Status(NamedTuple):
@@ -306,7 +308,7 @@ class Verified(NamedTuple):
 
 
 def campaign_verify(where: Where, share: float = 0.01, *, progress: Progress = silent) -> Verified:
-    """Check all shards, compute a share of them again by chance, and compare the bits.
+    """Check all shards and histories, compute a share again by chance, and compare the bits.
 
     Raises:
         InputError: there is nothing to compare.
@@ -330,13 +332,15 @@ def campaign_verify(where: Where, share: float = 0.01, *, progress: Progress = s
         statistics: Statistics = worker.found(chunk, [shard.filter])[shard.filter]
         if worker.packed(shard, chunk, statistics) != store.get(shard.name):
             different.append(shard.name)
-    return Verified(len(whole) + len(damaged), damaged, [s.name for _, s in drawn], different)
+    spoilt = [*damaged, *retention.damaged(store, by_stem(plan.shards))]
+    return Verified(len(whole) + len(damaged), spoilt, [s.name for _, s in drawn], different)
 
 
 def mend(where: Where) -> int:
-    """Remove damaged shards, to be computed again; how many."""
+    """Remove damaged shards, and those of damaged histories, to be computed again; how many."""
     store, plan = ready(where)
-    damaged = gather(store, plan).damaged
-    for shard in damaged:
-        store.drop(shard.name)
-    return len(damaged)
+    spoilt = retention.damaged(store, by_stem(plan.shards))
+    shards = {shard.name for shard in (*gather(store, plan).damaged, *spoilt.values())}
+    for name in (*spoilt, *shards):
+        store.drop(name)
+    return len(shards)

@@ -1,4 +1,4 @@
-"""The command `sweep`: a campaign for each value of a parameter, or of two, as one result."""
+"""A campaign for each value of a parameter, or of two, as one result."""
 
 from __future__ import annotations
 
@@ -15,12 +15,21 @@ import xarray as xr
 from robins import units
 from robins.campaign.gather import gather
 from robins.campaign.machine import available_cores
-from robins.campaign.plan import Plan, needed
+from robins.campaign.plan import Plan
 from robins.campaign.statistics import Statistics, rms_with_bounds
 from robins.campaign.store import Store, open_store
 from robins.results import Outcome, Progress, array, silent
 from robins.systems.study import StateBlock
-from robins.workbench.campaigns import SWEEP, Where, plan_campaign, problem_of
+from robins.workbench.campaigns import (
+    SWEEP,
+    Status,
+    Where,
+    campaign_report,
+    campaign_status,
+    plan_campaign,
+    problem_of,
+    ready,
+)
 from robins.workbench.errors import InputError
 from robins.workbench.publication import csv_of
 from robins.workbench.scenarios import asked
@@ -81,7 +90,12 @@ def points(where: Where, vary: Sequence[Varied]) -> Iterator[Point]:
     """All choices, the last parameter first to change."""
     for place in itertools.product(*(range(len(v.values)) for v in vary)):
         settings = tuple(f"{v.key}={v.values[k]}" for v, k in zip(vary, place, strict=True))
-        yield Point(place, settings, f"{where}/points/{'-'.join(map(str, place))}")
+        yield Point(place, settings, f"{where}/{name_of(place)}")
+
+
+def name_of(place: Sequence[int]) -> str:
+    """The folder of a point in that of its sweep."""
+    return f"points/{'-'.join(map(str, place))}"
 
 
 def sweep(
@@ -126,15 +140,41 @@ def sweep(
         more = (*settings, *point.settings)
         plan = plan_campaign(point.where, name, settings=more, machine=machine, **options)
         campaigns.append((point.where, plan))
-    open_store(where).put(
-        SWEEP, json.dumps({"points": [point.where for point in every]}).encode(), anew=True
-    )
+    said = {"vary": list(vary), "points": [name_of(point.place) for point in every]}
+    open_store(where).put(SWEEP, json.dumps(said).encode(), anew=True)
 
     def filling(share: float, what: str) -> None:
         progress(0.1 + 0.9 * share, what)
 
     fill(where, campaigns, workers or available_cores(), filling)
-    return _outcome(name, chosen, every, settings)
+    return _outcome(chosen, every)
+
+
+def status(where: Where) -> Status | dict[str, Status]:
+    """How far a campaign is, or by the settings of its points each of those of a sweep."""
+    every = _asked(where)
+    if every is None:
+        return campaign_status(where)
+    return {", ".join(point.settings): campaign_status(point.where) for point in every[1]}
+
+
+def report(where: Where) -> Outcome:
+    """What the runs say that are there of a campaign, or of all campaigns of a sweep.
+
+    Raises:
+        InputError: there is no run of some filter.
+    """
+    every = _asked(where)
+    return campaign_report(where) if every is None else _outcome(*every)
+
+
+def _asked(where: Where) -> tuple[list[Varied], list[Point]] | None:
+    """What the sweep of a folder varies, and its points; None where there is one campaign."""
+    content = open_store(where).get(SWEEP)
+    if content is None:
+        return None
+    chosen = [varied(text) for text in json.loads(content)["vary"]]
+    return chosen, list(points(where, chosen))
 
 
 class Rms(NamedTuple):
@@ -153,11 +193,9 @@ class Rms(NamedTuple):
         return cls(*rms_with_bounds(squares), float(np.sqrt(np.mean(stated))))
 
 
-def _outcome(
-    name: str, vary: Sequence[Varied], every: Sequence[Point], settings: Sequence[str]
-) -> Outcome:
+def _outcome(vary: Sequence[Varied], every: Sequence[Point]) -> Outcome:
     """The errors of all filters at all points."""
-    plans = {point: needed(open_store(point.where)) for point in every}
+    plans = {point: ready(point.where)[1] for point in every}
     plan = plans[every[0]]
     blocks = problem_of(plan).blocks
     sizes = (*(len(v.values) for v in vary), 1)[:2]
