@@ -1,6 +1,7 @@
 """A campaign in a folder: the same table whoever fills it, whatever is killed, damaged or added."""
 
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -18,8 +19,9 @@ from robins.campaign import simulate
 from robins.campaign.gather import gather
 from robins.campaign.machine import Part
 from robins.campaign.plan import needed, write
+from robins.campaign.retention import content_of
 from robins.campaign.store import open_store
-from robins.campaign.work import Worker, missing
+from robins.campaign.work import Missing, Worker, missing
 from robins.errors import RobinsError
 from robins.program import CPP, LANE_FLAGS
 from robins.workbench import simulated
@@ -184,12 +186,26 @@ def test_a_run_in_lanes_is_that_of_the_campaign(tmp_path, monkeypatch):
     list(worker.work())
     whole = gather(store, plan, problem).found["kf"]
     chunks = list(plan.chunks)
-    for run in (0, 13, 20):
-        alone = worker.runs_of(chunks[run // 8], ["kf"], [run])["kf"][run]
-        np.testing.assert_array_equal(alone.run_rms[0], whole.run_rms[run])
+    alone = {run: worker.runs_of(chunks[run // 8], ["kf"], [run])["kf"][run] for run in (0, 13, 20)}
+    for run, one in alone.items():
+        np.testing.assert_array_equal(one.run_rms[0], whole.run_rms[run])
     again = Worker(store, plan, problem).found(chunks[1], ["kf"])["kf"]
     shard = plan.shard(chunks[1], "kf")
     assert worker.packed(shard, chunks[1], again) == store.get(shard.name)
+    keeps = plan_campaign(
+        tmp_path / "keeps",
+        BALLOON,
+        runs=21,
+        filters=("kf",),
+        settings=(*SHORT, "keep=[13]"),
+        machine="c",
+    )
+    keeps = plans.replace(keeps, width=8)
+    worker = Worker(open_store(tmp_path / "keeps"), keeps, problem)
+    worker.compute(Missing(chunks[1], [shard]))
+    assert open_store(tmp_path / "keeps").get(shard.name) == store.get(shard.name)
+    kept = content_of(worker.store, shard, 13)
+    assert kept == worker.packed(shard, chunks[1], alone[13])
 
 
 def test_runs_that_diverge_are_named(tmp_path):
@@ -274,6 +290,34 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
     command = [*ROBINS, "work", str(serial), "--json"]
     assert json.loads(subprocess.run(command, capture_output=True, check=True).stdout)["done"] == 14
     assert campaign_status(where).digest == campaign_status(serial).digest
+
+
+UNSHARED = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c")
+
+
+def test_a_disk_that_gets_full_loses_nothing(undisturbed, tmp_path):
+    """On a file system of its own that has room for half of the shards."""
+    small, left = tmp_path / "small", tmp_path / "left"
+    mounted = f"mount -t tmpfs -o size={{size}} none {small}"
+    small.mkdir()
+    try:
+        subprocess.run([*UNSHARED, mounted.format(size="64k")], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("this machine lets nobody mount a small file system")
+    begun(left)
+    size = sum(path.stat().st_size for path in undisturbed.rglob("*.npz")) // 2
+    worker = f"{shlex.join([*ROBINS, 'work', str(small), '--json'])}; code=$?"
+    script = f"{mounted.format(size=size)} && cp -r {left}/. {small} && {worker}"
+    told = subprocess.run(
+        [*UNSHARED, f"{script}; cp -r {small}/. {left}; exit $code"], capture_output=True, text=True
+    )
+    assert told.returncode == 1, told
+    assert "No space left on device; make room" in told.stderr
+    status = campaign_status(left)
+    assert 0 < status.missing < 14
+    assert not status.damaged
+    list(campaign_work(left))
+    assert campaign_status(left).digest == campaign_status(undisturbed).digest
 
 
 def test_ctrl_c_ends_all_at_once_and_it_goes_on(tmp_path):
