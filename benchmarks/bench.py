@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from robins.bench.run.one_program import in_process
+from robins.bench.rigs.satellite.errors import inside
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
 from robins.bench.run.telemetry import difference
@@ -25,15 +25,15 @@ def main() -> None:
         record = Path(folder) / "bench.mcap"
         flight = changed(read("satellite/s1"), {"seconds": asked.seconds})
         ran = Session(flight, record).run()
-        in_process(flight, ran.kit)  # compiles
+        inside(ran.kit)  # compiles
         began = time.perf_counter()
-        inside = in_process(flight, ran.kit)
-        spent = (time.perf_counter() - began) / len(inside.time_s)
+        alone = inside(ran.kit)
+        spent = (time.perf_counter() - began) / ran.steps
         steps = ran.steps / ran.seconds
         print(f"lock-step, seven processes   {steps:10.0f} steps/s")
         ratio = 1.0 / spent / steps
         print(f"one program                  {1.0 / spent:10.0f} steps/s, {ratio:.0f} times")
-        print(f"difference                   {difference(ran.flown, inside):10.3g}")
+        print(f"difference                   {difference(ran.flown, alone):10.3g}")
         print(f"record                       {record.stat().st_size / ran.steps:10.0f} bytes/step")
         print(ran.latencies.table())
         real = changed(flight, {"clock": "realtime", "rate": 100.0})

@@ -13,7 +13,8 @@ from timing import best_of, show
 
 from robins.bench.broker.injector import Injector, LinkFault
 from robins.bench.recording import Entry, Recorder
-from robins.bench.wire import MESSAGES, Header, Receiver, decode, decode_frame, encode, encode_frame
+from robins.bench.rigs.satellite.messages import WIRE
+from robins.bench.wire import Header, Receiver, decode_frame, encode_frame
 
 FRAMES = 2000
 CYCLE = (16, 16, 16, 17, 17, 18, 18, 18, 19, 19, 20, 20, 21, 21, 22, 22, 23, 23, 24)
@@ -71,11 +72,13 @@ def values_of(m, rng):
 
 
 def there(m, values):
-    return [encode_frame(Header(m.number, 7, k, k), encode(m.name, values)) for k in range(FRAMES)]
+    return [
+        encode_frame(Header(m.number, 7, k, k), WIRE.encode(m.name, values)) for k in range(FRAMES)
+    ]
 
 
 def back(m, made):
-    return [decode(m.name, decode_frame(one).payload) for one in made]
+    return [WIRE.decode(m.name, decode_frame(one).payload) for one in made]
 
 
 def record(some, known):
@@ -102,8 +105,8 @@ def inject(injector, some):
 
 def main():
     rng = np.random.default_rng(0)
-    values = {m.number: values_of(m, rng) for m in MESSAGES}
-    for m in MESSAGES:
+    values = {m.number: values_of(m, rng) for m in WIRE.messages}
+    for m in WIRE.messages:
         made = [one[1:-1] for one in there(m, values[m.number])]
         tasks = {
             "encode": lambda m=m: there(m, values[m.number]),
@@ -112,9 +115,9 @@ def main():
         for name, seconds in best_of(tasks).items():
             show(f"{name} {m.name}, {len(made[0]) + 2} bytes", seconds, FRAMES, "frame")
 
-    by_number = {m.number: m for m in MESSAGES}
+    by_number = {m.number: m for m in WIRE.messages}
     some = [
-        encode_frame(Header(n, 7, k, k), encode(by_number[n].name, values[n]))
+        encode_frame(Header(n, 7, k, k), WIRE.encode(by_number[n].name, values[n]))
         for k, n in enumerate(CYCLE * (FRAMES // len(CYCLE)))
     ]
     stream = b"".join(some)

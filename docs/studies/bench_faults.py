@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from robins.bench.broker import LinkFault
-from robins.bench.run import Session, telemetry
-from robins.bench.run.outcome import figures
+from robins.bench.rigs.satellite import RIG, errors
+from robins.bench.run import Session
+from robins.bench.run.outcome import figures, judged
 from robins.bench.run.setup import changed, read
 
 DEG = math.pi / 180.0
@@ -30,22 +30,22 @@ CASES = {
 
 def flown(case: str, filter_: str, seed: int, seconds: float) -> dict:
     fault = CASES[case][0]
-    faults = () if fault is None else (LinkFault(**{"begin": 600.0, **fault}),)
+    faults = () if fault is None else (RIG.fault(**{"begin": 600.0, **fault}),)
     flight = read("satellite/s1")
     options = {"filter": filter_, "seed": seed, "seconds": seconds, "faults": faults}
     flight = changed(flight, options)
     ran = Session(flight).run()
     assert not ran.failure, ran.failure
-    told = figures(flight, ran, None)
+    told = figures(flight, ran, judged(flight, ran), None)
     # As in the specification: peaks and figures of the time from the fault on.
-    after = slice(round(600.0 / flight.loop.step), None)
-    error = telemetry.attitude_error(ran.flown)
-    wanted = np.asarray(ran.kit.rows.course.ref_end_q_ib)[: ran.steps]
-    pointing = telemetry.turn(wanted, ran.flown.q_ib)
+    after = slice(round(600.0 / flight.given.step), None)
+    error = errors.attitude_error(ran.flown)
+    wanted = errors.reference_q_ib(ran.kit)[: ran.steps]
+    pointing = errors.turn(wanted, ran.flown["motion.q_ib"])
     return told | {
-        "attitude_peak": telemetry.peak_arcsec(error, after),
+        "attitude_peak": errors.peak_arcsec(error, after),
         "attitude_end": told["attitude_end_arcsec"],
-        "pointing_peak": telemetry.peak_arcsec(pointing, after),
+        "pointing_peak": errors.peak_arcsec(pointing, after),
     }
 
 

@@ -127,11 +127,12 @@ def stream_and_cuts(data: bytes) -> tuple[bytes, list[int]]:
 
 def seeds() -> list[bytes]:
     """Inputs to begin with: each message of the wire, as bytes and composed, and noise."""
-    from robins.bench.wire import MESSAGES, Header, encode_frame, size_of
+    from robins.bench.rigs.satellite.messages import WIRE
+    from robins.bench.wire import Header, encode_frame
 
     out = []
-    for k, m in enumerate(MESSAGES):
-        payload = bytes((7 * i + k) % 256 for i in range(size_of(m.name)))
+    for k, m in enumerate(WIRE.messages):
+        payload = bytes((7 * i + k) % 256 for i in range(WIRE.size_of(m.name)))
         frame = encode_frame(Header(m.number, 7, k, k * 10**8), payload)
         out.append(bytes([0, 3, k, 30]) + frame + b"\x11\x22" * k + frame)
         out.append(bytes([1, 9, 1, k, 1, len(payload)]) + payload + bytes([0, 3]) + b"abc")

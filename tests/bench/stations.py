@@ -10,14 +10,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from robins.bench.parts.satellite import BUILD, Kit
-from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.parts.station import Part, Station, ready, serve
 from robins.bench.ports.port import address, open_port
-from robins.bench.run.one_program import in_process
+from robins.bench.rig import Rig
+from robins.bench.rigs.satellite import BUILD, Kit
+from robins.bench.rigs.satellite.errors import inside
+from robins.bench.rigs.satellite.messages import WIRE
+from robins.bench.rigs.satellite.preparing import kit_for
 from robins.bench.run.setup import read
-from robins.bench.run.telemetry import Flown
-from robins.bench.wire import Frame, Header, Receiver, decode, encode, encode_frame, message
+from robins.bench.wire import Frame, Header, Receiver, Wire, encode_frame
 
 RUN = 7
 ORDER = ("acm", "actuators", "plant", "table", "gyro", "star", "adm")
@@ -36,13 +37,13 @@ def alive(pid: int) -> bool:
 @cache
 def kit(name: str = "satellite/s1", filter_: str = "mekf", *settings: str) -> Kit:
     flight = read(name, settings)
-    return kit_for(flight.loop, filter_, seed=0)
+    return kit_for(flight.given, filter_, seed=0)
 
 
 @cache
-def one_program(name: str, filter_: str, *settings: str) -> Flown:
+def one_program(name: str, filter_: str, *settings: str) -> dict[str, np.ndarray]:
     """The run of a kit without any wire."""
-    return in_process(read(name, settings), kit(name, filter_, *settings))
+    return inside(kit(name, filter_, *settings))
 
 
 _READY: dict[int, tuple[Kit, dict[str, Part]]] = {}
@@ -58,9 +59,9 @@ def parts(of: Kit) -> dict[str, Part]:
 class Threads:
     """In the place of `Crew`: parts on threads, over pseudo-terminals; starts no process."""
 
-    stations: ClassVar[Mapping[str, Callable[[Part], Station]]] = {}  # of parts that are odd
+    stations: ClassVar[Mapping[str, Callable[[Part, Wire], Station]]] = {}  # of parts that are odd
 
-    def __init__(self, kit: Kit, realtime: bool = False, restarts: bool = False):
+    def __init__(self, rig: Rig, kit: Kit, realtime: bool = False, restarts: bool = False):
         self.parts, self.threads = parts(kit), list[threading.Thread]()
 
     def __enter__(self) -> "Threads":
@@ -73,7 +74,7 @@ class Threads:
     def start(self, name: str, port: str, since: int = -1) -> None:
         def be():
             with suppress(OSError), open_port(address(port), timeout_s=None) as line:
-                serve(line, self.stations.get(name, Station)(self.parts[name]))
+                serve(line, self.stations.get(name, Station)(self.parts[name], WIRE))
 
         self.threads.append(threading.Thread(target=be, daemon=True))
         self.threads[-1].start()
@@ -102,17 +103,17 @@ class Loop:
 
     def __init__(self, of: Kit, meddle: Meddle | None = None):
         self.kit, self.meddle = of, meddle
-        self.stations = {name: Station(part) for name, part in parts(of).items()}
+        self.stations = {name: Station(part, WIRE) for name, part in parts(of).items()}
         self.sent = dict.fromkeys(BUILD, 0)
         self.receivers = {name: Receiver() for name in BUILD}
         self.heard: dict[str, list[dict[str, Any]]] = {}
         self.said: list[tuple[str, Frame]] = []
         self.step = 0
         for name in BUILD:
-            self.to(name, "begin", encode("begin", {"step": of.step_ns}), 0)
+            self.to(name, "begin", WIRE.encode("begin", {"step": of.step_ns}), 0)
 
     def to(self, part: str, name: str, payload: bytes, time_ns: int) -> bytes:
-        header = Header(message(name).number, RUN, self.sent[part], time_ns)
+        header = Header(WIRE.message(name).number, RUN, self.sent[part], time_ns)
         self.sent[part] += 1
         return self.stations[part].feed(encode_frame(header, payload))
 
@@ -120,18 +121,18 @@ class Loop:
         for k in range(self.step, self.step + steps):
             now = (k + 1) * self.kit.step_ns
             for part in ORDER:
-                answer = self.to(part, "tick", encode("tick", {"step": k}), now)
+                answer = self.to(part, "tick", WIRE.encode("tick", {"step": k}), now)
                 for frame in self.receivers[part].feed(answer):
                     self.pass_on(k, part, frame)
         self.step += steps
         return self
 
     def pass_on(self, step: int, part: str, frame: Frame) -> None:
-        name = message(frame.header.type).name
+        name = WIRE.message(frame.header.type).name
         self.said.append((part, frame))
         if name == "done":
             return
-        self.heard.setdefault(name, []).append(decode(name, frame.payload))
+        self.heard.setdefault(name, []).append(WIRE.decode(name, frame.payload))
         for taker, station in self.stations.items():
             if name in station.part.takes:
                 pieces = [(frame.header.time_ns, frame.payload)]

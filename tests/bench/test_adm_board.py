@@ -11,10 +11,9 @@ import pytest
 from stations import Loop, kit, on_threads
 from test_firmware import SANITISERS, Board, build, sanitised, unpacked
 
-from robins.bench import wire
 from robins.bench.ports.cable import cable
 from robins.bench.ports.port import open_pair
-from robins.bench.wire.schema import HELD, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.messages import HELD, SAFE, SHORT, SILENT, USED, WIRE
 from robins.cli import main
 from robins.filters import OnlineFilter
 from robins.program import Memory
@@ -54,9 +53,9 @@ def flown(of, meddled):
             if meddled and (step in NO_GYRO if name == "gyro" else step in NO_STAR):
                 return []
             if meddled and name == "star" and step in NO_LENGTH:
-                said = wire.decode(name, payload)
-                payload = wire.encode(name, {**said, "q_ib": 0.9 * said["q_ib"]})
-            reached[step][name] = wire.decode(name, payload)
+                said = WIRE.decode(name, payload)
+                payload = WIRE.encode(name, {**said, "q_ib": 0.9 * said["q_ib"]})
+            reached[step][name] = WIRE.decode(name, payload)
         return [((step + 1) * of.step_ns, payload)]
 
     return reached, Loop(of, meddle).run(STEPS)
@@ -77,8 +76,8 @@ def answers(program, of, reached):
                 while len(told["done"]) <= k:
                     frame = board.frame()
                     assert frame is not None, f"no answer in step {k}"
-                    name = wire.message(frame.header.type).name
-                    told[name].append(wire.decode(name, frame.payload))
+                    name = WIRE.message(frame.header.type).name
+                    told[name].append(WIRE.decode(name, frame.payload))
         finally:
             board.process.kill()
             board.process.communicate()

@@ -2,8 +2,8 @@
 
 import pytest
 
-from robins.bench.run.telemetry import Alarms
-from robins.bench.wire.schema import FLAGS
+from robins.bench.rigs.satellite.messages import FLAGS
+from robins.bench.rigs.satellite.view import Alarms
 
 USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
 BETWEEN = [0] * 4  # estimates without a star frame
@@ -12,7 +12,7 @@ BETWEEN = [0] * 4  # estimates without a star frame
 def heard(*flags: int) -> list[tuple[int, str, str]]:
     """Number of the estimate, level and text of all that is said."""
     alarms = Alarms()
-    return [(k, *said) for k, one in enumerate(flags) for said in alarms.hear(one)]
+    return [(k, *said) for k, one in enumerate(flags) for said in alarms.said(one)]
 
 
 RUNS = {

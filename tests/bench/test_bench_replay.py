@@ -15,9 +15,9 @@ from robins.bench.ports.port import Address, open_port
 from robins.bench.recording import Entry, Event, Record, Recorder, read_record
 from robins.bench.recording.differences import differences
 from robins.bench.recording.replay import ReplayError, recorded, replay
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header, Receiver
-from robins.bench.wire.c_header import firmware, schema_number
-from robins.bench.wire.schema import PARTS
+from robins.bench.wire.c_header import firmware
 
 STEP_NS = 100_000_000
 STEPS = 60
@@ -30,7 +30,7 @@ def time_ns(step: int) -> int:
 
 def encoded(name: str, sequence: int, at_ns: int, run: int = RUN, **values) -> bytes:
     return wire.encode_frame(
-        Header(wire.NUMBERS[name], run, sequence, at_ns), wire.encode(name, values)
+        Header(WIRE.numbers[name], run, sequence, at_ns), WIRE.encode(name, values)
     )
 
 
@@ -64,7 +64,7 @@ class Echo(threading.Thread):
 
     def talk(self, port) -> None:
         receiver, run, sequence, total, answer = Receiver(), 0, 0, np.zeros(3), (-1, b"")
-        said = {"part": PARTS.index(self.odd.get("part", "adm")), "schema": schema_number()}
+        said = {"part": WIRE.parts.index(self.odd.get("part", "adm")), "schema": WIRE.number}
         said["schema"] ^= self.odd.get("schema", 0)
         port.write(encoded("hello", 0, 0, run=0, **said))
         inbox: dict[int, np.ndarray] = {}
@@ -72,12 +72,12 @@ class Echo(threading.Thread):
             data = receive(port)
             self.heard += data
             for frame in receiver.feed(data):
-                name, head = wire.message(frame.header.type).name, frame.header
+                name, head = WIRE.message(frame.header.type).name, frame.header
                 if name == "begin" and head.run != run:
                     run, sequence, total = head.run, 0, np.zeros(3)
                 if name == "stop":
                     return
-                values = wire.decode(name, frame.payload)
+                values = WIRE.decode(name, frame.payload)
                 if name == "gyro" and head.run == run:
                     inbox.setdefault(head.time_ns, values["theta_b"])
                 if name != "tick" or values["step"] < answer[0]:
@@ -94,10 +94,10 @@ class Echo(threading.Thread):
                 if k > answer[0]:
                     total = total + inbox.get(head.time_ns, 0.0)
                     told = self.odd.get("change", lambda e, k: e)(estimate(total, k), k)
-                    answer = (k, wire.encode("estimate", told))
+                    answer = (k, WIRE.encode("estimate", told))
                 at = head.time_ns
                 out = wire.encode_frame(
-                    Header(wire.NUMBERS["estimate"], run, sequence, at), answer[1]
+                    Header(WIRE.numbers["estimate"], run, sequence, at), answer[1]
                 )
                 took = int(np.random.default_rng().integers(10**6))
                 port.write(out + encoded("done", sequence + 1, at, run, step=k, compute=took))
@@ -134,7 +134,7 @@ class Story:
         self.entries.append(Entry(len(self.entries), link, "from", data))
 
     def hello(self) -> None:
-        said = {"part": PARTS.index("adm"), "schema": schema_number()}
+        said = {"part": WIRE.parts.index("adm"), "schema": WIRE.number}
         self.back(encoded("hello", 0, 0, run=0, **said))
 
     def begin(self) -> None:
@@ -210,7 +210,7 @@ def noisy_story() -> Story:
 @pytest.mark.parametrize("story", [plain_story, noisy_story])
 def test_the_same_part_says_the_same(story, tmp_path):
     """Through a file, as a record is."""
-    with Recorder(tmp_path / "run.mcap", {}) as recorder:
+    with Recorder(tmp_path / "run.mcap", WIRE, {}) as recorder:
         for entry in story().entries:
             recorder.write(entry)
         recorder.event(Event(0, "note", "nothing", {}))
@@ -223,7 +223,7 @@ def test_the_same_part_says_the_same(story, tmp_path):
             yield part
 
     record = read_record(tmp_path / "run.mcap")
-    found = replay(record, "adm", start, 5.0, lambda k, n: told.append((k, n)))
+    found = replay(record, WIRE, "adm", start, 5.0, lambda k, n: told.append((k, n)))
     assert found.first_difference is None
     assert found.same
     assert (found.part, found.starts, found.step_ns) == ("adm", 1, STEP_NS)
@@ -241,12 +241,12 @@ def test_a_part_that_has_changed_is_found_out():
             said["gyro_bias"][1] = np.nextafter(said["gyro_bias"][1], 9.0)
         return said
 
-    found = replay(plain_story().record(), "adm", starting(change=change), 5.0)
+    found = replay(plain_story().record(), WIRE, "adm", starting(change=change), 5.0)
     assert not found.same
-    then = float(wire.decode("estimate", found.recorded[23].payload)["gyro_bias"][1])
+    then = float(WIRE.decode("estimate", found.recorded[23].payload)["gyro_bias"][1])
     words = f"was {then!r}, is {float(np.nextafter(then, 9.0))!r}"
     assert found.first_difference == f"step 23 (2.4 s): estimate.gyro_bias[1] {words}"
-    (d,) = differences(found.recorded, found.frames, found.step_ns)
+    (d,) = differences(WIRE, found.recorded, found.frames, found.step_ns)
     assert (d.field, d.component, d.first_step, d.count) == ("gyro_bias", 1, 23, STEPS - 23)
 
 
@@ -256,7 +256,7 @@ def test_a_nan_of_other_bits_is_not_byte_for_byte():
             said["sigma"] = -np.full(6, np.nan)
         return said
 
-    found = replay(plain_story().record(), "adm", starting(change=change), 5.0)
+    found = replay(plain_story().record(), WIRE, "adm", starting(change=change), 5.0)
     assert not found.same
     words = "step 7 (0.8 s): 'estimate' of 0.8 s, number 14, has the same numbers in other bytes"
     assert words in found.first_difference
@@ -265,26 +265,26 @@ def test_a_nan_of_other_bits_is_not_byte_for_byte():
 def test_frames_too_many_and_too_few_are_told():
     story = plain_story()
     lacking = [e for k, e in enumerate(story.entries) if k != 2 + 5 * 8 + 3]
-    found = replay(Record({}, lacking, [], True, ""), "adm", starting(), 5.0)
+    found = replay(Record({}, lacking, [], True, ""), WIRE, "adm", starting(), 5.0)
     words = "step 8 (0.9 s): 'estimate' of 0.9 s, number 16, is said now and was not recorded"
     assert found.first_difference == words
     more = {"innovation": [0] * 3, "sigma": [0] * 3, "ratio": 0}
     story.back(encoded("innovation", 2 * STEPS, time_ns(60), **more))
-    found = replay(story.record(), "adm", starting(), 5.0)
+    found = replay(story.record(), WIRE, "adm", starting(), 5.0)
     assert "number 120, was recorded and is not said now" in found.first_difference
 
 
 def test_a_frame_that_the_bench_heard_twice_counts_once():
     story = plain_story()
     doubled = [e for e in story.entries for _ in range(1 + (e.direction == "from"))]
-    assert replay(Record({}, doubled, [], True, ""), "adm", starting(), 5.0).same
+    assert replay(Record({}, doubled, [], True, ""), WIRE, "adm", starting(), 5.0).same
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3, 4, 5, 6])
 def test_a_record_that_was_cut_is_replayed_so_far(lost):
     """Wherever an answer was cut, what is there is the same."""
     cut = Record({}, plain_story().entries[:-lost], [], False, "cut")
-    found = replay(cut, "adm", starting(), 5.0)
+    found = replay(cut, WIRE, "adm", starting(), 5.0)
     assert found.same
     assert found.steps == STEPS - (lost >= 4)
 
@@ -302,7 +302,7 @@ def test_a_part_that_was_started_anew_is_started_anew():
     story.begin()
     for k in range(21, STEPS):
         story.step(k)
-    found = replay(story.record(), "adm", starting(), 5.0)
+    found = replay(story.record(), WIRE, "adm", starting(), 5.0)
     assert found.first_difference is None
     assert (found.starts, found.steps) == (2, STEPS)
 
@@ -328,23 +328,23 @@ def test_a_part_that_does_not_go_through_with_it(odd, words):
         yield parts[0]
 
     with pytest.raises(ReplayError, match=words):
-        replay(plain_story().record(), "adm", start, 0.5)
+        replay(plain_story().record(), WIRE, "adm", start, 0.5)
     parts[0].join(3.0)  # it ends when its line does
     assert not parts[0].is_alive()
 
 
 def test_a_part_that_says_nothing():
     with pytest.raises(ReplayError, match=r"'adm' did not answer before its hello for 0\.2 s"):
-        replay(plain_story().record(), "adm", lambda _: contextlib.nullcontext(), 0.2)
+        replay(plain_story().record(), WIRE, "adm", lambda _: contextlib.nullcontext(), 0.2)
 
 
 def test_a_record_without_the_part_lists_those_it_has():
     with pytest.raises(ReplayError, match="no begin to the part 'star'; links in it: adm, gyro"):
-        replay(plain_story().record(), "star", starting())
+        replay(plain_story().record(), WIRE, "star", starting())
     with pytest.raises(ReplayError, match="links in it: adm, gyro"):
         recorded(plain_story().record(), "star")
     with pytest.raises(ReplayError, match="links in it: none"):
-        replay(Record({}, [], [], True, ""), "star", starting())
+        replay(Record({}, [], [], True, ""), WIRE, "star", starting())
 
 
 def test_a_process_that_dies_is_told_by_its_code():
@@ -356,13 +356,13 @@ def test_a_process_that_dies_is_told_by_its_code():
         process.wait()
 
     with pytest.raises(ReplayError, match=r"died before its hello \(exit code 3\)"):
-        replay(plain_story().record(), "adm", start, 30.0)
+        replay(plain_story().record(), WIRE, "adm", start, 30.0)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
 def test_a_board_in_c_says_the_same_to_a_record(tmp_path):
     """The turn between attitudes about one axis, by hand, to the bit where it is an exact one."""
-    for name, text in firmware().items():
+    for name, text in firmware(WIRE).items():
         (tmp_path / name).write_text(text)
     command = ["gcc", "-std=c99", "-O1", "gyro_board.c", "platform_posix.c", "-lm", "-o", "board"]
     subprocess.run(command, cwd=tmp_path, check=True)
@@ -388,10 +388,12 @@ def test_a_board_in_c_says_the_same_to_a_record(tmp_path):
         turn = [np.nan] * 3 if k == 0 else [0.0, 0.0, (1 if k % 2 else -1) * np.pi / 2]
         entry("from", encoded("gyro", 2 * k, time_ns(k), theta_b=turn))
         entry("from", encoded("done", 2 * k + 1, time_ns(k), step=k, compute=1))
-    found = replay(Record({}, entries, [], True, ""), "gyro", start, 5.0)
-    worst = differences(found.recorded, found.frames)
+    found = replay(Record({}, entries, [], True, ""), WIRE, "gyro", start, 5.0)
+    worst = differences(WIRE, found.recorded, found.frames)
     assert all(d.max_abs < 1e-15 for d in worst)
-    again = replay(Record({}, [*now(entries, found.frames)], [], True, ""), "gyro", start, 5.0)
+    again = replay(
+        Record({}, [*now(entries, found.frames)], [], True, ""), WIRE, "gyro", start, 5.0
+    )
     assert again.same
 
 

@@ -18,18 +18,18 @@ import numpy as np
 import pytest
 from stations import Station, alive, kit, on_threads, one_program
 
-from robins.bench.broker import BenchError, LinkFault
+from robins.bench.broker import BenchError
 from robins.bench.ports.cable import cable
 from robins.bench.recording import read_record
-from robins.bench.run import Flight, Setup
-from robins.bench.run.one_program import in_process
+from robins.bench.rigs.satellite import RIG
+from robins.bench.rigs.satellite.errors import flag, inside
+from robins.bench.rigs.satellite.messages import WIRE
+from robins.bench.run import Flight
 from robins.bench.run.session import Ran, Session
 from robins.bench.run.setup import built_in, changed, read
-from robins.bench.run.telemetry import difference, flag
+from robins.bench.run.telemetry import difference
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.receiver import Receiver
-from robins.bench.wire.records import decode
-from robins.bench.wire.schema import message
 from robins.scenario import ScenarioError
 
 LOOP = "duration=60 s", "counted_from=10 s"
@@ -107,7 +107,7 @@ def test_lock_step_has_the_bits_of_one_program_even_if_a_part_is_stopped(plain):
     assert done.ran.steps == 280
     assert done.off == 0.0
     assert max(h.wrong + h.lost + h.late + h.strange for h in done.ran.health.values()) == 0
-    assert done.ran.star_frames == 56
+    assert np.sum(flag(done.ran.flown, "star used")) == 56
     assert done.ran.deaths == 2
     told = [e.text.split(" told ")[1] for e in done.ran.events if e.kind == "restarted"]
     assert told == ["all again", "all since step 255 again"]
@@ -118,13 +118,13 @@ def test_it_has_the_bits_of_a_campaign_of_one_run(plain):
     from robins.systems.satellite.study import STUDY
 
     done, _ = plain
-    problem = STUDY.problem(flight().loop, ("mekf",), 0)
+    problem = STUDY.problem(flight().given, ("mekf",), 0)
     ((world, count),) = worlds(problem, 1)
     found = record(problem, "mekf", world, count)
     for flown, wanted in (
-        (done.ran.flown.q_est_ib, found["mean"].attitude.wxyz),
-        (done.ran.flown.bias, found["mean"].gyro_bias),
-        (done.ran.flown.wheel_h, found["outputs"]["wheel_momentum"]),
+        (done.ran.flown["estimate.q_ib"], found["mean"].attitude.wxyz),
+        (done.ran.flown["estimate.gyro_bias"], found["mean"].gyro_bias),
+        (done.ran.flown["wheels.momentum"], found["outputs"]["wheel_momentum"]),
     ):
         np.testing.assert_array_equal(flown, wanted[0, :280])
 
@@ -142,11 +142,11 @@ def test_the_record_holds_all_that_went_over_the_links(plain):
     estimates = {
         f.header.time_ns: f.payload
         for f in said["adm", "from"]
-        if f.header.type == message("estimate").number
+        if f.header.type == WIRE.message("estimate").number
     }
-    q = np.array([decode("estimate", estimates[time])["q_ib"] for time in sorted(estimates)])
-    np.testing.assert_array_equal(q, done.ran.flown.q_est_ib)
-    ticks = [f for f in said["adm", "to"] if f.header.type == message("tick").number]
+    q = np.array([WIRE.decode("estimate", estimates[time])["q_ib"] for time in sorted(estimates)])
+    np.testing.assert_array_equal(q, done.ran.flown["estimate.q_ib"])
+    ticks = [f for f in said["adm", "to"] if f.header.type == WIRE.message("tick").number]
     # the one that was not answered for two seconds was sent again
     assert 280 < len(ticks) <= 283
     assert [f.header.sequence for f in said["adm", "to"]] == list(range(len(said["adm", "to"])))
@@ -323,24 +323,24 @@ def test_overrun_may_abort_the_run(threads):
 def test_every_scenario_of_the_bench_flies(threads, name):
     of = changed(read(name), {"seconds": 2.0})
     ran = Session(of).run()
-    assert (ran.failure, ran.steps) == ("", round(2.0 / of.loop.step))
-    assert np.isfinite(ran.flown.q_ib).all()
+    assert (ran.failure, ran.steps) == ("", round(2.0 / of.given.step))
+    assert np.isfinite(ran.flown["motion.q_ib"]).all()
 
 
 def test_faults_are_the_same_however_fast_it_goes(threads):
     faults = (
-        LinkFault(kind="bit errors", begin=2.0, share=0.05),
-        LinkFault(kind="loss", begin=4.0, end=8.0, share=0.05, direction="to"),
-        LinkFault(kind="duplication", begin=2.0, share=0.05),
-        LinkFault(kind="delay", begin=5.0, link="star", delay=0.5, share=0.3),
-        LinkFault(kind="reorder", begin=8.0, link="gyro", share=0.3),
+        RIG.fault(kind="bit errors", begin=2.0, share=0.05),
+        RIG.fault(kind="loss", begin=4.0, end=8.0, share=0.05, direction="to"),
+        RIG.fault(kind="duplication", begin=2.0, share=0.05),
+        RIG.fault(kind="delay", begin=5.0, link="star", delay=0.5, share=0.3),
+        RIG.fault(kind="reorder", begin=8.0, link="gyro", share=0.3),
     )
     fast, slow = (
         run(flight(filter="mekf-gate", seconds=12.0, faults=faults, **more))
         for more in ({}, {"baud": 115200})
     )
-    np.testing.assert_array_equal(fast.ran.flown.q_est_ib, slow.ran.flown.q_est_ib)
-    np.testing.assert_array_equal(fast.ran.flown.q_ib, slow.ran.flown.q_ib)
+    np.testing.assert_array_equal(fast.ran.flown["estimate.q_ib"], slow.ran.flown["estimate.q_ib"])
+    np.testing.assert_array_equal(fast.ran.flown["motion.q_ib"], slow.ran.flown["motion.q_ib"])
     assert fast.ran.injected == slow.ran.injected
     assert {kind for kind, _ in fast.ran.injected} == {f.kind for f in faults}
     health = fast.ran.health.values()
@@ -376,7 +376,7 @@ def test_a_part_may_be_a_board_on_a_real_port(threads):
         of = changed(whole, {"ports": {"gyro": ends.bench}})
         ran = Session(of).run()
         assert ran.failure == ""
-        assert difference(ran.flown, in_process(of, ran.kit)) == 0.0
+        assert difference(ran.flown, inside(ran.kit)) == 0.0
         said, _ = process.communicate(timeout=20.0)
         assert "The bench has said stop." in said
 
@@ -403,4 +403,4 @@ def test_a_board_that_says_nothing_is_named(monkeypatch, threads):
     assert "gyro" in ran.failure
     assert ran.steps == 0
     assert isinstance(BenchError("x"), RuntimeError)
-    assert Setup().clock == "lockstep"
+    assert RIG.setup().clock == "lockstep"

@@ -8,6 +8,7 @@ import pytest
 from stations import on_threads
 
 from robins.bench.ports.cable import cable
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire.c_header import firmware
 from robins.cli import main
 
@@ -19,7 +20,7 @@ STAR_ARCSEC = 10.0  # noise of the star sensor, across its axis
 
 def test_a_board_takes_the_place_of_the_gyro(tmp_path, capsys, monkeypatch):
     on_threads(monkeypatch)  # the other parts
-    for name, text in firmware().items():
+    for name, text in firmware(WIRE).items():
         (tmp_path / name).write_text(text)
     command = ["gcc", "-std=c99", "-O1", "gyro_board.c", "platform_posix.c", "-lm", "-o", "board"]
     subprocess.run(command, cwd=tmp_path, check=True)

@@ -7,19 +7,20 @@ import pytest
 from cobs import cobs
 
 from robins.bench import wire
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header, Receiver, Sequence, receiver
 from robins.bench.wire.receiver import LONGEST
 
 EACH = 4000
 KINDS = ("one bit", "two bits", "burst", "truncated", "dropped byte", "noise")
-DATA = [m for m in wire.MESSAGES if m.number >= 16]
+DATA = [m for m in WIRE.messages if m.number >= 16]
 Pieces = list[tuple[bytes, Frame, bool]]  # on the line, what it was, whether damaged
 
 
 def sound(k: int, rng: np.random.Generator) -> Frame:
     """A frame of any kind of data, of any values."""
     m = DATA[k % len(DATA)]
-    return Frame(Header(m.number, 7, k, k * 10**8), rng.bytes(wire.size_of(m.name)))
+    return Frame(Header(m.number, 7, k, k * 10**8), rng.bytes(WIRE.size_of(m.name)))
 
 
 def damaged(kind: str, made: bytes, rng: np.random.Generator) -> bytes:
@@ -99,7 +100,7 @@ def test_no_wrong_frame_and_no_good_one_lost(kind):
 
 def test_every_error_of_one_or_two_bits():
     """A Castagnoli check finds them all; here with the stuffing, where a bit may make a zero."""
-    made = wire.encode_frame(Header(2, 7, 1, 10**8), wire.encode("tick", {"step": 77}))
+    made = wire.encode_frame(Header(2, 7, 1, 10**8), WIRE.encode("tick", {"step": 77}))
     as_number = int.from_bytes(made, "big")
     flips = [1 << k for k in range(8 * len(made))]
     taker, count = Receiver(), 0

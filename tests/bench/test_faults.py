@@ -1,6 +1,7 @@
 """Faults on purpose: what a scenario may say, and what becomes of frames."""
 
 from collections import Counter
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robins.bench import wire
-from robins.bench.broker.injector import ROUTES, Injector, LinkFault, Piece
+from robins.bench.broker.injector import Injector, LinkFault, Piece
+from robins.bench.rigs.satellite import RIG
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header, Receiver
 from robins.rotation import from_rotvec, multiply
 from robins.scenario import Parameters, ScenarioError, parse
@@ -20,11 +23,12 @@ from robins.systems.satellite.parameters import Star
 from robins.systems.satellite.world import _star_says
 
 S = 10**9
+injecting = partial(Injector, RIG.table)
 WORKING = np.arange(1.0, 5.0)
 
 
 class Scenario(Parameters):
-    faults: tuple[LinkFault, ...] = ()
+    faults: tuple[RIG.fault, ...] = ()
 
 
 def faults(*texts: str) -> tuple[LinkFault, ...]:
@@ -34,8 +38,8 @@ def faults(*texts: str) -> tuple[LinkFault, ...]:
 
 
 def frame(name: str, values: dict, time_ns: int = 0, sequence: int = 0) -> Frame:
-    payload = wire.encode(name, values)
-    return Frame(Header(wire.message(name).number, 7, sequence, time_ns), payload)
+    payload = WIRE.encode(name, values)
+    return Frame(Header(WIRE.message(name).number, 7, sequence, time_ns), payload)
 
 
 def gyro(k: int) -> Frame:
@@ -53,7 +57,7 @@ def put(injector: Injector, link: str, direction: str, one: Frame, now_ns: int) 
 def said(pieces: list[Piece]) -> dict:
     (piece,) = pieces
     assert piece.raw is None
-    return wire.decode(wire.message(piece.frame.header.type).name, piece.frame.payload)
+    return WIRE.decode(WIRE.message(piece.frame.header.type).name, piece.frame.payload)
 
 
 def numbers(pieces: list[Piece]) -> list[int]:
@@ -111,22 +115,22 @@ def test_faults_as_they_are_written():
 
 def test_routes_are_of_the_messages_there_are():
     """Each data message comes from one part, and goes to one at least."""
-    data = {m.name for m in wire.MESSAGES if m.number >= 16}
-    assert Counter(m for r in ROUTES.values() for m in r["from"]) == Counter(data)
-    taken = {m for route in ROUTES.values() for m in route["to"]}
+    data = {m.name for m in WIRE.data}
+    assert Counter(m for sent in RIG.sends.values() for m in sent) == Counter(data)
+    taken = {m for taken in RIG.takes.values() for m in taken}
     assert taken == data - {"innovation"}  # for who watches
 
 
 def test_seeds_that_cannot_be():
     with pytest.raises(ValueError, match="seed must be from 0 to"):
-        Injector(seed=-1)
+        injecting(seed=-1)
 
 
 # ---------------------------------------------------------------------------------------- the line
 
 
 def test_bit_errors_spoil_a_frame_by_as_many_bits():
-    injector = Injector(faults('kind = "bit errors"; begin = "0 s"; link = "gyro"; bits = 3'), 1)
+    injector = injecting(faults('kind = "bit errors"; begin = "0 s"; link = "gyro"; bits = 3'), 1)
     receiver, seen = Receiver(), set()
     for k in range(200):
         one = gyro(k)
@@ -146,9 +150,9 @@ def test_bit_errors_spoil_a_frame_by_as_many_bits():
 def lossy(share: str, link: str, seed: int, count: int = 4000, **more) -> np.ndarray:
     """Which frames a fault of loss leaves."""
     text = f'kind = "loss"; begin = "0 s"; link = "{link}"; share = "{share}"'
-    injector = Injector([*more.get("before", ()), *faults(text), *more.get("after", ())], seed)
-    name = ROUTES[link]["from"][0]
-    fields = {f.name: np.zeros(f.length, int) for f in wire.message(name).fields}
+    injector = injecting([*more.get("before", ()), *faults(text), *more.get("after", ())], seed)
+    name = RIG.sends[link][0]
+    fields = {f.name: np.zeros(f.length, int) for f in WIRE.message(name).fields}
     one = frame(name, fields)
     out = []
     for k in range(count):
@@ -181,7 +185,7 @@ def test_noise_of_a_fault_is_its_own():
 
 
 def test_duplication_and_silence():
-    injector = Injector(
+    injector = injecting(
         faults(
             'kind = "duplication"; begin = "1 s"; end = "2 s"; link = "gyro"',
             'kind = "silent"; begin = "2 s"; end = "3 s"; link = "gyro"',
@@ -201,7 +205,7 @@ def test_duplication_and_silence():
 
 
 def test_delayed_frames_are_due_later():
-    injector = Injector(
+    injector = injecting(
         faults('kind = "delay"; begin = "0 s"; end = "0.3 s"; delay = "0.25 s"; link = "gyro"')
     )
     went = []
@@ -214,7 +218,7 @@ def test_delayed_frames_are_due_later():
 
 
 def test_delayed_frames_come_as_they_are_due():
-    injector = Injector(
+    injector = injecting(
         faults(
             'kind = "delay"; begin = "0 s"; end = "0.1 s"; delay = "0.3 s"; link = "gyro"',
             'kind = "delay"; begin = "0.1 s"; delay = "0.1 s"; link = "gyro"',
@@ -226,7 +230,7 @@ def test_delayed_frames_come_as_they_are_due():
 
 
 def test_disorder_swaps_neighbours_of_the_same_message():
-    injector = Injector(faults('kind = "reorder"; begin = "0 s"; end = "0.45 s"; link = "adm"'))
+    injector = injecting(faults('kind = "reorder"; begin = "0 s"; end = "0.45 s"; link = "adm"'))
     sigma = {"innovation": [0, 0, 0], "sigma": [1, 1, 1], "ratio": 0.5}
     went = []
     for k in range(7):
@@ -240,7 +244,7 @@ def test_disorder_swaps_neighbours_of_the_same_message():
 
 
 def test_a_swapped_frame_goes_with_its_successor_even_after_the_fault():
-    injector = Injector(faults('kind = "reorder"; begin = "0 s"; end = "0.15 s"; link = "gyro"'))
+    injector = injecting(faults('kind = "reorder"; begin = "0 s"; end = "0.15 s"; link = "gyro"'))
     assert put(injector, "gyro", "from", gyro(0), 0) == []
     assert numbers(put(injector, "gyro", "from", gyro(2), S // 5)) == [2, 0]
     assert injector.release("gyro", "from", S) == []
@@ -265,7 +269,7 @@ def test_what_is_held_back_comes_once(drawn, seed):
         + (f'; delay = "{late} s"' if kind == "delay" else "")
         for kind, b, n, share, late in drawn
     ]
-    injector, went = Injector(faults(*texts), seed), []
+    injector, went = injecting(faults(*texts), seed), []
     for k in range(40):
         went += numbers(injector.release("gyro", "from", k * S))
         went += numbers(put(injector, "gyro", "from", gyro(k), k * S))
@@ -284,16 +288,16 @@ def test_the_clock_is_spared():
         'kind = "reorder"; begin = "0 s"; direction = "to"',
         'kind = "killed"; begin = "0 s"; link = "gyro"',
     )
-    injector = Injector(faults(*every), 3)
-    for m in wire.MESSAGES:
-        one = Frame(Header(m.number, 7, 0, 0), bytes(wire.size_of(m.name)))
+    injector = injecting(faults(*every), 3)
+    for m in WIRE.messages:
+        one = Frame(Header(m.number, 7, 0, 0), bytes(WIRE.size_of(m.name)))
         for direction in ("to", "from"):
             kept = put(injector, "gyro", direction, one, 0) == [Piece(None, one)]
             assert kept is (m.number < 16)
 
 
 def test_killed_once_each():
-    injector = Injector(
+    injector = injecting(
         faults(
             'kind = "killed"; begin = "2 s"; link = "adm"',
             'kind = "killed"; begin = "3 s"; link = "gyro"',
@@ -309,7 +313,7 @@ def test_faults_come_and_go():
         'kind = "loss"; begin = "1 s"; end = "2 s"; link = "gyro"',
         'kind = "loss"; begin = "0 s"; link = "gyro"',
     )
-    injector = Injector([first])
+    injector = injecting([first])
     assert [injector.active(t) for t in (S - 1, S, 2 * S - 1, 2 * S)] == [[], [first], [first], []]
     assert len(put(injector, "gyro", "from", gyro(0), 5 * S)) == 1
     injector.add(second)
@@ -326,7 +330,7 @@ def test_one_fault_is_taken_away():
         'kind = "loss"; begin = "0 s"; link = "adm"',
         'kind = "delay"; begin = "0 s"; delay = "2 s"; link = "table"',
     )
-    injector = Injector([first, second, third])
+    injector = injecting([first, second, third])
     assert put(injector, "table", "from", gyro(4), S) == []
     for fault in (first, third):
         injector.remove(fault)
@@ -342,7 +346,7 @@ def test_one_fault_is_taken_away():
 
 
 def test_a_wheel_without_torque():
-    injector = Injector(faults('kind = "wheel"; begin = "1 s"; wheel = 2'))
+    injector = injecting(faults('kind = "wheel"; begin = "1 s"; wheel = 2'))
     one = frame("actuation", {"wheel_torque": WORKING, "dipole_b": [7.0, 8.0, 9.0]})
     assert put(injector, "actuators", "from", one, S - 1) == [Piece(None, one)]
     now = said(put(injector, "actuators", "from", one, S))
@@ -352,7 +356,7 @@ def test_a_wheel_without_torque():
 
 def test_a_turned_attitude():
     q = np.array([0.5, -0.5, 0.1, 0.7]) / np.linalg.norm([0.5, -0.5, 0.1, 0.7])
-    injector = Injector(faults('kind = "turned"; begin = "0 s"; angle = "25 deg"'))
+    injector = injecting(faults('kind = "turned"; begin = "0 s"; angle = "25 deg"'))
     now = said(put(injector, "star", "from", star(q), 0))
     turn = from_rotvec(jnp.array([0.0, 0.0, np.radians(25.0)]))
     np.testing.assert_allclose(now["q_ib"], multiply(jnp.asarray(q), turn), rtol=0, atol=2e-16)
@@ -361,14 +365,14 @@ def test_a_turned_attitude():
 
 
 def test_a_star_sensor_that_is_lost():
-    injector = Injector(faults('kind = "lost"; begin = "0 s"'))
+    injector = injecting(faults('kind = "lost"; begin = "0 s"'))
     now = said(put(injector, "star", "from", star(WORKING), 0))
     assert np.isnan(now["q_ib"]).all()
     assert (now["stars"], np.any(now["factor"])) == (0, False)
 
 
 def test_stuck_to_what_was_said_before_and_not_to_nothing():
-    injector = Injector(faults('kind = "stuck"; begin = "3 s"; end = "5 s"'))
+    injector = injecting(faults('kind = "stuck"; begin = "3 s"; end = "5 s"'))
     q = np.eye(4)
     nothing = np.full(4, np.nan)
     given_q = [q[0], q[1], nothing, q[2], nothing, q[3]]  # a second apart
@@ -380,29 +384,29 @@ def test_stuck_to_what_was_said_before_and_not_to_nothing():
         np.testing.assert_array_equal(now["q_ib"], given_q[then])
         assert now["stars"] == then
     # without anything before it, to the first within
-    alone = Injector(faults('kind = "stuck"; begin = "0 s"'))
+    alone = injecting(faults('kind = "stuck"; begin = "0 s"'))
     went = [said(put(alone, "star", "from", star(one), 0)) for one in (nothing, q[2], q[3])]
     np.testing.assert_array_equal([o["q_ib"] for o in went], [nothing, q[2], q[2]])
 
 
 def test_damaged_and_strange_payloads_pass_as_they_are():
     """A board may send what is no `star`; who takes it refuses it."""
-    injector = Injector(faults('kind = "turned"; begin = "0 s"'))
-    short = Frame(Header(wire.message("star").number, 7, 0, 0), b"abc")
+    injector = injecting(faults('kind = "turned"; begin = "0 s"'))
+    short = Frame(Header(WIRE.message("star").number, 7, 0, 0), b"abc")
     assert put(injector, "star", "from", short, 0) == [Piece(None, short)]
 
 
 def test_a_lie_on_a_noisy_line():
     """Bit errors hit what the sensor says under its fault, not what it would have said."""
-    injector = Injector(
+    injector = injecting(
         faults(
             'kind = "bit errors"; begin = "0 s"; message = "star"', 'kind = "lost"; begin = "0 s"'
         )
     )
     one = star(WORKING)
     (piece,) = put(injector, "star", "from", one, 0)
-    lie = said(put(Injector(faults('kind = "lost"; begin = "0 s"')), "star", "from", one, 0))
-    raw = wire.encode_frame(one.header, wire.encode("star", lie))
+    lie = said(put(injecting(faults('kind = "lost"; begin = "0 s"')), "star", "from", one, 0))
+    raw = wire.encode_frame(one.header, WIRE.encode("star", lie))
     flipped = np.frombuffer(piece.raw, "u1") ^ np.frombuffer(raw, "u1")
     assert np.unpackbits(flipped).sum() == 1
 
@@ -444,7 +448,7 @@ def test_the_star_sensor_lies_as_in_one_program():
         return jax.lax.scan(step, q[0], (q, says))[1]
 
     inside = np.asarray(run(q, says))
-    injector = Injector(
+    injector = injecting(
         faults(
             *(f'kind = "{k}"; begin = "{b} s"; end = "{e} s"' for k, b, e in spans),
             *(f'kind = "lost"; begin = "{b} s"; end = "{e} s"' for b, e in lost),

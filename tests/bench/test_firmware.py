@@ -15,12 +15,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins.bench import wire
-from robins.bench.broker.faults import ROUTES
 from robins.bench.ports.line import BITS_PER_BYTE
 from robins.bench.ports.port import open_pair
+from robins.bench.rigs.satellite import RIG
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header, Receiver, Sequence
-from robins.bench.wire.c_header import firmware, schema_number
-from robins.bench.wire.schema import PARTS
+from robins.bench.wire.c_header import firmware
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 GCC = shutil.which("gcc")
@@ -49,7 +49,7 @@ def sanitised(folder: Path) -> bool:
 
 
 def unpacked(folder: Path) -> Path:
-    for name, text in firmware().items():
+    for name, text in firmware(WIRE).items():
         (folder / name).write_text(text)
     return folder
 
@@ -77,7 +77,7 @@ class Board:
         self.process = subprocess.Popen([program, pair.path], stderr=subprocess.PIPE, text=True)
 
     def send(self, name: str, time_ns: int = 0, **values) -> None:
-        self.put(wire.message(name).number, wire.encode(name, values), time_ns)
+        self.put(WIRE.message(name).number, WIRE.encode(name, values), time_ns)
 
     def put(self, kind: int, payload: bytes, time_ns: int = 0) -> None:
         self.write(wire.encode_frame(Header(kind, self.run, self.sequence, time_ns), payload))
@@ -100,8 +100,8 @@ class Board:
     def got(self, name: str, patience_s: float = 3.0) -> tuple[Header, dict]:
         one = self.frame(patience_s)
         assert one is not None, f"no {name} came"
-        assert wire.message(one.header.type).name == name
-        return one.header, wire.decode(name, one.payload)
+        assert WIRE.message(one.header.type).name == name
+        return one.header, WIRE.decode(name, one.payload)
 
     def begin(self, run: int) -> None:
         """Answer a hello."""
@@ -153,7 +153,7 @@ def attitudes(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def test_it_says_hello_until_it_is_answered(board):
     header, hello = board.got("hello")
     assert (header.run, header.sequence) == (0, 0)
-    assert (PARTS[hello["part"]], hello["schema"]) == ("gyro", schema_number())
+    assert (WIRE.parts[hello["part"]], hello["schema"]) == ("gyro", WIRE.number)
     began = time.monotonic()
     assert board.got("hello")[0].sequence == 1
     assert 0.3 < time.monotonic() - began < 1.0
@@ -183,7 +183,7 @@ def test_a_tick_that_comes_again_has_the_same_answer(board):
     assert len({a.payload for a in answers[::2]}) == 1
     assert len({a.payload for a in answers[1::2]}) == 1  # done with its time, too
     np.testing.assert_allclose(
-        wire.decode("gyro", answers[0].payload)["theta_b"], turns[1], rtol=1e-12, atol=1e-15
+        WIRE.decode("gyro", answers[0].payload)["theta_b"], turns[1], rtol=1e-12, atol=1e-15
     )
     board.send("tick", 2 * STEP_NS, step=1)  # its sample is not known any more
     assert board.frame(NOTHING) is None
@@ -214,8 +214,8 @@ def test_what_is_of_another_run_or_length_or_kind_is_not_taken(board):
     board.run = 0
     board.send("tick", 2 * STEP_NS, step=1)
     board.run = 7
-    board.put(wire.message("tick").number, b"\x01\x00\x00")
-    board.put(wire.message("mounted").number, bytes(8), 2 * STEP_NS)
+    board.put(WIRE.message("tick").number, b"\x01\x00\x00")
+    board.put(WIRE.message("mounted").number, bytes(8), 2 * STEP_NS)
     board.put(255, b"of a later version")
     board.send("begin", step=STEP_NS)  # again, as two hellos may be answered: nothing is lost
     assert board.frame(NOTHING) is None
@@ -268,8 +268,8 @@ def test_ten_thousand_steps_on_a_noisy_line(board):
         time_ns = (k + 1) * STEP_NS
         mounted, tick = (
             wire.encode_frame(
-                Header(wire.message(name).number, 7, 2 * k + n + 1, time_ns),
-                wire.encode(name, values),
+                Header(WIRE.message(name).number, 7, 2 * k + n + 1, time_ns),
+                WIRE.encode(name, values),
             )
             for n, (name, values) in enumerate([("mounted", {"q_ib": q[k]}), ("tick", {"step": k})])
         )
@@ -281,8 +281,8 @@ def test_ten_thousand_steps_on_a_noisy_line(board):
         assert one.header.time_ns == two.header.time_ns == time_ns
         assert order.take(one.header.sequence)
         assert order.take(two.header.sequence)
-        samples[k] = wire.decode("gyro", one.payload)["theta_b"]
-        assert wire.decode("done", two.payload)["step"] == k
+        samples[k] = WIRE.decode("gyro", one.payload)["theta_b"]
+        assert WIRE.decode("done", two.payload)["step"] == k
     assert (order.lost, board.receiver.counts.wrong) == (0, 0)
     np.testing.assert_allclose(samples[1:], turns, rtol=1e-12, atol=1e-15)
 
@@ -291,16 +291,16 @@ def test_ten_thousand_steps_on_a_noisy_line(board):
 
 
 def test_the_loop_has_forty_lines_and_no_heap():
-    text = firmware()["gyro_board.c"]
+    text = firmware(WIRE)["gyro_board.c"]
     code = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
     lines = [line for line in code.splitlines() if line.strip()]
     assert len(lines) <= 40
     assert max(len(line) for line in text.splitlines()) <= 110
-    assert not re.search(r"\b(m|c|re)alloc\b", "".join(firmware().values()))
+    assert not re.search(r"\b(m|c|re)alloc\b", "".join(firmware(WIRE).values()))
 
 
 def test_every_file_of_the_example_is_given():
-    assert list(firmware()) == [
+    assert list(firmware(WIRE)) == [
         "adm_board.c",
         "gyro_board.c",
         "platform.h",
@@ -312,7 +312,7 @@ def test_every_file_of_the_example_is_given():
 # ------------------------------------------------------------------------------------------ page
 
 # What goes over each line, beside tick and done; a star sensor that is no camera takes less.
-LINES = {f"`{part}`": (ways["to"], ways["from"]) for part, ways in ROUTES.items()}
+LINES = {f"`{part}`": (RIG.takes[part], sent) for part, sent in RIG.sends.items()}
 LINES["`star`, a camera"] = LINES["`star`"]
 LINES["`star`"] = (("motion",), ("star",))
 BAUDS, RATES_HZ = (115200, 460800, 921600), (10, 100, 200)
@@ -320,7 +320,7 @@ BAUDS, RATES_HZ = (115200, 460800, 921600), (10, 100, 200)
 
 def on_the_line(names: tuple[str, ...]) -> int:
     blank = Header(1, 1, 1, 1)
-    return sum(len(wire.encode_frame(blank, bytes(wire.size_of(name)))) for name in names)
+    return sum(len(wire.encode_frame(blank, bytes(WIRE.size_of(name)))) for name in names)
 
 
 def test_the_page_has_the_budget():
@@ -449,7 +449,7 @@ def test_its_order_is_ours(tmp_path):
 
 def test_it_knows_the_length_of_every_message(tmp_path):
     found, _ = ran(compiled(tmp_path, SIZES))
-    known = {m.number: wire.size_of(m.name) for m in wire.MESSAGES}
+    known = {m.number: WIRE.size_of(m.name) for m in WIRE.messages}
     assert [int(n) for n in found.split()] == [known.get(k, -1) for k in range(256)]
 
 
@@ -467,9 +467,9 @@ int main(void) {
 
 
 def test_it_refuses_the_numbers_that_we_refuse(tmp_path):
-    longest = max(wire.size_of(m.name) for m in wire.MESSAGES)
+    longest = max(WIRE.size_of(m.name) for m in WIRE.messages)
     given, expected = b"", b""
-    for m in wire.MESSAGES:
+    for m in WIRE.messages:
         blank = {f.name: np.zeros(f.length, int) for f in m.fields}
         for f in (f for f in m.fields if f.limits and f.kind == "f64"):
             least, most = f.limits
@@ -478,9 +478,9 @@ def test_it_refuses_the_numbers_that_we_refuse(tmp_path):
                 for k in range(f.length):
                     values = np.zeros(f.length)
                     values[k] = x
-                    payload = wire.encode(m.name, {**blank, f.name: values})
+                    payload = WIRE.encode(m.name, {**blank, f.name: values})
                     given += bytes([m.number]) + payload.ljust(longest, b"\0")
-                    expected += bytes([wire.unsound(m.name, payload) is None])
+                    expected += bytes([WIRE.unsound(m.name, payload) is None])
     assert ran(compiled(tmp_path, SOUND), given)[0] == expected
     assert 0.1 < np.mean(np.frombuffer(expected, "u1")) < 0.6
 
@@ -494,7 +494,7 @@ def test_a_receiver_for_a_small_board_is_small(tmp_path):
 
 def test_buffers_too_small_for_a_message_do_not_compile(tmp_path):
     (unpacked(tmp_path) / "main.c").write_text(SIZES)
-    longest = max(wire.size_of(m.name) for m in wire.MESSAGES)
+    longest = max(WIRE.size_of(m.name) for m in WIRE.messages)
     build(tmp_path, "main.c", extra=(f"-DROBINS_MOST_PAYLOAD={longest}u",))
     with pytest.raises(AssertionError, match="robins_room"):
         build(tmp_path, "main.c", extra=(f"-DROBINS_MOST_PAYLOAD={longest - 1}u",))

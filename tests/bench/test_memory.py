@@ -4,9 +4,10 @@ from stations import RUN, Loop, kit
 
 from robins.bench.broker.revive import History, beginning
 from robins.bench.parts import station as memory
-from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station
-from robins.bench.wire import Header, Receiver, decode, encode_frame, message
+from robins.bench.rigs.satellite import BUILD
+from robins.bench.rigs.satellite.messages import WIRE
+from robins.bench.wire import Header, Receiver, encode_frame
 
 LAST = 68  # step whose memory is gone on from
 SHORT = "duration=60 s", "counted_from=10 s"
@@ -20,8 +21,8 @@ class Told(Loop):
         super().__init__(*given)
 
     def to(self, part, name, payload, time_ns):
-        header = Header(message(name).number, RUN, self.sent[part], time_ns)
-        step = decode("tick", payload)["step"] if name == "tick" else None
+        header = Header(WIRE.message(name).number, RUN, self.sent[part], time_ns)
+        step = WIRE.decode("tick", payload)["step"] if name == "tick" else None
         self.histories[part].add(step, encode_frame(header, payload))
         answer = super().to(part, name, payload, time_ns)
         if step is not None:
@@ -40,7 +41,7 @@ def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == kept
     for name, history in loop.histories.items():
         saved = memory.path_of(tmp_path, name, LAST).read_bytes()
-        new, receiver = Station(loop.stations[name].part, saved), Receiver()
+        new, receiver = Station(loop.stations[name].part, WIRE, saved), Receiver()
         assert not new.begun
         assert new.feed(beginning(RUN, loop.kit.step_ns)) == b""
         assert new.begun
@@ -49,7 +50,7 @@ def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_pat
         end_ns = (LAST + 1) * loop.kit.step_ns
         said = [f for who, f in loop.said if who == name and f.header.time_ns > end_ns]
         assert [f.header for f in again] == [f.header for f in said]
-        done = message("done").number  # tells how long computing took
+        done = WIRE.message("done").number  # tells how long computing took
         payloads = [[f.payload for f in x if f.header.type != done] for x in (again, said)]
         assert payloads[0] == payloads[1]
         assert len(payloads[0]) >= 30 // 5

@@ -11,6 +11,7 @@ import pytest
 from robins.bench import wire
 from robins.bench.recording import Recorder, read_record
 from robins.bench.recording.replay import recorded
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.cli import main
 
 RECORD = Path(__file__).parent / "records" / "adm.mcap"
@@ -29,8 +30,8 @@ def told(capsys, *arguments: str) -> tuple[int, dict]:
 def test_the_record_has_what_it_is_for():
     record = read_record(RECORD)
     assert record.whole
-    said = [(wire.message(f.header.type).name, f.payload) for f in recorded(record, "adm")]
-    flags = [wire.decode(name, p)["flags"] for name, p in said if name == "estimate"]
+    said = [(WIRE.message(f.header.type).name, f.payload) for f in recorded(record, "adm")]
+    flags = [WIRE.decode(name, p)["flags"] for name, p in said if name == "estimate"]
     assert len(flags) == STEPS
     together = 0
     for one in flags:
@@ -46,7 +47,7 @@ def test_the_record_has_what_it_is_for():
 
 def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
     damaged, record = tmp_path / "damaged.mcap", read_record(RECORD)
-    with Recorder(damaged, record.header) as out:
+    with Recorder(damaged, WIRE, record.header) as out:
         for number, entry in enumerate(record.entries):
             out.write(entry)
             if number % 50 == 49:
@@ -84,18 +85,18 @@ def test_the_filter_makes_of_it_what_it_made(capsys):
 @pytest.mark.parametrize(("field", "step"), [("flags", 30), ("q_ib", 79)])
 def test_a_change_is_found(capsys, tmp_path, field, step):
     record = read_record(RECORD)
-    number = wire.message("estimate").number
-    with Recorder(tmp_path / "changed.mcap", record.header) as out:
+    number = WIRE.message("estimate").number
+    with Recorder(tmp_path / "changed.mcap", WIRE, record.header) as out:
         for entry in record.entries:
             found = wire.Receiver().feed(entry.data)
             head = found[0].header if found else None
             if head and head.type == number and head.time_ns == (step + 1) * 100_000_000:
-                values = wire.decode("estimate", found[0].payload)
+                values = WIRE.decode("estimate", found[0].payload)
                 if field == "flags":
                     values["flags"] ^= 16
                 else:
                     values[field][3] += 1e-7
-                changed = wire.encode("estimate", values)
+                changed = WIRE.encode("estimate", values)
                 entry = entry._replace(data=wire.encode_frame(head, changed))
             out.write(entry)
     code, said = told(capsys, "--diff", str(tmp_path / "changed.mcap"))

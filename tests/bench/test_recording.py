@@ -19,6 +19,7 @@ from mcap.writer import Writer
 from robins.bench import wire
 from robins.bench.recording import Entry, Event, Recorder, RecordingError, read_record
 from robins.bench.recording.layout import CHUNK
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header
 
 HEADER = {"scenario": "title = 'é'\n", "seeds": [1, 2], "versions": {"robins": "0.1"}}
@@ -26,7 +27,7 @@ MS = 10**6
 
 
 def frame(k: int, rng: np.random.Generator) -> bytes:
-    payload = wire.encode("gyro", {"theta_b": rng.normal(size=3)})
+    payload = WIRE.encode("gyro", {"theta_b": rng.normal(size=3)})
     return wire.encode_frame(Header(18, 7, k, k * MS + 5), payload)
 
 
@@ -56,7 +57,7 @@ def put(recorder: Recorder, some: list[Entry | Event]) -> None:
 
 
 def record(path: Path, some: list[Entry | Event], **more) -> bytes:
-    with Recorder(path, HEADER, **more) as recorder:
+    with Recorder(path, WIRE, HEADER, **more) as recorder:
         put(recorder, some)
     return path.read_bytes()
 
@@ -92,7 +93,7 @@ def test_an_empty_record(tmp_path):
 def test_the_same_entries_make_the_same_bytes(made, tmp_path):
     some, content = made
     assert record(tmp_path / "a.mcap", some) == content
-    with Recorder(tmp_path / "b.mcap", dict(reversed(HEADER.items()))) as recorder:
+    with Recorder(tmp_path / "b.mcap", WIRE, dict(reversed(HEADER.items()))) as recorder:
         for one in some:
             if isinstance(one, Event):
                 recorder.event(one)
@@ -104,7 +105,7 @@ def test_the_same_entries_make_the_same_bytes(made, tmp_path):
 
 def test_what_is_written_in_a_block_that_fails_is_kept(tmp_path):
     some = messages(9)
-    recorder = Recorder(tmp_path / "a.mcap", HEADER)
+    recorder = Recorder(tmp_path / "a.mcap", WIRE, HEADER)
 
     def fail():
         with recorder:
@@ -119,7 +120,7 @@ def test_what_is_written_in_a_block_that_fails_is_kept(tmp_path):
 
 def test_flush_hands_over_what_there_is(tmp_path):
     some, path = messages(9), tmp_path / "a.mcap"
-    recorder = Recorder(path, HEADER)
+    recorder = Recorder(path, WIRE, HEADER)
     put(recorder, some)
     assert read_record(path).entries == []
     recorder.flush()
@@ -163,7 +164,7 @@ def test_the_readers_of_mcap_open_it(made, tmp_path):
             )
             for schema, channel, m in found
         ] == expected
-    assert found[0][0].data.decode() == wire.markdown()
+    assert found[0][0].data.decode() == WIRE.markdown()
 
 
 def test_the_summary_leads_to_what_is_asked(made, tmp_path):
@@ -234,7 +235,7 @@ def test_a_file_cut_anywhere_gives_what_comes_before(tmp_path):
     some = messages(300)
     content = record(tmp_path / "whole.mcap", some)
     path, end = tmp_path / "cut.mcap", np.array(ends(content, some))
-    begin = content.index(wire.markdown().encode()) - 30  # of the schemas; the header is before
+    begin = content.index(WIRE.markdown().encode()) - 30  # of the schemas; the header is before
     footer = content.rindex(bytes([2, 20, 0, 0, 0, 0, 0, 0, 0]))
     drawn = np.random.default_rng(0).integers(0, len(content), 300)
     places = {*range(0, begin, 7), *range(footer, len(content)), *drawn}
@@ -263,7 +264,7 @@ def test_a_flipped_bit_gives_what_comes_before_it(tmp_path):
     content = record(tmp_path / "whole.mcap", some)
     path, end = tmp_path / "flipped.mcap", np.array(ends(content, some))
     rng = np.random.default_rng(1)
-    begin = content.index(wire.markdown().encode()) - 50  # of the schemas; the header is before
+    begin = content.index(WIRE.markdown().encode()) - 50  # of the schemas; the header is before
     places = np.r_[0:begin, rng.integers(begin, len(content), 400)]
     refused = []
     for at in places:
@@ -328,9 +329,10 @@ CHILD = """
 import os, resource, signal, sys
 from robins.bench.recording.layout import CHUNK
 from robins.bench.recording import Entry, Recorder
+from robins.bench.wire.schema import BARE
 
 path, way = sys.argv[1:]
-recorder = Recorder(path, {"run": 1})
+recorder = Recorder(path, BARE, {"run": 1})
 if way == "full":
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 told = 0
@@ -381,7 +383,7 @@ def test_a_full_disk_is_said_once(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_disk_that_is_full_from_the_start():
     with pytest.raises(OSError, match=r"No space left on device; the record ends.*/dev/full"):
-        Recorder("/dev/full", HEADER, overwrite=True)
+        Recorder("/dev/full", WIRE, HEADER, overwrite=True)
 
 
 # ------------------------------------------------------------------------------------ refusals
@@ -391,17 +393,17 @@ def test_records_that_cannot_be_begun(tmp_path):
     path = tmp_path / "a.mcap"
     record(path, [])
     with pytest.raises(RecordingError, match=r"a\.mcap' is there already: give another name"):
-        Recorder(path, HEADER)
+        Recorder(path, WIRE, HEADER)
     assert read_record(path).whole
     assert record(path, messages(3), overwrite=True)
     assert len(read_record(path).entries) == 3
     with pytest.raises(RecordingError, match=r"header of .*: JSON cannot hold it"):
-        Recorder(tmp_path / "b.mcap", {"x": np.zeros(3)})
+        Recorder(tmp_path / "b.mcap", WIRE, {"x": np.zeros(3)})
     assert not (tmp_path / "b.mcap").exists()
     with pytest.raises(OSError, match=r"no/a\.mcap"):
-        Recorder(tmp_path / "no" / "a.mcap", HEADER)
+        Recorder(tmp_path / "no" / "a.mcap", WIRE, HEADER)
     with (
-        Recorder(tmp_path / "c.mcap", HEADER) as recorder,
+        Recorder(tmp_path / "c.mcap", WIRE, HEADER) as recorder,
         pytest.raises(RecordingError, match="event 'fault': JSON cannot hold it"),
     ):
         recorder.event(Event(0, "fault", "", {"x": float("nan")}))
@@ -458,7 +460,7 @@ def test_records_of_others(tmp_path):
 
 def test_a_huge_file_of_nothing_takes_no_memory(tmp_path):
     some, path = messages(20), tmp_path / "a.mcap"
-    recorder = Recorder(path, HEADER)
+    recorder = Recorder(path, WIRE, HEADER)
     put(recorder, some)
     recorder.flush()
     size = path.stat().st_size

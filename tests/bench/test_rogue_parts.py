@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from stations import Threads, kit, on_threads
 
-from robins.bench import wire
-from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Part, Station
 from robins.bench.recording import Event
+from robins.bench.rigs.satellite import BUILD
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run import outcome
 from robins.bench.run.crew import Death
 from robins.bench.run.session import Session
 from robins.bench.run.setup import changed, read
+from robins.bench.wire import Wire
 
 SHORT = "duration=60 s", "counted_from=10 s"
 FLIGHT = changed(read("satellite/s1", SHORT), {"seconds": 4.0, "filter": "mekf-gate"})
@@ -24,8 +25,8 @@ AGAIN = 5  # steps between two star frames
 class Rogue(Station):
     """Says more, or something else, in some steps."""
 
-    def __init__(self, of: Part, modes: tuple[str, ...]):
-        super().__init__(of)
+    def __init__(self, of: Part, wire: Wire, modes: tuple[str, ...]):
+        super().__init__(of, wire)
         self._modes = {WRONG + k * AGAIN: mode for k, mode in enumerate(modes)}
 
     def _frame(self, name: str, payload: bytes, time_ns: int) -> bytes:
@@ -37,9 +38,9 @@ class Rogue(Station):
         elif mode == "jump":
             self._sent = (self._sent + 2**31) % 2**32
         else:
-            said = {k: np.ravel(v).copy() for k, v in wire.decode(name, payload).items()}
+            said = {k: np.ravel(v).copy() for k, v in WIRE.decode(name, payload).items()}
             said[next(iter(said))][-1] = float(mode)
-            payload = wire.encode(name, said)
+            payload = WIRE.encode(name, said)
         return more + super()._frame(name, payload, time_ns)
 
 
@@ -56,6 +57,10 @@ def session(of):
     return Session(of, kit=kit("satellite/s1", "mekf-gate", *SHORT))
 
 
+def figures(ran):
+    return outcome.figures(FLIGHT, ran, outcome.judged(FLIGHT, ran), None)
+
+
 ALL = ("long", "1e308", "inf", "nan")
 
 
@@ -65,9 +70,9 @@ ALL = ("long", "1e308", "inf", "nan")
 )
 def test_what_cannot_be_goes_no_further(fly, name, refused):
     ran = fly(name, *ALL)
-    told = outcome.figures(FLIGHT, ran, None)
+    told = figures(ran)
     assert ran.failure == ""
-    assert np.isfinite(ran.flown.q_ib).all()
+    assert np.isfinite(ran.flown["motion.q_ib"]).all()
     assert np.isfinite(told["attitude_rms_arcsec"])
     assert {k: h.refused for k, h in ran.health.items() if h.refused} == {name: refused}
     assert told["counts"]["refused_frames"] == refused
@@ -84,23 +89,23 @@ def test_a_run_whose_truth_cannot_be_has_failed(fly, mode, words):
     assert f"at {(WRONG + 1) * 0.1:.1f} s 'plant' says a true motion that cannot be" in ran.failure
     assert words in ran.failure
     assert ran.steps == WRONG
-    assert np.isfinite(ran.flown.q_ib).all()
+    assert np.isfinite(ran.flown["motion.q_ib"]).all()
 
 
 def test_a_true_motion_of_a_wrong_length_is_refused_and_the_right_one_taken(fly):
     ran = fly("plant", "long")
     assert (ran.failure, ran.health["plant"].refused) == ("", 1)
-    assert np.isfinite(ran.flown.q_ib).all()
+    assert np.isfinite(ran.flown["motion.q_ib"]).all()
 
 
 def test_a_part_that_counts_anew_is_heard(fly):
     honest, jumped = fly(), fly("gyro", "jump")
-    np.testing.assert_array_equal(jumped.flown.q_est_ib, honest.flown.q_est_ib)
+    np.testing.assert_array_equal(jumped.flown["estimate.q_ib"], honest.flown["estimate.q_ib"])
     assert (jumped.health["gyro"].repeated, jumped.health["gyro"].lost) == (0, 0)
     # and what happens once is told, whatever happens often
     often = [Event(k, "missed", f"step {k}", {"time_s": 0.0}) for k in range(500)]
     once = Event(0, "died", "'adm' was killed", {"time_s": 0.0})
-    told = outcome.figures(FLIGHT, honest._replace(events=[once, *often]), None)["events"]
+    told = figures(honest._replace(events=[once, *often]))["events"]
     assert (len(told), told[0]["kind"]) == (200, "died")
 
 

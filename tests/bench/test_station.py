@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from robins.bench.parts.station import Part, Station, ready
-from robins.bench.wire import PARTS, Header, Receiver, decode, encode, encode_frame, message
-from robins.bench.wire.c_header import schema_number
+from robins.bench.rigs.satellite.messages import WIRE
+from robins.bench.wire import Header, Receiver, encode_frame
 
 STEP = 100
 
@@ -26,7 +26,7 @@ class Bench:
     """The far end, by hand."""
 
     def __init__(self, run: int = 5):
-        self.station, self.receiver = Station(part()), Receiver()
+        self.station, self.receiver = Station(part(), WIRE), Receiver()
         self.run, self.number = run, 0
         self.begin()
 
@@ -36,13 +36,17 @@ class Bench:
     def send(self, name, values, time_ns, number=None, run=None):
         if number is None:
             number, self.number = self.number, self.number + 1
-        header = Header(message(name).number, run or self.run, number, time_ns)
-        return self.feed(encode_frame(header, encode(name, values)))
+        header = Header(WIRE.message(name).number, run or self.run, number, time_ns)
+        return self.feed(encode_frame(header, WIRE.encode(name, values)))
 
     def feed(self, data):
         found = self.receiver.feed(self.station.feed(data))
         return [
-            (message(f.header.type).name, f.header, decode(message(f.header.type).name, f.payload))
+            (
+                WIRE.message(f.header.type).name,
+                f.header,
+                WIRE.decode(WIRE.message(f.header.type).name, f.payload),
+            )
             for f in found
         ]
 
@@ -59,13 +63,13 @@ def theta(answer):
 
 
 def test_it_says_who_it_is_until_it_is_answered():
-    station = Station(part())
+    station = Station(part(), WIRE)
     assert not station.begun
     (hello,) = Receiver().feed(station.hello())
     assert hello.header.run == 0
-    said = decode("hello", hello.payload)
-    assert PARTS[said["part"]] == "gyro"
-    assert said["schema"] == schema_number()
+    said = WIRE.decode("hello", hello.payload)
+    assert WIRE.parts[said["part"]] == "gyro"
+    assert said["schema"] == WIRE.number
     assert Bench().station.begun
 
 
@@ -126,7 +130,7 @@ def test_frames_of_another_run_or_an_unknown_message_are_strange():
 
 def test_a_payload_of_another_length_is_as_if_it_had_not_come():
     bench = Bench()
-    bench.feed(encode_frame(Header(message("mounted").number, 5, 1, STEP), b"short"))
+    bench.feed(encode_frame(Header(WIRE.message("mounted").number, 5, 1, STEP), b"short"))
     assert theta(bench.tick(0)) == [0.0, 1.0, 0.0]
     assert bench.station.counts["size"] == 1
 
@@ -153,9 +157,11 @@ def test_stop_ends_it():
 
 def test_how_bytes_are_cut_makes_no_difference():
     whole, bytewise = Bench(), Bench()
-    shown = encode("mounted", {"q_ib": [3.0, 0, 0, 0]})
-    frames = encode_frame(Header(message("mounted").number, 5, 1, STEP), shown)
-    frames += encode_frame(Header(message("tick").number, 5, 2, STEP), encode("tick", {"step": 0}))
+    shown = WIRE.encode("mounted", {"q_ib": [3.0, 0, 0, 0]})
+    frames = encode_frame(Header(WIRE.message("mounted").number, 5, 1, STEP), shown)
+    frames += encode_frame(
+        Header(WIRE.message("tick").number, 5, 2, STEP), WIRE.encode("tick", {"step": 0})
+    )
     expected = theta(whole.feed(b"\x07noise" + frames))
     pieces = [bytewise.feed(bytes([b])) for b in b"\x07noise" + frames]
     assert theta([x for answer in pieces for x in answer]) == expected == [3.0, 1.0, 0.0]
@@ -163,7 +169,7 @@ def test_how_bytes_are_cut_makes_no_difference():
 
 def test_warming_up_leaves_no_trace():
     warm = part(example={"mounted": {"q_ib": np.ones(4)}})
-    station = Station(ready(warm, (0, 1)))
+    station = Station(ready(warm, (0, 1)), WIRE)
     bench = Bench()
     bench.station = station
     bench.number = 0
@@ -174,7 +180,7 @@ def test_warming_up_leaves_no_trace():
 def test_a_message_that_was_forgotten_is_an_error_of_ours():
     broken = Part("gyro", {}, lambda: None, lambda state, step, inputs: (state, [("gyro", {})]))
     bench = Bench()
-    bench.station = Station(broken)
+    bench.station = Station(broken, WIRE)
     bench.begin()
     with pytest.raises(ValueError, match="has the fields"):
         bench.tick(0)

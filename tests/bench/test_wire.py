@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robins.bench import wire
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header, Receiver, RecordError, Sequence
-from robins.bench.wire.c_header import c_header, firmware, schema_number
+from robins.bench.wire.c_header import c_header, firmware
 from robins.bench.wire.frames import LEAST, MOST_PAYLOAD, FrameError
 from robins.bench.wire.receiver import LONGEST
 
@@ -48,8 +49,8 @@ def test_golden_bytes():
     body += struct.pack("<I", crc32c(body))
     by_hand = b"\x00" + plain_cobs(body) + b"\x00"
     made = wire.encode_frame(
-        Header(wire.message("tick").number, 7, 258, 100_000_000),
-        wire.encode("tick", {"step": 1800}),
+        Header(WIRE.message("tick").number, 7, 258, 100_000_000),
+        WIRE.encode("tick", {"step": 1800}),
     )
     assert made == by_hand
     assert made == GOLDEN_TICK
@@ -172,7 +173,7 @@ def test_a_sender_that_counts_anew_is_not_locked_out():
 # ---------------------------------------------------------------------------------------- records
 
 
-@pytest.mark.parametrize("m", wire.MESSAGES, ids=lambda m: m.name)
+@pytest.mark.parametrize("m", WIRE.messages, ids=lambda m: m.name)
 def test_values_come_back_bit_for_bit(m):
     rng = np.random.default_rng(m.number)
     values = {
@@ -181,16 +182,16 @@ def test_values_come_back_bit_for_bit(m):
         else rng.integers(0, 200, f.length)
         for f in m.fields
     }
-    payload = wire.encode(m.name, values)
-    assert len(payload) == wire.size_of(m.name)
-    back = wire.decode(m.name, payload)
+    payload = WIRE.encode(m.name, values)
+    assert len(payload) == WIRE.size_of(m.name)
+    back = WIRE.decode(m.name, payload)
     for name, value in values.items():
         np.testing.assert_array_equal(np.ravel(back[name]), value)
-    assert wire.encode(m.name, back) == payload
+    assert WIRE.encode(m.name, back) == payload
 
 
 def test_nan_is_a_number_of_the_wire():
-    back = wire.decode("gyro", wire.encode("gyro", GYRO))
+    back = WIRE.decode("gyro", WIRE.encode("gyro", GYRO))
     np.testing.assert_array_equal(back["theta_b"], GYRO["theta_b"])
 
 
@@ -207,14 +208,14 @@ def test_nan_is_a_number_of_the_wire():
 )
 def test_values_that_are_not_the_message(name, values, words):
     with pytest.raises(RecordError, match=words):
-        wire.encode(name, values)
+        WIRE.encode(name, values)
 
 
 def test_payloads_that_are_not_the_message():
     with pytest.raises(RecordError, match="message 'tick' has 4 bytes, got 3"):
-        wire.decode("tick", b"abc")
+        WIRE.decode("tick", b"abc")
     with pytest.raises(KeyError, match="no message 'tock' in version 1; there are hello, tick"):
-        wire.encode("tock", {})
+        WIRE.encode("tock", {})
 
 
 @pytest.mark.parametrize(
@@ -232,37 +233,37 @@ def test_payloads_that_are_not_the_message():
     ],
 )
 def test_what_cannot_be_is_refused(name, values, words):
-    why = wire.unsound(name, wire.encode(name, values))
+    why = WIRE.unsound(name, WIRE.encode(name, values))
     assert why.sized
     assert re.match(words, why.text)
 
 
 def test_the_gate_knows_lengths_and_what_may_be_missing():
-    for m in wire.MESSAGES:
-        whole = bytes(wire.size_of(m.name))
-        assert wire.unsound(m.name, whole) is None
+    for m in WIRE.messages:
+        whole = bytes(WIRE.size_of(m.name))
+        assert WIRE.unsound(m.name, whole) is None
         for other in (whole + b"\1", whole[:-1]) if whole else (b"\1",):
-            why = wire.unsound(m.name, other)
+            why = WIRE.unsound(m.name, other)
             assert not why.sized
             assert str(len(other)) in why.text
-    gone = wire.encode("star", {"q_ib": [np.nan] * 4, "factor": [np.nan] * 9, "stars": 0})
-    assert wire.unsound("star", gone) is None
-    assert wire.unsound("gyro", wire.encode("gyro", GYRO)) is None
+    gone = WIRE.encode("star", {"q_ib": [np.nan] * 4, "factor": [np.nan] * 9, "stars": 0})
+    assert WIRE.unsound("star", gone) is None
+    assert WIRE.unsound("gyro", WIRE.encode("gyro", GYRO)) is None
 
 
 def test_the_table_is_sound():
-    numbers = [m.number for m in wire.MESSAGES]
+    numbers = [m.number for m in WIRE.messages]
     assert numbers == sorted(set(numbers))
     assert all(0 < n < 256 for n in numbers)
-    for m in wire.MESSAGES:
+    for m in WIRE.messages:
         assert len({f.name for f in m.fields}) == len(m.fields)
-        assert wire.size_of(m.name) <= MOST_PAYLOAD
-        assert wire.message(m.number) is wire.message(m.name)
+        assert WIRE.size_of(m.name) <= MOST_PAYLOAD
+        assert WIRE.message(m.number) is WIRE.message(m.name)
 
 
 def test_the_page_has_the_table():
     page = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
-    assert wire.markdown() in page.read_text("utf-8")
+    assert WIRE.markdown() in page.read_text("utf-8")
 
 
 # ---------------------------------------------------------------------------------------------- C
@@ -296,10 +297,10 @@ int main(void) {
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 def test_firmware_makes_the_same_bytes(tmp_path):
-    (tmp_path / "robins_wire.h").write_text(c_header())
+    (tmp_path / "robins_wire.h").write_text(c_header(WIRE))
     (tmp_path / "echo.c").write_text(PROGRAM)
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1"]
-    schema = f'-DSCHEMA="{schema_number():#x}"'
+    schema = f'-DSCHEMA="{WIRE.number:#x}"'
     command = ["gcc", *flags, schema, "echo.c", "-o", "echo"]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
@@ -322,7 +323,7 @@ def test_firmware_makes_the_same_bytes(tmp_path):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 def test_the_example_compiles_as_c_plus_plus_too(tmp_path):
-    files = firmware()
+    files = firmware(WIRE)
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", "-x", "c++"]

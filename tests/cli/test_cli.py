@@ -265,7 +265,7 @@ def test_the_list_names_everything(robins, systems):
         "systems": [car, kite],
         "filters": filters,
         "claims": [claim | {"system": "car"}],
-        "bench": sorted(p.stem for p in PACKAGE.glob("bench/run/scenarios/*.toml")),
+        "bench": sorted(p.stem for p in PACKAGE.glob("bench/rigs/*/scenarios/*.toml")),
         "designs": sorted(p.stem for p in PACKAGE.glob("workbench/problems/*.toml")),
     }
     assert json.loads(robins("list", "car", "--json").out) == car

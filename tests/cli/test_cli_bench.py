@@ -13,9 +13,10 @@ import mcap.writer
 import pydantic
 import pytest
 
-from robins.bench.broker.faults import LinkFault
+from robins.bench.rigs.satellite import RIG
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run.session import Session
-from robins.bench.run.setup import NODES, built_in
+from robins.bench.run.setup import built_in
 from robins.bench.wire.c_header import c_header
 from robins.cli import app
 from robins.results import ResultWriter
@@ -28,7 +29,7 @@ BENCH = app.commands["bench"]
 assert isinstance(BENCH, click.Group)
 COMMANDS = BENCH.commands
 SATELLITE = "satellite/s1"
-PARTS = ", ".join(NODES)
+PARTS = ", ".join(RIG.parts)
 OF_A_FILTER = ("--node", "adm", "--filter", "mekf")
 RECORD = ROOT / "tests" / "bench" / "records" / "adm.mcap"
 
@@ -93,36 +94,53 @@ def test_the_contract_names_commands_and_options():
     assert {k: sorted(v) for k, v in told.items()} == {k: sorted(v) for k, v in has.items()}
 
 
-def keys(tree: ast.AST, name: str | None = None) -> list[str]:
-    """Keys of the dictionary that `figures` returns, or of the one under a key of it."""
-    (function,) = (
-        n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == "figures"
-    )
-    (returned,) = (n.value for n in ast.walk(function) if isinstance(n, ast.Return))
-    assert isinstance(returned, ast.Dict)
-    for key, value in zip(returned.keys, returned.values, strict=True):
-        if name and key and ast.literal_eval(key) == name:
-            returned = value
-    return [ast.literal_eval(key) for key in returned.keys if key is not None]
+def function(module: str, name: str) -> ast.FunctionDef:
+    tree = ast.parse((ROOT / "src" / "robins" / "bench" / module).read_text("utf-8"))
+    found = (n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == name)
+    return next(found)
+
+
+def keys(of: ast.AST) -> list[str]:
+    """Names of the keys that a dictionary is written with."""
+    assert isinstance(of, ast.Dict)
+    return [ast.literal_eval(key) for key in of.keys if key is not None]
 
 
 def test_the_page_names_every_key_of_the_object():
-    source = ROOT / "src" / "robins" / "bench" / "run" / "outcome.py"
-    tree, told = ast.parse(source.read_text("utf-8")), rows(PAGE, "For scripts")
-    assert sorted(k for row in told for k in code(row[0])) == sorted(keys(tree))
-    (counts,) = (row[1] for row in told if row[0] == "`counts`")
-    assert code(counts) == keys(tree, "counts")
+    (told,) = (
+        n.value
+        for n in ast.walk(function("run/outcome.py", "figures"))
+        if isinstance(n, ast.Return)
+    )
+    assert isinstance(told, ast.Dict)
+    counts = told.values[keys_of(told).index("counts")]
+    judge = function("rigs/satellite/judging.py", "judge")
+    (metrics,) = (n.value for n in ast.walk(judge) if isinstance(n, ast.Assign) and is_dict(n))
+    (said,) = (n.value for n in ast.walk(judge) if isinstance(n, ast.Return))
+    assert isinstance(said, ast.Call)
+    named = rows(PAGE, "For scripts")
+    assert sorted(k for row in named for k in code(row[0])) == sorted([*keys(told), *keys(metrics)])
+    (counted,) = (row[1] for row in named if row[0] == "`counts`")
+    assert sorted(code(counted)) == sorted([*keys(counts), *keys(said.args[1])])
+
+
+def is_dict(n: ast.Assign) -> bool:
+    return isinstance(n.value, ast.Dict)
+
+
+def keys_of(d: ast.Dict) -> list[str | None]:
+    return [None if key is None else ast.literal_eval(key) for key in d.keys]
 
 
 def test_the_page_names_every_kind_of_fault_with_its_fields():
     told = {code(row[0])[0]: code(row[2]) for row in rows(PAGE, "Faults") if len(row) == 3}
-    kinds = typing.get_args(LinkFault.model_fields["kind"].annotation)
+    kinds = typing.get_args(RIG.fault.model_fields["kind"].annotation)
     assert sorted(told) == sorted(kinds)
     every = {"link": "star", "direction": "to", "message": "star", "share": 0.5, "bits": 2}
     every |= {"delay": 0.1, "angle": 0.1, "wheel": 0}
     for kind in kinds:
         with pytest.raises(pydantic.ValidationError) as refused:
-            LinkFault(kind=kind, begin=0.0, **every)
+            RIG.fault(kind=kind, begin=0.0, **every)
         (takes,) = re.findall(r"it takes ([\w, ]+\w)", str(refused.value))
         assert told[kind] == [f for f in takes.split(", ") if f not in ("kind", "begin", "end")]
 
@@ -131,7 +149,7 @@ def test_the_page_names_every_kind_of_fault_with_its_fields():
 
 
 def test_the_header_is_that_of_the_wire(robins):
-    assert robins("bench", "header").out == c_header()
+    assert robins("bench", "header").out == c_header(WIRE)
 
 
 def test_ports_are_listed_for_programs(robins):

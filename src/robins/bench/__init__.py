@@ -4,7 +4,7 @@ From the ground up:
 
 - `wire`: every message, field by field, and the frames that carry it; the same for firmware.
 - `ports`: serial devices, pseudo-terminals in their place, and a line that takes its time.
-- `parts`: what sits at the end of a line, and the seven parts of the satellite.
+- `parts`: what sits at the end of a line. `rig`: a vehicle as data; `rigs`: those there are.
 - `broker`: the middle, which says what to whom; what goes wrong on purpose.
 - `recording`: what went over the lines, written down, heard again, compared.
 - `live`: a running bench in a browser.
@@ -13,6 +13,8 @@ From the ground up:
 Needs the extra "bench"; the page needs "live".
 """
 
-from robins.bench.wire import MESSAGES, PARTS, VERSION
+from robins.bench.parts import Part
+from robins.bench.rig import Judged, Rig, Timing, View
+from robins.bench.wire import VERSION, Wire
 
-__all__ = ["MESSAGES", "PARTS", "VERSION"]
+__all__ = ["VERSION", "Judged", "Part", "Rig", "Timing", "View", "Wire"]

@@ -85,10 +85,10 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter for the att
 def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> int:
     """Run SCENARIO on the bench: one of the satellite, one of the bench, or a file of either.
 
-    Plant, rate table, gyro, star sensor, attitude determination, control and actuators are
-    processes, each on its own serial line; the bench connects, records and disturbs the lines. With
-    --node a board replaces a process. In lock-step (the default) the run equals `robins run` bit
-    for bit; real time is soft, as on any ordinary kernel.
+    Each part of the vehicle, such as plant, gyro or attitude determination, is a process on its own
+    serial line; the bench connects, records and disturbs the lines. With --node a board replaces a
+    process. In lock-step (the default) the run equals `robins run` bit for bit; real time is soft,
+    as on any ordinary kernel. A rig of your own is named with its file, my_rig.py:rig.
 
     Scenarios of the bench: killed-adm, lost-star, lost-wheel, noisy-line, sign-star, stuck-star,
     wrong-star.
@@ -186,9 +186,14 @@ def node(part: str, port: str, scenario: str, **options: Any) -> None:
     short_help="Print the wire as a C header, for firmware.",
     epilog=examples("robins bench header > robins_wire.h"),
 )
+@click.argument("rig", default="satellite")
 @DEBUG
-def header() -> None:
-    """Print robins_wire.h: every message, frames, a receiver; C99 or C++11, no heap."""
+def header(rig: str) -> None:
+    """Print robins_wire.h of RIG: every message, frames, a receiver; C99 or C++11, no heap.
+
+    RIG is one that comes with robins, by default the satellite, or "file.py:rig".
+    """
+    from robins.bench.rigs import rig_of
     from robins.bench.wire.c_header import c_header
 
-    click.echo(c_header(), nl=False)
+    click.echo(c_header(rig_of(rig).wire), nl=False)

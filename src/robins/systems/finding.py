@@ -42,9 +42,7 @@ def find_system(name: str, folder: Path = Path()) -> System:
 def _of_file(name: str, folder: Path) -> System:
     where, _, wanted = name.partition(":")
     path = (folder / where).resolve()
-    if not path.is_file():
-        raise UnknownSystem("there is no such file", path)
-    module = _imported(path)
+    module = imported(path)
     offered = [key for key, value in vars(module).items() if isinstance(value, Study | System)]
     if not offered:
         raise UnknownSystem(
@@ -59,8 +57,14 @@ def _of_file(name: str, folder: Path) -> System:
     return as_system(f"{path.stem}:{wanted}", getattr(module, wanted), str(path))
 
 
-def _imported(path: Path) -> ModuleType:
-    """The file as a module, importable by its name as if Python had been started beside it."""
+def imported(path: Path) -> ModuleType:
+    """A file as a module, importable by its name as if Python had been started beside it.
+
+    Raises:
+        UnknownSystem: there is no such file, or it cannot be imported.
+    """
+    if not path.is_file():
+        raise UnknownSystem("there is no such file", path)
     if str(path.parent) not in sys.path:
         sys.path.insert(0, str(path.parent))
     try:

@@ -12,16 +12,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import address, open_port
 from robins.bench.recording import read_record
 from robins.bench.recording.differences import FieldDifference, differences, table
 from robins.bench.recording.replay import Start, recorded, replay
-from robins.bench.run.one_program import in_process
 from robins.bench.run.outcome import outcome
 from robins.bench.run.session import Session, kit_of
-from robins.bench.run.setup import NODES, Flight, changed, read, recorded_flight
+from robins.bench.run.setup import Flight, changed, read, recorded_flight, recorded_rig
 from robins.bench.run.watching import Looking, page_for, starting
 from robins.bench.status import Status
 from robins.results import Outcome, Progress, silent
@@ -46,7 +44,8 @@ def bench_up(
     """Run a scenario on the bench: each part a process or a board on a serial line.
 
     Args:
-        scenario: of the satellite, of the bench, or a file of either.
+        scenario: of a system that has a rig, of the bench, a file of either, or a rig of the user's
+            own, "pendulum.py:rig".
         settings: "path=value" texts that change it.
         record: a file for what goes over the lines, moved into the result folder in the end; what
             interrupts the run leaves it there.
@@ -75,11 +74,16 @@ def bench_up(
             if file is not None:
                 interrupt.add_note(f"what was flown is in {file}")
             raise
-    loop = None
-    if flight.setup.clock == "lockstep" and ran.steps and not flight.setup.ports:
+    inside, rig = None, flight.rig
+    if (
+        rig.inside is not None
+        and flight.setup.clock == "lockstep"
+        and ran.steps
+        and not flight.setup.ports
+    ):
         progress(0.97, "the same inside one program")
-        loop = in_process(flight, ran.kit)
-    return outcome(flight, ran, loop, file)
+        inside = rig.inside(ran.kit)
+    return outcome(flight, ran, inside, file)
 
 
 def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> Flight:
@@ -105,7 +109,7 @@ def _onlooker(
         if live:
             try:
                 title = flight.setup.title or flight.name
-                page = page_for(title, os.getpid(), len(flight.loop.wheels.axes), host, port)
+                page = page_for(flight.rig, flight.given, title, os.getpid(), host, port)
             except ImportError as error:
                 raise InputError(str(error)) from error
             except OSError as error:
@@ -178,19 +182,21 @@ def bench_replay(
     """
     if filter_ and diff:
         raise InputError("the one runs a filter, the other compares records", "--filter and --diff")
-    if node not in NODES:
-        raise InputError(f"there is no part '{node}', only {', '.join(NODES)}", "--node")
     first, second = read_record(record), None if diff is None else read_record(diff)
+    rig = recorded_rig(first.header)
+    if node not in rig.parts:
+        raise InputError(f"there is no part '{node}', only {', '.join(rig.parts)}", "--node")
+    wire = rig.wire
     step_ns, told = int(first.header["step_ns"]), None
     if second is None:
         with _starter(recorded_flight(first.header, filter_), node) as start:
             heard = replay(
-                first, node, start, progress=lambda k, n: progress(k / max(n, 1), "hearing")
+                first, wire, node, start, progress=lambda k, n: progress(k / max(n, 1), "hearing")
             )
         a, b, same, told = heard.recorded, heard.frames, heard.same, heard.first_difference
     else:
         a, b = recorded(first, node), recorded(second, node)
-        same = not differences(a, b)
+        same = not differences(wire, a, b)
     damages = [
         f"{path} is not whole: {one.why}"
         for path, one in ((record, first), (diff, second))
@@ -200,7 +206,7 @@ def bench_replay(
         node=node,
         frames=len(b),
         same=same,
-        differences=differences(a, b, step_ns),
+        differences=differences(wire, a, b, step_ns),
         whole=not damages,
         damages=damages,
         until_s=min(max((f.header.time_ns for f in x), default=0) for x in (a, b)) * 1e-9,
@@ -219,7 +225,8 @@ def _starter(flight: Flight, part: str) -> Iterator[Start]:
 
         @contextlib.contextmanager
         def start(port: str) -> Iterator[subprocess.Popen]:
-            command = [sys.executable, "-m", "robins.bench.parts.node", part, port, str(path)]
+            command = [sys.executable, "-m", "robins.bench.parts.node"]
+            command += [flight.rig.address or flight.rig.name, part, port, str(path)]
             process = subprocess.Popen(command, start_new_session=True)
             try:
                 yield process
@@ -253,11 +260,13 @@ def bench_node(
         InputError, robins.scenario.ScenarioError: no such part or scenario.
         robins.bench.ports.port.PortError: the port cannot be opened.
     """
-    if name not in BUILD:
-        raise InputError(f"no part '{name}', only {', '.join(NODES)}")
+    flight = flight_of(scenario, (), {"filter": filter_, "seed": seed})
+    rig = flight.rig
+    if name not in rig.parts:
+        raise InputError(f"no part '{name}', only {', '.join(rig.parts)}")
     at = address(port)
-    kit = kit_of(flight_of(scenario, (), {"filter": filter_, "seed": seed}))
-    made = Station(ready(BUILD[name](kit), kit.frames))
+    kit = kit_of(flight)
+    made = Station(ready(rig.build[name](kit), kit.frames), rig.wire)
     with open_port(at, timeout_s=None) as line:
         opened()
         serve(line, made)

@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 from robins.bench.recording import Recorder, read_record
+from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run.session import Session
 from robins.bench.run.setup import read
 
@@ -50,7 +51,7 @@ def main() -> None:
     # how the faults were made is no matter of who hears what came of them
     header = {k: v for k, v in record.header.items() if k != "run"}
     header["setup"] = {k: v for k, v in header["setup"].items() if k != "faults"}
-    with Recorder(HERE / "adm.mcap", header, overwrite=True) as out:
+    with Recorder(HERE / "adm.mcap", WIRE, header, overwrite=True) as out:
         for number, entry in enumerate(e for e in record.entries if e.link == "adm"):
             out.write(entry._replace(received_ns=number * 1_000_000))
 

@@ -6,12 +6,11 @@
 """
 
 from robins.bench.broker.broker import Broker, Wiring
-from robins.bench.broker.faults import ROUTES, LinkFault
+from robins.bench.broker.faults import LinkFault, Said, Table
 from robins.bench.broker.injector import Injector, Piece
 from robins.bench.broker.link import BenchError, Health, Link, LinkLost
 
 __all__ = [
-    "ROUTES",
     "BenchError",
     "Broker",
     "Health",
@@ -20,5 +19,7 @@ __all__ = [
     "LinkFault",
     "LinkLost",
     "Piece",
+    "Said",
+    "Table",
     "Wiring",
 ]

@@ -15,10 +15,8 @@ from typing import NamedTuple
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Link, LinkLost
 from robins.bench.broker.revive import History, beginning, catch_up
-from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame
-from robins.bench.wire.records import decode, encode
-from robins.bench.wire.schema import PARTS
+from robins.bench.wire.schema import BARE, Wire
 
 Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
@@ -27,8 +25,9 @@ _CLOCK_NS = time.monotonic_ns
 
 
 class Wiring(NamedTuple):
-    """Who says what to whom."""
+    """Who says what to whom, in which messages."""
 
+    wire: Wire
     sends: Sends
     takes: Takes
 
@@ -130,19 +129,19 @@ class Broker:
             self.poll(_GLANCE_S)
 
     def _greet(self, name: str, frame: Frame) -> None:
-        link, said = self.links[name], decode("hello", frame.payload)
-        if said["schema"] != schema_number():
+        link, said, wire = self.links[name], BARE.decode("hello", frame.payload), self.wiring.wire
+        if said["schema"] != wire.number:
             raise BenchError(
                 f"'{name}' speaks another version of the wire (schema {said['schema']:#010x}, "
-                f"here {schema_number():#010x}): build it with the header of this version"
+                f"here {wire.number:#010x}): build it with the header of this version"
             )
-        if (number := said["part"]) != PARTS.index(name):
-            known = PARTS[number] if number < len(PARTS) else f"part {number}"
+        if (number := said["part"]) != wire.parts.index(name):
+            known = wire.parts[number] if number < len(wire.parts) else f"part {number}"
             raise BenchError(f"at the port of '{name}' there is {known}: exchange the ports")
         if link.greeted and self._step >= 0 and frame.header.sequence == 0:
             link.restart(self._run)  # it has been started anew
         link.greeted = True
-        self._put(link, "begin", encode("begin", {"step": self.step_ns}), 0)
+        self._put(link, "begin", BARE.encode("begin", {"step": self.step_ns}), 0)
         link.flush(_CLOCK_NS())
 
     # ----------------------------------------------------------------------------------- a step
@@ -282,7 +281,7 @@ class Broker:
                 self._route(message, frame)
 
     def _finished(self, name: str, frame: Frame) -> None:
-        said = decode("done", frame.payload)
+        said = BARE.decode("done", frame.payload)
         if name in self._kept:
             self._kept[name].answered(said["step"])
         if said["step"] != self._step or name not in self._ticked or name in self._done:

@@ -3,53 +3,77 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import pydantic
 
-from robins.bench.wire.schema import FIRST_DATA, MESSAGES, WHEELS
+from robins.bench.wire.schema import BARE, PROTOCOL, Wire
 from robins.scenario import Parameters, Quantity, default
 
 Direction = Literal["from", "to"]
-_CLOCK = frozenset(m.name for m in MESSAGES if m.number < FIRST_DATA)
+Stage = Literal["sensed", "repeated", "said", "blind"]
+"""When the content of a frame is changed, in this order: what a sensor measures, what it says again
+and again in its place, what it says of it, and that it says nothing of it. What a blind sensor had
+lost it does not repeat."""
 
-ROUTES: dict[str, dict[Direction, tuple[str, ...]]] = {
-    "plant": {"to": ("actuation",), "from": ("motion",)},
-    "table": {"to": ("motion",), "from": ("mounted",)},
-    "gyro": {"to": ("mounted",), "from": ("gyro",)},
-    "star": {"to": ("motion", "gyro", "estimate"), "from": ("star",)},
-    "adm": {"to": ("gyro", "star"), "from": ("estimate", "innovation")},
-    "acm": {"to": ("estimate", "gyro", "wheels"), "from": ("command",)},
-    "actuators": {"to": ("command",), "from": ("actuation", "wheels")},
-}
-"""What goes over the link of each part, to it and from it."""
-
-# where the faults of a sensor and an actuator are: link and message
-_SPEAKER: dict[str, tuple[str, str]] = {
-    **dict.fromkeys(("turned", "stuck", "sign", "lost"), ("star", "star")),
-    "wheel": ("actuators", "actuation"),
-}
 _PLACE = ("link", "direction", "message", "share")
-_TAKES: dict[str, tuple[str, ...]] = {
+_LINE: dict[str, tuple[str, ...]] = {
     "bit errors": (*_PLACE, "bits"),
     "loss": _PLACE,
     "duplication": _PLACE,
     "reorder": _PLACE,
     "delay": (*_PLACE, "delay"),
-    "stuck": _PLACE,
-    "turned": (*_PLACE, "angle"),
-    "lost": _PLACE,
-    "sign": _PLACE,
-    "wheel": (*_PLACE, "wheel"),
     "killed": ("link",),
     "silent": ("link", "direction"),
 }
-_NEEDS = {"delay": "delay", "wheel": "wheel", "killed": "link"}
+"""Faults of the line and of processes, and what each takes."""
+_NEEDS = {"delay": "delay", "killed": "link"}
 
 
-_OfFrames = Literal["bit errors", "loss", "duplication", "reorder", "delay", "stuck"]
-_OfParts = Literal["turned", "lost", "sign", "wheel", "killed", "silent"]
+class Said(NamedTuple):
+    """A fault of a sensor or an actuator: its frames are sound, what they say is not.
+
+    Attributes:
+        link: of the part that has it.
+        message: that says it.
+        stage: see `Stage`; who repeats says again what it said last.
+        act: (values of the message, the fault, time of the run [ns]) -> values as they are said.
+        takes: its parameters, besides place and share.
+        needs: one of them that must be given; "": none.
+    """
+
+    link: str
+    message: str
+    stage: Stage
+    act: Callable[[dict[str, Any], Any, int], Mapping[str, Any]] = lambda said, fault, now: said
+    takes: tuple[str, ...] = ()
+    needs: str = ""
+
+
+class Table(NamedTuple):
+    """What the faults of a rig may be.
+
+    Attributes:
+        wire: its messages.
+        sends: messages by part.
+        takes: messages by part.
+        said: faults of its sensors and actuators, by kind.
+    """
+
+    wire: Wire = BARE
+    sends: Mapping[str, tuple[str, ...]] = {}
+    takes: Mapping[str, tuple[str, ...]] = {}
+    said: Mapping[str, Said] = {}
+
+    @property
+    def kinds(self) -> dict[str, tuple[str, ...]]:
+        """All kinds of faults, with what each takes."""
+        return _LINE | {kind: (*_PLACE, *one.takes) for kind, one in self.said.items()}
+
+    def carried(self, link: str, direction: Direction) -> tuple[str, ...]:
+        """What goes over the link of a part."""
+        return (self.sends if direction == "from" else self.takes)[link]
 
 
 class LinkFault(Parameters):
@@ -62,19 +86,17 @@ class LinkFault(Parameters):
     - "duplication": a frame comes twice.
     - "reorder": a frame comes after the next one of the same message, as what is late.
     - "delay": a frame comes ``delay`` later.
-    - "stuck": the star sensor says again and again what it said last.
-    - "turned": its attitude is turned by ``angle`` about its boresight z.
-    - "sign": in every other second its attitude has the opposite sign, which is no fault of it.
-    - "lost": its frames come, without an attitude.
-    - "wheel": the wheel of that number, from 0, gives no torque.
     - "killed": the part of the link is killed, at `begin`.
+    - and those of the sensors and actuators of a rig.
 
     ``link`` is that of a part, left out: of each; ``direction`` is "from" the part or "to" it;
     ``message`` left out: each but those of the clock, which no fault touches. ``share`` is that of
     the frames that are hit, at random.
     """
 
-    kind: Literal[_OfFrames, _OfParts]
+    table: ClassVar[Table] = Table()
+
+    kind: str
     begin: Annotated[float, Quantity("time", least="0 s")]
     end: Annotated[float, Quantity("time", above="0 s")] | None = None
     link: str | None = None
@@ -83,30 +105,29 @@ class LinkFault(Parameters):
     share: Annotated[float, Quantity("ratio", above="0", most="1")] = default("100 %")
     bits: Annotated[int, pydantic.Field(ge=1, le=64)] = 1
     delay: Annotated[float, Quantity("time", above="0 s")] | None = None
-    angle: Annotated[float, Quantity("angle", above="0 deg", most="180 deg")] = default("10 deg")
-    wheel: Annotated[int, pydantic.Field(ge=0, lt=WHEELS)] | None = None
 
     @pydantic.model_validator(mode="before")
     @classmethod
     def _at_its_speaker(cls, given: Any) -> Any:
         """Where the fault of a sensor or an actuator is, if it is left out."""
-        if isinstance(given, Mapping) and given.get("kind") in _SPEAKER:
-            link, said = _SPEAKER[given["kind"]]
-            return {"link": link, "message": said, **given}
+        if isinstance(given, Mapping) and (said := cls.table.said.get(given.get("kind", ""))):
+            return {"link": said.link, "message": said.message, **given}
         return given
 
     @pydantic.model_validator(mode="after")
     def _sound(self) -> LinkFault:
         if self.end is not None and self.end <= self.begin:
             raise ValueError(f"end ({self.end:g} s) must come after begin ({self.begin:g} s)")
-        allowed = ("kind", "begin", "end", *_TAKES[self.kind])
+        said = self.table.said.get(self.kind)
+        allowed = ("kind", "begin", "end", *self.table.kinds[self.kind])
         if "end" in self.model_fields_set and self.kind == "killed":
             raise ValueError("end: a part is killed once, at begin: leave end out")
         if more := sorted(self.model_fields_set - set(allowed)):
             raise ValueError(
                 f"{more[0]}: a fault of kind '{self.kind}' has none; it takes {', '.join(allowed)}"
             )
-        if (need := _NEEDS.get(self.kind)) and getattr(self, need) is None:
+        need = said.needs if said else _NEEDS.get(self.kind)
+        if need and getattr(self, need) is None:
             raise ValueError(f"{need}: a fault of kind '{self.kind}' needs it")
         _check_place(self)
         return self
@@ -126,21 +147,36 @@ class LinkFault(Parameters):
         return self.begin_ns <= now_ns < self.end_ns
 
 
+def faults_of(table: Table, **more: Any) -> type[LinkFault]:
+    """The faults of a rig as parameters.
+
+    Args:
+        table: what they may be.
+        more: parameters of those of its sensors and actuators: the type and its default.
+    """
+    fields: dict[str, Any] = {"kind": (Literal[tuple(table.kinds)], ...), **more}
+    made = pydantic.create_model("Fault", __base__=LinkFault, **fields)
+    made.__doc__, made.table = LinkFault.__doc__, table
+    return made
+
+
 def _check_place(fault: LinkFault) -> None:
     """That what the fault is to meet goes over that link."""
-    if fault.link is not None and fault.link not in ROUTES:
-        raise ValueError(f"link: there is no part '{fault.link}', only {', '.join(ROUTES)}")
-    names = [m.name for m in MESSAGES if m.number >= FIRST_DATA]
+    table = fault.table
+    if fault.link is not None and fault.link not in table.sends:
+        raise ValueError(f"link: there is no part '{fault.link}', only {', '.join(table.sends)}")
+    names = [m.name for m in table.wire.data]
     if fault.message is not None and fault.message not in names:
-        spared = " (those of the clock are spared)" if fault.message in _CLOCK else ""
+        clock = any(fault.message == m.name for m in PROTOCOL)
+        spared = " (those of the clock are spared)" if clock else ""
         raise ValueError(
             f"message: there is no '{fault.message}' to meet{spared}, only {', '.join(names)}"
         )
-    said = _SPEAKER.get(fault.kind, (None, None))[1]
-    if said is not None and fault.message != said:
-        raise ValueError(f"message: a fault of kind '{fault.kind}' is one of '{said}'")
+    said = table.said.get(fault.kind)
+    if said is not None and fault.message != said.message:
+        raise ValueError(f"message: a fault of kind '{fault.kind}' is one of '{said.message}'")
     if fault.link is not None and fault.message is not None:
-        carried = ROUTES[fault.link][fault.direction]
+        carried = table.carried(fault.link, fault.direction)
         if fault.message not in carried:
             raise ValueError(
                 f"message: '{fault.message}' never goes {fault.direction} '{fault.link}', "

@@ -19,19 +19,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.bench.broker.faults import ROUTES, Direction, LinkFault
+from robins.bench.broker.faults import Direction, LinkFault, Stage, Table
 from robins.bench.wire.frames import Frame, encode_frame
-from robins.bench.wire.records import decode, encode, size_of
-from robins.bench.wire.schema import FIRST_DATA, PARTS, message
-from robins.rotation import multiply
+from robins.bench.wire.schema import FIRST_DATA
 
-__all__ = ["ROUTES", "Direction", "Injector", "LinkFault", "Piece"]
+__all__ = ["Direction", "Injector", "LinkFault", "Piece"]
 
 _SECOND_NS = 1_000_000_000
-_STAR = message("star").number
 _CHANCE, _BITS = 0, 1  # what noise is for
 _BLOCK = 256  # chances drawn at once
-_SAYS = ("turned", "stuck", "sign", "lost", "wheel")  # what is changed is what is said
 
 
 class Piece(NamedTuple):
@@ -74,8 +70,13 @@ class Injector:
         counts: frames hit so far, by kind and link; parts for "killed".
     """
 
-    def __init__(self, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
+    def __init__(self, table: Table, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
         """Take the faults of a run.
+
+        Args:
+            table: what they may be.
+            faults: those there are from the beginning.
+            seed: of their noise.
 
         Raises:
             ValueError: a seed below 0 or of more than 64 bits.
@@ -83,12 +84,14 @@ class Injector:
         if not 0 <= seed < 2**64:
             raise ValueError(f"seed must be from 0 to 2^64 - 1, got {seed}")
         self.counts: Counter[tuple[str, str]] = Counter()
-        self._seed = seed
+        self._seed, self._table, self._wire = seed, table, table.wire
+        repeated = [one.message for one in table.said.values() if one.stage == "repeated"]
+        self._repeated = {table.wire.numbers[name] for name in repeated}
         self._faults: list[_Fault] = []
         self._added = 0
         self._met: Counter[tuple[int, str, str]] = Counter()
         self._chances: dict[tuple[int, str, str], np.ndarray] = {}
-        self._said: dict[tuple[str, str], bytes] = {}
+        self._said: dict[tuple[str, str, int], bytes] = {}
         self._held: dict[tuple[str, str], list[_Held]] = {}
         self._killed: set[int] = set()
         for fault in faults:
@@ -96,7 +99,7 @@ class Injector:
 
     def add(self, fault: LinkFault) -> None:
         """One more fault, after those there are; if its time has begun it acts from now on."""
-        kind = None if fault.message is None else message(fault.message).number
+        kind = None if fault.message is None else self._wire.numbers[fault.message]
         # a number is never used again, even when faults are cleared: each has its own noise
         self._faults.append(_Fault(self._added, fault.begin_ns, fault.end_ns, kind, fault))
         self._added += 1
@@ -143,14 +146,14 @@ class Injector:
             return [Piece(None, frame)]
         where = link, direction
         met = [one for one in self._faults if one.meets(link, direction, kind, now_ns)]
-        if met or kind == _STAR:
+        if met or kind in self._repeated:
             payload = self._say(where, kind, frame.payload, met, now_ns)
             if payload is not frame.payload:
                 frame = frame._replace(payload=payload)
                 raw = encode_frame(*frame)
         pieces = [Piece(None, frame)]
         for one in met:
-            if pieces and one.is_.kind not in _SAYS:
+            if pieces and one.is_.kind not in self._table.said:
                 pieces = self._spoil(where, kind, one, pieces, raw, now_ns)
         if pieces and where in self._held:
             pieces += self._overtaken(where, kind)
@@ -182,8 +185,9 @@ class Injector:
         self, where: tuple[str, str], one: _Fault, count: int, use: int
     ) -> np.random.Generator:
         """Random numbers of a fault, for a frame."""
-        place = 2 * PARTS.index(where[0]) + (where[1] == "to")
-        key = [self._seed, one.number * 2 * len(PARTS) + place]
+        parts = self._wire.parts
+        place = 2 * parts.index(where[0]) + (where[1] == "to")
+        key = [self._seed, one.number * 2 * len(parts) + place]
         return np.random.Generator(np.random.Philox(key=key, counter=[0, count, use, 0]))
 
     # ---------------------------------------------------------------- what is said
@@ -191,30 +195,37 @@ class Injector:
     def _say(
         self, where: tuple[str, str], kind: int, payload: bytes, met: list[_Fault], now_ns: int
     ) -> bytes:
-        """What a sensor or an actuator says, under the faults that it has.
-
-        The order is that of the loop in one program: a stuck sensor repeats a turned attitude, and
-        what it had lost it does not repeat.
-        """
-        if len(payload) != size_of(message(kind).name):
+        """What a sensor or an actuator says, under the faults that it has; see `Stage`."""
+        name = self._wire.names.get(kind)
+        if name is None or len(payload) != self._wire.size_of(name):
             return payload  # no such message; who takes it will refuse it
+        says = self._table.said
         hits = [
-            one.is_ for one in met if one.is_.kind in _SAYS and self._hit(where, one) is not None
+            one.is_ for one in met if one.is_.kind in says and self._hit(where, one) is not None
         ]
-        for fault in hits:
-            if fault.kind == "turned":
-                payload = _turned(payload, fault.angle)
-        if any(fault.kind == "stuck" for fault in hits):
-            payload = self._said.get(where, payload)
-        lost = any(fault.kind == "lost" for fault in hits)
-        if kind == _STAR and not lost and not _unsolved(payload):
-            self._said[where] = payload
-        for fault in hits:
-            if fault.kind == "sign" and (now_ns + 1) // _SECOND_NS % 2 == 1:
-                payload = _star(payload, -decode("star", payload)["q_ib"])
-            elif fault.kind == "wheel" and fault.wheel is not None:
-                payload = _without_wheel(payload, fault.wheel)
-        return _blind(payload) if lost else payload
+
+        def at(stage: Stage) -> list[LinkFault]:
+            return [fault for fault in hits if says[fault.kind].stage == stage]
+
+        def changed(payload: bytes, faults: list[LinkFault]) -> bytes:
+            for fault in faults:
+                values = self._wire.decode(name, payload)
+                payload = self._wire.encode(name, says[fault.kind].act(values, fault, now_ns))
+            return payload
+
+        payload, of = changed(payload, at("sensed")), (*where, kind)
+        if at("repeated"):
+            payload = self._said.get(of, payload)
+        blind = at("blind")
+        if kind in self._repeated and not blind and not self._lacks(name, payload):
+            self._said[of] = payload
+        return changed(changed(payload, at("said")), blind)
+
+    def _lacks(self, name: str, payload: bytes) -> bool:
+        """Whether a number is missing of what a message says."""
+        values = self._wire.decode(name, payload)
+        fields = self._wire.message(name).fields
+        return any(f.missing and np.isnan(values[f.name]).any() for f in fields)
 
     # ---------------------------------------------------------------- what the line does
 
@@ -262,27 +273,3 @@ def _inverted(raw: bytes, bits: int, noise: np.random.Generator) -> bytes:
     for k in noise.choice(8 * len(raw), min(bits, 8 * len(raw)), replace=False):
         out[k // 8] ^= 1 << int(k % 8)
     return bytes(out)
-
-
-def _star(payload: bytes, q_ib: np.ndarray, **other: object) -> bytes:
-    return encode("star", decode("star", payload) | {"q_ib": q_ib} | other)
-
-
-def _unsolved(payload: bytes) -> bool:
-    return bool(np.isnan(decode("star", payload)["q_ib"]).any())
-
-
-def _turned(payload: bytes, angle_rad: float) -> bytes:
-    """Times a turn about body z."""
-    about_z = np.array([math.cos(0.5 * angle_rad), 0.0, 0.0, math.sin(0.5 * angle_rad)])
-    return _star(payload, np.asarray(multiply(decode("star", payload)["q_ib"], about_z)))
-
-
-def _blind(payload: bytes) -> bytes:
-    return _star(payload, np.full(4, np.nan), factor=np.zeros(9), stars=0)
-
-
-def _without_wheel(payload: bytes, wheel: int) -> bytes:
-    values = decode("actuation", payload)
-    values["wheel_torque"][wheel] = 0.0
-    return encode("actuation", values)

@@ -17,8 +17,8 @@ from robins.bench.broker.injector import Injector, Piece
 from robins.bench.ports.line import Line
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
-from robins.bench.wire.records import Unsound, unsound
-from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS
+from robins.bench.wire.records import Unsound
+from robins.bench.wire.schema import FIRST_DATA, Wire
 from robins.errors import RobinsError
 
 
@@ -75,6 +75,7 @@ class Link:
         self,
         name: str,
         fd: int,
+        wire: Wire,
         injector: Injector,
         watch: Watcher,
         baud: int | None = None,
@@ -85,6 +86,7 @@ class Link:
         Args:
             name: of the part.
             fd: non-blocking file descriptor, of a pseudo-terminal or a real port.
+            wire: its messages.
             injector: what goes wrong on purpose.
             watch: told of everything on the line.
             baud: of the virtual line; None: bytes get through at once, or the line is real.
@@ -92,7 +94,7 @@ class Link:
                 no further.
         """
         self.name, self.fd = name, fd
-        self._refuse = refuse
+        self._wire, self._refuse = wire, refuse
         self.health = Health()
         self.greeted = False
         self._injector, self._watch = injector, watch
@@ -126,7 +128,7 @@ class Link:
             number, self._sent = 0, max(self._sent, 1)
         else:
             number, self._sent = self._sent, (self._sent + 1) % 2**32
-        header = Header(NUMBERS[name], self._run, number, time_ns)
+        header = Header(self._wire.numbers[name], self._run, number, time_ns)
         frame = Frame(header, payload)
         raw = encode_frame(header, payload)
         if header.type < FIRST_DATA:
@@ -206,7 +208,7 @@ class Link:
         self.health.bytes_in += len(data)
         found: list[tuple[str, Frame]] = []
         for frame in self._receiver.feed(data):
-            name = NAMES.get(frame.header.type)
+            name = self._wire.names.get(frame.header.type)
             if frame.header.type < FIRST_DATA:
                 self._control(name, frame, found, now_ns)
             elif frame.header.run != self._run:
@@ -240,7 +242,7 @@ class Link:
 
     def _bars(self, name: str, frame: Frame, now_ns: int) -> bool:
         """Refuse a frame that cannot be what its message says."""
-        if (why := unsound(name, frame.payload)) is None:
+        if (why := self._wire.unsound(name, frame.payload)) is None:
             return False
         if name != "hello":  # whose number is not of this run
             self._counts(frame, now_ns)
@@ -260,7 +262,7 @@ class Link:
                 self._use(frame, found, now_ns)
 
     def _use(self, frame: Frame, found: list[tuple[str, Frame]], now_ns: int) -> None:
-        name = NAMES.get(frame.header.type)
+        name = self._wire.names.get(frame.header.type)
         if name is None:
             self.health.strange += 1
         elif self._counts(frame, now_ns):

@@ -16,8 +16,7 @@ from robins.bench.broker.link import BenchError, Link
 from robins.bench.parts.station import is_due
 from robins.bench.wire.frames import Header, encode_frame
 from robins.bench.wire.receiver import Receiver
-from robins.bench.wire.records import decode, encode
-from robins.bench.wire.schema import NUMBERS
+from robins.bench.wire.schema import BARE, NUMBERS
 
 
 class Told(NamedTuple):
@@ -91,7 +90,9 @@ def catch_up(
 
 def beginning(run: int, step_ns: int) -> bytes:
     """The frame that begins a run."""
-    return encode_frame(Header(NUMBERS["begin"], run, 0, 0), encode("begin", {"step": step_ns}))
+    return encode_frame(
+        Header(NUMBERS["begin"], run, 0, 0), BARE.encode("begin", {"step": step_ns})
+    )
 
 
 class _Talk:
@@ -114,7 +115,7 @@ class _Talk:
             while self._come:
                 number, payload = self._come.pop(0)
                 if number == NUMBERS[name] and (
-                    step is None or decode(name, payload)["step"] == step
+                    step is None or BARE.decode(name, payload)["step"] == step
                 ):
                     return
             if time.monotonic() > end:

@@ -1,7 +1,6 @@
 """The parts of a vehicle, each at the end of a line.
 
 - `station`: the protocol of a part, without a port. `node`: a part as a process.
-- `satellite`: the seven parts of the satellite.
 """
 
 from robins.bench.parts.station import Part, Station, ready, serve

@@ -1,6 +1,6 @@
 """A part of the vehicle as a process of its own, which knows nothing but its port.
 
-python -m robins.bench.parts.node gyro /dev/pts/5,460800 kit.pickle
+python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 kit.pickle
 
 With a folder it puts its memory aside there, and with a step too it goes on from that of the step.
 """
@@ -17,9 +17,9 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from robins.bench.parts.satellite import BUILD
 from robins.bench.parts.station import Station, path_of, put_aside, ready, serve
 from robins.bench.ports.port import PortError, address, open_port
+from robins.bench.rigs import rig_of
 
 REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: ask for SCHED_FIFO
 _PRIORITY = 50
@@ -62,16 +62,17 @@ def few_collections() -> Iterator[None]:
 
 def main(arguments: Sequence[str]) -> int:
     """Be a part until the bench says stop, or is gone."""
-    name, port, kit_path, *more = arguments
+    rig_name, name, port, kit_path, *more = arguments
     # An interrupt of the terminal is for the bench, which then tells its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    rig = rig_of(rig_name)
     kit = pickle.loads(Path(kit_path).read_bytes())
-    part = ready(BUILD[name](kit), kit.frames)
-    station = Station(part)
+    part = ready(rig.build[name](kit), kit.frames)
+    station = Station(part, rig.wire)
     if more:
         folder, since = Path(more[0]), int(more[1])
         memory = None if since < 0 else path_of(folder, name, since).read_bytes()
-        station = Station(part, memory, partial(put_aside, folder, name))
+        station = Station(part, rig.wire, memory, partial(put_aside, folder, name))
     if os.environ.get(REALTIME) and (why := be_realtime()):
         print(why, file=sys.stderr)
     gc.collect()

@@ -22,11 +22,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver, Sequence
-from robins.bench.wire.records import RecordError, decode, encode, size_of
-from robins.bench.wire.schema import FIRST_DATA, NAMES, NUMBERS, PARTS
+from robins.bench.wire.records import RecordError
+from robins.bench.wire.schema import FIRST_DATA, Wire
 
 EVERY = 256  # steps
 
@@ -66,7 +65,7 @@ class Part(NamedTuple):
     """What a part does.
 
     Attributes:
-        name: one of `PARTS`.
+        name: one of the parts of its rig.
         takes: messages it takes, with how many steps they are older than the tick: 0 or 1.
         begin: () -> state before the first step.
         act: (state, step, inputs) -> (state, sent), at a tick.
@@ -95,6 +94,7 @@ class Station:
     def __init__(
         self,
         part: Part,
+        wire: Wire,
         memory: bytes | None = None,
         put_aside: Callable[[int, bytes], None] | None = None,
     ):
@@ -102,10 +102,11 @@ class Station:
 
         Args:
             part: which.
+            wire: the messages of its rig.
             memory: of the one in whose place it is started; None: it begins anew.
             put_aside: takes the step and the memory now and then; None: nobody wants it.
         """
-        self.part, self._put_aside = part, put_aside
+        self.part, self._wire, self._put_aside = part, wire, put_aside
         self.counts: Counter[str] = Counter()
         self.over = False
         self._receiver = Receiver()
@@ -120,10 +121,11 @@ class Station:
         """What it says until the bench answers; numbered, so that a part that was started anew is
         told from one whose hello was on its way when the bench answered.
         """
-        said = {"part": PARTS.index(self.part.name), "schema": schema_number()}
-        header = Header(NUMBERS["hello"], 0, self._hellos, 0)
+        wire = self._wire
+        said = {"part": wire.parts.index(self.part.name), "schema": wire.number}
+        header = Header(wire.numbers["hello"], 0, self._hellos, 0)
         self._hellos += 1
-        return encode_frame(header, encode("hello", said))
+        return encode_frame(header, wire.encode("hello", said))
 
     def feed(self, data: bytes) -> bytes:
         """Take bytes; the bytes to answer with."""
@@ -140,8 +142,12 @@ class Station:
 
     def _take(self, frame: Frame) -> bytes:
         head = frame.header
-        name = NAMES.get(head.type)
-        if name is not None and head.type < FIRST_DATA and len(frame.payload) != size_of(name):
+        name = self._wire.names.get(head.type)
+        if (
+            name is not None
+            and head.type < FIRST_DATA
+            and len(frame.payload) != self._wire.size_of(name)
+        ):
             self.counts["size"] += 1
             return b""
         if name == "begin":
@@ -149,14 +155,14 @@ class Station:
                 self._reset()
                 self._run, self.over = head.run, False
             self.begun = True
-            self._step_ns = decode("begin", frame.payload)["step"]
+            self._step_ns = self._wire.decode("begin", frame.payload)["step"]
             return b""
         if head.run != self._run or name is None:
             self.counts["strange"] += 1
             return b""
         fresh = self._sequence.take(head.sequence)
         if name == "tick":
-            return self._tick(decode("tick", frame.payload)["step"], head.time_ns)
+            return self._tick(self._wire.decode("tick", frame.payload)["step"], head.time_ns)
         if name == "stop":
             self.over = True
         elif name not in self.part.takes:
@@ -188,9 +194,9 @@ class Station:
         oldest = time_ns - self._step_ns
         self._inbox = {k: v for k, v in self._inbox.items() if k[1] > oldest}
         self._state, sent = self.part.act(self._state, step, inputs)
-        answer = [(name, encode(name, values)) for name, values in sent]
+        answer = [(name, self._wire.encode(name, values)) for name, values in sent]
         took = min(time.perf_counter_ns() - began, 2**32 - 1)
-        answer.append(("done", encode("done", {"step": step, "compute": took})))
+        answer.append(("done", self._wire.encode("done", {"step": step, "compute": took})))
         self._done = step, time_ns, answer
 
     def _input(self, name: str, time_ns: int) -> dict[str, Any] | None:
@@ -198,14 +204,14 @@ class Station:
         if payload is None:
             return None
         try:
-            return decode(name, payload)
+            return self._wire.decode(name, payload)
         except RecordError:
             self.counts["size"] += 1
             return None
 
     def _frame(self, name: str, payload: bytes, time_ns: int) -> bytes:
         assert self._run is not None
-        header = Header(NUMBERS[name], self._run, self._sent, time_ns)
+        header = Header(self._wire.numbers[name], self._run, self._sent, time_ns)
         self._sent = (self._sent + 1) % 2**32
         return encode_frame(header, payload)
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from robins.bench.status import aligned
+from robins.bench.wire.fields import Field, Message
 from robins.bench.wire.frames import Frame
-from robins.bench.wire.records import decode, size_of
-from robins.bench.wire.schema import FIRST_DATA, Field, Message, message
+from robins.bench.wire.schema import FIRST_DATA, Wire
 
 Payloads = dict[tuple[int, int, int], bytes]
 """Payloads by message, time, and which of those with both alike."""
@@ -38,7 +38,9 @@ class FieldDifference:
     count: int  # of frames that differ
 
 
-def differences(a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0) -> list[FieldDifference]:
+def differences(
+    wire: Wire, a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0
+) -> list[FieldDifference]:
     """Where the frames of two runs differ, the earliest difference first; none: an empty list.
 
     Frames belong together if message and time are the same; of several such, as of a tick that was
@@ -47,6 +49,7 @@ def differences(a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0) -> lis
     protocol are left out.
 
     Args:
+        wire: their messages.
         a: frames of one run.
         b: frames of the other.
         step_ns: length of a step, to tell steps; 0: not known.
@@ -54,7 +57,7 @@ def differences(a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0) -> lis
     of_a, of_b = _by_key(a), _by_key(b)
     found: list[FieldDifference] = []
     for number in sorted({key[0] for key in (*of_a, *of_b)}):
-        found += _of_message(number, of_a, of_b, step_ns)
+        found += _of_message(wire, number, of_a, of_b, step_ns)
     return sorted(found, key=lambda d: d.first_time_s)
 
 
@@ -71,8 +74,10 @@ def _by_key(frames: Iterable[Frame]) -> Payloads:
     return found
 
 
-def _of_message(number: int, a: Payloads, b: Payloads, step_ns: int) -> list[FieldDifference]:
-    of = _known(number)
+def _of_message(
+    wire: Wire, number: int, a: Payloads, b: Payloads, step_ns: int
+) -> list[FieldDifference]:
+    of = wire.message(number) if number in wire.names else None
     only_a: list[int] = []  # times [ns] of frames that only one has
     only_b: list[int] = []
     as_bytes: list[int] = []  # of frames that both have and no field tells apart
@@ -83,11 +88,11 @@ def _of_message(number: int, a: Payloads, b: Payloads, step_ns: int) -> list[Fie
             only_a.append(time_ns)
         elif x is None:
             only_b.append(time_ns)
-        elif x != y and of and len(x) == len(y) == size_of(of.name):
+        elif x != y and of and len(x) == len(y) == of.size:
             by_fields.append((time_ns, x, y))
         elif x != y:
             as_bytes.append(time_ns)
-    found = _of_fields(of, by_fields, step_ns) if of and by_fields else []
+    found = _of_fields(wire, of, by_fields, step_ns) if of and by_fields else []
     name = of.name if of else f"message {number}"
     for times, in_a, in_b in ((only_a, 1.0, 0.0), (only_b, 0.0, 1.0), (as_bytes, 1.0, 1.0)):
         if n := len(times):
@@ -101,18 +106,11 @@ def _when(time_ns: int, step_ns: int) -> tuple[int, float]:
     return time_ns // step_ns - 1 if step_ns else -1, time_ns * 1e-9
 
 
-def _known(number: int) -> Message | None:
-    try:
-        return message(number)
-    except KeyError:
-        return None
-
-
 def _of_fields(
-    of: Message, frames: Sequence[tuple[int, bytes, bytes]], step_ns: int
+    wire: Wire, of: Message, frames: Sequence[tuple[int, bytes, bytes]], step_ns: int
 ) -> list[FieldDifference]:
-    a = [decode(of.name, x) for _, x, _ in frames]
-    b = [decode(of.name, y) for _, _, y in frames]
+    a = [wire.decode(of.name, x) for _, x, _ in frames]
+    b = [wire.decode(of.name, y) for _, _, y in frames]
     found = []
     for f in of.fields:
         kind = np.float64 if f.kind == "f64" else np.uint64

@@ -15,7 +15,8 @@ from typing import Any, Literal, NamedTuple
 import fastcrc
 from mcap.records import Schema
 
-from robins.bench.wire.schema import VERSION, markdown
+from robins.bench.wire.frames import VERSION
+from robins.bench.wire.schema import Wire
 from robins.errors import RobinsError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -62,9 +63,9 @@ class Event(NamedTuple):
     fields: dict[str, Any]
 
 
-def schemas() -> tuple[Schema, Schema]:
+def schemas(wire: Wire) -> tuple[Schema, Schema]:
     """Of frames and of events."""
-    table, event = markdown().encode(), json.dumps(_EVENT, sort_keys=True).encode()
+    table, event = wire.markdown().encode(), json.dumps(_EVENT, sort_keys=True).encode()
     return (
         Schema(FRAMES_SCHEMA, table, "text/markdown", f"{ENCODING}{VERSION}"),
         Schema(EVENTS_SCHEMA, event, "jsonschema", "robins-event"),

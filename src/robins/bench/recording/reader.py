@@ -15,7 +15,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from robins.bench.recording import layout
-from robins.bench.wire.schema import VERSION
+from robins.bench.wire.frames import VERSION
 
 LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage, and no memory is asked for it
 _ABOUT = {"wire", "header", "check"}

@@ -19,11 +19,10 @@ from robins.bench.ports.port import Pair, open_pair
 from robins.bench.recording.differences import differences, name_of
 from robins.bench.recording.layout import Entry
 from robins.bench.recording.reader import Record
-from robins.bench.wire.c_header import schema_number
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver
-from robins.bench.wire.records import RecordError, decode, size_of
-from robins.bench.wire.schema import FIRST_DATA, NUMBERS, PARTS, message
+from robins.bench.wire.records import RecordError
+from robins.bench.wire.schema import BARE, FIRST_DATA, NUMBERS, Wire
 from robins.errors import RobinsError
 
 PATIENCE_S = 60.0  # a part may compile its filter before it answers
@@ -70,13 +69,13 @@ class _Life(NamedTuple):
 
     @property
     def step_ns(self) -> int:
-        return int(decode("begin", self.begin.payload)["step"])
+        return int(BARE.decode("begin", self.begin.payload)["step"])
 
     @property
     def ticks(self) -> list[int]:
         """Steps, in the order of their ticks."""
         return [
-            int(decode("tick", f.payload)["step"])
+            int(BARE.decode("tick", f.payload)["step"])
             for _, found in self.to
             for f in found
             if f.header.type == _TICK and f.header.run == self.run
@@ -85,6 +84,7 @@ class _Life(NamedTuple):
 
 def replay(
     record: Record,
+    wire: Wire,
     part: str,
     start: Start,
     patience_s: float = PATIENCE_S,
@@ -96,6 +96,7 @@ def replay(
 
     Args:
         record: of a run; one that was cut is replayed so far.
+        wire: its messages.
         part: whose link it is.
         start: runs the part at a port.
         patience_s: for the part's hello, and for each step.
@@ -119,8 +120,8 @@ def replay(
 
     for life in lives:
         with open_pair() as pair, start(pair.path) as process:
-            said = _Replay(part, pair, process, patience_s, life).run(count)
-        first = first or _first_difference(life, said)
+            said = _Replay(wire, part, pair, process, patience_s, life).run(count)
+        first = first or _first_difference(wire, life, said)
         frames += said
     return Replayed(
         part, frames, _said(lives), first is None, first, total, lives[0].step_ns, len(lives)
@@ -184,8 +185,8 @@ def _hear(life: _Life, frame: Frame) -> None:
         # the bench may have heard a frame twice: a fault doubled it, or the part died after it and
         # the one that took its place said it again
         life.said.setdefault(head.sequence, frame)
-    elif head.type == _DONE and len(frame.payload) == size_of("done"):
-        life.answered.add(int(decode("done", frame.payload)["step"]))
+    elif head.type == _DONE and len(frame.payload) == BARE.size_of("done"):
+        life.answered.add(int(BARE.decode("done", frame.payload)["step"]))
 
 
 # --------------------------------------------------------------------------------------- the part
@@ -194,8 +195,10 @@ def _hear(life: _Life, frame: Frame) -> None:
 class _Replay:
     """One life of a part, lived again."""
 
-    def __init__(self, part: str, pair: Pair, process: Any, patience_s: float, life: _Life):
-        self._part, self._pair, self._process = part, pair, process
+    def __init__(
+        self, wire: Wire, part: str, pair: Pair, process: Any, patience_s: float, life: _Life
+    ):
+        self._wire, self._part, self._pair, self._process = wire, part, pair, process
         self._patience_s, self._life = patience_s, life
         self._receiver = Receiver()
         self._waiting: list[Frame] = []
@@ -213,7 +216,7 @@ class _Replay:
                 last = frame.header
                 if last.type != _TICK or last.run != run:
                     continue
-                step = int(decode("tick", frame.payload)["step"])
+                step = int(BARE.decode("tick", frame.payload)["step"])
                 if step >= latest:  # a part has forgotten what it said to older ones
                     self._where = f"in step {step}"
                     said += self._until_done(step, latest)
@@ -229,13 +232,14 @@ class _Replay:
         while hello.header.type != _HELLO:
             hello = self._next()
         number = int(self._value("hello", hello, "part"))
-        name = PARTS[number] if number < len(PARTS) else f"number {number}"
+        parts, known = self._wire.parts, self._wire.number
+        name = parts[number] if number < len(parts) else f"number {number}"
         if name != self._part:
             raise ReplayError(f"'{self._part}' is to be replayed, but who says hello is '{name}'")
-        if (schema := self._value("hello", hello, "schema")) != schema_number():
+        if (schema := self._value("hello", hello, "schema")) != known:
             raise ReplayError(
                 f"part '{self._part}' has the schema {schema:#010x}, this is "
-                f"{schema_number():#010x}: build it with the header of this version"
+                f"{known:#010x}: build it with the header of this version"
             )
 
     def _until_done(self, step: int, latest: int) -> list[Frame]:
@@ -255,7 +259,7 @@ class _Replay:
 
     def _value(self, name: str, frame: Frame, field: str) -> Any:
         try:
-            return decode(name, frame.payload)[field]
+            return BARE.decode(name, frame.payload)[field]
         except RecordError as error:
             raise ReplayError(f"part '{self._part}', {self._where}: {error}") from None
 
@@ -304,7 +308,7 @@ class _Replay:
 # ---------------------------------------------------------------------------------------- compare
 
 
-def _first_difference(life: _Life, said: list[Frame]) -> str | None:
+def _first_difference(wire: Wire, life: _Life, said: list[Frame]) -> str | None:
     """The first frame that is not the same, in words."""
     now = {frame.header.sequence: frame for frame in said}
     # a record that was cut, or a part that died, ends in the middle of an answer
@@ -315,24 +319,24 @@ def _first_difference(life: _Life, said: list[Frame]) -> str | None:
         if a == b:
             continue
         if a is not None and b is not None:
-            return _in_words(life, a, b)
+            return _in_words(wire, life, a, b)
         if a is not None:
-            return f"{_place(life, a)}: {_told(a)} was recorded and is not said now"
+            return f"{_place(life, a)}: {_told(wire, a)} was recorded and is not said now"
         if b is not None and (whole or number < end):
-            return f"{_place(life, b)}: {_told(b)} is said now and was not recorded"
+            return f"{_place(life, b)}: {_told(wire, b)} is said now and was not recorded"
     return None
 
 
-def _in_words(life: _Life, then: Frame, now: Frame) -> str:
+def _in_words(wire: Wire, life: _Life, then: Frame, now: Frame) -> str:
     where = _place(life, then)
     if then.header != now.header:
-        return f"{where}: {_told(then)} was recorded, {_told(now)} is said now"
-    found = differences([then], [now], life.step_ns)
+        return f"{where}: {_told(wire, then)} was recorded, {_told(wire, now)} is said now"
+    found = differences(wire, [then], [now], life.step_ns)
     if not found:  # a NaN has many bit patterns
-        return f"{where}: {_told(then)} has the same numbers in other bytes"
+        return f"{where}: {_told(wire, then)} has the same numbers in other bytes"
     d = found[0]
     if not d.field:
-        return f"{where}: {_told(then)} has other bytes"
+        return f"{where}: {_told(wire, then)} has other bytes"
     return f"{where}: {name_of(d)} was {d.a!r}, is {d.b!r}"
 
 
@@ -341,10 +345,7 @@ def _place(life: _Life, frame: Frame) -> str:
     return f"step {time_ns // life.step_ns - 1} ({time_ns * 1e-9:g} s)"
 
 
-def _told(frame: Frame) -> str:
+def _told(wire: Wire, frame: Frame) -> str:
     head = frame.header
-    try:
-        name = message(head.type).name
-    except KeyError:
-        name = f"message {head.type}"
+    name = wire.names.get(head.type, f"message {head.type}")
     return f"'{name}' of {head.time_ns * 1e-9:g} s, number {head.sequence},"

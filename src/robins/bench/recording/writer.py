@@ -19,8 +19,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from robins.bench.recording import layout
-from robins.bench.wire.frames import FrameError, decode_frame
-from robins.bench.wire.schema import VERSION
+from robins.bench.wire.frames import VERSION, FrameError, decode_frame
+from robins.bench.wire.schema import Wire
 
 CHUNK_MESSAGES = 512
 CHUNK_BYTES = 65536
@@ -37,12 +37,13 @@ class Recorder:
     """
 
     def __init__(
-        self, path: str | Path, header: Mapping[str, Any], *, overwrite: bool = False
+        self, path: str | Path, wire: Wire, header: Mapping[str, Any], *, overwrite: bool = False
     ) -> None:
         """Begin a record.
 
         Args:
             path: of the file.
+            wire: the messages that go over the lines.
             header: of the run, such as its scenario, seeds and versions; becomes JSON.
             overwrite: whether a file that is there is replaced.
 
@@ -72,11 +73,12 @@ class Recorder:
         out = RecordBuilder()
         mcap.Header(layout.PROFILE, "robins").write(out)
         start = layout.MAGIC + out.end()
-        wire = str(VERSION)
-        about = {"wire": wire, "header": text, "check": layout.check_of(wire + text)}
+        version = str(VERSION)
+        about = {"wire": version, "header": text, "check": layout.check_of(version + text)}
         mcap.Metadata(layout.METADATA, about).write(out)
         self._metadata = mcap.MetadataIndex(len(start), out.count, layout.METADATA)
-        for schema in layout.schemas():
+        self._schemas = layout.schemas(wire)
+        for schema in self._schemas:
             schema.write(out)
         try:
             self._put(start + out.end())
@@ -250,7 +252,7 @@ class Recorder:
         start, parts, offsets = self._at + out.count, [out.end()], RecordBuilder()
         at = start
         for opcode, group in (
-            (Opcode.SCHEMA, _bytes_of(*layout.schemas())),
+            (Opcode.SCHEMA, _bytes_of(*self._schemas)),
             (Opcode.CHANNEL, _bytes_of(*self._topics)),
             (Opcode.STATISTICS, _bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, bytes(self._chunks)),
@@ -276,7 +278,7 @@ class Recorder:
             message_end_time=end,
             message_start_time=begin,
             metadata_count=1,
-            schema_count=len(layout.schemas()),
+            schema_count=len(self._schemas),
         )
 
 

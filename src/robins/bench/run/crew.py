@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from robins.bench.parts.node import REALTIME
 from robins.bench.parts.station import path_of
+from robins.bench.rig import Rig
 
 _ERROR = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 _GRACE_S = 2.0  # between being told and being killed
@@ -40,15 +41,17 @@ class Death(NamedTuple):
 class Crew:
     """Processes, one a part; a context that ends them all however it is left."""
 
-    def __init__(self, kit: Any, realtime: bool = False, restarts: bool = False):
+    def __init__(self, rig: Rig, kit: Any, realtime: bool = False, restarts: bool = False):
         """Lay out what they are given.
 
         Args:
+            rig: whose parts they are.
             kit: for all of them.
             realtime: whether they ask for a real-time scheduler.
             restarts: whether they put their memory aside, to be started anew from it.
         """
-        self._kit, self._realtime, self._restarts = kit, realtime, restarts
+        self._rig, self._kit = rig, kit
+        self._realtime, self._restarts = realtime, restarts
         self._folder: Path | None = None
         self._running: dict[str, subprocess.Popen] = {}
 
@@ -76,7 +79,8 @@ class Crew:
         environment = {**os.environ, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "false"}
         if self._realtime:
             environment[REALTIME] = "1"
-        command = [sys.executable, "-m", "robins.bench.parts.node", part, port]
+        command = [sys.executable, "-m", "robins.bench.parts.node"]
+        command += [self._rig.address or self._rig.name, part, port]
         command.append(str(self._folder / "kit.pickle"))
         if self._restarts:
             command += [str(self._folder), str(since)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,35 +10,37 @@ import numpy as np
 import xarray as xr
 
 from robins.bench.live.feed import latest
-from robins.bench.run import telemetry
+from robins.bench.rig import Judged
+from robins.bench.run.numbers import arrays_of
 from robins.bench.run.session import Ran
-from robins.bench.run.setup import Flight, counted_from
-from robins.bench.run.telemetry import ARCSEC, Flown, flag
+from robins.bench.run.setup import Flight
+from robins.bench.run.telemetry import Flown, difference
 from robins.results import Outcome, array, variable
 from robins.results.summary import dumps, plain
 
 RECORD, ACCOUNT = "record.mcap", "bench.json"
 
 _EVENTS = 200  # told; all are in the record
-_AXES = ("x", "y", "z (boresight)")
 
 
-def reference_q_ib(ran: Ran) -> np.ndarray:
-    """(E, 4) the wanted attitude at the end of each step."""
-    return np.asarray(ran.kit.rows.course.ref_end_q_ib)[: len(ran.flown.time_s)]
+def judged(flight: Flight, ran: Ran) -> Judged:
+    """What the rig says of the run."""
+    if flight.rig.judge is not None:
+        return flight.rig.judge(flight, ran)
+    return Judged(arrays=arrays_of(flight.rig, ran.flown))
 
 
-def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
+def figures(
+    flight: Flight, ran: Ran, said: Judged, inside: Mapping[str, np.ndarray] | None
+) -> dict[str, Any]:
     """Figures for scripts.
 
     Args:
         flight: what was asked for.
         ran: what came of it.
-        loop: the same run inside one program; None where there is none to compare with.
+        said: of it by the rig.
+        inside: the same run inside one program; None where there is none to compare with.
     """
-    flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
-    attitude = telemetry.attitude_error(flown)
-    pointing = telemetry.turn(reference_q_ib(ran), flown.q_ib)
     health = ran.health.values()
     summary = ran.latencies.summary()
     lateness = summary["cycle"]["lateness_us"]
@@ -51,8 +54,8 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
         "seconds": ran.seconds,
         "cycles_per_s": ran.steps / ran.seconds if ran.seconds > 0.0 else 0.0,
         "max_abs_difference_in_process": None
-        if loop is None or ran.steps == 0
-        else telemetry.difference(flown, loop),
+        if inside is None or ran.steps == 0
+        else difference(ran.flown, inside),
         "lateness_us": {k: lateness[k] for k in ("p50", "p99", "max")},
         "missed": summary["missed"],
         "counts": {
@@ -62,23 +65,14 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
             "repeated_frames": sum(h.repeated for h in health),
             "late_frames": sum(h.late for h in health),
             "refused_frames": sum(h.refused for h in health),
-            "refused_measurements": int(np.sum(flag(flown, "star refused"))),
-            "quaternions_of_wrong_length": int(
-                np.sum(flag(flown, "star of a length other than one"))
-            ),
-            "steps_without_gyro": int(np.sum(flag(flown, "gyro held"))),
-            "steps_in_safe_mode": int(np.sum(flag(flown, "safe: do not steer by this"))),
+            **said.counts,
             "silent_parts": sum(ran.silent.values()),
             "processes_died": ran.deaths,
         },
-        "attitude_rms_arcsec": telemetry.rms_arcsec(attitude, counted),
-        "attitude_peak_arcsec": telemetry.peak_arcsec(attitude, counted),
-        "attitude_end_arcsec": float(np.linalg.norm(attitude[-1])) / ARCSEC if ran.steps else None,
-        "pointing_rms_arcsec": telemetry.rms_arcsec(pointing, counted),
-        "pointing_peak_arcsec": telemetry.peak_arcsec(pointing, counted),
+        **said.metrics,
         "injected": {f"{kind} at {link}": n for (kind, link), n in ran.injected.items()},
         "failure": ran.failure,
-        "warnings": warnings(ran, attitude[counted]),
+        "warnings": [*refusals(ran), *said.warnings],
         "latencies": summary,
         "links": {name: dict(vars(h)) for name, h in ran.health.items()},
         "events": [
@@ -88,51 +82,51 @@ def figures(flight: Flight, ran: Ran, loop: Flown | None) -> dict[str, Any]:
     }
 
 
-def outcome(flight: Flight, ran: Ran, loop: Flown | None, record: Path | None) -> Outcome:
+def outcome(
+    flight: Flight, ran: Ran, inside: Mapping[str, np.ndarray] | None, record: Path | None
+) -> Outcome:
     """All that a result folder says of the run.
 
     Args:
         flight: what was asked for.
         ran: what came of it.
-        loop: the same run inside one program; None where there is none to compare with.
+        inside: the same run inside one program; None where there is none to compare with.
         record: what went over the lines, to be moved into the folder.
     """
-    told = figures(flight, ran, loop)
-    names = ("attitude_rms_arcsec", "attitude_peak_arcsec")
-    names += ("pointing_rms_arcsec", "pointing_peak_arcsec", "cycles_per_s")
+    said = judged(flight, ran)
+    told = figures(flight, ran, said, inside)
     files: dict[str, bytes | Path] = {ACCOUNT: dumps(plain(told)).encode()}
     last_lines = []
     if record is not None:
         files[RECORD] = record
         last_lines = [
             f"Record: {{out}}/{RECORD}   (opens in MCAP viewers too)",
-            f"Next:   robins bench replay {{out}}/{RECORD} --node adm",
+            f"Next:   robins bench replay {{out}}/{RECORD} --node {flight.rig.example}",
         ]
+    rig = flight.rig.address or flight.rig.name
+    flies = f'flies = "{flight.setup.flies}"\n' if flight.setup.flies else ""
+    name = flight.setup.filter or flight.rig.name
     return Outcome(
-        solution(flight, ran) if ran.steps else None,
-        {flight.setup.filter: {name: told[name] for name in names}},
+        solution(name, ran.flown, said, ran) if ran.steps else None,
+        {name: {**said.metrics, "cycles_per_s": told["cycles_per_s"]}},
         counts={k: v for k, v in told["counts"].items() if v},
         files=files,
         notes=notes(flight, told),
         warnings=told["warnings"],
         scenario=f"bench/{flight.name}",
         seed=flight.setup.seed,
-        parameters=flight.text or f'bench = "satellite"\nflies = "{flight.setup.flies}"\n',
-        tables=[text(told, ran)],
+        parameters=flight.text or f'bench = "{rig}"\n{flies}',
+        tables=[text(told, said, ran)],
         last_lines=last_lines,
         for_scripts=ACCOUNT,
         failure=told["failure"],
     )
 
 
-def text(told: dict[str, Any], ran: Ran) -> str:
+def text(told: dict[str, Any], said: Judged, ran: Ran) -> str:
     """The figures for a terminal: errors, the wire, how late parts were, what happened."""
-    lines = [
-        f"{name.replace('_', ' '):<16}{told[f'{name}_arcsec']:10.2f} arcsec"
-        for name in ("attitude_rms", "attitude_peak", "pointing_rms", "pointing_peak")
-    ]
     wire = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in told["counts"].items() if v)
-    lines += [f"{'wire':<16}{wire}\n", ran.latencies.table()]
+    lines = [*said.lines, f"{'wire':<16}{wire}\n", ran.latencies.table()]
     lines += [
         f"  {event['time_s']:9.2f} s  {event['text']}"
         for event in told["events"]
@@ -141,71 +135,22 @@ def text(told: dict[str, Any], ran: Ran) -> str:
     return "\n".join(lines)
 
 
-def warnings(ran: Ran, error: np.ndarray) -> list[str]:
-    """Why a reader should doubt the figures.
-
-    Args:
-        ran: the run.
-        error: (E, 3) of the attitude, over the counted steps; NaN where it is not known.
-    """
-    out = [
+def refusals(ran: Ran) -> list[str]:
+    """Whose frames were refused."""
+    return [
         f"'{name}': {h.refused} frames were refused, which cannot be what they say"
         for name, h in ran.health.items()
         if h.refused
     ]
-    if unknown := int(np.sum(~np.all(np.isfinite(error), axis=-1))):
-        out.append(
-            f"The error of the attitude is not known in {unknown} of the {len(error)} steps that "
-            "count, and the figures are those of the others"
-        )
-    return out
 
 
-def solution(flight: Flight, ran: Ran) -> xr.Dataset:
+def solution(name: str, flown: Flown, said: Judged, ran: Ran) -> xr.Dataset:
     """Time series of the run, as `robins.results` names them."""
-    f = ran.flown
-    heard = np.flatnonzero(np.isfinite(f.innovation[:, 0]))
-    bias = np.asarray(ran.kit.rows.gyro_bias)[: ran.steps]
-    wheels = f.wheel_h[:, : len(ran.kit.vehicle.craft.wheel_h)]
-    body: dict[str, Any] = {"unit": "rad", "frame": "body", "axes": _AXES, "display_unit": "arcsec"}
-    rate = body | {"unit": "rad/s", "display_unit": "arcsec/s"}
     arrays: dict[str, Any] = {
-        "filter": ("filter", [flight.setup.filter]),
-        "time": variable("time", f.time_s, "s", "time since the start"),
+        "filter": ("filter", [name]),
+        "time": variable("time", flown.time_s, "s", "time since the start"),
     }
-
-    def add(role: str, values: np.ndarray, of: str, **about: Any) -> None:
-        arrays.update(array(role, values[None], of, **about))
-
-    add("error", telemetry.attitude_error(f), "attitude", **body)
-    add("sigma", f.sigma[:, :3], "attitude", **body)
-    add("estimate", f.bias, "gyro_bias", **rate)
-    add("error", bias - f.bias, "gyro_bias", **rate)
-    add("sigma", f.sigma[:, 3:], "gyro_bias", **rate)
-    add(
-        "value",
-        telemetry.turn(reference_q_ib(ran), f.q_ib),
-        "pointing",
-        long_name="pointing error",
-        comment="Where the craft points against where it should.",
-        **body | {"frame": "reference", "axes": ("x", "y", "z")},
-    )
-    add(
-        "value",
-        wheels,
-        "wheel_momentum",
-        unit="N m s",
-        long_name="momentum of the wheels",
-        frame="wheel axes",
-        axes=[f"wheel {k}" for k in range(wheels.shape[1])],
-        dims="filter time axis_wheel",
-    )
-    if len(heard):
-        arrays["star_time"] = variable("star_time", f.time_s[heard], "s", "time since the start")
-        add("innovation", f.innovation[heard], "star", **body)
-        add("innovation_sigma", f.innovation_sigma[heard], "star", **body)
-        add("refused", flag(f, "star refused")[heard].astype(np.int8), "star")
-    return xr.Dataset(arrays | lateness(ran))
+    return xr.Dataset({**arrays, **said.arrays, **lateness(ran)})
 
 
 def lateness(ran: Ran) -> dict[str, Any]:

@@ -15,24 +15,22 @@ import numpy as np
 
 from robins import __version__
 from robins.bench.broker.broker import Broker, Wiring
-from robins.bench.broker.faults import ROUTES, LinkFault
+from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Direction, Health, Link
 from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
-from robins.bench.parts.satellite import BUILD, Kit
-from robins.bench.parts.satellite.preparing import kit_for
 from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
 from robins.bench.recording import Entry, Event, Recorder
+from robins.bench.rig import Kit, Rig
 from robins.bench.run.accounting import Latencies
 from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.crew import Crew, Death
-from robins.bench.run.setup import NODES, Flight, counted_from, steps_of
+from robins.bench.run.setup import Flight, counted_from, steps_of
 from robins.bench.run.telemetry import Flown, Telemetry
+from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Unsound
-from robins.bench.wire.schema import VERSION
 
-TRUTH = "motion"
 HELLO_S = 120.0  # for all to compile and say hello
 REVIVED_S = 60.0
 _TELL_S = 0.2  # between two words on how far it is
@@ -61,14 +59,13 @@ class Ran(NamedTuple):
     """What came of a run."""
 
     flown: Flown
-    kit: Kit
+    kit: Any  # of the rig
     steps: int  # that were done
     seconds: float  # of the wall clock, from the first tick to the last answer
     latencies: Latencies
     health: Mapping[str, Health]
     injected: Mapping[tuple[str, str], int]
     silent: Mapping[str, int]
-    star_frames: int
     events: list[Event]
     deaths: int
     failure: str  # empty: the run came to its end
@@ -122,9 +119,9 @@ class Session:
         Raises:
             ScenarioError: the length of the run does not fit the scenario.
             PortError: a port cannot be opened.
-            ValueError: what `kit_for` refuses.
+            ValueError: what the rig cannot prepare.
         """
-        self.flight, self._watch = flight, watch
+        self.flight, self.rig, self._watch = flight, flight.rig, watch
         self._tell = progress or (lambda share, what: None)
         self.steps = steps_of(flight)
         setup = flight.setup
@@ -133,9 +130,9 @@ class Session:
             self._tell(0.0, "preparing")
             kit = kit_of(flight)
         self.kit = kit
-        self.telemetry = Telemetry(self.steps, kit.step_ns)
-        self.crew = Crew(kit, setup.fifo, setup.on_death == "restart")
-        self.injector = Injector(setup.faults, setup.seed)
+        self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns)
+        self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart")
+        self.injector = Injector(self.rig.table, setup.faults, setup.seed)
         self.clock = LockStep() if setup.clock == "lockstep" else real_time(flight)
         self._broker: Broker | None = None  # until the links are open
         self._record_path = record
@@ -188,7 +185,7 @@ class Session:
                 if self._watch is not None:
                     self._watch.over(self, bool(failure))
         return Ran(
-            flown=Flown(*(x[:done] for x in self.telemetry.flown)),
+            flown=self.telemetry.flown.until(done),
             kit=self.kit,
             steps=done,
             seconds=seconds,
@@ -196,7 +193,6 @@ class Session:
             health={name: link.health for name, link in self.broker.links.items()},
             injected=dict(self.injector.counts),
             silent=dict(self.broker.silent),
-            star_frames=self.telemetry.star_frames,
             events=self.events,
             deaths=self.deaths,
             failure=failure,
@@ -240,11 +236,17 @@ class Session:
         """That something was heard to judge the estimates by.
 
         Raises:
-            BenchError: the true motion is not known in any step that counts.
+            BenchError: the truth is not known in any step that counts.
         """
-        q_ib = self.telemetry.flown.q_ib[counted_from(self.flight, steps) : steps]
-        if len(q_ib) and not np.any(np.all(np.isfinite(q_ib), axis=-1)):
-            raise BenchError(f"no true motion was heard from 'plant' up to {self.time_s:.1f} s")
+        if not (truth := self.rig.truth):
+            return
+        first = next(x for name, x in self.telemetry.flown.items() if name.startswith(f"{truth}."))
+        known = first[counted_from(self.flight, steps) : steps]
+        if len(known) and not np.any(np.all(np.isfinite(known.reshape(len(known), -1)), axis=-1)):
+            speaker = next(part for part, sent in self.rig.sends.items() if truth in sent)
+            raise BenchError(
+                f"no true {truth} was heard from '{speaker}' up to {self.time_s:.1f} s"
+            )
 
     def _obey(self, step: int) -> None:
         """Do what whoever looks on wants; wait while it is paused."""
@@ -280,7 +282,7 @@ class Session:
         """One more fault, from the next step on."""
         begin = self.time_s + self.kit.step_ns * 1e-9
         end = {} if seconds is None else {"end": begin + seconds}
-        made = LinkFault(**{**fault, "begin": begin, **end})
+        made = self.rig.fault.model_validate({**fault, "begin": begin, **end})
         self.injector.add(made)
         self._labels.append((label, made))
 
@@ -309,24 +311,27 @@ class Session:
     def _open_record(self, stack: contextlib.ExitStack) -> Recorder | None:
         if self._record_path is None:
             return None
-        setup, loop = self.flight.setup, self.flight.loop
+        setup, given = self.flight.setup, self.flight.given
         header = {
             "robins": __version__,
             "wire": VERSION,
+            "rig": self.rig.address or self.rig.name,
             "name": self.flight.name,
             "run": self.run_number,
             "setup": setup.model_dump(mode="json", exclude_unset=True),
-            "loop": loop.model_dump(mode="json", exclude_unset=True),
+            "loop": given.model_dump(mode="json", exclude_unset=True),
             "step_ns": self.kit.step_ns,
             "steps": self.steps,
         }
-        return stack.enter_context(Recorder(self._record_path, header, overwrite=True))
+        return stack.enter_context(
+            Recorder(self._record_path, self.rig.wire, header, overwrite=True)
+        )
 
     def _wire(self, stack: contextlib.ExitStack) -> Broker:
         """Open the far ends and start the processes."""
         setup = self.flight.setup
         links: dict[str, Link] = {}
-        for part in NODES:
+        for part in self.rig.parts:
             if (real := self.ports.get(part)) is not None:
                 fd = stack.enter_context(open_port(real)).fileno()
                 links[part] = self._link(part, fd, None)
@@ -339,7 +344,7 @@ class Session:
             self._histories = {p: History(partial(self.crew.remembers, p)) for p in own}
         return Broker(
             links,
-            wiring(self.kit),
+            wiring(self.rig, self.kit),
             self.kit.step_ns,
             self.injector,
             self._observe,
@@ -350,7 +355,7 @@ class Session:
         )
 
     def _link(self, part: str, fd: int, baud: int | None) -> Link:
-        return Link(part, fd, self.injector, self._watch_wire, baud, self._refused)
+        return Link(part, fd, self.rig.wire, self.injector, self._watch_wire, baud, self._refused)
 
     def _start(self, part: str, pair: Pair) -> None:
         self._speaks[part] = f"{pair.path},{self.flight.setup.baud or BAUD}"
@@ -395,12 +400,12 @@ class Session:
         """Tell of a frame that cannot be; of those like it that follow, their count tells.
 
         Raises:
-            BenchError: it is the true motion, without which nothing is to be judged.
+            BenchError: it is the truth, without which nothing is to be judged.
         """
-        if message == TRUTH and why.sized and message in ROUTES[link]["from"]:
+        if message == self.rig.truth and why.sized and message in self.rig.sends[link]:
             raise BenchError(
-                f"at {self.time_s:.1f} s '{link}' says a true motion that cannot be: {why.text}; "
-                "look in the record at what acted on it before"
+                f"at {self.time_s:.1f} s '{link}' says a true {message} that cannot be: "
+                f"{why.text}; look in the record at what acted on it before"
             )
         if (link, message) not in self._barred:
             self._barred.add((link, message))
@@ -480,17 +485,15 @@ class Session:
 def real_time(flight: Flight) -> RealTime:
     """The clock of a run in real time."""
     setup = flight.setup
-    return RealTime(setup.rate or 1.0 / flight.loop.step, setup.overrun, setup.patience)
+    return RealTime(setup.rate or 1.0 / flight.timing.step_s, setup.overrun, setup.patience)
 
 
 def kit_of(flight: Flight) -> Kit:
     """What the parts of a run are made from."""
-    setup = flight.setup
-    table = None if setup.table is None else setup.table.table()
-    return kit_for(flight.loop, setup.filter, setup.seed, table=table)
+    return flight.rig.prepare(flight.setup, flight.given)
 
 
-def wiring(kit: Kit) -> Wiring:
-    """Who says what to whom, for a satellite."""
-    sends = {part: ROUTES[part]["from"] for part in NODES}
-    return Wiring(sends, {part: dict(BUILD[part](kit).takes) for part in NODES})
+def wiring(rig: Rig, kit: Kit) -> Wiring:
+    """Who says what to whom."""
+    takes = {part: dict(build(kit).takes) for part, build in rig.build.items()}
+    return Wiring(rig.wire, rig.sends, takes)

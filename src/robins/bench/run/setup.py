@@ -1,11 +1,12 @@
 """The parameters of a run on the bench, with units: a scenario of the bench.
 
-flies = "satellite/s1"        # what flies: a scenario of the satellite, or a file of one
+bench = "satellite"           # the rig
+flies = "satellite/s1"        # what flies: a scenario of its system, or a file of one
 filter = "mekf-gate"
 seconds = "900 s"
 
 [[faults]]
-kind = "turned"
+kind = "loss"
 begin = "600 s"
 end = "601 s"
 """
@@ -14,44 +15,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import pydantic
 
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
-from robins.bench.wire.schema import PARTS
+from robins.bench.rig import Rig, Timing
+from robins.bench.rigs import RIGS, rig_of
 from robins.errors import hint
-from robins.scenario import Parameters, Quantity, ScenarioError, default
-from robins.sim.rate_table import RateTable, rate_table
-from robins.systems.satellite import SYSTEM
-from robins.systems.satellite.parameters import AttitudeLoop
-from robins.systems.satellite.study import FILTERS
+from robins.scenario import Parameters, Quantity, ScenarioError
+from robins.systems.catalogue import is_file
 
 Clock = Literal["lockstep", "realtime"]
-NODES = PARTS[1:]
-_HERE = Path(__file__).parent / "scenarios"
-
-
-class Carrier(Parameters):
-    """A rate table that is a little late; without one the gyro turns with the craft exactly."""
-
-    lag: Annotated[float, Quantity("time", above="0 s")] = default("20 ms")
-    rate_limit: Annotated[float, Quantity("angle rate", above="0 deg/s")] = default("100 deg/s")
-    acceleration_limit: Annotated[float, Quantity("angular acceleration", above="0 rad/s^2")] = (
-        default("10 rad/s^2")
-    )
-
-    def table(self) -> RateTable:
-        """As the simulation has it."""
-        return rate_table(self.lag, self.rate_limit, self.acceleration_limit)
 
 
 class Setup(Parameters):
     """A run on the bench.
 
-    - ``flies``: a scenario of the satellite, by its name or a path that ends in .toml; ``set``
-      changes its parameters, ``"gyro.bias=5 deg/h"``.
+    - ``bench``: the rig, by its name or as "file.py:rig" of the user's own.
+    - ``flies``: a scenario of its system, by its name or a path that ends in .toml; ``set`` changes
+      its parameters, ``"gyro.bias=5 deg/h"``.
     - ``clock``: "lockstep", as fast as it goes and always the same; "realtime", ``rate`` steps a
       second of the wall clock (left out: as many as the scenario has).
     - ``overrun``, in real time, when a step is not over at the next one's deadline: "continue"
@@ -65,11 +49,13 @@ class Setup(Parameters):
     - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``.
     """
 
-    bench: Literal["satellite"] = "satellite"
+    rig: ClassVar[Rig]
+
+    bench: str
     title: str = ""
-    flies: str = "satellite/s1"
+    flies: str = ""
     set: tuple[str, ...] = ()
-    filter: str = "mekf"
+    filter: str = ""
     seed: Annotated[int, pydantic.Field(ge=0, lt=2**63)] = 0
     seconds: Annotated[float, Quantity("time", above="0 s")] | None = None
     clock: Clock = "lockstep"
@@ -80,84 +66,110 @@ class Setup(Parameters):
     restarts: Annotated[int, pydantic.Field(ge=1, le=100_000)] = 10
     fifo: bool = False  # ask for the scheduler SCHED_FIFO
     baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
-    table: Carrier | None = None
     ports: dict[str, str] = pydantic.Field(default_factory=dict)
     faults: tuple[LinkFault, ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _sound(self) -> Setup:
-        if unknown := sorted(set(self.ports) - set(NODES)):
-            raise ValueError(f"ports: there is no part '{unknown[0]}', only {', '.join(NODES)}")
+        parts, filters = self.rig.parts, self.rig.filters()
+        if unknown := sorted(set(self.ports) - set(parts)):
+            raise ValueError(f"ports: there is no part '{unknown[0]}', only {', '.join(parts)}")
         if self.rate is not None and self.clock == "lockstep":
             raise ValueError('rate: a clock in lock-step has none; choose the clock "realtime"')
-        if self.filter not in FILTERS:
-            guess = f"{hint(self.filter, FILTERS)} It has {', '.join(FILTERS)}"
-            raise ValueError(f"filter: no filter '{self.filter}' for the satellite{guess}")
+        if self.filter not in filters:
+            guess = f"{hint(self.filter, filters)} It has {', '.join(filters)}"
+            raise ValueError(f"filter: no filter '{self.filter}' for the {self.rig.name}{guess}")
         return self
+
+
+def setup_of(rig: Rig) -> type[Setup]:
+    """The parameters of a run of a rig: those of all, with its names, its faults and its own."""
+    fields: dict[str, Any] = {
+        "bench": (str, rig.name),
+        "flies": (str, next(iter(rig.flies()), "")),
+        "filter": (str, rig.filters()[0]),
+        "faults": (tuple[rig.fault, ...], ()),
+        **rig.options(),
+    }
+    made = pydantic.create_model("Setup", __base__=Setup, **fields)
+    made.__doc__, made.rig = Setup.__doc__, rig
+    return made
 
 
 class Flight(NamedTuple):
     """A run that has been read."""
 
     name: str
-    setup: Setup
-    loop: AttitudeLoop
+    rig: Rig
+    setup: Any  # of the class of the rig
+    given: Any  # parameters of what flies
     text: str  # of the scenario of the bench, for the record
+
+    @property
+    def timing(self) -> Timing:
+        """Its steps, if it is flown to the end."""
+        return self.rig.timing(self.given)
 
 
 def built_in() -> dict[str, Path]:
     """Scenarios of the bench that come with robins, by name."""
-    return {path.stem: path for path in sorted(_HERE.glob("*.toml"))}
+    return {name: path for rig in RIGS for name, path in rig_of(rig).scenarios().items()}
 
 
 def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
-    """A run by the name of a scenario of the bench, of one of the satellite, or a file of either.
+    """A run by the name of a scenario of the bench or of a system, a file of either, or a rig.
 
     Args:
-        name: "noisy-line", "satellite/s1", "mine.toml".
-        settings: changes, ``"faults.0.angle=20 deg"``; of a scenario of the satellite those of
+        name: "noisy-line", "satellite/s1", "mine.toml", "pendulum.py:rig".
+        settings: changes, ``"faults.0.angle=20 deg"``; of a scenario of a system those of
             `Setup.set`.
 
     Raises:
         ScenarioError: there is none of this name, or it cannot be used.
+        robins.bench.rigs.UnknownRig: it is of a rig that there is not.
     """
-    text, own = _text(name)
-    if not own:
-        setup = Setup(flies=name, set=settings)
-        return Flight(name, setup, _loop(setup), "")
-    setup = scenario.parse(Setup, text, settings, source=name)
+    text, rig = _text(name)
+    if not text:
+        flies = "" if is_file(name) else name
+        setup = rig.setup.model_validate({"set": settings} | ({"flies": flies} if flies else {}))
+        return Flight(name, rig, setup, _flies(rig, setup), "")
+    setup = scenario.parse(rig.setup, text, settings, source=name)
     title = name if name in built_in() else Path(name).stem
-    return Flight(title, setup, _loop(setup), text)
+    return Flight(title, rig, setup, _flies(rig, setup), text)
 
 
-def _text(name: str) -> tuple[str, bool]:
-    """The text of a scenario, and whether it is one of the bench."""
-    if name in (ours := built_in()):
-        return ours[name].read_text("utf-8"), True
-    if name.endswith(".toml"):
-        text = scenario.read_text(name)
-        return text, "bench" in scenario.mapping_of(text, source=name)
-    theirs = [f"satellite/{k}" for k in SYSTEM.scenarios]
-    if name not in theirs:
+def _text(name: str) -> tuple[str, Rig]:
+    """The text of a scenario, empty if it is not one of the bench; and its rig."""
+    if is_file(name):
+        return "", rig_of(name)
+    ours = built_in()
+    theirs = {flown: rig for rig in RIGS for flown in rig_of(rig).flies()}
+    if name in theirs:
+        return "", rig_of(theirs[name])
+    if name not in ours and not name.endswith(".toml"):
         known = [*ours, *theirs]
         guess = f"{hint(name, known)} It has {', '.join(known)}"
         raise ScenarioError([f"no scenario '{name}' for the bench{guess}"])
-    return "", False
+    text = ours[name].read_text("utf-8") if name in ours else scenario.read_text(name)
+    said = scenario.mapping_of(text, source=name)
+    if "bench" in said:
+        return text, rig_of(str(said["bench"]), Path(name).parent)
+    return "", rig_of(str(said.get("system", RIGS[0])))
 
 
-def _loop(setup: Setup) -> AttitudeLoop:
-    """The satellite that flies."""
-    packaged = {f"satellite/{k}": p for k, p in SYSTEM.scenarios.items()}
-    if setup.flies in packaged:
-        text = packaged[setup.flies].read_text("utf-8")
-    elif setup.flies.endswith(".toml"):
-        text = scenario.read_text(setup.flies)
+def _flies(rig: Rig, setup: Setup) -> Parameters:
+    """The parameters of what flies."""
+    packaged, flies = rig.flies(), setup.flies
+    if flies in packaged:
+        text = packaged[flies].read_text("utf-8")
+    elif flies.endswith(".toml"):
+        text = scenario.read_text(flies)
+    elif not flies:
+        text = ""
     else:
-        there = ", ".join(packaged)
-        raise ScenarioError(
-            [f"flies: no scenario '{setup.flies}'; there are {there}, or a .toml file"]
-        )
-    return scenario.parse(AttitudeLoop, text, setup.set, source=setup.flies)
+        there = ", ".join([*packaged, "a .toml file"])
+        raise ScenarioError([f"flies: no scenario '{flies}'; there are {there}"])
+    return scenario.parse(rig.parameters(), text, setup.set, source=flies or rig.name)
 
 
 def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
@@ -173,7 +185,7 @@ def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
     if "clock" in options and options["clock"] == "lockstep":
         given.pop("rate", None)
     try:
-        setup = Setup(**{**given, **options, "ports": ports})
+        setup = flight.rig.setup.model_validate({**given, **options, "ports": ports})
     except pydantic.ValidationError as error:
         told = [
             str(e["ctx"]["error"] if "ctx" in e and "error" in e["ctx"] else e["msg"])
@@ -185,7 +197,7 @@ def changed(flight: Flight, options: Mapping[str, Any]) -> Flight:
 
 def counted_from(flight: Flight, steps: int) -> int:
     """First step of which figures of merit count: as the scenario says, else the second half."""
-    first = round(flight.loop.counted_from / flight.loop.step)
+    first = flight.timing.counted_from
     return first if first < steps else steps // 2
 
 
@@ -195,15 +207,15 @@ def steps_of(flight: Flight) -> int:
     Raises:
         ScenarioError: longer than the scenario, or not a step long.
     """
-    most = round(flight.loop.duration / flight.loop.step)
+    step_s, most, _ = flight.timing
     if flight.setup.seconds is None:
         return most
-    steps = round(flight.setup.seconds / flight.loop.step)
+    steps = round(flight.setup.seconds / step_s)
     if not 1 <= steps <= most:
         raise ScenarioError(
             [
-                f"seconds: {flight.setup.seconds:g} s is not from a step ({flight.loop.step:g} s) "
-                f"to the end of the scenario ({flight.loop.duration:g} s); "
+                f"seconds: {flight.setup.seconds:g} s is not from a step ({step_s:g} s) "
+                f"to the end of the scenario ({most * step_s:g} s); "
                 "set its duration to make that longer"
             ]
         )
@@ -216,13 +228,19 @@ def recorded_flight(header: Mapping[str, Any], filter_: str | None = None) -> Fl
     Raises:
         ScenarioError: the header is of another version of robins.
     """
+    rig = recorded_rig(header)
     try:
         # JSON has lists where parameters have tuples.
-        setup = Setup.model_validate(header["setup"], strict=False)
-        loop = AttitudeLoop.model_validate(header["loop"], strict=False)
+        setup = rig.setup.model_validate(header["setup"], strict=False)
+        given = rig.parameters().model_validate(header["loop"], strict=False)
     except (KeyError, TypeError, pydantic.ValidationError) as error:
         raise ScenarioError(
             [f"the record was made by another version of robins ({header.get('robins')}): {error}"]
         ) from None
-    flight = Flight(str(header["name"]), setup, loop, "")
+    flight = Flight(str(header["name"]), rig, setup, given, "")
     return flight if filter_ is None else changed(flight, {"filter": filter_})
+
+
+def recorded_rig(header: Mapping[str, Any]) -> Rig:
+    """The rig of a record; older ones do not say it."""
+    return rig_of(str(header.get("rig", RIGS[0])))

@@ -7,20 +7,16 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-
 from robins.bench.live import Live, Signal
-from robins.bench.run import telemetry
+from robins.bench.rig import Rig
 from robins.bench.run.session import Session
 from robins.bench.run.setup import Flight, steps_of
-from robins.bench.run.telemetry import ARCSEC, Alarms
 from robins.bench.status import STARTING, Status
-from robins.bench.wire.schema import FLAGS
 
 _EACH_S = 0.05  # samples for the page come no faster than that
 _STATUS_S = 0.5
 _COMMANDS, _COMMANDS_S = 10, 10.0  # so many are shown in so long a time
-_XYZ = ("x", "y", "z")
+STEP = Signal("time of a step", "ms", "time of a step")
 ALARMS = ("died", "failed", "killed")
 WARNINGS = ("missed", "refused", "command")
 
@@ -48,46 +44,6 @@ class Page(Protocol):
         """Keep its server alive."""
 
 
-def signals(wheels: int) -> list[Signal]:
-    """What the page draws."""
-
-    def three(plot: str, unit: str, sigma: bool = False) -> list[Signal]:
-        found = []
-        for axis in _XYZ:
-            found.append(Signal(f"{plot} {axis}", unit, plot))
-            if sigma:
-                found.append(Signal(f"{plot} sigma {axis}", unit, plot, "sigma", f"{plot} {axis}"))
-        return found
-
-    momentum = "wheel momentum"
-    return [
-        *three("attitude error", "arcsec", sigma=True),
-        *three("pointing error", "arcsec"),
-        *three("innovation of the star sensor", "arcsec", sigma=True),
-        Signal("test ratio", "1", "test ratio of the star sensor"),
-        Signal("test ratio limit", "1", "test ratio of the star sensor", "limit"),
-        *three("rate", "deg/s"),
-        *(Signal(f"{momentum} {k}", "mN m s", momentum) for k in range(wheels)),
-        Signal(f"{momentum} limit", "mN m s", momentum, "limit"),
-        Signal(f"{momentum} lower limit", "mN m s", momentum, "limit"),
-        Signal("time of a step", "ms", "time of a step"),
-    ]
-
-
-OFFERED: tuple[dict[str, Any], ...] = (
-    {"label": "star: wrong by 10 deg", "fault": {"kind": "turned"}},
-    {"label": "star: stuck", "fault": {"kind": "stuck"}},
-    {"label": "star: lost", "fault": {"kind": "lost"}},
-    {"label": "star: sign flips", "fault": {"kind": "sign"}},
-    {"label": "star: link silent", "fault": {"kind": "silent", "link": "star"}},
-    {"label": "gyro: link silent", "fault": {"kind": "silent", "link": "gyro"}},
-    {"label": "wheel 0: no torque", "fault": {"kind": "wheel", "wheel": 0}},
-    {"label": "all links: 2 % of frames damaged", "fault": {"kind": "bit errors", "share": 0.02}},
-    {"label": "all links: 2 % of frames lost", "fault": {"kind": "loss", "share": 0.02}},
-)
-"""Faults that the page offers."""
-
-
 class Looking:
     """Tells the page and the status file; as `robins.bench.run.session.Watch` wants it."""
 
@@ -96,7 +52,8 @@ class Looking:
         self._page, self._status = page, status
         self._told = 0.0
         self._due = 0.0  # when the page gets its next sample
-        self._alarms = Alarms()
+        self._alarms, self._listens = None, False  # of the rig, from the first step on
+        self._since = 0  # first step that no sample has shown
         self._commanded: deque[float] = deque(maxlen=_COMMANDS)
         self._flooded = False
 
@@ -135,12 +92,17 @@ class Looking:
     def step(self, session: Session, step: int) -> None:
         """A step is over."""
         if self._page is not None:
-            for level, text in self._alarms.hear(int(session.telemetry.flown.flags[step])):
-                self._page.event(level, session.time_s, f"adm: {text}")
+            view, flown = session.rig.shown, session.telemetry.flown
+            if not self._listens:
+                self._alarms, self._listens = view.alarms(), True
+            for level, text in self._alarms.hear(flown, step) if self._alarms else ():
+                self._page.event(level, session.time_s, text)
             now = time.monotonic()
             if now >= self._due:  # a step that comes a little late does not make the next one wait
                 self._due = max(self._due + _EACH_S, now - _EACH_S)
-                self._page.push(session.time_s, sample(session, step))
+                values = view.sample(flown, session.kit, self._since, step)
+                self._page.push(session.time_s, [*values, session.step_ms])
+                self._since = step + 1
         self._tell(session, step + 1)
 
     def _tell(self, session: Session, done: int) -> None:
@@ -152,42 +114,10 @@ class Looking:
             self._status.tell(report(session, done, "" if self._page is None else self._page.url))
 
 
-def sample(session: Session, step: int) -> list[float]:
-    """The signals of a step."""
-    f, now = session.telemetry.flown, slice(step, step + 1)
-    error = telemetry.turn(f.q_est_ib[now], f.q_ib[now])[0] / ARCSEC
-    sigma = f.sigma[step, :3] / ARCSEC
-    wanted = np.asarray(session.kit.rows.course.ref_end_q_ib)[now]
-    pointing = telemetry.turn(wanted, f.q_ib[now])[0] / ARCSEC
-    # star frames are rarer than samples: the page gets the latest since the last sample
-    heard = session.telemetry.latest_innovation
-    innovation, its_sigma, ratio = (
-        heard if heard is not None else (np.full(3, np.nan),) * 2 + (np.nan,)
-    )
-    session.telemetry.latest_innovation = None
-    wheels = len(session.kit.vehicle.craft.wheel_h)
-    limit = float(np.asarray(session.kit.given.craft.wheel_momentum_limit)[0])
-    both = [x for pair in zip(error, sigma, strict=True) for x in pair]
-    innovated = [x / ARCSEC for pair in zip(innovation, its_sigma, strict=True) for x in pair]
-    return [
-        *both,
-        *pointing,
-        *innovated,
-        ratio,
-        1.0,
-        *np.degrees(f.omega_b[step]),
-        *(1e3 * f.wheel_h[step, :wheels]),
-        1e3 * limit,
-        -1e3 * limit,
-        session.step_ms,
-    ]
-
-
 def state(session: Session, done: int) -> dict[str, Any]:
     """How the bench is, for the page."""
     recent = session.latencies.recent()
     late = recent["cycle"]["lateness_us"]
-    flags = session.telemetry.flown.flags[:done]
     now_ns, links, health = session.broker.time_ns, session.broker.links, _health(session)
     return {
         "state": "paused" if session.paused else "running",
@@ -207,7 +137,7 @@ def state(session: Session, done: int) -> dict[str, Any]:
             {"label": label, "until_s": fault.end} for label, fault in session.active_faults()
         ],
         "counts": {
-            "refused_measurements": int(np.sum(flags >> FLAGS.index("star refused") & 1)),
+            **session.rig.shown.counts(session.telemetry.flown, done),
             "wrong_frames": sum(counted["wrong"] for counted in health.values()),
             "lost_frames": sum(counted["lost"] for counted in health.values()),
             "processes_died": session.deaths,
@@ -219,7 +149,7 @@ def _clock(session: Session) -> str:
     setup = session.flight.setup
     if setup.clock == "lockstep":
         return "lock-step"
-    return f"real time, {setup.rate or 1.0 / session.flight.loop.step:g} Hz"
+    return f"real time, {setup.rate or 1.0 / session.flight.timing.step_s:g} Hz"
 
 
 def starting(flight: Flight) -> dict[str, Any]:
@@ -266,10 +196,10 @@ def _health(session: Session) -> dict[str, dict[str, int]]:
     return {link: {k: getattr(one.health, k) for k in names} for link, one in links}
 
 
-def page_for(session_name: str, run: int, wheels: int, host: str, port: int) -> Live:
+def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -> Live:
     """A live page for a run.
 
     Raises:
         ImportError, OSError, RuntimeError: as `Live` says.
     """
-    return Live(signals(wheels), session_name, run, host, port, OFFERED)
+    return Live([*rig.shown.signals(given), STEP], title, run, host, port, rig.shown.offered)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from importlib import resources
 
-import fastcrc
-
-from robins.bench.wire.frames import MOST_PAYLOAD
-from robins.bench.wire.records import size_of
-from robins.bench.wire.schema import MESSAGES, PARTS, SIZES, VERSION, Message, markdown
+from robins.bench.wire.fields import SIZES, Message
+from robins.bench.wire.frames import MOST_PAYLOAD, VERSION
+from robins.bench.wire.schema import Wire
 
 _TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "u64": "uint64_t", "f64": "double"}
 
@@ -231,31 +229,25 @@ static inline int robins_in_order(robins_order *order, uint32_t sequence) {
 """
 
 
-def schema_number() -> int:
-    """CRC-32C of the schema as it is documented: the same table, the same number."""
-    return fastcrc.crc32.iscsi(markdown().encode())
-
-
-def c_header() -> str:
-    """The text of ``robins_wire.h``."""
-    longest = max(size_of(m.name) for m in MESSAGES)
-    top = _TOP.format(version=VERSION, schema=schema_number(), most=MOST_PAYLOAD, longest=longest)
-    sizes = "".join(_size_check(m) for m in MESSAGES if m.fields)
-    parts = "".join(f"#define ROBINS_PART_{p.upper()} {k}u\n" for k, p in enumerate(PARTS))
-    cases = "".join(
-        f"    case ROBINS_{m.name.upper()}: return {size_of(m.name)};\n" for m in MESSAGES
-    )
-    structs = "".join(_struct(m) for m in MESSAGES)
+def c_header(wire: Wire) -> str:
+    """The text of ``robins_wire.h`` for the messages of a rig."""
+    every = wire.messages
+    longest = max(m.size for m in every)
+    top = _TOP.format(version=VERSION, schema=wire.number, most=MOST_PAYLOAD, longest=longest)
+    sizes = "".join(_size_check(m) for m in every if m.fields)
+    parts = "".join(f"#define ROBINS_PART_{p.upper()} {k}u\n" for k, p in enumerate(wire.parts))
+    cases = "".join(f"    case ROBINS_{m.name.upper()}: return {m.size};\n" for m in every)
+    structs = "".join(_struct(m) for m in every)
     stream = _STREAM.replace("@cases@", cases)
-    stream = stream.replace("@limits@", "".join(_limits(m) for m in MESSAGES))
+    stream = stream.replace("@limits@", "".join(_limits(m) for m in every))
     return top + "\n" + parts + structs + _END.format(sizes=sizes) + stream
 
 
-def firmware() -> dict[str, str]:
+def firmware(wire: Wire) -> dict[str, str]:
     """The files of the example of a board, by name: loop, platform, one for a PC, and the wire."""
     there = resources.files("robins.bench.wire") / "firmware"
     files = {f.name: f.read_text("utf-8") for f in there.iterdir() if f.name.endswith((".c", ".h"))}
-    return {**dict(sorted(files.items())), "robins_wire.h": c_header()}
+    return {**dict(sorted(files.items())), "robins_wire.h": c_header(wire)}
 
 
 def _struct(m: Message) -> str:
@@ -285,4 +277,4 @@ def _limits(m: Message) -> str:
 
 def _size_check(m: Message) -> str:
     name = f"robins_{m.name}"
-    return f"typedef char {name}_size[sizeof({name}) == {size_of(m.name)} ? 1 : -1];\n"
+    return f"typedef char {name}_size[sizeof({name}) == {m.size} ? 1 : -1];\n"

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import fastcrc
 from cobs import cobs
 
-from robins.bench.wire.schema import VERSION
 from robins.errors import RobinsError
 
+VERSION = 1
 EDGE = b"\x00"
 _HEADER = struct.Struct("<BBIIQ")
 _CRC = struct.Struct("<I")

@@ -1,16 +1,15 @@
-"""Payloads: values of a message to bytes and back, and whether they can be, as the schema says."""
+"""Payloads: values of a message to bytes and back, and whether they can be, as its table says."""
 
 from __future__ import annotations
 
 import math
 import struct
 from collections.abc import Mapping
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from robins.bench.wire.schema import SIZES, Field, message
+from robins.bench.wire.fields import SIZES, Field, Message
 from robins.errors import RobinsError
 
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "f64": "d"}
@@ -27,33 +26,80 @@ class Unsound(NamedTuple):
     sized: bool  # it has the length of its message, so one of its numbers is to blame
 
 
-@cache
-def size_of(name: str) -> int:
-    """Bytes of a payload.
+class _Number(NamedTuple):
+    """What a number of a payload may be."""
 
-    Raises:
-        KeyError: there is no such message.
-    """
-    return sum(f.length * SIZES[f.kind] for f in message(name).fields)
+    name: str
+    least: float
+    most: float
+    field: Field
 
 
-def encode(name: str, values: Mapping[str, Any]) -> bytes:
-    """The payload of a message.
+class Record:
+    """The payloads of one message."""
 
-    Args:
-        name: of the message.
-        values: by field; a number, or as many as the field has. Floats go as they are, bit for
-            bit, NaN included.
+    def __init__(self, of: Message):
+        """Lay out its numbers."""
+        self.message, self.size, self._names = of, of.size, {f.name for f in of.fields}
+        numbers: list[_Number] = []
+        for f in of.fields:
+            least, most = f.limits or (0.0, 256.0 ** SIZES[f.kind])
+            for k in range(f.length):
+                numbers.append(_Number(f.name + f"[{k}]" * (f.length > 1), least, most, f))
+        self._numbers = tuple(numbers)
+        self._all = struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in of.fields))
 
-    Raises:
-        KeyError: there is no such message.
-        RecordError: a field is missing, unknown, of another length, or beyond its type.
-    """
-    of = message(name)
-    if len(values) != len(of.fields) or not all(f.name in values for f in of.fields):
-        fields = sorted(f.name for f in of.fields)
-        raise RecordError(f"message '{name}' has the fields {fields}, got {sorted(values)}")
-    return b"".join([_field(name, f, values[f.name]) for f in of.fields])
+    def encode(self, values: Mapping[str, Any]) -> bytes:
+        """The payload.
+
+        Args:
+            values: by field; a number, or as many as the field has. Floats go as they are, bit for
+                bit, NaN included.
+
+        Raises:
+            RecordError: a field is missing, unknown, of another length, or beyond its type.
+        """
+        of = self.message
+        if values.keys() != self._names:
+            raise RecordError(
+                f"message '{of.name}' has the fields {sorted(self._names)}, got {sorted(values)}"
+            )
+        return b"".join([_field(of.name, f, values[f.name]) for f in of.fields])
+
+    def decode(self, payload: bytes) -> dict[str, Any]:
+        """The values: a number for a field of one, else an array.
+
+        Raises:
+            RecordError: the payload is not as long as the message.
+        """
+        of = self.message
+        if len(payload) != self.size:
+            raise RecordError(f"message '{of.name}' has {self.size} bytes, got {len(payload)}")
+        out: dict[str, Any] = {}
+        at = 0
+        for f in of.fields:
+            if f.kind == "f64" and f.length > 1:
+                out[f.name] = np.frombuffer(payload, "<f8", f.length, at).copy()
+            else:
+                some = struct.unpack_from(f"<{f.length}{_CODES[f.kind]}", payload, at)
+                out[f.name] = some[0] if f.length == 1 else np.array(some)
+            at += f.length * SIZES[f.kind]
+        return out
+
+    def unsound(self, payload: bytes) -> Unsound | None:
+        """The one gate of every frame: its length, and least and most of each number; None: sound.
+
+        An infinity is beyond every limit; NaN passes only where the table says that it stands for a
+        number that there is not.
+        """
+        if len(payload) != self.size:
+            why = f"it has {len(payload)} bytes, '{self.message.name}' has {self.size}"
+            return Unsound(why, False)
+        for x, n in zip(self._all.unpack(payload), self._numbers, strict=True):
+            if not n.least <= x <= n.most and not (n.field.missing and math.isnan(x)):
+                unit = "" if n.field.unit == "1" else f" {n.field.unit}"
+                return Unsound(f"{n.name} is {x:g}{unit}, not {n.field.span}", True)
+        return None
 
 
 def _field(name: str, f: Field, value: Any) -> bytes:
@@ -73,64 +119,3 @@ def _field(name: str, f: Field, value: Any) -> bytes:
             f"message '{name}': {name}.{f.name} is {f.kind}: whole numbers are wanted, as large as "
             f"{256 ** SIZES[f.kind] - 1} at most, got {value}"
         ) from None
-
-
-def decode(name: str, payload: bytes) -> dict[str, Any]:
-    """The values of a payload: a number for a field of one, else an array.
-
-    Raises:
-        KeyError: there is no such message.
-        RecordError: the payload is not as long as the message.
-    """
-    of = message(name)
-    if len(payload) != size_of(name):
-        raise RecordError(f"message '{name}' has {size_of(name)} bytes, got {len(payload)}")
-    out: dict[str, Any] = {}
-    at = 0
-    for f in of.fields:
-        if f.kind == "f64" and f.length > 1:
-            out[f.name] = np.frombuffer(payload, "<f8", f.length, at).copy()
-        else:
-            some = struct.unpack_from(f"<{f.length}{_CODES[f.kind]}", payload, at)
-            out[f.name] = some[0] if f.length == 1 else np.array(some)
-        at += f.length * SIZES[f.kind]
-    return out
-
-
-class _Number(NamedTuple):
-    """What a number of a payload may be."""
-
-    name: str
-    least: float
-    most: float
-    field: Field
-
-
-@cache
-def _layout(name: str) -> tuple[struct.Struct, tuple[_Number, ...]]:
-    fields = message(name).fields
-    numbers = []
-    for f in fields:
-        least, most = f.limits or (0.0, 256.0 ** SIZES[f.kind])
-        for k in range(f.length):
-            numbers.append(_Number(f.name + f"[{k}]" * (f.length > 1), least, most, f))
-    return struct.Struct("<" + "".join(f"{f.length}{_CODES[f.kind]}" for f in fields)), (*numbers,)
-
-
-def unsound(name: str, payload: bytes) -> Unsound | None:
-    """The one gate of every frame: its length, and least and most of each number; None: sound.
-
-    An infinity is beyond every limit; NaN passes only where the table says that it stands for a
-    number that there is not.
-
-    Raises:
-        KeyError: there is no such message.
-    """
-    packed, numbers = _layout(name)
-    if len(payload) != packed.size:
-        return Unsound(f"it has {len(payload)} bytes, '{name}' has {packed.size}", False)
-    for x, n in zip(packed.unpack(payload), numbers, strict=True):
-        if not n.least <= x <= n.most and not (n.field.missing and math.isnan(x)):
-            unit = "" if n.field.unit == "1" else f" {n.field.unit}"
-            return Unsound(f"{n.name} is {x:g}{unit}, not {n.field.span}", True)
-    return None

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.bench.parts.satellite.kit import Kit, driven
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.wire.schema import WHEELS
+from robins.bench.rigs.satellite.kit import Kit, driven
+from robins.bench.rigs.satellite.messages import WHEELS
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.sim.rate_table import RateTable, TableState, step
 from robins.sim.spacecraft import CraftState, rate_b

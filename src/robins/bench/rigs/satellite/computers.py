@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robins.bench.parts.satellite.kit import Kit, driven
-from robins.bench.parts.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.wire.schema import HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.kit import Kit, driven
+from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState

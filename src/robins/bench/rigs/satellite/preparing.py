@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from robins.bench.parts.satellite.kit import Kit
-from robins.bench.wire.schema import WHEELS
+from robins.bench.rigs.satellite.kit import Kit
+from robins.bench.rigs.satellite.messages import WHEELS
 from robins.sim.rate_table import RateTable
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.study import FILTERS, contender

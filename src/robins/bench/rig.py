@@ -1,0 +1,215 @@
+"""A vehicle on the bench, as data: its parts, messages and wiring, its faults, what is looked at.
+
+A rig needs a wire, parts, who sends what, and how a run of it is prepared; all else has a default
+that follows from its messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+
+from robins.bench.parts.station import Part
+from robins.bench.wire.schema import Wire
+from robins.errors import RobinsError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from robins.bench.broker.faults import LinkFault, Said, Table
+    from robins.bench.live.feed import Signal
+    from robins.bench.run.session import Ran
+    from robins.bench.run.setup import Flight, Setup
+    from robins.bench.run.telemetry import Flown
+    from robins.scenario import Parameters
+
+
+class RigError(RobinsError, ValueError):
+    """A rig that contradicts itself."""
+
+
+@runtime_checkable
+class Kit(Protocol):
+    """What the parts of a run are given, so that processes can have a copy; pickled."""
+
+    @property
+    def step_ns(self) -> int:
+        """Length of a step."""
+        ...
+
+    @property
+    def frames(self) -> Iterable[int]:
+        """A step of each kind that parts compute otherwise, to be compiled before the first."""
+        ...
+
+
+class Timing(NamedTuple):
+    """The steps that the parameters of a rig ask for."""
+
+    step_s: float
+    steps: int
+    counted_from: int  # first step that counts in figures of merit
+
+
+def timing(given: Any) -> Timing:
+    """Of parameters with ``duration``, ``step`` and perhaps ``counted_from``, in seconds."""
+    steps = round(given.duration / given.step)
+    return Timing(given.step, steps, round(getattr(given, "counted_from", 0.0) / given.step))
+
+
+class Judged(NamedTuple):
+    """What a rig says of a run.
+
+    Attributes:
+        metrics: figures of merit by name, which ends in the unit.
+        counts: of what was odd.
+        warnings: why a reader should doubt the figures.
+        arrays: of the solution, as `robins.results.array` makes them.
+        lines: figures for a terminal.
+    """
+
+    metrics: Mapping[str, float | None] = MappingProxyType({})
+    counts: Mapping[str, int] = MappingProxyType({})
+    warnings: Sequence[str] = ()
+    arrays: Mapping[str, Any] = MappingProxyType({})
+    lines: Sequence[str] = ()
+
+
+class Told(NamedTuple):
+    """Something to tell people; levels are those of the page."""
+
+    level: Any
+    text: str
+
+
+@runtime_checkable
+class Alarms(Protocol):
+    """Listens to one step after another."""
+
+    def hear(self, flown: Flown, step: int) -> list[Told]:
+        """What there is to say of a step."""
+        ...
+
+
+class View(NamedTuple):
+    """What the page of a rig shows.
+
+    Attributes:
+        signals: what is drawn, of the parameters of what flies.
+        sample: (arrays, kit, first step since the last sample, step) -> their values.
+        alarms: a listener for a run.
+        counts: (arrays, steps done) -> what was counted, by name.
+        offered: faults that can be injected, each with its label.
+    """
+
+    signals: Callable[[Any], list[Signal]]
+    sample: Callable[[Flown, Any, int, int], Sequence[float]]
+    alarms: Callable[[], Alarms | None] = lambda: None
+    counts: Callable[[Flown, int], dict[str, int]] = lambda flown, done: {}
+    offered: tuple[dict[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A vehicle on the bench.
+
+    Attributes:
+        name: of it.
+        wire: its parts and messages.
+        build: how a part is made of a kit, by part.
+        sends: messages by part, each of one part alone.
+        takes: messages by part.
+        parameters: () -> the class of what flies.
+        prepare: (setup, parameters) -> the kit of a run; the same for the same.
+        truth: the message without which nothing can be judged; "": there is none.
+        kept: messages that are noted for figures and page; left out: all.
+        timing: of the parameters.
+        flies: scenarios of its system, by name; the first is flown where none is named.
+        filters: that its parameters can be flown with; the first where none is named.
+        scenarios: of the bench, by name.
+        options: parameters of a run besides those of all rigs, each with type and default.
+        said: faults of its sensors and actuators, by kind, and their parameters.
+        view: of the page; left out: all numbers of its messages.
+        inside: (kit) -> arrays of the same run inside one program, named as `Flown` names them.
+        judge: figures of merit of a run; left out: none, and all numbers in its arrays.
+        example: the part with which commands are shown; left out: its last.
+        address: by which processes find it; left out: its name.
+    """
+
+    name: str
+    wire: Wire
+    build: Mapping[str, Callable[[Any], Part]]
+    sends: Mapping[str, tuple[str, ...]]
+    takes: Mapping[str, tuple[str, ...]]
+    parameters: Callable[[], type[Parameters]]
+    prepare: Callable[[Any, Any], Kit]
+    truth: str = ""
+    kept: tuple[str, ...] = ()
+    timing: Callable[[Any], Timing] = timing
+    flies: Callable[[], Mapping[str, Path]] = dict
+    filters: Callable[[], Sequence[str]] = lambda: ("",)
+    scenarios: Callable[[], Mapping[str, Path]] = dict
+    options: Callable[[], Mapping[str, Any]] = dict
+    said: Callable[[], tuple[Mapping[str, Said], Mapping[str, Any]]] = lambda: ({}, {})
+    view: Callable[[], View] | None = None
+    inside: Callable[[Any], Mapping[str, np.ndarray]] | None = None
+    judge: Callable[[Flight, Ran], Judged] | None = None
+    example: str = ""
+    address: str = ""
+
+    def __post_init__(self) -> None:
+        """Check that its tables agree.
+
+        Raises:
+            RigError: they do not; says how.
+        """
+        parts = self.parts
+        for what, table in (("build", self.build), ("sends", self.sends), ("takes", self.takes)):
+            if set(table) != set(parts):
+                raise RigError(f"{what} is of {', '.join(table)}, the wire has {', '.join(parts)}")
+        if not self.example:
+            object.__setattr__(self, "example", parts[-1])
+        named = {m.name for m in self.wire.data}
+        said = [name for sent in self.sends.values() for name in sent]
+        if sorted(said) != sorted(named):
+            raise RigError(f"each message is sent by one part: {sorted(said)} of {sorted(named)}")
+        heard = {name for taken in self.takes.values() for name in taken} | {*self.kept}
+        if unknown := sorted((heard | ({self.truth} - {""})) - named):
+            raise RigError(f"there is no message '{unknown[0]}', only {', '.join(sorted(named))}")
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Its parts, without the bench."""
+        return self.wire.parts[1:]
+
+    @cached_property
+    def table(self) -> Table:
+        """What its faults may be."""
+        from robins.bench.broker.faults import Table
+
+        return Table(self.wire, self.sends, self.takes, self.said()[0])
+
+    @cached_property
+    def fault(self) -> type[LinkFault]:
+        """The parameters of a fault."""
+        from robins.bench.broker.faults import faults_of
+
+        return faults_of(self.table, **self.said()[1])
+
+    @cached_property
+    def setup(self) -> type[Setup]:
+        """The parameters of a run."""
+        from robins.bench.run.setup import setup_of
+
+        return setup_of(self)
+
+    @cached_property
+    def shown(self) -> View:
+        """What its page shows."""
+        from robins.bench.run.numbers import view_of
+
+        return self.view() if self.view is not None else view_of(self)

@@ -1,0 +1,54 @@
+"""The rigs of the bench: one a vehicle, each in a folder or a file of its own; a row in the table.
+
+A user's own rig is in a file, "pendulum.py:rig".
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from robins.bench.rig import Rig
+from robins.errors import RobinsError, hint
+from robins.systems.catalogue import is_file
+
+RIGS: tuple[str, ...] = ("satellite",)
+"""Those that come with robins: each a module here, which calls it RIG."""
+
+
+class UnknownRig(RobinsError, ValueError):
+    """There is no such rig, or what is said to be one is none."""
+
+
+def rig_of(name: str, folder: Path = Path()) -> Rig:
+    """A rig by its name, or "file.py:name", relative to a folder.
+
+    Raises:
+        UnknownRig: there is none; the message says what there is.
+    """
+    if name in RIGS:
+        return importlib.import_module(f"{__name__}.{name.replace('-', '_')}").RIG
+    if is_file(name):
+        where, _, wanted = name.partition(":")
+        return _of_file((folder / where).resolve(), wanted)
+    raise UnknownRig(
+        f"no rig '{name}'{hint(name, RIGS)} There are {', '.join(RIGS)}",
+        fix="for one of your own write file.py:name",
+    )
+
+
+@cache
+def _of_file(path: Path, wanted: str) -> Rig:
+    from robins.systems.finding import imported
+
+    module = imported(path)
+    if not isinstance(found := getattr(module, wanted, None), Rig):
+        offered = [key for key, value in vars(module).items() if isinstance(value, Rig)]
+        raise UnknownRig(
+            f"no rig '{wanted}' in it{hint(wanted, offered)}",
+            path,
+            "assign a robins.bench.Rig to a name at its top level",
+        )
+    return replace(found, address=f"{path}:{wanted}")

@@ -1,0 +1,64 @@
+"""What page and report show of a rig that says nothing of it: all numbers of its messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from robins.bench.live.feed import Signal
+from robins.bench.rig import Rig, View
+from robins.bench.run.telemetry import Flown
+from robins.bench.wire.fields import Field, Message
+from robins.results import array
+
+_AXES = ("x", "y", "z")
+
+
+def kept_fields(rig: Rig) -> list[tuple[Message, Field]]:
+    """Fields with numbers that can be drawn, of the messages that are kept."""
+    every = [m for m in rig.wire.data if m.name in rig.kept or not rig.kept]
+    return [(m, f) for m in every for f in m.fields if f.kind == "f64"]
+
+
+def axes_of(f: Field) -> list[str]:
+    """Names of the components of a field."""
+    return list(_AXES) if f.length == len(_AXES) else [str(k) for k in range(f.length)]
+
+
+def view_of(rig: Rig) -> View:
+    """A page that draws every number."""
+    fields = kept_fields(rig)
+    names = [f"{m.name}.{f.name}" for m, f in fields]
+
+    def signals(given: Any) -> list[Signal]:
+        return [
+            Signal(f"{m.name} {f.name} {axis}" if f.length > 1 else plot, f.unit, plot)
+            for m, f in fields
+            for plot in (f"{m.name} {f.name}",)
+            for axis in axes_of(f)
+        ]
+
+    def sample(flown: Flown, kit: Any, since: int, step: int) -> Sequence[float]:
+        every = [np.ravel(latest(flown[name], since, step)) for name in names]
+        return np.concatenate(every).tolist()
+
+    return View(signals, sample)
+
+
+def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:
+    """The last row from one step to another of which something was heard; else NaN."""
+    some = values[since : step + 1]
+    heard = np.flatnonzero(np.isfinite(some.reshape(len(some), -1)).any(axis=1))
+    return np.asarray(some[heard[-1]] if len(heard) else np.full(values.shape[1:], np.nan))
+
+
+def arrays_of(rig: Rig, flown: Flown) -> dict[str, Any]:
+    """Every number as an array of the solution, with its unit."""
+    out: dict[str, Any] = {}
+    for m, f in kept_fields(rig):
+        values = flown[f"{m.name}.{f.name}"].reshape(1, len(flown.time_s), -1)
+        about = {"unit": f.unit, "long_name": f"{m.name}: {f.name}", "comment": f.text}
+        out |= array("value", values, f"{m.name}_{f.name}", axes=axes_of(f), frame=m.name, **about)
+    return out

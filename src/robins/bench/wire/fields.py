@@ -1,0 +1,59 @@
+"""What a message is made of: fields of numbers with their units and limits.
+
+All numbers are little endian; lengths of vectors are fixed, so that firmware needs no heap.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+WireType = Literal["u8", "u16", "u32", "u64", "f64"]
+SIZES: dict[WireType, int] = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "f64": 8}
+
+
+class Field(NamedTuple):
+    """Some numbers of one kind."""
+
+    name: str
+    kind: WireType
+    length: int
+    unit: str  # "1": a pure number
+    text: str
+    limits: tuple[float, float] | None = None  # least and most of a sound frame; None: of its type
+    missing: bool = False  # whether NaN stands for a number that there is not
+
+    @property
+    def span(self) -> str:
+        """The limits in words."""
+        if self.limits is None:
+            return ""
+        return "{:g} to {:g}".format(*self.limits) + (" or NaN" if self.missing else "")
+
+
+class Message(NamedTuple):
+    """What one part of the bench tells another."""
+
+    number: int
+    name: str
+    text: str
+    fields: tuple[Field, ...]
+
+    @property
+    def size(self) -> int:
+        """Bytes of a payload."""
+        return sum(f.length * SIZES[f.kind] for f in self.fields)
+
+
+def f64(name: str, length: int, unit: str, text: str, most: float, missing: bool = False) -> Field:
+    """Floats from ``-most`` to ``most``."""
+    return Field(name, "f64", length, unit, text, (-most, most), missing)
+
+
+def size(name: str, length: int, unit: str, text: str, most: float) -> Field:
+    """Floats that are never negative; NaN: not known."""
+    return Field(name, "f64", length, unit, text, (0.0, most), True)
+
+
+def message(number: int, name: str, text: str, *fields: Field) -> Message:
+    """A message."""
+    return Message(number, name, text, fields)
