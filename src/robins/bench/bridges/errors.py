@@ -50,7 +50,7 @@ def needed(module: str, extra: str) -> ModuleType:
         ) from error
 
 
-def finite(name: str, value: float, message: str) -> float:
+def finite(name: str, value: float | int, message: str) -> float:
     """A number that a message can carry.
 
     Raises:
@@ -72,13 +72,14 @@ def vector(name: str, values: Sequence[float] | np.ndarray, message: str, size: 
     return [finite(name, value, message) for value in values]
 
 
-def whole(name: str, value: float, low: int, high: int, message: str) -> int:
+def whole(name: str, value: float | int, low: int, high: int, message: str) -> int:
     """The nearest whole number, where a field holds those from `low` to `high` only.
 
     Raises:
         BridgeError: it is beyond them, or not finite.
     """
-    number = round(finite(name, value, message))
+    finite(name, value, message)
+    number = round(value)
     if not low <= number <= high:
         raise BridgeError(
             f"{name} = {number} does not fit: its field holds {low} to {high}", message

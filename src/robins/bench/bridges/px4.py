@@ -93,8 +93,14 @@ class Px4Simulator:
 
     def close(self) -> None:
         """Hang up and stop listening. May be repeated."""
-        self._hang_up()
+        self.hang_up()
         self._server.close()
+
+    def hang_up(self) -> None:
+        """End the connection that there may be; PX4 can connect again. May be repeated."""
+        if self._line is not None:
+            self._line.close()
+            self._line = None
 
     def accept(self, timeout_s: float) -> None:
         """Wait for PX4 to connect, in place of a connection that there may be, and greet it.
@@ -102,7 +108,7 @@ class Px4Simulator:
         Raises:
             BridgeTimeout: it did not.
         """
-        self._hang_up()
+        self.hang_up()
         self._server.settimeout(timeout_s)
         try:
             self._line, _ = self._server.accept()
@@ -137,7 +143,8 @@ class Px4Simulator:
         deadline = time.monotonic() + timeout_s
         while not self._waiting:
             left = deadline - time.monotonic()
-            if not self._take(max(left, 0.0)) and left <= 0.0:
+            self._take(max(left, 0.0))
+            if left <= 0.0 and not self._waiting:
                 return None
         self._answers = True
         return self._waiting.popleft()
@@ -182,21 +189,20 @@ class Px4Simulator:
         except OSError as error:  # of a message cut off nothing more can be sent
             raise self._gone(error) from None
 
-    def _take(self, timeout_s: float) -> bool:
-        """Sort what came in; False if nothing did."""
+    def _take(self, timeout_s: float) -> None:
+        """Sort what comes in within a time."""
         line = self._connected()
         line.settimeout(timeout_s)
         try:
             data = line.recv(65536)
         except (TimeoutError, BlockingIOError):
-            return False
+            return
         except OSError as error:
             raise self._gone(error) from None
         if not data:
             raise self._gone("the connection ended")
         for one in self._mav.parse_buffer(data) or ():
             self._sort(one)
-        return True
 
     def _sort(self, one: Any) -> None:
         kind = one.get_type()
@@ -217,10 +223,5 @@ class Px4Simulator:
         return self._line
 
     def _gone(self, why: object) -> BridgeClosed:
-        self._hang_up()
+        self.hang_up()
         return BridgeClosed(f"PX4 has gone: {why}", self._where, "accept() waits for it again")
-
-    def _hang_up(self) -> None:
-        if self._line is not None:
-            self._line.close()
-            self._line = None

@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.bench.bridges import frames
-from robins.bench.bridges.errors import finite, needed, vector, whole
+from robins.bench.bridges.errors import BridgeError, finite, needed, vector, whole
 from robins.earth.atmosphere import pressure_altitude_m
 
 Vector = Sequence[float] | np.ndarray
 
-INT16, UINT16, INT32, UINT64 = (-(2**15), 2**15 - 1), (0, 2**16 - 1), (-(2**31), 2**31 - 1), 2**64
+INT16, UINT16, INT32 = (-(2**15), 2**15 - 1), (0, 2**16 - 1), (-(2**31), 2**31 - 1)
 UNKNOWN = 65535  # of 16-bit fields
 GRAVITY_M_S2 = 9.80665  # of a unit "G" of MAVLink
 
@@ -161,7 +161,10 @@ def _hil_sensor(s: Sensors) -> Any:
         updated |= 0b111 << 6
     if s.pressure_Pa is not None:
         hectopascal = finite("pressure_Pa", s.pressure_Pa, name) / 100.0
-        altitude = pressure_altitude_m(s.pressure_Pa)
+        try:
+            altitude = pressure_altitude_m(s.pressure_Pa)
+        except ValueError as error:
+            raise BridgeError(f"pressure_Pa has no height: {error}", name) from None
         # PX4 takes a pressure only with its height and its temperature.
         updated |= (
             mavlink.HIL_SENSOR_UPDATED_ABS_PRESSURE
@@ -220,7 +223,7 @@ def _hil_state(s: Truth) -> Any:
 
 
 def _time(s: Sample, name: str) -> int:
-    return whole("time_us", s.time_us, 0, UINT64 - 1, name)
+    return whole("time_us", s.time_us, 0, 2**64 - 1, name)
 
 
 def _position(s: Fix | Truth, name: str) -> tuple[int, int, int]:
