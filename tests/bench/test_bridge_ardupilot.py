@@ -12,7 +12,7 @@ import pytest
 from rotorcraft import STEP_US, Craft, Pilot, angle_deg, fly
 
 from robins.bench.bridges import BridgeClosed, BridgeError
-from robins.bench.bridges.ardupilot import ArduPilotPhysics, Servos, State, decode, encode
+from robins.bench.bridges.ardupilot import ArduPilotPhysics, BodyState, Servos, decode, encode
 
 
 def packet(count, pwm=(), rate=400, magic=18458):
@@ -72,7 +72,7 @@ def state(**more):
         "v_n_m_s": (4.0, 5.0, -6.0),
         "q_nb": (1.0, 0.0, 0.0, 0.0),
     }
-    return State(**{**given, **more})
+    return BodyState(**{**given, **more})
 
 
 # ------------------------------------------------------------------------------------- bytes

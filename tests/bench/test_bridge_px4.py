@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from rotorcraft import STEP_US, Craft, Pilot, angle_deg, fly
 
-from robins.bench.bridges import BridgeClosed, BridgeError, BridgeTimeout, MissingExtra
+from robins.bench.bridges import BridgeClosed, BridgeError, BridgeTimeout, MissingPackage
 from robins.bench.bridges import errors as bridge_errors
 from robins.bench.bridges.px4 import Px4Simulator
-from robins.bench.bridges.px4_messages import Actuators, Fix, Sensors, Truth, message
+from robins.bench.bridges.px4_messages import Actuators, GnssFix, Sensors, Truth, message
 
 mavlink = pytest.importorskip(
     "pymavlink.dialects.v20.common", reason="needs pymavlink, of the extra 'autopilot'"
@@ -194,7 +194,7 @@ def test_the_fields_that_are_told():
 def test_a_fix_and_the_truth_in_the_units_of_mavlink():
     place = {"lat_rad": math.radians(-33.5), "lon_rad": math.radians(151.25), "alt_m": 58.125}
     motion = {"time_us": 12_345, "v_n_m_s": (-3.0, 4.0, -0.5)}
-    fix = message(Fix(**place, **motion, horizontal_m=0.9, vertical_m=1.25))
+    fix = message(GnssFix(**place, **motion, horizontal_m=0.9, vertical_m=1.25))
     packed = bytes(fix.pack(mavlink.MAVLink(None)))[10:-2].ljust(39, b"\0")
     sent = struct.unpack("<QiiiHHHhhhHBBBH", packed)
     assert sent[:6] == (12_345, -335_000_000, 1_512_500_000, 58_125, 90, 125)
@@ -219,11 +219,11 @@ def test_a_fix_and_the_truth_in_the_units_of_mavlink():
         (sensors(time_us=-1), "time_us = -1 does not fit"),
         (sensors(pressure_Pa=0.0), "pressure_Pa has no height"),
         (
-            Fix(time_us=0, lat_rad=0.0, lon_rad=0.0, alt_m=0.0, v_n_m_s=(0.0, 0.0, 400.0)),
+            GnssFix(time_us=0, lat_rad=0.0, lon_rad=0.0, alt_m=0.0, v_n_m_s=(0.0, 0.0, 400.0)),
             r"v_n_m_s \[cm/s\] = 40000 does not fit",
         ),
         (
-            Fix(time_us=0, lat_rad=1.6, lon_rad=0.0, alt_m=0.0, v_n_m_s=(0.0, 0.0, 0.0)),
+            GnssFix(time_us=0, lat_rad=1.6, lon_rad=0.0, alt_m=0.0, v_n_m_s=(0.0, 0.0, 0.0)),
             r"lat_rad \[degE7\]",
         ),
     ],
@@ -285,13 +285,18 @@ def test_an_answer_to_another_sample_is_none(connected):
     assert simulator.counts.late == 1
     with pytest.raises(BridgeTimeout, match=r"no answer to the sample of 300 us within 0\.05 s"):
         simulator.step(sensors(300), timeout_s=0.05)
+    peer.put(controls_frame(12, [0.5]))  # its clock is another
+    with pytest.raises(BridgeTimeout, match=r"within 0\.05 s, but one to 12 us; look whether"):
+        simulator.step(sensors(400), timeout_s=0.05)
 
 
-def test_without_lockstep_any_answer_counts(connected):
+def test_without_lockstep_the_newest_answer_counts(connected):
     simulator, peer = connected
-    peer.put(controls_frame(987_654_321, [1.0], mode=1, flags=0))
+    peer.put(b"".join(controls_frame(987_654_321 + k, [k / 4], mode=1, flags=0) for k in range(5)))
     answer = simulator.step(sensors(4000))
-    assert (answer.time_us, answer.armed, answer.lockstep) == (987_654_321, False, False)
+    assert (answer.time_us, answer.armed, answer.lockstep) == (987_654_325, False, False)
+    assert answer.controls[0] == 1.0
+    assert simulator.actuators(0.0) is None
 
 
 # ---------------------------------------------------------------------------------- trouble
@@ -356,8 +361,11 @@ def test_a_line_that_ends_is_told(connected):
 def test_a_port_that_is_taken_is_told(simulator):
     with pytest.raises(BridgeClosed, match=f"127.0.0.1:{simulator.port}: cannot listen"):
         Px4Simulator(port=simulator.port)
+    simulator.close()
+    with pytest.raises(BridgeClosed, match="cannot wait for PX4"):
+        simulator.accept(0.05)
 
 
 def test_a_missing_package_names_its_extra():
-    with pytest.raises(MissingExtra, match=r"pip install 'robins\[autopilot\]'"):
+    with pytest.raises(MissingPackage, match=r"pip install 'robins\[autopilot\]'"):
         bridge_errors.needed("pymavlink_that_is_not_there", "autopilot")

@@ -22,8 +22,8 @@ from ros_peer import imu_payload, imu_read  # noqa: E402
 from robins.bench.bridges import BridgeClosed, BridgeError  # noqa: E402
 from robins.bench.bridges.ros2 import Ros2Topics, attachment, topic_key  # noqa: E402
 from robins.bench.bridges.ros2_messages import (  # noqa: E402
-    Fix,
-    Imu,
+    ImuSample,
+    NavSatFix,
     Odometry,
     decode,
     encode,
@@ -53,7 +53,7 @@ def imu(time_ns=1_700_000_000_123_456_789, **more):
         "omega_ib_b_rad_s": np.array([0.1, -0.2, 0.3]),
         "f_b_m_s2": np.array([0.5, 0.25, -9.75]),
     }
-    return Imu(time_ns=time_ns, **{**given, **more})
+    return ImuSample(time_ns=time_ns, **{**given, **more})
 
 
 def same(a, b):
@@ -92,13 +92,13 @@ def test_an_imu_byte_for_byte():
 def test_an_imu_without_an_attitude_says_so():
     n = imu_read(encode(imu()))[3]
     assert n[4] == -1.0
-    assert decode(Imu, encode(imu())).q_nb is None
+    assert decode(ImuSample, encode(imu())).q_nb is None
 
 
 def test_a_fix_byte_for_byte():
     P = covariance(2)
     data = encode(
-        Fix(
+        NavSatFix(
             time_ns=5_000_000_007,
             lat_rad=math.radians(-33.5),
             lon_rad=math.radians(151.25),
@@ -155,7 +155,7 @@ def test_what_is_sent_is_what_is_read(numbers, roll, heading, time_ns):
     q_nb = attitude(roll, 0.5, heading).as_quat(scalar_first=True)
     for record in (
         imu(time_ns, omega_ib_b_rad_s=a, f_b_m_s2=b, q_nb=q_nb, f_covariance=covariance(5)),
-        Fix(time_ns=time_ns, lat_rad=roll / 2.0, lon_rad=heading, alt_m=float(a[0])),
+        NavSatFix(time_ns=time_ns, lat_rad=roll / 2.0, lon_rad=heading, alt_m=float(a[0])),
     ):
         same(decode(type(record), encode(record)), record)
     sent = Odometry(time_ns=time_ns, position_n_m=a, q_nb=q_nb, v_n_m_s=b, omega_nb_b_rad_s=c)
@@ -169,7 +169,7 @@ def test_what_is_sent_is_what_is_read(numbers, roll, heading, time_ns):
 @pytest.mark.parametrize("cut", [0, 3, 4, 20, 200])
 def test_damaged_bytes_are_refused(cut):
     with pytest.raises(BridgeError, match=f"{cut} bytes are no sensor_msgs/msg/Imu"):
-        decode(Imu, encode(imu())[:cut])
+        decode(ImuSample, encode(imu())[:cut])
 
 
 # -------------------------------------------------------------------------------------- keys
@@ -177,18 +177,18 @@ def test_damaged_bytes_are_refused(cut):
 
 @pytest.mark.parametrize("convention", KEY)
 def test_keys(convention):
-    assert topic_key("/imu/data", Imu, convention, domain=3) == KEY[convention].format("data")
+    assert topic_key("/imu/data", ImuSample, convention, domain=3) == KEY[convention].format("data")
 
 
 def test_keys_of_other_messages_and_distributions():
     key = topic_key("/odom", Odometry, "rmw_zenoh", distro="humble")
     assert key == "0/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported"
-    assert topic_key("/fix", Fix, "rmw_zenoh").startswith(
+    assert topic_key("/fix", NavSatFix, "rmw_zenoh").startswith(
         "0/fix/sensor_msgs::msg::dds_::NavSatFix_/"
     )
     for topic in ("imu", "/", "/imu/", "/imu//data", "/1st", "/imu/*"):
         with pytest.raises(BridgeError, match="is no full name of a topic"):
-            topic_key(topic, Imu, "ros2dds")
+            topic_key(topic, ImuSample, "ros2dds")
     with pytest.raises(BridgeError, match=r"no distribution 'jazy' of ROS 2; there are .*jazzy"):
         typestore("jazy")
 
@@ -239,7 +239,7 @@ def until_heard(topics, topic, record):
 @pytest.mark.parametrize("convention", KEY)
 def test_two_processes_talk(endpoint, start, convention):
     with Ros2Topics(convention=convention, listen=[endpoint], domain=3) as topics:
-        topics.subscribe("/imu/back", Imu)
+        topics.subscribe("/imu/back", ImuSample)
         for flight in range(2):  # the other side goes and comes back
             process = start(endpoint, convention)
             until_heard(topics, "/imu/data", imu(1_000_000_000))
@@ -267,7 +267,7 @@ def test_bytes_that_are_no_message_are_counted(endpoint):
         Ros2Topics(convention="ros2dds", listen=[endpoint]) as ours,
         Ros2Topics(convention="ros2dds", connect=[endpoint]) as theirs,
     ):
-        ours.subscribe("/imu", Imu)
+        ours.subscribe("/imu", ImuSample)
         until_heard(theirs, "/imu", imu(5))
         theirs._session.put("imu", b"\0\1\0\0nothing")
         theirs.publish("/imu", imu(6))

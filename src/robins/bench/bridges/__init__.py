@@ -8,6 +8,6 @@
 A bridge owns its socket and knows nothing of the bench's broker.
 """
 
-from robins.bench.bridges.errors import BridgeClosed, BridgeError, BridgeTimeout, MissingExtra
+from robins.bench.bridges.errors import BridgeClosed, BridgeError, BridgeTimeout, MissingPackage
 
-__all__ = ["BridgeClosed", "BridgeError", "BridgeTimeout", "MissingExtra"]
+__all__ = ["BridgeClosed", "BridgeError", "BridgeTimeout", "MissingPackage"]

@@ -47,7 +47,7 @@ class Servos(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
+class BodyState:
     """What ArduPilot is told of the motion; None: no such sensor.
 
     Attributes:
@@ -94,7 +94,7 @@ def decode(datagram: bytes) -> Servos:
     return Servos(frame, rate_hz, tuple(pwm_us))
 
 
-def encode(state: State) -> bytes:
+def encode(state: BodyState) -> bytes:
     """The line of JSON of a motion, newlines at both ends included.
 
     Raises:
@@ -129,7 +129,7 @@ def encode(state: State) -> bytes:
 
 
 @dataclass
-class Counts:
+class ArduPilotCounts:
     """What came since we listen."""
 
     packets: int = 0  # of servo outputs, those that are repeated included
@@ -168,7 +168,7 @@ class ArduPilotPhysics:
                 "end the program that listens there, or start ArduPilot with another instance",
             ) from None
         self.port: int = self._socket.getsockname()[1]
-        self.counts = Counts()
+        self.counts = ArduPilotCounts()
         self._last: int | None = None  # number of the packet that was handed out last
         self._peer: Address | None = None  # who sent it
         self._answer = b""  # to it; empty: none yet
@@ -201,7 +201,7 @@ class ArduPilotPhysics:
             if (servos := self._sort(*arrived)) is not None:
                 return servos
 
-    def reply(self, state: State) -> None:
+    def reply(self, state: BodyState) -> None:
         """Answer the packet that was received last with the motion after its step.
 
         Raises:

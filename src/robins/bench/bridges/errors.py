@@ -28,7 +28,7 @@ class BridgeTimeout(RobinsError, TimeoutError):
     bad_input = False
 
 
-class MissingExtra(RobinsError, ImportError):
+class MissingPackage(RobinsError, ImportError):
     """A bridge needs a package that is not installed."""
 
     bad_input = False
@@ -38,13 +38,13 @@ def needed(module: str, extra: str) -> ModuleType:
     """A module of an optional package.
 
     Raises:
-        MissingExtra: it is not installed; names the extra that brings it.
+        MissingPackage: it is not installed; names the extra that brings it.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
-        raise MissingExtra(
+        raise MissingPackage(
             f"this bridge needs the package '{package}' ({error})",
             fix=f"pip install 'robins[{extra}]'",
         ) from error

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robins.bench.bridges.errors import BridgeClosed, BridgeTimeout
-from robins.bench.bridges.px4_messages import Actuators, Sample, Sensors, dialect, message
+from robins.bench.bridges.px4_messages import Actuators, Px4Sample, Sensors, dialect, message
 
 PORT = 4560
 SYSTEM, COMPONENT = 1, 200  # ours; PX4 does not look at them
@@ -29,7 +29,7 @@ FREEWHEEL_S = 0.004  # that a step waits for an answer while PX4 starts
 
 
 @dataclass
-class Counts:
+class Px4Counts:
     """What came from PX4 since we listen."""
 
     actuators: int = 0
@@ -55,7 +55,7 @@ class Px4Simulator:
             port: 4560 and the number of PX4's instance; 0: any that is free.
 
         Raises:
-            MissingExtra: pymavlink is not installed.
+            MissingPackage: pymavlink is not installed.
             BridgeClosed: the port cannot be had.
         """
         self._mavlink = dialect()
@@ -68,7 +68,7 @@ class Px4Simulator:
                 "end the program that listens there, or start PX4 with another instance number",
             ) from None
         self.port: int = self._server.getsockname()[1]
-        self.counts = Counts()
+        self.counts = Px4Counts()
         self._where = f"PX4 at port {self.port}"
         self._line: socket.socket | None = None
         self._mav: Any = None
@@ -107,15 +107,18 @@ class Px4Simulator:
 
         Raises:
             BridgeTimeout: it did not.
+            BridgeClosed: this end was closed, or PX4 went at once.
         """
         self.hang_up()
-        self._server.settimeout(timeout_s)
         try:
+            self._server.settimeout(timeout_s)
             self._line, _ = self._server.accept()
         except (TimeoutError, BlockingIOError):
             raise BridgeTimeout(
                 f"PX4 did not connect within {timeout_s:g} s", self._where, "start PX4's SITL"
             ) from None
+        except OSError as error:
+            raise BridgeClosed(f"cannot wait for PX4: {error}", self._where) from None
         self._line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._mav = self._mavlink.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
         self._mav.robust_parsing = True
@@ -125,7 +128,7 @@ class Px4Simulator:
         kinds = (m.MAV_TYPE_GENERIC, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE)
         self._put(m.MAVLink_heartbeat_message(*kinds, 3))
 
-    def send(self, sample: Sample) -> None:
+    def send(self, sample: Px4Sample) -> None:
         """Send a sample of the sensors, a fix, or the true motion.
 
         Raises:
@@ -152,8 +155,8 @@ class Px4Simulator:
     def step(self, sample: Sensors, timeout_s: float = 5.0) -> Actuators | None:
         """Send a sample and wait for the answer with its time; None while PX4 starts.
 
-        A PX4 that was built without lock-step has a clock of its own: then the next controls count.
-        What else is due (`Fix`, `Truth`) is sent before.
+        A PX4 that was built without lock-step has a clock of its own: then the newest controls
+        count. What else is due (`GnssFix`, `Truth`) is sent before.
 
         Raises:
             BridgeError: the message cannot carry a number of the sample.
@@ -161,19 +164,24 @@ class Px4Simulator:
             BridgeTimeout: PX4 has answered before, but not this time.
         """
         self.send(sample)
-        start = time.monotonic()
+        start, other = time.monotonic(), ""
         while True:
             patience = FREEWHEEL_S if self.freewheeling else timeout_s
             answer = self.actuators(start + patience - time.monotonic())
             if answer is None:
                 break
-            if not answer.lockstep or answer.time_us == sample.time_us:
+            if not answer.lockstep:
+                newest = self._waiting.pop() if self._waiting else answer
+                self._waiting.clear()
+                return newest
+            if answer.time_us == sample.time_us:
                 return answer
             self.counts.late += 1
+            other = f", but one to {answer.time_us} us"
         if self.freewheeling:
             return None
         raise BridgeTimeout(
-            f"no answer to the sample of {sample.time_us} us within {timeout_s:g} s",
+            f"no answer to the sample of {sample.time_us} us within {timeout_s:g} s{other}",
             self._where,
             "look whether PX4 runs, and whether samples come as seldom as it computes (250 Hz)",
         )

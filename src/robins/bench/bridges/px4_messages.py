@@ -1,11 +1,9 @@
 """What goes between a simulator and PX4: four messages of MAVLink's common set.
 
-| message | number | from | holds |
-|---|---|---|---|
-| HIL_SENSOR | 107 | us | `Sensors`: IMU, magnetic field, pressure |
-| HIL_GPS | 113 | us | `Fix`: position and velocity of a receiver |
-| HIL_STATE_QUATERNION | 115 | us | `Truth`, for PX4's log only |
-| HIL_ACTUATOR_CONTROLS | 93 | PX4 | `Actuators` |
+    HIL_SENSOR (107), from us             `Sensors`: IMU, magnetic field, pressure
+    HIL_GPS (113), from us                `GnssFix`: position and velocity of a receiver
+    HIL_STATE_QUATERNION (115), from us   `Truth`, for PX4's log only
+    HIL_ACTUATOR_CONTROLS (93), from PX4  `Actuators`
 
 (MAVLink, common message set; PX4 guide, "Simulator MAVLink API".) Here everything is in SI, in NED
 and FRD; the units of the messages are made at the edge. Real numbers of HIL_SENSOR are 32 bit wide,
@@ -56,7 +54,7 @@ class Sensors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fix:
+class GnssFix:
     """A fix of a GNSS receiver.
 
     Attributes:
@@ -107,7 +105,7 @@ class Truth:
     f_b_m_s2: Vector = (0.0, 0.0, -GRAVITY_M_S2)
 
 
-Sample = Sensors | Fix | Truth
+Px4Sample = Sensors | GnssFix | Truth
 
 
 class Actuators(NamedTuple):
@@ -133,21 +131,21 @@ def dialect() -> Any:
     """MAVLink's common set as pymavlink has it.
 
     Raises:
-        MissingExtra: pymavlink is not installed.
+        MissingPackage: pymavlink is not installed.
     """
     return needed("pymavlink.dialects.v20.common", "autopilot")
 
 
-def message(sample: Sample) -> Any:
+def message(sample: Px4Sample) -> Any:
     """The message of a sample, to be packed by a `MAVLink` of pymavlink.
 
     Raises:
         BridgeError: a number that is not finite, or that its field cannot hold.
-        MissingExtra: pymavlink is not installed.
+        MissingPackage: pymavlink is not installed.
     """
     if isinstance(sample, Sensors):
         return _hil_sensor(sample)
-    return _hil_gps(sample) if isinstance(sample, Fix) else _hil_state(sample)
+    return _hil_gps(sample) if isinstance(sample, GnssFix) else _hil_state(sample)
 
 
 def _hil_sensor(s: Sensors) -> Any:
@@ -188,7 +186,7 @@ def _hil_sensor(s: Sensors) -> Any:
     )
 
 
-def _hil_gps(s: Fix) -> Any:
+def _hil_gps(s: GnssFix) -> Any:
     name = "HIL_GPS"
     v_n = vector("v_n_m_s", s.v_n_m_s, name)
     speed = math.hypot(v_n[0], v_n[1])
@@ -222,11 +220,11 @@ def _hil_state(s: Truth) -> Any:
     )
 
 
-def _time(s: Sample, name: str) -> int:
+def _time(s: Px4Sample, name: str) -> int:
     return whole("time_us", s.time_us, 0, 2**64 - 1, name)
 
 
-def _position(s: Fix | Truth, name: str) -> tuple[int, int, int]:
+def _position(s: GnssFix | Truth, name: str) -> tuple[int, int, int]:
     return (
         whole("lat_rad [degE7]", frames.degE7(s.lat_rad), -900_000_000, 900_000_000, name),
         whole("lon_rad [degE7]", frames.degE7(s.lon_rad), -1_800_000_000, 1_800_000_000, name),

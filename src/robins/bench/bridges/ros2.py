@@ -29,7 +29,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from robins.bench.bridges.errors import BridgeClosed, BridgeError, needed
-from robins.bench.bridges.ros2_messages import DISTRO, FORMS, Record, decode, encode, typestore
+from robins.bench.bridges.ros2_messages import DISTRO, FORMS, RosRecord, decode, encode, typestore
 
 Convention = Literal["ros2dds", "rmw_zenoh"]
 KEPT = 100  # samples of a topic that wait to be taken; beyond, the oldest go
@@ -40,7 +40,7 @@ _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 @functools.cache
 def topic_key(
     topic: str,
-    kind: type[Record],
+    kind: type[RosRecord],
     convention: Convention,
     domain: int = 0,
     distro: str = DISTRO,
@@ -56,7 +56,7 @@ def topic_key(
 
     Raises:
         BridgeError: the topic is not of that form.
-        MissingExtra: rosbags is not installed.
+        MissingPackage: rosbags is not installed.
     """
     if not _TOPIC.fullmatch(topic):
         raise BridgeError(f"'{topic}' is no full name of a topic", fix="write such as /imu/data")
@@ -104,7 +104,7 @@ class Ros2Topics:
 
         Raises:
             BridgeClosed: an endpoint cannot be listened at, or a client's router is not there.
-            MissingExtra: eclipse-zenoh or rosbags is not installed.
+            MissingPackage: eclipse-zenoh or rosbags is not installed.
         """
         zenoh = needed("zenoh", "ros")
         typestore(distro)
@@ -131,7 +131,7 @@ class Ros2Topics:
         self._publishers: dict[str, Any] = {}
         self._subscribers: dict[str, Any] = {}
         self._arrived: dict[str, queue.Queue[bytes]] = {}
-        self._kinds: dict[str, type[Record]] = {}
+        self._kinds: dict[str, type[RosRecord]] = {}
         self._sequence = 0
         self._gid = uuid.uuid4().bytes
 
@@ -145,7 +145,7 @@ class Ros2Topics:
         """Close the session with all its publishers and subscribers. May be repeated."""
         self._session.close()
 
-    def publish(self, topic: str, record: Record) -> None:
+    def publish(self, topic: str, record: RosRecord) -> None:
         """Send a record; who does not listen yet misses it.
 
         Raises:
@@ -166,7 +166,7 @@ class Ros2Topics:
         publisher = None if kind is None else self._publishers.get(self._key(topic, kind))
         return publisher is not None and publisher.matching_status.matching
 
-    def subscribe(self, topic: str, kind: type[Record]) -> None:
+    def subscribe(self, topic: str, kind: type[RosRecord]) -> None:
         """Keep what comes on a topic until it is taken, the last 100 samples.
 
         Raises:
@@ -186,7 +186,7 @@ class Ros2Topics:
 
         self._subscribers[key] = self._session.declare_subscriber(key, keep)
 
-    def take(self, topic: str, timeout_s: float) -> Record | None:
+    def take(self, topic: str, timeout_s: float) -> RosRecord | None:
         """The oldest record that waits on a topic; None: nothing came in that time.
 
         Raises:
@@ -206,7 +206,7 @@ class Ros2Topics:
             except BridgeError:
                 self.bad += 1
 
-    def _key(self, topic: str, kind: type[Record]) -> str:
+    def _key(self, topic: str, kind: type[RosRecord]) -> str:
         key = topic_key(topic, kind, self._convention, self._domain, self._distro)
         if self._kinds.setdefault(topic, kind) is not kind:
             had = FORMS[self._kinds[topic]].name

@@ -1,10 +1,8 @@
 """Three messages of ROS 2: made of what robins has, read into it, and as bytes.
 
-| message | here | its frames |
-|---|---|---|
-| sensor_msgs/msg/Imu | `Imu` | FLU; orientation FLU to ENU, scalar last |
-| sensor_msgs/msg/NavSatFix | `Fix` | degrees, height above WGS-84; covariance ENU |
-| nav_msgs/msg/Odometry | `Odometry` | pose ENU; twist in FLU, so the velocity too |
+    sensor_msgs/msg/Imu        `ImuSample`; FLU, orientation FLU to ENU, scalar last
+    sensor_msgs/msg/NavSatFix  `NavSatFix`; degrees, height above WGS-84, covariance ENU
+    nav_msgs/msg/Odometry      `Odometry`; pose ENU, twist FLU, so the velocity too
 
 (ROS, common_interfaces; REP 103 for axes, REP 145 for IMUs.) Here everything is in SI and radians,
 in NED and FRD. A covariance that is not known is all zeros in ROS and None here; an IMU without an
@@ -40,7 +38,7 @@ _NO_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])  # in the place of one; its covari
 
 
 @dataclass(frozen=True, kw_only=True)
-class Imu:
+class ImuSample:
     """A sample of an inertial unit.
 
     Attributes:
@@ -65,7 +63,7 @@ class Imu:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fix:
+class NavSatFix:
     """A fix of a GNSS receiver.
 
     Attributes:
@@ -113,7 +111,7 @@ class Odometry:
     child: str = "base_link"
 
 
-Record = Imu | Fix | Odometry
+RosRecord = ImuSample | NavSatFix | Odometry
 
 
 @functools.cache
@@ -122,7 +120,7 @@ def typestore(distro: str = DISTRO) -> Any:
 
     Raises:
         BridgeError: rosbags does not know the distribution.
-        MissingExtra: rosbags is not installed.
+        MissingPackage: rosbags is not installed.
     """
     known = needed("rosbags.typesys", "ros")
     try:
@@ -134,22 +132,22 @@ def typestore(distro: str = DISTRO) -> Any:
         ) from None
 
 
-def encode(record: Record) -> bytes:
+def encode(record: RosRecord) -> bytes:
     """A record as CDR, with its header of four bytes.
 
     Raises:
-        MissingExtra: rosbags is not installed.
+        MissingPackage: rosbags is not installed.
     """
     form = FORMS[type(record)]
     return bytes(typestore().serialize_cdr(form.message(record), form.name))
 
 
-def decode(kind: type[Record], data: bytes) -> Record:
+def decode(kind: type[RosRecord], data: bytes) -> RosRecord:
     """The record of bytes of CDR.
 
     Raises:
         BridgeError: they are no such message.
-        MissingExtra: rosbags is not installed.
+        MissingPackage: rosbags is not installed.
     """
     form = FORMS[kind]
     store = typestore()
@@ -212,14 +210,14 @@ def _by_blocks(P: np.ndarray, turn: Callable[[np.ndarray], np.ndarray]) -> np.nd
 # --------------------------------------------------------------------------------------- messages
 
 
-def _imu(s: Imu) -> Any:
+def _imu(s: ImuSample) -> Any:
     if s.q_nb is None:
         orientation, covariance = _NO_ATTITUDE, np.array([-1.0] + [0.0] * 8)
     else:
         orientation = s.q_nb
         covariance = _flat(s.attitude_covariance, frames.enu_covariance_from_ned)
     return _make(
-        FORMS[Imu].name,
+        FORMS[ImuSample].name,
         _header(s.time_ns, s.frame),
         _quaternion(orientation),
         covariance,
@@ -230,10 +228,10 @@ def _imu(s: Imu) -> Any:
     )
 
 
-def _imu_record(m: Any) -> Imu:
+def _imu_record(m: Any) -> ImuSample:
     attitude = m.orientation_covariance[0] != -1.0
     turn, same = frames.ned_covariance_from_enu, frames.frd_covariance_from_flu
-    return Imu(
+    return ImuSample(
         time_ns=_time_ns(m.header),
         omega_ib_b_rad_s=frames.frd_from_flu(_array(m.angular_velocity)),
         f_b_m_s2=frames.frd_from_flu(_array(m.linear_acceleration)),
@@ -245,10 +243,10 @@ def _imu_record(m: Any) -> Imu:
     )
 
 
-def _fix(s: Fix) -> Any:
+def _fix(s: NavSatFix) -> Any:
     known = s.covariance_n_m2 is not None
     return _make(
-        FORMS[Fix].name,
+        FORMS[NavSatFix].name,
         _header(s.time_ns, s.frame),
         _make("sensor_msgs/msg/NavSatStatus", 0 if s.valid else -1, GPS_SERVICE),
         math.degrees(s.lat_rad),
@@ -259,10 +257,10 @@ def _fix(s: Fix) -> Any:
     )
 
 
-def _fix_record(m: Any) -> Fix:
+def _fix_record(m: Any) -> NavSatFix:
     known = m.position_covariance_type != 0
     turn = frames.ned_covariance_from_enu
-    return Fix(
+    return NavSatFix(
         time_ns=_time_ns(m.header),
         lat_rad=math.radians(m.latitude),
         lon_rad=math.radians(m.longitude),
@@ -312,16 +310,16 @@ def _odometry_record(m: Any) -> Odometry:
     )
 
 
-class Form(NamedTuple):
+class RosForm(NamedTuple):
     """How a record and its message become each other."""
 
     name: str
     message: Callable[[Any], Any]
-    record: Callable[[Any], Record]
+    record: Callable[[Any], RosRecord]
 
 
-FORMS: dict[type, Form] = {
-    Imu: Form("sensor_msgs/msg/Imu", _imu, _imu_record),
-    Fix: Form("sensor_msgs/msg/NavSatFix", _fix, _fix_record),
-    Odometry: Form("nav_msgs/msg/Odometry", _odometry, _odometry_record),
+FORMS: dict[type, RosForm] = {
+    ImuSample: RosForm("sensor_msgs/msg/Imu", _imu, _imu_record),
+    NavSatFix: RosForm("sensor_msgs/msg/NavSatFix", _fix, _fix_record),
+    Odometry: RosForm("nav_msgs/msg/Odometry", _odometry, _odometry_record),
 }
