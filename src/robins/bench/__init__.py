@@ -8,9 +8,10 @@ From the ground up:
 - `broker`: the middle, which says what to whom; what goes wrong on purpose.
 - `recording`: what went over the lines, written down, heard again, compared.
 - `live`: a running bench in a browser.
+- `bridges`: autopilots and ROS 2, by their protocols; know nothing of the rest.
 - `run`: what is asked for, doing it, what came of it. `status`: the benches of this machine.
 
-Needs the extra "bench"; the page needs "live".
+Needs the extra "bench"; the page needs "live", bridges "autopilot" and "ros".
 """
 
 from robins.bench.parts import Part

@@ -1,8 +1,9 @@
-"""The Earth: ellipsoid, gravity, rates of the local frame, magnetic field, positions as states.
+"""The Earth: ellipsoid, gravity, rates of the local frame, magnetic field, air, positions.
 
 - `wgs84`: constants and functions of the WGS-84 ellipsoid; `Geodetic`, latitude, longitude and
   height with `retract` and `local` in metres.
 - `magnetic`: the field of the WMM2020 and WMM2025 (import it by its name).
+- `atmosphere`: the standard atmosphere of 1976 (import it by its name).
 - `stars`: a catalogue, and the stars near a direction (import it by its name).
 """
 

@@ -1,0 +1,270 @@
+"""The physics that ArduPilot's SITL asks for: servo outputs come, the motion goes back as JSON.
+
+Over UDP; ArduPilot sends to port 9002, we answer to where that came from. Its packets, little
+endian, of 16 channels or, with its parameter SERVO_32_ENABLE, of 32:
+
+    magic u16 (18458; 29569 of 32) | frame_rate u16 [Hz] | frame_count u32 | pwm u16, u16 ... [us]
+
+ArduPilot waits for an answer to each packet, so the two are in lock-step. If none comes for some
+seconds it sends the packet again with the same count, and we answer the same again: nothing is
+computed twice. A count that jumps tells of packets that were lost. A smaller count, or another
+sender, tells of an ArduPilot that was started anew: the physics then has to begin anew too.
+
+(ArduPilot, libraries/SITL/examples/JSON/readme.md.) ArduPilot looks for the names of fields as
+text: no blank may follow a colon, "velocity" has to come before "velocity_wind", and each answer
+begins and ends with a newline.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins.bench.bridges.errors import BridgeClosed, BridgeError, finite, vector
+
+PORT = 9002
+MAGIC = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
+RANGEFINDERS = 6  # that ArduPilot has fields for
+Vector = Sequence[float] | np.ndarray
+Address = tuple[str, int]
+
+
+class Servos(NamedTuple):
+    """A packet of ArduPilot."""
+
+    frame: int  # number of the packet since ArduPilot started
+    rate_hz: int  # steps a second that ArduPilot would like; the physics may take others
+    pwm_us: tuple[int, ...]  # 16 or 32 pulses, 1000 to 2000; 0: this output does nothing
+    restarted: bool = False  # ArduPilot was started anew: begin at time zero
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyState:
+    """What ArduPilot is told of the motion; None: no such sensor.
+
+    Attributes:
+        time_s: of the physics, since its start.
+        f_b_m_s2: specific force, FRD: (0, 0, -9.8) at rest and level.
+        omega_ib_b_rad_s: rate against inertial, FRD; ArduPilot knows no rotation of the Earth.
+        position_n_m: north, east, down of ArduPilot's origin.
+        v_n_m_s: north, east, down.
+        q_nb: FRD to NED, scalar first.
+        airspeed_m_s: of the pitot tube.
+        wind_n_m_s: north, east, down; of the air over ground.
+        apparent_wind: direction [rad], clockwise from ahead, where it comes from; speed [m/s].
+        rangefinders_m: 6 at most.
+        battery: voltage [V], current [A].
+    """
+
+    time_s: float
+    f_b_m_s2: Vector
+    omega_ib_b_rad_s: Vector
+    position_n_m: Vector
+    v_n_m_s: Vector
+    q_nb: Vector
+    airspeed_m_s: float | None = None
+    wind_n_m_s: Vector | None = None
+    apparent_wind: tuple[float, float] | None = None
+    rangefinders_m: Sequence[float] = ()
+    battery: tuple[float, float] | None = None
+
+
+def decode(datagram: bytes) -> Servos:
+    """A packet of servo outputs.
+
+    Raises:
+        BridgeError: it is none: of another length, or of another magic number.
+    """
+    layout = MAGIC.get(int.from_bytes(datagram[:2], "little"))
+    if layout is None or len(datagram) != layout.size:
+        sizes = ", ".join(f"{known} and {form.size} bytes" for known, form in MAGIC.items())
+        raise BridgeError(
+            f"a packet of {len(datagram)} bytes that begins with {datagram[:2].hex(' ')} is none "
+            f"of ArduPilot's servo outputs, whose magic numbers and lengths are {sizes}"
+        )
+    _, rate_hz, frame, *pwm_us = layout.unpack(datagram)
+    return Servos(frame, rate_hz, tuple(pwm_us))
+
+
+def encode(state: BodyState) -> bytes:
+    """The line of JSON of a motion, newlines at both ends included.
+
+    Raises:
+        BridgeError: a number is NaN or infinite, or there are too few or too many.
+    """
+    name = "JSON"
+    told: dict[str, Any] = {
+        "timestamp": finite("time_s", state.time_s, name),
+        "imu": {
+            "gyro": vector("omega_ib_b_rad_s", state.omega_ib_b_rad_s, name),
+            "accel_body": vector("f_b_m_s2", state.f_b_m_s2, name),
+        },
+        "position": vector("position_n_m", state.position_n_m, name),
+        "quaternion": vector("q_nb", state.q_nb, name, 4),
+        "velocity": vector("v_n_m_s", state.v_n_m_s, name),
+    }
+    if state.airspeed_m_s is not None:
+        told["airspeed"] = finite("airspeed_m_s", state.airspeed_m_s, name)
+    if state.wind_n_m_s is not None:
+        told["velocity_wind"] = vector("wind_n_m_s", state.wind_n_m_s, name)
+    if state.apparent_wind is not None:
+        both = vector("apparent_wind", state.apparent_wind, name, 2)
+        told["windvane"] = dict(zip(("direction", "speed"), both, strict=True))
+    if len(state.rangefinders_m) > RANGEFINDERS:
+        raise BridgeError(f"rangefinders_m has {RANGEFINDERS} at most", name)
+    for number, range_m in enumerate(state.rangefinders_m, 1):
+        told[f"rng_{number}"] = finite("rangefinders_m", range_m, name)
+    if state.battery is not None:
+        both = vector("battery", state.battery, name, 2)
+        told["battery"] = dict(zip(("voltage", "current"), both, strict=True))
+    return b"\n" + json.dumps(told, separators=(",", ":")).encode() + b"\n"
+
+
+@dataclass
+class ArduPilotCounts:
+    """What came since we listen."""
+
+    packets: int = 0  # of servo outputs, those that are repeated included
+    lost: int = 0  # by the jumps of the count
+    repeated: int = 0  # that ArduPilot sent again, for want of an answer
+    restarts: int = 0
+    wrong: int = 0  # datagrams that are no servo outputs
+
+
+class ArduPilotPhysics:
+    """The end of the line that ArduPilot sends to; closes as a context. For one thread.
+
+    Attributes:
+        port: that ArduPilot has to send to.
+        counts: of what came.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = PORT):
+        """Listen.
+
+        Args:
+            host: address of this machine to listen at.
+            port: 9002, and 10 more for each further instance of ArduPilot; 0: any that is free.
+
+        Raises:
+            BridgeClosed: the port cannot be had.
+        """
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            raise BridgeClosed(
+                f"cannot listen: {error.strerror or error}",
+                f"{host}:{port}",
+                "end the program that listens there, or start ArduPilot with another instance",
+            ) from None
+        self.port: int = self._socket.getsockname()[1]
+        self.counts = ArduPilotCounts()
+        self._last: int | None = None  # number of the packet that was handed out last
+        self._peer: Address | None = None  # who sent it
+        self._answer = b""  # to it; empty: none yet
+        self._waiting: deque[tuple[bytes, Address]] = deque()
+
+    def __enter__(self) -> ArduPilotPhysics:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop listening. May be repeated."""
+        self._socket.close()
+
+    def receive(self, timeout_s: float) -> Servos | None:
+        """The next packet that asks for a step; None: none came in that time.
+
+        A packet that was answered and comes again is answered again and not handed out.
+
+        Raises:
+            BridgeClosed: this end was closed.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left = max(deadline - time.monotonic(), 0.0)
+            arrived = self._waiting.popleft() if self._waiting else self._take(left)
+            if arrived is None:
+                return None
+            if (servos := self._sort(*arrived)) is not None:
+                return servos
+
+    def reply(self, state: BodyState) -> None:
+        """Answer the packet that was received last with the motion after its step.
+
+        Raises:
+            BridgeError: a number is NaN or infinite, or there are too few or too many.
+            BridgeClosed: nobody asked, or this end was closed.
+        """
+        if self._peer is None:
+            raise BridgeClosed(
+                "no packet of ArduPilot came yet", f"port {self.port}", "call receive() first"
+            )
+        answer = encode(state)
+        # If we were slow, ArduPilot asked again meanwhile. It takes the answers one for one, so
+        # each beyond the first would leave it a step behind.
+        while (arrived := self._take(0.0)) is not None:
+            self._waiting.append(arrived)
+        asked = self._waiting
+        self._waiting = deque(one for one in asked if not self._repeats(*one))
+        self.counts.packets += len(asked) - len(self._waiting)
+        self.counts.repeated += len(asked) - len(self._waiting)
+        self._answer = answer
+        self._send(self._peer)
+
+    def _repeats(self, datagram: bytes, sender: Address) -> bool:
+        try:
+            return decode(datagram).frame == self._last and sender == self._peer
+        except BridgeError:
+            return False
+
+    def _sort(self, datagram: bytes, sender: Address) -> Servos | None:
+        """A packet that asks for a step; None: it was no packet, or it was answered again."""
+        try:
+            servos = decode(datagram)
+        except BridgeError:
+            self.counts.wrong += 1
+            return None
+        self.counts.packets += 1
+        last, peer = self._last, self._peer
+        if (servos.frame, sender) == (last, peer):
+            self.counts.repeated += 1
+            if self._answer:
+                self._send(sender)
+                return None
+            return servos
+        self._last, self._peer, self._answer = servos.frame, sender, b""
+        if last is None:
+            return servos
+        if servos.frame < last or sender != peer:
+            self.counts.restarts += 1
+            return servos._replace(restarted=True)
+        self.counts.lost += servos.frame - last - 1
+        return servos
+
+    def _send(self, peer: Address) -> None:
+        try:
+            self._socket.sendto(self._answer, peer)
+        except OSError as error:
+            raise BridgeClosed(f"cannot answer: {error}", f"port {self.port}") from None
+
+    def _take(self, timeout_s: float) -> tuple[bytes, Address] | None:
+        try:
+            self._socket.settimeout(timeout_s)
+            return self._socket.recvfrom(65536)
+        except (TimeoutError, BlockingIOError):
+            return None
+        except OSError as error:
+            raise BridgeClosed(f"cannot receive: {error}", f"port {self.port}") from None

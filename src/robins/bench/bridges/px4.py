@@ -1,0 +1,235 @@
+"""The simulator that PX4's SITL connects to: MAVLink 2 over TCP, in lock-step.
+
+PX4 is the client, we listen (port 4560 and its instance number). In lock-step its clock is the time
+of our samples, so that neither side can run ahead:
+
+    1. We send HIL_SENSOR with the time of the simulation, and what else is due.
+    2. PX4 sets its clock, runs once, and sends HIL_ACTUATOR_CONTROLS with the same time.
+    3. We compute the next step, and so on.
+
+While PX4 starts it takes samples and does not answer; the simulation runs on without it
+("freewheeling") until its first answer (PX4 guide, "Lockstep Simulation").
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from robins.bench.bridges.errors import BridgeClosed, BridgeTimeout
+from robins.bench.bridges.px4_messages import Actuators, Px4Sample, Sensors, dialect, message
+
+PORT = 4560
+SYSTEM, COMPONENT = 1, 200  # ours; PX4 does not look at them
+SEND_S = 5.0  # that PX4 may leave our bytes unread
+FREEWHEEL_S = 0.004  # that a step waits for an answer while PX4 starts
+
+
+@dataclass
+class Px4Counts:
+    """What came from PX4 since we listen."""
+
+    actuators: int = 0
+    heartbeats: int = 0
+    late: int = 0  # answers to an earlier sample than the one that a step waited for
+    others: int = 0  # messages that we do not use
+    bad: int = 0  # pieces of bytes that are no message, of a wrong check for example
+
+
+class Px4Simulator:
+    """The end of the line that PX4 connects to; closes as a context. For one thread.
+
+    Attributes:
+        port: that PX4 has to connect to.
+        counts: of what came.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = PORT):
+        """Listen.
+
+        Args:
+            host: address of this machine to listen at.
+            port: 4560 and the number of PX4's instance; 0: any that is free.
+
+        Raises:
+            MissingPackage: pymavlink is not installed.
+            BridgeClosed: the port cannot be had.
+        """
+        self._mavlink = dialect()
+        try:
+            self._server = socket.create_server((host, port))
+        except OSError as error:
+            raise BridgeClosed(
+                f"cannot listen: {error.strerror or error}",
+                f"{host}:{port}",
+                "end the program that listens there, or start PX4 with another instance number",
+            ) from None
+        self.port: int = self._server.getsockname()[1]
+        self.counts = Px4Counts()
+        self._where = f"PX4 at port {self.port}"
+        self._line: socket.socket | None = None
+        self._mav: Any = None
+        self._waiting: deque[Actuators] = deque()
+        self._answers = False
+
+    def __enter__(self) -> Px4Simulator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection; that PX4 has gone shows at the next send or receive."""
+        return self._line is not None
+
+    @property
+    def freewheeling(self) -> bool:
+        """Whether PX4 has not answered a sample yet."""
+        return not self._answers
+
+    def close(self) -> None:
+        """Hang up and stop listening. May be repeated."""
+        self.hang_up()
+        self._server.close()
+
+    def hang_up(self) -> None:
+        """End the connection that there may be; PX4 can connect again. May be repeated."""
+        if self._line is not None:
+            self._line.close()
+            self._line = None
+
+    def accept(self, timeout_s: float) -> None:
+        """Wait for PX4 to connect, in place of a connection that there may be, and greet it.
+
+        Raises:
+            BridgeTimeout: it did not.
+            BridgeClosed: this end was closed, or PX4 went at once.
+        """
+        self.hang_up()
+        try:
+            self._server.settimeout(timeout_s)
+            self._line, _ = self._server.accept()
+        except (TimeoutError, BlockingIOError):
+            raise BridgeTimeout(
+                f"PX4 did not connect within {timeout_s:g} s", self._where, "start PX4's SITL"
+            ) from None
+        except OSError as error:
+            raise BridgeClosed(f"cannot wait for PX4: {error}", self._where) from None
+        self._line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._mav = self._mavlink.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+        self._mav.robust_parsing = True
+        self._waiting.clear()
+        self._answers = False
+        m = self._mavlink
+        kinds = (m.MAV_TYPE_GENERIC, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE)
+        self._put(m.MAVLink_heartbeat_message(*kinds, 3))
+
+    def send(self, sample: Px4Sample) -> None:
+        """Send a sample of the sensors, a fix, or the true motion.
+
+        Raises:
+            BridgeError: the message cannot carry a number of the sample.
+            BridgeClosed: PX4 is not connected, or has gone.
+        """
+        self._put(message(sample))
+
+    def actuators(self, timeout_s: float) -> Actuators | None:
+        """The next that PX4 asks of the actuators; None: nothing came in that time.
+
+        Raises:
+            BridgeClosed: PX4 is not connected, or has gone.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not self._waiting:
+            left = deadline - time.monotonic()
+            self._take(max(left, 0.0))
+            if left <= 0.0 and not self._waiting:
+                return None
+        self._answers = True
+        return self._waiting.popleft()
+
+    def step(self, sample: Sensors, timeout_s: float = 5.0) -> Actuators | None:
+        """Send a sample and wait for the answer with its time; None while PX4 starts.
+
+        A PX4 that was built without lock-step has a clock of its own: then the newest controls
+        count. What else is due (`GnssFix`, `Truth`) is sent before.
+
+        Raises:
+            BridgeError: the message cannot carry a number of the sample.
+            BridgeClosed: PX4 is not connected, or has gone.
+            BridgeTimeout: PX4 has answered before, but not this time.
+        """
+        self.send(sample)
+        start, other = time.monotonic(), ""
+        while True:
+            patience = FREEWHEEL_S if self.freewheeling else timeout_s
+            answer = self.actuators(start + patience - time.monotonic())
+            if answer is None:
+                break
+            if not answer.lockstep:
+                newest = self._waiting.pop() if self._waiting else answer
+                self._waiting.clear()
+                return newest
+            if answer.time_us == sample.time_us:
+                return answer
+            self.counts.late += 1
+            other = f", but one to {answer.time_us} us"
+        if self.freewheeling:
+            return None
+        raise BridgeTimeout(
+            f"no answer to the sample of {sample.time_us} us within {timeout_s:g} s{other}",
+            self._where,
+            "look whether PX4 runs, and whether samples come as seldom as it computes (250 Hz)",
+        )
+
+    def _put(self, packed: Any) -> None:
+        line = self._connected()
+        line.settimeout(SEND_S)
+        # `pack` leaves the count of messages to who sends.
+        data = packed.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        try:
+            line.sendall(data)
+        except OSError as error:  # of a message cut off nothing more can be sent
+            raise self._gone(error) from None
+
+    def _take(self, timeout_s: float) -> None:
+        """Sort what comes in within a time."""
+        line = self._connected()
+        line.settimeout(timeout_s)
+        try:
+            data = line.recv(65536)
+        except (TimeoutError, BlockingIOError):
+            return
+        except OSError as error:
+            raise self._gone(error) from None
+        if not data:
+            raise self._gone("the connection ended")
+        for one in self._mav.parse_buffer(data) or ():
+            self._sort(one)
+
+    def _sort(self, one: Any) -> None:
+        kind = one.get_type()
+        if kind == "HIL_ACTUATOR_CONTROLS":
+            self.counts.actuators += 1
+            told = Actuators(one.time_usec, tuple(one.controls), one.mode, one.flags)
+            self._waiting.append(told)
+        elif kind == "HEARTBEAT":
+            self.counts.heartbeats += 1
+        elif kind == "BAD_DATA":
+            self.counts.bad += 1
+        else:
+            self.counts.others += 1
+
+    def _connected(self) -> socket.socket:
+        if self._line is None:
+            raise BridgeClosed("PX4 is not connected", self._where, "call accept()")
+        return self._line
+
+    def _gone(self, why: object) -> BridgeClosed:
+        self.hang_up()
+        return BridgeClosed(f"PX4 has gone: {why}", self._where, "accept() waits for it again")

@@ -1,0 +1,214 @@
+"""Topics of ROS 2 over Zenoh, without ROS: publish and subscribe.
+
+ROS 2 is reached by one of two programs on its side, each with its convention for keys:
+
+- "ros2dds": zenoh-bridge-ros2dds, beside ROS 2 over DDS. The key is the topic without its first
+  slash, "imu/data"; the payload is CDR.
+- "rmw_zenoh": ROS 2 with rmw_zenoh_cpp. The key is "<domain>/<topic>/<type>/<hash>", such as
+  "0/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a..."; the payload is CDR. Each sample has an
+  attachment, little endian: sequence i64 | time i64 [ns] | length of the gid u8 | gid u8 x 16.
+
+(zenoh-plugin-ros2dds, README; rmw_zenoh, docs/design.md; the hash is that of REP 2016.) No
+liveliness token is declared, so tools that list topics do not show ours.
+
+A session finds nobody by itself: it connects to the endpoints that are given and listens at those
+that are given, such as "tcp/127.0.0.1:7447".
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import queue
+import re
+import struct
+import time
+import uuid
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from robins.bench.bridges.errors import BridgeClosed, BridgeError, needed
+from robins.bench.bridges.ros2_messages import DISTRO, FORMS, RosRecord, decode, encode, typestore
+
+Convention = Literal["ros2dds", "rmw_zenoh"]
+KEPT = 100  # samples of a topic that wait to be taken; beyond, the oldest go
+_ATTACHMENT = struct.Struct("<qqB16s")
+_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+
+
+@functools.cache
+def topic_key(
+    topic: str,
+    kind: type[RosRecord],
+    convention: Convention,
+    domain: int = 0,
+    distro: str = DISTRO,
+) -> str:
+    """The key that a topic has in Zenoh.
+
+    Args:
+        topic: fully qualified, such as "/imu/data".
+        kind: what is sent on it.
+        convention: of the program on the side of ROS.
+        domain: ROS_DOMAIN_ID, for rmw_zenoh.
+        distro: of ROS, for rmw_zenoh, whose keys have a hash of the definition since Iron.
+
+    Raises:
+        BridgeError: the topic is not of that form.
+        MissingPackage: rosbags is not installed.
+    """
+    if not _TOPIC.fullmatch(topic):
+        raise BridgeError(f"'{topic}' is no full name of a topic", fix="write such as /imu/data")
+    if convention == "ros2dds":
+        return topic[1:]
+    name = FORMS[kind].name
+    package, _, message = name.split("/")
+    if distro == "humble":  # has no hashes
+        return f"{domain}{topic}/{package}::msg::dds_::{message}_/TypeHashNotSupported"
+    return f"{domain}{topic}/{package}::msg::dds_::{message}_/{typestore(distro).hash_rihs01(name)}"
+
+
+def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
+    """What rmw_zenoh attaches to a sample; gid: 16 bytes that name the publisher."""
+    return _ATTACHMENT.pack(sequence, time_ns, len(gid), gid)
+
+
+class Ros2Topics:
+    """A session of Zenoh with publishers and subscribers of ROS topics; closes as a context.
+
+    Attributes:
+        bad: samples taken that were no message of their topic.
+        dropped: samples that nobody took in time.
+    """
+
+    def __init__(
+        self,
+        *,
+        convention: Convention,
+        connect: Sequence[str] = (),
+        listen: Sequence[str] = (),
+        mode: Literal["peer", "client"] = "peer",
+        domain: int = 0,
+        distro: str = DISTRO,
+    ):
+        """Open the session.
+
+        Args:
+            convention: of the program on the side of ROS.
+            connect: endpoints to connect to. A peer tries until they are there, a client does not.
+            listen: endpoints to listen at.
+            mode: "client" where a router stands between, which then forwards everything.
+            domain: ROS_DOMAIN_ID, for rmw_zenoh.
+            distro: of ROS, for rmw_zenoh.
+
+        Raises:
+            BridgeClosed: an endpoint cannot be listened at, or a client's router is not there.
+            MissingPackage: eclipse-zenoh or rosbags is not installed.
+        """
+        zenoh = needed("zenoh", "ros")
+        typestore(distro)
+        config = zenoh.Config()
+        settings = {
+            "mode": mode,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "connect/endpoints": list(connect),
+            "listen/endpoints": list(listen),
+        }
+        for name, value in settings.items():
+            config.insert_json5(name, json.dumps(value))
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            where = ", ".join((*listen, *connect))
+            raise BridgeClosed(
+                f"Zenoh cannot open a session: {error}", where, "start the program on that side"
+            ) from None
+        self.bad = self.dropped = 0
+        self._convention: Convention = convention
+        self._domain, self._distro = domain, distro
+        self._publishers: dict[str, Any] = {}
+        self._subscribers: dict[str, Any] = {}
+        self._arrived: dict[str, queue.Queue[bytes]] = {}
+        self._kinds: dict[str, type[RosRecord]] = {}
+        self._sequence = 0
+        self._gid = uuid.uuid4().bytes
+
+    def __enter__(self) -> Ros2Topics:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the session with all its publishers and subscribers. May be repeated."""
+        self._session.close()
+
+    def publish(self, topic: str, record: RosRecord) -> None:
+        """Send a record; who does not listen yet misses it.
+
+        Raises:
+            BridgeError: the topic has no full name, or had another kind of record before.
+        """
+        key = self._key(topic, type(record))
+        if key not in self._publishers:
+            self._publishers[key] = self._session.declare_publisher(key)
+        attached = None
+        if self._convention == "rmw_zenoh":
+            self._sequence += 1
+            attached = attachment(self._sequence, time.time_ns(), self._gid)
+        self._publishers[key].put(encode(record), attachment=attached)
+
+    def heard(self, topic: str) -> bool:
+        """Whether somebody subscribes to a topic on which we have published."""
+        kind = self._kinds.get(topic)
+        publisher = None if kind is None else self._publishers.get(self._key(topic, kind))
+        return publisher is not None and publisher.matching_status.matching
+
+    def subscribe(self, topic: str, kind: type[RosRecord]) -> None:
+        """Keep what comes on a topic until it is taken, the last 100 samples.
+
+        Raises:
+            BridgeError: the topic has no full name, or had another kind of record before.
+        """
+        key = self._key(topic, kind)
+        if topic in self._arrived:
+            return
+        waiting = self._arrived[topic] = queue.Queue[bytes]()
+
+        def keep(sample: Any) -> None:  # in a thread of Zenoh
+            while waiting.qsize() >= KEPT:
+                with contextlib.suppress(queue.Empty):
+                    waiting.get_nowait()
+                    self.dropped += 1
+            waiting.put(sample.payload.to_bytes())
+
+        self._subscribers[key] = self._session.declare_subscriber(key, keep)
+
+    def take(self, topic: str, timeout_s: float) -> RosRecord | None:
+        """The oldest record that waits on a topic; None: nothing came in that time.
+
+        Raises:
+            BridgeError: there is no subscription to the topic.
+        """
+        waiting = self._arrived.get(topic)
+        if waiting is None:
+            raise BridgeError(f"no subscription to {topic}", fix="call subscribe() first")
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                data = waiting.get(timeout=max(deadline - time.monotonic(), 0.0))
+            except queue.Empty:
+                return None
+            try:
+                return decode(self._kinds[topic], data)
+            except BridgeError:
+                self.bad += 1
+
+    def _key(self, topic: str, kind: type[RosRecord]) -> str:
+        key = topic_key(topic, kind, self._convention, self._domain, self._distro)
+        if self._kinds.setdefault(topic, kind) is not kind:
+            had = FORMS[self._kinds[topic]].name
+            raise BridgeError(f"{topic} has {had}, not {FORMS[kind].name}")
+        return key
