@@ -188,6 +188,8 @@ class _Reader:
 
     def _inner(self, opcode: int, data: bytes) -> None:
         """Take a record within a chunk."""
+        if opcode == Opcode.SCHEMA:
+            return
         if opcode == Opcode.CHANNEL:
             channel = mcap.Channel.read(_stream(data[layout.RECORD.size :]))
             self._topics[channel.id] = _place(channel)
