@@ -15,7 +15,7 @@ costs: 8.6 us a message, where a writer of our own took 2.2 us. A step of the sa
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
 from robins.bench.recording import layout
+from robins.bench.recording.topics import Topic, Topics
 from robins.bench.wire.frames import FrameError, decode_frame
 from robins.bench.wire.schema import VERSION
 
@@ -38,7 +39,7 @@ class Recorder:
 
     Attributes:
         path: of the file.
-        messages: entries and events so far.
+        messages: all that was taken so far: entries, events, and messages for other tools.
         lost: of them, those that found no disk.
     """
 
@@ -47,6 +48,7 @@ class Recorder:
         path: str | Path,
         header: Mapping[str, Any],
         *,
+        topics: Iterable[Topic] = (),
         overwrite: bool = False,
     ) -> None:
         """Begin a record.
@@ -54,14 +56,17 @@ class Recorder:
         Args:
             path: of the file.
             header: of the run, such as its scenario, seeds and versions; becomes JSON.
+            topics: what other tools get of the frames that parts send, beside the frames.
             overwrite: whether a file that is there is replaced.
 
         Raises:
-            RecordingError: the file is there, or JSON cannot hold the header.
+            RecordingError: the file is there, JSON cannot hold the header, or a row of the topics
+                does not fit the messages.
             OSError: it cannot be written.
         """
         self.path = Path(path)
         self.messages = self.lost = 0
+        self._decoded = Topics(topics)
         text = layout.json_text(f"header of '{path}'", dict(header))
         self._links: dict[tuple[str, str], int] = {}  # numbers of channels
         self._topics: dict[str, int] = {}  # likewise, of all topics
@@ -112,6 +117,9 @@ class Recorder:
         if time_ns is None:
             time_ns = _time_ns(data, received_ns)
         self._add(channel, received_ns, time_ns, data)
+        for made in self._decoded.of(entry):
+            channel = self._channel(made.topic, made.encoding, made.schema)
+            self._add(channel, received_ns, made.time_ns, made.data)
 
     def event(self, event: layout.Event) -> None:
         """Take what happened.
@@ -124,6 +132,11 @@ class Recorder:
         text = layout.json_text(f"event '{event.kind}'", told)
         channel = self._channel(layout.EVENTS, MessageEncoding.JSON, layout.schemas()[1])
         self._add(channel, event.received_ns, event.received_ns, text.encode())
+
+    @property
+    def failed(self) -> int:
+        """Messages for other tools that a row's function could not make; they are left out."""
+        return self._decoded.failed
 
     def flush(self) -> None:
         """Hand to the disk what has been taken; for times in which nothing comes.
