@@ -64,6 +64,36 @@ def test_times_are_seconds_and_nanoseconds(time_ns):
     assert nanosec < NS
 
 
+@pytest.mark.parametrize("name", ros.TYPES)
+@pytest.mark.parametrize("order", "<>")
+def test_another_encoder_is_understood(name, order):
+    """rosbags writes in both orders; NaN is compared as NaN."""
+    typesys = pytest.importorskip("rosbags.typesys", reason="the cross-check needs rosbags")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    made = any_message(name)
+    theirs = store.deserialize_cdr(ros.encode(made, 3 * NS + 4, "frame"), name)
+    back = ros.decode(
+        ros.TYPES[name], bytes(store.serialize_cdr(theirs, name, little_endian=order == "<"))
+    )
+    assert (back.time_ns, back.frame_id) == (3 * NS + 4, "frame")
+    assert type(back.message) is type(made)
+    for one, other in zip(back.message, made, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_bytes_that_are_no_message():
+    made = ros.encode(ros.MagneticField([1.0, 2.0, 3.0], [0.0] * 9), 5, "frame")
+    assert ros.decode(ros.MagneticField, made + b"\0\0\0").message.magnetic_field == (1, 2, 3)
+    for cut in range(2, len(made)):
+        with pytest.raises(ros.RosError, match=r"MagneticField of .* bytes cannot be decoded"):
+            ros.decode(ros.MagneticField, made[:cut])
+    with pytest.raises(ros.RosError, match=r"encoded in another way .00070000"):
+        ros.decode(ros.MagneticField, b"\0\7" + made[2:])
+    huge = made[:12] + b"\xff\xff\xff\x7f" + made[16:]
+    with pytest.raises(ros.RosError, match="cannot be decoded"):
+        ros.decode(ros.MagneticField, huge)
+
+
 def test_what_cannot_be_encoded():
     field = ros.MagneticField([0.0] * 3, [0.0] * 9)
     with pytest.raises(ros.RosError, match="MagneticField at 2147483648000000000 ns cannot"):

@@ -5,7 +5,7 @@
 - `cdr`: the bytes of a message.
 """
 
-from robins.ros.cdr import RosError, encode
+from robins.ros.cdr import RosError, Stamped, decode, encode
 from robins.ros.convert import imu, magnetic_field, nav_sat_fix, odometry
 from robins.ros.messages import (
     TYPES,
@@ -26,6 +26,8 @@ __all__ = [
     "NavSatFix",
     "Odometry",
     "RosError",
+    "Stamped",
+    "decode",
     "definition",
     "encode",
     "imu",
