@@ -185,7 +185,8 @@ def _covariance(spread: ArrayLike | None, axes: _Axes, vectors: int = 1) -> Floa
     order = [3 * k + i for k in range(vectors) for i in axes.order]
     sign = np.array(axes.sign * vectors)
     matrix = np.asarray(spread, np.float64).reshape(size, size)
-    return (matrix[np.ix_(order, order)] * np.outer(sign, sign)).ravel().tolist()
+    turned = matrix[np.ix_(order, order)] * np.outer(sign, sign)
+    return (turned + 0.0).ravel().tolist()  # no -0.0
 
 
 def _quaternion(q_nb: Any, body: _Axes, nav: _Axes) -> Floats:
