@@ -8,8 +8,8 @@ the same entries make the same bytes. See `layout` for how they lie there.
 The writer is that of the package `mcap`; only when a chunk is over, and how it reaches the disk, is
 decided here. By itself it ends a chunk by size alone: of 3030 frames at 300 Hz, killed by SIGKILL,
 its usual chunks of 1 MiB left none and those of 64 KiB lacked 2.1 s, where this lacks 0.2 s. It
-costs: 8.6 us a message, where a writer of our own took 2.2 us. A step of the satellite's bench has
-31 messages, so that is 0.2 ms of a step more, and ten times as fast as the bench is.
+takes 8.6 us a message (116 000 a second), where a writer of our own took 2.2 us. A bench of seven
+parts passes 31 messages a step, so a step costs 0.2 ms more, mostly while the parts compute.
 """
 
 from __future__ import annotations
