@@ -1,6 +1,7 @@
 """The beginning of a file of every format, by its name."""
 
 from made_nine_axis import broad_bytes
+from made_rosbag import drive, rosbag
 from made_ulog import flight
 
 GNSS_IMU = "".join(f"17564022{k}.961,0.01,0.02,1.01,0.1,0.2,0.3,0,0,0,0\n" for k in range(40, 60))
@@ -69,4 +70,5 @@ SAMPLES = {
     "phone-csv": PHONE,
     "broad-npz": broad_bytes(),
     "px4-ulog": flight(0.1)[0],
+    "ros-mcap": rosbag(drive()),
 }

@@ -3,7 +3,7 @@
 - `open_log`, `load_dataset`, `load_pair`: any known format, recognised by content, into the tables
   of `robins.dataset`; `FORMATS` lists them. A file is read exactly or refused with a `LogError`.
 - `load_ranges`: pseudoranges and odometry of a car, text of libRSF, into a `RangeLog`.
-- `write_log`: the same formats as text, by default those with units in their header.
+- `write_log`: text, by default with units in its header, or a recording of ROS 2.
 - `TextFormat` and `Column`: a row for a format of your own, `columns_from` reads it from TOML.
 - `Mounting`: how the IMU sits in the vehicle.
 - `examine`: the doctor; findings in sentences about units, axes, time, sigmas.

@@ -79,7 +79,7 @@ OF_READERS = (
     Code("no_velocity", "note", "RTKLIB did not solve for velocities"),
     Code("height_above_geoid", "warning", "heights are above the geoid, not the ellipsoid"),
     Code("dt_disagrees", "warning", "the column dt is not the time that has passed"),
-    Code("several_instances", "note", "a flight log holds several sensors of one kind"),
+    Code("several_instances", "note", "a recording holds several sensors of one kind"),
     Code("angle_range", "warning", "single angles that cannot be; they are taken as missing"),
     Code("quaternion_length", "warning", "single quaternions of another length; likewise"),
     Code("other_kinds", "note", "a file holds lines of kinds that are not read"),

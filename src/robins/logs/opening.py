@@ -27,8 +27,8 @@ _FOREIGN = {
     b"\x28\xb5\x2f\xfd": ("a zstd file", "unpack it first"),
     b"ULog": ("a PX4 ULog", "leave the format to be recognised"),
     b"#ROSBAG": ("a ROS bag", "export the IMU and GNSS topics to CSV"),
-    b"SQLite": ("an SQLite file (a ROS 2 bag?)", "export the IMU and GNSS topics to CSV"),
-    b"\x89MCAP": ("an MCAP file", "export the IMU and GNSS topics to CSV"),
+    b"SQLite": ("an SQLite file (a ROS 2 bag?)", "convert it to MCAP: ros2 bag convert"),
+    b"\x89MCAP": ("an MCAP file", "leave the format to be recognised"),
     b"\x89HDF": ("an HDF5 or MATLAB v7.3 file", "export the columns to CSV"),
     b"MATLAB": ("a MATLAB file", "export the columns to CSV"),
 }
@@ -152,8 +152,10 @@ def whole(path: str | os.PathLike[str], limit: int) -> tuple[bytes, bool]:
 _OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 
 
-def write_lines(path: str | os.PathLike[str], blocks: Iterable[str]) -> None:
-    """Write text, compressed if the name ends in .xz or .gz; an earlier file stays until the end.
+def write_lines(path: str | os.PathLike[str], blocks: Iterable[str | bytes]) -> None:
+    """Write text or bytes, compressed if the name ends in .xz or .gz.
+
+    An earlier file stays until the end.
 
     Raises:
         LogError: the file cannot be written; no part of it is left behind.
@@ -171,13 +173,13 @@ def write_lines(path: str | os.PathLike[str], blocks: Iterable[str]) -> None:
         ) from error
 
 
-def _write(path: str | Path, suffix: str, blocks: Iterable[str]) -> None:
-    with _OPENERS.get(suffix, open)(path, "wt", encoding="utf-8", newline="\n") as file:
+def _write(path: str | Path, suffix: str, blocks: Iterable[str | bytes]) -> None:
+    with _OPENERS.get(suffix, open)(path, "wb") as file:
         for block in blocks:
-            file.write(block)
+            file.write(block.encode() if isinstance(block, str) else block)
 
 
-def _write_and_rename(path: Path, blocks: Iterable[str]) -> None:
+def _write_and_rename(path: Path, blocks: Iterable[str | bytes]) -> None:
     handle, temporary = tempfile.mkstemp(prefix=".", dir=path.parent)
     os.close(handle)
     try:

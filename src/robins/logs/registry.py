@@ -1,7 +1,7 @@
-"""The formats of logs, recognised by content: `open_log` reads them, `write_log` writes text.
+"""The formats of logs, recognised by content: `open_log` reads them, `write_log` writes some.
 
 Text is described by the rows of `robins.logs.text_formats`; what is no table of numbers has a
-reader of its own and a row here.
+reader of its own and a row here, and perhaps a writer.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import partial
 from typing import NamedTuple
 
 from robins.dataset import Dataset
-from robins.logs import broad, phone, rtklib, ulog
+from robins.logs import broad, phone, rosbag, rtklib, ulog
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.mounting import Origin
 from robins.logs.opening import beginning
@@ -23,6 +23,7 @@ from robins.logs.tables import Table, kind_in_text, tables_of
 from robins.logs.text import Head, peek
 from robins.logs.text_format import TextFormat
 from robins.logs.text_formats import TEXT_FORMATS
+from robins.logs.write_rosbag import write_rosbag
 from robins.logs.write_text import write_text
 
 
@@ -36,6 +37,7 @@ class Format(NamedTuple):
     read: Callable[..., Table | Dataset]
     binary: bool = False
     text: TextFormat | None = None  # its row, by which it is also written
+    write: Callable[[str | os.PathLike[str], Table | Dataset], None] | None = None  # no text
 
 
 def _of_text(row: TextFormat) -> Format:
@@ -73,6 +75,15 @@ FORMATS: tuple[Format, ...] = (
         ulog.is_ulog,
         ulog.read_ulog,
         binary=True,
+    ),
+    Format(
+        "ros-mcap",
+        ("imu", "mag", "gnss"),
+        "ROS 2: .mcap with Imu, MagneticField, NavSatFix; needs the extra 'robins[logs]'",
+        rosbag.is_mcap,
+        rosbag.read_rosbag,
+        binary=True,
+        write=write_rosbag,
     ),
 )
 """All of them."""
@@ -160,13 +171,14 @@ def write_log(
     week: int | None = None,
     origin: Origin | None = None,
 ) -> None:
-    """Write a table as text that is read back as it was: every number, but for conversions.
+    """Write a table so that it is read back as it was: every number, but for conversions.
 
     Args:
         path: the file; compressed if its name ends in .xz or .gz.
         table: what the format holds; several tables as a dataset.
         format: a name in `FORMATS`, or a row of your own; by default ``named-imu`` for inertial
-            samples and ``named-path`` for a path.
+            samples and ``named-path`` for a path, both text, and ``ros-mcap`` if the name ends in
+            .mcap.
         week: where time is that of a GPS week: the week whose beginning absolute stamps are counted
             from, by default that of the first (give the same for the files of one run), and that
             which other stamps are of.
@@ -179,13 +191,22 @@ def write_log(
     if isinstance(format, TextFormat):
         row = format
     else:
-        written = [f for f in FORMATS if f.text is not None]
-        row = _called(format or _usual(path, table), written, path).text
+        written = [f for f in FORMATS if f.text or f.write]
+        named = _called(format or _usual(path, table), written, path)
+        if named.write is not None:
+            if week is not None or origin is not None:
+                cause = f"{named.name} has neither a GPS week nor local metres"
+                raise LogError(str(path), cause, "give no week and no origin")
+            named.write(path, table)
+            return
+        row = named.text
     assert row is not None
     write_text(row, path, table, week=week, origin=origin)
 
 
 def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
+    if str(path).endswith(".mcap"):
+        return "ros-mcap"
     kinds = tuple(map(kind_in_text, tables_of(table)))
     for name in ("named-imu", "named-path"):
         if kinds == _called(name, FORMATS, path).holds:
@@ -193,7 +214,7 @@ def _usual(path: str | os.PathLike[str], table: Table | Dataset) -> str:
     raise LogError(
         str(path),
         f"no named format holds {' and '.join(map(words_of, kinds))}",
-        f"choose a format: {', '.join(f.name for f in FORMATS if f.text)}",
+        f"choose a format: {', '.join(f.name for f in FORMATS if f.text or f.write)}",
     )
 
 

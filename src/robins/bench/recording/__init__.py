@@ -1,6 +1,7 @@
 """Records of the lines: written, read, replayed to a part, compared.
 
 - `layout`: how entries lie in an MCAP file. `writer`, `reader`: to the disk and back.
+- `topics`: messages for other tools beside the frames, a row a topic.
 - `replay`: a part hears a record again. `differences`: two runs, field by field.
 """
 
@@ -8,6 +9,7 @@ from robins.bench.recording.differences import FieldDifference
 from robins.bench.recording.layout import Entry, Event, RecordingError
 from robins.bench.recording.reader import Record, read_record
 from robins.bench.recording.replay import Replayed, ReplayError
+from robins.bench.recording.topics import Topic
 from robins.bench.recording.writer import Recorder
 
 __all__ = [
@@ -19,5 +21,6 @@ __all__ = [
     "RecordingError",
     "ReplayError",
     "Replayed",
+    "Topic",
     "read_record",
 ]

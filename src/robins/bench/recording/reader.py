@@ -13,12 +13,15 @@ from mcap import records as mcap
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
+from mcap.well_known import MessageEncoding
 
 from robins.bench.recording import layout
 from robins.bench.wire.frames import VERSION
 
 LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage, and no memory is asked for it
 _ABOUT = {"wire", "header", "check"}
+_Place = tuple[str, Literal["to", "from"]]
+_EVENTS: _Place = ("", "from")  # no link has this name
 _DIRECTIONS: dict[str, Literal["to", "from"]] = {"to": "to", "from": "from"}
 
 
@@ -109,7 +112,7 @@ class _Reader:
         self.events: list[layout.Event] = []
         self._file = file
         self._at = self._check = self._before = 0
-        self._topics: dict[int, tuple[str, Literal["to", "from"]] | None] = {}  # None: events
+        self._topics: dict[int, _Place | None] = {}  # None: of messages for other tools
         self._count = 0  # messages so far, which have numbers
 
     def take(self, size: int) -> bytes:
@@ -188,6 +191,8 @@ class _Reader:
 
     def _inner(self, opcode: int, data: bytes) -> None:
         """Take a record within a chunk."""
+        if opcode == Opcode.SCHEMA:
+            return
         if opcode == Opcode.CHANNEL:
             channel = mcap.Channel.read(_stream(data[layout.RECORD.size :]))
             self._topics[channel.id] = _place(channel)
@@ -198,10 +203,10 @@ class _Reader:
         if number != self._count & 0xFFFFFFFF:
             raise _Damage(f"message {number} where number {self._count} should be")
         place, content = self._topics[channel], data[layout.MESSAGE.size :]
-        if place is None:
+        if place == _EVENTS:
             told = json.loads(content)
             self.events.append(layout.Event(log_ns, told["kind"], told["text"], told["fields"]))
-        else:
+        elif place is not None:
             self.entries.append(layout.Entry(log_ns, *place, content))
         self._count += 1
 
@@ -225,9 +230,11 @@ def _stream(body: bytes) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(body))
 
 
-def _place(channel: mcap.Channel) -> tuple[str, Literal["to", "from"]] | None:
-    """Link and direction of a topic; None: events."""
+def _place(channel: mcap.Channel) -> _Place | None:
+    """Link and direction of a topic, or that of events; None: its messages are for other tools."""
     if channel.topic == layout.EVENTS:
+        return _EVENTS
+    if channel.message_encoding in (MessageEncoding.CDR, MessageEncoding.JSON):
         return None
     empty, link, direction = channel.topic.split("/")
     if empty or channel.message_encoding != f"{layout.ENCODING}{VERSION}":

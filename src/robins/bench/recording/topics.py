@@ -1,0 +1,184 @@
+"""Messages of the wire as topics that other tools decode: a table, a row a topic.
+
+A row says which message becomes which type of ROS 2, or JSON, by which function, in which frame:
+
+    Topic("sample", "/imu", "sensor_msgs/msg/Imu", lambda v: imu(v["omega_b"], body="FRD"), "imu")
+    Topic("mode", "/mode", JSON, as_json)
+
+A `Recorder` with rows writes, next to each sound frame that a part sends, what the rows make of it.
+The header has the time of the frame, so the start of the run is zero. Messages of ROS are along the
+axes that `robins.ros.convert` names; JSON has the fields and units of the wire. The functions of
+that module are here too, for the rows.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.records import Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+
+from robins.bench.recording.layout import EVENTS, Entry, RecordingError
+from robins.bench.wire.fields import Message
+from robins.bench.wire.frames import FrameError, decode_frame
+from robins.bench.wire.schema import Wire
+from robins.ros import TYPES, definition, encode
+from robins.ros import Message as RosMessage
+from robins.ros import imu as imu
+from robins.ros import magnetic_field as magnetic_field
+from robins.ros import nav_sat_fix as nav_sat_fix
+from robins.ros import odometry as odometry
+
+JSON = "json"
+Values = Mapping[str, Any]
+"""Of a message, by field."""
+_FAILS = (LookupError, TypeError, ValueError, ArithmeticError)
+
+
+class Topic(NamedTuple):
+    """Which message of the wire becomes which message of a topic."""
+
+    message: str  # of the wire
+    topic: str  # begins with a slash
+    type: str  # of ROS, one of `robins.ros.TYPES`, or `JSON`
+    make: Callable[[Values], RosMessage | dict[str, Any]]  # from decoded values
+    frame_id: str = ""
+
+
+class Made(NamedTuple):
+    """A message of a topic."""
+
+    topic: str
+    encoding: str
+    schema: Schema
+    time_ns: int
+    data: bytes
+
+
+def as_json(values: Values) -> dict[str, Any]:
+    """All fields of a message as JSON has them: lists, and null where a number is not finite."""
+
+    def plain(x: Any) -> Any:
+        if isinstance(x, list):
+            return [plain(one) for one in x]
+        return x if isinstance(x, int) or math.isfinite(x) else None
+
+    return {name: plain(np.asarray(value).tolist()) for name, value in values.items()}
+
+
+class Topics:
+    """Rows, ready to be applied to what parts send.
+
+    Attributes:
+        failed: messages that a row's function could not make; they are left out.
+    """
+
+    def __init__(self, wire: Wire, rows: Iterable[Topic]):
+        """Check the rows on messages of zeros.
+
+        Args:
+            wire: the messages.
+            rows: of the table.
+
+        Raises:
+            RecordingError: a row names a message, a type, or a topic that cannot be, or its
+                function does not make what it says.
+        """
+        self.failed, self._wire = 0, wire
+        self._by_number: dict[int, list[tuple[Topic, Schema]]] = {}
+        taken = {EVENTS}
+        for row in rows:
+            if row.message not in wire.numbers:
+                there = ", ".join(wire.numbers)
+                raise _wrong(row, f"no message '{row.message}'", f"one of {there}")
+            if row.type != JSON and row.type not in TYPES:
+                raise _wrong(row, f"no type '{row.type}'", f"one of {', '.join([*TYPES, JSON])}")
+            if not re.fullmatch(r"(/[A-Za-z_]\w*)+", row.topic):
+                raise _wrong(row, "this is no name of a topic", "one such as /sensor/imu")
+            if row.topic in taken or re.fullmatch("/[^/]+/(to|from)", row.topic):
+                raise _wrong(row, "the topic has other messages", "another name")
+            taken.add(row.topic)
+            _try(wire, row)
+            number = wire.numbers[row.message]
+            self._by_number.setdefault(number, []).append((row, _schema(row, wire.message(number))))
+
+    def of(self, entry: Entry) -> list[Made]:
+        """What the rows make of something that was on a line; nothing if it is no sound frame."""
+        if not self._by_number or entry.direction != "from" or len(entry.data) < 2:
+            return []
+        try:
+            head, payload = decode_frame(entry.data[1:-1])
+        except FrameError:
+            return []
+        rows = self._by_number.get(head.type)
+        if not rows or self._wire.unsound(rows[0][0].message, payload):
+            return []
+        values, made = self._wire.decode(rows[0][0].message, payload), []
+        for row, schema in rows:
+            try:
+                data = _bytes_of(row, row.make(values), head.time_ns)
+            except _FAILS:  # what others would see is not worth the run, and the frame is kept
+                self.failed += 1
+                continue
+            encoding = MessageEncoding.JSON if row.type == JSON else MessageEncoding.CDR
+            made.append(Made(row.topic, encoding, schema, head.time_ns, data))
+        return made
+
+
+def _wrong(row: Topic, what: str, fix: str) -> RecordingError:
+    return RecordingError(what, f"topic '{row.topic}'", f"give {fix}")
+
+
+def _try(wire: Wire, row: Topic) -> None:
+    """That the function of a row makes what it says.
+
+    Raises:
+        RecordingError: it does not.
+    """
+    values = wire.decode(row.message, bytes(wire.size_of(row.message)))
+    try:
+        made = row.make(values)
+        fits = isinstance(made, TYPES.get(row.type, dict))
+        if fits:
+            _bytes_of(row, made, 0)
+    except _FAILS as error:
+        why = f"its function fails ({type(error).__name__}: {error})"
+        raise _wrong(row, why, f"one of the fields {', '.join(values)}") from None
+    if not fits:
+        why = f"its function makes {type(made).__name__}, not {row.type}"
+        raise _wrong(row, why, "one that makes this type")
+
+
+def _bytes_of(row: Topic, made: Any, time_ns: int) -> bytes:
+    if row.type != JSON:
+        return encode(made, time_ns, row.frame_id)
+    sec, nsec = divmod(time_ns, 1_000_000_000)
+    head = {"timestamp": {"sec": sec, "nsec": nsec}, "frame_id": row.frame_id}
+    return json.dumps(head | made, allow_nan=False).encode()
+
+
+def _schema(row: Topic, of: Message) -> Schema:
+    """What the messages of a topic are made of."""
+    if row.type != JSON:
+        text = definition(TYPES[row.type])
+        return Schema(0, text.encode(), SchemaEncoding.ROS2, row.type)
+    whole = {"type": "integer"}
+    fields: dict[str, Any] = {
+        "timestamp": {"type": "object", "properties": {"sec": whole, "nsec": whole}},
+        "frame_id": {"type": "string"},
+    }
+    for f in of.fields:
+        # Foxglove takes one type a field, so null is said in words
+        one = {"type": "number" if f.kind == "f64" else "integer"}
+        many = {"type": "array", "items": one, "minItems": f.length, "maxItems": f.length}
+        unit = "" if f.unit == "1" else f" [{f.unit}]"
+        missing = "; null: not known" if f.missing else ""
+        about = {"description": f"{f.text}{unit}{missing}", "unit": f.unit}
+        fields[f.name] = (one if f.length == 1 else many) | about
+    text = json.dumps({"type": "object", "description": of.text, "properties": fields})
+    return Schema(0, text.encode(), SchemaEncoding.JSONSchema, f"robins.{of.name}")

@@ -1,0 +1,184 @@
+"""Recordings of ROS 2 in MCAP files: the messages of `robins.ros`, as tables.
+
+Of each type the first topic that has messages counts:
+
+- ``sensor_msgs/msg/Imu``: rates [rad/s] and specific force [m/s^2]. The orientation is the estimate
+  of whoever wrote it, no truth, and is left alone.
+- ``sensor_msgs/msg/MagneticField``: magnetic field [T].
+- ``sensor_msgs/msg/NavSatFix``: fixes; sigmas are missing where the covariance is not known.
+
+Axes of sensors are forward-left-up (REP-103) and become those of a table. The stamp is that of the
+header: UTC since 1970, which becomes GPS time, or else a count from a start of its own, which stays
+(a second of UTC that is a leap second has no stamp of its own).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins import ros
+from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.gps_time import GPS_EPOCH_S, gps_of
+from robins.logs.findings import Finding, LogError, report, telling
+from robins.logs.opening import whole
+from robins.logs.tables import Table
+from robins.logs.text import Head
+
+MAGIC = b"\x89MCAP0\r\n"
+_LARGEST = 1 << 30  # bytes of a file
+_FLU = np.array([1.0, -1.0, -1.0])  # forward-left-up <-> forward-right-down
+_NED = [1, 0, 2]  # of east, north, up: variances have no sign
+_QUALITY = {0: 5, 1: 3, 2: 4}  # status of a NavSatFix -> RTKLIB's Q
+_KINDS: tuple[type[ros.Message], ...] = (ros.Imu, ros.MagneticField, ros.NavSatFix)
+_EARLY = (
+    "{name} breaks off ({why}): the recording or the copy was interrupted. All before it was read."
+)
+NO_PACKAGE = "is an MCAP file, and the package for these is not installed"
+INSTALL = "install it with: pip install 'robins[logs]'"
+
+
+class _Found(NamedTuple):
+    """The messages of a topic."""
+
+    topic: str
+    time_ns: np.ndarray
+    messages: list[Any]
+
+    def column(self, name: str) -> np.ndarray:
+        """A field of all messages."""
+        return np.array([getattr(one, name) for one in self.messages], np.float64)
+
+    def known(self, name: str) -> np.ndarray:
+        """A quantity of an Imu, along forward-right-down; NaN where it says that it has none."""
+        values, first = self.column(name) * _FLU, self.column(f"{name}_covariance")[:, 0]
+        return np.where((first == -1.0)[:, None], np.nan, values)
+
+
+def is_mcap(head: Head) -> bool:
+    """Whether a file begins as MCAP files do."""
+    return head.start.startswith(MAGIC)
+
+
+def read_rosbag(
+    path: str | os.PathLike[str], findings: list[Finding] | None = None
+) -> Table | Dataset:
+    """Read inertial samples, magnetic field and fixes.
+
+    Args:
+        path: the file, plain or compressed.
+        findings: receives what was left out; without it that is issued as `LogWarning`.
+
+    Returns:
+        A dataset; a table where there are no inertial samples but magnetic field or fixes.
+
+    Raises:
+        LogError: the package `mcap` is not installed; the file is damaged, or holds no samples.
+    """
+    file = str(path)
+    topics = _messages(file, path, findings)
+    imu, mag, gnss = (_first(file, topics, kind, findings) for kind in _KINDS)
+    field = mag and MagTable(mag.time_ns, mag.column("magnetic_field") * _FLU, source=file)
+    fixes = gnss and _fixes(file, gnss)
+    if imu is not None:
+        rates, accel = imu.known("angular_velocity"), imu.known("linear_acceleration")
+        return Dataset(
+            name=Path(file).name.split(".")[0],
+            imu=ImuTable(imu.time_ns, rates, accel, "rate", source=file),
+            mag=field,
+            gnss=fixes,
+            time_unit_known=(file,),
+        )
+    alone = field if fixes is None else fixes
+    if alone is None or (field is not None and fixes is not None):
+        held = ", ".join(sorted({name for name, _ in topics})) or "no messages that robins reads"
+        cause = f"has no messages {ros.name_of(ros.Imu)}; it holds {held}"
+        raise LogError(file, cause, "record that topic as well")
+    return alone
+
+
+def _messages(
+    file: str, path: str | os.PathLike[str], findings: list[Finding] | None
+) -> dict[tuple[str, str], list[ros.Stamped]]:
+    """All messages of these types, by type and topic.
+
+    Raises:
+        LogError: as `read_rosbag`.
+    """
+    try:
+        from mcap.exceptions import EndOfFile, McapError
+        from mcap.reader import NonSeekingReader
+    except ImportError as error:
+        raise LogError(file, NO_PACKAGE, INSTALL) from error
+    data, cut = whole(path, _LARGEST)
+    found: dict[tuple[str, str], list[ros.Stamped]] = {}
+    names = {ros.name_of(kind): kind for kind in _KINDS}
+    reader = NonSeekingReader(io.BytesIO(data), validate_crcs=True)
+    why = "its compressed stream has no end" if cut else ""
+    try:
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if schema is None or schema.name not in names or channel.message_encoding != "cdr":
+                continue
+            one = ros.decode(names[schema.name], message.data)
+            found.setdefault((schema.name, channel.topic), []).append(one)
+    except EndOfFile:
+        why = f"after {len(data)} bytes"
+    except (McapError, ros.RosError, struct.error, ValueError, KeyError) as error:
+        mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
+        raise LogError(file, f"is damaged ({type(error).__name__}: {error})", mend) from error
+    if why:
+        sentence = _EARLY.format(name=Path(file).name, why=why)
+        place = f"byte {len(data)}"
+        report(findings, Finding("warning", "ends_early", file, place, len(data), sentence))
+    return found
+
+
+def _first(
+    file: str,
+    topics: dict[tuple[str, str], list[ros.Stamped]],
+    kind: type[ros.Message],
+    findings: list[Finding] | None,
+) -> _Found | None:
+    """The first topic of a type."""
+    name = ros.name_of(kind)
+    found = [topic for of, topic in topics if of == name]
+    if not found:
+        return None
+    if len(found) > 1:
+        telling(findings, "note", "several_instances", file, value=len(found))(
+            f"{name} was recorded on {len(found)} topics; the first, {found[0]}, is read and the "
+            f"others are left alone: {', '.join(found[1:])}."
+        )
+    stamped = topics[name, found[0]]
+    time_ns = np.array([one.time_ns for one in stamped], np.int64)
+    dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
+    return _Found(
+        found[0], np.where(dated, gps_of(time_ns), time_ns), [one.message for one in stamped]
+    )
+
+
+def _fixes(file: str, gnss: _Found) -> GnssTable:
+    status = gnss.column("status")
+    lost = status < 0
+    variance = gnss.column("position_covariance")[:, [0, 4, 8]][:, _NED]
+    unknown = gnss.column("position_covariance_type") == 0
+    with np.errstate(invalid="ignore"):  # a negative variance is none
+        sigma_m = np.where(unknown[:, None], np.nan, np.sqrt(variance))
+
+    def known(name: str) -> np.ndarray:
+        return np.where(lost, np.nan, gnss.column(name))
+
+    return GnssTable(
+        time_ns=gnss.time_ns,
+        lat_rad=np.deg2rad(known("latitude")),
+        lon_rad=np.deg2rad(known("longitude")),
+        alt_m=known("altitude"),
+        sigma_m=sigma_m,
+        quality=np.array([_QUALITY.get(int(k), 0) for k in status], np.int64),
+        source=file,
+    )

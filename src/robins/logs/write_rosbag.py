@@ -1,0 +1,153 @@
+"""Writing inertial samples, magnetic field and fixes as ROS 2 records them, in an MCAP file.
+
+Profile "ros2" of MCAP (mcap.dev/spec/registry). Topics have the names that drivers usually give:
+``/imu/data_raw``, ``/imu/mag``, ``/gnss/fix``. Axes of sensors become forward-left-up, covariances
+east-north-up. Stamps that are GPS time become UTC, others stay.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robins import ros
+from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.gps_time import GPS_EPOCH_S, utc_of
+from robins.logs.findings import LogError, LogWarning
+from robins.logs.opening import write_lines
+from robins.logs.quantities import words_of
+from robins.logs.rosbag import INSTALL, NO_PACKAGE
+from robins.logs.tables import Table, kind_in_text, tables_of
+
+_LATEST_NS = (1 << 31) * 1_000_000_000
+_BLOCK = 2000  # messages that are handed to the file at once
+_STATUS = {3: 1, 4: 2, 1: 2, 2: 2}  # RTKLIB's Q -> status of a NavSatFix; else 0, a plain fix
+
+
+class _Topic(NamedTuple):
+    """How rows of a table are written."""
+
+    name: str
+    frame_id: str
+    kind: type[ros.Message]
+    make: Callable[[Any, int], ros.Message]  # of a table, from its row
+
+
+def _fix(table: GnssTable, k: int) -> ros.Message:
+    place = float(table.lat_rad[k]), float(table.lon_rad[k]), float(table.alt_m[k])
+    quality = 0 if table.quality is None else int(table.quality[k])
+    status = _STATUS.get(quality, 0) if np.isfinite(place[:2]).all() else None
+    spread = np.diag(table.sigma_m[k] ** 2)
+    return ros.nav_sat_fix(*place, covariance=spread, nav=table.nav, status=status)
+
+
+_TOPICS: dict[type[Any], _Topic] = {
+    ImuTable: _Topic(
+        "/imu/data_raw",
+        "imu",
+        ros.Imu,
+        lambda t, k: ros.imu(t.gyro[k], t.accel[k], body=t.body),
+    ),
+    MagTable: _Topic(
+        "/imu/mag",
+        "imu",
+        ros.MagneticField,
+        lambda t, k: ros.magnetic_field(t.field_t[k], body=t.body),
+    ),
+    GnssTable: _Topic("/gnss/fix", "gnss", ros.NavSatFix, _fix),
+}
+
+
+def write_rosbag(path: str | os.PathLike[str], table: Table | Dataset) -> None:
+    """Write tables; `robins.logs.rosbag.read_rosbag` reads them back.
+
+    Velocities of fixes have no place in a NavSatFix: they are left out, and a `LogWarning` says so.
+    Neither has a fix of which one sigma is missing: then none is known. Of the qualities 1, 2 and 4
+    of RTKLIB all become "with ground-based augmentation".
+
+    Raises:
+        LogError: a table of another kind, increments, or a time that ROS cannot say; the package
+            `mcap` is not installed; or the file cannot be written. No part of it is left behind.
+    """
+    tables = tables_of(table)
+    for one in tables:
+        _check(str(path), one)
+    write_lines(path, _blocks(str(path), tables))
+    if any(isinstance(one, GnssTable) and one.v_n is not None for one in tables):
+        left = "velocities of the fixes are left out, for NavSatFix has no place for them"
+        warnings.warn(f"{Path(path).name}: {left}", LogWarning, stacklevel=2)
+
+
+def _check(file: str, table: Table) -> None:
+    """Refuse what these messages do not hold."""
+    if type(table) not in _TOPICS:
+        held = "inertial samples, magnetic field and fixes"
+        cause = f"ros-mcap holds {held}, not {words_of(kind_in_text(table))}"
+        raise LogError(file, cause, "choose another format")
+    if isinstance(table, ImuTable) and table.kind != "rate":
+        cause = "ros-mcap wants rates, these are increments"
+        raise LogError(file, cause, "divide them by their dt first")
+    if len(table) and not (table.time_ns.min() >= 0 and table.time_ns.max() < _LATEST_NS):
+        cause = "ROS has times from 1970 to 2038 only, as seconds from 0 to 2^31"
+        raise LogError(file, cause, "let the stamps begin at zero")
+
+
+class _Sink:
+    """What the writer of MCAP takes for a file; gives what was written, in pieces."""
+
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+        self._at = 0
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at + len(self._waiting)
+
+    def take(self) -> bytes:
+        out = bytes(self._waiting)
+        self._at += len(out)
+        self._waiting.clear()
+        return out
+
+
+def _blocks(file: str, tables: list[Table]) -> Iterator[bytes]:
+    """The file, in pieces; messages in the order of their times."""
+    try:
+        from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+        from mcap.writer import Writer
+    except ImportError as error:
+        raise LogError(file, NO_PACKAGE, INSTALL) from error
+    sink: Any = _Sink()
+    writer = Writer(sink)
+    writer.start(Profile.ROS2, "robins")
+    topics, channels = [_TOPICS[type(one)] for one in tables], []
+    for topic in topics:
+        name, text = ros.name_of(topic.kind), ros.definition(topic.kind).encode()
+        schema = writer.register_schema(name, SchemaEncoding.ROS2, text)
+        about = {"offered_qos_profiles": ""}  # the profile wants it
+        channels.append(writer.register_channel(topic.name, MessageEncoding.CDR, schema, about))
+    times = [_utc(one.time_ns) for one in tables]
+    which = np.repeat(np.arange(len(tables)), [len(one) for one in tables])
+    row = np.concatenate([np.arange(len(one)) for one in tables])
+    order = np.argsort(np.concatenate(times), kind="stable")
+    for count, (t, k) in enumerate(zip(which[order].tolist(), row[order].tolist(), strict=True)):
+        topic, time_ns = topics[t], int(times[t][k])
+        data = ros.encode(topic.make(tables[t], k), time_ns, topic.frame_id)
+        writer.add_message(channels[t], time_ns, data, time_ns, k)
+        if count % _BLOCK == _BLOCK - 1:
+            yield sink.take()
+    writer.finish()
+    yield sink.take()
+
+
+def _utc(time_ns: np.ndarray) -> np.ndarray:
+    dated = time_ns >= GPS_EPOCH_S * 1_000_000_000
+    return np.where(dated, utc_of(time_ns).astype(np.int64), time_ns)
