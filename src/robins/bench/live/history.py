@@ -21,7 +21,7 @@ import numpy as np
 from robins.bench.live.feed import MARK, SAMPLE_HEAD
 
 BUCKETS = 4096
-BLOCK = 64  # samples are taken in together, since each call of NumPy costs as much as ten values
+BLOCK = 128  # samples are taken in together, since each call of NumPy costs as much as ten values
 HISTORY_HEAD = struct.Struct("<6I")
 
 

@@ -3,22 +3,27 @@
 import { say } from "./format.js";
 
 const SURE_MS = 3000;
-const RUNNING = new Set(["running"]);
+const BUSY = new Set(["running", "preparing"]);
 const OVER = new Set(["stopped", "failed"]);
 
 const answer = document.getElementById("answer");
 const form = document.getElementById("inject");
 
-/** Say what became of a command. */
+let before = "";
+let times = 0;
+
+/** Say what became of a command; what is said again and again is counted. */
 export function told(text, good) {
-  say(answer, text);
+  times = text === before ? times + 1 : 1;
+  before = text;
+  say(answer, times > 1 ? `${text} (${times} times)` : text);
   answer.classList.toggle("alarm", !good);
 }
 
 /** Grey what makes no sense now. It stays focusable, so that the keyboard does not lose its place. */
 export function allow(open, state) {
   const off = {
-    start: !open || RUNNING.has(state) || OVER.has(state),
+    start: !open || BUSY.has(state) || OVER.has(state),
     pause: !open || state === "paused" || OVER.has(state),
     stop: !open || OVER.has(state),
     clear: !open || OVER.has(state),
@@ -28,7 +33,7 @@ export function allow(open, state) {
   form.querySelector("[type=submit]").setAttribute("aria-disabled", String(off.clear || form.classList.contains("none")));
 }
 
-/** Join the buttons with what sends a command. */
+/** Join the buttons with what sends a command; gives what sends another and says if that fails. */
 export function wire(send) {
   const press = (command) => {
     if (!send(command)) told("not sent: the page has no server now", false);
@@ -46,6 +51,7 @@ export function wire(send) {
     const length = document.getElementById("duration").value;
     press({ do: "inject", label: document.getElementById("fault").value, duration_s: length === "" ? null : Number(length) });
   });
+  return press;
 }
 
 /** Stop ends the run, so it is pressed twice. */
