@@ -20,6 +20,11 @@ from robins.bench.wire.schema import FLAGS
 _EACH_S = 0.05  # samples for the page come no faster than that
 _STATUS_S = 0.5
 _COMMANDS, _COMMANDS_S = 10, 10.0  # so many are shown in so long a time
+_SPANS = 100  # so many of faults are told
+_PREPARING = {
+    "state": "preparing",
+    "doing": "The filter is compiled, then each part starts as a process and says hello.",
+}
 _XYZ = ("x", "y", "z")
 ALARMS = ("died", "failed", "killed")
 WARNINGS = ("missed", "refused", "command")
@@ -59,8 +64,13 @@ def signals(wheels: int) -> list[Signal]:
                 found.append(Signal(f"{plot} sigma {axis}", unit, plot, "sigma", f"{plot} {axis}"))
         return found
 
+    def attitude(of: str) -> list[Signal]:
+        return [Signal(f"q {of} {c}", "1", "attitude", "attitude", of) for c in "wxyz"]
+
     momentum = "wheel momentum"
     return [
+        *attitude("true"),
+        *attitude("estimated"),
         *three("attitude error", "arcsec", sigma=True),
         *three("pointing error", "arcsec"),
         *three("innovation of the star sensor", "arcsec", sigma=True),
@@ -99,12 +109,14 @@ class Looking:
         self._alarms = Alarms()
         self._commanded: deque[float] = deque(maxlen=_COMMANDS)
         self._flooded = False
+        self._command = ""  # that was shown last
+        self._spans: dict[tuple[str, float], float | None] = {}  # of faults: label, begin; end
 
     def over(self, session: Session, failed: bool) -> None:
         """The run is over."""
         if self._page is not None:
-            last = {**state(session, session.done), "state": "failed" if failed else "stopped"}
-            self._page.status(last)
+            last = self._state(session, session.done)
+            self._page.status(last | {"state": "failed" if failed else "stopped"})
             self._page.poll()
 
     def event(self, kind: str, time_s: float, text: str) -> None:
@@ -114,7 +126,13 @@ class Looking:
             self._page.event(level, time_s, text)
 
     def _shown(self, text: str) -> str:
-        """What is shown of a command, so that many do not hide all else; the record has each."""
+        """What is shown of a command, so that many do not hide all else; the record has each.
+
+        One that comes again and again is shown, since the page counts it in one line.
+        """
+        if text == self._command:
+            return text
+        self._command = text
         now, flooded = time.monotonic(), self._flooded
         full = len(self._commanded) == _COMMANDS and now - self._commanded[0] < _COMMANDS_S
         self._flooded = full
@@ -135,6 +153,7 @@ class Looking:
     def step(self, session: Session, step: int) -> None:
         """A step is over."""
         if self._page is not None:
+            self._follow(session)
             for level, text in self._alarms.hear(int(session.telemetry.flown.flags[step])):
                 self._page.event(level, session.time_s, f"adm: {text}")
             now = time.monotonic()
@@ -143,11 +162,29 @@ class Looking:
                 self._page.push(session.time_s, sample(session, step))
         self._tell(session, step + 1)
 
+    def _follow(self, session: Session) -> None:
+        """Note when faults begin and end; one may be shorter than what lies between two status."""
+        active = {(label, fault.begin) for label, fault in session.active_faults()}
+        for span, end in self._spans.items():
+            if end is None and span not in active:
+                self._spans[span] = session.time_s
+        for span in sorted(active - self._spans.keys()):
+            self._spans[span] = None
+            if len(self._spans) > _SPANS:
+                self._spans.pop(next(iter(self._spans)))
+
+    def _state(self, session: Session, done: int) -> dict[str, Any]:
+        spans = [
+            {"label": label, "begin_s": begin, "end_s": end}
+            for (label, begin), end in self._spans.items()
+        ]
+        return state(session, done) | {"fault_spans": spans}
+
     def _tell(self, session: Session, done: int) -> None:
         now = time.monotonic()
         if self._page is not None and now - self._told >= _STATUS_S:
             self._told = now
-            self._page.status(state(session, done))
+            self._page.status(self._state(session, done))
         if self._status.due:
             self._status.tell(report(session, done, "" if self._page is None else self._page.url))
 
@@ -170,6 +207,8 @@ def sample(session: Session, step: int) -> list[float]:
     both = [x for pair in zip(error, sigma, strict=True) for x in pair]
     innovated = [x / ARCSEC for pair in zip(innovation, its_sigma, strict=True) for x in pair]
     return [
+        *f.q_ib[step],
+        *f.q_est_ib[step],
         *both,
         *pointing,
         *innovated,
@@ -272,4 +311,6 @@ def page_for(session_name: str, run: int, wheels: int, host: str, port: int) -> 
     Raises:
         ImportError, OSError, RuntimeError: as `Live` says.
     """
-    return Live(signals(wheels), session_name, run, host, port, OFFERED)
+    page = Live(signals(wheels), session_name, run, host, port, OFFERED)
+    page.status(_PREPARING)
+    return page
