@@ -31,6 +31,7 @@ export class Attitude {
     this.figure = element("figure", "plot attitude", element("figcaption", "", element("strong", "", title), element("span", "readouts", ...axes, ...apart)), this.canvas);
     this.figure.setAttribute("aria-label", `${title}: ${this.groups.map((g) => g.of).join(", ")}; body axes against the reference`);
     this.craft = new Craft(this.surface);
+    this.surface.addEventListener("webglcontextrestored", () => (this.drawn = ""));
     if (!this.craft.supported) this.surface.replaceWith(element("p", "empty", "This browser has no WebGL, so the attitude is not drawn."));
   }
 
@@ -50,6 +51,15 @@ export class Attitude {
     say(this.readout, first && second ? angle(angleBetween(first, second)) : "–");
     const names = this.groups.map((g, k) => (k ? `ghost: ${g.of}` : `solid: ${g.of}`)).join(" · ");
     say(this.note, unknown.length ? `${names} · not known here: ${unknown.join(", ")}` : names);
+    this.#draw();
+  }
+
+  /** Only where it would look different: without a graphics card it is dear. */
+  #draw() {
+    const { clientWidth, clientHeight } = this.surface;
+    const looks = JSON.stringify([this.now.map((q) => q?.map((u) => u.toFixed(3))), clientWidth, clientHeight, this.colours]);
+    if (looks === this.drawn) return;
+    this.drawn = looks;
     this.craft.draw(this.now, this.colours);
   }
 

@@ -21,7 +21,7 @@ uniform vec4 colour;
 varying float light;
 void main() { gl_FragColor = vec4(light * colour.rgb * colour.a, colour.a); }`;
 
-const RADIUS = 1.3; // of what is seen
+const RADIUS = 1.1; // of what is seen
 const STILL = [1, 0, 0, 0];
 // z of the reference is up; seen from the right and from above
 const CAMERA = multiply(turn(0.4, [1, 0, 0]), multiply(turn(-Math.PI / 2, [1, 0, 0]), turn(-0.6, [0, 0, 1])));
@@ -103,13 +103,13 @@ export class Craft {
     const least = Math.min(width, height);
     gl.uniform2f(at.scale, least / width / RADIUS, least / height / RADIUS);
     gl.uniform4fv(at.camera, CAMERA);
-    for (const axis of [0, 1, 2]) this.#box(STILL, bar(axis, 1.2, 0.006), colours.frame, 1);
+    for (const axis of [0, 1, 2]) this.#box(STILL, bar(axis, 1.1, 0.006), colours.frame, 1);
     attitudes.forEach((q, k) => {
       if (!q) return;
       const ghost = k > 0;
       gl.depthMask(!ghost); // a ghost hides nothing
       for (const box of HULL) this.#box(q, box, ghost ? colours.ghost : colours.craft, ghost ? 0.3 : 1);
-      for (const axis of [0, 1, 2]) this.#box(q, bar(axis, ghost ? 1.25 : 0.95, ghost ? 0.009 : 0.022), colours.axes[axis], ghost ? 0.75 : 1);
+      for (const axis of [0, 1, 2]) this.#box(q, bar(axis, ghost ? 1.05 : 0.85, ghost ? 0.009 : 0.022), colours.axes[axis], ghost ? 0.75 : 1);
     });
     gl.depthMask(true);
   }

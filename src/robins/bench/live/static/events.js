@@ -115,6 +115,7 @@ export class EventList {
     const shown = waiting.at(-1) ?? this.all.filter((one) => one.level === "alarm").at(-1);
     say(byId("alarm-text"), shown ? `${seconds(shown.time_s)}  ${words(shown)}` : "no alarm");
     say(byId("alarm-tally"), waiting.length ? `${count(waiting.length)} not acknowledged` : shown ? "acknowledged" : "");
+    say(byId("acknowledge"), waiting.length > 1 ? `Acknowledge all ${count(waiting.length)}` : "Acknowledge");
     byId("acknowledge").hidden = !waiting.length;
     byId("alarm").dataset.level = waiting.length ? "alarm" : shown ? "old" : "none";
     this.changed();

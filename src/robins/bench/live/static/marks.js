@@ -10,7 +10,7 @@ export function drawBands({ ctx, bbox }, span, spans, now, colours, named) {
   ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
   ctx.clip();
   ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
-  ctx.textBaseline = "bottom";
+  Object.assign(ctx, { textAlign: "left", textBaseline: "bottom" });
   for (const { label, begin_s: begin, end_s: end } of spans) {
     const left = Math.max(bbox.left, at(begin));
     const right = Math.max(left + devicePixelRatio, at(end ?? now));

@@ -248,8 +248,11 @@ function draw() {
   else return;
   pointed = false;
   bench.frames++;
-  bench.drawn_ms = performance.now() - began;
-  rested = performance.now() + REST * bench.drawn_ms;
+  queueMicrotask(() => {
+    // after those in which the plots are drawn
+    bench.drawn_ms = performance.now() - began;
+    rested = performance.now() + REST * bench.drawn_ms;
+  });
 }
 
 const spans = () => status?.fault_spans ?? [];
