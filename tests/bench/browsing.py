@@ -10,14 +10,20 @@ from playwright.sync_api import sync_playwright
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
-@contextmanager
-def a_browser(*arguments: str):
-    """One that is installed, else the test is skipped."""
+def installed() -> str:
+    """Where one is; the test is skipped if there is none."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         pytest.skip(f"needs a Chromium: none of {', '.join(BROWSERS)} is on the path")
+    return path
+
+
+@contextmanager
+def a_browser():
+    """One for all tests of a module."""
+    path = installed()
     with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=path, args=["--no-sandbox", *arguments])
+        browser = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield browser
         browser.close()
 
@@ -37,9 +43,10 @@ def browse(chromium, url: str, **options):
             route.abort()
 
     def hear(said):
-        # The browser says itself that a server is gone, and that drawing without a graphics card
-        # is slow; all else on the console is the page's.
-        of_browser = "ERR_CONNECTION" in said.text or "GPU stall" in said.text
+        # What the browser says of itself: a server is gone, drawing without a graphics card is
+        # slow, and so is reading pixels, as a test does. All else on the console is the page's.
+        of_itself = ("ERR_CONNECTION", "GPU stall", "willReadFrequently")
+        of_browser = any(words in said.text for words in of_itself)
         if said.type in {"error", "warning"} and not of_browser:
             wrong.append(said.text)
 

@@ -169,6 +169,7 @@ function told(message) {
     case "hello":
       return hello(message);
     case "status":
+      if (JSON.stringify(message.status?.fault_spans) !== JSON.stringify(status?.fault_spans)) redraw();
       status = message.status;
       showStatus(status);
       return refresh();

@@ -60,9 +60,9 @@ export class Timeline {
     this.#fit(time - length / 2, length);
   }
 
-  /** Hold a span of that length inside the run. */
+  /** Hold a span of that length inside the run, or inside what is shown where that is more. */
   #fit(from, length) {
-    const end = Math.max(this.now, length);
+    const end = Math.max(this.now, this.span[1]);
     const inside = Math.min(length, end);
     const begin = Math.min(Math.max(0, from), end - inside);
     this.#set([begin, begin + inside]);
