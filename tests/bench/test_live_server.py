@@ -364,6 +364,22 @@ def test_a_killed_server_comes_back_at_the_same_port_with_what_was(live):
     assert hello["status"] == {"state": "running"}
 
 
+def test_a_server_that_comes_back_has_the_whole_run(live):
+    for k in range(1000):
+        live.push(0.1 * k, [float(k), 1.0, 1.0])
+        live.poll()
+    live.restart()
+    while live._samples or live._partial:
+        live.poll()
+    with page_of(live) as page:
+        while not (isinstance(got := page.recv(timeout=3.0), bytes) and is_history(got)):
+            pass
+        samples = numbers(frames(page, 300))
+    assert struct.unpack_from("<6I", got)[2:] == (700, 3, 1, 700)
+    assert np.array_equal(np.frombuffer(got, "<f8", 700, 24), 0.1 * np.arange(700))
+    assert np.array_equal(samples, np.arange(700, 1000))
+
+
 def test_a_server_that_keeps_dying_is_not_started_more_than_once_a_second(live):
     started = set()
     until = time.monotonic() + 2.5

@@ -13,6 +13,7 @@ from robins.bench.live import Live, Signal
 from robins.bench.run import telemetry
 from robins.bench.run.session import Session
 from robins.bench.run.setup import Flight, steps_of
+from robins.bench.run.spans import FaultSpans
 from robins.bench.run.telemetry import ARCSEC, Alarms
 from robins.bench.status import STARTING, Status
 from robins.bench.wire.schema import FLAGS
@@ -20,7 +21,6 @@ from robins.bench.wire.schema import FLAGS
 _EACH_S = 0.05  # samples for the page come no faster than that
 _STATUS_S = 0.5
 _COMMANDS, _COMMANDS_S = 10, 10.0  # so many are shown in so long a time
-_SPANS = 100  # so many of faults are told
 _PREPARING = {
     "state": "preparing",
     "doing": "The filter is compiled, then each part starts as a process and says hello.",
@@ -110,7 +110,7 @@ class Looking:
         self._commanded: deque[float] = deque(maxlen=_COMMANDS)
         self._flooded = False
         self._command = ""  # that was shown last
-        self._spans: dict[tuple[str, float], float | None] = {}  # of faults: label, begin; end
+        self._spans = FaultSpans()
 
     def over(self, session: Session, failed: bool) -> None:
         """The run is over."""
@@ -153,7 +153,8 @@ class Looking:
     def step(self, session: Session, step: int) -> None:
         """A step is over."""
         if self._page is not None:
-            self._follow(session)
+            active = ((label, fault.begin) for label, fault in session.active_faults())
+            self._spans.hear(active, session.time_s)
             for level, text in self._alarms.hear(int(session.telemetry.flown.flags[step])):
                 self._page.event(level, session.time_s, f"adm: {text}")
             now = time.monotonic()
@@ -162,23 +163,8 @@ class Looking:
                 self._page.push(session.time_s, sample(session, step))
         self._tell(session, step + 1)
 
-    def _follow(self, session: Session) -> None:
-        """Note when faults begin and end; one may be shorter than what lies between two status."""
-        active = {(label, fault.begin) for label, fault in session.active_faults()}
-        for span, end in self._spans.items():
-            if end is None and span not in active:
-                self._spans[span] = session.time_s
-        for span in sorted(active - self._spans.keys()):
-            self._spans[span] = None
-            if len(self._spans) > _SPANS:
-                self._spans.pop(next(iter(self._spans)))
-
     def _state(self, session: Session, done: int) -> dict[str, Any]:
-        spans = [
-            {"label": label, "begin_s": begin, "end_s": end}
-            for (label, begin), end in self._spans.items()
-        ]
-        return state(session, done) | {"fault_spans": spans}
+        return state(session, done) | {"fault_spans": self._spans.told}
 
     def _tell(self, session: Session, done: int) -> None:
         now = time.monotonic()
