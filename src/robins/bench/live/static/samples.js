@@ -56,7 +56,7 @@ export class Samples {
     if (past.samples && begin === 0) {
       const first = Math.max(0, firstFrom(past.last, past.buckets, from) - 1);
       const end = Math.min(past.buckets, firstFrom(past.first, past.buckets, to) + 1);
-      parts.push({ first: past.first, last: past.last, least: past.least, most: past.most, begin: first, end, shift: 0 });
+      parts.push({ ...past, begin: first, end, shift: 0, raw: past.per === 1 });
     }
     const end = Math.min(this.length, this.from(to) + 1);
     const raw = { first: this.time, last: this.time, least: this.values, most: this.values, raw: true };
