@@ -3,7 +3,7 @@
 import { say } from "./format.js";
 
 const SURE_MS = 3000;
-const BUSY = new Set(["running", "preparing"]);
+const RUNNING = new Set(["running"]);
 const OVER = new Set(["stopped", "failed"]);
 
 const answer = document.getElementById("answer");
@@ -23,7 +23,7 @@ export function told(text, good) {
 /** Grey what makes no sense now. It stays focusable, so that the keyboard does not lose its place. */
 export function allow(open, state) {
   const off = {
-    start: !open || BUSY.has(state) || OVER.has(state),
+    start: !open || RUNNING.has(state) || OVER.has(state),
     pause: !open || state === "paused" || OVER.has(state),
     stop: !open || OVER.has(state),
     clear: !open || OVER.has(state),
