@@ -38,12 +38,13 @@ class History:
         self.per = 1
         self._first, self._last = np.full((2, BUCKETS), np.nan)
         self._least, self._most = np.full((2, BUCKETS, signals), np.nan)
-        self._waiting: list[bytes] = []
+        self._row = SAMPLE_HEAD.size + 8 * signals  # bytes
+        self._waiting = bytearray()
 
-    def add(self, sample: bytes) -> None:
-        """Take a sample, as `feed.pack_sample` makes it, later than all before."""
-        self._waiting.append(sample)
-        if len(self._waiting) == BLOCK:
+    def add(self, samples: bytes) -> None:
+        """Take samples, one or one after another, as `feed.pack_sample` makes them."""
+        self._waiting += samples
+        if len(self._waiting) >= BLOCK * self._row:
             self._take_in()
 
     def pack(self, run: int) -> bytes:
@@ -70,7 +71,7 @@ class History:
     def _take_in(self) -> None:
         if not self._waiting:
             return
-        rows = np.frombuffer(b"".join(self._waiting), "<f8").reshape(len(self._waiting), -1)
+        rows = np.frombuffer(bytes(self._waiting), "<f8").reshape(-1, self._row // 8)
         self._waiting.clear()
         time, values = rows[:, 1], rows[:, SAMPLE_HEAD.size // 8 :]
         values = np.where(np.isfinite(values), values, np.nan)
