@@ -107,7 +107,7 @@ def take(url: str, browser: str, folder: Path, wanted: dict[str, tuple[int, int,
             page.wait_for_selector(".plot")
         next(iter(pages.values())).get_by_test_id("start").click()
         for name, page in pages.items():
-            reached = f"() => parseFloat(document.getElementById('time').textContent) >= {AT_S}"
+            reached = f"() => bench.time >= {AT_S}"
             page.wait_for_function(reached, timeout=300e3)
             picture = Image.open(BytesIO(page.screenshot(full_page=len(pages) > 1)))
             picture.quantize(256).save(folder / f"{name}.png", optimize=True)

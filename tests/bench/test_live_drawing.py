@@ -45,7 +45,9 @@ COLUMN = """async ([time, values, start]) => {
     view.setFloat64(0, values[i] ?? NaN, true);
     samples.add(t, view, 0);
   });
-  const { out, found, last } = samples.column(0, start, 3);
+  // a slice begins with the sample before its first
+  const slice = samples.slice(start ? time[start + 1] : -Infinity, Infinity);
+  const { out, found, last } = slice.column(0, 3);
   // JSON has no undefined
   return [out.map((v) => (v === undefined ? "goes on" : v === null ? "breaks" : v)), found, last];
 }"""

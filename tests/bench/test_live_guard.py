@@ -18,6 +18,7 @@ from websockets.sync.client import connect
 from robins.bench import live as package
 from robins.bench.live import Live, Signal
 from robins.bench.live.commands import CommandError, read
+from robins.bench.live.feed import check
 from robins.bench.live.guard import known_host, same_origin
 
 STATIC = Path(package.__file__).parent / "static"
@@ -167,7 +168,16 @@ def test_a_bench_that_takes_no_commands_is_not_buried_under_them(live):
     assert {c["do"] for c in live.commands()} == {"pause"}
 
 
+ALARMS = [{"id": k, "time_s": 1.5 * k, "text": f"alarm {k}"} for k in (3, 5, 8)]
 GOOD = [
+    (
+        '{"do":"acknowledge","alarms":[5]}',
+        {"do": "acknowledge", "alarms": [5], "label": "'alarm 5' of 7.5 s"},
+    ),
+    (
+        '{"do":"acknowledge","alarms":[8,3,4]}',  # another page was quicker with 4
+        {"do": "acknowledge", "alarms": [3, 8], "label": "2 alarms, the last 'alarm 8' of 12.0 s"},
+    ),
     ('{"do":"start"}', {"do": "start"}),
     ('{"do":"inject","label":"noise"}', {"do": "inject", **FAULTS[1], "duration_s": None}),
     (
@@ -177,7 +187,18 @@ GOOD = [
     ('{"do":"clear","label":null}', {"do": "clear", "label": None}),
 ]
 WRONG = [
-    ('{"do":"starts"}', "no command 'starts'; there are: start, pause, stop, inject, clear"),
+    (
+        '{"do":"starts"}',
+        "no command 'starts'; there are: start, pause, stop, inject, clear, acknowledge",
+    ),
+    ('{"do":"acknowledge"}', "a list of their numbers: None"),
+    ('{"do":"acknowledge","alarms":3}', "a list of their numbers"),
+    ('{"do":"acknowledge","alarms":["3"]}', "a list of their numbers"),
+    ('{"do":"acknowledge","alarms":[true]}', "a list of their numbers"),
+    ('{"do":"acknowledge","alarms":[3.0]}', "a list of their numbers"),
+    ('{"do":"acknowledge","alarms":[]}', "none of these alarms waits"),
+    ('{"do":"acknowledge","alarms":[4]}', "none of these alarms waits"),
+    ('{"do":"acknowledge","alarms":[3],"label":"all"}', "takes no 'label'"),
     ("{}", "no command None"),
     ('{"do":["start"]}', "no command"),
     ('{"do":"stop","now":1}', "'stop' takes no 'now'"),
@@ -201,13 +222,13 @@ WRONG = [
 
 @pytest.mark.parametrize(("text", "command"), GOOD)
 def test_a_command_is_read(text, command):
-    assert read(text, FAULTS) == command
+    assert read(text, FAULTS, ALARMS) == command
 
 
 @pytest.mark.parametrize(("text", "says"), WRONG)
 def test_a_wrong_command_is_told_what_is_wrong(text, says):
     with pytest.raises(CommandError) as error:
-        read(text, FAULTS)
+        read(text, FAULTS, ALARMS)
     assert says in str(error.value)
     assert len(str(error.value)) < 200
 
@@ -219,22 +240,32 @@ values = st.recursive(
     ),
     max_leaves=6,
 )
-keys = st.sampled_from(["do", "label", "duration_s", "fault"])
-words = st.sampled_from(["start", "stop", "inject", "clear", "noise"])
+keys = st.sampled_from(["do", "label", "duration_s", "fault", "alarms"])
+words = st.sampled_from(["start", "stop", "inject", "clear", "noise", "acknowledge"])
 
 
 @given(st.dictionaries(keys, words | values).map(json.dumps) | st.text() | st.binary())
 def test_whatever_a_page_sends_is_a_command_or_refused(text):
     try:
-        command = read(text, FAULTS)
+        command = read(text, FAULTS, ALARMS)
     except CommandError:
         return
-    assert command["do"] in {"start", "pause", "stop", "inject", "clear"}
+    assert command["do"] in {"start", "pause", "stop", "inject", "clear", "acknowledge"}
+    if command["do"] == "acknowledge":
+        assert set(command["alarms"]) <= {3, 5, 8}
     if command["do"] == "inject":
         assert {k: command[k] for k in ("label", "fault")} in FAULTS
 
 
 # ------------------------------------------------------------------------------------- bad input
+
+
+def attitude(of: str = "true", name: str = "q") -> list[Signal]:
+    return [Signal(f"{name} {c}", "1", "Q", "attitude", of) for c in "wxyz"]
+
+
+def test_attitudes_are_four_signals_each():
+    check([*attitude(), *attitude("estimated", "p"), Signal("a", "m", "A")])
 
 
 @pytest.mark.parametrize(
@@ -246,7 +277,15 @@ def test_whatever_a_page_sends_is_a_command_or_refused(text):
         ([Signal("s", "m", "A", "sigma", "a")], "is of 'a', which is no value of its plot"),
         ([Signal("a", "m", "B"), Signal("s", "m", "A", "sigma", "a")], "no value of its plot"),
         ([Signal("a", "m", "A", "limit", "b")], "only a sigma is"),
-        ([Signal("a", "m", "A")._replace(role="mean")], "none of value, sigma, limit"),
+        ([Signal("a", "m", "A")._replace(role="mean")], "none of value, sigma, limit, attitude"),
+        (attitude()[:3], "attitude 'true' of plot 'Q' must be four signals in a row"),
+        ([*attitude(), *attitude(name="p")], "must be four signals in a row"),
+        (
+            [s._replace(unit="rad") for s in attitude()],
+            "signal 'q w': plot 'Q' is one of attitudes",
+        ),
+        ([s._replace(of="") for s in attitude()], "and says `of` what it is"),
+        ([*attitude(), Signal("a", "1", "Q")], "signal 'a': plot 'Q' is one of attitudes"),
     ],
 )
 def test_signals_that_cannot_be_drawn(signals, says):

@@ -1,21 +1,18 @@
 """The live page in a headless Chromium that reaches nothing but this machine."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from browsing import a_browser, browse
+from playwright.sync_api import expect
 
 from robins.bench.live import Live, Signal
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 AXES = "xyz"
 SIGNALS = [
     *[Signal(f"error {a}", "arcsec", "Attitude error") for a in AXES],
@@ -52,45 +49,8 @@ def values(k: int) -> list[float]:
 
 @pytest.fixture(scope="module")
 def chromium():
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.skip(f"needs a Chromium: none of {', '.join(BROWSERS)} is on the path")
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
+    with a_browser() as browser:
         yield browser
-        browser.close()
-
-
-@contextmanager
-def browse(chromium, url: str, **options):
-    """A page of its own; it fails if a script does, or if it asks for anything from elsewhere."""
-    context = chromium.new_context(**{"viewport": {"width": 1280, "height": 800}, **options})
-    page = context.new_page()
-    outside, wrong = [], []
-
-    def let(route):
-        if urlsplit(route.request.url).hostname == "127.0.0.1":
-            route.continue_()
-        else:
-            outside.append(route.request.url)
-            route.abort()
-
-    def hear(said):
-        # The browser says itself that a server is gone; all else on the console is the page's.
-        if said.type in {"error", "warning"} and "ERR_CONNECTION" not in said.text:
-            wrong.append(said.text)
-
-    context.route("**/*", let)
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("console", hear)
-    try:
-        page.goto(url)
-        page.wait_for_function("() => bench.hellos > 0")  # what is done before, the hello may undo
-        yield page
-        assert outside == []
-        assert wrong + page.evaluate("bench.errors") == []
-    finally:
-        context.close()
 
 
 @pytest.fixture(scope="module")

@@ -79,9 +79,13 @@ def frames(page, many: int, within_s: float = 5.0) -> list[bytes]:
             got = page.recv(timeout=0.5)
         except TimeoutError:
             continue
-        if isinstance(got, bytes):
+        if isinstance(got, bytes) and not is_history(got):
             found.append(got)
     return found
+
+
+def is_history(frame: bytes) -> bool:
+    return frame[4:8] == b"\xff\xff\xff\xff"
 
 
 def numbers(samples: list[bytes]) -> np.ndarray:
@@ -131,7 +135,17 @@ def test_a_page_that_comes_late_sees_what_was(shared):
     with page_of(shared) as page:
         hello = texts(page, "hello")
         assert hello["history"] == 300
+        before = page.recv(timeout=3.0)
+        while isinstance(before, str):
+            before = page.recv(timeout=3.0)
         assert np.array_equal(numbers(frames(page, 300)), np.arange(200, 500))
+    # what was before the latest 300: one bucket a sample, since there are few; by the documented
+    # layout: head, times, least and greatest of each signal
+    assert struct.unpack_from("<6I", before) == (shared.run, 0xFFFFFFFF, 200, 3, 1, 200)
+    rows = np.array(struct.unpack_from("<1600d", before, 24)).reshape(8, 200)
+    k = np.arange(200.0)
+    wanted = [0.1 * k, 0.1 * k, k, k**0, 0.5 * k**0, k, k**0, 0.5 * k**0]
+    assert np.array_equal(rows, wanted)
     assert [e["text"] for e in hello["events"]] == [f"event {k}" for k in range(50, 250)]
     assert hello["status"] == {"state": "running", "deadlines": {"missed": 2}}
 
@@ -144,7 +158,8 @@ def test_the_latest_status_and_every_event_come(shared):
         shared.event("alarm", 3.5, "star refused")
         event = texts(page, "event")
     assert got == {"deadlines": {"lateness_us": {"p50": 1.5, "max": None}}}
-    assert event == {"kind": "event", "level": "alarm", "time_s": 3.5, "text": "star refused"}
+    said = {"id": event["id"], "level": "alarm", "time_s": 3.5, "text": "star refused"}
+    assert event == {"kind": "event", **said}
 
 
 def test_another_run_begins_on_the_same_page(shared):
@@ -161,6 +176,51 @@ def test_another_run_begins_on_the_same_page(shared):
     assert struct.unpack_from("<IId", frame) == (old + 1, 0, 0.1)
     with pytest.raises(ValueError, match=f"run {old + 1} is shown already"):
         shared.new_run(old + 1)
+
+
+def test_an_event_that_comes_again_and_again_is_one_line_with_a_count(shared):
+    with page_of(shared) as page:
+        texts(page, "hello")
+        for k in range(50):
+            shared.event("warning", float(k), "command pause")
+            got = texts(page, "event")
+        shared.event("info", 51.0, "something else")
+        shared.event("warning", 52.0, "command pause")
+        assert texts(page, "event")["text"] == "something else"
+        assert "count" not in texts(page, "event")
+    with page_of(shared) as page:
+        kept = texts(page, "hello")["events"]
+    assert (got["count"], got["time_s"], got["until_s"]) == (50, 0.0, 49.0)
+    assert [(e["text"], e.get("count", 1)) for e in kept] == [
+        ("command pause", 50),
+        ("something else", 1),
+        ("command pause", 1),
+    ]
+
+
+def test_an_alarm_waits_until_one_page_acknowledges_it_for_all(shared):
+    with page_of(shared) as page, page_of(shared) as other:
+        texts(page, "hello")
+        for time_s, level in ((1.0, "alarm"), (1.5, "warning"), (2.0, "alarm")):
+            shared.event(level, time_s, f"{level} at {time_s}")
+        first, _, second = (texts(page, "event")["id"] for _ in range(3))
+        page.send(json.dumps({"do": "acknowledge", "alarms": [first]}))
+        assert texts(other, "acknowledged")["alarms"] == [first]
+        assert texts(page, "taken")["do"] == "acknowledge"
+        page.send(json.dumps({"do": "acknowledge", "alarms": [first]}))
+        assert "none of these alarms waits" in texts(page, "refused")["text"]
+        other.send(json.dumps({"do": "acknowledge", "alarms": [first, second]}))
+        assert texts(page, "acknowledged")["alarms"] == [second]
+    label = "'alarm at 1.0' of 1.0 s"
+    commands = shared.commands()
+    assert commands[0] == {"do": "acknowledge", "alarms": [first], "label": label}
+    assert commands[1]["alarms"] == [second]
+    shared.restart()  # a server that comes anew knows it too, from the bench
+    shared.event("alarm", 3.0, "alarm at 2.0")
+    with page_of(shared) as page:
+        while len(kept := texts(page, "hello")["events"]) < 4:
+            pass
+    assert [e.get("acknowledged") for e in kept] == [True, None, True, None]
 
 
 def test_json_has_nothing_that_a_browser_does_not_read():
@@ -302,6 +362,22 @@ def test_a_killed_server_comes_back_at_the_same_port_with_what_was(live):
         hello = texts(page, "hello")
     assert [e["text"] for e in hello["events"]] == ["before"]
     assert hello["status"] == {"state": "running"}
+
+
+def test_a_server_that_comes_back_has_the_whole_run(live):
+    for k in range(1000):
+        live.push(0.1 * k, [float(k), 1.0, 1.0])
+        live.poll()
+    live.restart()
+    while live._samples or live._partial:
+        live.poll()
+    with page_of(live) as page:
+        while not (isinstance(got := page.recv(timeout=3.0), bytes) and is_history(got)):
+            pass
+        samples = numbers(frames(page, 300))
+    assert struct.unpack_from("<6I", got)[2:] == (700, 3, 1, 700)
+    assert np.array_equal(np.frombuffer(got, "<f8", 700, 24), 0.1 * np.arange(700))
+    assert np.array_equal(samples, np.arange(700, 1000))
 
 
 def test_a_server_that_keeps_dying_is_not_started_more_than_once_a_second(live):

@@ -1,9 +1,12 @@
 """Who looks on sees what matters, however much else happens."""
 
-from robins.bench.live.feed import latest
+from robins.bench.live.feed import check, latest
+from robins.bench.rigs.satellite.view import signals
 from robins.bench.run import watching
+from robins.bench.run.spans import FaultSpans
 from robins.bench.run.watching import Looking
 from robins.bench.status import Status
+from robins.systems.satellite.parameters import AttitudeLoop
 
 
 class Page:
@@ -54,3 +57,37 @@ def test_a_frequent_kind_does_not_push_out_a_rare_one():
     assert found == ["a", "a", *"i" * 30, *"w" * 168]
     assert latest(events[:200], str, 200) == events[:200]
     assert latest(list(range(300)), lambda k: k % 2, 200) == list(range(100, 300))
+
+
+def test_a_command_that_comes_again_and_again_is_shown_each_time(monkeypatch):
+    """The page counts what is the same in one line, so it hides nothing."""
+    monkeypatch.setattr(watching.time, "monotonic", lambda: 100.0)
+    page = Page()
+    looking = Looking(page, Status())
+    for text in ("pause", *["clear"] * 50, "pause"):
+        looking.event("command", 1.0, text)
+    assert [text for _, text in page.shown] == ["pause", *["clear"] * 50, "pause"]
+
+
+def test_spans_of_faults_are_told_though_they_are_short():
+    """One of two steps, one that is cleared, one that is on; the latest hundred."""
+    spans = FaultSpans()
+    for k in range(100):
+        on = [("star: lost", 1.0)] * (10 <= k < 12) + [("gyro: silent", 2.0)] * (20 <= k < 50)
+        spans.hear(on + [("star: lost", 7.0)] * (k >= 70), 0.1 * k)
+    assert spans.told == [
+        {"label": "star: lost", "begin_s": 1.0, "end_s": 0.1 * 12},
+        {"label": "gyro: silent", "begin_s": 2.0, "end_s": 5.0},
+        {"label": "star: lost", "begin_s": 7.0, "end_s": None},
+    ]
+    for k in range(150):
+        spans.hear([("again", float(k))], float(k))
+    assert [one["begin_s"] for one in spans.told] == [float(k) for k in range(50, 150)]
+
+
+def test_true_and_estimated_attitude_are_signals_of_the_page():
+    found = signals(AttitudeLoop())
+    check(found)
+    attitudes = [s for s in found if s.role == "attitude"]
+    assert [s.of for s in attitudes] == ["true"] * 4 + ["estimated"] * 4
+    assert found[:8] == attitudes  # as `sample` has them first

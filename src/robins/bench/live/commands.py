@@ -16,13 +16,18 @@ class CommandError(RobinsError, ValueError):
     """What the page sent is no command; the text is for the page."""
 
 
-def read(text: str | bytes, faults: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def read(
+    text: str | bytes,
+    faults: Sequence[Mapping[str, Any]],
+    alarms: Sequence[Mapping[str, Any]] = (),
+) -> dict[str, Any]:
     """The command that a page sent.
 
     Args:
         text: JSON: `{"do": ...}`, with "label" and "duration_s" (or neither) for "inject", with
-            "label" (or not) for "clear".
+            "label" (or not) for "clear", with "alarms", their numbers, for "acknowledge".
         faults: that the page was offered, each with its label.
+        alarms: that wait to be acknowledged, the oldest first: "id", "time_s", "text".
 
     Returns:
         The command as `Live.commands` gives it.
@@ -54,8 +59,24 @@ def read(text: str | bytes, faults: Sequence[Mapping[str, Any]]) -> dict[str, An
         if label is not None and not isinstance(label, str):
             raise CommandError("the label of a fault is a text")
         return {"do": do, "label": label}
-    known = ", ".join((*PLAIN, "inject", "clear"))
+    if do == "acknowledge":
+        _only(asked, {"do", "alarms"})
+        return {"do": do, **_acknowledged(asked.get("alarms"), alarms)}
+    known = ", ".join((*PLAIN, "inject", "clear", "acknowledge"))
     raise CommandError(f"no command {_short(do)}; there are: {known}")
+
+
+def _acknowledged(ids: Any, alarms: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Which of these alarms wait, and a label by which a record tells them."""
+    if not isinstance(ids, list) or not all(type(one) is int for one in ids):
+        raise CommandError(f"alarms are acknowledged by a list of their numbers: {_short(ids)}")
+    found = [one for one in alarms if one["id"] in ids]  # another page may have been quicker
+    if not found:
+        raise CommandError(f"none of these alarms waits to be acknowledged: {_short(ids)}")
+    last = found[-1]
+    what = f"'{last['text']:.100}' of {last['time_s']:.1f} s"
+    label = what if len(found) == 1 else f"{len(found)} alarms, the last {what}"
+    return {"alarms": [one["id"] for one in found], "label": label}
 
 
 def _only(asked: Mapping[str, Any], allowed: set[str]) -> None:

@@ -1,9 +1,10 @@
 """Messages between the bench and the server of its page, over a pair of sockets.
 
-To the server: `length u32 | kind u8 | body`, little endian; a body is a sample as the browser gets
-it, or JSON. Back: JSON, one object a line.
+To the server: `length u32 | kind u8 | body`, little endian; a body is a sample or a history as the
+browser gets it, or JSON. Back: JSON, one object a line.
 
-    sample: run u32 | sequence u32 | time_s f64 | values f64 ...
+    sample:  run u32 | sequence u32 | time_s f64 | values f64 ...
+    history: run u32 | MARK u32 | ...  what came before the latest samples; see `live.history`
 
 The page draws signals, gathered in plots.
 """
@@ -16,11 +17,12 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import IntEnum
+from itertools import groupby
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-Role = Literal["value", "sigma", "limit"]
+Role = Literal["value", "sigma", "limit", "attitude"]
 
 
 class Signal(NamedTuple):
@@ -28,13 +30,17 @@ class Signal(NamedTuple):
 
     Signals of one plot share `plot`, its title, and their unit. Values of a plot get the colours
     of x, y, z and a fourth in the order in which they come.
+
+    An attitude is four signals that follow one another, w, x, y, z of the quaternion from body to
+    reference, scalar first, with the same `of`. A plot of attitudes is drawn in three dimensions:
+    the first is solid, others are ghosts beside it.
     """
 
     name: str
     unit: str
     plot: str
     role: Role = "value"  # "sigma": a band of +-3 about zero; "limit": a dashed line
-    of: str = ""  # for "sigma": the value whose deviation from zero it states
+    of: str = ""  # "sigma": the value whose deviation it states; "attitude": what that is, "true"
 
 
 def check(signals: Sequence[Signal]) -> None:
@@ -42,7 +48,8 @@ def check(signals: Sequence[Signal]) -> None:
 
     Raises:
         ValueError: there are none, two of one name, a plot of two units, an unknown role, a sigma
-            of something that is no value of the same plot, or an `of` where there is no sigma.
+            of something that is no value of the same plot, an attitude that is not four signals of
+            a plot of attitudes, or an `of` where there is neither.
     """
     if not signals:
         raise ValueError("a live page needs at least one signal")
@@ -60,14 +67,32 @@ def check(signals: Sequence[Signal]) -> None:
                 "give it a plot of its own or another unit"
             )
         by_name[s.name] = s
+    _check_attitudes(signals)
     for s in signals:
         if s.role != "sigma":
-            if s.of:
+            if s.of and s.role != "attitude":
                 raise ValueError(f"signal '{s.name}' is a {s.role}; only a sigma is `of` another")
             continue
         of = by_name.get(s.of)
         if of is None or of.role != "value" or of.plot != s.plot:
             raise ValueError(f"sigma '{s.name}' is of '{s.of}', which is no value of its plot")
+
+
+def _check_attitudes(signals: Sequence[Signal]) -> None:
+    plots = {s.plot for s in signals if s.role == "attitude"}
+    for s in signals:
+        if s.plot in plots and (s.role != "attitude" or s.unit != "1" or not s.of):
+            raise ValueError(
+                f"signal '{s.name}': plot '{s.plot}' is one of attitudes; each of its signals has "
+                "the role 'attitude', the unit '1', and says `of` what it is"
+            )
+    groups = [(key, len(list(four))) for key, four in groupby(signals, lambda s: (s.plot, s.of))]
+    attitudes = [(key, many) for key, many in groups if key[0] in plots]
+    for (plot, of), many in attitudes:
+        if many != 4 or attitudes.count(((plot, of), many)) > 1:
+            raise ValueError(
+                f"attitude '{of}' of plot '{plot}' must be four signals in a row: w, x, y, z"
+            )
 
 
 def as_json(signals: Sequence[Signal]) -> list[dict[str, Any]]:
@@ -77,7 +102,8 @@ def as_json(signals: Sequence[Signal]) -> list[dict[str, Any]]:
 
 HEAD = struct.Struct("<IB")
 SAMPLE_HEAD = struct.Struct("<IId")
-RECENT = 300  # samples that a page which comes later is shown
+MARK = 0xFFFFFFFF  # in place of the number of a sample: it is a history
+RECENT = 300  # samples that a page which comes later is shown each, and those before as a history
 EVENTS = 200  # lines of the same
 
 
@@ -88,6 +114,7 @@ class Kind(IntEnum):
     SAMPLE = 1
     STATUS = 2
     EVENT = 3
+    HISTORY = 4
 
 
 def pack(kind: Kind, body: bytes) -> bytes:
@@ -99,7 +126,7 @@ def pack_sample(
     run: int, sequence: int, time_s: float, values: Sequence[float] | np.ndarray
 ) -> bytes:
     """The body of a sample."""
-    head = SAMPLE_HEAD.pack(run & 0xFFFFFFFF, sequence & 0xFFFFFFFF, time_s)
+    head = SAMPLE_HEAD.pack(run & 0xFFFFFFFF, sequence % MARK, time_s)
     return head + np.asarray(values, dtype="<f8").tobytes()
 
 

@@ -18,7 +18,9 @@ from typing import Any, Literal
 import numpy as np
 
 from robins.bench.live import feed
-from robins.bench.live.feed import Kind, Signal, as_json, check, latest
+from robins.bench.live.events import Events
+from robins.bench.live.feed import Kind, Signal, as_json, check
+from robins.bench.live.history import History
 
 START_S = 20.0  # most that a server may take to listen
 END_S = 3.0  # most that it may take to end before it is killed
@@ -79,8 +81,9 @@ class Live:
         self.restarts = 0
         self._signals, self._title, self._faults = tuple(signals), title, tuple(faults)
         self._sequence = 0
-        self._recent: deque[bytes] = deque(maxlen=feed.RECENT)
-        self._events: list[tuple[str, bytes]] = []  # with their levels
+        self._recent: deque[bytes] = deque()
+        self._history = History(len(signals))  # of the samples before
+        self._events = Events()
         self._last_status: bytes | None = None
         self._commands: deque[dict[str, Any]] = deque(maxlen=100)
         self._process: subprocess.Popen[bytes] | None = None
@@ -112,6 +115,8 @@ class Live:
             raise ValueError(f"{len(self._signals)} signals are shown, got {len(values)} values")
         sample = feed.pack_sample(self.run, self._sequence, time_s, values)
         self._sequence += 1
+        if len(self._recent) == feed.RECENT:
+            self._history.add(self._recent.popleft())
         self._recent.append(sample)
         if len(self._samples) == feed.RECENT:
             self._samples.popleft()
@@ -129,17 +134,16 @@ class Live:
         self._pump()
 
     def event(self, level: Level, time_s: float, text: str) -> None:
-        """Add a line to the events; "alarm" goes to the alarm line too.
+        """Add a line to the events, or to the count of the last if it says the same.
+
+        An "alarm" goes to the alarm line too, until somebody acknowledges it.
 
         Args:
             level: how much it matters.
             time_s: since the start of the run.
             text: one sentence.
         """
-        line = feed.to_json({"level": level, "time_s": time_s, "text": text}).encode()
-        kept = [*self._events, (level, line)]
-        self._events = latest(kept, lambda one: one[0], feed.EVENTS)
-        self._lines.append(line)
+        self._lines.append(feed.to_json(self._events.happened(level, time_s, text)).encode())
         self._pump()
 
     def new_run(self, run: int) -> None:
@@ -152,8 +156,10 @@ class Live:
             raise ValueError(f"run {run} is shown already; another run has another number")
         self.run = run
         self._sequence = 0
-        for old in (self._recent, self._events, self._samples, self._lines, self._commands):
+        for old in (self._recent, self._samples, self._lines, self._commands):
             old.clear()
+        self._history, self._before = History(len(self._signals)), b""
+        self._events.kept.clear()
         self._last_status = self._status = None
         self._hello = self._make_hello()
         self._pump()
@@ -163,9 +169,10 @@ class Live:
     def commands(self) -> list[dict[str, Any]]:
         """What was pressed since the last call, oldest first.
 
-        Each has "do": "start", "pause", "stop", "inject" or "clear". "inject" has the "label" and
-        the "fault" as they were given, and "duration_s", a number, or None for "until cleared";
-        "clear" has the "label" of one fault, or None for all.
+        Each has "do": "start", "pause", "stop", "inject", "clear" or "acknowledge". "inject" has
+        the "label" and the "fault" as they were given, and "duration_s", a number, or None for
+        "until cleared"; "clear" has the "label" of one fault, or None for all; "acknowledge" has
+        "alarms", the numbers of events, and a "label" that says in words which.
         """
         self._receive()
         taken = list(self._commands)
@@ -226,7 +233,9 @@ class Live:
         self._pipe, self._unread, self._listens = ours, b"", False
         # A server that comes anew shows what the one before it did.
         self._hello: bytes | None = self._make_hello()
-        self._lines = deque((line for _, line in self._events), maxlen=feed.EVENTS)
+        self._before = self._history.pack(self.run)
+        lines = (feed.to_json(event).encode() for event in self._events.kept)
+        self._lines = deque(lines, maxlen=feed.EVENTS)
         self._samples = deque(self._recent)
         self._status, self._partial = self._last_status, b""
         fds = (theirs.fileno(), self._at.fileno())
@@ -271,6 +280,8 @@ class Live:
         """What goes next, in the order in which a page needs it; empty: nothing waits."""
         if self._hello is not None:
             kind, body, self._hello = Kind.HELLO, self._hello, None
+        elif self._before:
+            kind, body, self._before = Kind.HISTORY, self._before, b""
         elif self._lines:
             kind, body = Kind.EVENT, self._lines.popleft()
         elif self._status is not None:
@@ -310,6 +321,8 @@ class Live:
             for line in map(json.loads, lines):
                 if "do" in line:
                     self._commands.append(line)
+                    if line["do"] == "acknowledge":
+                        self._events.acknowledge(line["alarms"])
                 else:
                     self._listens = True
 

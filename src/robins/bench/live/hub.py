@@ -12,7 +12,9 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from robins.bench.live.feed import EVENTS, RECENT, Kind, latest, sequence_of, to_json
+from robins.bench.live.events import Events
+from robins.bench.live.feed import EVENTS, MARK, RECENT, Kind, sequence_of, to_json
+from robins.bench.live.history import History
 
 QUEUE = 2 * RECENT  # samples that wait for a page
 
@@ -28,13 +30,15 @@ class Client:
         self.dropped = 0
         self._lines: deque[str] = deque(maxlen=EVENTS)
         self._latest: dict[str, str] = {}  # of which only the newest matters
+        self._history = b""
         self._samples: deque[bytes] = deque()
         self._some = asyncio.Event()
 
-    def greet(self, hello: str, recent: deque[bytes]) -> None:
+    def greet(self, hello: str, history: bytes, recent: deque[bytes]) -> None:
         """All from the beginning: what waits is of no more interest."""
         self._lines.clear()
         self._latest.clear()
+        self._history = history
         self._samples = deque(recent)
         self._lines.append(hello)
         self._some.set()
@@ -68,6 +72,9 @@ class Client:
                 await send_text(self._lines.popleft())
             elif self._latest:
                 await send_text(self._latest.pop(next(iter(self._latest))))
+            elif self._history:
+                history, self._history = self._history, b""
+                await send_bytes(history)
             elif self._samples:
                 await send_bytes(self._samples.popleft())
             else:
@@ -81,14 +88,16 @@ class Hub:
     Attributes:
         clients: pages.
         faults: that a page may inject.
+        events: of the run.
     """
 
     def __init__(self) -> None:
         self.clients: set[Client] = set()
         self.faults: list[dict[str, Any]] = []
         self._hello: dict[str, Any] | None = None
-        self._events: list[dict[str, Any]] = []
-        self._recent: deque[bytes] = deque(maxlen=RECENT)
+        self.events = Events()
+        self._history = History(0)
+        self._recent: deque[bytes] = deque()
         self._status: dict[str, Any] | None = None
         self._expected: int | None = None  # number of the next sample
         self._dropped = 0  # on the way from the bench
@@ -97,6 +106,9 @@ class Hub:
         """Something the bench said."""
         if kind == Kind.SAMPLE:
             return self._take_sample(body)
+        if kind == Kind.HISTORY:
+            self._history = History.unpack(body)
+            return self._greet_all()
         said = json.loads(body)
         if kind == Kind.HELLO:
             self._take_hello(said)
@@ -104,19 +116,24 @@ class Hub:
             self._status = said
             self._tell_latest("status", {"kind": "status", "status": said})
         elif kind == Kind.EVENT:
-            self._events = latest([*self._events, said], lambda one: one.get("level"), EVENTS)
+            self.events.keep(said)
             self._tell({"kind": "event", **said})
         return None
 
     def join(self, client: Client) -> None:
         """A page that came."""
-        client.greet(self._greeting(), self._recent)
+        client.greet(*self._greeting())
         self.clients.add(client)
         self.beat()
 
     def leave(self, client: Client) -> None:
         """A page that went."""
         self.clients.discard(client)
+
+    def acknowledge(self, alarms: list[int]) -> None:
+        """Tell each page that somebody has acknowledged alarms."""
+        self.events.acknowledge(alarms)
+        self._tell({"kind": "acknowledged", "alarms": alarms})
 
     def beat(self) -> None:
         """Tell each page that the server lives, and what was dropped."""
@@ -139,31 +156,40 @@ class Hub:
         self._dropped = said["dropped"]
         self._expected = None
         self._status = None
-        self._events.clear()
+        self.events = Events()
+        self._history = History(len(said["signals"]))
         self._recent.clear()
-        for client in self.clients:
-            client.greet(self._greeting(), self._recent)
+        self._greet_all()
 
     def _take_sample(self, sample: bytes) -> None:
         number = sequence_of(sample)
         if self._expected is not None:
-            self._dropped += (number - self._expected) & 0xFFFFFFFF
+            self._dropped += (number - self._expected) % MARK
         self._expected = number + 1
+        if len(self._recent) == RECENT:
+            self._history.add(self._recent.popleft())
         self._recent.append(sample)
         for client in self.clients:
             client.sample(sample)
 
-    def _greeting(self) -> str:
-        return to_json(
+    def _greet_all(self) -> None:
+        for client in self.clients:
+            client.greet(*self._greeting())
+
+    def _greeting(self) -> tuple[str, bytes, deque[bytes]]:
+        """Hello, history and the latest samples."""
+        hello = self._hello or {"run": 0, "title": "", "signals": [], "faults": []}
+        text = to_json(
             {
                 "kind": "hello",
                 "bench": self._hello is not None,
-                **(self._hello or {"run": 0, "title": "", "signals": [], "faults": []}),
-                "events": self._events,
+                **hello,
+                "events": self.events.kept,
                 "status": self._status,
                 "history": len(self._recent),
             }
         )
+        return text, self._history.pack(hello["run"]), self._recent
 
     def _tell(self, message: dict[str, Any]) -> None:
         text = to_json(message)

@@ -78,11 +78,14 @@ async def _listen(websocket: WebSocket, client: Client, hub: Hub, pass_on: Pass)
         if message["type"] == "websocket.disconnect":
             return
         try:
-            command = commands.read(message.get("text") or message.get("bytes") or "", hub.faults)
+            text = message.get("text") or message.get("bytes") or ""
+            command = commands.read(text, hub.faults, hub.events.waiting())
         except commands.CommandError as error:
             client.line(to_json({"kind": "refused", "text": str(error)}))
             continue
         if pass_on(command):
+            if command["do"] == "acknowledge":
+                hub.acknowledge(command["alarms"])
             client.line(to_json({"kind": "taken", "do": command["do"]}))
         else:
             client.line(to_json({"kind": "refused", "text": "no bench takes commands now"}))

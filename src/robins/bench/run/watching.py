@@ -11,12 +11,17 @@ from robins.bench.live import Live, Signal
 from robins.bench.rig import Rig
 from robins.bench.run.session import Session
 from robins.bench.run.setup import Flight, steps_of
+from robins.bench.run.spans import FaultSpans
 from robins.bench.status import STARTING, Status
 
 _EACH_S = 0.05  # samples for the page come no faster than that
 _STATUS_S = 0.5
 _COMMANDS, _COMMANDS_S = 10, 10.0  # so many are shown in so long a time
 STEP = Signal("time of a step", "ms", "time of a step")
+_PREPARING = {
+    "state": "preparing",
+    "doing": "The filter is compiled, then each part starts as a process and says hello.",
+}
 ALARMS = ("died", "failed", "killed")
 WARNINGS = ("missed", "refused", "command")
 
@@ -56,12 +61,14 @@ class Looking:
         self._since = 0  # first step that no sample has shown
         self._commanded: deque[float] = deque(maxlen=_COMMANDS)
         self._flooded = False
+        self._command = ""  # that was shown last
+        self._spans = FaultSpans()
 
     def over(self, session: Session, failed: bool) -> None:
         """The run is over."""
         if self._page is not None:
-            last = {**state(session, session.done), "state": "failed" if failed else "stopped"}
-            self._page.status(last)
+            last = self._state(session, session.done)
+            self._page.status(last | {"state": "failed" if failed else "stopped"})
             self._page.poll()
 
     def event(self, kind: str, time_s: float, text: str) -> None:
@@ -71,7 +78,13 @@ class Looking:
             self._page.event(level, time_s, text)
 
     def _shown(self, text: str) -> str:
-        """What is shown of a command, so that many do not hide all else; the record has each."""
+        """What is shown of a command, so that many do not hide all else; the record has each.
+
+        One that comes again and again is shown, since the page counts it in one line.
+        """
+        if text == self._command:
+            return text
+        self._command = text
         now, flooded = time.monotonic(), self._flooded
         full = len(self._commanded) == _COMMANDS and now - self._commanded[0] < _COMMANDS_S
         self._flooded = full
@@ -92,6 +105,8 @@ class Looking:
     def step(self, session: Session, step: int) -> None:
         """A step is over."""
         if self._page is not None:
+            active = ((label, fault.begin) for label, fault in session.active_faults())
+            self._spans.hear(active, session.time_s)
             view, flown = session.rig.shown, session.telemetry.flown
             if not self._listens:
                 self._alarms, self._listens = view.alarms(), True
@@ -105,11 +120,14 @@ class Looking:
                 self._since = step + 1
         self._tell(session, step + 1)
 
+    def _state(self, session: Session, done: int) -> dict[str, Any]:
+        return state(session, done) | {"fault_spans": self._spans.told}
+
     def _tell(self, session: Session, done: int) -> None:
         now = time.monotonic()
         if self._page is not None and now - self._told >= _STATUS_S:
             self._told = now
-            self._page.status(state(session, done))
+            self._page.status(self._state(session, done))
         if self._status.due:
             self._status.tell(report(session, done, "" if self._page is None else self._page.url))
 
@@ -202,4 +220,6 @@ def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -
     Raises:
         ImportError, OSError, RuntimeError: as `Live` says.
     """
-    return Live([*rig.shown.signals(given), STEP], title, run, host, port, rig.shown.offered)
+    page = Live([*rig.shown.signals(given), STEP], title, run, host, port, rig.shown.offered)
+    page.status(_PREPARING)
+    return page

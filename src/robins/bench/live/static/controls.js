@@ -9,9 +9,14 @@ const OVER = new Set(["stopped", "failed"]);
 const answer = document.getElementById("answer");
 const form = document.getElementById("inject");
 
-/** Say what became of a command. */
+let before = "";
+let times = 0;
+
+/** Say what became of a command; what is said again and again is counted. */
 export function told(text, good) {
-  say(answer, text);
+  times = text === before ? times + 1 : 1;
+  before = text;
+  say(answer, times > 1 ? `${text} (${times} times)` : text);
   answer.classList.toggle("alarm", !good);
 }
 
@@ -28,7 +33,7 @@ export function allow(open, state) {
   form.querySelector("[type=submit]").setAttribute("aria-disabled", String(off.clear || form.classList.contains("none")));
 }
 
-/** Join the buttons with what sends a command. */
+/** Join the buttons with what sends a command; gives what sends another and says if that fails. */
 export function wire(send) {
   const press = (command) => {
     if (!send(command)) told("not sent: the page has no server now", false);
@@ -46,6 +51,7 @@ export function wire(send) {
     const length = document.getElementById("duration").value;
     press({ do: "inject", label: document.getElementById("fault").value, duration_s: length === "" ? null : Number(length) });
   });
+  return press;
 }
 
 /** Stop ends the run, so it is pressed twice. */

@@ -21,10 +21,38 @@ export function count(value) {
   return Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, "\u202f");
 }
 
-/** Seconds since the start of the run. */
+const two = (value) => String(Math.floor(value)).padStart(2, "0");
+
+/** Seconds in words: "12.3 s", "2 min 03 s", "2 h 03 min". */
 export function seconds(value, decimals = 1) {
-  return Number.isFinite(value) ? `${value.toFixed(decimals)} s` : DASH;
+  if (!Number.isFinite(value)) return DASH;
+  if (Math.abs(value) < 59.95) return minus(`${value.toFixed(decimals)} s`);
+  const whole = Math.round(Math.abs(value));
+  const sign = value < 0 ? "-" : "";
+  if (whole < 3600) return minus(`${sign}${Math.floor(whole / 60)} min ${two(whole % 60)} s`);
+  return minus(`${sign}${Math.floor(whole / 3600)} h ${two((whole % 3600) / 60)} min`);
 }
+
+/**
+ * A time of the run, short and as fine as `step`: "12.3 s", "5 min", "5:07 min", "2 h", "2:15 h",
+ * "2:15:07 h".
+ */
+export function clock(value, step = 0.1) {
+  if (!Number.isFinite(value)) return DASH;
+  const decimals = step >= 1 ? 0 : Math.min(3, Math.ceil(-Math.log10(step) - 1e-9));
+  const rounded = Number(Math.abs(value).toFixed(decimals));
+  const rest = (rounded % 60).toFixed(decimals).padStart(decimals ? decimals + 3 : 2, "0");
+  const minutes = Math.floor(rounded / 60);
+  const sign = value < 0 && rounded ? "\u2212" : "";
+  if (rounded < 60) return `${sign}${rounded.toFixed(decimals)}\u202fs`;
+  if (rounded < 3600) return `${sign}${minutes}${step % 60 ? `:${rest}` : ""}\u202fmin`;
+  const hours = Math.floor(minutes / 60);
+  const fine = step % 60 ? `:${two(minutes % 60)}:${rest}` : step % 3600 ? `:${two(minutes % 60)}` : "";
+  return `${sign}${hours}${fine}\u202fh`;
+}
+
+/** Steps between two ticks of an axis of time [s]. */
+export const TIME_STEPS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400, 172800];
 
 /** A number at an axis that goes up to `top`; short, whatever that is. */
 export function tick(value, top) {

@@ -1,15 +1,12 @@
-// Everything beside the plots: clock, links, faults, counts, events, alarm line.
+// Everything beside the plots but the events: clock, links, faults, counts.
 
-import { count, element, number, say, seconds } from "./format.js";
+import { clock as timeOf, count, element, number, say, seconds } from "./format.js";
 
 const byId = (id) => document.getElementById(id);
-const MOST_EVENTS = 200;
 const SILENT_S = 1;
-const FRESH_MS = 10000; // an alarm is loud for so long
+const MOST_PAST = 50; // faults that are over and are listed
 const GOOD = /^(ok|up|run|ready|live|alive|done)/i;
 const BAD = /^(dead|fail|kill|lost|gone|silent)/i;
-
-const alarms = { tally: 0, timer: 0 };
 
 /** One number with its name. `mood`: "", "warning" or "alarm". */
 function fact(name, text, mood = "") {
@@ -75,7 +72,8 @@ function showLinks(links = {}, nodes = {}) {
   replace(byId("links").tBodies[0], rows);
 }
 
-function showFaults(faults = []) {
+/** Faults that act; below, those that did, each with a button that goes there. */
+function showFaults(faults = [], spans = []) {
   const rows = faults.map((fault) => {
     const given = typeof fault === "string" ? { label: fault } : fault;
     const until = Number.isFinite(given.until_s) ? `until ${seconds(given.until_s)}` : "until cleared";
@@ -86,7 +84,15 @@ function showFaults(faults = []) {
     clear.setAttribute("aria-label", `Clear ${given.label}`);
     return element("li", "", element("span", "", String(given.label)), element("small", "", until), clear);
   });
-  replace(byId("faults"), rows);
+  const past = spans.filter((one) => one.end_s !== null).slice(-MOST_PAST).reverse();
+  const over = past.map(({ label, begin_s: begin, end_s: end }) => {
+    const step = end - begin < 1 || begin < 60 ? 0.1 : 1;
+    const at = element("button", "time", `${timeOf(begin, step)} to ${timeOf(end, step)}`);
+    Object.assign(at, { type: "button", title: `show ${label}` });
+    at.dataset.go = begin;
+    return element("li", "over", element("span", "", label), at);
+  });
+  replace(byId("faults"), [...rows, ...over]);
   say(byId("fault-tally"), faults.length ? `${faults.length} active` : "none");
   byId("fault-tally").classList.toggle("warning", faults.length > 0);
 }
@@ -108,7 +114,7 @@ export function showStatus(status) {
   const given = status ?? {};
   showDeadlines(given.deadlines, given.clock);
   showLinks(given.links, given.nodes);
-  showFaults(given.faults);
+  showFaults(given.faults, given.fault_spans);
   showCounts(given.counts);
   const state = given.state ?? "–";
   say(byId("bench-state"), state);
@@ -123,35 +129,4 @@ export function offerFaults(faults) {
   const options = faults.map(({ label }) => new Option(label, label, false, label === chosen));
   list.replaceChildren(...(options.length ? options : [new Option("no faults prepared", "")]));
   byId("inject").classList.toggle("none", !options.length);
-}
-
-/** The line to give up: a frequent level must not push out a rare one. */
-function oldestOfTheMost(list) {
-  const lines = {};
-  for (const line of list.children) (lines[line.className] ??= []).push(line);
-  return Object.values(lines).reduce((a, b) => (b.length > a.length ? b : a)).at(-1);
-}
-
-/** A line of the events; alarms go to the alarm line too. */
-export function addEvent({ level, time_s, text }, fresh = true) {
-  const list = byId("events");
-  const line = element("li", level, element("time", "", seconds(time_s)), element("span", "", text));
-  list.prepend(line);
-  if (list.children.length > MOST_EVENTS) oldestOfTheMost(list).remove();
-  if (level !== "alarm") return;
-  alarms.tally++;
-  say(byId("alarm-text"), `${seconds(time_s)}  ${text}`);
-  say(byId("alarm-tally"), alarms.tally === 1 ? "1 alarm" : `${count(alarms.tally)} alarms`);
-  byId("alarm").dataset.level = fresh ? "alarm" : "old";
-  clearTimeout(alarms.timer);
-  alarms.timer = setTimeout(() => (byId("alarm").dataset.level = "old"), FRESH_MS);
-}
-
-export function clearEvents() {
-  byId("events").replaceChildren();
-  alarms.tally = 0;
-  clearTimeout(alarms.timer);
-  say(byId("alarm-text"), "no alarm");
-  say(byId("alarm-tally"), "");
-  byId("alarm").dataset.level = "none";
 }

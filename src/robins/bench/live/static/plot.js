@@ -1,6 +1,7 @@
 // One plot: values, their bands and limits, and what they are now.
 
-import { decimalsFor, element, number, say, tick } from "./format.js";
+import { clock, decimalsFor, element, number, say, tick, TIME_STEPS } from "./format.js";
+import { drawBands, drawEvents } from "./marks.js";
 import { Scale } from "./scale.js";
 
 /* global uPlot */
@@ -43,8 +44,9 @@ export class Plot {
     this.readouts = this.values.map((s, k) => {
       const value = element("b", "", "–");
       const names = shortNames(this.values.map((v) => v.name));
-      const line = element("span", `readout colour-${k % 4}`, element("i"), names[k], value);
-      line.title = s.name;
+      const line = element("button", `readout colour-${k % 4}`, element("i"), names[k], value);
+      Object.assign(line, { type: "button", tabIndex: -1, title: `${s.name}: show or hide` });
+      line.dataset.signal = s.name;
       return { line, value };
     });
     this.canvas = element("div", "canvas", this.note);
@@ -107,12 +109,12 @@ export class Plot {
       cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { size: (_, k) => (k <= this.values.length ? 5 : 0) }, y: false },
       scales: { x: { time: false, range: () => this.span ?? [0, 1] }, y: { range: () => this.range ?? [0, 1] } },
       axes: [
-        { ...axis, size: 22, gap: 2, space: 70, values: (_, ticks) => ticks.map((t) => `${t}\u202fs`) },
+        { ...axis, size: 22, gap: 2, space: 70, incrs: TIME_STEPS, values: (_, ticks, __, ___, step) => ticks.map((t) => clock(t, step)) },
         { ...axis, size: AXIS_WIDTH, gap: 3, space: 32, values: (_, ticks) => ticks.map((t) => tick(t, this.range?.[1] ?? 1)) },
       ],
       series,
       bands,
-      hooks: { draw: [(chart) => this.#mark(chart)] },
+      hooks: { drawClear: [(chart) => this.#under(chart)], draw: [(chart) => this.#mark(chart)] },
     };
   }
 
@@ -125,10 +127,13 @@ export class Plot {
     if (this.chart && (width !== this.chart.width || height !== this.chart.height)) this.chart.setSize({ width, height });
   }
 
-  /** Show the samples from an index on, over a span of time. */
-  show(samples, start, span) {
-    const time = Array.from(samples.time.subarray(start, samples.length));
-    const read = (s, factor) => samples.column(s.index, start, factor);
+  /** Show a slice of the samples; signals whose names are hidden take no part. */
+  show(context) {
+    const { slice, span, hidden } = context;
+    this.context = context;
+    const time = Array.from(slice.time);
+    const nothing = () => ({ out: new Array(time.length), found: time.length, last: NaN });
+    const read = (s, factor) => (hidden.has(s.name) || hidden.has(s.of) ? nothing() : slice.column(s.index, factor));
     const values = this.values.map((s) => read(s));
     const sigmas = this.sigmas.map((s) => read(s, BAND));
     const limits = this.limits.map((s) => read(s));
@@ -144,11 +149,15 @@ export class Plot {
     this.latest = values.map((v) => v.last);
     const pairs = uppers.flatMap((upper, k) => [upper, lowers[k]]);
     this.chart.setData([time, ...values.map((v) => v.out), ...pairs, ...limits.map((v) => v.out)], true);
-    this.#read();
+    this.read();
+  }
+
+  destroy() {
+    this.chart?.destroy();
   }
 
   /** What the values are: at the cursor where there is one, else now. */
-  #read() {
+  read() {
     const decimals = decimalsFor(this.range[1]);
     const left = this.chart.cursor.left;
     const at = left >= 0 ? this.chart.posToIdx(left) : null;
@@ -156,6 +165,7 @@ export class Plot {
       const shown = at === null ? this.latest[k] : heldAt(this.chart.data[k + 1], at);
       say(value, number(shown, decimals));
       const edge = this.beyond.sigma[k] ?? this.beyond.limit;
+      line.classList.toggle("off", this.context.hidden.has(this.values[k].name));
       line.classList.toggle("beyond", at === null && Math.abs(shown) > edge);
     });
     const { limit } = this.beyond;
@@ -166,9 +176,16 @@ export class Plot {
     say(this.note, notes.join(" · "));
   }
 
-  /** Triangles at the edge where values are off the scale, rings where they are over the limit. */
+  /** Behind the lines: when faults were on. */
+  #under(chart) {
+    const { spans, samples, first } = this.context ?? { spans: [] };
+    if (this.span) drawBands(chart, this.span, spans, samples?.last, this.colours, first === this);
+  }
+
+  /** Events; triangles at the edge where values are off the scale, rings where they are over the limit. */
   #mark(chart) {
     const { ctx, bbox } = chart;
+    if (this.context) drawEvents(chart, this.span, this.context.events, this.context.chosen, this.colours);
     const [least, most] = this.range ?? [0, 1];
     const limit = this.beyond?.limit ?? NaN;
     const size = 5 * devicePixelRatio;

@@ -1,12 +1,30 @@
-// The samples that are kept: by signal, of constant size however long the bench runs.
+// The samples of a run, of constant size however long it is: the latest each, those before as a history.
+
+import { History } from "./history.js";
+import { Slice } from "./slice.js";
 
 const MOST = 24000; // of each signal; 20 minutes at 20 a second
+const NARROW = 0.1; // a bucket whose values differ by less has a value
+
+/** Index of the first of some sorted times that is not before a time. */
+function firstFrom(times, length, time) {
+  let low = 0;
+  let high = length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] < time) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
 
 export class Samples {
-  constructor(signals) {
+  constructor(signals, past = new History(signals)) {
+    this.past = past;
     this.time = new Float64Array(2 * MOST);
     this.values = Array.from({ length: signals }, () => new Float64Array(2 * MOST));
     this.length = 0;
+    this.forgotten = 0; // samples that went into the history
   }
 
   /** Add a sample: a view of its values, little endian, and its time. */
@@ -15,59 +33,57 @@ export class Samples {
     const n = this.length++;
     this.time[n] = time;
     this.values.forEach((column, k) => {
-      column[n] = view.getFloat64(at + 8 * k, true);
+      const value = view.getFloat64(at + 8 * k, true);
+      column[n] = Number.isFinite(value) ? value : NaN;
     });
   }
 
   get last() {
-    return this.length ? this.time[this.length - 1] : NaN;
+    if (this.length) return this.time[this.length - 1];
+    return this.past.samples ? this.past.last[this.past.buckets - 1] : NaN;
   }
 
   /** Index of the first sample not before a time. */
   from(time) {
-    let low = 0;
-    let high = this.length;
-    while (low < high) {
-      const middle = (low + high) >> 1;
-      if (this.time[middle] < time) low = middle + 1;
-      else high = middle;
-    }
-    return low;
+    return firstFrom(this.time, this.length, time);
   }
 
-  /**
-   * Samples of a signal from an index on, times a factor, as uPlot wants them: a number, undefined
-   * where the line goes on to the next one, null where it breaks. A signal that comes seldom is
-   * no broken one: the line breaks where nothing came for more than 2.5 of its usual intervals.
-   */
-  column(k, start, factor = 1) {
-    const { time, length } = this;
+  /** What is to be drawn of a span of time, and one sample beside it on each side. */
+  slice(from, to) {
+    const { past } = this;
+    const begin = this.from(from);
+    const parts = [];
+    if (past.samples && begin === 0) {
+      const first = Math.max(0, firstFrom(past.last, past.buckets, from) - 1);
+      const end = Math.min(past.buckets, firstFrom(past.first, past.buckets, to) + 1);
+      parts.push({ ...past, begin: first, end, shift: 0, raw: past.per === 1 });
+    }
+    const end = Math.min(this.length, this.from(to) + 1);
+    const raw = { first: this.time, last: this.time, least: this.values, most: this.values, raw: true };
+    parts.push({ ...raw, begin: Math.max(0, begin - 1), end, shift: this.forgotten });
+    return new Slice(parts);
+  }
+
+  /** A signal at a time, or what was said of it last; NaN where it is not known. */
+  valueAt(k, time) {
     const column = this.values[k];
-    const out = new Array(length - start);
-    let first = -1;
-    let last = -1;
-    let found = 0;
-    for (let i = start; i < length; i++) {
-      const value = column[i];
-      if (Number.isFinite(value)) {
-        out[i - start] = value * factor;
-        if (first < 0) first = i;
-        last = i;
-        found++;
-      } else out[i - start] = undefined;
+    if (this.length && time >= this.time[0]) {
+      let i = Math.min(this.from(time), this.length - 1);
+      if (this.time[i] > time) i--;
+      while (i > 0 && Number.isNaN(column[i])) i--;
+      return column[i];
     }
-    const usual = found > 1 ? (time[last] - time[first]) / (found - 1) : 0;
-    const most = 2.5 * usual;
-    for (let i = first + 1, before = first; i <= last && first >= 0; i++) {
-      if (out[i - start] === undefined) continue;
-      if (i > before + 1 && time[i] - time[before] > most) out[before + 1 - start] = null;
-      before = i;
-    }
-    return { out, found, last: last < 0 ? NaN : column[last] * factor };
+    const { past } = this;
+    const b = firstFrom(past.last, past.buckets, time);
+    if (b === past.buckets) return NaN;
+    const [least, most] = [past.least[k][b], past.most[k][b]];
+    return most - least < NARROW ? (least + most) / 2 : NaN;
   }
 
   #forget() {
+    for (let i = 0; i < MOST; i++) this.past.add(this.time[i], this.values, i);
     for (const column of [this.time, ...this.values]) column.copyWithin(0, MOST, 2 * MOST);
     this.length = MOST;
+    this.forgotten += MOST;
   }
 }

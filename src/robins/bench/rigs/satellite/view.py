@@ -30,8 +30,13 @@ def signals(given: Any) -> list[Signal]:
                 found.append(Signal(f"{plot} sigma {axis}", unit, plot, "sigma", f"{plot} {axis}"))
         return found
 
+    def attitude(of: str) -> list[Signal]:
+        return [Signal(f"q {of} {c}", "1", "attitude", "attitude", of) for c in "wxyz"]
+
     momentum = "wheel momentum"
     return [
+        *attitude("true"),
+        *attitude("estimated"),
         *three("attitude error", "arcsec", sigma=True),
         *three("pointing error", "arcsec"),
         *three("innovation of the star sensor", "arcsec", sigma=True),
@@ -58,6 +63,8 @@ def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
     wheels = len(kit.vehicle.craft.wheel_h)
     limit = 1e3 * float(np.asarray(kit.given.craft.wheel_momentum_limit)[0])
     return [
+        *flown["motion.q_ib"][step],
+        *flown["estimate.q_ib"][step],
         *np.ravel([error, sigma], order="F"),
         *pointing,
         *np.ravel([innovation / ARCSEC, its_sigma / ARCSEC], order="F"),

@@ -1,0 +1,49 @@
+"""The events of a run, of which a bounded number is kept, and who has acknowledged its alarms.
+
+An event is a mapping: `id`, `level`, `time_s`, `text`; `count` and `until_s` if it came more than
+once in a row; `acknowledged` of an alarm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from robins.bench.live.feed import EVENTS, latest
+
+
+class Events:
+    """The latest events; a frequent level does not push out a rare one."""
+
+    def __init__(self) -> None:
+        self.kept: list[dict[str, Any]] = []
+        self._next = 0
+
+    def happened(self, level: str, time_s: float, text: str) -> dict[str, Any]:
+        """Note an event; one like the last is the last once more, unless that is acknowledged."""
+        last = self.kept[-1] if self.kept else {}
+        if (last.get("level"), last.get("text")) == (level, text) and "acknowledged" not in last:
+            again = {**last, "count": last.get("count", 1) + 1, "until_s": time_s}
+        else:
+            again = {"id": self._next, "level": level, "time_s": time_s, "text": text}
+            self._next += 1
+        self.keep(again)
+        return again
+
+    def keep(self, event: dict[str, Any]) -> None:
+        """Keep an event in the place of what was known of it."""
+        if self.kept and self.kept[-1]["id"] == event["id"]:
+            self.kept[-1] = event
+        else:
+            self.kept = latest([*self.kept, event], lambda one: one["level"], EVENTS)
+
+    def waiting(self) -> list[dict[str, Any]]:
+        """Alarms that nobody has acknowledged."""
+        alarms = (one for one in self.kept if one["level"] == "alarm")
+        return [one for one in alarms if "acknowledged" not in one]
+
+    def acknowledge(self, ids: Collection[int]) -> None:
+        """Note that somebody has."""
+        for one in self.waiting():
+            if one["id"] in ids:
+                one["acknowledged"] = True

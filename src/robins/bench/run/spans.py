@@ -1,0 +1,42 @@
+"""When faults were on, for the live page.
+
+It hears of the bench each half second, and some faults are shorter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+MOST = 100  # that are kept, the latest
+
+
+class FaultSpans:
+    """Listens to which faults are on, step by step."""
+
+    def __init__(self) -> None:
+        self._ends: dict[tuple[str, float], float | None] = {}
+
+    def hear(self, active: Iterable[tuple[str, float]], time_s: float) -> None:
+        """Take what is on after a step.
+
+        Args:
+            active: label and begin [s] of each fault.
+            time_s: of the run.
+        """
+        now = set(active)
+        for span, end in self._ends.items():
+            if end is None and span not in now:
+                self._ends[span] = time_s
+        for span in sorted(now - self._ends.keys()):
+            self._ends[span] = None
+            if len(self._ends) > MOST:
+                self._ends.pop(next(iter(self._ends)))
+
+    @property
+    def told(self) -> list[dict[str, Any]]:
+        """As the page takes them; one that is still on has no end."""
+        return [
+            {"label": label, "begin_s": begin, "end_s": end}
+            for (label, begin), end in self._ends.items()
+        ]
