@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robins.bench import wire
-from robins.bench.broker.injector import Injector, LinkFault, Piece
+from robins.bench.broker.faults import LinkFault
+from robins.bench.broker.injector import Injector, Piece
 from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header, Receiver

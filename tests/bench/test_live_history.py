@@ -65,7 +65,7 @@ def test_buckets_have_the_least_and_the_greatest_of_their_samples(many, monkeypa
 def test_a_server_that_comes_anew_goes_on_where_the_one_before_it_was(before, after):
     def add(kept, begin, many):
         for k in range(begin, begin + many):
-            kept.add(pack_sample(RUN, k, 0.1 * k, [np.sin(k), np.nan if k % 3 else k]))
+            kept.add(pack_sample(RUN, k, 0.1 * k, [np.sin(k), np.nan if k % 3 else float(k)]))
 
     whole, first = History(2), History(2)
     add(whole, 0, before + after)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any
 
 from robins.systems import catalogue
+
+_ROBINS = files("robins")
 
 
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
@@ -61,19 +64,21 @@ def titles(system: str) -> dict[str, str]:
 
 def _benches() -> dict[str, str]:
     """Looked up without the bench: its packages are an extra."""
-    return _packaged("bench", "run", "scenarios")
+    every = (rig.joinpath("scenarios") for rig in _ROBINS.joinpath("bench", "rigs").iterdir())
+    found = [_titled(folder) for folder in every if folder.is_dir()]
+    return {name: title for one in found for name, title in one.items()}
 
 
 def designs() -> dict[str, str]:
     """Titles of the problems of design that come with robins."""
-    return _packaged("workbench", "problems")
+    return _titled(_ROBINS.joinpath("workbench", "problems"))
 
 
-def _packaged(*folder: str) -> dict[str, str]:
+def _titled(folder: Traversable) -> dict[str, str]:
     """Titles of the files in a folder of the package, by their names."""
     found = {
         file.name.removesuffix(".toml"): tomllib.loads(file.read_text("utf-8"))["title"]
-        for file in files("robins").joinpath(*folder).iterdir()
+        for file in folder.iterdir()
         if file.name.endswith(".toml")
     }
     return dict(sorted(found.items()))

@@ -23,8 +23,6 @@ from robins.bench.broker.faults import Direction, LinkFault, Stage, Table
 from robins.bench.wire.frames import Frame, encode_frame
 from robins.bench.wire.schema import FIRST_DATA
 
-__all__ = ["Direction", "Injector", "LinkFault", "Piece"]
-
 _SECOND_NS = 1_000_000_000
 _CHANCE, _BITS = 0, 1  # what noise is for
 _BLOCK = 256  # chances drawn at once

@@ -14,6 +14,8 @@ from robins.bench.rig import Rig
 from robins.errors import RobinsError, hint
 from robins.systems.catalogue import is_file
 
+__all__ = ["RIGS", "UnknownRig", "rig_of"]
+
 RIGS: tuple[str, ...] = ("satellite",)
 """Those that come with robins: each a module here, which calls it RIG."""
 
