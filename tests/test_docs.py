@@ -13,7 +13,7 @@ import pytest
 from plain_docstrings import plain
 
 from robins import scenario
-from robins.bench.run.setup import Setup
+from robins.bench.rigs import rig_of
 from robins.cli import Status, app
 from robins.filters import Filter, Rule
 from robins.logs import columns_from
@@ -167,7 +167,7 @@ def test_the_configurations_shown_can_be_read(tmp_path):
             columns_from(tmp_path / "shown.toml")
             continue
         if "bench" in mapping:
-            scenario.validate(Setup, mapping)
+            scenario.validate(rig_of(mapping["bench"]).setup, mapping)
             continue
         if "project" in mapping:  # of a package of the user's
             continue

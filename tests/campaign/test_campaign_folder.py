@@ -117,15 +117,21 @@ def test_what_was_claimed_by_the_dead_is_computed(undisturbed, tmp_path, monkeyp
 def test_damage_is_told_and_mended(undisturbed, tmp_path):
     begun(tmp_path)
     list(campaign_work(tmp_path))
-    path = sorted((tmp_path / "shards").iterdir())[3]
+    plan = needed(open_store(tmp_path))
+    first, *_, last = plan.shards.values()
+    path = tmp_path / last[0].name
     path.write_bytes(path.read_bytes()[:-1000])
     found = campaign_status(tmp_path)
     assert found.damaged == [f"shards/{path.name}"]
     assert (found.missing, found.digest) == (0, None)
-    assert sum(found.done.values()) in (2 * RUNS - 8, 2 * RUNS - 5)
+    assert found.done == {"gated": RUNS, "kf": RUNS} | {last[0].filter: RUNS - 5}
     assert campaign_verify(tmp_path).damaged == found.damaged
-    assert "kf" in " ".join(campaign_report(tmp_path).warnings) or found.done["kf"] == RUNS
-    assert mend(tmp_path) == 1
+    told = f"{last[0].filter}: {RUNS - 5} of {RUNS} runs are done"
+    assert told in campaign_report(tmp_path).warnings
+    (tmp_path / first[0].name).write_bytes(b"")
+    with pytest.raises(RobinsError, match="has no first run"):
+        campaign_report(tmp_path)
+    assert mend(tmp_path) == 2
     list(campaign_work(tmp_path))
     assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
 

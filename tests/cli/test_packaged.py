@@ -278,6 +278,7 @@ def folder(tmp_path_factory):
     logs.write_log(here / "master.csv", dataset.master)
     logs.write_log(here / "slave.csv", dataset.imu)
     (here / "my_system.py").write_bytes((ROOT / "docs/examples/balloon.py").read_bytes())
+    (here / "my_rig.py").write_bytes((ROOT / "docs/examples/pendulum.py").read_bytes())
     problem = ROOT / "src/robins/workbench/problems/baro-height.toml"
     (here / "my-problem.toml").write_text(problem.read_text())
     balloon = f"{here}/my_system.py:study"
@@ -298,6 +299,7 @@ STANDS_FOR = {
     "record.mcap": "results/bench-satellite-s1/record.mcap",
     "other.mcap": "results/bench-satellite-s1/record.mcap",
     "docs/examples/balloon.py:study": "my_system.py:study",
+    "docs/examples/pendulum.py:rig": "my_rig.py:rig",
 }
 # A reader's own devices, and pages that stay open until someone closes them.
 NEEDS_MORE = re.compile(r"/dev/|--live|bench node|> ")

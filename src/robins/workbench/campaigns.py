@@ -219,16 +219,17 @@ def campaign_report(where: Where) -> Outcome:
     """What all runs say that are there; fewer than wanted are told.
 
     Raises:
-        InputError: there is no run of some filter.
+        InputError: the first run of some filter is not there.
     """
     store, plan = ready(where)
     problem = problem_of(plan)
     found = gather(store, plan, problem)
-    if not all(found.done.values()):
+    # the figures show the first run of each filter
+    if any(one.example is None for one in found.found.values()):
         raise InputError(
-            "some filter has no run yet",
+            "some filter has no first run",
             where,
-            f"`robins campaign work {where}` computes them.",
+            "the same `robins campaign run` computes it.",
         )
     outcome = outcome_of(problem, found.found, _bound(problem))
     short = {name: n for name, n in found.done.items() if n < plan.runs}
