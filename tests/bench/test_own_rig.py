@@ -88,6 +88,8 @@ def test_faults_of_the_line_and_settings_are_of_any_rig(tmp_path):
     assert flight.setup.faults[0].link == "pendulum"
     with pytest.raises(ScenarioError, match="there is no part 'gyro', only pendulum, camera"):
         read(str(scenario), ("faults.0.link=gyro",))
+    with pytest.raises(ScenarioError, match="filter: the pendulum has none to choose: leave it"):
+        read(str(scenario), ("filter=kf",))
     with pytest.raises(ScenarioError, match="lengt"):
         Session(read(RIG, ("lengt=2 m",)))
 

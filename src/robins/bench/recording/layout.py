@@ -28,7 +28,6 @@ EVENTS = "/events"
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<BQHIQQ")  # of a record; channel, number, log time, publish time
 CHUNK = struct.Struct("<BQQQQIIQ")  # of a record; first, last, size, check, 0: plain, size
-INDEX = struct.Struct("<QQ")  # log time, place in the chunk
 
 FRAMES_SCHEMA, EVENTS_SCHEMA = 1, 2
 _EVENT = {

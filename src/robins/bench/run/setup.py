@@ -77,6 +77,8 @@ class Setup(Parameters):
         if self.rate is not None and self.clock == "lockstep":
             raise ValueError('rate: a clock in lock-step has none; choose the clock "realtime"')
         if self.filter not in filters:
+            if not any(filters):
+                raise ValueError(f"filter: the {self.rig.name} has none to choose: leave it out")
             guess = f"{hint(self.filter, filters)} It has {', '.join(filters)}"
             raise ValueError(f"filter: no filter '{self.filter}' for the {self.rig.name}{guess}")
         return self
