@@ -134,7 +134,8 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
     if not text:
         flies = "" if is_file(name) else name
         setup = rig.setup.model_validate({"set": settings} | ({"flies": flies} if flies else {}))
-        return Flight(name, rig, setup, _flies(rig, setup), "")
+        title = Path(name).name.replace(".py:", ":") if is_file(name) else name
+        return Flight(title, rig, setup, _flies(rig, setup), "")
     setup = scenario.parse(rig.setup, text, settings, source=name)
     title = name if name in built_in() else Path(name).stem
     return Flight(title, rig, setup, _flies(rig, setup), text)
