@@ -34,6 +34,7 @@ from robins.bench.wire.records import Unsound
 HELLO_S = 120.0  # for all to compile and say hello
 REVIVED_S = 60.0
 _TELL_S = 0.2  # between two words on how far it is
+_MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
 _GLANCE_NS = 50_000_000  # how often processes are looked at
 
 
@@ -145,6 +146,7 @@ class Session:
         self.step_ms = self.pace = 0.0
         self._labels: list[tuple[str, LinkFault]] = []
         self._histories: dict[str, History] = {}  # of parts that are started anew if they die
+        self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
         self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
@@ -323,9 +325,9 @@ class Session:
             "step_ns": self.kit.step_ns,
             "steps": self.steps,
         }
-        return stack.enter_context(
-            Recorder(self._record_path, self.rig.wire, header, overwrite=True)
-        )
+        rows = self.rig.topics(self.kit)
+        recorder = Recorder(self._record_path, self.rig.wire, header, topics=rows, overwrite=True)
+        return stack.enter_context(recorder)
 
     def _wire(self, stack: contextlib.ExitStack) -> Broker:
         """Open the far ends and start the processes."""
@@ -450,24 +452,29 @@ class Session:
             time.sleep(0.001)
             deaths += self.crew.deaths()
         for death in deaths:
-            self._mourn(death)
+            self._mourn(death, by_itself=death.part != until)
 
-    def _mourn(self, death: Death) -> None:
+    def _mourn(self, death: Death, by_itself: bool) -> None:
         part, setup = death.part, self.flight.setup
         while True:
             self.deaths += 1
             self.event("died", str(death))
             fatal = f"{death}, at {self.time_s:.1f} s of the run"
+            if by_itself:  # a fault may kill it as often as it likes
+                died, now = self._died.setdefault(part, []), time.monotonic()
+                died[:] = [*(at for at in died if now - at < _MINUTE_S), now]
             if setup.on_death == "fail" or self.broker.time_ns == 0:
                 raise BenchError(f'{fatal}; on_death = "restart" would start it anew')
             if self.deaths > setup.restarts:
                 raise BenchError(f"{fatal}; that is one more than restarts = {setup.restarts}")
+            if len(self._died.get(part, ())) >= _MOST_DEATHS:
+                raise BenchError(f"{fatal}; that is its third death in a minute")
             since = self._histories[part].since
             self.crew.start(part, self._speaks[part], since)
             try:
                 self.broker.revive(part, REVIVED_S, partial(self._still_lives, part))
             except _DiedAgainError as again:
-                death = again.death
+                death, by_itself = again.death, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
             return self.event("restarted", f"'{part}' was started anew and told {told} again")

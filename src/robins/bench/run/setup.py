@@ -44,7 +44,8 @@ class Setup(Parameters):
       without it.
     - ``on_death``: what becomes of a run whose process dies: it "fail"s, or the process is
       "restart"ed and told again what it has forgotten, for which the run waits; in real time it
-      misses deadlines. ``restarts``: how often, of all processes together; one more fails the run.
+      misses deadlines. ``restarts``: how often, of all processes together; one more fails the run,
+      and so does the third death of a part within a minute that no fault has killed.
     - ``baud``: of a virtual line that each link without a real port has; left out: no delay.
     - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``.
     """
@@ -215,11 +216,13 @@ def steps_of(flight: Flight) -> int:
         return most
     steps = round(flight.setup.seconds / step_s)
     if not 1 <= steps <= most:
+        wanted = f"duration={flight.setup.seconds:g} s"
+        longer = f'set = ["{wanted}"] in it' if flight.text else f'--set "{wanted}"'
         raise ScenarioError(
             [
                 f"seconds: {flight.setup.seconds:g} s is not from a step ({step_s:g} s) "
                 f"to the end of the scenario ({most * step_s:g} s); "
-                "set its duration to make that longer"
+                f"{longer} makes that longer"
             ]
         )
     return steps
