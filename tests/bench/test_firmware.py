@@ -302,6 +302,7 @@ def test_the_loop_has_forty_lines_and_no_heap():
 def test_every_file_of_the_example_is_given():
     assert list(firmware(WIRE)) == [
         "adm_board.c",
+        "board.mk",
         "gyro_board.c",
         "platform.h",
         "platform_posix.c",

@@ -20,7 +20,7 @@ from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Direction, Health, Link
 from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
-from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
+from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port, program
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.rig import Kit, Rig
 from robins.bench.run.accounting import Latencies
@@ -126,13 +126,15 @@ class Session:
         self._tell = progress or (lambda share, what: None)
         self.steps = steps_of(flight)
         setup = flight.setup
-        self.ports = {part: address(text) for part, text in setup.ports.items()}
+        found = {part: program(text) for part, text in setup.ports.items()}
+        programs = {part: path for part, path in found.items() if path is not None}
+        self.ports = {p: address(text) for p, text in setup.ports.items() if p not in programs}
         if kit is None:
             self._tell(0.0, "preparing")
             kit = kit_of(flight)
         self.kit = kit
         self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns)
-        self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart")
+        self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart", programs)
         self.injector = Injector(self.rig.table, setup.faults, setup.seed)
         self.clock = LockStep() if setup.clock == "lockstep" else real_time(flight)
         self._broker: Broker | None = None  # until the links are open

@@ -47,7 +47,8 @@ class Setup(Parameters):
       misses deadlines. ``restarts``: how often, of all processes together; one more fails the run,
       and so does the third death of a part within a minute that no fault has killed.
     - ``baud``: of a virtual line that each link without a real port has; left out: no delay.
-    - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``.
+    - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``, or
+      programs, which are given the path of a port: ``adm = "adm-c/adm_board"``.
     """
 
     rig: ClassVar[Rig]
