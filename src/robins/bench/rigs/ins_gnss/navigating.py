@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
 from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
-import pydantic
 
 from robins import logs, manifold
 from robins.bench.live.feed import Signal
@@ -55,15 +54,15 @@ class Journey(Replay):
     )
     fix_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
 
-    @pydantic.model_validator(mode="before")
     @classmethod
-    def _of_a_drive(cls, said: Any) -> Any:
-        """A scenario of a drive, taken apart: what is true, and what is believed."""
-        if not isinstance(said, Mapping) or "legs" not in said:
-            return said
-        gnss = {k: v for k, v in dict(said.get("gnss", {})).items() if k in Gnss.model_fields}
-        drive = {k: v for k, v in said.items() if k != "log"}
-        return {k: said[k] for k in _SHARED if k in said} | {"gnss": gnss, "drive": drive}
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Journey:
+        """Of a scenario; that of a drive is taken apart: what is true, and what is believed."""
+        said = json.loads(json_data)
+        if "legs" in said:
+            gnss = {k: v for k, v in said.get("gnss", {}).items() if k in Gnss.model_fields}
+            drive = {k: v for k, v in said.items() if k != "log"}
+            said = {k: said[k] for k in _SHARED if k in said} | {"gnss": gnss, "drive": drive}
+        return super().model_validate_json(json.dumps(said), **options)
 
 
 class Kit(NamedTuple):
@@ -97,7 +96,8 @@ def _as_sensors_say(dataset: Dataset) -> Dataset:
 
 
 def _rate_hz(table: Any) -> float:
-    return 1e9 / float(np.median(np.diff(table.time_ns))) if len(table) > 1 else 1.0
+    # rounded as a replay rounds it: whether a sample is missing may hang on the last digit
+    return 1.0 / float(np.median(np.diff(table.time_ns) * 1e-9)) if len(table) > 1 else 1.0
 
 
 def timing(given: Journey) -> Timing:
@@ -242,7 +242,7 @@ def judge(flight: Any, ran: Any) -> Judged:
     arrays = track_arrays([_nav(flown, "state").position], "{} of the unit")
     arrays |= attitude_array(flown["state.q_nb"][None], "FRD to NED")
     for block in blocks:
-        arrays |= block_array("sigma", block, flown["state.sigma"][None, :, block.part])
+        arrays |= block_array("sigma", block, flown["state.sigma"][None, :, block.where])
     metrics: dict[str, Any] = {}
     if kit.dataset is not None:
         log = on_one_clock(in_body_axes(kit.dataset, kit.given.imu.orientation), kit.given)
@@ -250,7 +250,7 @@ def judge(flight: Any, ran: Any) -> Judged:
     if kit.dataset is not None and kit.dataset.truth is not None:
         error = against_truth(kit.dataset.truth, flown)
         for block in blocks:
-            arrays |= block_array("error", block, error[None, :, block.part])
+            arrays |= block_array("error", block, error[None, :, block.where])
         for name, e in (
             ("heading_rms_deg", np.degrees(error[:, 2])),
             ("velocity_rms_m_s", np.linalg.norm(error[:, 3:6], axis=1)),
