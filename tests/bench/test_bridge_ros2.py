@@ -24,7 +24,8 @@ KEY = {
 
 
 def imu(f_b=(0.5, 0.25, -9.75), q_nb=None):
-    return ros.imu((0.1, -0.2, 0.3), f_b, q_nb, body="FRD", nav="NED")
+    rate = np.array([0.1, -0.2, 0.3])
+    return ros.imu(rate, np.array(f_b), q_nb, body="FRD", nav="NED")
 
 
 # -------------------------------------------------------------------------------------- keys
