@@ -89,6 +89,7 @@ def export_filter(
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
     problem, wanted, label = _asked(name, filter_name, seed, settings)
+    wire = _on_the_wire(label) if board else {}
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
     library, record, found = _library(problem, wanted, label, unroll, precision)
@@ -100,9 +101,8 @@ def export_filter(
         "test.c": check_c(library, record),
         "Makefile": makefile(library),
         "README.md": _readme(library, wanted, label, found),
+        **wire,
     }
-    if board:
-        files |= _on_the_wire(label)
     _write(to, files)
     made = _built(to) if board else None
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
