@@ -205,7 +205,7 @@ def test_without_samples_it_says_what_to_give():
     assert judged(boards, kit, silent).metrics == {}
 
 
-@pytest.mark.parametrize("machine", ["jax", pytest.param("c", marks=pytest.mark.certify)])
+@pytest.mark.parametrize("machine", ["jax", "c"])
 def test_the_walk_has_the_figures_of_its_replay(data_dir, machine):
     paths = [data_dir / f"gnssimu_walk_{part}.xz" for part in ("imu.csv", "gnss.pos")]
     if not all(path.exists() for path in paths):

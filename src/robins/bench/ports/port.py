@@ -15,7 +15,7 @@ import os
 import stat
 import termios
 import tty
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -61,6 +61,17 @@ def program(text: str) -> Path | None:
     """The program that stands for a part, if that is what a text names; else it is a port."""
     path = Path(text.strip())
     return path.resolve() if path.is_file() and os.access(path, os.X_OK) else None
+
+
+def parted(texts: Mapping[str, str]) -> tuple[dict[str, Address], dict[str, Path]]:
+    """Boards at their ports, and programs, each by the part that it stands for.
+
+    Raises:
+        PortError: as `address`.
+    """
+    found = {part: program(text) for part, text in texts.items()}
+    boards = {part: address(text) for part, text in texts.items() if found[part] is None}
+    return boards, {part: path for part, path in found.items() if path is not None}
 
 
 def obstacle(path: str) -> str:

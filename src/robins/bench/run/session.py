@@ -20,13 +20,13 @@ from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Direction, Health, Link
 from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
-from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port, program
+from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.rig import Kit, Rig
 from robins.bench.run.accounting import Latencies
 from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.crew import Crew, Death
-from robins.bench.run.setup import Flight, counted_from, steps_of
+from robins.bench.run.setup import Flight, counted_from, kit_of, steps_of
 from robins.bench.run.telemetry import Flown, Telemetry
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Unsound
@@ -126,9 +126,7 @@ class Session:
         self._tell = progress or (lambda share, what: None)
         self.steps = steps_of(flight)
         setup = flight.setup
-        found = {part: program(text) for part, text in setup.ports.items()}
-        programs = {part: path for part, path in found.items() if path is not None}
-        self.ports = {p: address(text) for p, text in setup.ports.items() if p not in programs}
+        self.ports, programs = parted(setup.ports)
         if kit is None:
             self._tell(0.0, "preparing")
             kit = kit_of(flight)
@@ -318,8 +316,7 @@ class Session:
         setup, given = self.flight.setup, self.flight.given
         header = {
             "robins": __version__,
-            "wire": VERSION,
-            "rig": self.rig.address or self.rig.name,
+            **{"wire": VERSION, "rig": self.rig.address or self.rig.name},
             "name": self.flight.name,
             "run": self.run_number,
             "setup": setup.model_dump(mode="json", exclude_unset=True),
@@ -327,8 +324,8 @@ class Session:
             "step_ns": self.kit.step_ns,
             "steps": self.steps,
         }
-        rows = self.rig.topics(self.kit)
-        recorder = Recorder(self._record_path, self.rig.wire, header, topics=rows, overwrite=True)
+        rows, wire = self.rig.topics(self.kit), self.rig.wire
+        recorder = Recorder(self._record_path, wire, header, topics=rows, overwrite=True)
         return stack.enter_context(recorder)
 
     def _wire(self, stack: contextlib.ExitStack) -> Broker:
@@ -487,19 +484,14 @@ class Session:
         Raises:
             _DiedAgainError: it has.
         """
-        for death in self.crew.deaths(part):
-            raise _DiedAgainError(death)
+        if died := self.crew.deaths(part):
+            raise _DiedAgainError(died[0])
 
 
 def real_time(flight: Flight) -> RealTime:
     """The clock of a run in real time."""
     setup = flight.setup
     return RealTime(setup.rate or 1.0 / flight.timing.step_s, setup.overrun, setup.patience)
-
-
-def kit_of(flight: Flight) -> Kit:
-    """What the parts of a run are made from."""
-    return flight.rig.prepare(flight.setup, flight.given)
 
 
 def wiring(rig: Rig, kit: Kit) -> Wiring:

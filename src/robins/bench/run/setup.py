@@ -115,6 +115,11 @@ class Flight(NamedTuple):
         return self.rig.timing(self.given)
 
 
+def kit_of(flight: Flight) -> Any:
+    """What the parts of a run are made from."""
+    return flight.rig.prepare(flight.setup, flight.given)
+
+
 def built_in() -> dict[str, Path]:
     """Scenarios of the bench that come with robins, by name."""
     return {name: path for rig in RIGS for name, path in rig_of(rig).scenarios().items()}

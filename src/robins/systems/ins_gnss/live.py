@@ -36,10 +36,10 @@ import numpy as np
 from robins.dataset import ImuTable
 from robins.errors import require
 from robins.filters import OnlineFilter
-from robins.filters.run import Step
 from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
+from robins.systems.ins_gnss.live_answers import Navigation, answer_of, kept, predicted
 from robins.systems.ins_gnss.live_fixes import TOLD, WIDTH, row_of, some, table_of
 from robins.systems.ins_gnss.log import (
     SMOOTHED,
@@ -50,7 +50,6 @@ from robins.systems.ins_gnss.log import (
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
-from robins.systems.ins_gnss.robust import navigation
 from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
@@ -72,41 +71,12 @@ _UNITS_S = 1.0  # of samples, whose size tells their unit
 _MOST_START_S = 600.0  # of samples that the start is sought in
 
 
-class Navigation(NamedTuple):
-    """The answer to a sample or a fix: the state of the IMU; NaN while `STARTING`."""
-
-    time_ns: int
-    q_nb: np.ndarray  # (4,) forward-right-down to north-east-down, scalar first
-    v_n: np.ndarray  # (3,) m/s
-    lat_rad: float
-    lon_rad: float
-    alt_m: float
-    sigma: np.ndarray  # (9,) attitude [rad], velocity [m/s], position [m], each NED
-    flags: Flag
-
-
 class Epoch(NamedTuple):
     """Where the filter is: the end of a block."""
 
     time_s: float
     wanted_s: float  # the fix, or the start, since which the blocks are counted
     number: int  # of blocks since
-
-
-def _predicted(filter_: Any, model: Any, state: Any, u: Block) -> jax.Array:
-    """Mean and standard deviations after a block, in one vector."""
-    return _vector(filter_.predict(state, model.motion, u)[1].belief)
-
-
-def _vector(belief: Any) -> jax.Array:
-    x = navigation(belief.mean)
-    p = x.position
-    place = jnp.stack([p.lat, p.lon, p.alt])
-    return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma[:9]])
-
-
-def _kept(step: Step) -> jax.Array:
-    return _vector(step.posterior)
 
 
 class LiveInsGnss(Live):
@@ -270,8 +240,7 @@ class LiveInsGnss(Live):
         oldest = self._past[0][0] if self._past else -math.inf
         if why := self._refused_fix(row, oldest, newest):
             self.counts[f"gnss_{why}"] += 1
-        nothing = why == "nan"  # was measured at this time
-        if why and not (nothing and self._online is not None):
+        if why and not (why == "nan" and self._online is not None):  # which is an epoch then
             return self._answer(self._raw_ns[-1] if self._raw_ns else time, Flag.REFUSED)
         at = int(np.searchsorted(self._fixes[:, 0], row[0]))
         self._fixes = np.insert(self._fixes, at, row, axis=0)
@@ -279,7 +248,7 @@ class LiveInsGnss(Live):
         self._first_fix_s = min(self._first_fix_s, float(row[0]))
         self._go_back(float(row[0]))
         self._advance()
-        return self._answer(self._raw_ns[-1], Flag.REFUSED if nothing else Flag(0))
+        return self._answer(self._raw_ns[-1], Flag.REFUSED if why else Flag(0))
 
     def _refused_fix(self, row: np.ndarray, oldest: float, newest: float) -> str:
         if math.isnan(row[0]) or row[0] <= 0.0:
@@ -288,9 +257,8 @@ class LiveInsGnss(Live):
             return "duplicate"
         if row[0] <= oldest + 1e-9:
             return "too_old"
-        if row[0] > newest + _AHEAD_S:
-            return "ahead"
-        return "" if np.any(np.isfinite(row[TOLD])) else "nan"
+        nothing = "" if np.any(np.isfinite(row[TOLD])) else "nan"
+        return "ahead" if row[0] > newest + _AHEAD_S else nothing
 
     def _seconds(self, time_ns: int) -> float:
         assert self._origin_ns is not None
@@ -418,8 +386,8 @@ class LiveInsGnss(Live):
         row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (y | known, aux | about))
         u = self._block(to.time_s, rows, at, self._width)
         self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
-        kept = np.asarray(self._online.step(row[0], u, row[1], keep=_kept))
-        self.epoch = self._told(to.time_s, kept, Flag(0))
+        said = np.asarray(self._online.step(row[0], u, row[1], keep=kept))
+        self.epoch = self._told(to.time_s, said, Flag(0))
         self.passed.append(self.epoch)
         self._past.append(tuple(to))
         self._states.append(self._online.state)
@@ -471,13 +439,12 @@ class LiveInsGnss(Live):
         rows = np.concatenate([rows, last])
         end_s = float(rows[-1, 0])
         u = self._block(end_s, rows, at, self._width + 8)
-        found = self._online.look(_predicted, u)
+        found = self._online.look(predicted, u)
         return self._told(end_s, np.asarray(found), mark)._replace(time_ns=time_ns)
 
     def _told(self, time_s: float, x: np.ndarray, flags: Flag) -> Navigation:
         time_ns = round(time_s * 1e9) + (self._origin_ns or 0)
-        lat, lon, alt = x[7:10].tolist()
-        return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:], flags)
+        return answer_of(time_ns, x, flags)
 
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""

@@ -19,6 +19,8 @@ from robins.bench.wire.fields import Field, f64, message, size
 from robins.bench.wire.schema import Wire
 from robins.scenario import Quantity, default
 
+__all__ = ["FLAGS", "RIG", "WIRE"]
+
 FLAGS = ("starting", "refused", "rest", "saturated", "disturbed", "doubtful", "behind")
 """Bits of `state.flags`, from the lowest: `robins.systems.streaming.Flag`."""
 _SPEED, _FAR = 1e5, 1e9  # m/s, m: far beyond any vehicle

@@ -28,7 +28,8 @@ from robins.ins.state import InsState
 from robins.rotation import Rotation
 from robins.scenario import Quantity, default
 from robins.systems.ins_gnss import model
-from robins.systems.ins_gnss.live import LiveInsGnss, Navigation
+from robins.systems.ins_gnss.live import LiveInsGnss
+from robins.systems.ins_gnss.live_answers import Navigation
 from robins.systems.ins_gnss.log import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
@@ -184,11 +185,13 @@ class Navigating(NamedTuple):
 
 def navigation(kit: Kit) -> Part:
     """The navigation computer: says what `LiveInsGnss` says."""
-    live = LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine)  # compiles
+    made: list[LiveInsGnss] = []
 
     def begin() -> Navigating:
-        live.start_over()
-        return Navigating(live, ())
+        if not made:  # which compiles, and is not needed by who only asks what it takes
+            made.append(LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine))
+        made[0].start_over()
+        return Navigating(made[0], ())
 
     def act(state: Navigating, k: int, inputs: Inputs):
         live, waiting = state
