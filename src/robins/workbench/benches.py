@@ -19,7 +19,7 @@ from robins.bench.recording.differences import FieldDifference, differences, tab
 from robins.bench.recording.replay import Start, recorded, replay
 from robins.bench.run.outcome import outcome
 from robins.bench.run.session import Session
-from robins.bench.run.setup import Flight, changed, read, recorded_flight, recorded_rig
+from robins.bench.run.setup import Flight, changed, kit_of, read, recorded_flight, recorded_rig
 from robins.bench.run.watching import Looking, page_for, starting
 from robins.bench.status import Status
 from robins.results import Outcome, Progress, silent
