@@ -93,7 +93,7 @@ def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> 
     your own is named with its file, my_rig.py:rig.
 
     Scenarios of the bench: killed-adm, lost-star, lost-wheel, noisy-line, sign-star, stuck-star,
-    wrong-star of the satellite, lost-gnss of INS/GNSS.
+    wrong-star of the satellite, lost-gnss of INS/GNSS, false-place of the airship.
     """
     out = out or RESULTS / f"bench-{folder_name(scenario)}"
     outcome = carry_out(
