@@ -50,8 +50,8 @@ def later(where: str) -> Callable[..., Any]:
 
 def packaged(file: str) -> Callable[[], dict[str, Path]]:
     """The scenarios of the bench in the folder beside a file, by name."""
-    found = (Path(file).parent / "scenarios").glob("*.toml")
-    return lambda: {path.stem: path for path in sorted(found)}
+    found = sorted((Path(file).parent / "scenarios").glob("*.toml"))
+    return lambda: {path.stem: path for path in found}
 
 
 @runtime_checkable
