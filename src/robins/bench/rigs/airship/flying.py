@@ -13,6 +13,7 @@ import numpy as np
 from robins import manifold
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rig import Judged, Timing
+from robins.bench.run.numbers import figures_of
 from robins.bench.run.setup import counted_from
 from robins.bench.run.telemetry import Flown
 from robins.earth import Geodetic
@@ -197,7 +198,5 @@ def judge(flight: Any, ran: Any) -> Judged:
         squares = np.sum(error[counted, where] ** 2, axis=1)
         known = squares[np.isfinite(squares)]
         metrics[name] = float(np.sqrt(np.mean(known))) / unit if len(known) else None
-    shown = [(name, x) for name, x in metrics.items() if x is not None]
-    lines = [f"{name.replace('_', ' '):<24}{x:10.3f}" for name, x in shown]
     counts = {"steps_without_increment": int(np.sum(flown["state.held"]))}
-    return Judged(metrics, counts, arrays=arrays, lines=lines)
+    return Judged(metrics, counts, arrays=arrays, lines=figures_of(metrics))

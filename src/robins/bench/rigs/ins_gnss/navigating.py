@@ -17,7 +17,7 @@ from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
 from robins.bench.recording.topics import imu as imu_of_ros
 from robins.bench.rig import Judged, RigError, Timing, View
 from robins.bench.rigs.ins_gnss import FLAGS
-from robins.bench.run.numbers import latest
+from robins.bench.run.numbers import figures_of, latest
 from robins.bench.run.telemetry import Flown
 from robins.dataset import Dataset
 from robins.earth import Geodetic
@@ -30,6 +30,7 @@ from robins.scenario import Quantity, default
 from robins.systems.ins_gnss import model
 from robins.systems.ins_gnss.live import LiveInsGnss
 from robins.systems.ins_gnss.live_answers import Navigation
+from robins.systems.ins_gnss.live_fixes import some
 from robins.systems.ins_gnss.log import antenna_of, distances, fix_arrays
 from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
 from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
@@ -249,7 +250,9 @@ def judge(flight: Any, ran: Any) -> Judged:
     metrics: dict[str, Any] = {}
     if kit.dataset is not None:
         log = on_one_clock(in_body_axes(kit.dataset, kit.given.imu.orientation), kit.given)
-        metrics, arrays = against_fixes(kit, log, flown), arrays | fix_arrays(log)
+        metrics, flew = against_fixes(kit, log, flown), log.gnss_s <= flown.time_s[-1]
+        flown_by = log._replace(gnss=some(log.gnss, flew), gnss_s=log.gnss_s[flew])
+        arrays |= fix_arrays(flown_by)
     if kit.dataset is not None and kit.dataset.truth is not None:
         error = against_truth(kit.dataset.truth, flown)
         for block in blocks:
@@ -265,9 +268,7 @@ def judge(flight: Any, ran: Any) -> Judged:
         f"steps_{name}": int(np.sum(flown["state.flags"] >> k & 1))
         for k, name in enumerate(FLAGS[:2])
     }
-    shown = [(name, x) for name, x in metrics.items() if isinstance(x, float)]
-    lines = [f"{name.replace('_', ' '):<28}{x:10.3f}" for name, x in shown]
-    return Judged(metrics, counts, arrays=arrays, lines=lines)
+    return Judged(metrics, counts, arrays=arrays, lines=figures_of(metrics))
 
 
 def _nav(flown: Flown, message: str, rows: Any = slice(None)) -> Nav:
