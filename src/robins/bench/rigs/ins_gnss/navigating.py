@@ -92,8 +92,7 @@ def _as_sensors_say(dataset: Dataset) -> Dataset:
     """Rates in the place of increments, forward-right-down and north-east-down."""
     imu = to_ned_frd(dataset.imu)
     if imu.kind == "increment":
-        dt = np.diff(imu.time_ns, prepend=2 * imu.time_ns[0] - imu.time_ns[1]) * 1e-9
-        dt = own_intervals(dt, imu.gyro, imu.accel)[:, None]
+        dt = own_intervals(np.diff(imu.time_ns) * 1e-9, imu.gyro, imu.accel)[:, None]
         imu = replace(imu, gyro=imu.gyro / dt, accel=imu.accel / dt, kind="rate")
     gnss = None if dataset.gnss is None else to_ned_frd(dataset.gnss)
     return replace(dataset, imu=imu, gnss=gnss)
