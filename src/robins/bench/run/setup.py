@@ -21,7 +21,7 @@ import pydantic
 
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
-from robins.bench.rig import Rig, Timing
+from robins.bench.rig import Kit, Rig, Timing
 from robins.bench.rigs import RIGS, rig_of
 from robins.errors import hint
 from robins.scenario import Parameters, Quantity, ScenarioError
@@ -115,7 +115,7 @@ class Flight(NamedTuple):
         return self.rig.timing(self.given)
 
 
-def kit_of(flight: Flight) -> Any:
+def kit_of(flight: Flight) -> Kit:
     """What the parts of a run are made from."""
     return flight.rig.prepare(flight.setup, flight.given)
 

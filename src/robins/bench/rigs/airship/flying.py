@@ -147,7 +147,7 @@ def navigation(kit: Kit) -> Part:
         x = np.asarray(online[0].step(y, increment, aux, keep=_kept))
         return Navigating(online[0].state, increment), [("state", {**_told(x), "held": int(held)})]
 
-    takes = dict.fromkeys(("increment", "fix", "attitude", "wind"), 0)
+    takes = {"increment": 0, "fix": 0, "attitude": 0, "wind": 0}
     return Part("navigation", takes, first, act, dict.fromkeys(takes))
 
 
@@ -176,7 +176,9 @@ def errors(kit: Kit, flown: Flown) -> np.ndarray:
     """(E, 9) true less estimated attitude [rad], velocity, position [m], each ENU."""
     q, v, *place = (np.asarray(flown[f"state.{f}"]) for f in ("q_nb", "v_n", "lat", "lon", "alt"))
     truth = jax.tree_util.tree_map(lambda x: x[: len(q)], kit.truth)
-    off = jax.jit(jax.vmap(manifold.local))(Nav(Rotation(q), v, Geodetic(*place)), truth)
+    off = jax.jit(jax.vmap(manifold.local))(
+        Nav(Rotation(q), jnp.asarray(v), Geodetic(*place)), truth
+    )
     return np.asarray(off) @ ENU_OF_NED.T
 
 

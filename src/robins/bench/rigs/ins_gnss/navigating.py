@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from robins import logs, manifold
@@ -274,7 +275,7 @@ def judge(flight: Any, ran: Any) -> Judged:
 
 def _nav(flown: Flown, message: str, rows: Any = slice(None)) -> Nav:
     q, v, *place = (flown[f"{message}.{f}"][rows] for f in ("q_nb", "v_n", "lat", "lon", "alt"))
-    return Nav(Rotation(q), v, Geodetic(*place))
+    return Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
 
 
 def epochs_of(flown: Flown) -> np.ndarray:
@@ -293,7 +294,7 @@ def against_fixes(kit: Kit, log: Any, flown: Flown) -> dict[str, Any]:
     if not len(rows := epochs_of(flown)):
         return {}
     epoch_s = (flown["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
-    nothing = np.zeros((len(rows), 3))
+    nothing = jnp.zeros((len(rows), 3))
     mean = InsState(*_nav(flown, "epoch", rows), nothing, nothing)
     rate_b = rate_about(log.increments, log.time_s, epoch_s)
     antenna = antenna_of(model.mount_of(kit.given.gnss, kit.given.aids), mean, rate_b)
@@ -305,7 +306,7 @@ def against_truth(t: Any, flown: Flown) -> np.ndarray:
     """(E, 9) true less estimated attitude [rad], velocity and position [m], each NED."""
     at = np.clip(np.searchsorted(t.time_ns, flown["state.time"]), 0, len(t) - 1)
     place = Geodetic(*(np.asarray(x)[at] for x in (t.lat_rad, t.lon_rad, t.alt_m)))
-    truth = Nav(Rotation(np.asarray(t.q_nb)[at]), np.asarray(t.v_n)[at], place)
+    truth = Nav(Rotation(np.asarray(t.q_nb)[at]), jnp.asarray(t.v_n)[at], place)
     return np.asarray(jax.jit(jax.vmap(manifold.local))(_nav(flown, "state"), truth))
 
 
