@@ -69,9 +69,10 @@ def prepare(setup: Any, given: Airship) -> Kit:
     problem = study.problem(given, (setup.filter,), setup.seed)
     of = problem.contenders[setup.filter]
     case = of.case(jax.jit(problem.simulate)(jnp.asarray(0)))
-    rows = jax.tree_util.tree_map(np.asarray, (case.u, dict(case.y), dict(case.aux)))
-    truth = jax.tree_util.tree_map(np.asarray, nav_of(case.truth))
-    return Kit(round(1e9 * given.epoch), setup.filter, of.model, case.start, *rows, truth)
+    u, y, aux, truth = jax.tree_util.tree_map(
+        np.asarray, (case.u, dict(case.y), dict(case.aux), nav_of(case.truth))
+    )
+    return Kit(round(1e9 * given.epoch), setup.filter, of.model, case.start, u, y, aux, truth)
 
 
 def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
@@ -119,13 +120,14 @@ def navigation(kit: Kit) -> Part:
     """The navigation computer: any filter that takes what comes; what does not come is missing."""
     windy = WIND in kit.y
     begin = Increments(*(np.asarray(x)[0] for x in kit.u))
-    online: list[OnlineFilter] = []
+    online: list[OnlineFilter] = []  # made when it is needed, not by who asks what it takes
+    starts: list[Any] = []
 
     def first() -> Navigating:
         if not online:
             online.append(OnlineFilter(CANDIDATES[kit.filter].make(), kit.model, kit.start))
-            online.append(online[0].state)
-        return Navigating(online[1], begin)
+            starts.append(online[0].state)
+        return Navigating(starts[0], begin)
 
     def act(state: Navigating, k: int, inputs: Inputs):
         u, fix, seen, wind = (inputs[of] for of in ("increment", "fix", "attitude", "wind"))
@@ -176,9 +178,8 @@ def errors(kit: Kit, flown: Flown) -> np.ndarray:
     """(E, 9) true less estimated attitude [rad], velocity, position [m], each ENU."""
     q, v, *place = (np.asarray(flown[f"state.{f}"]) for f in ("q_nb", "v_n", "lat", "lon", "alt"))
     truth = jax.tree_util.tree_map(lambda x: x[: len(q)], kit.truth)
-    off = jax.jit(jax.vmap(manifold.local))(
-        Nav(Rotation(q), jnp.asarray(v), Geodetic(*place)), truth
-    )
+    estimate = Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
+    off = jax.jit(jax.vmap(manifold.local))(estimate, truth)
     return np.asarray(off) @ ENU_OF_NED.T
 
 
