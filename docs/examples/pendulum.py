@@ -11,6 +11,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from robins.bench import Judged, Part, Rig, Wire
+from robins.bench.run.setup import counted_from
 from robins.bench.wire.fields import f64, message, size
 from robins.filters import Belief, Model, Motion, OnlineFilter, Sensor, kalman
 from robins.results import array
@@ -106,7 +107,7 @@ def camera(kit: Kit) -> Part:
 
 
 def judge(flight, ran) -> Judged:
-    flown, first = ran.flown, flight.timing.counted_from
+    flown, first = ran.flown, counted_from(flight, ran.steps)
     error = np.degrees(flown["swing.angle"] - flown["estimate.angle"])[:, None]
     sigma = np.degrees(flown["estimate.sigma"][:, :1])
     rms = float(np.sqrt(np.nanmean(error[first:] ** 2)))

@@ -61,7 +61,7 @@ class Threads:
 
     stations: ClassVar[Mapping[str, Callable[[Part, Wire], Station]]] = {}  # of parts that are odd
 
-    def __init__(self, rig: Rig, kit: Kit, realtime: bool = False, restarts: bool = False):
+    def __init__(self, rig: Rig, kit: Kit, *_: object):
         self.parts, self.threads = parts(kit), list[threading.Thread]()
 
     def __enter__(self) -> "Threads":

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 from functools import partial
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,7 @@ from robins.workbench.boards import SMALL, export_filter
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
 SETTINGS = "duration=60 s", "counted_from=10 s"
+FLAGSHIP = "mekf"
 STEPS = 170
 # Steps in which something does not reach the filter: one sample of the gyro, two in a row, frames
 # of the star sensor for longer than it may be silent; and a frame of no length.
@@ -118,7 +120,47 @@ def test_it_has_the_bits_of_the_same_filter_in_c_on_the_host(program, of):
     np.testing.assert_allclose(all_of(told, "q_ib"), loop.all("estimate", "q_ib"), atol=1e-14)
 
 
-def test_the_satellite_flies_with_it(program, tmp_path, capsys, monkeypatch):
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+def test_it_compiles_as_c_plus_plus_too(program):
+    flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c++"]
+    command = ["g++", *flags, "adm_board.c", "robins.c"]
+    where = Path(program).parent
+    built = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+
+
+def test_from_a_design_to_a_board_in_three_commands(tmp_path, capsys):
+    """docs/from-design-to-board.md: exported and built, flown and recorded, heard again."""
+    of = ["satellite/s1", "--filter", FLAGSHIP, *(f"--set={one}" for one in SETTINGS)]
+    folder, out = tmp_path / "adm", tmp_path / "out"
+    assert main(["export", *of, "--to", str(folder), "--board", "--json"]) == 0
+    built = json.loads(capsys.readouterr().out)["program"]
+    flown = ["bench", "up", *of, "--node", f"adm={built}", "--seconds", "20"]
+    assert main([*flown, "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["steps"], said["failure"]) == (200, "")
+    # the closed loop with the C on its line is that of the same filter inside one program
+    assert 0.0 <= said["max_abs_difference_in_process"] < 1e-10
+    assert said["attitude_rms_arcsec"] < 30.0
+    assert (out / "report.html").exists()
+    again = ["bench", "replay", str(out / "record.mcap"), "--node", "adm", "--json"]
+    assert main(again) == 0
+    heard = json.loads(capsys.readouterr().out)
+    assert heard["same"]
+    # who hears it is the program: another one in its place answers otherwise
+    Path(built).write_text("#!/bin/sh\nexit 3\n")
+    assert main(again) != 0
+    assert "died" in capsys.readouterr().err
+
+
+def test_what_is_no_part_of_a_rig_is_not_built(tmp_path, capsys):
+    of = ["export", "ins-gnss/drive", "--filter", "ekf", "--to", str(tmp_path / "c"), "--board"]
+    assert main(of) == 2
+    assert "no part of the bench is made of a filter of ins-gnss" in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()
+
+
+def test_the_satellite_flies_with_it_over_a_cable(program, tmp_path, capsys, monkeypatch):
     on_threads(monkeypatch)  # the other parts
     common = ["bench", "up", "satellite/s1", "--seconds", "20", "--json"]
     asked = [*common, *(f"--set={one}" for one in SETTINGS)]

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(GCC is None, reason="needs a C compiler, gcc")
 FLAGS = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1"]
 SANITISERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 STEP_NS = 10_000_000
-NOTHING = 0.05  # s without an answer are no answer
+NOTHING = 0.05  # s without an answer
 
 
 def build(folder: Path, *sources: str, extra: tuple[str, ...] = ()) -> Path:
@@ -300,13 +300,8 @@ def test_the_loop_has_forty_lines_and_no_heap():
 
 
 def test_every_file_of_the_example_is_given():
-    assert list(firmware(WIRE)) == [
-        "adm_board.c",
-        "gyro_board.c",
-        "platform.h",
-        "platform_posix.c",
-        "robins_wire.h",
-    ]
+    examples = ["adm_board.c", "board.mk", "gyro_board.c", "platform.h", "platform_posix.c"]
+    assert list(firmware(WIRE)) == [*examples, "robins_wire.h"]
 
 
 # ------------------------------------------------------------------------------------------ page

@@ -6,6 +6,7 @@ that follows from its messages.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from robins.bench.broker.faults import LinkFault, Said, Table
     from robins.bench.live.feed import Signal
+    from robins.bench.recording.topics import Topic
     from robins.bench.run.session import Ran
     from robins.bench.run.setup import Flight, Setup
     from robins.bench.run.telemetry import Flown
@@ -30,6 +32,26 @@ if TYPE_CHECKING:
 
 class RigError(RobinsError, ValueError):
     """A rig that contradicts itself."""
+
+
+def named(where: str) -> Any:
+    """What has a name in a module: "package.module:name".
+
+    So processes of parts import what they need alone, and start sooner.
+    """
+    module, _, name = where.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def later(where: str) -> Callable[..., Any]:
+    """A function that is imported when it is called; as of `named`."""
+    return lambda *args: named(where)(*args)
+
+
+def packaged(file: str) -> Callable[[], dict[str, Path]]:
+    """The scenarios of the bench in the folder beside a file, by name."""
+    found = sorted((Path(file).parent / "scenarios").glob("*.toml"))
+    return lambda: {path.stem: path for path in found}
 
 
 @runtime_checkable
@@ -134,6 +156,7 @@ class Rig:
         options: parameters of a run besides those of all rigs, each with type and default.
         said: faults of its sensors and actuators, by kind, and their parameters.
         view: of the page; left out: all numbers of its messages.
+        topics: (kit) -> what viewers and ROS 2 get of its messages, in the record.
         inside: (kit) -> arrays of the same run inside one program, named as `Flown` names them.
         judge: figures of merit of a run; left out: none, and all numbers in its arrays.
         example: the part with which commands are shown; left out: its last.
@@ -156,6 +179,7 @@ class Rig:
     options: Callable[[], Mapping[str, Any]] = dict
     said: Callable[[], tuple[Mapping[str, Said], Mapping[str, Any]]] = lambda: ({}, {})
     view: Callable[[], View] | None = None
+    topics: Callable[[Any], Sequence[Topic]] = lambda kit: ()
     inside: Callable[[Any], Mapping[str, np.ndarray]] | None = None
     judge: Callable[[Flight, Ran], Judged] | None = None
     example: str = ""

@@ -30,6 +30,7 @@ from robins.cli.tell import carry_out, say
         "robins bench up satellite/s1                  seven processes, one loop, bit for bit",
         "robins bench up satellite/s1 --live           with a page to watch it",
         "robins bench up noisy-line                    damaged, lost, late frames",
+        "robins bench up ins-gnss/drive --filter ekf   inertial unit, receiver, navigation",
         "robins bench up satellite/s1 --clock realtime --node gyro=/dev/ttyUSB0,460800",
         "robins bench replay results/bench-satellite-s1/record.mcap --node adm",
     ),
@@ -51,7 +52,7 @@ def _ports(
 
 
 _SEED = option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of all noise. [default: 0]")
-_FILTER = option("--filter", "filter_", metavar="NAME", help="Filter for the attitude.")
+_FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with.")
 
 
 @bench.command(
@@ -72,7 +73,7 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter for the att
 @option("--overrun", type=click.Choice(["continue", "skip", "abort"]), help="For a late step.")
 @option("--on-death", type=click.Choice(["fail", "restart"]), help="If a part dies.")
 @option("--restarts", type=click.IntRange(1, 100_000), help="Upper limit. [default: 10]")
-@option("--node", "ports", multiple=True, callback=_ports, metavar="PART=PORT", help="A board.")
+@option("--node", "ports", multiple=True, callback=_ports, metavar="PART=PORT", help="Or =PROGRAM.")
 @option("--baud", type=click.IntRange(300), help="Speed of the virtual lines.")
 @option("--fifo", is_flag=True, help="Ask for the real-time scheduler SCHED_FIFO.")
 @option("--live", is_flag=True, help="Serve a page that shows the run.")
@@ -83,15 +84,16 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter for the att
 @_SEED
 @publishes
 def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> int:
-    """Run SCENARIO on the bench: one of the satellite, one of the bench, or a file of either.
+    """Run SCENARIO on the bench: one of a vehicle, one of the bench, or a file of either.
 
     Each part of the vehicle, such as plant, gyro or attitude determination, is a process on its own
     serial line; the bench connects, records and disturbs the lines. With --node a board replaces a
-    process. In lock-step (the default) the run equals `robins run` bit for bit; real time is soft,
-    as on any ordinary kernel. A rig of your own is named with its file, my_rig.py:rig.
+    process, or a program of your own that is given the path of a line. In lock-step (the default)
+    the run equals `robins run` bit for bit; real time is soft, as on any ordinary kernel. A rig of
+    your own is named with its file, my_rig.py:rig.
 
-    Scenarios of the bench: killed-adm, lost-star, lost-wheel, noisy-line, sign-star, stuck-star,
-    wrong-star.
+    Scenarios of the bench: false-place, killed-adm, lost-gnss, lost-star, lost-wheel, noisy-line,
+    sign-star, stuck-star, wrong-star.
     """
     out = out or RESULTS / f"bench-{folder_name(scenario)}"
     outcome = carry_out(
@@ -184,16 +186,26 @@ def node(part: str, port: str, scenario: str, **options: Any) -> None:
 
 @bench.command(
     short_help="Print the wire as a C header, for firmware.",
-    epilog=examples("robins bench header > robins_wire.h"),
+    epilog=examples("robins bench header > robins_wire.h", "robins bench header --to board"),
 )
 @click.argument("rig", default="satellite")
+@option("--to", type=click.Path(path_type=Path), metavar="DIR", help="Write the examples too.")
 @DEBUG
-def header(rig: str) -> None:
+def header(rig: str, to: Path | None) -> None:
     """Print robins_wire.h of RIG: every message, frames, a receiver; C99 or C++11, no heap.
 
-    RIG is one that comes with robins, by default the satellite, or "file.py:rig".
+    RIG is one that comes with robins, by default the satellite, or "file.py:rig". With --to it goes
+    into a folder, with the example of a board and how it is built for this machine.
     """
     from robins.bench.rigs import rig_of
-    from robins.bench.wire.c_header import c_header
+    from robins.bench.wire.c_header import c_header, firmware
 
-    click.echo(c_header(rig_of(rig).wire), nl=False)
+    wire = rig_of(rig).wire
+    if to is None:
+        return click.echo(c_header(wire), nl=False)
+    to.mkdir(parents=True, exist_ok=True)
+    files = firmware(wire)
+    for name, text in files.items():
+        (to / name).write_text(text, "utf-8")
+    click.echo(f"Wrote:  {to}/  {', '.join(files)}")
+    click.echo(f"Next:   make -C {to} -f board.mk gyro_board   builds the example for this machine")

@@ -43,7 +43,7 @@ Examples:
   robins list                                    what there is to run
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
-  robins campaign run ins-gnss/drive --runs 500 --out drive   many runs; goes on if stopped
+  robins campaign run ins-gnss/drive --runs 500 --out drives  many runs; goes on if stopped
   robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
   robins tune imu.csv gnss.pos --filter ekf --vary imu.accel_noise --out tuned
   robins sensitivity my.toml --vary "gnss.sigma=1 m to 5 m" --vary "start.tilt=1 deg to 5 deg"
@@ -327,6 +327,7 @@ app.add_command(sensitivity)
         "robins export ins-gnss/drive --filter ekf --to drive-c",
         "robins export transfer-alignment/s0 --filter kf-flexure --to alignment-c --fast",
         "make -C drive-c check",
+        "robins export satellite/s1 --filter mekf --to adm --board",
     ),
 )
 @click.argument("scenario")
@@ -336,6 +337,7 @@ app.add_command(sensitivity)
 @option("--to", type=click.Path(path_type=Path), required=True, metavar="DIR", help="A new folder.")
 @option("--small/--fast", "small", default=True, help="Keep loops, or write them out.")
 @option("--float32", is_flag=True, help="Single precision, and what it costs.")
+@option("--board", is_flag=True, help="Build it as a part of the bench too.")
 @option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of the recorded run.")
 @SETTINGS
 @answers
@@ -345,7 +347,8 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
     DIR gets one file of C that needs math.h alone, a header that names all fields with their units,
     a page that says how to call it, and `make check`: it replays recorded steps and compares each
     state and each code with those of this program. With --float32 it runs the scenario in single
-    precision too, and tells what that costs against the simulated truth.
+    precision too, and tells what that costs against the simulated truth. With --board it builds a
+    program that stands for the satellite's attitude determination on the bench.
     """
     write(scenario, to, fast=not small, as_json=as_json, **options)
 

@@ -30,6 +30,10 @@ def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
         f"Next:   make -C {to} check   compiles it here and replays recorded steps\n"
         f"        {to}/README.md says how to call it"
     )
+    if made.program:
+        flown = f"robins bench up {scenario} --filter {made.filter} --node adm={made.program}"
+        text += f"\n        {flown}   flies with it"
     cost = made.cost and made.cost.as_data()
     data = {**made._asdict(), "folder": str(to), "scenario": scenario, "cost": cost}
+    data["program"] = made.program and str(made.program)
     say(data, text, as_json)

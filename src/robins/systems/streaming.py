@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Mapping
 from enum import IntFlag
 from typing import Any, ClassVar, TypeVar
 
@@ -159,18 +160,7 @@ class Live:
         Raises:
             ResultError: it cannot be written; the sentence says why.
         """
-        leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(self._state_now())]
-        state = {
-            "made_with": self._made_with,
-            "counts": dict(self.counts),
-            "own": {name: getattr(self, name) for name in self._kept},
-            "parts": {name: dict(vars(getattr(self, name))) for name in self._parts},
-            "filter": leaves if self._state_now() is not None else None,
-        }
-        for part in state["parts"].values():
-            part.pop("_rest", None)  # parameters, which the file has as text
-        told = text_of(_plain(self.parameters.model_dump(exclude_none=True)))
-        snapshot.write(path, type(self).__name__, told, state)
+        snapshot.write(path, type(self).__name__, *self._all_known())
 
     @classmethod
     def load(cls: type[LiveT], path: str | os.PathLike[str]) -> LiveT:
@@ -180,16 +170,41 @@ class Live:
             ResultError: the file cannot be read, is damaged, or of another version or class.
         """
         found = snapshot.read(path, cls.__name__)
-        given = cls._parameters.model_validate(_tuples(mapping_of(found.parameters)))
-        made = cls(given, **found.state["made_with"])
-        made.counts.update(found.state["counts"])
-        for name, value in found.state["own"].items():
-            setattr(made, name, value)
-        for name, part in found.state["parts"].items():
-            vars(getattr(made, name)).update(part)
-        if found.state["filter"] is not None:
-            made._go_on_from([jnp.asarray(x) for x in found.state["filter"]])
-        return made
+        return _made_again(cls, found.parameters, found.state)
+
+    def __reduce__(self) -> Any:
+        """To be pickled as it is saved: what was compiled is compiled again."""
+        return _made_again, (type(self), *self._all_known())
+
+    def _all_known(self) -> tuple[str, dict[str, Any]]:
+        """Parameters as TOML, and all else."""
+        now = self._state_now()
+        state = {
+            "made_with": self._made_with,
+            "counts": dict(self.counts),
+            "own": {name: getattr(self, name) for name in self._kept},
+            "parts": {name: dict(vars(getattr(self, name))) for name in self._parts},
+            "filter": None
+            if now is None
+            else [np.asarray(x) for x in jax.tree_util.tree_leaves(now)],
+        }
+        for part in state["parts"].values():
+            part.pop("_rest", None)  # parameters, which the file has as text
+        return text_of(_plain(self.parameters.model_dump(exclude_none=True))), state
+
+
+def _made_again(cls: type[LiveT], parameters: str, state: Mapping[str, Any]) -> LiveT:
+    """The object of which this is known."""
+    given = cls._parameters.model_validate(_tuples(mapping_of(parameters)))
+    made = cls(given, **state["made_with"])
+    made.counts.update(state["counts"])
+    for name, value in state["own"].items():
+        setattr(made, name, value)
+    for name, part in state["parts"].items():
+        vars(getattr(made, name)).update(part)
+    if state["filter"] is not None:
+        made._go_on_from([jnp.asarray(x) for x in state["filter"]])
+    return made
 
 
 def as_before(like: Any, leaves: list[Any]) -> Any:

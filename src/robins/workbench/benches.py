@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from robins.bench.parts.station import Station, ready, serve
-from robins.bench.ports.port import address, open_port
+from robins.bench.ports.port import address, open_port, program
 from robins.bench.recording import read_record
 from robins.bench.recording.differences import FieldDifference, differences, table
 from robins.bench.recording.replay import Start, recorded, replay
 from robins.bench.run.outcome import outcome
-from robins.bench.run.session import Session, kit_of
-from robins.bench.run.setup import Flight, changed, read, recorded_flight, recorded_rig
+from robins.bench.run.session import Session
+from robins.bench.run.setup import Flight, changed, kit_of, read, recorded_flight, recorded_rig
 from robins.bench.run.watching import Looking, page_for, starting
 from robins.bench.status import Status
 from robins.results import Outcome, Progress, silent
@@ -79,7 +79,7 @@ def bench_up(
         rig.inside is not None
         and flight.setup.clock == "lockstep"
         and ran.steps
-        and not flight.setup.ports
+        and all(map(program, flight.setup.ports.values()))
     ):
         progress(0.97, "the same inside one program")
         inside = rig.inside(ran.kit)
@@ -189,7 +189,9 @@ def bench_replay(
     wire = rig.wire
     step_ns, told = int(first.header["step_ns"]), None
     if second is None:
-        with _starter(recorded_flight(first.header, filter_), node) as start:
+        flight = recorded_flight(first.header, filter_)
+        other = None if filter_ else program(flight.setup.ports.get(node, ""))
+        with _starter(flight, node, other) as start:
             heard = replay(
                 first, wire, node, start, progress=lambda k, n: progress(k / max(n, 1), "hearing")
             )
@@ -217,8 +219,8 @@ def bench_replay(
 
 
 @contextlib.contextmanager
-def _starter(flight: Flight, part: str) -> Iterator[Start]:
-    """What starts a part of a recorded run on a path."""
+def _starter(flight: Flight, part: str, other: Path | None) -> Iterator[Start]:
+    """What starts a part of a recorded run on a path, or the program that was in its place."""
     with tempfile.TemporaryDirectory(prefix="robins-bench-") as folder:
         path = Path(folder) / "kit.pickle"
         path.write_bytes(pickle.dumps(kit_of(flight)))
@@ -227,6 +229,7 @@ def _starter(flight: Flight, part: str) -> Iterator[Start]:
         def start(port: str) -> Iterator[subprocess.Popen]:
             command = [sys.executable, "-m", "robins.bench.parts.node"]
             command += [flight.rig.address or flight.rig.name, part, port, str(path)]
+            command = command if other is None else [str(other), port]
             process = subprocess.Popen(command, start_new_session=True)
             try:
                 yield process

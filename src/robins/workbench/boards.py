@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ import jax
 import numpy as np
 
 from robins import __version__, _float64, scenario
+from robins.bench.rigs import rig_of
+from robins.bench.wire.c_header import firmware
 from robins.filters import SENTENCES, Code
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
 from robins.program.harness import Recorded, check_c, makefile, recorded_h
@@ -47,6 +50,7 @@ class Exported(NamedTuple):
     bytes: int  # of the C
     real: str  # the type of its reals
     cost: Cost | None  # of single precision
+    program: Path | None = None  # that stands for a part of the bench
 
 
 def export_filter(
@@ -58,6 +62,7 @@ def export_filter(
     float32: bool = False,
     seed: int = 0,
     settings: Sequence[str] = (),
+    board: bool = False,
 ) -> Exported:
     """Write a filter of a scenario as C99, with a test for the user's own compiler.
 
@@ -70,9 +75,11 @@ def export_filter(
         float32: reals in single precision, with a report of what that costs.
         seed: of the run that is recorded for the test.
         settings: "path=value" texts that change the scenario.
+        board: build it, too, as a part of the bench, for this machine.
 
     Raises:
-        InputError: there is no such scenario or filter, or the folder holds something.
+        InputError: there is no such scenario or filter, or the folder holds something; or no part
+            of a rig is made of such a filter.
         robins.program.ProgramError: the filter does what has no place in C yet; the message names
             the line of the model or the rule.
         robins.program.BuildError: single precision is asked for, and there is no compiler here by
@@ -82,6 +89,7 @@ def export_filter(
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
     problem, wanted, label = _asked(name, filter_name, seed, settings)
+    wire = _on_the_wire(label) if board else {}
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
     library, record, found = _library(problem, wanted, label, unroll, precision)
@@ -93,10 +101,44 @@ def export_filter(
         "test.c": check_c(library, record),
         "Makefile": makefile(library),
         "README.md": _readme(library, wanted, label, found),
+        **wire,
     }
     _write(to, files)
+    made = _built(to) if board else None
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
-    return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found)
+    return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found, made)
+
+
+def _on_the_wire(label: str) -> dict[str, str]:
+    """The files that join a filter to the bench, by name.
+
+    Raises:
+        InputError: there are none for this system.
+    """
+    system = label.partition("/")[0]
+    if system != "satellite":
+        what = f"no part of the bench is made of a filter of {system}"
+        fix = "leave --board out, and write its loop around robins_wire.h (robins bench header)"
+        raise InputError(what, "--board", fix)
+    return firmware(rig_of(system).wire)
+
+
+def _built(folder: Path) -> Path:
+    """The attitude determination of the satellite as a program.
+
+    Raises:
+        InputError: it cannot be built; the files are there.
+    """
+    command = ["make", "-s", "-C", str(folder), "-f", "board.mk", "adm_board"]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except FileNotFoundError:
+        raise InputError("there is no make on this machine", "--board", "install one") from None
+    except subprocess.CalledProcessError as error:
+        why = (error.stderr.strip().splitlines() or ["no word from it"])[0]
+        fix = "a filter of another state needs another adm_board.c: see docs/board.md"
+        raise InputError(f"adm_board does not build: {why}", str(folder), fix) from None
+    return folder / "adm_board"
 
 
 def _asked(

@@ -15,7 +15,7 @@ _ROBINS = files("robins")
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
     """A sentence on every system, on the bench and on design, and titles of what each can run."""
     told = {name: (text, titles(name)) for name, text in catalogue.summaries().items()}
-    bench = "the satellite part by part over serial lines, `robins bench up`"
+    bench = "vehicles part by part over serial lines, `robins bench up`"
     design = "gains between H2 and H-infinity, `robins design`"
     return told | {"bench": (bench, _benches()), "design": (design, designs())}
 
@@ -66,7 +66,7 @@ def _benches() -> dict[str, str]:
     """Looked up without the bench: its packages are an extra."""
     every = (rig.joinpath("scenarios") for rig in _ROBINS.joinpath("bench", "rigs").iterdir())
     found = [_titled(folder) for folder in every if folder.is_dir()]
-    return {name: title for one in found for name, title in one.items()}
+    return dict(sorted((name, title) for one in found for name, title in one.items()))
 
 
 def designs() -> dict[str, str]:

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robins.bench.bridges import frames
 from robins.bench.bridges.errors import BridgeError, finite, needed, vector, whole
 from robins.earth.atmosphere import pressure_altitude_m
 
@@ -28,6 +27,7 @@ Vector = Sequence[float] | np.ndarray
 INT16, UINT16, INT32 = (-(2**15), 2**15 - 1), (0, 2**16 - 1), (-(2**31), 2**31 - 1)
 UNKNOWN = 65535  # of 16-bit fields
 GRAVITY_M_S2 = 9.80665  # of a unit "G" of MAVLink
+GAUSS_PER_T = 1e4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +155,7 @@ def _hil_sensor(s: Sensors) -> Any:
     updated = 0b111_111
     field, hectopascal, differential, altitude = [0.0] * 3, 0.0, 0.0, 0.0
     if s.field_b_T is not None:
-        field = [frames.gauss(b) for b in vector("field_b_T", s.field_b_T, name)]
+        field = [GAUSS_PER_T * b for b in vector("field_b_T", s.field_b_T, name)]
         updated |= 0b111 << 6
     if s.pressure_Pa is not None:
         hectopascal = finite("pressure_Pa", s.pressure_Pa, name) / 100.0
@@ -190,7 +190,8 @@ def _hil_gps(s: GnssFix) -> Any:
     name = "HIL_GPS"
     v_n = vector("v_n_m_s", s.v_n_m_s, name)
     speed = math.hypot(v_n[0], v_n[1])
-    course = round(frames.course_cdeg(np.array(v_n))) % 36000 if speed > 0.0 else UNKNOWN
+    course_deg = math.degrees(math.atan2(v_n[1], v_n[0])) % 360.0  # clockwise from north
+    course = round(100.0 * course_deg) % 36000 if speed > 0.0 else UNKNOWN
     return dialect().MAVLink_hil_gps_message(
         _time(s, name),
         whole("kind", s.kind, 0, 255, name),
@@ -226,8 +227,10 @@ def _time(s: Px4Sample, name: str) -> int:
 
 def _position(s: GnssFix | Truth, name: str) -> tuple[int, int, int]:
     return (
-        whole("lat_rad [degE7]", frames.degE7(s.lat_rad), -900_000_000, 900_000_000, name),
-        whole("lon_rad [degE7]", frames.degE7(s.lon_rad), -1_800_000_000, 1_800_000_000, name),
+        whole("lat_rad [degE7]", 1e7 * math.degrees(s.lat_rad), -900_000_000, 900_000_000, name),
+        whole(
+            "lon_rad [degE7]", 1e7 * math.degrees(s.lon_rad), -1_800_000_000, 1_800_000_000, name
+        ),
         whole("alt_m [mm]", 1e3 * s.alt_m, *INT32, name),
     )
 

@@ -11,6 +11,9 @@ ROS 2 is reached by one of two programs on its side, each with its convention fo
 (zenoh-plugin-ros2dds, README; rmw_zenoh, docs/design.md; the hash is that of REP 2016.) No
 liveliness token is declared, so tools that list topics do not show ours.
 
+Messages are those of `robins.ros`, in the frames of ROS; its functions `imu`, `nav_sat_fix` and
+`odometry` make them of what robins has. Only the hash of a type needs rosbags.
+
 A session finds nobody by itself: it connects to the endpoints that are given and listens at those
 that are given, such as "tcp/127.0.0.1:7447".
 """
@@ -29,8 +32,9 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from robins.bench.bridges.errors import BridgeClosed, BridgeError, needed
-from robins.bench.bridges.ros2_messages import DISTRO, FORMS, RosRecord, decode, encode, typestore
+from robins.ros import Message, RosError, Stamped, decode, encode, name_of
 
+DISTRO = "jazzy"  # whose definitions are hashed
 Convention = Literal["ros2dds", "rmw_zenoh"]
 KEPT = 100  # samples of a topic that wait to be taken; beyond, the oldest go
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -38,9 +42,28 @@ _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @functools.cache
+def hash_of(kind: type[Message], distro: str = DISTRO) -> str:
+    """The hash of a type (REP 2016) in a distribution of ROS 2.
+
+    Raises:
+        BridgeError: rosbags does not know the distribution.
+        MissingPackage: rosbags is not installed.
+    """
+    known = needed("rosbags.typesys", "ros")
+    try:
+        store = known.get_typestore(known.Stores(f"ros2_{distro}"))
+    except ValueError:
+        names = [s.value.removeprefix("ros2_") for s in known.Stores if "ros2" in s.value]
+        raise BridgeError(
+            f"no distribution '{distro}' of ROS 2", fix=f"there are {', '.join(names)}"
+        ) from None
+    return str(store.hash_rihs01(name_of(kind)))
+
+
+@functools.cache
 def topic_key(
     topic: str,
-    kind: type[RosRecord],
+    kind: type[Message],
     convention: Convention,
     domain: int = 0,
     distro: str = DISTRO,
@@ -55,18 +78,16 @@ def topic_key(
         distro: of ROS, for rmw_zenoh, whose keys have a hash of the definition since Iron.
 
     Raises:
-        BridgeError: the topic is not of that form.
+        BridgeError: the topic is not of that form, or there is no such distribution.
         MissingPackage: rosbags is not installed.
     """
     if not _TOPIC.fullmatch(topic):
         raise BridgeError(f"'{topic}' is no full name of a topic", fix="write such as /imu/data")
     if convention == "ros2dds":
         return topic[1:]
-    name = FORMS[kind].name
-    package, _, message = name.split("/")
-    if distro == "humble":  # has no hashes
-        return f"{domain}{topic}/{package}::msg::dds_::{message}_/TypeHashNotSupported"
-    return f"{domain}{topic}/{package}::msg::dds_::{message}_/{typestore(distro).hash_rihs01(name)}"
+    package, _, message = name_of(kind).split("/")
+    told = "TypeHashNotSupported" if distro == "humble" else hash_of(kind, distro)
+    return f"{domain}{topic}/{package}::msg::dds_::{message}_/{told}"
 
 
 def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
@@ -104,10 +125,9 @@ class Ros2Topics:
 
         Raises:
             BridgeClosed: an endpoint cannot be listened at, or a client's router is not there.
-            MissingPackage: eclipse-zenoh or rosbags is not installed.
+            MissingPackage: eclipse-zenoh is not installed.
         """
         zenoh = needed("zenoh", "ros")
-        typestore(distro)
         config = zenoh.Config()
         settings = {
             "mode": mode,
@@ -131,7 +151,7 @@ class Ros2Topics:
         self._publishers: dict[str, Any] = {}
         self._subscribers: dict[str, Any] = {}
         self._arrived: dict[str, queue.Queue[bytes]] = {}
-        self._kinds: dict[str, type[RosRecord]] = {}
+        self._kinds: dict[str, type[Message]] = {}
         self._sequence = 0
         self._gid = uuid.uuid4().bytes
 
@@ -145,20 +165,22 @@ class Ros2Topics:
         """Close the session with all its publishers and subscribers. May be repeated."""
         self._session.close()
 
-    def publish(self, topic: str, record: RosRecord) -> None:
-        """Send a record; who does not listen yet misses it.
+    def publish(self, topic: str, message: Message, time_ns: int, frame_id: str = "") -> None:
+        """Send a message, with the time and frame of its header; who does not listen yet misses it.
 
         Raises:
-            BridgeError: the topic has no full name, or had another kind of record before.
+            BridgeError: the topic has no full name, or had another type before.
+            RosError: as `robins.ros.encode`.
         """
-        key = self._key(topic, type(record))
+        key = self._key(topic, type(message))
+        data = encode(message, time_ns, frame_id)
         if key not in self._publishers:
             self._publishers[key] = self._session.declare_publisher(key)
         attached = None
         if self._convention == "rmw_zenoh":
             self._sequence += 1
             attached = attachment(self._sequence, time.time_ns(), self._gid)
-        self._publishers[key].put(encode(record), attachment=attached)
+        self._publishers[key].put(data, attachment=attached)
 
     def heard(self, topic: str) -> bool:
         """Whether somebody subscribes to a topic on which we have published."""
@@ -166,11 +188,11 @@ class Ros2Topics:
         publisher = None if kind is None else self._publishers.get(self._key(topic, kind))
         return publisher is not None and publisher.matching_status.matching
 
-    def subscribe(self, topic: str, kind: type[RosRecord]) -> None:
+    def subscribe(self, topic: str, kind: type[Message]) -> None:
         """Keep what comes on a topic until it is taken, the last 100 samples.
 
         Raises:
-            BridgeError: the topic has no full name, or had another kind of record before.
+            BridgeError: the topic has no full name, or had another type before.
         """
         key = self._key(topic, kind)
         if topic in self._arrived:
@@ -186,8 +208,8 @@ class Ros2Topics:
 
         self._subscribers[key] = self._session.declare_subscriber(key, keep)
 
-    def take(self, topic: str, timeout_s: float) -> RosRecord | None:
-        """The oldest record that waits on a topic; None: nothing came in that time.
+    def take(self, topic: str, timeout_s: float) -> Stamped | None:
+        """The oldest message that waits on a topic; None: nothing came in that time.
 
         Raises:
             BridgeError: there is no subscription to the topic.
@@ -203,12 +225,12 @@ class Ros2Topics:
                 return None
             try:
                 return decode(self._kinds[topic], data)
-            except BridgeError:
+            except RosError:
                 self.bad += 1
 
-    def _key(self, topic: str, kind: type[RosRecord]) -> str:
+    def _key(self, topic: str, kind: type[Message]) -> str:
         key = topic_key(topic, kind, self._convention, self._domain, self._distro)
         if self._kinds.setdefault(topic, kind) is not kind:
-            had = FORMS[self._kinds[topic]].name
-            raise BridgeError(f"{topic} has {had}, not {FORMS[kind].name}")
+            had = name_of(self._kinds[topic])
+            raise BridgeError(f"{topic} has {had}, not {name_of(kind)}")
         return key

@@ -15,8 +15,9 @@ import os
 import stat
 import termios
 import tty
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import serial
@@ -56,6 +57,23 @@ def address(text: str) -> Address:
     return Address(path, int(speed))
 
 
+def program(text: str) -> Path | None:
+    """The program that stands for a part, if that is what a text names; else it is a port."""
+    path = Path(text.strip())
+    return path.resolve() if path.is_file() and os.access(path, os.X_OK) else None
+
+
+def parted(texts: Mapping[str, str]) -> tuple[dict[str, Address], dict[str, Path]]:
+    """Boards at their ports, and programs, each by the part that it stands for.
+
+    Raises:
+        PortError: as `address`.
+    """
+    found = {part: program(text) for part, text in texts.items()}
+    boards = {part: address(text) for part, text in texts.items() if found[part] is None}
+    return boards, {part: path for part, path in found.items() if path is not None}
+
+
 def obstacle(path: str) -> str:
     """Why we may not open a path as a serial port, with what to do about it; empty if we may."""
     try:
@@ -64,7 +82,7 @@ def obstacle(path: str) -> str:
         there = ", ".join(sorted(p.device for p in system.comports())) or "none"
         return f"there is no such path; serial ports of this machine: {there}"
     if not stat.S_ISCHR(kind):
-        return "it is no character device; a serial port is one such as /dev/ttyUSB0"
+        return "it is no character device such as /dev/ttyUSB0, and no program that may be run"
     if not os.access(path, os.R_OK | os.W_OK):
         return (
             f"no permission to read and write it; it belongs to the group '{_group(path)}': "

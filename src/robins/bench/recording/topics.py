@@ -6,9 +6,10 @@ A row says which message becomes which type of ROS 2, or JSON, by which function
     Topic("mode", "/mode", JSON, as_json)
 
 A `Recorder` with rows writes, next to each sound frame that a part sends, what the rows make of it.
-The header has the time of the frame, so the start of the run is zero. Messages of ROS are along the
-axes that `robins.ros.convert` names; JSON has the fields and units of the wire. The functions of
-that module are here too, for the rows.
+The header has the time of the frame, so the start of the run is zero, or where the row says so a
+stamp of the message: GPS time becomes UTC, as in ROS, and a count from elsewhere stays. Messages of
+ROS are along the axes that `robins.ros.convert` names; JSON has the fields and units of the wire.
+The functions of that module are here too, for the rows.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from robins.bench.recording.layout import EVENTS, Entry, RecordingError
 from robins.bench.wire.fields import Message
 from robins.bench.wire.frames import FrameError, decode_frame
 from robins.bench.wire.schema import Wire
+from robins.gps_time import dated, utc_of
 from robins.ros import TYPES, definition, encode
 from robins.ros import Message as RosMessage
 from robins.ros import imu as imu
@@ -48,6 +50,7 @@ class Topic(NamedTuple):
     type: str  # of ROS, one of `robins.ros.TYPES`, or `JSON`
     make: Callable[[Values], RosMessage | dict[str, Any]]  # from decoded values
     frame_id: str = ""
+    stamp: str = ""  # field of the message that has its time [ns]; "": that of the frame
 
 
 class Made(NamedTuple):
@@ -121,7 +124,7 @@ class Topics:
         values, made = self._wire.decode(rows[0][0].message, payload), []
         for row, schema in rows:
             try:
-                data = _bytes_of(row, row.make(values), head.time_ns)
+                data = _bytes_of(row, row.make(values), _stamp(row, values, head.time_ns))
             except _FAILS:  # what others would see is not worth the run, and the frame is kept
                 self.failed += 1
                 continue
@@ -132,6 +135,14 @@ class Topics:
 
 def _wrong(row: Topic, what: str, fix: str) -> RecordingError:
     return RecordingError(what, f"topic '{row.topic}'", f"give {fix}")
+
+
+def _stamp(row: Topic, values: Values, time_ns: int) -> int:
+    """The time of the header [ns]."""
+    if not row.stamp:
+        return time_ns
+    stamp = int(values[row.stamp])
+    return int(utc_of(np.asarray(stamp)).astype(np.int64)) if dated(stamp) else stamp
 
 
 def _try(wire: Wire, row: Topic) -> None:
@@ -145,7 +156,7 @@ def _try(wire: Wire, row: Topic) -> None:
         made = row.make(values)
         fits = isinstance(made, TYPES.get(row.type, dict))
         if fits:
-            _bytes_of(row, made, 0)
+            _bytes_of(row, made, _stamp(row, values, 0))
     except _FAILS as error:
         why = f"its function fails ({type(error).__name__}: {error})"
         raise _wrong(row, why, f"one of the fields {', '.join(values)}") from None

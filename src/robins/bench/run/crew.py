@@ -12,7 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from robins.bench.parts.node import REALTIME
@@ -41,7 +43,14 @@ class Death(NamedTuple):
 class Crew:
     """Processes, one a part; a context that ends them all however it is left."""
 
-    def __init__(self, rig: Rig, kit: Any, realtime: bool = False, restarts: bool = False):
+    def __init__(
+        self,
+        rig: Rig,
+        kit: Any,
+        realtime: bool = False,
+        restarts: bool = False,
+        programs: Mapping[str, Path] = MappingProxyType({}),
+    ):
         """Lay out what they are given.
 
         Args:
@@ -49,8 +58,9 @@ class Crew:
             kit: for all of them.
             realtime: whether they ask for a real-time scheduler.
             restarts: whether they put their memory aside, to be started anew from it.
+            programs: in the place of a part of the rig, by part; each is given the path of a port.
         """
-        self._rig, self._kit = rig, kit
+        self._rig, self._kit, self._programs = rig, kit, programs
         self._realtime, self._restarts = realtime, restarts
         self._folder: Path | None = None
         self._running: dict[str, subprocess.Popen] = {}
@@ -84,6 +94,8 @@ class Crew:
         command.append(str(self._folder / "kit.pickle"))
         if self._restarts:
             command += [str(self._folder), str(since)]
+        if part in self._programs:
+            command = [str(self._programs[part]), port.partition(",")[0]]
         with words:
             self._running[part] = subprocess.Popen(
                 command,

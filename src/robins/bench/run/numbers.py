@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,20 @@ def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:
     some = values[since : step + 1]
     heard = np.flatnonzero(np.isfinite(some.reshape(len(some), -1)).any(axis=1))
     return np.asarray(some[heard[-1]] if len(heard) else np.full(values.shape[1:], np.nan))
+
+
+_UNITS = {"arcsec": "arcsec", "deg": "deg", "m_s": "m/s", "m": "m"}
+
+
+def figures_of(metrics: Mapping[str, Any]) -> list[str]:
+    """Lines of figures for a terminal; their names end in the unit."""
+    lines = []
+    for name, value in metrics.items():
+        unit = next((end for end in _UNITS if name.endswith(f"_{end}")), "")
+        if unit and value is not None:
+            words = name.removesuffix(f"_{unit}").replace("_", " ")
+            lines.append(f"{words:<24}{value:10.3f} {_UNITS[unit]}")
+    return lines
 
 
 def arrays_of(rig: Rig, flown: Flown) -> dict[str, Any]:

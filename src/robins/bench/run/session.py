@@ -20,13 +20,13 @@ from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Direction, Health, Link
 from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
-from robins.bench.ports.port import BAUD, Pair, address, open_pair, open_port
+from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
 from robins.bench.rig import Kit, Rig
 from robins.bench.run.accounting import Latencies
 from robins.bench.run.clocks import LockStep, RealTime
 from robins.bench.run.crew import Crew, Death
-from robins.bench.run.setup import Flight, counted_from, steps_of
+from robins.bench.run.setup import Flight, counted_from, kit_of, steps_of
 from robins.bench.run.telemetry import Flown, Telemetry
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Unsound
@@ -34,6 +34,7 @@ from robins.bench.wire.records import Unsound
 HELLO_S = 120.0  # for all to compile and say hello
 REVIVED_S = 60.0
 _TELL_S = 0.2  # between two words on how far it is
+_MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
 _GLANCE_NS = 50_000_000  # how often processes are looked at
 
 
@@ -125,13 +126,13 @@ class Session:
         self._tell = progress or (lambda share, what: None)
         self.steps = steps_of(flight)
         setup = flight.setup
-        self.ports = {part: address(text) for part, text in setup.ports.items()}
+        self.ports, programs = parted(setup.ports)
         if kit is None:
             self._tell(0.0, "preparing")
             kit = kit_of(flight)
         self.kit = kit
         self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns)
-        self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart")
+        self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart", programs)
         self.injector = Injector(self.rig.table, setup.faults, setup.seed)
         self.clock = LockStep() if setup.clock == "lockstep" else real_time(flight)
         self._broker: Broker | None = None  # until the links are open
@@ -145,6 +146,7 @@ class Session:
         self.step_ms = self.pace = 0.0
         self._labels: list[tuple[str, LinkFault]] = []
         self._histories: dict[str, History] = {}  # of parts that are started anew if they die
+        self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
         self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
         self._paused, self._stop = paused, False
         self._speaks: dict[str, str] = {}  # by part: the port that its process opens
@@ -314,8 +316,7 @@ class Session:
         setup, given = self.flight.setup, self.flight.given
         header = {
             "robins": __version__,
-            "wire": VERSION,
-            "rig": self.rig.address or self.rig.name,
+            **{"wire": VERSION, "rig": self.rig.address or self.rig.name},
             "name": self.flight.name,
             "run": self.run_number,
             "setup": setup.model_dump(mode="json", exclude_unset=True),
@@ -323,9 +324,9 @@ class Session:
             "step_ns": self.kit.step_ns,
             "steps": self.steps,
         }
-        return stack.enter_context(
-            Recorder(self._record_path, self.rig.wire, header, overwrite=True)
-        )
+        rows, wire = self.rig.topics(self.kit), self.rig.wire
+        recorder = Recorder(self._record_path, wire, header, topics=rows, overwrite=True)
+        return stack.enter_context(recorder)
 
     def _wire(self, stack: contextlib.ExitStack) -> Broker:
         """Open the far ends and start the processes."""
@@ -450,24 +451,29 @@ class Session:
             time.sleep(0.001)
             deaths += self.crew.deaths()
         for death in deaths:
-            self._mourn(death)
+            self._mourn(death, by_itself=death.part != until)
 
-    def _mourn(self, death: Death) -> None:
+    def _mourn(self, death: Death, by_itself: bool) -> None:
         part, setup = death.part, self.flight.setup
         while True:
             self.deaths += 1
             self.event("died", str(death))
             fatal = f"{death}, at {self.time_s:.1f} s of the run"
+            if by_itself:  # a fault may kill it as often as it likes
+                died, now = self._died.setdefault(part, []), time.monotonic()
+                died[:] = [*(at for at in died if now - at < _MINUTE_S), now]
             if setup.on_death == "fail" or self.broker.time_ns == 0:
                 raise BenchError(f'{fatal}; on_death = "restart" would start it anew')
             if self.deaths > setup.restarts:
                 raise BenchError(f"{fatal}; that is one more than restarts = {setup.restarts}")
+            if len(self._died.get(part, ())) >= _MOST_DEATHS:
+                raise BenchError(f"{fatal}; that is its third death in a minute")
             since = self._histories[part].since
             self.crew.start(part, self._speaks[part], since)
             try:
                 self.broker.revive(part, REVIVED_S, partial(self._still_lives, part))
             except _DiedAgainError as again:
-                death = again.death
+                death, by_itself = again.death, True
                 continue
             told = "all" if since < 0 else f"all since step {since}"
             return self.event("restarted", f"'{part}' was started anew and told {told} again")
@@ -478,19 +484,14 @@ class Session:
         Raises:
             _DiedAgainError: it has.
         """
-        for death in self.crew.deaths(part):
-            raise _DiedAgainError(death)
+        if died := self.crew.deaths(part):
+            raise _DiedAgainError(died[0])
 
 
 def real_time(flight: Flight) -> RealTime:
     """The clock of a run in real time."""
     setup = flight.setup
     return RealTime(setup.rate or 1.0 / flight.timing.step_s, setup.overrun, setup.patience)
-
-
-def kit_of(flight: Flight) -> Kit:
-    """What the parts of a run are made from."""
-    return flight.rig.prepare(flight.setup, flight.given)
 
 
 def wiring(rig: Rig, kit: Kit) -> Wiring:

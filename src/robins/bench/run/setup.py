@@ -21,7 +21,7 @@ import pydantic
 
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
-from robins.bench.rig import Rig, Timing
+from robins.bench.rig import Kit, Rig, Timing
 from robins.bench.rigs import RIGS, rig_of
 from robins.errors import hint
 from robins.scenario import Parameters, Quantity, ScenarioError
@@ -44,9 +44,11 @@ class Setup(Parameters):
       without it.
     - ``on_death``: what becomes of a run whose process dies: it "fail"s, or the process is
       "restart"ed and told again what it has forgotten, for which the run waits; in real time it
-      misses deadlines. ``restarts``: how often, of all processes together; one more fails the run.
+      misses deadlines. ``restarts``: how often, of all processes together; one more fails the run,
+      and so does the third death of a part within a minute that no fault has killed.
     - ``baud``: of a virtual line that each link without a real port has; left out: no delay.
-    - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``.
+    - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``, or
+      programs, which are given the path of a port: ``adm = "adm-c/adm_board"``.
     """
 
     rig: ClassVar[Rig]
@@ -111,6 +113,11 @@ class Flight(NamedTuple):
     def timing(self) -> Timing:
         """Its steps, if it is flown to the end."""
         return self.rig.timing(self.given)
+
+
+def kit_of(flight: Flight) -> Kit:
+    """What the parts of a run are made from."""
+    return flight.rig.prepare(flight.setup, flight.given)
 
 
 def built_in() -> dict[str, Path]:
@@ -215,11 +222,13 @@ def steps_of(flight: Flight) -> int:
         return most
     steps = round(flight.setup.seconds / step_s)
     if not 1 <= steps <= most:
+        wanted = f"duration={flight.setup.seconds:g} s"
+        longer = f'set = ["{wanted}"] in it' if flight.text else f'--set "{wanted}"'
         raise ScenarioError(
             [
                 f"seconds: {flight.setup.seconds:g} s is not from a step ({step_s:g} s) "
                 f"to the end of the scenario ({most * step_s:g} s); "
-                "set its duration to make that longer"
+                f"{longer} makes that longer"
             ]
         )
     return steps

@@ -246,7 +246,11 @@ def c_header(wire: Wire) -> str:
 def firmware(wire: Wire) -> dict[str, str]:
     """The files of the example of a board, by name: loop, platform, one for a PC, and the wire."""
     there = resources.files("robins.bench.wire") / "firmware"
-    files = {f.name: f.read_text("utf-8") for f in there.iterdir() if f.name.endswith((".c", ".h"))}
+    files = {
+        f.name: f.read_text("utf-8")
+        for f in there.iterdir()
+        if f.name.endswith((".c", ".h", ".mk"))
+    }
     return {**dict(sorted(files.items())), "robins_wire.h": c_header(wire)}
 
 

@@ -17,6 +17,7 @@ at once and a live object has not:
   rest, at most ten seconds from the first fix on, and then takes the quietest window so far, where
   a replay takes the quietest of the log. A magnetometer is asked where for 30 s no fix was fast
   enough; a replay asks it where none of the log is. Answers before are `STARTING`, without numbers.
+- A fix without a number, as of a receiver that sees no satellites, is an epoch, as in a replay.
 - A gap longer than `update.longest_gap` begins anew. `outages` are not looked at: fixes that are
   not given are not there. Whether velocities are means is a hypothesis of `robust` here as there.
 - Rates that a replay takes from the whole log (of samples, of fixes) are told by who makes it.
@@ -35,10 +36,10 @@ import numpy as np
 from robins.dataset import ImuTable
 from robins.errors import require
 from robins.filters import OnlineFilter
-from robins.filters.run import Step
 from robins.ins.blocks import cut, rate_about, reach_of_rate, usual_width
 from robins.ins.increments import Increments, from_imu
 from robins.systems import replaying
+from robins.systems.ins_gnss.live_answers import Navigation, answer_of, kept, predicted
 from robins.systems.ins_gnss.live_fixes import TOLD, WIDTH, row_of, some, table_of
 from robins.systems.ins_gnss.log import (
     SMOOTHED,
@@ -49,7 +50,6 @@ from robins.systems.ins_gnss.log import (
 )
 from robins.systems.ins_gnss.parameters import Replay
 from robins.systems.ins_gnss.recording import Log, axes_of, believed_sigmas
-from robins.systems.ins_gnss.robust import navigation
 from robins.systems.ins_gnss.start import CARRIED, Usual, calmest, find_start, turned
 from robins.systems.parts import Block
 from robins.systems.streaming import (
@@ -71,41 +71,12 @@ _UNITS_S = 1.0  # of samples, whose size tells their unit
 _MOST_START_S = 600.0  # of samples that the start is sought in
 
 
-class Navigation(NamedTuple):
-    """The answer to a sample or a fix: the state of the IMU; NaN while `STARTING`."""
-
-    time_ns: int
-    q_nb: np.ndarray  # (4,) forward-right-down to north-east-down, scalar first
-    v_n: np.ndarray  # (3,) m/s
-    lat_rad: float
-    lon_rad: float
-    alt_m: float
-    sigma: np.ndarray  # (9,) attitude [rad], velocity [m/s], position [m], each NED
-    flags: Flag
-
-
 class Epoch(NamedTuple):
     """Where the filter is: the end of a block."""
 
     time_s: float
     wanted_s: float  # the fix, or the start, since which the blocks are counted
     number: int  # of blocks since
-
-
-def _predicted(filter_: Any, model: Any, state: Any, u: Block) -> jax.Array:
-    """Mean and standard deviations after a block, in one vector."""
-    return _vector(filter_.predict(state, model.motion, u)[1].belief)
-
-
-def _vector(belief: Any) -> jax.Array:
-    x = navigation(belief.mean)
-    p = x.position
-    place = jnp.stack([p.lat, p.lon, p.alt])
-    return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma[:9]])
-
-
-def _kept(step: Step) -> jax.Array:
-    return _vector(step.posterior)
 
 
 class LiveInsGnss(Live):
@@ -116,6 +87,7 @@ class LiveInsGnss(Live):
             `blocks_over_imu_gaps`, `steps_again` (blocks repeated for late fixes).
         start: the sentence on how the start was found; "" before.
         epoch: what the filter itself said last, with the fixes up to then; None before.
+        passed: the same of each epoch that the last sample or fix brought, in order.
     """
 
     _parameters: ClassVar[type[Any]] = Replay
@@ -169,9 +141,15 @@ class LiveInsGnss(Live):
         self._on = partial(OnlineFilter, asked.filter, asked.model, machine=machine)
         self._case = asked.case
         self._C_bs = axes_of(p.imu.orientation) if any(p.imu.orientation) else None
-        self._door = Door(p.update.longest_gap, max(3, round(_PATIENCE_S * rate_hz)))
-        self._begin_anew()
+        self._patience = max(3, round(_PATIENCE_S * rate_hz))
+        self.start_over()
         self._compile()
+
+    def start_over(self) -> None:
+        """Be as new: without samples, fixes and counts."""
+        self._door = Door(self.parameters.update.longest_gap, self._patience)
+        self.counts.clear()
+        self._begin_anew()
 
     def _begin_anew(self) -> None:
         """Forget all but the counts and the stamps."""
@@ -187,6 +165,7 @@ class LiveInsGnss(Live):
         self._calmest, self._velocities = math.inf, False
         self._first_fix_s = math.inf
         self.start, self.epoch = "", None
+        self.passed: list[Navigation] = []
         self._online: OnlineFilter | None = None
 
     def push_imu(
@@ -204,7 +183,7 @@ class LiveInsGnss(Live):
             LiveError: a stamp or vector of another kind, or numbers that are those of another unit;
                 the object goes on with the next sample.
         """
-        time = stamp(time_ns)
+        self.passed, time = [], stamp(time_ns)
         values = np.stack([numbers("gyro", gyro_rad_s, 3), numbers("accel", accel_m_s2, 3)])
         field = None if field_t is None else numbers("field", field_t, 3)
         why = self._door.ask(time, values.ravel())
@@ -254,13 +233,14 @@ class LiveInsGnss(Live):
             LiveError: a stamp or number of another kind, or angles that are those of another unit;
                 the object goes on.
         """
-        time = stamp(time_ns)
+        self.passed, time = [], stamp(time_ns)
         seconds = math.nan if self._origin_ns is None else self._seconds(time)
         row = row_of(seconds, (lat_rad, lon_rad, alt_m), sigma_m, v_n, sigma_v, quality)
         newest = self._newest[0, 0] if len(self._newest) else 0.0
         oldest = self._past[0][0] if self._past else -math.inf
         if why := self._refused_fix(row, oldest, newest):
             self.counts[f"gnss_{why}"] += 1
+        if why and not (why == "nan" and self._online is not None):  # which is an epoch then
             return self._answer(self._raw_ns[-1] if self._raw_ns else time, Flag.REFUSED)
         at = int(np.searchsorted(self._fixes[:, 0], row[0]))
         self._fixes = np.insert(self._fixes, at, row, axis=0)
@@ -268,18 +248,17 @@ class LiveInsGnss(Live):
         self._first_fix_s = min(self._first_fix_s, float(row[0]))
         self._go_back(float(row[0]))
         self._advance()
-        return self._answer(self._raw_ns[-1], Flag(0))
+        return self._answer(self._raw_ns[-1], Flag.REFUSED if why else Flag(0))
 
     def _refused_fix(self, row: np.ndarray, oldest: float, newest: float) -> str:
-        if not np.any(np.isfinite(row[TOLD])):
-            return "nan"
         if math.isnan(row[0]) or row[0] <= 0.0:
             return "too_old"  # before the first sample
         if np.any(np.abs(self._fixes[:, 0] - row[0]) < 1e-9):
             return "duplicate"
         if row[0] <= oldest + 1e-9:
             return "too_old"
-        return "ahead" if row[0] > newest + _AHEAD_S else ""
+        nothing = "" if np.any(np.isfinite(row[TOLD])) else "nan"
+        return "ahead" if row[0] > newest + _AHEAD_S else nothing
 
     def _seconds(self, time_ns: int) -> float:
         assert self._origin_ns is not None
@@ -407,8 +386,9 @@ class LiveInsGnss(Live):
         row = jax.tree_util.tree_map(lambda a: np.asarray(a)[0], (y | known, aux | about))
         u = self._block(to.time_s, rows, at, self._width)
         self.counts["blocks_over_imu_gaps"] += int(np.asarray(u.noise_scale) > 1.0)
-        kept = np.asarray(self._online.step(row[0], u, row[1], keep=_kept))
-        self.epoch = self._told(to.time_s, kept, Flag(0))
+        said = np.asarray(self._online.step(row[0], u, row[1], keep=kept))
+        self.epoch = self._told(to.time_s, said, Flag(0))
+        self.passed.append(self.epoch)
         self._past.append(tuple(to))
         self._states.append(self._online.state)
         self._forget()
@@ -459,19 +439,18 @@ class LiveInsGnss(Live):
         rows = np.concatenate([rows, last])
         end_s = float(rows[-1, 0])
         u = self._block(end_s, rows, at, self._width + 8)
-        found = self._online.look(_predicted, u)
+        found = self._online.look(predicted, u)
         return self._told(end_s, np.asarray(found), mark)._replace(time_ns=time_ns)
 
     def _told(self, time_s: float, x: np.ndarray, flags: Flag) -> Navigation:
         time_ns = round(time_s * 1e9) + (self._origin_ns or 0)
-        lat, lon, alt = x[7:10].tolist()
-        return Navigation(time_ns, x[:4], x[4:7], lat, lon, alt, x[10:], flags)
+        return answer_of(time_ns, x, flags)
 
     def _compile(self) -> None:
         """Have all compiled by a standstill that is thrown away."""
-        counts, step = type(self.counts)(), round(1e9 * self._usual.sample_s)
+        step = round(1e9 * self._usual.sample_s)
         turned(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros((CARRIED, 3)))
-        door, second, ones = vars(self._door).copy(), max(1, round(1e9 / step)), np.ones(3)
+        second, ones = max(1, round(1e9 / step)), np.ones(3)
         place = Replay.model_validate({"start": {"known_heading": 0.0}}).start
         p, self.parameters = self.parameters, self.parameters.model_copy(update={"start": place})
         C, self._C_bs = self._C_bs, None
@@ -482,10 +461,9 @@ class LiveInsGnss(Live):
                     self.push_fix((k - 1) * step, 0.7, 0.1, 100.0, ones, 0.0 * ones, ones)
                 self.push_imu(k * step, np.zeros(3), np.array([0.0, 0.0, -9.8]))
         finally:
-            self.parameters, self._C_bs, self.counts = p, C, counts
+            self.parameters, self._C_bs = p, C
             self._compiled_state = None if self._online is None else self._online.state
-            self._begin_anew()
-            vars(self._door).update(door)
+            self.start_over()
 
     def _state_now(self) -> Any:
         return None if self._online is None else self._states

@@ -353,8 +353,8 @@ def replay(
     epoch_s = replaying.epochs_of(pieces)
     rate, withheld = replaying.end_to_end([(piece.rate_b, piece.withheld) for piece in pieces])
     mount = model.mount_of(parameters.gnss, parameters.aids)
-    antennas = {name: _antenna(mount, answer.mean, rate) for name, answer in answers.items()}
-    variables = track_arrays(antennas.values(), "{} of the antenna") | _fix_arrays(log)
+    antennas = {name: antenna_of(mount, answer.mean, rate) for name, answer in answers.items()}
+    variables = track_arrays(antennas.values(), "{} of the antenna") | fix_arrays(log)
     variables |= array("outage", withheld.astype(np.int8), long_name="GNSS withheld")
     used = np.any([piece.used for piece in pieces], axis=0)
     counts = replaying.gap_counts(pieces, problems) | {"pieces_not_navigated": len(problems)}
@@ -368,7 +368,7 @@ def replay(
             causes=CAUSES,
             assumed=(model.STANDSTILL, model.STILL_RATE, model.ROAD),
         ),
-        metrics=lambda answer: _distances(log, used, epoch_s, antennas[answer.name]),
+        metrics=lambda answer: distances(log, used, epoch_s, antennas[answer.name]),
         variables=variables,
         counts=dict(dataset.counts) | counts,
         notes=[f"Start: {piece.start.sentence}." for piece in pieces]
@@ -381,7 +381,7 @@ def replay(
 
 
 @jax.jit
-def _antenna(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
+def antenna_of(mount: model.Mount, mean: InsState, rate_b) -> Geodetic:
     """Where a filter thinks the antenna is, at each epoch."""
     return jax.vmap(lambda x, omega: model.read_position(mount, x, omega))(mean, rate_b)
 
@@ -391,9 +391,7 @@ def _estimates(mean: InsState) -> Mapping[str, Any]:
     return {"velocity": mean.v_n, "q_nb": mean.q_nb.wxyz, **biases_and_scales}
 
 
-def _distances(
-    log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic
-) -> dict[str, Any]:
+def distances(log: Log, used: np.ndarray, epoch_s: np.ndarray, antenna: Geodetic) -> dict[str, Any]:
     """How far the antenna is from the best fixes, with aids and in outages.
 
     The best fixes are those of quality 1 where the receiver states a quality, else all.
@@ -426,7 +424,8 @@ def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2))) if x.size else float("nan")
 
 
-def _fix_arrays(log: Log) -> dict[str, Any]:
+def fix_arrays(log: Log) -> dict[str, Any]:
+    """The fixes of a log, on its clock."""
     g = log.gnss
     out: dict[str, Any] = {
         "gnss_time": variable("gnss_time", log.gnss_s, "s", "time of the fixes"),

@@ -11,13 +11,9 @@ What processes of parts do not need is imported when it is asked for: so they st
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from robins.bench.rig import Judged, Rig, View
+from robins.bench.rig import Rig, later, named, packaged
 from robins.bench.rigs.satellite.computers import acm, adm
 from robins.bench.rigs.satellite.kit import Kit
 from robins.bench.rigs.satellite.messages import SENDS, TAKES, WIRE
@@ -35,66 +31,16 @@ BUILD = {
 """How each part is made of a kit."""
 
 
-def _parameters() -> Any:
-    from robins.systems.satellite.parameters import AttitudeLoop
-
-    return AttitudeLoop
-
-
-def _prepare(setup: Any, given: Any) -> Kit:
-    from robins.bench.rigs.satellite.preparing import kit_for
-
-    table_ = None if setup.table is None else setup.table.table()
-    return kit_for(given, setup.filter, setup.seed, table=table_)
-
-
 def _flies() -> dict[str, Path]:
     from robins.systems.satellite import SYSTEM
 
-    named = {f"satellite/{name}": path for name, path in SYSTEM.scenarios.items()}
-    return {"satellite/s1": named["satellite/s1"]} | named
+    of = {f"satellite/{name}": path for name, path in SYSTEM.scenarios.items()}
+    return {"satellite/s1": of["satellite/s1"]} | of
 
 
-def _filters() -> Sequence[str]:
-    from robins.systems.satellite.study import FILTERS
-
-    return ["mekf", *(name for name in FILTERS if name != "mekf")]
-
-
-def _scenarios() -> dict[str, Path]:
-    return {
-        path.stem: path for path in sorted((Path(__file__).parent / "scenarios").glob("*.toml"))
-    }
-
-
-def _options() -> dict[str, Any]:
-    from robins.bench.rigs.satellite.setup import Carrier
-
-    return {"table": (Carrier | None, None)}
-
-
-def _said() -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    from robins.bench.rigs.satellite.faults import PARAMETERS, SAID
-
-    return SAID, PARAMETERS
-
-
-def _view() -> View:
-    from robins.bench.rigs.satellite.view import VIEW
-
-    return VIEW
-
-
-def _inside(kit: Any) -> Mapping[str, np.ndarray]:
-    from robins.bench.rigs.satellite.errors import inside
-
-    return inside(kit)
-
-
-def _judge(flight: Any, ran: Any) -> Judged:
-    from robins.bench.rigs.satellite.judging import judge
-
-    return judge(flight, ran)
+def _filters() -> list[str]:
+    names = named("robins.systems.satellite.study:FILTERS")
+    return ["mekf", *(name for name in names if name != "mekf")]
 
 
 RIG = Rig(
@@ -103,18 +49,19 @@ RIG = Rig(
     build=BUILD,
     sends=SENDS,
     takes=TAKES,
-    parameters=_parameters,
-    prepare=_prepare,
+    parameters=lambda: named("robins.systems.satellite.parameters:AttitudeLoop"),
+    prepare=later(f"{__name__}.preparing:prepare"),
     truth="motion",
     kept=("motion", "estimate", "innovation", "wheels"),
     flies=_flies,
     filters=_filters,
-    scenarios=_scenarios,
-    options=_options,
-    said=_said,
-    view=_view,
-    inside=_inside,
-    judge=_judge,
+    scenarios=packaged(__file__),
+    options=lambda: {"table": (named(f"{__name__}.setup:Carrier") | None, None)},
+    said=later(f"{__name__}.faults:said"),
+    view=lambda: named(f"{__name__}.view:VIEW"),
+    topics=later(f"{__name__}.topics:topics"),
+    inside=later(f"{__name__}.errors:inside"),
+    judge=later(f"{__name__}.judging:judge"),
     example="adm",
 )
 

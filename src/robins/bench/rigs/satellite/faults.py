@@ -59,6 +59,12 @@ PARAMETERS: dict[str, Any] = {
     "wheel": (_WHEEL | None, None),
 }
 
+
+def said() -> tuple[Mapping[str, Said], Mapping[str, Any]]:
+    """Its faults, and their parameters."""
+    return SAID, PARAMETERS
+
+
 _ALL = {"share": 0.02}
 OFFERED: tuple[dict[str, Any], ...] = (
     {"label": "star: wrong by 10 deg", "fault": {"kind": "turned"}},

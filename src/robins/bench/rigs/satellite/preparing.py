@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,12 @@ from robins.sim.rate_table import RateTable
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.study import FILTERS, contender
 from robins.systems.satellite.world import lay_out, simulate
+
+
+def prepare(setup: Any, given: AttitudeLoop) -> Kit:
+    """The kit of a run of the bench."""
+    table = None if setup.table is None else setup.table.table()
+    return kit_for(given, setup.filter, setup.seed, table=table)
 
 
 def kit_for(

@@ -1,0 +1,205 @@
+"""The kit of a flight of the airship, its parts, and what came of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import manifold
+from robins.bench.parts.station import Inputs, Part
+from robins.bench.rig import Judged, Timing
+from robins.bench.run.numbers import figures_of
+from robins.bench.run.setup import counted_from
+from robins.bench.run.telemetry import Flown
+from robins.earth import Geodetic
+from robins.filters import Belief, Model, OnlineFilter, run
+from robins.filters.run import Step
+from robins.ins.increments import Increments
+from robins.ins.mechanise import Nav
+from robins.manifold import Angle
+from robins.rotation import Rotation
+from robins.systems.airship import SYSTEM
+from robins.systems.airship import instruments as fitted
+from robins.systems.airship.instruments import SAR, STAR, WIND
+from robins.systems.airship.model import ENU_OF_NED, NINE
+from robins.systems.airship.model import navigation as nav_of
+from robins.systems.airship.parameters import Airship
+from robins.systems.airship.study import BLOCKS, CANDIDATES
+from robins.systems.tables import block_array
+
+_TAKEN = (fitted.RADAR, fitted.STARS, fitted.SOFT)
+_ARCSEC = math.pi / 648000.0
+
+
+class Kit(NamedTuple):
+    """A flight, to the last number; E epochs."""
+
+    step_ns: int
+    filter: str
+    model: Model
+    start: Belief
+    u: Increments  # (E, ...)
+    y: Mapping[str, Any]  # by sensor, leading axis E
+    aux: Mapping[str, Any]
+    truth: Nav  # leading axis E
+    frames: tuple[int, ...] = (0,)  # all steps are computed alike
+
+
+def filters() -> Sequence[str]:
+    """Those that take what the wire carries."""
+    of = {name: c for name, c in CANDIDATES.items() if c.states is NINE}
+    fit = [name for name, c in of.items() if all(i in _TAKEN for i in c.instruments)]
+    return ["ukf", *(name for name in fit if name != "ukf")]
+
+
+def timing(given: Airship) -> Timing:
+    """A step is an epoch; the figures of the study count from the first that is not before."""
+    first = max(math.ceil(given.counted.begin / given.epoch - 1e-9) - 1, 0)
+    return Timing(given.epoch, round(given.duration / given.epoch), first)
+
+
+def prepare(setup: Any, given: Airship) -> Kit:
+    """The kit of run 0 of a campaign of this seed."""
+    (study,) = SYSTEM.studies.values()
+    problem = study.problem(given, (setup.filter,), setup.seed)
+    of = problem.contenders[setup.filter]
+    case = of.case(jax.jit(problem.simulate)(jnp.asarray(0)))
+    u, y, aux, truth = jax.tree_util.tree_map(
+        np.asarray, (case.u, dict(case.y), dict(case.aux), nav_of(case.truth))
+    )
+    return Kit(round(1e9 * given.epoch), setup.filter, of.model, case.start, u, y, aux, truth)
+
+
+def _says(part: str, message: str, rows: Mapping[str, np.ndarray]) -> Part:
+    """A part that says row after row."""
+
+    def act(state: None, k: int, inputs: Inputs):
+        said = {name: x[k] for name, x in rows.items() if k < len(x)}
+        return None, [(message, said)] if said else []
+
+    return Part(part, {}, lambda: None, act)
+
+
+def sins(kit: Kit) -> Part:
+    """The inertial unit, with what an epoch adds up to."""
+    u = kit.u
+    rows = {"dt": u.dt, "theta_b": u.theta, "dv_b": u.dv, "dr_b": u.dr}
+    return _says("sins", "increment", {name: np.asarray(x) for name, x in rows.items()})
+
+
+def radar(kit: Kit) -> Part:
+    """Radar and barometer."""
+    place, heading, alt = kit.y[SAR]
+    return _says("radar", "fix", {"place": place, "heading": heading.rad, "alt": alt[:, 0]})
+
+
+def star(kit: Kit) -> Part:
+    """The star sensor."""
+    return _says("star", "attitude", {"euler": np.stack([a.rad for a in kit.y[STAR]], axis=1)})
+
+
+def air(kit: Kit) -> Part:
+    """Forecast and air data; silent where the filter takes none."""
+    rows = {"wind_n": kit.y[WIND], "through_b": kit.aux[WIND]} if WIND in kit.y else {}
+    return _says("air", "wind", rows)
+
+
+class Navigating(NamedTuple):
+    """State of the navigation computer."""
+
+    filter: Any
+    increment: Increments  # the last that came
+
+
+def navigation(kit: Kit) -> Part:
+    """The navigation computer: any filter that takes what comes; what does not come is missing."""
+    windy = WIND in kit.y
+    begin = Increments(*(np.asarray(x)[0] for x in kit.u))
+    online: list[OnlineFilter] = []  # made when it is needed, not by who asks what it takes
+    starts: list[Any] = []
+
+    def first() -> Navigating:
+        if not online:
+            online.append(OnlineFilter(CANDIDATES[kit.filter].make(), kit.model, kit.start))
+            starts.append(online[0].state)
+        return Navigating(starts[0], begin)
+
+    def act(state: Navigating, k: int, inputs: Inputs):
+        u, fix, seen, wind = (inputs[of] for of in ("increment", "fix", "attitude", "wind"))
+        held = u is None
+        increment = state.increment
+        if u is not None:
+            increment = Increments(np.float64(u["dt"]), u["theta_b"], u["dv_b"], u["dr_b"])
+        nothing = np.full(3, np.nan)
+        fix = fix or {"place": nothing[:2], "heading": math.nan, "alt": math.nan}
+        angles = nothing if seen is None else seen["euler"]
+        y: dict[str, Any] = {
+            SAR: (fix["place"], Angle(np.float64(fix["heading"])), np.array([fix["alt"]])),
+            STAR: tuple(Angle(np.float64(a)) for a in angles),
+        }
+        if windy:
+            y[WIND] = nothing[:2] if wind is None else wind["wind_n"]
+        aux = {WIND: np.zeros(3) if wind is None else wind["through_b"]} if windy else {}
+        online[0].state = state.filter
+        x = np.asarray(online[0].step(y, increment, aux, keep=_kept))
+        return Navigating(online[0].state, increment), [("state", {**_told(x), "held": int(held)})]
+
+    takes = {"increment": 0, "fix": 0, "attitude": 0, "wind": 0}
+    return Part("navigation", takes, first, act, dict.fromkeys(takes))
+
+
+def _kept(step: Step) -> jax.Array:
+    """Attitude, velocity, place and their sigmas, in one vector."""
+    belief = step.posterior
+    x = nav_of(belief.mean)
+    place = jnp.stack([x.position.lat, x.position.lon, x.position.alt])
+    return jnp.concatenate([x.q_nb.wxyz, x.v_n, place, belief.sigma])
+
+
+def _told(x: np.ndarray) -> dict[str, Any]:
+    """The fields of a state, of a vector or of vectors (E, 19)."""
+    place = {"lat": x[..., 7], "lon": x[..., 8], "alt": x[..., 9]}
+    return {"q_nb": x[..., :4], "v_n": x[..., 4:7], **place, "sigma": x[..., 10:19]}
+
+
+def inside(kit: Kit) -> dict[str, np.ndarray]:
+    """The same flight inside one program."""
+    made = CANDIDATES[kit.filter].make()
+    done = run(made, kit.model, kit.start, kit.y, kit.u, kit.aux, keep=_kept)
+    return {f"state.{name}": x for name, x in _told(np.asarray(done.steps)).items()}
+
+
+def errors(kit: Kit, flown: Flown) -> np.ndarray:
+    """(E, 9) true less estimated attitude [rad], velocity, position [m], each ENU."""
+    q, v, *place = (np.asarray(flown[f"state.{f}"]) for f in ("q_nb", "v_n", "lat", "lon", "alt"))
+    truth = jax.tree_util.tree_map(lambda x: x[: len(q)], kit.truth)
+    estimate = Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
+    off = jax.jit(jax.vmap(manifold.local))(estimate, truth)
+    return np.asarray(off) @ ENU_OF_NED.T
+
+
+def judge(flight: Any, ran: Any) -> Judged:
+    """Errors over the epochs that count."""
+    flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
+    error, sigma = errors(ran.kit, flown), flown["state.sigma"] @ np.abs(ENU_OF_NED).T
+    arrays: dict[str, Any] = {}
+    for block in BLOCKS:
+        arrays |= block_array("error", block, error[None, :, block.where])
+        arrays |= block_array("sigma", block, sigma[None, :, block.where])
+    lengths = (
+        ("attitude_rms_arcsec", slice(0, 3), _ARCSEC),
+        ("velocity_rms_m_s", slice(3, 6), 1.0),
+        ("horizontal_rms_m", slice(6, 8), 1.0),
+    )
+    metrics: dict[str, float | None] = {}
+    for name, where, unit in lengths:
+        squares = np.sum(error[counted, where] ** 2, axis=1)
+        known = squares[np.isfinite(squares)]
+        metrics[name] = float(np.sqrt(np.mean(known))) / unit if len(known) else None
+    counts = {"steps_without_increment": int(np.sum(flown["state.held"]))}
+    return Judged(metrics, counts, arrays=arrays, lines=figures_of(metrics))

@@ -1,0 +1,124 @@
+"""INS/GNSS on the bench: inertial unit, receiver, navigation computer, each on its own line.
+
+The plant is a simulated drive or a recorded log, or there is none: boards speak. The computer runs
+`robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from robins.bench.broker.faults import Said
+from robins.bench.rig import Rig, later, named, packaged
+from robins.bench.wire.fields import Field, f64, message, size
+from robins.bench.wire.schema import Wire
+from robins.scenario import Quantity, default
+
+__all__ = ["FLAGS", "RIG", "WIRE"]
+
+FLAGS = ("starting", "refused", "rest", "saturated", "disturbed", "doubtful", "behind")
+"""Bits of `state.flags`, from the lowest: `robins.systems.streaming.Flag`."""
+_SPEED, _FAR = 1e5, 1e9  # m/s, m: far beyond any vehicle
+_TIME = Field("time", "u64", 1, "ns", "of the clock that samples and fixes share")
+_PLACE = (
+    f64("lat", 1, "rad", "latitude", 0.5 * math.pi, True),
+    f64("lon", 1, "rad", "longitude", 2.0 * math.pi, True),
+    f64("alt", 1, "m", "height above the ellipsoid", _FAR, True),
+)
+_NAVIGATED = (
+    _TIME,
+    f64("q_nb", 4, "1", "forward-right-down to north-east-down, scalar first", 2.0, True),
+    f64("v_n", 3, "m/s", "north, east, down", _SPEED, True),
+    *_PLACE,
+    size("sigma", 9, "rad, m/s, m", "stated of attitude, velocity, position, each NED", _FAR),
+)
+
+WIRE = Wire(
+    ("imu", "gnss", "navigation"),
+    (
+        message(
+            16,
+            "sample",
+            "A sample of the inertial unit, along its own axes; NaN: missing.",
+            _TIME,
+            f64("omega_s", 3, "rad/s", "turn rate", 1e4, True),
+            f64("f_s", 3, "m/s^2", "specific force", 1e6, True),
+        ),
+        message(
+            17,
+            "fix",
+            "What the receiver found of its antenna; NaN: not found.",
+            _TIME,
+            *_PLACE,
+            size("sigma", 3, "m", "stated, north, east, down", _FAR),
+            f64("v_n", 3, "m/s", "north, east, down", _SPEED, True),
+            size("sigma_v", 3, "m/s", "stated, north, east, down", _FAR),
+            Field("quality", "u8", 1, "1", "of RTKLIB: 1 fix, 2 float, 5 single; 0: not told"),
+        ),
+        message(
+            18,
+            "state",
+            "The unit at the stamp of the newest sample.",
+            *_NAVIGATED,
+            Field("flags", "u8", 1, "1", ", ".join(f"bit {k}: {t}" for k, t in enumerate(FLAGS))),
+        ),
+        message(
+            19, "epoch", "What the filter says at the end of a block, with all fixes.", *_NAVIGATED
+        ),
+    ),
+)
+
+
+def _flies() -> dict[str, Path]:
+    drive = named("robins.systems.ins_gnss:SYSTEM").scenarios["drive"]
+    return {"ins-gnss/drive": drive, "ins-gnss/walk": drive.with_name("walk.toml")}
+
+
+def _filters() -> list[str]:
+    names, smoothed = (named(f"robins.systems.ins_gnss.log:{of}") for of in ("NAMES", "SMOOTHED"))
+    return [name for name in names if name not in smoothed]
+
+
+def _shifted(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+    """A position that is off to the north."""
+    return {**said, "lat": said["lat"] + fault.shift / 6.378137e6}
+
+
+def _blind(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
+    """No satellites: a stamp and no numbers."""
+    nothing = np.full(3, np.nan)
+    return {**said, "lat": np.nan, "lon": np.nan, "alt": np.nan, "v_n": nothing, "quality": 0}
+
+
+_SAID = {
+    "shifted": Said("gnss", "fix", "sensed", _shifted, ("shift",)),
+    "stuck": Said("gnss", "fix", "repeated"),
+    "blind": Said("gnss", "fix", "blind", _blind),
+}
+_SHIFT = Annotated[float, Quantity("length", least="-100 km", most="100 km")]
+_OF = f"{__name__}.navigating"
+
+RIG = Rig(
+    name="ins-gnss",
+    wire=WIRE,
+    build={part: later(f"{_OF}:{part}") for part in WIRE.parts[1:]},
+    sends={"imu": ("sample",), "gnss": ("fix",), "navigation": ("state", "epoch")},
+    takes={"imu": (), "gnss": (), "navigation": ("sample", "fix")},
+    parameters=lambda: named(f"{_OF}:Journey"),
+    prepare=later(f"{_OF}:prepare"),
+    kept=("state", "epoch"),
+    timing=later(f"{_OF}:timing"),
+    flies=_flies,
+    filters=_filters,
+    scenarios=packaged(__file__),
+    options=lambda: {"machine": (Literal["jax", "c"], "jax")},
+    said=lambda: (_SAID, {"shift": (_SHIFT, default("30 m"))}),
+    view=later(f"{_OF}:view"),
+    topics=later(f"{_OF}:topics"),
+    judge=later(f"{_OF}:judge"),
+)

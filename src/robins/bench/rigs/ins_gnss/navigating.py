@@ -1,0 +1,339 @@
+"""The journey, its three parts, and what came of a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins import logs, manifold
+from robins.bench.live.feed import Signal
+from robins.bench.parts.station import Inputs, Part
+from robins.bench.recording.topics import JSON, Topic, as_json, nav_sat_fix
+from robins.bench.recording.topics import imu as imu_of_ros
+from robins.bench.rig import Judged, RigError, Timing, View
+from robins.bench.rigs.ins_gnss import FLAGS
+from robins.bench.run.numbers import figures_of, latest
+from robins.bench.run.telemetry import Flown
+from robins.dataset import Dataset
+from robins.earth import Geodetic
+from robins.ins.blocks import rate_about
+from robins.ins.frames import to_ned_frd
+from robins.ins.increments import own_intervals
+from robins.ins.mechanise import Nav
+from robins.ins.state import InsState
+from robins.rotation import Rotation
+from robins.scenario import Quantity, default
+from robins.systems.ins_gnss import model
+from robins.systems.ins_gnss.live import LiveInsGnss
+from robins.systems.ins_gnss.live_answers import Navigation
+from robins.systems.ins_gnss.live_fixes import some
+from robins.systems.ins_gnss.log import antenna_of, distances, fix_arrays
+from robins.systems.ins_gnss.parameters import Drive, Gnss, Replay
+from robins.systems.ins_gnss.recording import in_body_axes, on_one_clock, with_lever_arm
+from robins.systems.ins_gnss.world import drive_dataset, motion_of
+from robins.systems.tables import attitude_array, block_array, track_arrays
+
+_SHARED = ("system", "title", "imu", "start", "aids", "update", "outages", "log")
+
+
+class Journey(Replay):
+    """What the navigation computer believes, and where the samples come from.
+
+    A configuration of a replay, with the files of a ``log``; or a scenario of a simulated drive,
+    whose sensors are believed as they are drawn. With neither, boards at ``imu`` and ``gnss`` speak
+    at ``imu_rate`` and ``fix_rate``, for the ``duration``.
+    """
+
+    log: tuple[str, ...] = ()
+    drive: Drive | None = None
+    duration: Annotated[float, Quantity("time", above="0 s", most="1 d")] = default("10 min")
+    imu_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default(
+        "100 Hz"
+    )
+    fix_rate: Annotated[float, Quantity("frequency", above="0 Hz", most="1 kHz")] = default("1 Hz")
+
+    @classmethod
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Journey:
+        """Of a scenario; that of a drive is taken apart: what is true, and what is believed."""
+        said = json.loads(json_data)
+        if "legs" in said:
+            gnss = {k: v for k, v in said.get("gnss", {}).items() if k in Gnss.model_fields}
+            drive = {k: v for k, v in said.items() if k != "log"}
+            said = {k: said[k] for k in _SHARED if k in said} | {"gnss": gnss, "drive": drive}
+        return super().model_validate_json(json.dumps(said), **options)
+
+
+class Kit(NamedTuple):
+    """A run, to the last number."""
+
+    step_ns: int
+    given: Replay
+    filter: str
+    machine: str
+    rates_hz: tuple[float, float]  # of samples and fixes
+    dataset: Dataset | None  # rates along the unit's axes and fixes in NED; None: boards speak
+    frames: tuple[int, ...] = (0,)  # all steps are computed alike
+
+
+@lru_cache(maxsize=4)
+def _logged(files: tuple[str, ...]) -> Dataset:
+    dataset = logs.clean(logs.load_dataset(files))
+    if dataset.gnss is None or len(dataset.gnss) == 0:
+        raise RigError("the log has no GNSS fixes", ", ".join(files), "give the receiver's file")
+    return _as_sensors_say(dataset)
+
+
+def _as_sensors_say(dataset: Dataset) -> Dataset:
+    """Rates in the place of increments, forward-right-down and north-east-down."""
+    imu = to_ned_frd(dataset.imu)
+    if imu.kind == "increment":
+        dt = own_intervals(np.diff(imu.time_ns) * 1e-9, imu.gyro, imu.accel)[:, None]
+        imu = replace(imu, gyro=imu.gyro / dt, accel=imu.accel / dt, kind="rate")
+    gnss = None if dataset.gnss is None else to_ned_frd(dataset.gnss)
+    return replace(dataset, imu=imu, gnss=gnss)
+
+
+def _rate_hz(table: Any) -> float:
+    # rounded as a replay rounds it: whether a sample is missing may hang on the last digit
+    return 1.0 / float(np.median(np.diff(table.time_ns) * 1e-9)) if len(table) > 1 else 1.0
+
+
+def timing(given: Journey) -> Timing:
+    """A step is a sample: of the log in the order of its rows, whatever gaps there are."""
+    if given.log:
+        samples = _logged(given.log).imu
+        return Timing(1.0 / _rate_hz(samples), len(samples), 0)
+    lasts_s, rate_hz = given.duration, given.imu_rate
+    if given.drive is not None:
+        lasts_s, rate_hz = motion_of(given.drive).duration_s, given.drive.imu_rate
+    return Timing(1.0 / rate_hz, round(lasts_s * rate_hz), 0)
+
+
+def prepare(setup: Any, given: Journey) -> Kit:
+    """The kit of a run.
+
+    Raises:
+        RigError: nobody speaks as imu or gnss.
+        robins.logs.LogError: a file of the log cannot be read.
+    """
+    believed, dataset = Replay(**{k: getattr(given, k) for k in Replay.model_fields}), None
+    if given.log:
+        dataset = _logged(given.log)
+        believed = with_lever_arm(believed, dataset.lever_arm_b_m)
+    elif given.drive is not None:
+        dataset = _as_sensors_say(drive_dataset(given.drive, setup.seed))
+    elif silent := sorted({"imu", "gnss"} - set(setup.ports)):
+        what = "this configuration has no log and no drive"
+        fix = 'give a log, --set \'log=["imu.csv", "gnss.pos"]\', or boards, --node imu=PORT'
+        raise RigError(f"nobody speaks as {' and '.join(silent)}: {what}", fix=fix)
+    rates_hz = given.imu_rate, given.fix_rate
+    if dataset is not None:
+        rates_hz = _rate_hz(dataset.imu), _rate_hz(dataset.gnss)
+    step_ns = round(1e9 * timing(given).step_s)
+    return Kit(step_ns, believed, setup.filter, setup.machine, rates_hz, dataset)
+
+
+def imu(kit: Kit) -> Part:
+    """The inertial unit: a sample a step."""
+    samples = None if kit.dataset is None else kit.dataset.imu
+
+    def act(state: None, k: int, inputs: Inputs):
+        if samples is None or k >= len(samples):
+            return None, []
+        said = {"omega_s": samples.gyro[k], "f_s": samples.accel[k]}
+        return None, [("sample", {"time": int(samples.time_ns[k]), **said})]
+
+    return Part("imu", {}, lambda: None, act)
+
+
+def gnss(kit: Kit) -> Part:
+    """The receiver: a fix with the first sample that is not older; in an outage, one of NaN.
+
+    Its state is the number of the next fix.
+    """
+    if kit.dataset is None or kit.dataset.gnss is None:
+        return Part("gnss", {}, lambda: 0, lambda sent, k, inputs: (sent, []))
+    fixes, sample_ns = kit.dataset.gnss, kit.dataset.imu.time_ns
+    since_s = (fixes.time_ns - sample_ns[0]) * 1e-9
+    place = np.stack([fixes.lat_rad, fixes.lon_rad, fixes.alt_m], axis=1)
+    nothing = np.full(place.shape, np.nan)
+    v_n, sigma_v = (nothing if x is None else np.array(x) for x in (fixes.v_n, fixes.sigma_v))
+    withheld = kit.given.withheld(since_s, since_s)
+    place[withheld] = v_n[withheld] = np.nan
+
+    def act(sent: int, k: int, inputs: Inputs):
+        if sent == len(fixes) or fixes.time_ns[sent] > sample_ns[min(k, len(sample_ns) - 1)]:
+            return sent, []
+        lat, lon, alt = place[sent]
+        said = {"lat": lat, "lon": lon, "alt": alt, "v_n": v_n[sent], "sigma_v": sigma_v[sent]}
+        said |= {"time": int(fixes.time_ns[sent]), "sigma": fixes.sigma_m[sent]}
+        said |= {"quality": 0 if fixes.quality is None else int(fixes.quality[sent])}
+        return sent + 1, [("fix", said)]
+
+    return Part("gnss", {}, lambda: int(np.searchsorted(since_s, 0.0, side="right")), act)
+
+
+class Navigating(NamedTuple):
+    """State of the navigation computer; the object in it is always the same, and changes."""
+
+    live: LiveInsGnss
+    waiting: tuple[Navigation, ...]  # epochs that have not been told: one is told a step
+
+
+def navigation(kit: Kit) -> Part:
+    """The navigation computer: says what `LiveInsGnss` says."""
+    made: list[LiveInsGnss] = []
+
+    def begin() -> Navigating:
+        if not made:  # which compiles, and is not needed by who only asks what it takes
+            made.append(LiveInsGnss(kit.given, *kit.rates_hz, kit.filter, machine=kit.machine))
+        made[0].start_over()
+        return Navigating(made[0], ())
+
+    def act(state: Navigating, k: int, inputs: Inputs):
+        live, waiting = state
+        answer, flags = None, 0
+        if (sample := inputs["sample"]) is not None:
+            answer = live.push_imu(sample["time"], sample["omega_s"], sample["f_s"])
+            flags, waiting = answer.flags, (*waiting, *live.passed)
+        if (fix := inputs["fix"]) is not None:
+            place = fix["lat"], fix["lon"], fix["alt"]
+            moves = (fix["v_n"], fix["sigma_v"]) if np.any(np.isfinite(fix["v_n"])) else ()
+            answer = live.push_fix(
+                fix["time"], *place, fix["sigma"], *moves, quality=fix["quality"]
+            )
+            flags, waiting = flags | answer.flags, (*waiting, *live.passed)
+        said: list[tuple[str, dict[str, Any]]] = []
+        if answer is not None:
+            said.append(("state", {**_told(answer), "flags": int(flags)}))
+        if waiting:
+            said.append(("epoch", _told(waiting[0])))
+        return Navigating(live, waiting[1:]), said
+
+    nothing = {"sample": None, "fix": None}
+    return Part("navigation", {"sample": 0, "fix": 0}, begin, act, nothing)
+
+
+def _told(n: Navigation) -> dict[str, Any]:
+    place = {"lat": n.lat_rad, "lon": n.lon_rad, "alt": n.alt_m}
+    return {"time": n.time_ns, "q_nb": n.q_nb, "v_n": n.v_n, **place, "sigma": n.sigma}
+
+
+def topics(kit: Kit) -> tuple[Topic, ...]:
+    """Samples and fixes as ROS 2 has them, so that `robins replay` reads a record; states."""
+
+    def fix(v: Any) -> Any:
+        covariance = np.diag(np.square(v["sigma"]))
+        return nav_sat_fix(v["lat"], v["lon"], v["alt"], covariance=covariance)
+
+    def sample(v: Any) -> Any:
+        return imu_of_ros(v["omega_s"], v["f_s"], body="FRD")
+
+    return (
+        Topic("sample", "/imu/data_raw", "sensor_msgs/msg/Imu", sample, "imu", "time"),
+        Topic("fix", "/gnss/fix", "sensor_msgs/msg/NavSatFix", fix, "gnss", "time"),
+        Topic("state", "/navigation/state", JSON, as_json, "imu", "time"),
+    )
+
+
+def judge(flight: Any, ran: Any) -> Judged:
+    """Figures of a replay of the log, and errors where the truth is known."""
+    flown, kit, blocks = ran.flown, ran.kit, model.state_blocks(False)[:3]
+    arrays = track_arrays([_nav(flown, "state").position], "{} of the unit")
+    arrays |= attitude_array(flown["state.q_nb"][None], "FRD to NED")
+    for block in blocks:
+        arrays |= block_array("sigma", block, flown["state.sigma"][None, :, block.where])
+    metrics: dict[str, Any] = {}
+    if kit.dataset is not None:
+        log = on_one_clock(in_body_axes(kit.dataset, kit.given.imu.orientation), kit.given)
+        metrics, flew = against_fixes(kit, log, flown), log.gnss_s <= flown.time_s[-1]
+        flown_by = log._replace(gnss=some(log.gnss, flew), gnss_s=log.gnss_s[flew])
+        arrays |= fix_arrays(flown_by)
+    if kit.dataset is not None and kit.dataset.truth is not None:
+        error = against_truth(kit.dataset.truth, flown)
+        for block in blocks:
+            arrays |= block_array("error", block, error[None, :, block.where])
+        for name, e in (
+            ("heading_rms_deg", np.degrees(error[:, 2])),
+            ("velocity_rms_m_s", np.linalg.norm(error[:, 3:6], axis=1)),
+            ("horizontal_rms_m", np.linalg.norm(error[:, 6:8], axis=1)),
+        ):
+            known = e[np.isfinite(e)]
+            metrics[name] = float(np.sqrt(np.mean(known**2))) if len(known) else None
+    counts = {
+        f"steps_{name}": int(np.sum(flown["state.flags"] >> k & 1))
+        for k, name in enumerate(FLAGS[:2])
+    }
+    return Judged(metrics, counts, arrays=arrays, lines=figures_of(metrics))
+
+
+def _nav(flown: Flown, message: str, rows: Any = slice(None)) -> Nav:
+    q, v, *place = (flown[f"{message}.{f}"][rows] for f in ("q_nb", "v_n", "lat", "lon", "alt"))
+    return Nav(Rotation(q), jnp.asarray(v), Geodetic(*place))
+
+
+def epochs_of(flown: Flown) -> np.ndarray:
+    """Steps in which the filter's last word on each epoch was told, in the order of epochs."""
+    heard = np.flatnonzero(flown["epoch.time"] > 0)[::-1]
+    return heard[np.unique(flown["epoch.time"][heard], return_index=True)[1]]
+
+
+def against_fixes(kit: Kit, log: Any, flown: Flown) -> dict[str, Any]:
+    """Distances of the antenna from the fixes, as of `robins replay`.
+
+    The gyro bias is not on the wire: with a latency it would move the antenna by the lever arm
+    times both.
+    """
+    assert kit.dataset is not None
+    if not len(rows := epochs_of(flown)):
+        return {}
+    epoch_s = (flown["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
+    nothing = jnp.zeros((len(rows), 3))
+    mean = InsState(*_nav(flown, "epoch", rows), nothing, nothing)
+    rate_b = rate_about(log.increments, log.time_s, epoch_s)
+    antenna = antenna_of(model.mount_of(kit.given.gnss, kit.given.aids), mean, rate_b)
+    near = np.minimum(np.searchsorted(epoch_s, log.gnss_s - 1e-6), len(epoch_s) - 1)
+    return distances(log, np.abs(epoch_s[near] - log.gnss_s) < 1e-6, epoch_s, antenna)
+
+
+def against_truth(t: Any, flown: Flown) -> np.ndarray:
+    """(E, 9) true less estimated attitude [rad], velocity and position [m], each NED."""
+    at = np.clip(np.searchsorted(t.time_ns, flown["state.time"]), 0, len(t) - 1)
+    place = Geodetic(*(np.asarray(x)[at] for x in (t.lat_rad, t.lon_rad, t.alt_m)))
+    truth = Nav(Rotation(np.asarray(t.q_nb)[at]), jnp.asarray(t.v_n)[at], place)
+    return np.asarray(jax.jit(jax.vmap(manifold.local))(_nav(flown, "state"), truth))
+
+
+def view() -> View:
+    """A page with attitude, velocity, and where the vehicle is from where it was first."""
+    plots = (("velocity", "m/s"), ("position from the start", "m"), ("sigma of the position", "m"))
+    three = [
+        Signal(f"{plot} {axis}", unit, plot)
+        for plot, unit in plots
+        for axis in ("north", "east", "down")
+    ]
+    drawn = [*(Signal(f"q {c}", "1", "attitude", "attitude", "navigated") for c in "wxyz"), *three]
+    faults = (
+        ("gnss: 30 m to the north", {"kind": "shifted"}),
+        ("gnss: no satellites", {"kind": "blind"}),
+        ("gnss: link silent", {"kind": "silent", "link": "gnss"}),
+        ("imu: 2 % of samples lost", {"kind": "loss", "link": "imu", "share": 0.02}),
+    )
+
+    def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
+        names = ("q_nb", "v_n", "sigma", "lat", "lon", "alt")
+        q, v, sigma, *place = (latest(flown[f"state.{name}"], since, step) for name in names)
+        known = np.flatnonzero(np.isfinite(flown["state.lat"][: step + 1]))
+        first = known[0] if len(known) else step
+        begin = [flown[f"state.{name}"][first] for name in names[3:]]
+        to_m = np.array([1.0, np.cos(begin[0]), 0.0]) * 6.378137e6 - np.array([0.0, 0.0, 1.0])
+        return [*q, *v, *((np.array(place) - begin) * to_m), *sigma[6:]]
+
+    offered = tuple({"label": label, "fault": fault} for label, fault in faults)
+    return View(lambda given: drawn, sample, offered=offered)

@@ -1,0 +1,236 @@
+"""INS/GNSS on the bench: what the navigation computer says is what a replay of the log says."""
+
+import pickle
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robins.bench.recording import read_record
+from robins.bench.rig import RigError
+from robins.bench.rigs import rig_of
+from robins.bench.rigs.ins_gnss import FLAGS
+from robins.bench.rigs.ins_gnss.navigating import Kit, epochs_of
+from robins.bench.run.setup import read
+from robins.bench.run.telemetry import Telemetry
+from robins.logs import load_dataset
+from robins.results import read as read_result
+from robins.scenario import ScenarioError
+from robins.systems.ins_gnss import SYSTEM
+from robins.systems.streaming import Flag
+from robins.workbench import bench_replay, bench_up, publish
+from robins.workbench import replay as replay_log
+
+RIG = rig_of("ins-gnss")
+DRIVE = """
+system = "ins-gnss"
+imu_rate = "50 Hz"
+[place]
+latitude = "46 deg"
+longitude = "9 deg"
+height = "300 m"
+heading = "70 deg"
+[imu]
+gyro_noise = "0.004 deg/s/sqrt(Hz)"
+accel_noise = "150 ug/sqrt(Hz)"
+gyro_bias = "0.1 deg/s"
+accel_bias = "5 mg"
+gyro_bias_walk = "0.0005 deg/s/sqrt(s)"
+accel_bias_walk = "5 ug/sqrt(s)"
+[gnss]
+rate = "2 Hz"
+sigma = "0.5 m"
+velocity_sigma = "0.05 m/s"
+lever_arm = ["1 m", "0 m", "-1 m"]
+[outages]
+length = "3 s"
+first = "9 s"
+gap = "100 s"
+last = "1 s"
+[[legs]]
+do = "stop"
+seconds = "4 s"
+[[legs]]
+do = "accelerate"
+seconds = "4 s"
+speed = "10 m/s"
+[[legs]]
+do = "turn"
+angle = "70 deg"
+rate = "14 deg/s"
+[[legs]]
+do = "accelerate"
+seconds = "4 s"
+speed = "0 m/s"
+"""
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory):
+    path = tmp_path_factory.mktemp("drive") / "short.toml"
+    path.write_text(DRIVE)
+    return str(path)
+
+
+def flown(kit: Kit, steps: int, begin: int = 0, states=None):
+    """The parts in their order, without lines; what they said, and their last states."""
+    parts = [RIG.build[name](kit) for name in RIG.parts]
+    states = states or {part.name: part.begin() for part in parts}
+    telemetry = Telemetry(RIG, steps, kit.step_ns)
+    for k in range(begin, steps):
+        heard = {}
+        for part in parts:
+            inputs = {name: heard.get(name) for name in part.takes}
+            states[part.name], sent = part.act(states[part.name], k, inputs)
+            for name, values in sent:
+                payload = RIG.wire.encode(name, values)
+                assert RIG.wire.unsound(name, payload) is None
+                heard[name] = RIG.wire.decode(name, payload)
+                telemetry.observe(name, (k + 1) * kit.step_ns, payload)
+    return telemetry.flown, states
+
+
+@pytest.fixture(scope="module")
+def run(scenario):
+    flight = read(scenario)
+    flight = flight._replace(setup=flight.setup.model_copy(update={"filter": "ekf"}))
+    kit = RIG.prepare(flight.setup, flight.given)
+    steps = flight.timing.steps
+    return flight, kit, steps, flown(kit, steps)[0]
+
+
+def judged(flight, kit, of):
+    return RIG.judge(flight, SimpleNamespace(flown=of, kit=kit, steps=len(of.time_s)))
+
+
+def as_replayed(kit):
+    """Figures and epochs of a replay of what the sensors say, by the code of the replay."""
+    outcome = SYSTEM.replay(kit.dataset, kit.given, ("ekf",))
+    return outcome.metrics["ekf"], outcome.solution
+
+
+def test_its_figures_are_those_of_a_replay_with_outages(run):
+    flight, kit, _, of = run
+    wanted, solution = as_replayed(kit)
+    said = judged(flight, kit, of).metrics
+    # the last fixes are waited for
+    assert wanted["outage_fixes"] == said["outage_fixes"] == 6
+    assert 0 <= wanted["aided_fixes"] - said["aided_fixes"] <= 2
+    for name in ("outage_horizontal_rms_m", "outage_horizontal_max_m", "outage_vertical_rms_m"):
+        np.testing.assert_allclose(said[name], wanted[name], rtol=0.0, atol=1e-7)
+    rows = epochs_of(of)
+    told_s = (of["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
+    at = np.searchsorted(solution["time"].values, told_s - 1e-6)
+    np.testing.assert_allclose(solution["time"].values[at], told_s, atol=1e-6)
+    assert len(at) >= solution.sizes["time"] - 3
+    q_nb = np.asarray(solution["q_nb"].values)[0]
+    np.testing.assert_allclose(of["epoch.q_nb"][rows], q_nb[at], atol=2e-9)
+
+
+def test_it_is_right_about_the_drive(run):
+    flight, kit, _, of = run
+    said = judged(flight, kit, of)
+    assert said.metrics["heading_rms_deg"] < 10.0
+    error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
+    known = np.all(np.isfinite(error), axis=1)
+    assert np.mean(known) > 0.5
+    assert 0.2 < np.sqrt(np.mean((error[known] / sigma[known]) ** 2)) < 2.0
+    assert said.counts["steps_starting"] == int(np.sum(of["state.flags"] & 1))
+    assert said.counts["steps_refused"] == 6  # each fix of the outage has no number
+    view = RIG.shown
+    named = [signal.name for signal in view.signals(flight.given)]
+    values = dict(zip(named, view.sample(of, kit, 0, len(of.time_s) - 1), strict=True))
+    truth = kit.dataset.truth
+    north = 6.37e6 * (truth.lat_rad[-1] - truth.lat_rad[0])
+    assert abs(values["position from the start north"] - north) < 5.0
+
+
+def test_the_computer_goes_on_from_its_memory_to_the_bit(run):
+    _, kit, steps, whole = run
+    half = steps // 2
+    _, states = flown(kit, half)
+    again, _ = flown(kit, steps, half, pickle.loads(pickle.dumps(states)))
+    for name in ("state.q_nb", "state.v_n", "state.lat", "epoch.q_nb"):
+        np.testing.assert_array_equal(again[name][half:], whole[name][half:])
+
+
+def test_flags_are_those_of_the_live_object():
+    assert [(flag.name or "").lower() for flag in Flag] == list(FLAGS)
+
+
+def test_it_flies_by_processes_and_its_record_is_heard_again(scenario, run, tmp_path):
+    _, _, _, of = run
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(
+        f'bench = "ins-gnss"\nflies = "{scenario}"\nfilter = "ekf"\n'
+        '[[faults]]\nkind = "shifted"\nshift = "50 m"\nbegin = "12 s"\nend = "14 s"\n'
+    )
+    outcome = bench_up(str(wrong), record=tmp_path / "record.mcap")
+    folder = publish(outcome, tmp_path / "out").path
+    assert outcome.failure == ""
+    solution = read_result(folder).solution
+    lat = solution["lat_rad"].values[0]
+    before = solution["time"].values < 12.0
+    np.testing.assert_array_equal(lat[before], of["state.lat"][before])
+    assert not np.array_equal(lat[~before], of["state.lat"][~before], equal_nan=True)
+    record = folder / "record.mcap"
+    assert read_record(record).header["rig"] == "ins-gnss"
+    assert bench_replay(record, node="navigation").same
+    # the record is a log, as ROS 2 has them
+    _, kit, steps, _ = run
+    heard = load_dataset([record])
+    np.testing.assert_array_equal(heard.imu.time_ns, kit.dataset.imu.time_ns[:steps])
+    np.testing.assert_allclose(heard.imu.gyro, kit.dataset.imu.gyro[:steps], rtol=1e-15)
+    shown = np.isfinite(heard.gnss.lat_rad)
+    at = np.searchsorted(kit.dataset.gnss.time_ns, heard.gnss.time_ns)
+    at_s = 1e-9 * heard.gnss.time_ns
+    np.testing.assert_array_equal(~shown, (at_s >= 9.5) & (at_s < 12.5))
+    # what was injected came after
+    wanted = kit.dataset.gnss.lat_rad[at]
+    np.testing.assert_allclose(heard.gnss.lat_rad[shown], wanted[shown], rtol=1e-15)
+
+
+def test_without_samples_it_says_what_to_give():
+    flight = read("ins-gnss/walk")
+    with pytest.raises(RigError, match=r"nobody speaks as gnss and imu: .* no log and no drive"):
+        RIG.prepare(flight.setup, flight.given)
+    with pytest.raises(ScenarioError, match="imu_rate"):
+        read("ins-gnss/walk", ("imu_rate=0 Hz",))
+    boards = read("ins-gnss/walk", ("imu_rate=20 Hz", "duration=5 s"))
+    setup = boards.setup.model_copy(update={"ports": {"imu": "a", "gnss": "b"}, "filter": "ekf"})
+    kit = RIG.prepare(setup, boards.given)
+    assert (kit.rates_hz, boards.timing.steps) == ((20.0, 1.0), 100)
+    silent, _ = flown(kit, 3)
+    assert np.isnan(silent["state.lat"]).all()
+    assert judged(boards, kit, silent).metrics == {}
+
+
+@pytest.mark.parametrize("machine", ["jax", "c"])
+def test_the_walk_has_the_figures_of_its_replay(data_dir, machine):
+    paths = [data_dir / f"gnssimu_walk_{part}.xz" for part in ("imu.csv", "gnss.pos")]
+    if not all(path.exists() for path in paths):
+        pytest.skip("the walk is not in the folder of real logs")
+    files = ", ".join(f'"{path}"' for path in paths)
+    flight = read("ins-gnss/walk", (f"log=[{files}]",))
+    setup = flight.setup.model_copy(update={"filter": "ekf", "machine": machine})
+    kit = RIG.prepare(setup, flight.given)
+    configuration = SYSTEM.replay_default.parent / "walk.toml"
+    whole = machine == "c"
+    steps = flight.timing.steps if whole else 150 * 40
+    of, _ = flown(kit, steps)
+    said = judged(flight, kit, of).metrics
+    outcome = replay_log([*paths, configuration], filters=("ekf",))
+    if whole:
+        wanted = outcome.metrics["ekf"]
+        for name in ("outage_horizontal_rms_m", "outage_horizontal_max_m", "aided_vertical_rms_m"):
+            np.testing.assert_allclose(said[name], wanted[name], rtol=0.0, atol=1e-6)
+    solution = outcome.solution
+    rows = epochs_of(of)
+    told_s = (of["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
+    at = np.searchsorted(solution["time"].values, told_s - 1e-6)
+    np.testing.assert_allclose(solution["time"].values[at], told_s, atol=1e-6)
+    assert np.sum(np.asarray(solution["outage"].values)[at]) >= 40  # epochs without fixes
+    q_nb = np.asarray(solution["q_nb"].values)[0]
+    np.testing.assert_allclose(of["epoch.q_nb"][rows], q_nb[at], atol=2e-9)
+    v_n = np.asarray(solution["estimate_velocity"].values)[0]
+    np.testing.assert_allclose(of["epoch.v_n"][rows], v_n[at], atol=2e-9)
