@@ -43,7 +43,7 @@ Examples:
   robins list                                    what there is to run
   robins run ins-gnss/drive --runs 20            simulate and compare filters
   robins run ins-gnss/drive --set imu.gyro_bias="5 deg/h" --filters ekf,ukf
-  robins campaign run ins-gnss/drive --runs 500 --out drives  many runs; goes on if stopped
+  robins campaign run ins-gnss/drive --runs 500 --out drives   many runs; goes on if stopped
   robins sweep ins-gnss/drive --vary "imu.gyro_bias=1 deg/h,10 deg/h" --out biases
   robins tune imu.csv gnss.pos --filter ekf --vary imu.accel_noise --out tuned
   robins sensitivity my.toml --vary "gnss.sigma=1 m to 5 m" --vary "start.tilt=1 deg to 5 deg"
