@@ -4,36 +4,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from flights import flown
 
 from robins.bench.broker.faults import LinkFault
 from robins.bench.rigs import rig_of
 from robins.bench.run.setup import read
-from robins.bench.run.telemetry import Telemetry, difference
+from robins.bench.run.telemetry import difference
 from robins.results import read as read_result
 from robins.workbench import bench_replay, bench_up, publish
 
 RIG = rig_of("airship")
 SPANS = [f"{of}.{edge}" for of in ("counted", "wind.span") for edge in ("begin=20 s", "end=60 s")]
 SETTINGS = ("duration=60 s", *SPANS)
-
-
-def flown(kit, steps, lost=lambda name, k: False):
-    """The parts in their order, without lines; what is lost does not come."""
-    parts = [RIG.build[name](kit) for name in RIG.parts]
-    states = {part.name: part.begin() for part in parts}
-    telemetry = Telemetry(RIG, steps, kit.step_ns)
-    for k in range(steps):
-        heard = {}
-        for part in parts:
-            inputs = {name: heard.get(name) for name in part.takes}
-            states[part.name], sent = part.act(states[part.name], k, inputs)
-            for name, values in sent:
-                payload = RIG.wire.encode(name, values)
-                assert RIG.wire.unsound(name, payload) is None
-                if not lost(name, k):
-                    heard[name] = RIG.wire.decode(name, payload)
-                telemetry.observe(name, (k + 1) * kit.step_ns, payload)
-    return telemetry.flown
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +32,8 @@ def judged(flight, kit, of):
 def test_it_is_the_run_inside_one_program(run):
     flight, kit = run
     assert flight.timing.steps == len(kit.u.dt) == 60
-    of = flown(kit, 60)
-    assert difference(of, RIG.inside(kit)) < 1e-9
+    of = flown(RIG, kit, 60)[0]
+    assert difference(of, RIG.inside(kit)) < 1e-12
     said = judged(flight, kit, of)
     error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
     assert 0.1 < np.sqrt(np.mean((error / sigma) ** 2)) < 3.0
@@ -61,14 +43,16 @@ def test_it_is_the_run_inside_one_program(run):
 
 def test_what_does_not_come_is_missing(run):
     flight, kit = run
-    whole = flown(kit, 40)
-    blind = flown(kit, 40, lambda name, k: name == "attitude" and 20 <= k < 30)
+    whole = flown(RIG, kit, 40)[0]
+    blind = flown(RIG, kit, 40, lambda name, k: name == "attitude" and 20 <= k < 30)[0]
     place = slice(6, 9)
     np.testing.assert_array_equal(blind["state.sigma"][:20], whole["state.sigma"][:20])
     assert np.all(blind["state.sigma"][29, :3] > 1.1 * whole["state.sigma"][29, :3])
-    nothing = flown(kit, 40, lambda name, k: name in ("fix", "attitude", "wind") and k >= 20)
+    nothing = flown(RIG, kit, 40, lambda name, k: name in ("fix", "attitude", "wind") and k >= 20)[
+        0
+    ]
     assert np.all(nothing["state.sigma"][39, place] > whole["state.sigma"][39, place])
-    dark = flown(kit, 40, lambda name, k: name == "increment" and k == 30)
+    dark = flown(RIG, kit, 40, lambda name, k: name == "increment" and k == 30)[0]
     assert judged(flight, kit, dark).counts["steps_without_increment"] == 1
     assert np.isfinite(dark["state.lat"]).all()
 

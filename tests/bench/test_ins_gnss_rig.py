@@ -5,14 +5,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from flights import flown
+from short_drive import DRIVE
 
 from robins.bench.recording import read_record
 from robins.bench.rig import RigError
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.ins_gnss import FLAGS
-from robins.bench.rigs.ins_gnss.navigating import Kit, epochs_of
+from robins.bench.rigs.ins_gnss.navigating import epochs_of
 from robins.bench.run.setup import read
-from robins.bench.run.telemetry import Telemetry
 from robins.logs import load_dataset
 from robins.results import read as read_result
 from robins.scenario import ScenarioError
@@ -22,72 +23,16 @@ from robins.workbench import bench_replay, bench_up, publish
 from robins.workbench import replay as replay_log
 
 RIG = rig_of("ins-gnss")
-DRIVE = """
-system = "ins-gnss"
-imu_rate = "50 Hz"
-[place]
-latitude = "46 deg"
-longitude = "9 deg"
-height = "300 m"
-heading = "70 deg"
-[imu]
-gyro_noise = "0.004 deg/s/sqrt(Hz)"
-accel_noise = "150 ug/sqrt(Hz)"
-gyro_bias = "0.1 deg/s"
-accel_bias = "5 mg"
-gyro_bias_walk = "0.0005 deg/s/sqrt(s)"
-accel_bias_walk = "5 ug/sqrt(s)"
-[gnss]
-rate = "2 Hz"
-sigma = "0.5 m"
-velocity_sigma = "0.05 m/s"
-lever_arm = ["1 m", "0 m", "-1 m"]
-[outages]
-length = "3 s"
-first = "9 s"
-gap = "100 s"
-last = "1 s"
-[[legs]]
-do = "stop"
-seconds = "4 s"
-[[legs]]
-do = "accelerate"
-seconds = "4 s"
-speed = "10 m/s"
-[[legs]]
-do = "turn"
-angle = "70 deg"
-rate = "14 deg/s"
-[[legs]]
-do = "accelerate"
-seconds = "4 s"
-speed = "0 m/s"
-"""
+PLACE = 'velocity_sigma = "0.05 m/s"\n'
+ARM = 'lever_arm = ["1 m", "0 m", "-1 m"]\n'
+OUTAGE = '[outages]\nlength = "3 s"\nfirst = "9 s"\ngap = "100 s"\nlast = "1 s"\n'
 
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "short.toml"
-    path.write_text(DRIVE)
+    path.write_text('system = "ins-gnss"\n' + DRIVE.replace(PLACE, PLACE + ARM) + OUTAGE)
     return str(path)
-
-
-def flown(kit: Kit, steps: int, begin: int = 0, states=None):
-    """The parts in their order, without lines; what they said, and their last states."""
-    parts = [RIG.build[name](kit) for name in RIG.parts]
-    states = states or {part.name: part.begin() for part in parts}
-    telemetry = Telemetry(RIG, steps, kit.step_ns)
-    for k in range(begin, steps):
-        heard = {}
-        for part in parts:
-            inputs = {name: heard.get(name) for name in part.takes}
-            states[part.name], sent = part.act(states[part.name], k, inputs)
-            for name, values in sent:
-                payload = RIG.wire.encode(name, values)
-                assert RIG.wire.unsound(name, payload) is None
-                heard[name] = RIG.wire.decode(name, payload)
-                telemetry.observe(name, (k + 1) * kit.step_ns, payload)
-    return telemetry.flown, states
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +41,7 @@ def run(scenario):
     flight = flight._replace(setup=flight.setup.model_copy(update={"filter": "ekf"}))
     kit = RIG.prepare(flight.setup, flight.given)
     steps = flight.timing.steps
-    return flight, kit, steps, flown(kit, steps)[0]
+    return flight, kit, steps, flown(RIG, kit, steps)[0]
 
 
 def judged(flight, kit, of):
@@ -117,20 +62,20 @@ def test_its_figures_are_those_of_a_replay_with_outages(run):
     assert wanted["outage_fixes"] == said["outage_fixes"] == 6
     assert 0 <= wanted["aided_fixes"] - said["aided_fixes"] <= 2
     for name in ("outage_horizontal_rms_m", "outage_horizontal_max_m", "outage_vertical_rms_m"):
-        np.testing.assert_allclose(said[name], wanted[name], rtol=0.0, atol=1e-7)
+        np.testing.assert_allclose(said[name], wanted[name], rtol=0.0, atol=5e-9)
     rows = epochs_of(of)
     told_s = (of["epoch.time"][rows] - int(kit.dataset.imu.time_ns[0])) * 1e-9
     at = np.searchsorted(solution["time"].values, told_s - 1e-6)
     np.testing.assert_allclose(solution["time"].values[at], told_s, atol=1e-6)
     assert len(at) >= solution.sizes["time"] - 3
     q_nb = np.asarray(solution["q_nb"].values)[0]
-    np.testing.assert_allclose(of["epoch.q_nb"][rows], q_nb[at], atol=2e-9)
+    np.testing.assert_allclose(of["epoch.q_nb"][rows], q_nb[at], atol=1e-12)
 
 
 def test_it_is_right_about_the_drive(run):
     flight, kit, _, of = run
     said = judged(flight, kit, of)
-    assert said.metrics["heading_rms_deg"] < 10.0
+    assert said.metrics["heading_rms_deg"] < 3.0
     error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
     known = np.all(np.isfinite(error), axis=1)
     assert np.mean(known) > 0.5
@@ -148,8 +93,8 @@ def test_it_is_right_about_the_drive(run):
 def test_the_computer_goes_on_from_its_memory_to_the_bit(run):
     _, kit, steps, whole = run
     half = steps // 2
-    _, states = flown(kit, half)
-    again, _ = flown(kit, steps, half, pickle.loads(pickle.dumps(states)))
+    _, states = flown(RIG, kit, half)
+    again, _ = flown(RIG, kit, steps, begin=half, states=pickle.loads(pickle.dumps(states)))
     for name in ("state.q_nb", "state.v_n", "state.lat", "epoch.q_nb"):
         np.testing.assert_array_equal(again[name][half:], whole[name][half:])
 
@@ -200,7 +145,7 @@ def test_without_samples_it_says_what_to_give():
     setup = boards.setup.model_copy(update={"ports": {"imu": "a", "gnss": "b"}, "filter": "ekf"})
     kit = RIG.prepare(setup, boards.given)
     assert (kit.rates_hz, boards.timing.steps) == ((20.0, 1.0), 100)
-    silent, _ = flown(kit, 3)
+    silent, _ = flown(RIG, kit, 3)
     assert np.isnan(silent["state.lat"]).all()
     assert judged(boards, kit, silent).metrics == {}
 
@@ -215,9 +160,9 @@ def test_the_walk_has_the_figures_of_its_replay(data_dir, machine):
     setup = flight.setup.model_copy(update={"filter": "ekf", "machine": machine})
     kit = RIG.prepare(setup, flight.given)
     configuration = SYSTEM.replay_default.parent / "walk.toml"
-    whole = machine == "c"
+    whole, off = machine == "c", {"jax": 1e-12, "c": 1e-9}[machine]
     steps = flight.timing.steps if whole else 150 * 40
-    of, _ = flown(kit, steps)
+    of, _ = flown(RIG, kit, steps)
     said = judged(flight, kit, of).metrics
     outcome = replay_log([*paths, configuration], filters=("ekf",))
     if whole:
@@ -231,6 +176,6 @@ def test_the_walk_has_the_figures_of_its_replay(data_dir, machine):
     np.testing.assert_allclose(solution["time"].values[at], told_s, atol=1e-6)
     assert np.sum(np.asarray(solution["outage"].values)[at]) >= 40  # epochs without fixes
     q_nb = np.asarray(solution["q_nb"].values)[0]
-    np.testing.assert_allclose(of["epoch.q_nb"][rows], q_nb[at], atol=2e-9)
+    np.testing.assert_allclose(of["epoch.q_nb"][rows], q_nb[at], atol=off)
     v_n = np.asarray(solution["estimate_velocity"].values)[0]
-    np.testing.assert_allclose(of["epoch.v_n"][rows], v_n[at], atol=2e-9)
+    np.testing.assert_allclose(of["epoch.v_n"][rows], v_n[at], atol=off)

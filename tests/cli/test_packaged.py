@@ -455,6 +455,7 @@ def computes(folder, monkeypatch, capsys):
         status = main(as_short_as_can_be(list(words)))
         told = capsys.readouterr()
         if words[0] == "tune" and TOO_SHORT in told.err:
+            assert status == Status.BAD_INPUT
             return
         assert status == Status.DONE, told.out + told.err  # so the demo has passed
         assert "fault of robins" not in told.err

@@ -160,6 +160,8 @@ class Rig:
         inside: (kit) -> arrays of the same run inside one program, named as `Flown` names them.
         judge: figures of merit of a run; left out: none, and all numbers in its arrays.
         example: the part with which commands are shown; left out: its last.
+        exported: the part that an exported filter can be, by the loop of that name among the files
+            of `robins.bench.wire.c_header.firmware`; "": none.
         address: by which processes find it; left out: its name.
     """
 
@@ -183,6 +185,7 @@ class Rig:
     inside: Callable[[Any], Mapping[str, np.ndarray]] | None = None
     judge: Callable[[Flight, Ran], Judged] | None = None
     example: str = ""
+    exported: str = ""
     address: str = ""
 
     def __post_init__(self) -> None:

@@ -195,7 +195,7 @@ def header(rig: str, to: Path | None) -> None:
     """Print robins_wire.h of RIG: every message, frames, a receiver; C99 or C++11, no heap.
 
     RIG is one that comes with robins, by default the satellite, or "file.py:rig". With --to it goes
-    into a folder, with the example of a board and how it is built for this machine.
+    into a folder, with what a board needs beside it, and examples where there are some.
     """
     from robins.bench.rigs import rig_of
     from robins.bench.wire.c_header import c_header, firmware
@@ -208,4 +208,8 @@ def header(rig: str, to: Path | None) -> None:
     for name, text in files.items():
         (to / name).write_text(text, "utf-8")
     click.echo(f"Wrote:  {to}/  {', '.join(files)}")
-    click.echo(f"Next:   make -C {to} -f board.mk gyro_board   builds the example for this machine")
+    examples = [name.removesuffix(".c") for name in files if name.endswith("_board.c")]
+    then = "write PART_board.c around platform.h   there is an example for the satellite alone"
+    if examples:
+        then = f"make -C {to} -f board.mk {examples[-1]}   builds an example for this machine"
+    click.echo(f"Next:   {then}")

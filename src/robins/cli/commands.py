@@ -327,7 +327,7 @@ app.add_command(sensitivity)
         "robins export ins-gnss/drive --filter ekf --to drive-c",
         "robins export transfer-alignment/s0 --filter kf-flexure --to alignment-c --fast",
         "make -C drive-c check",
-        "robins export satellite/s1 --filter mekf --to adm --board",
+        "robins export satellite/s1 --filter mixed-bias --to adm --board",
     ),
 )
 @click.argument("scenario")

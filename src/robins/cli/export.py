@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,11 @@ def write(scenario: str, to: Path, *, as_json: bool, **options: Any) -> None:
         f"        {to}/README.md says how to call it"
     )
     if made.program:
-        flown = f"robins bench up {scenario} --filter {made.filter} --node adm={made.program}"
+        # what it believes is in the code, so that it flies with what it was exported with
+        told = "".join(f" --set {shlex.quote(one)}" for one in options["settings"])
+        told += f" --seed {options['seed']}" if options["seed"] else ""
+        node = f"{made.program.name.removesuffix('_board')}={made.program}"
+        flown = f"robins bench up {scenario} --filter {made.filter} --node {node}{told}"
         text += f"\n        {flown}   flies with it"
     cost = made.cost and made.cost.as_data()
     data = {**made._asdict(), "folder": str(to), "scenario": scenario, "cost": cost}

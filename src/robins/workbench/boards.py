@@ -14,7 +14,8 @@ import jax
 import numpy as np
 
 from robins import __version__, _float64, scenario
-from robins.bench.rigs import rig_of
+from robins.bench.rig import Rig
+from robins.bench.rigs import RIGS, rig_of
 from robins.bench.wire.c_header import firmware
 from robins.filters import SENTENCES, Code
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
@@ -89,7 +90,7 @@ def export_filter(
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
     problem, wanted, label = _asked(name, filter_name, seed, settings)
-    wire = _on_the_wire(label) if board else {}
+    rig = _rig_for(label) if board else None
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
     library, record, found = _library(problem, wanted, label, unroll, precision)
@@ -101,44 +102,45 @@ def export_filter(
         "test.c": check_c(library, record),
         "Makefile": makefile(library),
         "README.md": _readme(library, wanted, label, found),
-        **wire,
+        **(firmware(rig.wire) if rig else {}),
     }
     _write(to, files)
-    made = _built(to) if board else None
+    made = _built(to, rig.exported) if rig else None
     scalars = {entry.name: len(entry.program.live) for entry in library.entries}
     return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found, made)
 
 
-def _on_the_wire(label: str) -> dict[str, str]:
-    """The files that join a filter to the bench, by name.
+def _rig_for(label: str) -> Rig:
+    """The rig of a system, of which a part can be an exported filter.
 
     Raises:
-        InputError: there are none for this system.
+        InputError: there is none.
     """
     system = label.partition("/")[0]
-    if system != "satellite":
+    rig = rig_of(system) if system in RIGS else None
+    if rig is None or not rig.exported:
         what = f"no part of the bench is made of a filter of {system}"
         fix = "leave --board out, and write its loop around robins_wire.h (robins bench header)"
         raise InputError(what, "--board", fix)
-    return firmware(rig_of(system).wire)
+    return rig
 
 
-def _built(folder: Path) -> Path:
-    """The attitude determination of the satellite as a program.
+def _built(folder: Path, part: str) -> Path:
+    """The part as a program.
 
     Raises:
         InputError: it cannot be built; the files are there.
     """
-    command = ["make", "-s", "-C", str(folder), "-f", "board.mk", "adm_board"]
+    command = ["make", "-s", "-C", str(folder), "-f", "board.mk", f"{part}_board"]
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except FileNotFoundError:
         raise InputError("there is no make on this machine", "--board", "install one") from None
     except subprocess.CalledProcessError as error:
         why = (error.stderr.strip().splitlines() or ["no word from it"])[0]
-        fix = "a filter of another state needs another adm_board.c: see docs/board.md"
-        raise InputError(f"adm_board does not build: {why}", str(folder), fix) from None
-    return folder / "adm_board"
+        fix = f"a filter of another state needs another {part}_board.c: see docs/board.md"
+        raise InputError(f"{part}_board does not build: {why}", str(folder), fix) from None
+    return folder / f"{part}_board"
 
 
 def _asked(

@@ -244,14 +244,19 @@ def c_header(wire: Wire) -> str:
 
 
 def firmware(wire: Wire) -> dict[str, str]:
-    """The files of the example of a board, by name: loop, platform, one for a PC, and the wire."""
+    """The files of a board, by name: the wire, the platform, one for a PC, and an example.
+
+    An example is the loop of a part, and is given where the wire has a part of its name.
+    """
     there = resources.files("robins.bench.wire") / "firmware"
-    files = {
-        f.name: f.read_text("utf-8")
-        for f in there.iterdir()
-        if f.name.endswith((".c", ".h", ".mk"))
+    kinds, loop = (".c", ".h", ".mk"), "_board.c"
+    files = {f.name: f.read_text("utf-8") for f in there.iterdir() if f.name.endswith(kinds)}
+    fit = {
+        name: text
+        for name, text in sorted(files.items())
+        if not name.endswith(loop) or name.removesuffix(loop) in wire.parts
     }
-    return {**dict(sorted(files.items())), "robins_wire.h": c_header(wire)}
+    return {**fit, "robins_wire.h": c_header(wire)}
 
 
 def _struct(m: Message) -> str:

@@ -63,6 +63,7 @@ RIG = Rig(
     inside=later(f"{__name__}.errors:inside"),
     judge=later(f"{__name__}.judging:judge"),
     example="adm",
+    exported="adm",
 )
 
 __all__ = ["BUILD", "RIG", "Kit", "acm", "actuators", "adm", "gyro", "plant", "star", "table"]
