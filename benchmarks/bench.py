@@ -1,6 +1,6 @@
 """The bench: steps a second with seven processes in lock-step, and lateness in real time.
 
-    python benchmarks/bench.py [--seconds 200]
+    python benchmarks/bench.py [--seconds 200] [--machine c]
 
 The peer is the same loop inside one program, a compiled scan, so the ratio is what the wire costs:
 seven processes, fourteen switches between them a step, frames made, checked and recorded.
@@ -20,10 +20,11 @@ from robins.bench.run.telemetry import difference
 def main() -> None:
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     ask.add_argument("--seconds", type=float, default=200.0)
+    ask.add_argument("--machine", choices=("jax", "c"), default="jax", help="of the parts")
     asked = ask.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "bench.mcap"
-        flight = changed(read("satellite/s1"), {"seconds": asked.seconds})
+        flight = changed(read("satellite/s1"), {"seconds": asked.seconds, "machine": asked.machine})
         ran = Session(flight, record).run()
         inside(ran.kit)  # compiles
         began = time.perf_counter()

@@ -5,9 +5,11 @@ says how long compiling took, how far their RMS errors are apart, and the most m
 
     python benchmarks/campaigns.py [RUNS [SYSTEM ...]]
     python benchmarks/campaigns.py --memory
+    python benchmarks/campaigns.py --linear
 
 The second measures the most memory in use by a campaign of an alignment, over truth steps and
-runs, and of the drive, each in a process of its own: of its set-up, and of all.
+runs, and of the drive, each in a process of its own: of its set-up, and of all. The third times an
+alignment over truth steps and over runs, after it has compiled.
 """
 
 import resource
@@ -90,7 +92,31 @@ def memory():
         subprocess.run([sys.executable, __file__, "--one", *map(str, row)], check=True)
 
 
+LINEAR = (  # truth steps, runs
+    (1_000, 100), (1_000, 1_000), (1_000, 10_000), (1_000, 100_000),
+    (10_000, 1_000), (100_000, 1_000),
+)  # fmt: skip
+LINEAR_BY_JAX = ((1_000, 128), (1_000, 1_024), (10_000, 128), (100_000, 128))
+
+
+def linear():
+    """Microseconds a truth step of one run, which are the same where the time is linear."""
+    print(
+        f"{'machine':>8s}{'steps':>8s}{'runs':>8s}{'time [s]':>12s}{'a step [us]':>14s}{'MB':>8s}"
+    )
+    for made, sizes in ((InLanes, LINEAR), (ByJax, LINEAR_BY_JAX)):
+        for steps, runs in sizes:
+            duration = f"manoeuvre.duration={0.01 * steps} s"
+            problem = problem_of(*ALIGNMENT, duration, "settle=5 s")
+            _, spent, _ = timed(made(problem), runs)
+            each = spent / (steps * runs) * 1e6
+            row = f"{made.name:>8s}{steps:8d}{runs:8d}{spent:12.2f}{each:14.3f}{used():8.0f}"
+            print(row, flush=True)
+
+
 def main():
+    if sys.argv[1:] == ["--linear"]:
+        return linear()
     if sys.argv[1:2] == ["--one"]:
         return one_campaign(*sys.argv[2:])
     if sys.argv[1:] == ["--memory"]:

@@ -146,6 +146,32 @@ def test_a_bank_begins_anew_with_all_its_modes():
     assert np.all(off < 120.0 * ARCSEC)
 
 
+@pytest.mark.parametrize("name", ["mekf-gate", "mixed-bias"])
+def test_by_c_the_loop_is_the_same_to_rounding_and_comes_back_from_safe_mode(name):
+    of = kit("satellite/s1", name, *SHORT)
+    lost = without("gyro", "adm acm", range(50, 60))
+    by_jax, by_c = (Loop(of._replace(machine=m), lost).run(120) for m in ("jax", "c"))
+    np.testing.assert_array_equal(by_c.flags(), by_jax.flags())
+    assert np.any(bit(by_c.flags(), FLAGS[3]))
+    for what in (
+        ("motion", "q_ib"),
+        ("estimate", "q_ib"),
+        ("estimate", "sigma"),
+        ("gyro", "theta_b"),
+    ):
+        np.testing.assert_allclose(by_c.all(*what), by_jax.all(*what), rtol=1e-9, atol=1e-13)
+    wanted = reference(name, 50)["estimate.q_ib"]
+    np.testing.assert_allclose(by_c.all("estimate", "q_ib")[:50], wanted, atol=1e-13)
+
+
+def test_a_camera_is_played_by_jax_when_the_rest_is_by_c():
+    settings = "duration=30 s", "counted_from=10 s", "star.camera.magnitude=5.0"
+    of = kit("satellite/stars", "mekf", *settings)._replace(machine="c")
+    inside = one_program("satellite/stars", "mekf", *settings)
+    found = Loop(of).run(40).all("estimate", "q_ib")
+    np.testing.assert_allclose(found, inside["estimate.q_ib"][:40], atol=1e-12)
+
+
 def test_whatever_is_lost_nothing_is_compiled_while_it_runs():
     # In real time a step that waits for the compiler misses its deadline, and some after it.
     of = kit("satellite/s1", "mekf-gate", *SHORT)

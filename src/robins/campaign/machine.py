@@ -18,7 +18,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from robins.campaign.memory import CHUNK, CHUNK_BYTES, LEAST, MEMORY, at_once, said, width_of
+from robins.campaign.memory import (
+    CHUNK,
+    CHUNK_BYTES,
+    LEAST,
+    MEMORY,
+    at_once,
+    give_back,
+    said,
+    width_of,
+)
 from robins.campaign.monte_carlo import (
     batch_of,
     blocks_of,
@@ -105,7 +114,11 @@ class ByJax:
     def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
         """What is kept of some filters over one chunk."""
         batch, _ = next(worlds(self.problem, part.width, part.width, part.begin, self._batch))
-        return {name: taken(name, record(self.problem, name, batch, part.runs)) for name in names}
+        kept = {}
+        for name in names:
+            kept[name] = taken(name, record(self.problem, name, batch, part.runs))
+            give_back()
+        return kept
 
     def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
         """All that was recorded of some filters over one chunk."""

@@ -12,6 +12,7 @@ What processes of parts do not need is imported when it is asked for: so they st
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from robins.bench.rig import Rig, later, named, packaged
 from robins.bench.rigs.satellite.computers import acm, adm
@@ -56,7 +57,10 @@ RIG = Rig(
     flies=_flies,
     filters=_filters,
     scenarios=packaged(__file__),
-    options=lambda: {"table": (named(f"{__name__}.setup:Carrier") | None, None)},
+    options=lambda: {
+        "table": (named(f"{__name__}.setup:Carrier") | None, None),
+        "machine": (Literal["jax", "c"], "jax"),
+    },
     said=later(f"{__name__}.faults:said"),
     view=lambda: named(f"{__name__}.view:VIEW"),
     topics=later(f"{__name__}.topics:topics"),

@@ -9,6 +9,7 @@ magnetorquers rest, and when the gyro is back the filter begins anew from the ne
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rigs.satellite.kit import Kit, driven
+from robins.bench.rigs.satellite.kit import Kit, compiled, driven
 from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
@@ -29,8 +30,6 @@ from robins.systems.satellite.nodes import STAR, Command, Given, Row
 
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
 _LIMIT = float(chi_square(GATE, 3))
-
-_believable = jax.jit(nodes.believable)
 
 
 def sample_of(gyro: Any) -> np.ndarray | None:
@@ -52,13 +51,14 @@ class Determined(NamedTuple):
 def adm(kit: Kit) -> Part:
     """Attitude determination: predicts with the gyro, updates with the star sensor."""
     form, additive = kit.form, kit.build == "quaternion"
-    online = OnlineFilter(kit.filter, kit.model, kit.start)
+    online = OnlineFilter(kit.filter, kit.model, kit.start, machine=kit.machine)
     first = online.state
     period = int(np.max(np.diff(np.flatnonzero(kit.due)), initial=1))
 
     attitude = jax.jit(form.attitude)
+    believable = compiled(kit, nodes.believable)
 
-    @jax.jit
+    @partial(compiled, kit)
     def report(belief: Belief):
         q = nodes.apart(form.attitude, belief.mean)  # as in `nodes.react`
         rows = form.rows(q)
@@ -68,12 +68,12 @@ def adm(kit: Kit) -> Part:
     # A filter that refuses a frame does not say how far off it is; one without rules does.
     plain, sensor = make_filter("quaternion" if additive else "mekf"), kit.model.sensor(STAR)
 
-    @jax.jit
+    @partial(compiled, kit)
     def judge(belief: Belief, y: Any, factor: Any):
         info = plain.update(plain.init(belief, kit.model.dims), sensor, y, factor)[1]
         return info.innovation, info.sigma, info.nis
 
-    @jax.jit
+    @partial(compiled, kit)
     def fresh(q_ib: Any, bias: Any, state: FilterState) -> FilterState:
         q = normalise(q_ib)
         believed = start(q, kit.attitude_rad, 0.0, additive)
@@ -92,7 +92,7 @@ def adm(kit: Kit) -> Part:
             online.predict(gyro.values)
         said, heard = [], False
         if frame is not None:
-            y = _believable(frame["q_ib"])
+            y = believable(frame["q_ib"])
             heard = bool(np.isfinite(np.asarray(y.wxyz)[0]))
             if not heard and np.all(np.isfinite(frame["q_ib"])):
                 flags |= SHORT

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import numpy as np
 
-from robins.bench.rigs.satellite.kit import Kit, as_numpy
+from robins.bench.rigs.satellite.kit import Kit
 from robins.bench.rigs.satellite.messages import FLAGS
 from robins.bench.rigs.satellite.vehicle import padded
 from robins.filters import Loop, run_closed
 from robins.rotation import conjugate, multiply, to_rotvec
-from robins.systems.satellite.nodes import STAR, react
+from robins.systems.satellite.nodes import STAR, StateForm, react
 
 ARCSEC = np.pi / 648000.0
 Arrays = Mapping[str, np.ndarray]
@@ -52,10 +53,21 @@ def peak_arcsec(error: np.ndarray, counted: slice) -> float:
     return float(np.nanmax(size)) / ARCSEC if np.any(np.isfinite(size)) else float("nan")
 
 
+@lru_cache
+def _reacts(form: StateForm) -> Callable:
+    """One function for each form, so that it is compiled once."""
+    return partial(react, form)
+
+
+@partial(jax.jit, static_argnames="form")
+def _attitudes(form: StateForm, mean: Any) -> Any:
+    return jax.vmap(form.attitude)(mean)
+
+
 def inside(kit: Kit) -> dict[str, np.ndarray]:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
     loop = Loop(
-        jax.tree_util.Partial(partial(react, kit.form), kit.given),
+        jax.tree_util.Partial(_reacts(kit.form), kit.given),
         kit.vehicle,
         kit.rows,
         {STAR: kit.due},
@@ -66,7 +78,7 @@ def inside(kit: Kit) -> dict[str, np.ndarray]:
     return {
         # the first leaf of the state of each kind
         "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(said.truth)[0]),
-        "estimate.q_ib": np.asarray(as_numpy(jax.jit(jax.vmap(kit.form.attitude))(mean))),
+        "estimate.q_ib": np.asarray(_attitudes(kit.form, mean)),
         "estimate.gyro_bias": np.asarray(kit.form.bias(mean)),
         "wheels.momentum": np.stack([padded(h) for h in momenta]),
     }

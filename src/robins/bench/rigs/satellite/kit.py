@@ -7,6 +7,7 @@ machine computes the same.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -35,6 +36,7 @@ class Kit(NamedTuple):
     start: Belief | FilterState
     attitude_rad: float  # believed of an attitude from a single star frame
     table: RateTable | None  # None: it goes with the craft exactly
+    machine: str = "jax"  # that parts compute by
 
     @property
     def filter(self) -> Filter:
@@ -57,6 +59,22 @@ class Kit(NamedTuple):
         return int(np.argmin(self.due)), int(np.argmax(self.due))
 
 
+def compiled(kit: Kit, function: Callable) -> Callable:
+    """A pure function as the parts of a run compute it: by JAX, or by C from its first call on."""
+    if kit.machine == "jax":
+        return jax.jit(function)
+    from robins.program import native  # what runs by JAX does not need it
+
+    made: list[Callable] = []
+
+    def call(*args: Any) -> Any:
+        if not made:
+            made.append(native(function, *args))
+        return made[0](*args)
+
+    return call
+
+
 def driven(kit: Kit, node: Callable) -> Callable:
     """A node compiled, driven by the rows of a run.
 
@@ -77,15 +95,12 @@ def driven(kit: Kit, node: Callable) -> Callable:
     table = np.concatenate([x.reshape(steps, -1).astype(float) for x in columns], axis=1)
     ends = np.cumsum([x[0].size for x in columns])
 
-    @jax.jit
     def run(given: Given, numbers: Array, *args: Any):
         pieces = zip(jnp.split(numbers, ends[:-1]), columns, strict=True)
         row = shape.unflatten([p.reshape(x.shape[1:]).astype(x.dtype) for p, x in pieces])
         return apart(node, given, *args, row)
 
-    return lambda step, *args: run(kit.given, table[min(step, steps - 1)], *args)
-
-
-def as_numpy(tree: Any) -> Any:
-    """Arrays that were computed, on the host."""
-    return jax.tree_util.tree_map(np.asarray, tree)
+    # JAX is given what stays the same, as `react` is; in a program it is folded.
+    by_jax = kit.machine == "jax"
+    call = partial(jax.jit(run), kit.given) if by_jax else compiled(kit, partial(run, kit.given))
+    return lambda step, *args: call(table[min(step, steps - 1)], *args)

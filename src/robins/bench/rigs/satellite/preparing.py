@@ -20,7 +20,7 @@ from robins.systems.satellite.world import lay_out, simulate
 def prepare(setup: Any, given: AttitudeLoop) -> Kit:
     """The kit of a run of the bench."""
     table = None if setup.table is None else setup.table.table()
-    return kit_for(given, setup.filter, setup.seed, table=table)
+    return kit_for(given, setup.filter, setup.seed, table=table)._replace(machine=setup.machine)
 
 
 def kit_for(
