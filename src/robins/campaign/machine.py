@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
+from time import monotonic
 from typing import Any, NamedTuple
 
 import jax
@@ -49,6 +50,7 @@ MACHINES = ("jax", "c", "cuda")
 PAYS = 60.0  # seconds of JAX on one core for which it pays to compile lanes
 FEWEST = 100  # runs of which this is asked
 NS = 0.5  # of JAX, for a scalar operation in a scan (measured: 0.4 to 0.8)
+BETWEEN_S = 1.0  # between two times that memory is given back
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
 
 Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chunk: what is kept
@@ -114,11 +116,7 @@ class ByJax:
     def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
         """What is kept of some filters over one chunk."""
         batch, _ = next(worlds(self.problem, part.width, part.width, part.begin, self._batch))
-        kept = {}
-        for name in names:
-            kept[name] = taken(name, record(self.problem, name, batch, part.runs))
-            give_back()
-        return kept
+        return {name: taken(name, record(self.problem, name, batch, part.runs)) for name in names}
 
     def histories(self, part: Part, names: Sequence[str]) -> dict[str, Any]:
         """All that was recorded of some filters over one chunk."""
@@ -202,8 +200,12 @@ class InLanes:
                 pool.submit(self._chunk, begin, width, min(width, runs - begin), taken)
                 for begin in begins[:ahead_by]
             )
+            returned = monotonic()
             for k, begin in enumerate(begins):
                 found = ahead.popleft().result()
+                if monotonic() - returned > BETWEEN_S:
+                    give_back()
+                    returned = monotonic()
                 for later in begins[k + ahead_by : k + ahead_by + 1]:
                     count = min(width, runs - later)
                     ahead.append(pool.submit(self._chunk, later, width, count, taken))
