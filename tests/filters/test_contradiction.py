@@ -1,10 +1,11 @@
 """Measurements without noise that contradict what is known exactly, or each other."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from robins.filters import Belief, Code, Sensor, Tally, imm, kalman, particle
+from robins.filters import Belief, Code, Sensor, Tally, imm, kalman, particle, unscented
 from robins.filters.analysis.consistency import grand_mean_nis
 from robins.filters.limits.constrain import constrain
 
@@ -58,6 +59,32 @@ def test_an_exact_component_that_cannot_be_is_said(factor, H, W, y, code):
     assert np.isinf(tally.nis["y"]) == (code != Code.DONE)
     verdict = grand_mean_nis(np.array([1.0, info.nis]), np.array([1, info.dof]))
     assert np.isinf(verdict.value) == (code != Code.DONE)
+
+
+@pytest.mark.parametrize("one", [kalman(), kalman(unscented())], ids=["taylor", "unscented"])
+def test_what_is_known_to_rounding_contradicts_nothing(one):
+    # Three readings without noise of a state that is known to 1e-14 but for one direction: of two
+    # that repeat the first to rounding, one may be used and the other is then known.
+    H = np.random.default_rng(0).normal(size=(3, 4))
+    sensor = Sensor(lambda x, aux: aux @ x, np.zeros((3, 3)), 3)
+
+    @jax.jit
+    def code(mean, factor, y):
+        state = one.init(Belief(mean, factor), {"y": 3})
+        return one.update(state, sensor, y, jnp.array(H))[1].code
+
+    def trial(seed, off):
+        rng = np.random.default_rng(seed)
+        factor = np.tril(2e-14 * rng.normal(size=(4, 4)))
+        factor[:, 0] = H[0]
+        mean = 30.0 * rng.normal(size=4)
+        y = H @ (mean + factor[:, 0] * rng.normal()) + off
+        return int(code(jnp.array(mean), jnp.array(factor), jnp.array(y)))
+
+    assert {trial(seed, 0.0) for seed in range(100)} == {Code.DONE}
+    # and what cannot be is still found: the last reading is off by far more than rounding
+    last = np.array([0.0, 0.0, 1e-3])
+    assert {trial(seed, last) for seed in range(20)} == {Code.CONTRADICTED}
 
 
 def test_what_is_missing_contradicts_nothing():

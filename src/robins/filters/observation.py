@@ -146,10 +146,16 @@ def contradicted(o: Observation, seen: Normalised) -> Array:
 
     def compare() -> Array:
         wide = jnp.concatenate([o.spread, o.excess, o.noise], axis=1)
-        among = jnp.where(seen.used[:, None], wide, 0.0) @ wide.T
-        if o.deficit is not None:
-            among = among - jnp.where(seen.used, o.deficit, 0.0)[:, None] * o.deficit[None, :]
-        share = linalg.solve_lower(seen.factor, among).T
+        used = jnp.where(seen.used[:, None], wide, 0.0)
+        if o.deficit is None:
+            # By an orthogonal transform: products of rows, divided by a pivot that is small
+            # against its row, would be rounding.
+            m = len(used)
+            top = jnp.concatenate([used, jnp.diag(jnp.where(seen.used, 0.0, 1.0))], axis=1)
+            share = linalg.tria(jnp.concatenate([top, jnp.pad(wide, ((0, 0), (0, m)))]))[m:, :m]
+        else:
+            among = used @ wide.T - jnp.outer(jnp.where(seen.used, o.deficit, 0.0), o.deficit)
+            share = linalg.solve_lower(seen.factor, among).T
         off = jnp.abs(o.residual - share @ seen.white)
         return idle & (off > _CONTRADICTS * (o.size + jnp.abs(share) @ jnp.abs(seen.white)))
 
