@@ -227,8 +227,8 @@ def test_payloads_that_are_not_the_message():
         ("wheels", {"momentum": [np.nan] * 4}, r"momentum\[0\] is nan N m s"),
         (
             "estimate",
-            {"q_ib": [1, 0, 0, 0], "gyro_bias": [0] * 3, "sigma": [np.nan] * 6, "flags": 64},
-            "flags is 64, not 0 to 63",
+            {"q_ib": [1, 0, 0, 0], "gyro_bias": [0] * 3, "sigma": [np.nan] * 6, "flags": 128},
+            "flags is 128, not 0 to 127",
         ),
     ],
 )

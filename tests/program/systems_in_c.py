@@ -52,8 +52,8 @@ def check(name, filter_):
 
 def walk(name):
     """What differs of all filters of a scenario, by their names."""
-    # A smoother runs the filter that it is named after.
-    filters = [f for f in read_scenario(name, ()).study.filters if not f.endswith("+rts")]
+    # A smoother runs the filter that it is named after; what is on request calls Python.
+    filters = [f for f in read_scenario(name, ()).study.usual if not f.endswith("+rts")]
     differs = {}
     for filter_ in filters:
         try:

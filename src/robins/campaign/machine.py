@@ -303,10 +303,18 @@ def machine_for(problem: Problem, runs: int, name: str = "") -> ByJax | InLanes:
         name: one of `MACHINES`; not given, lanes where they pay and there is a compiler.
 
     Raises:
-        RobinsError: the machine asked for is not there.
+        RobinsError: the machine asked for is not there, or a filter calls Python at its steps.
     """
     check_machine(name)
-    if name == "jax" or (not name and (runs < FEWEST or not has_compiler())):
+    hosted = [(n, c.on_host) for n, c in problem.contenders.items() if c.on_host]
+    if name == "c" and hosted:
+        which, why = hosted[0]
+        raise RobinsError(
+            f"filter '{which}' cannot be a program: {why}",
+            "--machine c",
+            "say jax, or choose other filters by --filters",
+        )
+    if name == "jax" or (not name and (runs < FEWEST or hosted or not has_compiler())):
         return ByJax(problem)
     lanes = InLanes(problem)
     return lanes if name or lanes.seconds_by_jax(runs) > PAYS else ByJax(problem)

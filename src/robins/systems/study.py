@@ -84,6 +84,8 @@ class Contender(NamedTuple):
     reported: np.ndarray | None = None  # (r, n) reported = this @ tangent error; None: all of it
     bounds: bool = False  # it states bounds of an H-infinity filter, not standard deviations
     facts: Mapping[str, Any] = {}  # figures known without a run, put among its metrics
+    # why its steps call Python, "it solves ... in Python": such a filter runs by JAX alone
+    on_host: str = ""
 
 
 def recipe(function: Callable[..., Any], *kinds: Any, numbers: Any) -> Partial:
@@ -219,7 +221,7 @@ class Scenario(Parameters):
     study: str = ""
     title: str = ""
     runs: Runs = 50
-    filters: Names = ()  # all of the study where none is named
+    filters: Names = ()  # the usual ones of the study where none is named
     claims: tuple[str, ...] | None = None  # ids of those it checks; None: all of the study
     # of a campaign in a folder: runs whose histories it keeps, and of how many that diverge
     keep: tuple[RunNumber, ...] = ()
@@ -241,6 +243,12 @@ class Study(NamedTuple):
     view: Callable[..., View]  # (parameters, course)
     lay_out: Callable[[Any], Any] = lambda given: None  # parameters -> course: what all runs share
     claims: Mapping[str, Claim] = {}  # by id, what its scenarios check
+    on_request: tuple[str, ...] = ()  # filters too slow to run where none is named
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """The filters that run where none is named."""
+        return tuple(name for name in self.filters if name not in self.on_request)
 
     def problem(self, given: Any, filters: Sequence[str], seed: int) -> Problem:
         """The scenario of these parameters with these filters, by name, ready for a campaign.

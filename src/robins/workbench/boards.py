@@ -79,8 +79,8 @@ def export_filter(
         board: build it, too, as a part of the bench, for this machine.
 
     Raises:
-        InputError: there is no such scenario or filter, or the folder holds something; or no part
-            of a rig is made of such a filter.
+        InputError: there is no such scenario or filter, it calls Python at its steps, or the folder
+            holds something; or no part of a rig is made of such a filter.
         robins.program.ProgramError: the filter does what has no place in C yet; the message names
             the line of the model or the rule.
         robins.program.BuildError: single precision is asked for, and there is no compiler here by
@@ -90,6 +90,9 @@ def export_filter(
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
     problem, wanted, label = _asked(name, filter_name, seed, settings)
+    if why := problem.contenders[wanted].on_host:
+        what = f"filter '{wanted}' cannot be exported: {why}, which no program in C does"
+        raise InputError(what, label, "choose another by --filter")
     rig = _rig_for(label) if board else None
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL

@@ -92,8 +92,8 @@ class Simulated(NamedTuple):
 
     @property
     def own(self) -> tuple[str, ...]:
-        """The filters that it names; else all of the study."""
-        return self.parameters.filters or self.study.filters
+        """The filters that it names; else the usual ones of the study."""
+        return self.parameters.filters or self.study.usual
 
     def problem(self, filters: Sequence[str], seed: int) -> Problem:
         """The problem of some of its filters.

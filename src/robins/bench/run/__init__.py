@@ -2,7 +2,8 @@
 
 - `setup`: what is asked for.
 - `session`: doing it. `crew`: its processes. `clocks`: when a step begins. `accounting`: how late.
-- `telemetry`, `outcome`: what came of it; `numbers`: where a rig says nothing of that.
+- `telemetry`, `outcome`: what came of it, in a `room` on disk if it is long; `numbers`: where a
+  rig says nothing of that.
 - `watching`: who looks on.
 """
 

@@ -119,7 +119,7 @@ class Session:
 
         Raises:
             ScenarioError: the length of the run does not fit the scenario.
-            PortError: a port cannot be opened.
+            PortError, ResultError: a port cannot be opened; there is no room for what passes.
             ValueError: what the rig cannot prepare.
         """
         self.flight, self.rig, self._watch = flight, flight.rig, watch
@@ -131,7 +131,7 @@ class Session:
             self._tell(0.0, "preparing")
             kit = kit_of(flight)
         self.kit = kit
-        self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns)
+        self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns, record)
         self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart", programs)
         self.injector = Injector(self.rig.table, setup.faults, setup.seed)
         self.clock = LockStep() if setup.clock == "lockstep" else real_time(flight)

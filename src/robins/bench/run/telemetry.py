@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robins.bench.rig import Rig
+from robins.bench.run.room import Room
+
+_OFTEN = 1 << 12  # messages, after which the memory of those before is let go
 
 
 @dataclass(frozen=True)
@@ -46,24 +50,31 @@ class Flown(Mapping[str, np.ndarray]):
 class Telemetry:
     """Listens to what passes."""
 
-    def __init__(self, rig: Rig, steps: int, step_ns: int):
+    def __init__(self, rig: Rig, steps: int, step_ns: int, beside: Path | None = None):
         """Make room.
 
         Args:
             rig: whose messages are kept.
             steps: E.
             step_ns: length of each.
+            beside: a file in whose folder a long run is kept; else that for temporary files.
+
+        Raises:
+            robins.results.ResultError: there is no room on disk.
         """
         self._wire, self._step_ns = rig.wire, step_ns
         every = [m for m in rig.wire.data if m.name in rig.kept or not rig.kept]
         self._fields = {m.name: [(f.name, f"{m.name}.{f.name}") for f in m.fields] for m in every}
 
-        def room(f: Any) -> np.ndarray:
+        def form(f: Any) -> tuple[tuple[int, ...], float | int]:
             shape = (steps, f.length) if f.length > 1 else (steps,)
-            return np.full(shape, np.nan) if f.kind == "f64" else np.zeros(shape, np.int64)
+            return shape, np.nan if f.kind == "f64" else 0
 
         time_s = np.arange(1, steps + 1) * (step_ns * 1e-9)
-        self.flown = Flown(time_s, {f"{m.name}.{f.name}": room(f) for m in every for f in m.fields})
+        shapes = {f"{m.name}.{f.name}": form(f) for m in every for f in m.fields}
+        self._room = Room(shapes, None if beside is None else beside.absolute().parent)
+        self._heard = 0
+        self.flown = Flown(time_s, self._room.arrays)
 
     def observe(self, message: str, time_ns: int, payload: bytes) -> None:
         """Take a message that passes."""
@@ -74,6 +85,9 @@ class Telemetry:
         said, arrays = self._wire.decode(message, payload), self.flown.arrays
         for field, name in fields:
             arrays[name][k] = said[field]
+        self._heard += 1
+        if self._heard % _OFTEN == 0:
+            self._room.forget()
 
 
 def difference(flown: Flown, inside: Mapping[str, np.ndarray]) -> float:

@@ -201,11 +201,13 @@ class EveryStep:
     spectral radius one, as every rotation has.
 
     The program is built at the first call and only filled in later; its units are those of the
-    first plant, until an answer in them fails.
+    first plant, until an answer in them fails. Where they are those of a plant that is named, a
+    gain depends on the plant of its step alone, to the last bit.
 
     Args:
         gamma: bound on the H-infinity norm of the plant frozen.
         form: "common" or "slack".
+        like: a plant whose units serve at all steps.
 
     Raises:
         ValueError: gamma is not positive, or the form is not known.
@@ -214,12 +216,13 @@ class EveryStep:
         FrozenTimeWarning: once, when it is made.
     """
 
-    def __init__(self, gamma: Number, form: ObserverForm = "common"):
+    def __init__(self, gamma: Number, form: ObserverForm = "common", like: Plant | None = None):
         check_gamma(gamma)
         one_of("form", form, ObserverForm)
         self.gamma = float(gamma)
         self.form: ObserverForm = form
-        self._scales: Scales | None = None
+        self._kept = like is not None
+        self._scales: Scales | None = None if like is None else self._units(like)
         warnings.warn(
             "LMIs for the plant frozen at each sample guarantee nothing for a plant that varies: "
             "neither that errors decay nor gamma",
@@ -237,7 +240,7 @@ class EveryStep:
         """
         sizes = (len(plant.A), len(plant.C))
         if self._scales is None or sizes != (len(self._scales.x), len(self._scales.y)):
-            self._scales = balanced(plant, None if np.isinf(self.gamma) else self.gamma)
+            self._scales = self._units(plant)
         answer = solve(
             self._scales.plant(plant), self.form, "h2" if np.isinf(self.gamma) else "mixed"
         )
@@ -245,8 +248,12 @@ class EveryStep:
             K = gain_of(answer, self._scales)
             if self._holds(plant, K, self._scales.h2(np.sqrt(max(answer.value, 0.0)))):
                 return K
-        self._scales = None
+        if not self._kept:
+            self._scales = None
         return observer(plant, self.gamma, self.form).gain
+
+    def _units(self, plant: Plant) -> Scales:
+        return balanced(plant, None if np.isinf(self.gamma) else self.gamma)
 
     def _holds(self, plant: Plant, K: np.ndarray, bound: float) -> bool:
         """The tests of `certify`, with gamma tested as a level instead of computing the norm."""

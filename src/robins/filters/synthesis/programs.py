@@ -68,10 +68,11 @@ def solve(plant: Plant, form: Form, aim: Aim) -> Answer:
         for name, parameter in program.parameters.items():
             parameter.value = getattr(plant, name)
         try:
-            # An answer that may be inaccurate says so in its status, and true norms decide.
+            # An answer that may be inaccurate says so in its status, and true norms decide. Each
+            # begins cold: a solver kept warm scales by the plant it saw first.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                program.problem.solve(solver=cp.CLARABEL, **_CLARABEL)
+                program.problem.solve(solver=cp.CLARABEL, warm_start=False, **_CLARABEL)
         except cp.SolverError:
             return Answer("solver_error", np.nan, {})
         found = {name: unknown.value for name, unknown in program.unknowns.items()}

@@ -33,7 +33,7 @@ from robins.systems.satellite.nodes import STAR, StateForm
 ARCSEC = math.pi / 648000.0
 GATE = 0.9999962  # chi-square of 3 at 27.9
 PATIENCE = 20  # frames refused in a row, after which what they agree on is believed again
-Build = Literal["mekf", "quaternion", "gated", "adaptive", "fixed", "fixed-gated"]
+Build = Literal["mekf", "quaternion", "gated", "adaptive", "fixed", "fixed-gated", "redesigned"]
 
 
 class AttitudeState(NamedTuple):
@@ -181,6 +181,10 @@ def make_filter(build: Build) -> Filter:
     """The filter of a build; those that differ in their gains share it, for a gain is data."""
     if build == "adaptive":
         return adaptive()
+    if build == "redesigned":  # imported here: other filters need no designs
+        from robins.systems.satellite.stepwise import redesigned
+
+        return kalman(taylor(), [redesigned()])
     reopened = gate(GATE, PATIENCE, "reinitialise")
     held = constant_gain({STAR: np.zeros((6, 3))})
     rules = {"gated": [reopened], "fixed": [held], "fixed-gated": [reopened, held]}

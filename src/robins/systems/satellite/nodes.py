@@ -35,6 +35,7 @@ from robins.sim.spacecraft import (
 from robins.sim.star_sensor import StarCamera, measure_attitude, read_star
 
 STAR = "star"  # the sensor
+NO_GAIN = "lmi_step.failed"  # note of a frame: no new gain passed, the last one stays
 UNIT = 1e-3  # that the length of a quaternion may be off by
 
 

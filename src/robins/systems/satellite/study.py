@@ -22,7 +22,7 @@ from robins.filters.rules import with_gains
 from robins.filters.synthesis import MissingExtra
 from robins.results import array
 from robins.systems.judgement import ratio_claims
-from robins.systems.satellite import design, model
+from robins.systems.satellite import design, model, stepwise
 from robins.systems.satellite.design import GainSpec, SensorNoise
 from robins.systems.satellite.model import ARCSEC, Build, make_filter
 from robins.systems.satellite.nodes import STAR, Given, Row, Step, begin, react
@@ -54,6 +54,7 @@ class FilterSpec(NamedTuple):
     build: Build
     gain: GainSpec | None = None  # of its gains; of a Kalman filter, of what its Q is inflated by
     drift: float | None = None  # variance of the bias' walk over the believed; None: told the truth
+    on_host: str = ""  # as of a `Contender`; such a filter runs only where it is named
 
 
 FILTERS: Mapping[str, FilterSpec] = {
@@ -68,6 +69,10 @@ FILTERS: Mapping[str, FilterSpec] = {
     "ekf-quaternion": FilterSpec("quaternion", None, 1.0),  # additive EKF of seven states
     "h2": FilterSpec("fixed", GainSpec("h2"), 1.0),  # steady Kalman gain
     "mixed-lmi": FilterSpec("fixed", GainSpec("lmi", 0.5), 1.0),  # mixed, by LMI, n on the rate
+    # the same, solved again at every star frame for the rate of the moment
+    "mixed-lmi-step": FilterSpec(
+        "redesigned", GainSpec("lmi", 0.5), 1.0, "it solves an LMI in Python at every star frame"
+    ),
     # mixed, by Riccati, n on the rate
     "mixed-riccati": FilterSpec("fixed", GainSpec("riccati", 0.5), 1.0),
     # the same, gamma halved
@@ -103,6 +108,7 @@ class Surroundings(NamedTuple):
     attitude_rad: Array  # believed at the start
     bias_rad_s: Array
     gain: Array  # (6, 3); zeros where there is none
+    frozen: Any  # `stepwise.Frozen`, or None
 
 
 def as_case(additive: bool, build: Build, around: Surroundings, world: World) -> Case:
@@ -113,6 +119,9 @@ def as_case(additive: bool, build: Build, around: Surroundings, world: World) ->
     start: Any = model.start(world.start_q_ib, around.attitude_rad, around.bias_rad_s, additive)
     if build.startswith("fixed"):
         start = with_gains(make_filter(build).init(start, {STAR: 3}), {STAR: around.gain})
+    if around.frozen is not None:
+        state = make_filter(build).init(start, {STAR: 3})
+        start = stepwise.begun(state, around.frozen, around.gain)
     loop = Loop(Partial(reacts, given), begin(given, world.craft), rows, {STAR: around.due})
     return Case(start=start, u=None, y={}, aux={}, truth=None, loop=loop)
 
@@ -129,7 +138,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
     walk = believed_walk(given, spec)
     noise = model.noise_of(given.gyro.random_walk, walk, given.step)
     sensors = SensorNoise(given.gyro.random_walk, walk, given.star.period, given.star.noise)
-    gain, facts = np.zeros((6, 3)), {}
+    gain, facts, frozen = np.zeros((6, 3)), {}, None
     if spec.gain is not None:
         try:
             facts = dict(design.facts(sensors, spec.gain))
@@ -137,12 +146,15 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
             raise ValueError(f"filter '{name}': {error}; or choose others by --filters") from error
         if spec.build.startswith("fixed"):
             gain = design.gain(sensors, spec.gain)
+        elif spec.build == "redesigned":
+            gain = design.gain(sensors, spec.gain)
+            frozen = stepwise.frozen(sensors, spec.gain, given.step)
         else:
             more = design.inflation(sensors, spec.gain) * math.sqrt(given.step / given.star.period)
             noise = noise._replace(factor=jnp.concatenate([noise.factor, more], axis=1))
     start = (jnp.asarray(given.believed.attitude), jnp.asarray(given.believed.bias))
     around = Surroundings(
-        course.given, course.steps, jnp.asarray(course.due), *start, jnp.asarray(gain)
+        course.given, course.steps, jnp.asarray(course.due), *start, jnp.asarray(gain), frozen
     )
     additive = spec.build == "quaternion"
     return Contender(
@@ -150,6 +162,7 @@ def contender(given: AttitudeLoop, course: Course, name: str) -> Contender:
         model=model.model(noise, given.star.noise, additive, given.star.camera is not None),
         case=recipe(as_case, additive, spec.build, numbers=around),
         facts=facts,
+        on_host=spec.on_host,
     )
 
 
@@ -244,6 +257,7 @@ def view(given: AttitudeLoop, course: Course) -> View:
 STUDY = Study(
     parameters=AttitudeLoop,
     filters=tuple(FILTERS),
+    on_request=tuple(name for name, spec in FILTERS.items() if spec.on_host),
     lay_out=lay_out,
     simulate=simulate,
     contender=contender,

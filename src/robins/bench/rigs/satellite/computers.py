@@ -18,7 +18,7 @@ import numpy as np
 
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.satellite.kit import Kit, compiled, driven
-from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.messages import HELD, KEPT, REFUSED, SAFE, SHORT, SILENT, USED
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
@@ -26,7 +26,7 @@ from robins.filters.kalman import FilterState
 from robins.rotation import normalise
 from robins.systems.satellite import nodes
 from robins.systems.satellite.model import GATE, make_filter, start
-from robins.systems.satellite.nodes import STAR, Command, Given, Row
+from robins.systems.satellite.nodes import NO_GAIN, STAR, Command, Given, Row
 
 SILENT_PERIODS = 4  # of the star sensor without a frame, after which it is said to be silent
 _LIMIT = float(chi_square(GATE, 3))
@@ -106,8 +106,10 @@ def adm(kit: Kit) -> Part:
                 factor = _factor(kit, frame)
                 if heard:
                     said.append(("innovation", _innovation(*judge(online.belief, y, factor))))
-                code = Code(int(online.update(y, STAR, factor).code))
+                info = online.update(y, STAR, factor)
+                code = Code(int(info.code))
                 flags |= USED * (code is Code.DONE) | REFUSED * (code is Code.REFUSED)
+                flags |= KEPT * bool(info.notes.get(NO_GAIN, False))
         since = 0 if heard else state.since_star + 1
         flags |= SILENT * (since > SILENT_PERIODS * period) | SAFE * lost
         q, bias, sigma = (np.asarray(x) for x in report(online.belief))

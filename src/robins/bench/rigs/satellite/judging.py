@@ -42,6 +42,7 @@ def judge(flight: Flight, ran: Ran) -> Judged:
             "quaternions_of_wrong_length": int(
                 np.sum(flag(flown, "star of a length other than one"))
             ),
+            "designs_not_passed": int(np.sum(flag(flown, "last gain kept: no new one passed"))),
             "steps_without_gyro": int(np.sum(flag(flown, "gyro held"))),
             "steps_in_safe_mode": int(np.sum(flag(flown, "safe: do not steer by this"))),
         },

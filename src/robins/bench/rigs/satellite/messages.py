@@ -19,9 +19,10 @@ FLAGS = (
     "safe: do not steer by this",
     "star silent",
     "star of a length other than one",
+    "last gain kept: no new one passed",
 )
 """Bits of `estimate.flags`, from the lowest."""
-USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
+USED, REFUSED, HELD, SAFE, SILENT, SHORT, KEPT = (1 << k for k in range(len(FLAGS)))
 _FLAGS = ", ".join(f"bit {k}: {text}" for k, text in enumerate(FLAGS))
 _ACTUATORS = (
     f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis", _ACTS),

@@ -11,7 +11,16 @@ from robins.bench.rig import Told, View
 from robins.bench.rigs.satellite.errors import ARCSEC, flag, reference_q_ib, turn
 from robins.bench.rigs.satellite.faults import OFFERED
 from robins.bench.rigs.satellite.kit import Kit
-from robins.bench.rigs.satellite.messages import FLAGS, HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.messages import (
+    FLAGS,
+    HELD,
+    KEPT,
+    REFUSED,
+    SAFE,
+    SHORT,
+    SILENT,
+    USED,
+)
 from robins.bench.run.numbers import latest
 from robins.bench.run.telemetry import Flown
 
@@ -102,7 +111,7 @@ class Alarms:
         """
         now, begun = flags, self._stands
         if not flags & _OF_FRAMES:  # no frame: what was said of the last one stands
-            now |= begun & (REFUSED | SHORT)
+            now |= begun & (REFUSED | SHORT | KEPT)
         new, over = now & ~begun, begun & ~now
         if flags & REFUSED:
             self._frames = 1 if new & REFUSED else self._frames + 1
@@ -113,7 +122,7 @@ class Alarms:
         if over & REFUSED:
             frames = "one frame was" if self._frames == 1 else f"{self._frames} frames were"
             said.append(Told("info", f"star used again, {frames} refused"))
-        for flag_ in (HELD, SILENT, SHORT):
+        for flag_ in (HELD, SILENT, SHORT, KEPT):
             if new & flag_:
                 said.append(Told("warning", FLAGS[flag_.bit_length() - 1]))
         if new & SAFE:
