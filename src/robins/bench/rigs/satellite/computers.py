@@ -18,6 +18,7 @@ import numpy as np
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.satellite.kit import Kit, driven
 from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.reference import Plan, Wanted, rehearse, told, wanted
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
@@ -153,15 +154,19 @@ def _innovation(innovation: Any, sigma: Any, nis: Any) -> dict[str, Any]:
 
 
 class Steered(NamedTuple):
-    """State of the attitude control: what it heard last."""
+    """State of the attitude control: what it heard last, and where it points."""
 
     estimate: Held  # q_ib, bias, whether it may be steered by
     theta: Held
     wheel_h: Any
+    plan: Plan | None = None  # None: the course of the scenario
 
 
-def _steers(given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, row: Row) -> Command:
-    return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
+def _steers(
+    given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, at: Wanted, row: Row
+) -> Command:
+    course = row.course._replace(ref_q_ib=at.q_ib, ref_omega_b=at.omega_b, ref_alpha_b=at.alpha_b)
+    return nodes.acm(given, q_ib, bias, theta, wheel_h, course)
 
 
 def acm(kit: Kit) -> Part:
@@ -171,31 +176,34 @@ def acm(kit: Kit) -> Part:
     wheels = len(vehicle.craft.wheel_h)
     mean = kit.belief.mean
     q0 = np.asarray(jax.jit(kit.form.attitude)(mean))
-    known = (q0, np.asarray(kit.form.bias(mean)), True)
-    begin = Steered(Held(known), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
+    first = (q0, np.asarray(kit.form.bias(mean)), True)
+    begin = Steered(Held(first), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
 
     def act(state: Steered, k: int, inputs: Inputs):
         estimate, gyro, speeds = inputs["estimate"], inputs["gyro"], inputs["wheels"]
         if k > 0:  # before the first step nobody has said anything
-            told = estimate and (
+            known = estimate and (
                 estimate["q_ib"],
                 estimate["gyro_bias"],
                 not estimate["flags"] & SAFE,
             )
             state = Steered(
-                renew(state.estimate, told),
+                renew(state.estimate, known),
                 renew(state.theta, sample_of(gyro)),
                 state.wheel_h if speeds is None else speeds["momentum"][:wheels],
+                state.plan,
             )
+        if (asked := inputs["reference"]) is not None:
+            state = state._replace(plan=told(kit, state.plan, k, asked["q_ib"], asked["rate"]))
         q, bias, steered = state.estimate.values
         if not (steered and trusted(state.estimate) and trusted(state.theta)):
             return state, [("command", rest())]
-        command = steers(k, q, bias, state.theta.values, state.wheel_h)
+        at = wanted(kit, state.plan, k)
+        command = steers(k, q, bias, state.theta.values, state.wheel_h, at)
         torque = padded(np.asarray(command.wheel_torque))
         return state, [
             ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})
         ]
 
-    takes = {"estimate": 1, "gyro": 1, "wheels": 1}
-    example = {"estimate": None, "gyro": None, "wheels": None}
-    return Part("acm", takes, lambda: begin, act, example)
+    takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1}
+    return Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))

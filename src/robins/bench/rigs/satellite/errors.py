@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
 import numpy as np
 
+from robins.bench.rig import Spoken
 from robins.bench.rigs.satellite.kit import Kit, as_numpy
 from robins.bench.rigs.satellite.messages import FLAGS
+from robins.bench.rigs.satellite.reference import Said, followed
 from robins.bench.rigs.satellite.vehicle import padded
 from robins.filters import Loop, run_closed
 from robins.rotation import conjugate, multiply, to_rotvec
-from robins.systems.satellite.nodes import STAR, react
+from robins.systems.satellite.nodes import STAR, Row, react
 
 ARCSEC = np.pi / 648000.0
 Arrays = Mapping[str, np.ndarray]
@@ -27,11 +29,6 @@ def turn(q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
 def attitude_error(flown: Arrays) -> np.ndarray:
     """(E, 3) true less estimated attitude [rad], body axes."""
     return turn(flown["estimate.q_ib"], flown["motion.q_ib"])
-
-
-def reference_q_ib(kit: Kit) -> np.ndarray:
-    """(E, 4) the wanted attitude at the end of each step."""
-    return np.asarray(kit.rows.course.ref_end_q_ib)
 
 
 def flag(flown: Arrays, text: str) -> np.ndarray:
@@ -52,12 +49,17 @@ def peak_arcsec(error: np.ndarray, counted: slice) -> float:
     return float(np.nanmax(size)) / ARCSEC if np.any(np.isfinite(size)) else float("nan")
 
 
-def inside(kit: Kit) -> dict[str, np.ndarray]:
-    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
+def inside(kit: Kit, said: Sequence[Spoken] = ()) -> dict[str, np.ndarray]:
+    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
+
+    Args:
+        kit: of the run.
+        said: by the operator.
+    """
     loop = Loop(
         jax.tree_util.Partial(partial(react, kit.form), kit.given),
         kit.vehicle,
-        kit.rows,
+        _rows(kit, [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]),
         {STAR: kit.due},
     )
     done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
@@ -70,3 +72,14 @@ def inside(kit: Kit) -> dict[str, np.ndarray]:
         "estimate.gyro_bias": np.asarray(kit.form.bias(mean)),
         "wheels.momentum": np.stack([padded(h) for h in momenta]),
     }
+
+
+def _rows(kit: Kit, said: list[Said]) -> Row:
+    """What drives each step, where the craft points as the operator says."""
+    if not said:
+        return kit.rows
+    q, omega, alpha = (np.stack(x) for x in zip(*followed(kit, said), strict=True))
+    course = kit.rows.course._replace(
+        ref_q_ib=q[:-1], ref_omega_b=omega[:-1], ref_alpha_b=alpha[:-1], ref_end_q_ib=q[1:]
+    )
+    return kit.rows._replace(course=course)

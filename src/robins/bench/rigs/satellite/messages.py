@@ -1,4 +1,4 @@
-"""What the seven parts of the satellite tell each other."""
+"""What the seven parts of the satellite tell each other, and what the operator tells them."""
 
 from __future__ import annotations
 
@@ -90,7 +90,25 @@ MESSAGES: tuple[Message, ...] = (
     ),
 )
 
-WIRE = Wire(PARTS, MESSAGES)
+_CONSOLE: tuple[Message, ...] = (
+    message(
+        25,
+        "reference",
+        "Where the craft is to point from now on, from the operator.",
+        f64(
+            "q_ib",
+            4,
+            "1",
+            f"{_QUATERNION}; either sign; NaN: back to the course of the scenario",
+            _UNIT,
+            True,
+        ),
+        Field("rate", "f64", 1, "rad/s", "greatest of the slew; 0: as the craft can", (0.0, _RATE)),
+    ),
+)
+
+WIRE = Wire(PARTS, (*MESSAGES, *_CONSOLE))
+CONSOLE = tuple(m.name for m in _CONSOLE)
 
 SENDS: dict[str, tuple[str, ...]] = {
     "plant": ("motion",),
@@ -107,6 +125,6 @@ TAKES: dict[str, tuple[str, ...]] = {
     "gyro": ("mounted",),
     "star": ("motion", "gyro", "estimate"),
     "adm": ("gyro", "star"),
-    "acm": ("estimate", "gyro", "wheels"),
+    "acm": ("estimate", "gyro", "wheels", "reference"),
     "actuators": ("command",),
 }
