@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from stations import Loop, kit, on_threads
 
 from robins.bench.recording import read_record
+from robins.bench.rig import Spoken
 from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.errors import inside
 from robins.bench.rigs.satellite.judging import judge
-from robins.bench.rigs.satellite.messages import WIRE
+from robins.bench.rigs.satellite.messages import SAFE, USED, WIRE
 from robins.bench.rigs.satellite.reference import (
     followed,
     limits,
@@ -208,6 +209,55 @@ def test_control_follows_what_it_hears_alone(of, asked):
     assert away(loop.all("motion", "q_ib")[-1], course[249]) > 0.3
 
 
+# ----------------------------------------------------------------------------------------- mode
+
+
+def mode(loop: Loop, **values: int) -> None:
+    for part in ("adm", "acm"):
+        loop.to(part, "mode", RIG.desk.payload("mode", values), loop.step * loop.kit.step_ns)
+
+
+def test_control_stands_by_while_the_determination_goes_on(of):
+    loop, plain = Loop(of).run(50), Loop(of).run(150)
+    mode(loop, mode=1)
+    loop.run(30)
+    mode(loop, mode=2)  # as it is
+    loop.run(20)
+    mode(loop, mode=0)
+    loop.run(50)
+    torque = loop.all("command", "wheel_torque")
+    np.testing.assert_array_equal(torque[:50], plain.all("command", "wheel_torque")[:50])
+    assert np.all(torque[50:100] == 0.0)
+    assert np.all(loop.all("command", "dipole_b")[50:100] == 0.0)
+    assert np.all(np.any(torque[100:] != 0.0, axis=1))
+    assert not np.any(loop.flags() & SAFE)
+    used = loop.flags() & USED == USED
+    np.testing.assert_array_equal(used, of.due[:150])
+
+
+def test_a_reset_filter_begins_anew_with_the_next_star_frame(of):
+    loop, plain = Loop(of).run(101), Loop(of).run(160)
+    mode(loop, mode=0, reset=1)
+    loop.run(59)
+    again = int(np.flatnonzero(of.due[101:])[0]) + 101
+    safe = np.flatnonzero(loop.flags() & SAFE)
+    assert list(safe) == list(range(101, again))
+    # the bias is that of the start, the attitude that of the frame, to the last bit
+    first = np.asarray(of.form.bias(of.belief.mean))
+    np.testing.assert_array_equal(loop.all("estimate", "gyro_bias")[again], first)
+    frame = loop.heard["star"][int(np.sum(of.due[:again]))]["q_ib"]
+    assert away(loop.all("estimate", "q_ib")[again], frame) < 1e-6
+    sigma = loop.all("estimate", "sigma")
+    before, plainly = (
+        loop.all("estimate", "gyro_bias")[100],
+        plain.all("estimate", "gyro_bias")[100],
+    )
+    np.testing.assert_array_equal(before, plainly)
+    assert np.all(sigma[again, :3] > 1.5 * sigma[100, :3])  # it knows as much as at the start
+    np.testing.assert_allclose(sigma[again, 3:], sigma[0, 3:], rtol=0.2)
+    assert inside(of, [Spoken(101, "mode", {"mode": 0, "reset": 1})]) is None
+
+
 # ----------------------------------------------------------------------------- scripts and pages
 
 
@@ -248,4 +298,6 @@ def test_all_that_the_page_offers_can_be_said(of):
     for label, says in SAYS.items():
         message, values = says(flown, of, 2)
         said = WIRE.decode(message, RIG.desk.payload(message, values))
+        if message == "mode":
+            continue
         assert np.isnan(said["q_ib"][0]) == (label == "back to the course")

@@ -3,7 +3,8 @@
 What they do when a sensor fails: the star sensor may be silent for as long as it likes, then the
 attitude is that of the gyro alone. A gyro's sample stands for one period more. After that nobody
 knows how the craft turns: the estimate says "safe: do not steer by this", control lets wheels and
-magnetorquers rest, and when the gyro is back the filter begins anew from the next star frame.
+magnetorquers rest, and when the gyro is back the filter begins anew from the next star frame. So it
+does when the operator resets it, with the bias that it began with.
 """
 
 from __future__ import annotations
@@ -17,7 +18,16 @@ import numpy as np
 
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.satellite.kit import Kit, driven
-from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.messages import (
+    AS_IT_IS,
+    HELD,
+    REFUSED,
+    SAFE,
+    SHORT,
+    SILENT,
+    STAND_BY,
+    USED,
+)
 from robins.bench.rigs.satellite.reference import Plan, Wanted, rehearse, told, wanted
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
@@ -89,6 +99,8 @@ def adm(kit: Kit) -> Part:
         gyro = renew(state.gyro, sample_of(inputs["gyro"]))
         flags = 0 if gyro.age == 0 else HELD
         online.state, lost = state.filter, state.lost or not trusted(gyro)
+        if (mode := inputs["mode"]) is not None and mode["reset"]:
+            online.state, lost = first, True
         if not lost:
             online.predict(gyro.values)
         said, heard = [], False
@@ -133,10 +145,11 @@ def adm(kit: Kit) -> Part:
     }
 
     def rare() -> None:
-        anew, _ = act(begin._replace(lost=True), 0, example)
-        act(anew, 0, {**example, "star": None})
+        anew, _ = act(begin._replace(lost=True), 0, {"mode": None, **example})
+        act(anew, 0, {**example, "star": None, "mode": None})
 
-    return Part("adm", {"gyro": 0, "star": 0}, lambda: begin, act, example, rare)
+    takes = {"gyro": 0, "star": 0, "mode": 1}
+    return Part("adm", takes, lambda: begin, act, {"mode": None, **example}, rare)
 
 
 def _factor(kit: Kit, frame: Any) -> Any:
@@ -160,6 +173,7 @@ class Steered(NamedTuple):
     theta: Held
     wheel_h: Any
     plan: Plan | None = None  # None: the course of the scenario
+    stands_by: bool = False
 
 
 def _steers(
@@ -192,11 +206,15 @@ def acm(kit: Kit) -> Part:
                 renew(state.theta, sample_of(gyro)),
                 state.wheel_h if speeds is None else speeds["momentum"][:wheels],
                 state.plan,
+                state.stands_by,
             )
         if (asked := inputs["reference"]) is not None:
             state = state._replace(plan=told(kit, state.plan, k, asked["q_ib"], asked["rate"]))
+        if (mode := inputs["mode"]) is not None and mode["mode"] != AS_IT_IS:
+            state = state._replace(stands_by=mode["mode"] == STAND_BY)
         q, bias, steered = state.estimate.values
-        if not (steered and trusted(state.estimate) and trusted(state.theta)):
+        heard = trusted(state.estimate) and trusted(state.theta)
+        if state.stands_by or not (steered and heard):
             return state, [("command", rest())]
         at = wanted(kit, state.plan, k)
         command = steers(k, q, bias, state.theta.values, state.wheel_h, at)
@@ -205,5 +223,5 @@ def acm(kit: Kit) -> Part:
             ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})
         ]
 
-    takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1}
+    takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1, "mode": 1}
     return Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))

@@ -49,13 +49,15 @@ def peak_arcsec(error: np.ndarray, counted: slice) -> float:
     return float(np.nanmax(size)) / ARCSEC if np.any(np.isfinite(size)) else float("nan")
 
 
-def inside(kit: Kit, said: Sequence[Spoken] = ()) -> dict[str, np.ndarray]:
+def inside(kit: Kit, said: Sequence[Spoken] = ()) -> dict[str, np.ndarray] | None:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
 
     Args:
         kit: of the run.
-        said: by the operator.
+        said: by the operator. In one program computers cannot stand by or be reset: None.
     """
+    if any(one.message != "reference" for one in said):
+        return None
     loop = Loop(
         jax.tree_util.Partial(partial(react, kit.form), kit.given),
         kit.vehicle,
@@ -63,11 +65,11 @@ def inside(kit: Kit, said: Sequence[Spoken] = ()) -> dict[str, np.ndarray]:
         {STAR: kit.due},
     )
     done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
-    mean, said = done.steps.mean, done.readings
-    momenta = np.asarray(said.outputs["wheel_momentum"])
+    mean, seen = done.steps.mean, done.readings
+    momenta = np.asarray(seen.outputs["wheel_momentum"])
     return {
         # the first leaf of the state of each kind
-        "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(said.truth)[0]),
+        "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(seen.truth)[0]),
         "estimate.q_ib": np.asarray(as_numpy(jax.jit(jax.vmap(kit.form.attitude))(mean))),
         "estimate.gyro_bias": np.asarray(kit.form.bias(mean)),
         "wheels.momentum": np.stack([padded(h) for h in momenta]),

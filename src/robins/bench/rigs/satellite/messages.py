@@ -22,6 +22,7 @@ FLAGS = (
 )
 """Bits of `estimate.flags`, from the lowest."""
 USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
+RUN, STAND_BY, AS_IT_IS = range(3)  # of `mode.mode`
 _FLAGS = ", ".join(f"bit {k}: {text}" for k, text in enumerate(FLAGS))
 _ACTUATORS = (
     f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis", _ACTS),
@@ -105,6 +106,13 @@ _CONSOLE: tuple[Message, ...] = (
         ),
         Field("rate", "f64", 1, "rad/s", "greatest of the slew; 0: as the craft can", (0.0, _RATE)),
     ),
+    message(
+        26,
+        "mode",
+        "What the computers on board are to do from now on, from the operator.",
+        Field("mode", "u8", 1, "1", "0: run; 1: stand by: control rests; 2: as it is", (0, 2)),
+        Field("reset", "u8", 1, "1", "1: the filter begins anew with the next star frame", (0, 1)),
+    ),
 )
 
 WIRE = Wire(PARTS, (*MESSAGES, *_CONSOLE))
@@ -124,7 +132,7 @@ TAKES: dict[str, tuple[str, ...]] = {
     "table": ("motion",),
     "gyro": ("mounted",),
     "star": ("motion", "gyro", "estimate"),
-    "adm": ("gyro", "star"),
-    "acm": ("estimate", "gyro", "wheels", "reference"),
+    "adm": ("gyro", "star", "mode"),
+    "acm": ("estimate", "gyro", "wheels", *CONSOLE),
     "actuators": ("command",),
 }

@@ -13,7 +13,18 @@ from robins.bench.rig import Told, View
 from robins.bench.rigs.satellite.errors import ARCSEC, flag, turn
 from robins.bench.rigs.satellite.faults import OFFERED
 from robins.bench.rigs.satellite.kit import Kit
-from robins.bench.rigs.satellite.messages import FLAGS, HELD, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.messages import (
+    AS_IT_IS,
+    FLAGS,
+    HELD,
+    REFUSED,
+    RUN,
+    SAFE,
+    SHORT,
+    SILENT,
+    STAND_BY,
+    USED,
+)
 from robins.bench.rigs.satellite.reference import wanted_after
 from robins.bench.run.numbers import latest
 from robins.bench.run.telemetry import Flown
@@ -141,6 +152,9 @@ SAYS = {
     },
     "hold this attitude": partial(_turned, turn_rad=np.zeros(3)),
     "back to the course": lambda flown, kit, step: ("reference", {}),
+    "control: stand by": lambda flown, kit, step: ("mode", {"mode": STAND_BY}),
+    "control: run": lambda flown, kit, step: ("mode", {"mode": RUN}),
+    "determination: reset": lambda flown, kit, step: ("mode", {"mode": AS_IT_IS, "reset": 1}),
 }
 """What the page offers to say."""
 
