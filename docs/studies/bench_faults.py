@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from robins.bench.rigs.satellite import RIG, errors
+from robins.bench.rigs.satellite.reference import reference_q_ib
 from robins.bench.run import Session
 from robins.bench.run.outcome import figures, judged
 from robins.bench.run.setup import changed, read
@@ -40,7 +41,7 @@ def flown(case: str, filter_: str, seed: int, seconds: float) -> dict:
     # As in the specification: peaks and figures of the time from the fault on.
     after = slice(round(600.0 / flight.given.step), None)
     error = errors.attitude_error(ran.flown)
-    wanted = errors.reference_q_ib(ran.kit)[: ran.steps]
+    wanted = reference_q_ib(ran.kit, ran.flown, ran.steps)
     pointing = errors.turn(wanted, ran.flown["motion.q_ib"])
     return told | {
         "attitude_peak": errors.peak_arcsec(error, after),

@@ -23,6 +23,7 @@ from robins.bench.live.guard import known_host, same_origin
 
 STATIC = Path(package.__file__).parent / "static"
 SIGNALS = [Signal("a", "1", "A"), Signal("b", "1", "A"), Signal("c", "m", "C")]
+SAYS = ["back to the course"]
 FAULTS = [
     {"label": "star stuck", "fault": {"kind": "stuck", "link": "star"}},
     {"label": "noise", "fault": {"kind": "bit errors", "bits": 2}},
@@ -31,7 +32,7 @@ FAULTS = [
 
 @pytest.fixture(scope="module")
 def live():
-    with Live(SIGNALS, "a bench", 1, faults=FAULTS) as made:
+    with Live(SIGNALS, "a bench", 1, faults=FAULTS, says=SAYS) as made:
         yield made
 
 
@@ -136,9 +137,11 @@ def test_nothing_but_the_page_is_served(live):
 
 def test_commands_reach_the_bench_and_nonsense_is_answered(live):
     inject = {"do": "inject", "label": "noise", "duration_s": 2.5}
+    say = {"do": "say", "label": SAYS[0]}
+    clear = {"do": "clear"}, {"do": "clear", "label": "noise"}
     with page_of(live) as page:
-        told(page, "hello")
-        for asked in ({"do": "pause"}, inject, {"do": "clear"}, {"do": "clear", "label": "noise"}):
+        assert told(page, "hello")["says"] == SAYS
+        for asked in ({"do": "pause"}, inject, *clear, say):
             page.send(json.dumps(asked))
             assert told(page, "taken")["do"] == asked["do"]
         for nonsense in ("{", b"\xff\x00", '{"do":"format"}', '{"do":"inject","label":"x"}', "[]"):
@@ -149,6 +152,7 @@ def test_commands_reach_the_bench_and_nonsense_is_answered(live):
         {"do": "inject", **FAULTS[1], "duration_s": 2.5},
         {"do": "clear", "label": None},
         {"do": "clear", "label": "noise"},
+        say,
     ]
     assert live.commands() == []
 
@@ -185,11 +189,12 @@ GOOD = [
         {"do": "inject", **FAULTS[1], "duration_s": 3.0},
     ),
     ('{"do":"clear","label":null}', {"do": "clear", "label": None}),
+    ('{"do":"say","label":"back to the course"}', {"do": "say", "label": SAYS[0]}),
 ]
 WRONG = [
     (
         '{"do":"starts"}',
-        "no command 'starts'; there are: start, pause, stop, inject, clear, acknowledge",
+        "no command 'starts'; there are: start, pause, stop, inject, clear, say, acknowledge",
     ),
     ('{"do":"acknowledge"}', "a list of their numbers: None"),
     ('{"do":"acknowledge","alarms":3}', "a list of their numbers"),
@@ -213,6 +218,10 @@ WRONG = [
     ('{"do":"inject","label":"noise","duration_s":1' + 400 * "0" + "}", "0 to 3600 s"),
     ('{"do":"inject","label":"noise","duration_s":true}', "0 to 3600 s"),
     ('{"do":"inject","label":"noise","duration_s":"3"}', "0 to 3600 s"),
+    ('{"do":"say"}', "None cannot be said to the parts; there is: 'back to the course'"),
+    ('{"do":"say","label":"noise"}', "'noise' cannot be said"),
+    ('{"do":"say","label":["back to the course"]}', "cannot be said"),
+    ('{"do":"say","message":"reference","values":{}}', "takes no 'message', 'values'"),
     ('{"do":"clear","label":3}', "label of a fault is a text"),
     ("7", "JSON object"),
     ("[" * 4000, "no JSON"),
@@ -222,13 +231,13 @@ WRONG = [
 
 @pytest.mark.parametrize(("text", "command"), GOOD)
 def test_a_command_is_read(text, command):
-    assert read(text, FAULTS, ALARMS) == command
+    assert read(text, FAULTS, ALARMS, SAYS) == command
 
 
 @pytest.mark.parametrize(("text", "says"), WRONG)
 def test_a_wrong_command_is_told_what_is_wrong(text, says):
     with pytest.raises(CommandError) as error:
-        read(text, FAULTS, ALARMS)
+        read(text, FAULTS, ALARMS, SAYS)
     assert says in str(error.value)
     assert len(str(error.value)) < 200
 
@@ -241,18 +250,20 @@ values = st.recursive(
     max_leaves=6,
 )
 keys = st.sampled_from(["do", "label", "duration_s", "fault", "alarms"])
-words = st.sampled_from(["start", "stop", "inject", "clear", "noise", "acknowledge"])
+words = st.sampled_from(["start", "stop", "inject", "clear", "noise", "say", "acknowledge", *SAYS])
 
 
 @given(st.dictionaries(keys, words | values).map(json.dumps) | st.text() | st.binary())
 def test_whatever_a_page_sends_is_a_command_or_refused(text):
     try:
-        command = read(text, FAULTS, ALARMS)
+        command = read(text, FAULTS, ALARMS, SAYS)
     except CommandError:
         return
-    assert command["do"] in {"start", "pause", "stop", "inject", "clear", "acknowledge"}
+    assert command["do"] in {"start", "pause", "stop", "inject", "clear", "say", "acknowledge"}
     if command["do"] == "acknowledge":
         assert set(command["alarms"]) <= {3, 5, 8}
+    if command["do"] == "say":
+        assert command["label"] in SAYS
     if command["do"] == "inject":
         assert {k: command[k] for k in ("label", "fault")} in FAULTS
 

@@ -355,6 +355,24 @@ def test_the_buttons_reach_the_bench(chromium, live):
         assert command(live) == {"do": "clear", "label": None}
 
 
+def test_what_the_operator_may_say_is_a_button_each(chromium, live):
+    says = ["slew 10 deg", 'back to "the course"']
+    with (
+        Live(SIGNALS, "a bench", 5, says=says) as made,
+        browse(chromium, made.url) as page,
+    ):
+        made.status({"state": "running"})
+        buttons = page.get_by_test_id("says").locator("button")
+        assert buttons.all_inner_texts() == says
+        buttons.nth(1).click()
+        assert command(made) == {"do": "say", "label": says[1]}
+        expect(page.get_by_test_id("answer")).to_have_text("say: the bench has it")
+        made.status({"state": "stopped"})
+        expect(buttons.nth(0)).to_have_attribute("aria-disabled", "true")
+    with browse(chromium, live.url) as page:  # a bench that offers none
+        expect(page.get_by_test_id("says")).to_be_hidden()
+
+
 def test_a_fault_is_injected_with_the_keyboard_alone(chromium, live):
     with browse(chromium, live.url) as page:
         page.get_by_test_id("fault").focus()

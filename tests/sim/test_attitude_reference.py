@@ -6,7 +6,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins.earth.wgs84 import GM
-from robins.sim.attitude_reference import Reference, inertial, nadir, slews
+from robins.sim.attitude_reference import (
+    PEAK_ACCELERATION,
+    PEAK_RATE,
+    Reference,
+    handed_over,
+    inertial,
+    nadir,
+    slews,
+)
 from robins.sim.orbit import Orbit, circular_orbit
 
 DEG = np.pi / 180.0
@@ -115,6 +123,51 @@ def test_slews_that_fade_in_start_at_rest_and_end_as_the_others():
     # From the first epoch on, whatever its time
     later = slews(base, AMPLITUDE, PERIOD, TIME + 1000.0, PHASE, fade_in_s=100.0)
     np.testing.assert_allclose(later.q_ib, reference.q_ib, rtol=0.0, atol=1e-13)
+
+
+TURN, LENGTH = np.array([0.3, -0.5, 0.2]), 40.0  # rad, s
+
+
+def way(base, rate, turn=TURN):
+    return numbers(handed_over(base, turn, np.asarray(rate, float), LENGTH, TIME))
+
+
+def test_the_way_between_two_attitudes_turns_about_one_axis_from_rest_to_rest():
+    base = inertial(STILL, TIME)
+    found = way(base, np.zeros(3))
+    check_rates(found, DT, 1e-6, 3e-5)
+    there = Rotation.from_quat(STILL, scalar_first=True)
+    left = (there.inv() * Rotation.from_quat(found.q_ib, scalar_first=True)).as_rotvec()
+    np.testing.assert_allclose(left[0], TURN, atol=1e-14)
+    axis, angle = TURN / np.linalg.norm(TURN), np.linalg.norm(TURN)
+    np.testing.assert_allclose(left, np.outer(left @ axis, axis), atol=1e-14)
+    assert np.all(np.diff(left @ axis) <= 1e-15)
+    over = TIME >= LENGTH
+    np.testing.assert_allclose(left[over], 0.0, atol=1e-15)
+    for k, peak in ((1, PEAK_RATE / LENGTH), (2, PEAK_ACCELERATION / LENGTH**2)):
+        size = np.linalg.norm(found[k], axis=1)
+        np.testing.assert_allclose(np.max(size), peak * angle, rtol=1e-5)
+        np.testing.assert_allclose(size[[0, -1]], 0.0, atol=1e-15)
+
+
+def test_a_reference_that_moves_is_left_and_come_to_without_a_jump_of_its_rate(orbit):
+    """From one that turns at 1 deg/s, a sixth of a turn away, to nadir."""
+    base = nadir(circular_orbit(500e3, 97.4 * DEG, 0.8, 0.3, TIME))
+    omega = np.array([1.0, -0.4, 0.2]) * DEG  # of the one that is left, in its axes
+    to, turn = numbers(base), Rotation.from_rotvec(TURN)
+    found = way(base, omega - turn.inv().apply(to.omega_b[0]))
+    check_rates(found, DT, 1e-6, 3e-5)
+    np.testing.assert_allclose(found.omega_b[0], omega, atol=1e-15)
+    then = Rotation.from_quat(to.q_ib[0], scalar_first=True) * turn
+    apart = then.inv() * Rotation.from_quat(found.q_ib[0], scalar_first=True)
+    np.testing.assert_allclose(apart.as_rotvec(), 0.0, atol=1e-14)
+    over = TIME >= LENGTH
+    for x, wanted in zip(found, to, strict=True):
+        np.testing.assert_allclose(x[over], wanted[over], atol=1e-14)
+    # The rate that dies away brings no more acceleration than is reckoned with.
+    dies = way(inertial(STILL, TIME), omega, np.zeros(3))
+    most = 4.0 * np.linalg.norm(omega) / LENGTH
+    assert 0.98 * most < np.max(np.linalg.norm(dies.alpha_b, axis=1)) < most
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from robins.bench.broker.faults import LinkFault, Said, Table
+    from robins.bench.broker.says import Desk, Saying
     from robins.bench.live.feed import Signal
     from robins.bench.recording.topics import Topic
     from robins.bench.run.session import Ran
@@ -126,6 +127,8 @@ class View(NamedTuple):
         alarms: a listener for a run.
         counts: (arrays, steps done) -> what was counted, by name.
         offered: faults that can be injected, each with its label.
+        says: what the operator can say, by label: (arrays, kit, last step that was done) -> the
+            message and its values.
     """
 
     signals: Callable[[Any], list[Signal]]
@@ -133,6 +136,17 @@ class View(NamedTuple):
     alarms: Callable[[], Alarms | None] = lambda: None
     counts: Callable[[Flown, int], dict[str, int]] = lambda flown, done: {}
     offered: tuple[dict[str, Any], ...] = ()
+    says: Mapping[str, Callable[[Flown, Any, int], tuple[str, Mapping[str, Any]]]] = (
+        MappingProxyType({})
+    )
+
+
+class Spoken(NamedTuple):
+    """What the operator said through the bench."""
+
+    step: int  # the first whose parts heard it
+    message: str
+    values: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -145,6 +159,10 @@ class Rig:
         build: how a part is made of a kit, by part.
         sends: messages by part, each of one part alone.
         takes: messages by part.
+        console: messages that no part sends: the operator says them through the bench, and parts
+            take them, if they do, with a lag of one.
+        refuses: (message, values) -> why the operator cannot say this, though each number is within
+            its limits; "": it can be said.
         parameters: () -> the class of what flies.
         prepare: (setup, parameters) -> the kit of a run; the same for the same.
         truth: the message without which nothing can be judged; "": there is none.
@@ -158,6 +176,7 @@ class Rig:
         view: of the page; left out: all numbers of its messages.
         topics: (kit) -> what viewers and ROS 2 get of its messages, in the record.
         inside: (kit) -> arrays of the same run inside one program, named as `Flown` names them.
+            With a console: (kit, what was said) -> the same, or None where it cannot be compared.
         judge: figures of merit of a run; left out: none, and all numbers in its arrays.
         example: the part with which commands are shown; left out: its last.
         exported: the part that an exported filter can be, by the loop of that name among the files
@@ -172,6 +191,8 @@ class Rig:
     takes: Mapping[str, tuple[str, ...]]
     parameters: Callable[[], type[Parameters]]
     prepare: Callable[[Any, Any], Kit]
+    console: tuple[str, ...] = ()
+    refuses: Callable[[str, Mapping[str, Any]], str] = lambda message, values: ""
     truth: str = ""
     kept: tuple[str, ...] = ()
     timing: Callable[[Any], Timing] = timing
@@ -182,7 +203,7 @@ class Rig:
     said: Callable[[], tuple[Mapping[str, Said], Mapping[str, Any]]] = lambda: ({}, {})
     view: Callable[[], View] | None = None
     topics: Callable[[Any], Sequence[Topic]] = lambda kit: ()
-    inside: Callable[[Any], Mapping[str, np.ndarray]] | None = None
+    inside: Callable[..., Mapping[str, np.ndarray] | None] | None = None
     judge: Callable[[Flight, Ran], Judged] | None = None
     example: str = ""
     exported: str = ""
@@ -201,9 +222,14 @@ class Rig:
         if not self.example:
             object.__setattr__(self, "example", parts[-1])
         named = {m.name for m in self.wire.data}
-        said = [name for sent in self.sends.values() for name in sent]
+        said = [name for sent in (*self.sends.values(), self.console) for name in sent]
         if sorted(said) != sorted(named):
-            raise RigError(f"each message is sent by one part: {sorted(said)} of {sorted(named)}")
+            console = " or said by the bench" if self.console else ""
+            raise RigError(
+                f"each message is sent by one part{console}: {sorted(said)} of {sorted(named)}"
+            )
+        if unheard := sorted(set(self.console) - {m for t in self.takes.values() for m in t}):
+            raise RigError(f"the bench says '{unheard[0]}', but no part takes it")
         heard = {name for taken in self.takes.values() for name in taken} | {*self.kept}
         if unknown := sorted((heard | ({self.truth} - {""})) - named):
             raise RigError(f"there is no message '{unknown[0]}', only {', '.join(sorted(named))}")
@@ -226,6 +252,20 @@ class Rig:
         from robins.bench.broker.faults import faults_of
 
         return faults_of(self.table, **self.said()[1])
+
+    @cached_property
+    def desk(self) -> Desk:
+        """What its operator may say."""
+        from robins.bench.broker.says import Desk
+
+        return Desk(self.wire, self.console, self.refuses)
+
+    @cached_property
+    def saying(self) -> type[Saying]:
+        """The parameters of something that is said."""
+        from robins.bench.broker.says import sayings_of
+
+        return sayings_of(self.desk)
 
     @cached_property
     def setup(self) -> type[Setup]:

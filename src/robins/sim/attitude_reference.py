@@ -114,10 +114,48 @@ def _slewing(base: Reference, amplitude, period, time, phase, fade_in_s: float) 
     return base
 
 
+PEAK_RATE = 15.0 / 8.0
+"""Greatest rate of a rest-to-rest turn, times its length, over its angle; half-way."""
+PEAK_ACCELERATION = 10.0 / 3.0**0.5
+"""Greatest acceleration of it, times its length squared, over its angle."""
+
+
+@jax.jit
+def handed_over(base: Reference, turn_rad: Any, rate_rad_s: Any, length_s: Any, time_s: Any):
+    """On top of a reference, the way to it from another: a turn about one axis, from rest to rest.
+
+    The turn dies away by 1 - s, s the polynomial 10 x^3 - 15 x^4 + 6 x^5, x = t/length (an
+    eigenaxis slew, Wie 2008, sec. 7.3, by the quintic of Craig 2005, "Introduction to Robotics",
+    sec. 7.3). What rate there is at the beginning goes on as a second turn, about the axis of that
+    rate, by length (x - 6 x^3 + 8 x^4 - 3 x^5), whose rate begins with 1 and which ends with
+    nothing. So attitude and rate go on without a jump, and from the end on the base is left.
+
+    Args:
+        base: the reference to come to, E epochs.
+        turn_rad: (3,) rotation vector from it to the other one, at time 0.
+        rate_rad_s: (3,) rate of the other one against it then, in the axes of the other one.
+        length_s: of the way; above 0.
+        time_s: (E,) since its beginning.
+    """
+    t = time_s[:, None]
+    s, s1, s2 = _from_rest_to_rest(t, length_s)
+    x = jnp.clip(t / length_s, 0.0, 1.0)
+    on = length_s * x * (1.0 - x**2 * (6.0 - x * (8.0 - 3.0 * x)))
+    on1 = 1.0 - x**2 * (18.0 - x * (32.0 - 15.0 * x))
+    on2 = -x * (36.0 - x * (96.0 - 60.0 * x)) / length_s
+    base = _turned(base, *(share * turn_rad[None] for share in (1.0 - s, -s1, -s2)))
+    return _turned(base, *(share * rate_rad_s[None] for share in (on, on1, on2)))
+
+
 def _fade_in(t: Array, length_s: float) -> tuple[Any, Any, Any]:
     """A factor that grows from 0 to 1, and its first two derivatives."""
     if length_s == 0.0:
         return 1.0, 0.0, 0.0
+    return _from_rest_to_rest(t, length_s)
+
+
+def _from_rest_to_rest(t: Array, length_s: Any) -> tuple[Any, Any, Any]:
+    """From 0 to 1 within a length of time, and its first two derivatives, 0 at both ends."""
     x = jnp.clip(t / length_s, 0.0, 1.0)
     return (
         x**3 * (10.0 - 15.0 * x + 6.0 * x**2),

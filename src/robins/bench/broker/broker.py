@@ -15,6 +15,7 @@ from typing import NamedTuple
 from robins.bench.broker.injector import Injector
 from robins.bench.broker.link import BenchError, Link, LinkLost
 from robins.bench.broker.revive import History, beginning, catch_up
+from robins.bench.broker.says import SayError
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.schema import BARE, Wire
 
@@ -30,6 +31,7 @@ class Wiring(NamedTuple):
     wire: Wire
     sends: Sends
     takes: Takes
+    console: tuple[str, ...] = ()  # messages that the bench itself says
 
     def sources(self, part: str) -> frozenset[str]:
         """Parts that must be done before this one may compute."""
@@ -93,7 +95,7 @@ class Broker:
         self._sources = {p: wiring.sources(p) & set(links) for p in links}
         self._takers = {
             name: tuple(p for p in wiring.takers(name) if p in links)
-            for sent in wiring.sends.values()
+            for sent in (*wiring.sends.values(), wiring.console)
             for name in sent
         }
         self._sends = {p: frozenset(wiring.sends[p]) for p in links}
@@ -211,6 +213,22 @@ class Broker:
     def _end(self, name: str) -> None:
         self._done.add(name)
         self._advance()
+
+    def say(self, message: str, payload: bytes) -> None:
+        """Pass on, between two steps, what the operator says; its time is the end of the last one.
+
+        It goes out with the ticks of the next step, to parts that take it with a lag of one.
+
+        Raises:
+            SayError: it is not for the bench to say, or has a number beyond its limits.
+        """
+        if message not in self.wiring.console:
+            raise SayError(f"message: the bench does not say '{message}'")
+        if why := self.wiring.wire.unsound(message, payload):
+            raise SayError(f"message '{message}': {why.text}")
+        self._observe(message, self.time_ns, payload)
+        for taker in self._takers[message]:
+            self._put(self.links[taker], message, payload, self.time_ns)
 
     def revive(self, name: str, patience_s: float, glance: Callable[[], None]) -> None:
         """Bring a part that was started anew to where the old one was; the run waits.

@@ -20,14 +20,17 @@ def read(
     text: str | bytes,
     faults: Sequence[Mapping[str, Any]],
     alarms: Sequence[Mapping[str, Any]] = (),
+    says: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The command that a page sent.
 
     Args:
         text: JSON: `{"do": ...}`, with "label" and "duration_s" (or neither) for "inject", with
-            "label" (or not) for "clear", with "alarms", their numbers, for "acknowledge".
+            "label" (or not) for "clear", with "label" for "say", with "alarms", their numbers, for
+            "acknowledge".
         faults: that the page was offered, each with its label.
         alarms: that wait to be acknowledged, the oldest first: "id", "time_s", "text".
+        says: labels of what the operator can say to the parts.
 
     Returns:
         The command as `Live.commands` gives it.
@@ -59,10 +62,16 @@ def read(
         if label is not None and not isinstance(label, str):
             raise CommandError("the label of a fault is a text")
         return {"do": do, "label": label}
+    if do == "say":
+        _only(asked, {"do", "label"})
+        if (label := asked.get("label")) not in says:
+            there = ", ".join(f"'{one}'" for one in says) or "nothing"
+            raise CommandError(f"{_short(label)} cannot be said to the parts; there is: {there}")
+        return {"do": do, "label": label}
     if do == "acknowledge":
         _only(asked, {"do", "alarms"})
         return {"do": do, **_acknowledged(asked.get("alarms"), alarms)}
-    known = ", ".join((*PLAIN, "inject", "clear", "acknowledge"))
+    known = ", ".join((*PLAIN, "inject", "clear", "say", "acknowledge"))
     raise CommandError(f"no command {_short(do)}; there are: {known}")
 
 

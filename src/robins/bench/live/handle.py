@@ -53,6 +53,7 @@ class Live:
         host: str = "127.0.0.1",
         port: int = 0,
         faults: Sequence[Mapping[str, Any]] = (),
+        says: Sequence[str] = (),
     ) -> None:
         """Start the server and wait until it listens.
 
@@ -64,6 +65,7 @@ class Live:
                 gives a warning.
             port: to listen at; 0: any that is free.
             faults: that the page offers to inject: each `{"label": str, "fault": {...}}`.
+            says: labels of what the page offers to say to the parts.
 
         Raises:
             ValueError: signals that cannot be drawn, or faults without a label of their own.
@@ -80,6 +82,7 @@ class Live:
         self.dropped = 0
         self.restarts = 0
         self._signals, self._title, self._faults = tuple(signals), title, tuple(faults)
+        self._says = tuple(says)
         self._sequence = 0
         self._recent: deque[bytes] = deque()
         self._history = History(len(signals))  # of the samples before
@@ -169,10 +172,11 @@ class Live:
     def commands(self) -> list[dict[str, Any]]:
         """What was pressed since the last call, oldest first.
 
-        Each has "do": "start", "pause", "stop", "inject", "clear" or "acknowledge". "inject" has
-        the "label" and the "fault" as they were given, and "duration_s", a number, or None for
-        "until cleared"; "clear" has the "label" of one fault, or None for all; "acknowledge" has
-        "alarms", the numbers of events, and a "label" that says in words which.
+        Each has "do": "start", "pause", "stop", "inject", "clear", "say" or "acknowledge". "inject"
+        has the "label" and the "fault" as they were given, and "duration_s", a number, or None for
+        "until cleared"; "clear" has the "label" of one fault, or None for all; "say" has the
+        "label" of what was offered; "acknowledge" has "alarms", the numbers of events, and a
+        "label" that says in words which.
         """
         self._receive()
         taken = list(self._commands)
@@ -256,6 +260,7 @@ class Live:
             "title": self._title,
             "signals": as_json(self._signals),
             "faults": [dict(f) for f in self._faults],
+            "says": list(self._says),
             "restarts": self.restarts,
             "dropped": self.dropped,
         }

@@ -88,12 +88,14 @@ class Hub:
     Attributes:
         clients: pages.
         faults: that a page may inject.
+        says: labels of what a page may say to the parts.
         events: of the run.
     """
 
     def __init__(self) -> None:
         self.clients: set[Client] = set()
         self.faults: list[dict[str, Any]] = []
+        self.says: list[str] = []
         self._hello: dict[str, Any] | None = None
         self.events = Events()
         self._history = History(0)
@@ -152,7 +154,7 @@ class Hub:
 
     def _take_hello(self, said: dict[str, Any]) -> None:
         self._hello = said
-        self.faults = said["faults"]
+        self.faults, self.says = said["faults"], said["says"]
         self._dropped = said["dropped"]
         self._expected = None
         self._status = None
@@ -178,7 +180,7 @@ class Hub:
 
     def _greeting(self) -> tuple[str, bytes, deque[bytes]]:
         """Hello, history and the latest samples."""
-        hello = self._hello or {"run": 0, "title": "", "signals": [], "faults": []}
+        hello = self._hello or {"run": 0, "title": "", "signals": [], "faults": [], "says": []}
         text = to_json(
             {
                 "kind": "hello",

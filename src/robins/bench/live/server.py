@@ -79,7 +79,7 @@ async def _listen(websocket: WebSocket, client: Client, hub: Hub, pass_on: Pass)
             return
         try:
             text = message.get("text") or message.get("bytes") or ""
-            command = commands.read(text, hub.faults, hub.events.waiting())
+            command = commands.read(text, hub.faults, hub.events.waiting(), hub.says)
         except commands.CommandError as error:
             client.line(to_json({"kind": "refused", "text": str(error)}))
             continue

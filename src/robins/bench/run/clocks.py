@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from robins.bench.broker.link import BenchError
+
+if TYPE_CHECKING:
+    from robins.bench.run.setup import Flight
 
 Overrun = Literal["continue", "skip", "abort"]
 _SPIN_NS = 200_000  # before a deadline from which on we do not sleep
@@ -99,3 +102,11 @@ class RealTime:
         if self._overrun == "skip":
             self.skipped += 1 + int(late_ns * 1e-9 * self._rate_hz)
         return True
+
+
+def clock_of(flight: Flight) -> LockStep | RealTime:
+    """The clock of a run."""
+    setup = flight.setup
+    if setup.clock == "lockstep":
+        return LockStep()
+    return RealTime(setup.rate or 1.0 / flight.timing.step_s, setup.overrun, setup.patience)

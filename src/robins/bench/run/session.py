@@ -22,10 +22,11 @@ from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
 from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
-from robins.bench.rig import Kit, Rig
+from robins.bench.rig import Kit, Rig, Spoken
 from robins.bench.run.accounting import Latencies
-from robins.bench.run.clocks import LockStep, RealTime
+from robins.bench.run.clocks import clock_of
 from robins.bench.run.crew import Crew, Death
+from robins.bench.run.orders import Orders, in_words
 from robins.bench.run.setup import Flight, counted_from, kit_of, steps_of
 from robins.bench.run.telemetry import Flown, Telemetry
 from robins.bench.wire.frames import VERSION
@@ -52,7 +53,7 @@ class Watch(Protocol):
         """The run is over."""
 
     def commands(self, session: Session) -> list[dict[str, Any]]:
-        """What whoever looks on wants done: "stop", "pause", "start", "inject", "clear"."""
+        """What whoever looks on wants done; see `robins.bench.live.Live.commands`."""
         ...
 
 
@@ -71,6 +72,7 @@ class Ran(NamedTuple):
     deaths: int
     failure: str  # empty: the run came to its end
     stopped: bool  # by whoever looked on
+    said: tuple[Spoken, ...] = ()  # by the operator
 
 
 class _DiedAgainError(Exception):
@@ -134,7 +136,8 @@ class Session:
         self.telemetry = Telemetry(self.rig, self.steps, kit.step_ns, record)
         self.crew = Crew(self.rig, kit, setup.fifo, setup.on_death == "restart", programs)
         self.injector = Injector(self.rig.table, setup.faults, setup.seed)
-        self.clock = LockStep() if setup.clock == "lockstep" else real_time(flight)
+        self._orders = Orders(flight, self.injector, kit.step_ns)
+        self.clock = clock_of(flight)
         self._broker: Broker | None = None  # until the links are open
         self._record_path = record
         self._recorder: Recorder | None = None
@@ -144,7 +147,6 @@ class Session:
         self.run_number = int.from_bytes(os.urandom(4), "little") or 1
         self.done = 0
         self.step_ms = self.pace = 0.0
-        self._labels: list[tuple[str, LinkFault]] = []
         self._histories: dict[str, History] = {}  # of parts that are started anew if they die
         self._died: dict[str, list[float]] = {}  # when, of late, by part; not of those killed
         self._barred: set[tuple[str, str]] = set()  # links and messages that were told of
@@ -199,6 +201,7 @@ class Session:
             deaths=self.deaths,
             failure=failure,
             stopped=self._stop and done < self.steps,
+            said=tuple(self._orders.said),
         )
 
     def _go(self) -> int:
@@ -257,16 +260,17 @@ class Session:
             self.event("killed", f"'{part}' is killed, as a fault")
             self.crew.kill(part)
             self._bury(until=part)
-        if self._watch is None:
-            return
-        began = time.monotonic_ns()
-        while True:
-            for command in self._watch.commands(self):
-                self._do(command)
-            if not self._paused or self._stop:
-                break
-            self.broker.poll(0.05)
-        self.clock.rested(time.monotonic_ns() - began)
+        if self._watch is not None:
+            began = time.monotonic_ns()
+            while True:
+                for command in self._watch.commands(self):
+                    self._do(command)
+                if not self._paused or self._stop:
+                    break
+                self.broker.poll(0.05)
+            self.clock.rested(time.monotonic_ns() - began)
+        if not self._stop:
+            self._say(step)
 
     def _do(self, command: Mapping[str, Any]) -> None:
         what, label = command.get("do"), command.get("label")
@@ -275,32 +279,34 @@ class Session:
         elif what in ("pause", "start"):
             self._paused = what == "pause"
         elif what == "clear":
-            self._clear(label)
+            self._orders.clear(label)
         elif what == "inject":
-            self._inject(str(label), command["fault"], command.get("duration_s"))
+            begin = self.time_s + self.kit.step_ns * 1e-9  # of the next step
+            self._orders.inject(str(label), command["fault"], begin, command.get("duration_s"))
+        elif what == "say":
+            self._catch_up()
+            of = self.rig.shown.says[str(label)]
+            self._orders.say(*of(self.telemetry.flown, self.kit, self.done - 1))
         self.event("command", f"{what} {label or ''}".strip())
 
-    def _inject(self, label: str, fault: Mapping[str, Any], seconds: float | None) -> None:
-        """One more fault, from the next step on."""
-        begin = self.time_s + self.kit.step_ns * 1e-9
-        end = {} if seconds is None else {"end": begin + seconds}
-        made = self.rig.fault.model_validate({**fault, "begin": begin, **end})
-        self.injector.add(made)
-        self._labels.append((label, made))
+    def say(self, message: str, **values: Any) -> None:
+        """Say something to the parts before the next step; a field left out is missing or 0.
 
-    def _clear(self, label: str | None) -> None:
-        for one, fault in self._labels:
-            if label in (None, one):
-                self.injector.remove(fault)
-        if label is None:
-            self.injector.clear()
-        self._labels = [x for x in self._labels if label is not None and x[0] != label]
+        Raises:
+            SayError: it is not for the bench to say, has no such field, or one beyond its limits.
+        """
+        self._orders.say(message, values)
+
+    def _say(self, step: int) -> None:
+        """What the operator says before a step."""
+        for one in self._orders.due(step):
+            self.broker.say(one.message, one.payload)
+            values = self.rig.wire.decode(one.message, one.payload)
+            self.event("said", in_words(one.message, values), one.planned)
 
     def active_faults(self) -> list[tuple[str, LinkFault]]:
         """Faults that are there now, with what they are called."""
-        names = {id(fault): label for label, fault in self._labels}
-        active = self.injector.active(self.broker.time_ns)
-        return [(names.get(id(f), f"{f.kind} at {f.link or 'all links'}"), f) for f in active]
+        return self._orders.active(self.broker.time_ns)
 
     def state_of(self, part: str) -> str:
         """What a part is: "up", "board", or "dead"."""
@@ -488,13 +494,7 @@ class Session:
             raise _DiedAgainError(died[0])
 
 
-def real_time(flight: Flight) -> RealTime:
-    """The clock of a run in real time."""
-    setup = flight.setup
-    return RealTime(setup.rate or 1.0 / flight.timing.step_s, setup.overrun, setup.patience)
-
-
 def wiring(rig: Rig, kit: Kit) -> Wiring:
     """Who says what to whom."""
     takes = {part: dict(build(kit).takes) for part, build in rig.build.items()}
-    return Wiring(rig.wire, rig.sends, takes)
+    return Wiring(rig.wire, rig.sends, takes, rig.console)

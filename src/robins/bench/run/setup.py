@@ -21,6 +21,7 @@ import pydantic
 
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
+from robins.bench.broker.says import Saying
 from robins.bench.rig import Kit, Rig, Timing
 from robins.bench.rigs import RIGS, rig_of
 from robins.errors import hint
@@ -49,6 +50,7 @@ class Setup(Parameters):
     - ``baud``: of a virtual line that each link without a real port has; left out: no delay.
     - ``ports``: parts that are boards, with their ports, ``gyro = "/dev/ttyUSB0,460800"``, or
       programs, which are given the path of a port: ``adm = "adm-c/adm_board"``.
+    - ``faults``: what goes wrong. ``says``: what the operator says to the parts.
     """
 
     rig: ClassVar[Rig]
@@ -70,6 +72,7 @@ class Setup(Parameters):
     baud: Annotated[int, pydantic.Field(ge=300, le=100_000_000)] | None = None
     ports: dict[str, str] = pydantic.Field(default_factory=dict)
     faults: tuple[LinkFault, ...] = ()
+    says: tuple[Saying, ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _sound(self) -> Setup:
@@ -93,6 +96,7 @@ def setup_of(rig: Rig) -> type[Setup]:
         "flies": (str, next(iter(rig.flies()), "")),
         "filter": (str, rig.filters()[0]),
         "faults": (tuple[rig.fault, ...], ()),
+        "says": (tuple[rig.saying, ...], ()),
         **rig.options(),
     }
     made = pydantic.create_model("Setup", __base__=Setup, **fields)

@@ -220,6 +220,7 @@ def page_for(rig: Rig, given: Any, title: str, run: int, host: str, port: int) -
     Raises:
         ImportError, OSError, RuntimeError: as `Live` says.
     """
-    page = Live([*rig.shown.signals(given), STEP], title, run, host, port, rig.shown.offered)
+    shown, signals = rig.shown, [*rig.shown.signals(given), STEP]
+    page = Live(signals, title, run, host, port, shown.offered, tuple(shown.says))
     page.status(_PREPARING)
     return page

@@ -27,6 +27,7 @@ export function allow(open, state) {
     pause: !open || state === "paused" || OVER.has(state),
     stop: !open || OVER.has(state),
     clear: !open || OVER.has(state),
+    say: !open || OVER.has(state),
   };
   for (const button of document.querySelectorAll("button[data-do]"))
     button.setAttribute("aria-disabled", String(off[button.dataset.do]));
@@ -43,7 +44,7 @@ export function wire(send) {
     if (!button || button.getAttribute("aria-disabled") === "true") return;
     const { do: what, label } = button.dataset;
     if (what === "stop" && !sure(button)) return;
-    press(what === "clear" && label ? { do: what, label } : { do: what });
+    press(label ? { do: what, label } : { do: what });
   });
   form.addEventListener("submit", (event) => {
     event.preventDefault();

@@ -9,7 +9,7 @@ import { clock, count, say, seconds } from "./format.js";
 import * as gestures from "./gestures.js";
 import { History, MARK } from "./history.js";
 import { Overview } from "./overview.js";
-import { offerFaults, showStatus } from "./panels.js";
+import { offerFaults, offerSays, showStatus } from "./panels.js";
 import { Plot } from "./plot.js";
 import { Samples } from "./samples.js";
 import { Timeline } from "./timeline.js";
@@ -100,6 +100,7 @@ function hello(message) {
   }
   events.show(message.events);
   offerFaults(message.faults);
+  offerSays(message.says);
   told({ kind: "status", status: message.status });
   history = message.history;
   say(byId("run"), message.bench ? String(message.run) : "–");

@@ -1,4 +1,4 @@
-// Everything beside the plots but the events: clock, links, faults, counts.
+// Everything beside the plots but the events: clock, links, commands to the parts, faults, counts.
 
 import { clock as timeOf, count, element, number, say, seconds } from "./format.js";
 
@@ -120,6 +120,18 @@ export function showStatus(status) {
   say(byId("bench-state"), state);
   byId("bench-state").classList.toggle("alarm", state === "failed");
   document.body.dataset.bench = state;
+}
+
+/** What can be said to the parts, a button each; none, no section. */
+export function offerSays(says) {
+  const buttons = says.map((label) => {
+    const button = element("button", "small", label);
+    button.type = "button";
+    Object.assign(button.dataset, { do: "say", label });
+    return button;
+  });
+  replace(byId("says"), buttons);
+  byId("says").parentElement.hidden = !buttons.length;
 }
 
 /** Faults that can be injected. What was chosen stays chosen, so that a server may come and go. */

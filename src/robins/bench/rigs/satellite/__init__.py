@@ -3,7 +3,7 @@
 - `messages`: what they say. `faults`: what may go wrong with sensors and actuators.
 - `kit`: the numbers that they are given before a run; `preparing` makes them.
 - `vehicle`: plant, rate table, actuators, gyro, star sensor.
-- `computers`: attitude determination and control.
+- `computers`: attitude determination and control. `reference`: where the craft is to point.
 - `errors`, `judging`, `view`: what came of it, for people.
 
 What processes of parts do not need is imported when it is asked for: so they start sooner.
@@ -17,7 +17,7 @@ from typing import Literal
 from robins.bench.rig import Rig, later, named, packaged
 from robins.bench.rigs.satellite.computers import acm, adm
 from robins.bench.rigs.satellite.kit import Kit
-from robins.bench.rigs.satellite.messages import SENDS, TAKES, WIRE
+from robins.bench.rigs.satellite.messages import CONSOLE, SENDS, TAKES, WIRE
 from robins.bench.rigs.satellite.vehicle import actuators, gyro, plant, star, table
 
 BUILD = {
@@ -52,8 +52,10 @@ RIG = Rig(
     takes=TAKES,
     parameters=lambda: named("robins.systems.satellite.parameters:AttitudeLoop"),
     prepare=later(f"{__name__}.preparing:prepare"),
+    console=CONSOLE,
+    refuses=later(f"{__name__}.reference:refuses"),
     truth="motion",
-    kept=("motion", "estimate", "innovation", "wheels"),
+    kept=("motion", "estimate", "innovation", "wheels", *CONSOLE),
     flies=_flies,
     filters=_filters,
     scenarios=packaged(__file__),

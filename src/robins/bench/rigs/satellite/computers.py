@@ -3,7 +3,8 @@
 What they do when a sensor fails: the star sensor may be silent for as long as it likes, then the
 attitude is that of the gyro alone. A gyro's sample stands for one period more. After that nobody
 knows how the craft turns: the estimate says "safe: do not steer by this", control lets wheels and
-magnetorquers rest, and when the gyro is back the filter begins anew from the next star frame.
+magnetorquers rest, and when the gyro is back the filter begins anew from the next star frame. So it
+does when the operator resets it, with the bias that it began with.
 """
 
 from __future__ import annotations
@@ -18,7 +19,18 @@ import numpy as np
 
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.satellite.kit import Kit, compiled, driven
-from robins.bench.rigs.satellite.messages import HELD, KEPT, REFUSED, SAFE, SHORT, SILENT, USED
+from robins.bench.rigs.satellite.messages import (
+    AS_IT_IS,
+    HELD,
+    KEPT,
+    REFUSED,
+    SAFE,
+    SHORT,
+    SILENT,
+    STAND_BY,
+    USED,
+)
+from robins.bench.rigs.satellite.reference import Plan, Wanted, rehearse, told, wanted
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
@@ -88,6 +100,8 @@ def adm(kit: Kit) -> Part:
         gyro = renew(state.gyro, sample_of(inputs["gyro"]))
         flags = 0 if gyro.age == 0 else HELD
         online.state, lost = state.filter, state.lost or not trusted(gyro)
+        if (mode := inputs["mode"]) is not None and mode["reset"]:
+            online.state, lost = first, True
         if not lost:
             online.predict(gyro.values)
         said, heard = [], False
@@ -134,10 +148,11 @@ def adm(kit: Kit) -> Part:
     }
 
     def rare() -> None:
-        anew, _ = act(begin._replace(lost=True), 0, example)
-        act(anew, 0, {**example, "star": None})
+        anew, _ = act(begin._replace(lost=True), 0, {"mode": None, **example})
+        act(anew, 0, {**example, "star": None, "mode": None})
 
-    return Part("adm", {"gyro": 0, "star": 0}, lambda: begin, act, example, rare)
+    takes = {"gyro": 0, "star": 0, "mode": 1}
+    return Part("adm", takes, lambda: begin, act, {"mode": None, **example}, rare)
 
 
 def _factor(kit: Kit, frame: Any) -> Any:
@@ -155,15 +170,20 @@ def _innovation(innovation: Any, sigma: Any, nis: Any) -> dict[str, Any]:
 
 
 class Steered(NamedTuple):
-    """State of the attitude control: what it heard last."""
+    """State of the attitude control: what it heard last, and where it points."""
 
     estimate: Held  # q_ib, bias, whether it may be steered by
     theta: Held
     wheel_h: Any
+    plan: Plan | None = None  # None: the course of the scenario
+    stands_by: bool = False
 
 
-def _steers(given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, row: Row) -> Command:
-    return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
+def _steers(
+    given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, at: Wanted, row: Row
+) -> Command:
+    course = row.course._replace(ref_q_ib=at.q_ib, ref_omega_b=at.omega_b, ref_alpha_b=at.alpha_b)
+    return nodes.acm(given, q_ib, bias, theta, wheel_h, course)
 
 
 def acm(kit: Kit) -> Part:
@@ -173,31 +193,38 @@ def acm(kit: Kit) -> Part:
     wheels = len(vehicle.craft.wheel_h)
     mean = kit.belief.mean
     q0 = np.asarray(jax.jit(kit.form.attitude)(mean))
-    known = (q0, np.asarray(kit.form.bias(mean)), True)
-    begin = Steered(Held(known), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
+    first = (q0, np.asarray(kit.form.bias(mean)), True)
+    begin = Steered(Held(first), Held(np.asarray(vehicle.theta)), np.asarray(vehicle.craft.wheel_h))
 
     def act(state: Steered, k: int, inputs: Inputs):
         estimate, gyro, speeds = inputs["estimate"], inputs["gyro"], inputs["wheels"]
         if k > 0:  # before the first step nobody has said anything
-            told = estimate and (
+            known = estimate and (
                 estimate["q_ib"],
                 estimate["gyro_bias"],
                 not estimate["flags"] & SAFE,
             )
             state = Steered(
-                renew(state.estimate, told),
+                renew(state.estimate, known),
                 renew(state.theta, sample_of(gyro)),
                 state.wheel_h if speeds is None else speeds["momentum"][:wheels],
+                state.plan,
+                state.stands_by,
             )
+        if (asked := inputs["reference"]) is not None:
+            state = state._replace(plan=told(kit, state.plan, k, asked["q_ib"], asked["rate"]))
+        if (mode := inputs["mode"]) is not None and mode["mode"] != AS_IT_IS:
+            state = state._replace(stands_by=mode["mode"] == STAND_BY)
         q, bias, steered = state.estimate.values
-        if not (steered and trusted(state.estimate) and trusted(state.theta)):
+        heard = trusted(state.estimate) and trusted(state.theta)
+        if state.stands_by or not (steered and heard):
             return state, [("command", rest())]
-        command = steers(k, q, bias, state.theta.values, state.wheel_h)
+        at = wanted(kit, state.plan, k)
+        command = steers(k, q, bias, state.theta.values, state.wheel_h, at)
         torque = padded(np.asarray(command.wheel_torque))
         return state, [
             ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})
         ]
 
-    takes = {"estimate": 1, "gyro": 1, "wheels": 1}
-    example = {"estimate": None, "gyro": None, "wheels": None}
-    return Part("acm", takes, lambda: begin, act, example)
+    takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1, "mode": 1}
+    return Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))

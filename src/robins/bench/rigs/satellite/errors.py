@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any
 
 import jax
 import numpy as np
 
+from robins.bench.rig import Spoken
 from robins.bench.rigs.satellite.kit import Kit
 from robins.bench.rigs.satellite.messages import FLAGS
+from robins.bench.rigs.satellite.reference import Said, followed
 from robins.bench.rigs.satellite.vehicle import padded
 from robins.filters import Loop, run_closed
 from robins.rotation import conjugate, multiply, to_rotvec
-from robins.systems.satellite.nodes import STAR, StateForm, react
+from robins.systems.satellite.nodes import STAR, Row, StateForm, react
 
 ARCSEC = np.pi / 648000.0
 Arrays = Mapping[str, np.ndarray]
@@ -28,11 +30,6 @@ def turn(q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
 def attitude_error(flown: Arrays) -> np.ndarray:
     """(E, 3) true less estimated attitude [rad], body axes."""
     return turn(flown["estimate.q_ib"], flown["motion.q_ib"])
-
-
-def reference_q_ib(kit: Kit) -> np.ndarray:
-    """(E, 4) the wanted attitude at the end of each step."""
-    return np.asarray(kit.rows.course.ref_end_q_ib)
 
 
 def flag(flown: Arrays, text: str) -> np.ndarray:
@@ -64,21 +61,39 @@ def _attitudes(form: StateForm, mean: Any) -> Any:
     return jax.vmap(form.attitude)(mean)
 
 
-def inside(kit: Kit) -> dict[str, np.ndarray]:
-    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
+def inside(kit: Kit, said: Sequence[Spoken] = ()) -> dict[str, np.ndarray] | None:
+    """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
+
+    Args:
+        kit: of the run.
+        said: by the operator. In one program computers cannot stand by or be reset: None.
+    """
+    if any(one.message != "reference" for one in said):
+        return None
     loop = Loop(
         jax.tree_util.Partial(_reacts(kit.form), kit.given),
         kit.vehicle,
-        kit.rows,
+        _rows(kit, [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]),
         {STAR: kit.due},
     )
     done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
-    mean, said = done.steps.mean, done.readings
-    momenta = np.asarray(said.outputs["wheel_momentum"])
+    mean, seen = done.steps.mean, done.readings
+    momenta = np.asarray(seen.outputs["wheel_momentum"])
     return {
         # the first leaf of the state of each kind
-        "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(said.truth)[0]),
+        "motion.q_ib": np.asarray(jax.tree_util.tree_leaves(seen.truth)[0]),
         "estimate.q_ib": np.asarray(_attitudes(kit.form, mean)),
         "estimate.gyro_bias": np.asarray(kit.form.bias(mean)),
         "wheels.momentum": np.stack([padded(h) for h in momenta]),
     }
+
+
+def _rows(kit: Kit, said: list[Said]) -> Row:
+    """What drives each step, where the craft points as the operator says."""
+    if not said:
+        return kit.rows
+    q, omega, alpha = (np.stack(x) for x in zip(*followed(kit, said), strict=True))
+    course = kit.rows.course._replace(
+        ref_q_ib=q[:-1], ref_omega_b=omega[:-1], ref_alpha_b=alpha[:-1], ref_end_q_ib=q[1:]
+    )
+    return kit.rows._replace(course=course)

@@ -12,10 +12,10 @@ from robins.bench.rigs.satellite.errors import (
     attitude_error,
     flag,
     peak_arcsec,
-    reference_q_ib,
     rms_arcsec,
     turn,
 )
+from robins.bench.rigs.satellite.reference import reference_q_ib
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, counted_from
 from robins.results import array, variable
@@ -27,7 +27,8 @@ def judge(flight: Flight, ran: Ran) -> Judged:
     """Errors of attitude determination and of pointing, over the steps that count."""
     flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
     attitude = attitude_error(flown)
-    pointing = turn(reference_q_ib(ran.kit)[: len(flown.time_s)], flown["motion.q_ib"])
+    wanted = reference_q_ib(ran.kit, flown, len(flown.time_s))
+    pointing = turn(wanted, flown["motion.q_ib"])
     metrics = {
         "attitude_rms_arcsec": rms_arcsec(attitude, counted),
         "attitude_peak_arcsec": peak_arcsec(attitude, counted),

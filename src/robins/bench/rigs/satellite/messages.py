@@ -1,4 +1,4 @@
-"""What the seven parts of the satellite tell each other."""
+"""What the seven parts of the satellite tell each other, and what the operator tells them."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ FLAGS = (
 )
 """Bits of `estimate.flags`, from the lowest."""
 USED, REFUSED, HELD, SAFE, SILENT, SHORT, KEPT = (1 << k for k in range(len(FLAGS)))
+RUN, STAND_BY, AS_IT_IS = range(3)  # of `mode.mode`
 _FLAGS = ", ".join(f"bit {k}: {text}" for k, text in enumerate(FLAGS))
 _ACTUATORS = (
     f64("wheel_torque", WHEELS, "N m", "on the body, along each wheel's axis", _ACTS),
@@ -91,7 +92,32 @@ MESSAGES: tuple[Message, ...] = (
     ),
 )
 
-WIRE = Wire(PARTS, MESSAGES)
+_CONSOLE: tuple[Message, ...] = (
+    message(
+        25,
+        "reference",
+        "Where the craft is to point from now on, from the operator.",
+        f64(
+            "q_ib",
+            4,
+            "1",
+            f"{_QUATERNION}; either sign; NaN: back to the course of the scenario",
+            _UNIT,
+            True,
+        ),
+        Field("rate", "f64", 1, "rad/s", "greatest of the slew; 0: as the craft can", (0.0, _RATE)),
+    ),
+    message(
+        26,
+        "mode",
+        "What the computers on board are to do from now on, from the operator.",
+        Field("mode", "u8", 1, "1", "0: run; 1: stand by: control rests; 2: as it is", (0, 2)),
+        Field("reset", "u8", 1, "1", "1: the filter begins anew with the next star frame", (0, 1)),
+    ),
+)
+
+WIRE = Wire(PARTS, (*MESSAGES, *_CONSOLE))
+CONSOLE = tuple(m.name for m in _CONSOLE)
 
 SENDS: dict[str, tuple[str, ...]] = {
     "plant": ("motion",),
@@ -107,7 +133,7 @@ TAKES: dict[str, tuple[str, ...]] = {
     "table": ("motion",),
     "gyro": ("mounted",),
     "star": ("motion", "gyro", "estimate"),
-    "adm": ("gyro", "star"),
-    "acm": ("estimate", "gyro", "wheels"),
+    "adm": ("gyro", "star", "mode"),
+    "acm": ("estimate", "gyro", "wheels", *CONSOLE),
     "actuators": ("command",),
 }

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from robins.bench.live.feed import Signal
 from robins.bench.rig import Told, View
-from robins.bench.rigs.satellite.errors import ARCSEC, flag, reference_q_ib, turn
+from robins.bench.rigs.satellite.errors import ARCSEC, flag, turn
 from robins.bench.rigs.satellite.faults import OFFERED
 from robins.bench.rigs.satellite.kit import Kit
 from robins.bench.rigs.satellite.messages import (
+    AS_IT_IS,
     FLAGS,
     HELD,
     KEPT,
     REFUSED,
+    RUN,
     SAFE,
     SHORT,
     SILENT,
+    STAND_BY,
     USED,
 )
+from robins.bench.rigs.satellite.reference import wanted_after
 from robins.bench.run.numbers import latest
 from robins.bench.run.telemetry import Flown
+from robins.rotation import from_rotvec, multiply
 
 _XYZ = ("x", "y", "z")
 _OF_FRAMES = USED | REFUSED | SHORT  # said of a star frame, so nothing between two frames
@@ -64,7 +71,7 @@ def sample(flown: Flown, kit: Kit, since: int, step: int) -> list[float]:
     q_ib = flown["motion.q_ib"][now]
     error = turn(flown["estimate.q_ib"][now], q_ib)[0] / ARCSEC
     sigma = flown["estimate.sigma"][step, :3] / ARCSEC
-    pointing = turn(reference_q_ib(kit)[now], q_ib)[0] / ARCSEC
+    pointing = turn(wanted_after(kit, flown, step + 1).q_ib[None], q_ib)[0] / ARCSEC
     innovation, its_sigma, ratio = (
         latest(flown[f"innovation.{name}"], since, step)
         for name in ("innovation", "sigma", "ratio")
@@ -132,4 +139,24 @@ class Alarms:
         return said
 
 
-VIEW = View(signals, sample, Alarms, counts, OFFERED)
+def _turned(flown: Flown, kit: Kit, step: int, turn_rad: np.ndarray) -> tuple[str, dict[str, Any]]:
+    """An attitude that is turned from where the craft is to point now; it stays inertial."""
+    now = wanted_after(kit, flown, step + 1).q_ib
+    return "reference", {"q_ib": np.asarray(multiply(now, from_rotvec(jnp.asarray(turn_rad))))}
+
+
+_SLEW_DEG = 10.0
+SAYS = {
+    **{
+        f"slew {_SLEW_DEG:g} deg about {axis}": partial(_turned, turn_rad=turn_rad)
+        for axis, turn_rad in zip(_XYZ, np.radians(_SLEW_DEG) * np.eye(3), strict=True)
+    },
+    "hold this attitude": partial(_turned, turn_rad=np.zeros(3)),
+    "back to the course": lambda flown, kit, step: ("reference", {}),
+    "control: stand by": lambda flown, kit, step: ("mode", {"mode": STAND_BY}),
+    "control: run": lambda flown, kit, step: ("mode", {"mode": RUN}),
+    "determination: reset": lambda flown, kit, step: ("mode", {"mode": AS_IT_IS, "reset": 1}),
+}
+"""What the page offers to say."""
+
+VIEW = View(signals, sample, Alarms, counts, OFFERED, SAYS)

@@ -1,0 +1,125 @@
+"""What the operator says to the parts through the bench: messages that no part sends.
+
+A scenario says them at times of the run, the page and scripts when they like. Each goes out at the
+boundary of two steps, with the time at which the step before it ended; parts hear it in the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import pydantic
+
+from robins import units
+from robins.bench.wire.fields import Field
+from robins.bench.wire.records import RecordError
+from robins.bench.wire.schema import BARE, Wire
+from robins.errors import RobinsError, hint
+from robins.scenario import Parameters, Quantity
+
+_KINDS = {known[0]: kind for kind, known in reversed(units.KINDS.items())}  # by the unit of the SI
+
+
+class SayError(RobinsError, ValueError):
+    """What cannot be said through the bench; names the message, field and limit."""
+
+
+class Desk(NamedTuple):
+    """What the operator of a rig may say.
+
+    Attributes:
+        wire: its messages.
+        console: names of those that the bench says.
+        refuses: (message, values) -> why it cannot be, though each number is within its limits.
+    """
+
+    wire: Wire = BARE
+    console: tuple[str, ...] = ()
+    refuses: Callable[[str, Mapping[str, Any]], str] = lambda message, values: ""
+
+    def payload(self, message: str, values: Mapping[str, Any]) -> bytes:
+        """What goes out.
+
+        Args:
+            message: which.
+            values: by field, in the units of the wire. One that is left out is NaN where the
+                message has that for missing, else 0.
+
+        Raises:
+            SayError: it is not for the bench to say, has no such field, or a value is beyond its
+                limits.
+        """
+        if message not in self.console:
+            known = f"{hint(message, self.console)} It says {', '.join(self.console) or 'nothing'}"
+            raise SayError(f"message: the bench does not say '{message}'{known}")
+        blank = {f.name: _blank(f) for f in self.wire.message(message).fields}
+        try:
+            payload = self.wire.encode(message, blank | dict(values))
+        except RecordError as error:
+            raise SayError(str(error)) from None
+        if why := self.wire.unsound(message, payload):
+            raise SayError(f"message '{message}': {why.text}")
+        if no := self.refuses(message, self.wire.decode(message, payload)):
+            raise SayError(f"message '{message}': {no}")
+        return payload
+
+
+def _blank(f: Field) -> Any:
+    nothing = float("nan") if f.missing else 0
+    return [nothing] * f.length
+
+
+class Saying(Parameters):
+    """Something that the operator says, `at` a time of the run: at the first boundary of steps from
+    then on, and not before the end of the first step.
+
+    ``message`` is one that the bench says; then follow its fields. One that is left out is missing
+    where the message allows that, else 0. Of two in one step the later one stands.
+    """
+
+    desk: ClassVar[Desk] = Desk()
+
+    at: Annotated[float, Quantity("time", least="0 s")]
+    message: str
+
+    @pydantic.model_validator(mode="after")
+    def _sound(self) -> Saying:
+        _ = self.payload
+        return self
+
+    @property
+    def payload(self) -> bytes:
+        """What goes out."""
+        given = self.model_fields_set - set(Saying.model_fields)
+        return self.desk.payload(self.message, {name: getattr(self, name) for name in given})
+
+    def step(self, step_ns: int) -> int:
+        """The first step whose parts hear it, from 1."""
+        return max(1, -(-round(self.at * 1e9) // step_ns))
+
+
+def sayings_of(desk: Desk) -> type[Saying]:
+    """What the operator of a rig may say, as parameters: a field for each of its messages.
+
+    Raises:
+        SayError: two messages have a field of one name that is not the same.
+    """
+    fields: dict[str, Field] = {}
+    for f in (f for name in desk.console for f in desk.wire.message(name).fields):
+        same = fields.setdefault(f.name, f)
+        if (same.kind, same.length, same.unit) != (f.kind, f.length, f.unit) or hasattr(
+            Saying, f.name
+        ):
+            raise SayError(f"field '{f.name}' of the console is there twice and not the same")
+    typed: dict[str, Any] = {name: (_type(f) | None, None) for name, f in fields.items()}
+    made = pydantic.create_model("Saying", __base__=Saying, **typed)
+    made.__doc__, made.desk = Saying.__doc__, desk
+    return made
+
+
+def _type(f: Field) -> Any:
+    """As a scenario gives a field: with a unit where the wire's is one of the SI."""
+    one: Any = float if f.kind == "f64" else Annotated[int, pydantic.Field(ge=0)]
+    of = one if f.length == 1 else tuple[(one,) * f.length]
+    return Annotated[of, Quantity(_KINDS[f.unit])] if f.unit in _KINDS and f.unit != "1" else of

@@ -1,0 +1,177 @@
+"""Where the craft is to point: along the course of its scenario, or where the operator says.
+
+An attitude that is said is come to by a turn about one axis, from rest to rest, from where the
+craft was to point then; back to the course likewise. It is a pure function of what was said, with
+the same bits in the control, in the run inside one program, and in what a run is judged by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from robins.bench.rigs.satellite.kit import Kit
+from robins.rotation import conjugate, multiply, rotate, to_rotvec
+from robins.sim.attitude_reference import PEAK_ACCELERATION, PEAK_RATE, Reference, handed_over
+from robins.systems.satellite.nodes import UNIT
+
+SHARE = 0.5  # of what the wheels can give, that a slew takes
+_AS_IT_CAN = 0.5  # of the greatest rate, where none is said
+_OFF = 2.0 * UNIT  # of the square of the length of a quaternion
+_BRAKES = 4.0  # greatest acceleration times length over rate, of a rate that dies away; 3.94
+
+Said = tuple[int, np.ndarray, float]  # first step that heard it, q_ib, rate
+
+
+class Wanted(NamedTuple):
+    """Where the craft is to point at an edge of two steps."""
+
+    q_ib: Any  # (4,)
+    omega_b: Any  # (3,) rad/s
+    alpha_b: Any  # (3,) rad/s^2
+
+
+class Plan(NamedTuple):
+    """What the operator said last, and the way there."""
+
+    edge: int  # at which it was heard: the beginning of the step of that number
+    q_ib: np.ndarray  # (4,) to point at; NaN: the course
+    turn: np.ndarray  # (3,) rad from there to where the craft was to point at the edge
+    rate: np.ndarray  # (3,) rad/s of the latter against the former
+    length_s: float  # of the way
+
+
+_STILL = np.zeros(3)
+
+
+def wanted(kit: Kit, plan: Plan | None, edge: int) -> Wanted:
+    """Where the craft is to point at an edge, 0 to E, by the last plan before it."""
+    if plan is None or np.isnan(plan.q_ib[0]):
+        course, last = kit.rows.course, len(kit.due) - 1
+        k = min(edge, last)
+        q = course.ref_q_ib[k] if edge <= last else course.ref_end_q_ib[last]
+        base = Wanted(q, course.ref_omega_b[k], course.ref_alpha_b[k])
+    else:
+        base = Wanted(plan.q_ib, _STILL, _STILL)
+    if plan is None:
+        return base
+    since_s = (edge - plan.edge) * kit.step_ns * 1e-9
+    if since_s >= plan.length_s:
+        return base
+    # one epoch at a time, so that all who ask have the same bits
+    one = Reference(*(x[None] for x in base))
+    way = handed_over(one, plan.turn, plan.rate, plan.length_s, np.array([since_s]))
+    return Wanted(*(np.asarray(x)[0] for x in way))
+
+
+def told(kit: Kit, plan: Plan | None, edge: int, q_ib: np.ndarray, rate: float) -> Plan | None:
+    """The plan after the operator has said something.
+
+    Args:
+        kit: of the run.
+        plan: until then.
+        edge: at which it was heard.
+        q_ib: (4,) to point at; NaN: back to the course. One whose length is not one is not
+            followed, as `believable` has it of the star sensor.
+        rate: greatest of the slew [rad/s]; 0: half of what the wheels allow.
+    """
+    square = float(np.sum(q_ib * q_ib))
+    if abs(square - 1.0) > _OFF:
+        return plan
+    now, to = wanted(kit, plan, edge), q_ib / np.sqrt(square)
+    there = wanted(kit, Plan(edge, to, _STILL, _STILL, 0.0), edge)
+    turn, against = (np.asarray(x) for x in _between(there, now))
+    angle, speed = float(np.sqrt(np.sum(turn**2))), float(np.sqrt(np.sum(against**2)))
+    most, acceleration = limits(kit)
+    at_most = min(rate or _AS_IT_CAN * most, most)
+    way_s = max(
+        PEAK_RATE * angle / at_most,
+        (PEAK_ACCELERATION * angle / acceleration) ** 0.5,
+        _BRAKES * speed / acceleration,
+        kit.step_ns * 1e-9,
+    )
+    return Plan(edge, to, turn, against, way_s)
+
+
+@jax.jit
+def _between(there: Wanted, now: Wanted):
+    """Turn and rate of the second against the first, in the axes of the second."""
+    turn = multiply(conjugate(there.q_ib), now.q_ib)
+    return to_rotvec(turn), now.omega_b - rotate(conjugate(turn), there.omega_b)
+
+
+def limits(kit: Kit) -> tuple[float, float]:
+    """Greatest rate [rad/s] and acceleration [rad/s^2] of a slew about any axis.
+
+    They take half of the momentum and of the torque of the wheels, about the axis where the
+    allocation gives least, for the greatest inertia (bounded by its rows).
+    """
+    craft = kit.given.craft
+    inertia = float(np.max(np.sum(np.abs(np.asarray(craft.inertia_b)), axis=1)))
+    shares = np.sqrt(np.sum(np.asarray(kit.given.pinv) ** 2, axis=1))  # of a torque of one
+    used = shares > 0.0
+    h, tau = (
+        float(np.min(np.asarray(x)[used] / shares[used]))
+        for x in (craft.wheel_momentum_limit, craft.wheel_torque_limit)
+    )
+    return SHARE * h / inertia, SHARE * tau / inertia
+
+
+def followed(kit: Kit, said: Iterable[Said]) -> list[Wanted]:
+    """Where the craft is to point at each edge of its E steps, E + 1 of them.
+
+    Args:
+        kit: of the run.
+        said: what the operator said, in its order; of two in one step the later one stands.
+    """
+    heard = {step: (q_ib, rate) for step, q_ib, rate in said}
+    out: list[Wanted] = []
+    plan = None
+    for edge in range(len(kit.due) + 1):
+        if edge in heard:
+            plan = told(kit, plan, edge, *heard[edge])
+        out.append(wanted(kit, plan, edge))
+    return out
+
+
+def said_in(flown: Mapping[str, np.ndarray], steps: int) -> list[Said]:
+    """What was said by the end of so many steps; its rate is a number, even if its attitude is
+    none.
+    """
+    rate = flown["reference.rate"][:steps]
+    heard = np.flatnonzero(np.isfinite(rate))
+    return [(int(k) + 1, flown["reference.q_ib"][k], float(rate[k])) for k in heard]
+
+
+def wanted_after(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> Wanted:
+    """Where the craft is to point after so many steps."""
+    plan = None
+    for step, q_ib, rate in said_in(flown, steps):
+        plan = told(kit, plan, step, q_ib, rate)
+    return wanted(kit, plan, steps)
+
+
+def reference_q_ib(kit: Kit, flown: Mapping[str, np.ndarray], steps: int) -> np.ndarray:
+    """(steps, 4) where the craft is to point at the end of each step."""
+    if not (said := said_in(flown, steps)):
+        return np.asarray(kit.rows.course.ref_end_q_ib)[:steps]
+    return np.array([at.q_ib for at in followed(kit, said)[1 : steps + 1]])
+
+
+def refuses(message: str, values: Mapping[str, Any]) -> str:
+    """Why the operator cannot say this."""
+    q = values.get("q_ib", np.full(4, np.nan))
+    square = float(np.sum(q * q))
+    if not np.any(np.isfinite(q)) or abs(square - 1.0) <= _OFF:
+        return ""
+    what = "misses a number" if np.isnan(square) else f"has the length {square**0.5:.6g}"
+    return f"q_ib {what}: give a quaternion of length one, w x y z, or none for the course"
+
+
+def rehearse(kit: Kit) -> None:
+    """Compile what is computed when something is said."""
+    plan = told(kit, None, 0, np.array([0.5, 0.5, 0.5, 0.5]), 0.0)
+    wanted(kit, plan, 1)

@@ -1,0 +1,96 @@
+"""What is ordered while a run goes: faults, by label, and messages of the operator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from robins.bench.broker.faults import LinkFault
+from robins.bench.broker.injector import Injector
+from robins.bench.rig import Spoken
+from robins.bench.run.setup import Flight
+
+
+class Due(NamedTuple):
+    """A message that the operator says now."""
+
+    message: str
+    payload: bytes
+    planned: bool  # by the scenario
+
+
+class Orders:
+    """Faults and messages of a run.
+
+    Attributes:
+        said: what went out.
+    """
+
+    def __init__(self, flight: Flight, injector: Injector, step_ns: int):
+        """Take the faults of a run, and what its scenario says."""
+        self.said: list[Spoken] = []
+        self._rig, self._injector, self._step_ns = flight.rig, injector, step_ns
+        self._labels: list[tuple[str, LinkFault]] = []
+        says = ((one.step(step_ns), one) for one in flight.setup.says)
+        self._planned = sorted(says, key=lambda known: known[0])
+        self._ordered: list[Due] = []
+
+    # ------------------------------------------------------------------------------------ faults
+
+    def inject(
+        self, label: str, fault: Mapping[str, Any], begin_s: float, length_s: float | None
+    ) -> None:
+        """One more fault."""
+        end = {} if length_s is None else {"end": begin_s + length_s}
+        made = self._rig.fault.model_validate({**fault, "begin": begin_s, **end})
+        self._injector.add(made)
+        self._labels.append((label, made))
+
+    def clear(self, label: str | None) -> None:
+        """The faults of that label no more, or none at all."""
+        for one, fault in self._labels:
+            if label in (None, one):
+                self._injector.remove(fault)
+        if label is None:
+            self._injector.clear()
+        self._labels = [x for x in self._labels if label is not None and x[0] != label]
+
+    def active(self, now_ns: int) -> list[tuple[str, LinkFault]]:
+        """Faults that are there at a time of the run, with what they are called."""
+        names = {id(fault): label for label, fault in self._labels}
+        active = self._injector.active(now_ns)
+        return [(names.get(id(f), f"{f.kind} at {f.link or 'all links'}"), f) for f in active]
+
+    # ---------------------------------------------------------------------------------- messages
+
+    def say(self, message: str, values: Mapping[str, Any]) -> None:
+        """Have something said before the next step; before the first one, it waits for its end.
+
+        Raises:
+            SayError: it cannot be said.
+        """
+        self._ordered.append(Due(message, self._rig.desk.payload(message, values), False))
+
+    def due(self, step: int) -> list[Due]:
+        """What goes out before a step, in its order: of the same message the last one stands."""
+        if step == 0:
+            return []
+        planned = [one for at, one in self._planned if at <= step]
+        self._planned = [known for known in self._planned if known[0] > step]
+        found = [Due(one.message, one.payload, True) for one in planned] + self._ordered
+        self._ordered = []
+        decode = self._rig.wire.decode
+        self.said += [Spoken(step, one.message, decode(one.message, one.payload)) for one in found]
+        return found
+
+
+def in_words(message: str, values: Mapping[str, Any]) -> str:
+    """What was said, for people."""
+    told = ((name, [float(x) for x in _flat(value)]) for name, value in values.items())
+    return f"'{message}': " + "; ".join(
+        f"{name} {' '.join(f'{x:.6g}' for x in some)}" for name, some in told
+    )
+
+
+def _flat(value: Any) -> Any:
+    return value if hasattr(value, "__len__") else [value]
