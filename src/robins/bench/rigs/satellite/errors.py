@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import jax
@@ -52,7 +52,7 @@ def peak_arcsec(error: np.ndarray, counted: slice) -> float:
     return float(np.nanmax(size)) / ARCSEC if np.any(np.isfinite(size)) else float("nan")
 
 
-def inside(kit: Kit) -> dict[str, np.ndarray]:
+def inside(kit: Kit, react: Callable = react) -> dict[str, np.ndarray]:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it."""
     loop = Loop(
         jax.tree_util.Partial(partial(react, kit.form), kit.given),
