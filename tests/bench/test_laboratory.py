@@ -12,7 +12,8 @@ from robins.bench.rigs import rig_of, satellite
 from robins.bench.rigs.laboratory import BUILD, RIG, SENDS, TAKES, WIRE
 from robins.bench.rigs.laboratory.parts import MARGIN_RAD, STARS
 from robins.bench.rigs.satellite import errors, messages
-from robins.bench.run.setup import read
+from robins.bench.run.session import Session
+from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
 from robins.earth.stars import synthetic
 from robins.scenario import ScenarioError
@@ -230,6 +231,31 @@ def test_parts_go_on_without_a_message(fly):
     assert error_arcsec(gone)[-1] < 60.0
 
 
+def test_a_determination_that_lost_its_state_comes_back_with_the_next_star_frame(fly):
+    gone = fly(250, off=lambda part, k: part == "adm" and 102 <= k < 172)
+    assert all(said is None for said in gone["estimate"][102:172])
+    safe = [k for k in range(172, 250) if gone["estimate"][k]["flags"] & messages.SAFE]
+    assert safe == [172, 173]  # the next star frame ends step 174
+    # the sensor has gone on by itself, and control has rested until it heard an estimate
+    solved = [np.all(np.isfinite(said["q_ib"])) for said in gone["star"] if said is not None]
+    assert len(solved) == 50
+    assert all(solved)
+    torque = rows(gone, "command", "wheel_torque")
+    assert np.all(torque[104:175] == 0.0)
+    assert np.all(np.any(torque[175:] != 0.0, axis=1))
+    moved = errors.turn(gone["motion"][0]["q_ib"], gone["motion"][174]["q_ib"])
+    assert np.linalg.norm(moved) > 1000.0 * ARCSEC  # from where the lost state would have it
+    for k in range(174, 250):
+        q_ib = gone["estimate"][k]["q_ib"]
+        assert np.linalg.norm(errors.turn(q_ib, gone["motion"][k]["q_ib"])) < 120.0 * ARCSEC
+
+
+def test_a_control_that_lost_its_state_rests_until_it_hears_an_estimate(fly):
+    gone = fly(160, off=lambda part, k: part == "acm" and 100 <= k < 130)
+    assert np.all(gone["command"][130]["wheel_torque"] == 0.0)
+    assert np.any(gone["command"][131]["wheel_torque"] != 0.0)
+
+
 # ------------------------------------------------------------------------------ processes
 
 
@@ -244,6 +270,30 @@ def test_it_flies_by_processes_and_its_record_is_heard_again(tmp_path):
         found = bench_replay(folder / "record.mcap", node=part)
         assert (found.same, found.whole) == (True, True)
         assert found.frames >= 20
+
+
+def test_a_part_without_power_has_lost_its_state_and_its_history(flight, fly, tmp_path):
+    """Off for 2 s, killed 2 s later and told all again, which is what came since it was on."""
+    faults = (
+        RIG.fault(kind="power", link="adm", begin=4.0, end=6.0),
+        RIG.fault(kind="killed", link="adm", begin=8.0),
+    )
+    of = changed(flight, {"seconds": 10.0, "faults": faults, "on_death": "restart"})
+    ran = Session(of, tmp_path / "r.mcap").run()
+    assert (ran.failure, ran.steps, ran.deaths) == ("", 100, 1)
+    assert ran.injected == {("power", "adm"): 1, ("killed", "adm"): 1}
+    assert [e.text for e in ran.events if e.kind == "power"] == [
+        "'adm' is switched off, as a fault",
+        "'adm' is switched on, and begins anew",
+    ]
+    wanted = fly(100, off=lambda part, k: part == "adm" and 39 <= k < 59)
+    for message, field in (("motion", "q_ib"), ("estimate", "q_ib"), ("estimate", "flags")):
+        there = [k for k in range(100) if wanted[message][k] is not None]
+        assert len(there) == (100 if message == "motion" else 80)
+        values = ran.flown[f"{message}.{field}"][there]
+        np.testing.assert_array_equal(values, rows(wanted, message, field))
+    again = bench_replay(tmp_path / "r.mcap", node="adm")
+    assert (again.same, again.whole) == (True, True)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
