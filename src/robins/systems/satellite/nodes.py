@@ -184,15 +184,17 @@ def expected(given: Given, q_ib: Array, bias: Array, theta: Array) -> Array:
 def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Row) -> Frame:
     """What the star sensor reports at the end of a step."""
     if given.lens is None:
-        return told(row, read_star(q_ib, row.star_error), None, None, before)
+        return told(row, before, read_star(q_ib, row.star_error))
     looks = partial(_looks, given.lens, given.star_key)
     found = jax.lax.cond(
         row.course.star.seen, looks, shut, q_ib, expected_q_ib, row.star_error, row.course.number
     )
-    return told(row, *found, before)
+    return told(row, before, *found)
 
 
-def told(row: Row, q_ib: Array, factor: Array | None, stars: Array | None, before: Array) -> Frame:
+def told(
+    row: Row, before: Array, q_ib: Array, factor: Array | None = None, stars: Array | None = None
+) -> Frame:
     """What the star sensor says of an attitude that it has measured."""
     says = row.course.star
     now = multiply(q_ib, from_rotvec(says.turn))

@@ -144,7 +144,7 @@ def _sensor(given: Given, vectors_s, magnitude, looks_q_ib, before, row: Row) ->
     found = jax.lax.cond(
         seen, solves, nodes.shut, vectors_s, magnitude, looks_q_ib, row.star_error, number
     )
-    return nodes.told(row, *found, before)
+    return nodes.told(row, before, *found)
 
 
 def _solves(lens: Lens, star_key: Array, vectors_s, magnitude, looks_q_ib, error, number):
