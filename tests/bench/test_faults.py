@@ -74,6 +74,7 @@ def numbers(pieces: list[Piece]) -> list[int]:
         ('kind = "loss"; angle = "3 deg"', "angle: a fault of kind 'loss' has none; it takes kind"),
         ('kind = "silent"; share = "3 %"', "share: a fault of kind 'silent' has none"),
         ('kind = "killed"', "link: a fault of kind 'killed' needs it"),
+        ('kind = "power"', "link: a fault of kind 'power' needs it"),
         ('kind = "killed"; link = "adm"; end = "3 s"', "a part is killed once, at begin: leave"),
         ('kind = "delay"', "delay: a fault of kind 'delay' needs it"),
         ('kind = "wheel"', "wheel: a fault of kind 'wheel' needs it"),
@@ -288,6 +289,7 @@ def test_the_clock_is_spared():
         'kind = "delay"; begin = "0 s"; delay = "1 s"',
         'kind = "reorder"; begin = "0 s"; direction = "to"',
         'kind = "killed"; begin = "0 s"; link = "gyro"',
+        'kind = "power"; begin = "0 s"; link = "gyro"',
     )
     injector = injecting(faults(*every), 3)
     for m in WIRE.messages:
@@ -295,6 +297,19 @@ def test_the_clock_is_spared():
         for direction in ("to", "from"):
             kept = put(injector, "gyro", direction, one, 0) == [Piece(None, one)]
             assert kept is (m.number < 16)
+
+
+def test_a_part_is_without_power_from_begin_to_end():
+    injector = injecting(
+        faults(
+            'kind = "power"; begin = "2 s"; end = "4 s"; link = "adm"',
+            'kind = "power"; begin = "3 s"; link = "gyro"',
+        )
+    )
+    off = [injector.off(k * S) for k in range(1, 6)]
+    assert off == [set(), {"adm"}, {"adm", "gyro"}, {"gyro"}, {"gyro"}]
+    injector.clear()
+    assert injector.off(5 * S) == set()
 
 
 def test_killed_once_each():

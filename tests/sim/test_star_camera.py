@@ -11,7 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from robins.earth.stars import synthetic
 from robins.sim.random import Component, stream
-from robins.sim.star_sensor import ARCSEC, StarCamera, index_for, measure_attitude, photograph
+from robins.sim.star_sensor import (
+    ARCSEC,
+    StarCamera,
+    expose,
+    index_for,
+    measure_attitude,
+    photograph,
+    show,
+    turned,
+)
 
 POINTINGS, HALF = 200, np.radians(10.0)
 MOUNT = Rotation.from_euler("ZYX", [0.4, -1.1, 2.0])
@@ -116,6 +125,26 @@ def test_an_error_of_all_stars_is_one_of_the_attitude(image):
     np.testing.assert_array_equal(turned.star, wanted.star)
     np.testing.assert_allclose(turned.vectors_b, wanted.vectors_b, atol=1e-14)
     assert np.any(turned.star != image.star)
+
+
+def test_a_camera_that_is_turned_before_a_sky_sees_what_it_sees_there():
+    """What is shown reaches beyond the field, so stars come in at its edge, and others go."""
+    turn = jnp.array([3e-3, -2e-3, 5e-3])
+
+    q_is = jnp.asarray((TRUE * MOUNT).as_quat(scalar_first=True))
+
+    def seen(margin_rad):
+        def one(key, q_is):
+            shown = show(INDEX, q_is, CAMERA, 60, margin_rad)
+            return expose(key, turned(shown, CAMERA, turn), CAMERA)
+
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(KEYS, q_is))
+
+    wanted, beyond = picture(turn=turn), seen(np.radians(0.4))
+    np.testing.assert_array_equal(beyond.star, wanted.star)
+    np.testing.assert_allclose(beyond.vectors_b, wanted.vectors_b, atol=1e-14)
+    np.testing.assert_allclose(beyond.magnitude, wanted.magnitude, atol=1e-14)
+    assert np.any(seen(0.0).star != wanted.star)
 
 
 def test_the_same_numbers_are_drawn_whatever_the_sizes(image):

@@ -92,8 +92,8 @@ def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> 
     the run equals `robins run` bit for bit; real time is soft, as on any ordinary kernel. A rig of
     your own is named with its file, my_rig.py:rig.
 
-    Scenarios of the bench: false-place, killed-adm, lost-gnss, lost-star, lost-wheel, noisy-line,
-    pointing-command, sign-star, stuck-star, wrong-star.
+    Scenarios of the bench: dark-sky, false-place, killed-adm, lost-gnss, lost-star, lost-wheel,
+    noisy-line, pointing-command, power-adm, sign-star, stuck-star, wrong-star.
     """
     out = out or RESULTS / f"bench-{folder_name(scenario)}"
     outcome = carry_out(

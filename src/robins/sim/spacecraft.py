@@ -188,6 +188,34 @@ def advance(
         disturbance_b: (3,) any other torque [N m], body axes.
         dt_s: length of the step.
     """
+    acts = wheel_torque, dipole_b, r_i_m, field_i_t, disturbance_b
+    turn = dynamics(craft, state, *acts, dt_s)
+    return CraftState(kinematics(state.q_ib, turn.gibbs_b), turn.momentum_i, turn.wheel_h)
+
+
+class Turn(NamedTuple):
+    """What the dynamics of a step come to."""
+
+    gibbs_b: Any  # (3,) tangent of half the turn along its axis, body axes, as three scalars
+    momentum_i: Any  # (3,) N m s, total angular momentum after it, inertial axes
+    wheel_h: Any  # (W,) N m s, momenta of the wheels after it
+
+
+def dynamics(
+    craft: Spacecraft,
+    state: CraftState,
+    wheel_torque: Float[Array, "w"],
+    dipole_b: Float[Array, "3"],
+    r_i_m: Float[Array, "3"],
+    field_i_t: Float[Array, "3"],
+    disturbance_b: Float[Array, "3"],
+    dt_s: Any,
+) -> Turn:
+    """The first half of `advance`, whose arguments it has: how the craft turns in a step.
+
+    `kinematics` is the other half. The torques of a step depend on the attitude at its beginning
+    and on the turn since, so the attitude after it is not needed here.
+    """
     h0, h1 = state.wheel_h, wheels_after(craft, state.wheel_h, wheel_torque, dt_s)
     W = u.matrix(craft.wheel_axes_b)
     held, gained = u.apply(W, u.scalars(h0)), u.apply(W, u.scalars(h1 - h0))
@@ -222,9 +250,18 @@ def advance(
     k3 = slope(u.times(0.5 * dt_s, k2), 0.5)
     k4 = slope(u.times(dt_s, k3), 1.0)
     step = u.times(dt_s / 6.0, u.plus(k1, u.times(2.0, u.plus(k2, k3)), k4))
-    q = jnp.stack(u.product(u.scalars(state.q_ib), (1.0, *step[:3])))
-    momentum = state.momentum_i + jnp.stack(u.apply(C, step[3:]))
-    return CraftState(q / jnp.sqrt(jnp.sum(q * q)), momentum, h1)
+    return Turn(step[:3], state.momentum_i + jnp.stack(u.apply(C, step[3:])), h1)
+
+
+def kinematics(q_ib: Float[Array, "4"], gibbs_b: Any) -> Float[Array, "4"]:
+    """The attitude after a turn, from that before it.
+
+    Args:
+        q_ib: before, body to inertial, scalar first.
+        gibbs_b: (3,) of the turn, as `Turn` has it.
+    """
+    q = jnp.stack(u.product(u.scalars(q_ib), (1.0, *gibbs_b)))
+    return q / jnp.sqrt(jnp.sum(q * q))
 
 
 def wheels_give(craft: Spacecraft, wheel_torque: Float[Array, "w"]) -> Float[Array, "w"]:

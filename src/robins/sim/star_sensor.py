@@ -9,8 +9,10 @@ and heading of a known motion, as papers do that state one accuracy for the thre
 `StarCamera` and `photograph` go a step further down: the stars of a catalogue that are in the field
 of view, each with an error of its own, some missed and some that are none. `measure_attitude` is
 the whole sensor: the image, the stars known again, the attitude by QUEST with its covariance, and
-no answer where there are too few. Aberration, the motion of a star across a long exposure and
-double stars that melt into one are not simulated.
+no answer where there are too few. Both are made of steps: `show` is the sky without any error, as a
+star simulator shows it to a sensor; `expose` is the image of it; `solve` is the attitude.
+Aberration, the motion of a star across a long exposure and double stars that melt into one are not
+simulated.
 """
 
 from __future__ import annotations
@@ -165,6 +167,58 @@ def index_for(camera: StarCamera, stars: Stars, margin_rad: float = np.radians(0
     return index_stars(seen, 0.5 * float(camera.field_rad) + margin_rad)
 
 
+class Shown(NamedTuple):
+    """Stars before a camera as they are, brightest first; N rows."""
+
+    vectors_s: Any  # (N, 3) unit vectors, sensor axes
+    magnitude: Any  # (N,)
+    star: Any  # (N,) int, place in the catalogue; -1: none, and the other numbers mean nothing
+
+
+def show(
+    index: StarIndex,
+    q_is: Float[Array, "4"],
+    camera: StarCamera,
+    most: int | None = None,
+    margin_rad: float = 0.0,
+) -> Shown:
+    """The stars in the field of a camera, without any error.
+
+    Args:
+        index: of the stars, from `index_for`.
+        q_is: attitude of the camera, sensor to inertial.
+        camera: the camera.
+        most: N; None: as many as the camera reports. The brightest are shown if there are more.
+        margin_rad: how far beyond the edge of the field stars are shown, at most the margin of the
+            index [rad].
+    """
+    members = near(index, rotate(q_is, jnp.array([0.0, 0.0, 1.0])))
+    vectors_s = rotate(conjugate(q_is), jnp.asarray(index.unit_i)[members])
+    there = Shown(vectors_s, jnp.asarray(index.magnitude)[members], members)
+    return _in_field(there, camera, camera.most_stars if most is None else most, margin_rad)
+
+
+def turned(shown: Shown, camera: StarCamera, turn_rad: Float[Array, "3"]) -> Shown:
+    """What a camera has before it that is turned a little [rad], sensor axes, from what is shown.
+
+    It is what `show` says of the turned camera, to rounding, if the margin of what is shown exceeds
+    the turn.
+    """
+    vectors_s = rotate(conjugate(from_rotvec(turn_rad)), shown.vectors_s)
+    return _in_field(shown._replace(vectors_s=vectors_s), camera, camera.most_stars)
+
+
+def _in_field(there: Shown, camera: StarCamera, most: int, margin_rad: float = 0.0) -> Shown:
+    """The first of those that a camera sees."""
+    cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float) + margin_rad)
+    seen = (there.star >= 0) & (there.vectors_s[:, 2] > cos_edge)
+    seen = seen & (there.magnitude < camera.magnitude_limit)
+    # Lists are brightest first, so the first of the seen are the brightest.
+    (first,) = jnp.nonzero(seen, size=most, fill_value=-1)
+    star = jnp.where(first >= 0, there.star[first], -1)
+    return Shown(there.vectors_s[first], there.magnitude[first], star)
+
+
 def photograph(
     key: Array, index: StarIndex, q_ib: Float[Array, "4"], camera: StarCamera, turn_rad: Any = None
 ) -> StarImage:
@@ -179,26 +233,30 @@ def photograph(
             `star_errors`: the image is that of the attitude that `read_star` makes of q_ib and
             it. None: there is none.
     """
-    q_bs = normalise(_given.rows("q_bs", camera.q_bs, 4))
-    q_is = multiply(q_ib, q_bs)
+    q_is = multiply(q_ib, normalise(_given.rows("q_bs", camera.q_bs, 4)))
     if turn_rad is not None:
         q_is = multiply(q_is, from_rotvec(jnp.asarray(turn_rad, float)))
+    return expose(key, show(index, q_is, camera), camera)
+
+
+def expose(key: Array, shown: Shown, camera: StarCamera) -> StarImage:
+    """The image of what is before a camera: each star with its error, some missed, false ones.
+
+    Args:
+        key: of the frame.
+        shown: ``camera.most_stars`` rows, of `show` or `turned`.
+        camera: the camera.
+    """
+    q_bs = normalise(_given.rows("q_bs", camera.q_bs, 4))
     rows = camera.most_stars + camera.false_stars
 
     normal = jax.random.normal(jax.random.fold_in(key, _NORMAL), (rows, 3))
     uniform = jax.random.uniform(jax.random.fold_in(key, _UNIFORM), (rows, 3))
-
-    members = near(index, rotate(q_is, jnp.array([0.0, 0.0, 1.0])))
-    vectors_s = rotate(conjugate(q_is), jnp.asarray(index.unit_i)[members])
-    cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float))
-    seen = (members >= 0) & (vectors_s[:, 2] > cos_edge)
-    seen = seen & (jnp.asarray(index.magnitude)[members] < camera.magnitude_limit)
-    # Lists are brightest first, so the first of the seen are the brightest.
-    (first,) = jnp.nonzero(seen, size=camera.most_stars, fill_value=-1)
     caught = uniform[: camera.most_stars, 0] >= camera.missed
-    star = jnp.where((first >= 0) & caught, members[first], -1)
+    star = jnp.where(caught, shown.star, -1)
 
     # False ones are uniform over the cap of the field, and bright as stars are, see `synthetic`.
+    cos_edge = jnp.cos(0.5 * jnp.asarray(camera.field_rad, float))
     where = uniform[camera.most_stars :]
     z, azimuth = 1.0 - where[:, 0] * (1.0 - cos_edge), 2.0 * np.pi * where[:, 1]
     across = jnp.sqrt(1.0 - z**2)
@@ -207,11 +265,11 @@ def photograph(
 
     there = jnp.concatenate([star >= 0, jnp.ones(camera.false_stars, bool)])
     star = jnp.concatenate([star, jnp.full(camera.false_stars, -1)])
-    magnitude = jnp.concatenate([jnp.asarray(index.magnitude)[members[first]], false_magnitude])
+    magnitude = jnp.concatenate([shown.magnitude, false_magnitude])
     fainter = jnp.maximum(magnitude - camera.sigma_magnitude, 0.0)
     sigma = camera.sigma_rad * 10.0 ** (camera.sigma_growth * fainter)
     noise = sigma[:, None] * normal[:, :2]
-    vectors_s = _shifted(jnp.concatenate([vectors_s[first], false_s]), noise)
+    vectors_s = _shifted(jnp.concatenate([shown.vectors_s, false_s]), noise)
     reported = magnitude + camera.magnitude_sigma * normal[:, 2]
 
     order = jnp.argsort(jnp.where(there, reported, jnp.inf))
@@ -252,6 +310,17 @@ def measure_attitude(
         far enough from another, the first two are NaN.
     """
     image = photograph(key, index, q_ib, camera, turn_rad)
+    return solve(image, index, camera, q_ib_prior, tolerance_rad)
+
+
+def solve(
+    image: StarImage,
+    index: StarIndex,
+    camera: StarCamera,
+    q_ib_prior: Any = None,
+    tolerance_rad: Any = None,
+) -> tuple[Float[Array, "4"], Float[Array, "3 3"], Int[Array, ""]]:
+    """The attitude of an image, from `expose`; all else as `measure_attitude` has it."""
     star = image.star
     if q_ib_prior is not None:
         boresight = rotate(normalise(_given.rows("q_bs", camera.q_bs, 4)), jnp.array([0.0, 0, 1.0]))

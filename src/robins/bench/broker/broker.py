@@ -7,6 +7,7 @@ clock, which only says when a step begins and how long a part is waited for.
 
 from __future__ import annotations
 
+import contextlib
 import select
 import time
 from collections.abc import Callable, Mapping
@@ -57,6 +58,7 @@ class Broker:
         links: by part.
         time_ns: of the run: the end of the step that is being computed.
         silent: steps in which a part did not answer in time, by part.
+        off: parts without power: nothing is sent to them, and none is waited for.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Broker:
         self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
         self.time_ns = 0
         self.silent = dict.fromkeys(links, 0)
+        self.off: set[str] = set()
         self._run = 0
         self._injector, self._observe = injector, observe
         self._glance, self._tell, self._meanwhile = glance, done, meanwhile
@@ -169,9 +172,11 @@ class Broker:
             LinkLost: the far end of a port is gone.
         """
         self._step, self.time_ns = number, (number + 1) * self.step_ns
-        self._done, self._ticked, self._routed = set(), {}, set()
+        self._done, self._ticked, self._routed = set(self.off), {}, set()
         self._glance()
         for name, link in self.links.items():
+            if name in self.off:
+                continue
             self._keep(link, None, link.release(self.time_ns))
             self._take(name, link.held(self.time_ns))
         self._advance()
@@ -200,7 +205,7 @@ class Broker:
     def _advance(self) -> None:
         """Tick every part whose sources are done."""
         for name, sources in self._sources.items():
-            if name not in self._ticked and sources <= self._done:
+            if name not in self._ticked and name not in self.off and sources <= self._done:
                 now = _CLOCK_NS()
                 self._ticked[name] = Ticked(now, now)
                 self._tick(name)
@@ -249,6 +254,31 @@ class Broker:
             catch_up(link, self._kept[name].told, begin, answered, patience_s, glance)
         except OSError as error:
             raise LinkLost(name, error) from None
+
+    def switch_off(self, name: str) -> None:
+        """Go on without a part, whose process has ended, until `switch_on`."""
+        link = self.links[name]
+        with contextlib.suppress(OSError):
+            link.read(_CLOCK_NS(), self.time_ns)  # what it said last is of no use
+        link.restart(self._run)
+        link.greeted = False
+        self.off.add(name)
+        if name in self._kept:
+            self._kept[name].forget()
+
+    def switch_on(self, name: str, patience_s: float) -> None:
+        """Take in a part that was started again; the run waits for its hello.
+
+        Raises:
+            BenchError: it says none.
+            LinkLost: the far end of a port is gone.
+        """
+        until = time.monotonic() + patience_s
+        while not self.links[name].greeted:
+            if time.monotonic() > until:
+                raise BenchError(f"'{name}' was switched on: no hello from it in {patience_s:g} s")
+            self.poll(_GLANCE_S)
+        self.off.remove(name)
 
     # ----------------------------------------------------------------------------------- the wire
 
@@ -313,6 +343,8 @@ class Broker:
         self._routed.add((message, at))
         self._observe(message, at, payload)
         for taker in self._takers[message]:
+            if taker in self.off:
+                continue
             link = self.links[taker]
             self._put(link, message, payload, at)
             if taker in self._ticked:

@@ -25,10 +25,13 @@ _LINE: dict[str, tuple[str, ...]] = {
     "reorder": _PLACE,
     "delay": (*_PLACE, "delay"),
     "killed": ("link",),
+    "power": ("link",),
     "silent": ("link", "direction"),
 }
 """Faults of the line and of processes, and what each takes."""
-_NEEDS = {"delay": "delay", "killed": "link"}
+_NEEDS = {"delay": "delay", "killed": "link", "power": "link"}
+PROCESS = ("killed", "power")
+"""Faults that no frame meets."""
 
 
 class Said(NamedTuple):
@@ -87,6 +90,7 @@ class LinkFault(Parameters):
     - "reorder": a frame comes after the next one of the same message, as what is late.
     - "delay": a frame comes ``delay`` later.
     - "killed": the part of the link is killed, at `begin`.
+    - "power": the part of the link is off, and begins anew at `end`, with nothing in mind.
     - and those of the sensors and actuators of a rig.
 
     ``link`` is that of a part, left out: of each; ``direction`` is "from" the part or "to" it;

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robins.bench.broker.faults import Direction, LinkFault, Stage, Table
+from robins.bench.broker.faults import PROCESS, Direction, LinkFault, Stage, Table
 from robins.bench.wire.frames import Frame, encode_frame
 from robins.bench.wire.schema import FIRST_DATA
 
@@ -57,7 +57,7 @@ class _Fault(NamedTuple):
             and self.is_.link in (None, link)
             and self.is_.direction == direction
             and self.type in (None, kind)
-            and self.is_.kind != "killed"
+            and self.is_.kind not in PROCESS
         )
 
 
@@ -65,7 +65,7 @@ class Injector:
     """Does what the faults say to the frames that pass.
 
     Attributes:
-        counts: frames hit so far, by kind and link; parts for "killed".
+        counts: frames hit so far, by kind and link; parts for "killed" and "power".
     """
 
     def __init__(self, table: Table, faults: Iterable[LinkFault] = (), seed: int = 0) -> None:
@@ -126,6 +126,10 @@ class Injector:
                 self.counts["killed", link] += 1
                 found.append(link)
         return found
+
+    def off(self, now_ns: int) -> set[str]:
+        """Links whose part has no power at that time of the run."""
+        return {f.link for f in self.active(now_ns) if f.kind == "power" and f.link}
 
     def pass_on(
         self, link: str, direction: Direction, frame: Frame, raw: bytes, now_ns: int

@@ -48,6 +48,11 @@ class History:
         """Remember what goes out, as `Told`."""
         self.told.append(Told(step, raw))
 
+    def forget(self) -> None:
+        """Begin anew: the part has lost its memory, and was told nothing."""
+        self.told.clear()
+        self.since = -1
+
     def answered(self, step: int) -> None:
         """Forget what is in the memory of a step that the part was done with."""
         if is_due(step) and step > self.since and self._is_there(step):

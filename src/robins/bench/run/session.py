@@ -28,6 +28,7 @@ from robins.bench.run.clocks import clock_of
 from robins.bench.run.crew import Crew, Death
 from robins.bench.run.orders import Orders, in_words
 from robins.bench.run.setup import Flight, counted_from, kit_of, steps_of
+from robins.bench.run.switching import switch
 from robins.bench.run.telemetry import Flown, Telemetry
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Unsound
@@ -256,10 +257,7 @@ class Session:
     def _obey(self, step: int) -> None:
         """Do what whoever looks on wants; wait while it is paused."""
         time_ns = (step + 1) * self.kit.step_ns
-        for part in self.injector.killed(time_ns):
-            self.event("killed", f"'{part}' is killed, as a fault")
-            self.crew.kill(part)
-            self._bury(until=part)
+        switch(self, time_ns, self._speaks, self._bury)
         if self._watch is not None:
             began = time.monotonic_ns()
             while True:
@@ -312,7 +310,8 @@ class Session:
         """What a part is: "up", "board", or "dead"."""
         if part in self.ports:
             return "board"
-        return "dead" if self.crew.process(part) is None else "up"
+        off = self.crew.process(part) is None or part in self.broker.off
+        return "dead" if off else "up"
 
     # ------------------------------------------------------------------------------- making ready
 

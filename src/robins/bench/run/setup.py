@@ -133,7 +133,7 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
     """A run by the name of a scenario of the bench or of a system, a file of either, or a rig.
 
     Args:
-        name: "noisy-line", "satellite/s1", "mine.toml", "pendulum.py:rig".
+        name: "noisy-line", "satellite/s1", "satellite" (its first), "mine.toml", "pendulum.py:rig".
         settings: changes, ``"faults.0.angle=20 deg"``; of a scenario of a system those of
             `Setup.set`.
 
@@ -143,7 +143,7 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
     """
     text, rig = _text(name)
     if not text:
-        flies = "" if is_file(name) else name
+        flies = "" if is_file(name) or name in RIGS else name
         setup = rig.setup.model_validate({"set": settings} | ({"flies": flies} if flies else {}))
         title = Path(name).name.replace(".py:", ":") if is_file(name) else name
         return Flight(title, rig, setup, _flies(rig, setup), "")
@@ -154,7 +154,7 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
 
 def _text(name: str) -> tuple[str, Rig]:
     """The text of a scenario, empty if it is not one of the bench; and its rig."""
-    if is_file(name):
+    if is_file(name) or name in RIGS:
         return "", rig_of(name)
     ours = built_in()
     theirs = {flown: rig for rig in RIGS for flown in rig_of(rig).flies()}

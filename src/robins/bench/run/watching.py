@@ -23,7 +23,7 @@ _PREPARING = {
     "doing": "The filter is compiled, then each part starts as a process and says hello.",
 }
 ALARMS = ("died", "failed", "killed")
-WARNINGS = ("missed", "refused", "command")
+WARNINGS = ("missed", "refused", "command", "power")
 
 
 @runtime_checkable

@@ -168,7 +168,8 @@ static inline long robins_take(robins_receiver *in, uint8_t byte) {
  * not. Returns whether a payload of the right length is sound. */
 static inline int robins_sound(uint8_t type, const uint8_t *payload) {
   static const struct {
-    uint8_t type, at, length, missing;
+    uint8_t type, missing;
+    uint16_t at, length;
     double least, most;
   } limits[] = {
 @limits@  };
@@ -278,7 +279,7 @@ def _limits(m: Message) -> str:
     for f in m.fields:
         if f.limits and f.kind == "f64":
             least, most = f.limits
-            rows += f"    {{ROBINS_{m.name.upper()}, {at}, {f.length}, {int(f.missing)}, "
+            rows += f"    {{ROBINS_{m.name.upper()}, {int(f.missing)}, {at}, {f.length}, "
             rows += f"{least!r}, {most!r}}},\n"
         at += f.length * SIZES[f.kind]
     return rows

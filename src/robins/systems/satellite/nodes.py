@@ -184,15 +184,21 @@ def expected(given: Given, q_ib: Array, bias: Array, theta: Array) -> Array:
 
 def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Row) -> Frame:
     """What the star sensor reports at the end of a step."""
-    says = row.course.star
     if given.lens is None:
-        now, factor, stars = read_star(q_ib, row.star_error), None, None
-    else:
-        looks = partial(_looks, given.lens, given.star_key)
-        now, factor, stars = jax.lax.cond(
-            says.seen, looks, _shut, q_ib, expected_q_ib, row.star_error, row.course.number
-        )
-    now = multiply(now, from_rotvec(says.turn))
+        return told(row, before, read_star(q_ib, row.star_error))
+    looks = partial(_looks, given.lens, given.star_key)
+    found = jax.lax.cond(
+        row.course.star.seen, looks, shut, q_ib, expected_q_ib, row.star_error, row.course.number
+    )
+    return told(row, before, *found)
+
+
+def told(
+    row: Row, before: Array, q_ib: Array, factor: Array | None = None, stars: Array | None = None
+) -> Frame:
+    """What the star sensor says of an attitude that it has measured."""
+    says = row.course.star
+    now = multiply(q_ib, from_rotvec(says.turn))
     now = jnp.where(says.seen & ~says.stuck, now, before)
     return Frame(jnp.where(says.seen, says.factor * now, jnp.nan), factor, stars, now)
 
@@ -200,14 +206,19 @@ def star(given: Given, q_ib: Array, expected_q_ib: Array, before: Array, row: Ro
 def _looks(lens: Lens, star_key: Array, q_ib: Array, expected_q_ib: Array, error: Array, number):
     """Attitude from an image, the factor of its covariance, stars; NaN where these are too few."""
     key = jax.random.fold_in(star_key, number)
-    q, P, stars = measure_attitude(
-        key, lens.sky, q_ib, lens.camera, error, expected_q_ib, lens.match_rad
+    return solved(
+        *measure_attitude(key, lens.sky, q_ib, lens.camera, error, expected_q_ib, lens.match_rad)
     )
-    solved = jnp.all(jnp.isfinite(P))
-    return q, linalg.cholesky(jnp.where(solved, P, jnp.eye(3))), stars
 
 
-def _shut(q_ib: Array, expected_q_ib: Array, error: Array, number: Array):
+def solved(q_ib: Array, covariance: Array, stars: Array) -> tuple[Array, Array, Array]:
+    """A measured attitude with the factor of its covariance; that of one where there is none."""
+    there = jnp.all(jnp.isfinite(covariance))
+    return q_ib, linalg.cholesky(jnp.where(there, covariance, jnp.eye(3))), stars
+
+
+def shut(*_: Any) -> tuple[Array, Array, Array]:
+    """What a camera finds that does not look."""
     return jnp.full(4, jnp.nan), jnp.eye(3), jnp.asarray(0)
 
 
@@ -243,15 +254,36 @@ def apart(node: Callable, *args: Any) -> Any:
     return settled(node(*settled(args)))
 
 
-def react(form: StateForm, given: Given, v: Vehicle, belief: Belief, row: Row):
-    """The loop one step on: control acts on what is believed, sensors see what comes of it."""
+_MOVES, _LOOKS = partial(apart, plant), partial(apart, star)
+
+
+def react(
+    form: StateForm,
+    given: Given,
+    v: Vehicle,
+    belief: Belief,
+    row: Row,
+    move: Callable = _MOVES,
+    look: Callable = _LOOKS,
+):
+    """The loop one step on: control acts on what is believed, sensors see what comes of it.
+
+    Args:
+        form: how the state of the filter is read.
+        given: numbers of the loop.
+        v: the vehicle at the beginning of the step.
+        belief: of the filter, there.
+        row: what drives the step from outside.
+        move: the plant, or nodes that do the same, kept apart.
+        look: the star sensor, or nodes that do the same, kept apart.
+    """
     q, bias = apart(form.attitude, belief.mean), form.bias(belief.mean)
     command = apart(acm, given, q, bias, v.theta, v.craft.wheel_h, row.course)
     acts = apart(actuators, given, v.craft.wheel_h, command, row.course)
-    craft = apart(plant, given, v.craft, acts, row.course)
+    craft = move(given, v.craft, acts, row.course)
     theta, residue = apart(gyro, given, v.craft.q_ib, craft.q_ib, v.residue, row)
     looks = apart(expected, given, q, bias, theta)
-    frame = apart(star, given, craft.q_ib, looks, v.star_q_ib, row)
+    frame = look(given, craft.q_ib, looks, v.star_q_ib, row)
     outputs = {
         "pointing": pointing_error(row.course.ref_end_q_ib, craft.q_ib),
         "wheel_momentum": craft.wheel_h,

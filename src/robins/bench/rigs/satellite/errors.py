@@ -51,7 +51,7 @@ def peak_arcsec(error: np.ndarray, counted: slice) -> float:
 
 
 @lru_cache
-def _reacts(form: StateForm) -> Callable:
+def _reacts(react: Callable, form: StateForm) -> Callable:
     """One function for each form, so that it is compiled once."""
     return partial(react, form)
 
@@ -61,17 +61,20 @@ def _attitudes(form: StateForm, mean: Any) -> Any:
     return jax.vmap(form.attitude)(mean)
 
 
-def inside(kit: Kit, said: Sequence[Spoken] = ()) -> dict[str, np.ndarray] | None:
+def inside(
+    kit: Kit, said: Sequence[Spoken] = (), react: Callable = react
+) -> dict[str, np.ndarray] | None:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
 
     Args:
         kit: of the run.
         said: by the operator. In one program computers cannot stand by or be reset: None.
+        react: the loop one step on, as of `robins.systems.satellite.nodes`.
     """
     if any(one.message != "reference" for one in said):
         return None
     loop = Loop(
-        jax.tree_util.Partial(_reacts(kit.form), kit.given),
+        jax.tree_util.Partial(_reacts(react, kit.form), kit.given),
         kit.vehicle,
         _rows(kit, [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]),
         {STAR: kit.due},

@@ -50,7 +50,7 @@ def rest() -> dict[str, np.ndarray]:
     return {"wheel_torque": np.zeros(WHEELS), "dipole_b": np.zeros(3)}
 
 
-def _acts(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
+def acting(held: Held, came: Any, wheels: int) -> tuple[Held, Any, Any]:
     """What acts in this step: torques and dipole that came, or came last, or none."""
     held = renew(held, came)
     use = held.values if trusted(held) else rest()
@@ -72,7 +72,7 @@ def plant(kit: Kit) -> Part:
 
     def act(state: tuple[CraftState, Held], k: int, inputs: Inputs):
         craft, held = state
-        held, torque, dipole = _acts(held, inputs["actuation"], wheels)
+        held, torque, dipole = acting(held, inputs["actuation"], wheels)
         acts = Actuation(torque, dipole, craft.wheel_h)
         craft, omega = moves(k, craft, acts)
         return (craft, held), [
@@ -133,7 +133,7 @@ def actuators(kit: Kit) -> Part:
 
     def act(state: tuple[Any, Held], k: int, inputs: Inputs):
         wheel_h, held = state
-        held, torque, dipole = _acts(held, inputs["command"], wheels)
+        held, torque, dipole = acting(held, inputs["command"], wheels)
         command = Command(torque, dipole)
         acts = gives(k, wheel_h, command)
         given = {

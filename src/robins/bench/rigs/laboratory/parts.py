@@ -1,0 +1,265 @@
+"""The parts of the laboratory that the rig of the satellite has not, and its run in one program.
+
+The equations are those of the satellite, cut in two. `robins.sim.spacecraft.advance` is `dynamics`
+and then `kinematics`; `robins.sim.star_sensor.measure_attitude` is `show`, `expose` and `solve`. On
+the bench each is compiled by itself, and `inside` keeps them apart in the same way, so in lock-step
+a run over lines has the bits of `inside`. These are also the bits of the satellite's own rig,
+unless its stars have an error in common: there it turns the camera, and here the directions that
+the camera is shown, which is the same but for rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from robins.bench.parts.station import Inputs, Part
+from robins.bench.rig import Spoken
+from robins.bench.rigs.satellite import computers, errors, preparing
+from robins.bench.rigs.satellite.kit import Kit, driven
+from robins.bench.rigs.satellite.messages import SAFE
+from robins.bench.rigs.satellite.vehicle import HELD, Held, acting, rest
+from robins.rotation import multiply, normalise
+from robins.scenario import ScenarioError
+from robins.sim import spacecraft
+from robins.sim.spacecraft import CraftState, Turn, rate_b
+from robins.sim.star_sensor import Shown, expose, show, solve, turned
+from robins.systems.satellite import nodes
+from robins.systems.satellite.nodes import Actuation, Frame, Given, Lens, Row, Step, apart
+from robins.systems.satellite.parameters import AttitudeLoop
+
+STARS = 48  # shown at most: those that a camera reports, and some at the edge of its field
+MARGIN_RAD = 2e-3  # shown beyond that edge, for a camera that is turned a little
+
+
+def prepare(setup: Any, given: AttitudeLoop) -> Kit:
+    """The kit of a run, which is that of the satellite.
+
+    Raises:
+        ScenarioError: there is no camera that a sky can be shown.
+    """
+    if given.star.camera is None:
+        raise ScenarioError(
+            [
+                "star.camera: the laboratory shows stars to a camera, and this satellite has none: "
+                "fly laboratory/stars, or give it a table [star.camera]"
+            ]
+        )
+    return preparing.prepare(setup, given)
+
+
+# ------------------------------------------------------------------------- the craft in two halves
+
+
+def _dynamics(given: Given, craft: CraftState, acts: Actuation, row: Step) -> Turn:
+    torque, where = (acts.wheel_torque, acts.dipole_b), (row.r_i_m, row.field_i_t)
+    return spacecraft.dynamics(given.craft, craft, *torque, *where, row.disturbance_b, given.step_s)
+
+
+def _turns(given: Given, craft: CraftState, acts: Actuation, row: Row):
+    turn = apart(_dynamics, given, craft, acts, row.course)
+    q = spacecraft.kinematics(craft.q_ib, turn.gibbs_b)
+    after = CraftState(q, turn.momentum_i, turn.wheel_h)
+    return jnp.stack(turn.gibbs_b), rate_b(given.craft, after), after
+
+
+_follows = jax.jit(partial(apart, spacecraft.kinematics))
+
+
+def dynamics(kit: Kit) -> Part:
+    """How the craft turns in a step: its momentum, under all torques.
+
+    The attitude at the beginning of the step is what kinematics said last; if nothing came, it is
+    where the turn before led.
+    """
+    wheels = len(kit.vehicle.craft.wheel_h)
+    turns = driven(kit, _turns)
+
+    def begin() -> tuple[CraftState, Held]:
+        return kit.vehicle.craft, Held(rest())
+
+    def act(state: tuple[CraftState, Held], k: int, inputs: Inputs):
+        craft, held = state
+        if (motion := inputs["motion"]) is not None:
+            craft = craft._replace(q_ib=motion["q_ib"])
+        held, torque, dipole = acting(held, inputs["actuation"], wheels)
+        gibbs, omega, craft = turns(k, craft, Actuation(torque, dipole, craft.wheel_h))
+        said = {"gibbs_b": np.asarray(gibbs), "omega_b": np.asarray(omega)}
+        return (craft, held), [("turn", said)]
+
+    example = {"actuation": rest(), "motion": {"q_ib": np.asarray(kit.vehicle.craft.q_ib)}}
+    return Part("dynamics", {"actuation": 0, "motion": 1}, begin, act, example)
+
+
+class Pointing(NamedTuple):
+    """State of the kinematics."""
+
+    q_ib: Any  # (4,)
+    gibbs_b: Any  # (3,) of the last turn
+    omega_b: Any  # (3,) rad/s, after it
+
+
+def kinematics(kit: Kit) -> Part:
+    """Where the craft points after each turn; if none comes, it turns as in the step before."""
+    craft = kit.vehicle.craft
+    omega = np.asarray(rate_b(kit.given.craft, craft))
+    first = Pointing(np.asarray(craft.q_ib), 0.5e-9 * kit.step_ns * omega, omega)
+
+    def act(state: Pointing, k: int, inputs: Inputs):
+        turn = inputs["turn"] or state._asdict()
+        q = np.asarray(_follows(state.q_ib, turn["gibbs_b"]))
+        state = Pointing(q, turn["gibbs_b"], turn["omega_b"])
+        return state, [("motion", {"q_ib": q, "omega_b": state.omega_b})]
+
+    return Part("kinematics", {"turn": 0}, lambda: first, act, {"turn": first._asdict()})
+
+
+# ------------------------------------------------------------------------- the sky and the sensor
+
+
+def _sky(given: Given, q_ib: Array) -> tuple[Array, Array]:
+    """Directions (N, 3) in sensor axes and magnitudes (N,), NaN where there is no star."""
+    assert given.lens is not None
+    camera = given.lens.camera
+    q_is = multiply(q_ib, normalise(jnp.asarray(camera.q_bs, float)))
+    shown = show(given.lens.sky, q_is, camera, STARS, MARGIN_RAD)
+    there = shown.star >= 0
+    vectors = jnp.where(there[:, None], shown.vectors_s, jnp.nan)
+    return vectors, jnp.where(there, shown.magnitude, jnp.nan)
+
+
+_shows = jax.jit(partial(apart, _sky))
+
+
+def _sensor(given: Given, vectors_s, magnitude, looks_q_ib, before, row: Row) -> Frame:
+    """What the star sensor makes of what it is shown; as `nodes.star`."""
+    assert given.lens is not None
+    solves = partial(_solves, given.lens, given.star_key)
+    seen, number = row.course.star.seen, row.course.number
+    found = jax.lax.cond(
+        seen, solves, nodes.shut, vectors_s, magnitude, looks_q_ib, row.star_error, number
+    )
+    return nodes.told(row, before, *found)
+
+
+def _solves(lens: Lens, star_key: Array, vectors_s, magnitude, looks_q_ib, error, number):
+    # Which stars they are is for the sensor to find out: here only whether there is one.
+    there = Shown(vectors_s, magnitude, jnp.where(jnp.isnan(magnitude), -1, 0))
+    key = jax.random.fold_in(star_key, number)
+    image = expose(key, turned(there, lens.camera, error), lens.camera)
+    return nodes.solved(*solve(image, lens.sky, lens.camera, looks_q_ib, lens.match_rad))
+
+
+def _is_due(kit: Kit, step: int) -> bool:
+    return bool(kit.due[min(step, len(kit.due) - 1)])
+
+
+def sky(kit: Kit) -> Part:
+    """The star simulator: the stars before the sensor, without an error, when a frame is due."""
+
+    def act(state: None, k: int, inputs: Inputs):
+        motion = inputs["motion"]
+        if motion is None or not _is_due(kit, k):
+            return None, []
+        vectors, magnitude = _shows(kit.given, motion["q_ib"])
+        said = {"vectors_s": np.asarray(vectors), "magnitude": np.asarray(magnitude)}
+        return None, [("stars", said)]
+
+    example = {"motion": {"q_ib": np.asarray(kit.vehicle.craft.q_ib)}}
+    return Part("sky", {"motion": 0}, lambda: None, act, example)
+
+
+class Tracking(NamedTuple):
+    """State of the star sensor."""
+
+    seen_q_ib: Any  # (4,) what it saw last, for one that is stuck
+    looks_q_ib: Any  # (4,) where it looks for its stars
+    bias: Any  # (3,) rad/s, of the gyro
+
+
+_expected = jax.jit(nodes.expected)
+
+
+def star(kit: Kit) -> Part:
+    """The star sensor: a camera that knows the stars again near where it is thought to look.
+
+    That is what attitude determination said last, turned by the gyro. As long as it says nothing,
+    or that its estimate is not to be relied on, the sensor goes by its own last attitude.
+    """
+    sees = driven(kit._replace(machine="jax"), _sensor)  # an image has no place in a program
+    q_first, bias = (f(kit.belief.mean) for f in (jax.jit(kit.form.attitude), kit.form.bias))
+    first = Tracking(np.asarray(kit.vehicle.star_q_ib), np.asarray(q_first), np.asarray(bias))
+
+    def act(state: Tracking, k: int, inputs: Inputs):
+        estimate, stars = inputs["estimate"], inputs["stars"]
+        q, bias = state.looks_q_ib, state.bias
+        if estimate is not None and not estimate["flags"] & SAFE:
+            q, bias = estimate["q_ib"], estimate["gyro_bias"]
+        theta = computers.sample_of(inputs["gyro"])
+        looks = np.asarray(_expected(kit.given, q, bias, np.zeros(3) if theta is None else theta))
+        state = Tracking(state.seen_q_ib, looks, bias)
+        if stars is None or not _is_due(kit, k):
+            return state, []
+        directions = stars["vectors_s"].reshape(STARS, 3)
+        frame = sees(k, directions, stars["magnitude"], looks, state.seen_q_ib)
+        q = np.asarray(frame.q_ib)
+        looks = q if np.all(np.isfinite(q)) else looks
+        said = {"q_ib": q, "factor": np.ravel(frame.factor), "stars": int(frame.stars)}
+        return Tracking(np.asarray(frame.seen_q_ib), looks, bias), [("star", said)]
+
+    shown = {"vectors_s": np.zeros(3 * STARS), "magnitude": np.zeros(STARS)}
+    example = {"stars": shown, "gyro": {"theta_b": np.zeros(3)}, "estimate": None}
+    return Part("star", {"stars": 0, "gyro": 0, "estimate": 1}, lambda: first, act, example)
+
+
+# ------------------------------------------------------------------------- the computers on board
+
+
+def _late(part: Part, forgets: Callable[[Any], Any]) -> Part:
+    """A part that knows, where its first step is not that of the run, that its state is not so."""
+    first = part.begin()
+
+    def act(state: Any, k: int, inputs: Inputs):
+        return part.act(forgets(first) if state is first and k > 0 else state, k, inputs)
+
+    return part._replace(begin=lambda: first, act=act)
+
+
+def adm(kit: Kit) -> Part:
+    """Attitude determination; one that is switched on late waits for a star frame to begin with."""
+    return _late(computers.adm(kit), lambda state: state._replace(lost=True))
+
+
+def acm(kit: Kit) -> Part:
+    """Attitude control; one that is switched on late rests until it hears an estimate."""
+    return _late(
+        computers.acm(kit),
+        lambda state: state._replace(estimate=state.estimate._replace(age=HELD + 1)),
+    )
+
+
+# -------------------------------------------------------------------------------- one program
+
+
+def _move(given: Given, craft: CraftState, acts: Actuation, row: Step) -> CraftState:
+    turn = apart(_dynamics, given, craft, acts, row)
+    q = apart(spacecraft.kinematics, craft.q_ib, turn.gibbs_b)
+    return CraftState(q, turn.momentum_i, turn.wheel_h)
+
+
+def _look(given: Given, q_ib: Array, looks_q_ib: Array, before: Array, row: Row) -> Frame:
+    return apart(_sensor, given, *apart(_sky, given, q_ib), looks_q_ib, before, row)
+
+
+_REACT = partial(nodes.react, move=_move, look=_look)
+
+
+def inside(kit: Kit, said: Sequence[Spoken] = ()) -> Mapping[str, np.ndarray] | None:
+    """The same run inside one program, of the same parts."""
+    return errors.inside(kit, said, _REACT)

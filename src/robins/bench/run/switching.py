@@ -1,0 +1,51 @@
+"""Faults of processes: parts that are killed, and parts whose power is switched off and on.
+
+A part that was killed is brought to where it was, if the run is to restart what dies. One that had
+no power has lost its state: it begins anew as before the first step, in the middle of the run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robins.bench.run.session import Session
+
+HELLO_S = 60.0  # for a part that is switched on to say hello
+
+
+def switch(
+    session: Session, time_ns: int, speaks: Mapping[str, str], bury: Callable[[str], None]
+) -> None:
+    """Do what the faults of processes say, before a step.
+
+    A part is started again as soon as it is off, and waits, so that it is ready when it is switched
+    on: what it takes to start is not part of the fault. Boards are left alone.
+
+    Args:
+        session: the run.
+        time_ns: of the run, that of the end of the step.
+        speaks: the ports of the parts that are processes.
+        bury: waits until a part has died, and does what the run is to do then.
+
+    Raises:
+        BenchError: a part that was switched on says no hello.
+    """
+    for part in session.injector.killed(time_ns):
+        session.event("killed", f"'{part}' is killed, as a fault")
+        session.crew.kill(part)
+        bury(part)
+    off, broker = session.injector.off(time_ns) & speaks.keys(), session.broker
+    for part in sorted(off - broker.off):
+        session.event("power", f"'{part}' is switched off, as a fault")
+        session.injector.counts["power", part] += 1
+        session.crew.kill(part)
+        while not session.crew.deaths(part):
+            time.sleep(0.001)
+        broker.switch_off(part)
+        session.crew.start(part, speaks[part])
+    for part in sorted(broker.off - off):
+        broker.switch_on(part, HELLO_S)
+        session.event("power", f"'{part}' is switched on, and begins anew")
