@@ -13,7 +13,7 @@ import numpy as np
 from robins.bench.parts.station import Part, Station, ready, serve
 from robins.bench.ports.port import address, open_port
 from robins.bench.rig import Rig
-from robins.bench.rigs.satellite import BUILD, Kit
+from robins.bench.rigs.satellite import BUILD, RIG, Kit
 from robins.bench.rigs.satellite.errors import inside
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.rigs.satellite.preparing import kit_for
@@ -46,13 +46,14 @@ def one_program(name: str, filter_: str, *settings: str) -> dict[str, np.ndarray
     return inside(kit(name, filter_, *settings))
 
 
-_READY: dict[int, tuple[Kit, dict[str, Part]]] = {}
+_READY: dict[int, tuple[Any, dict[str, Part]]] = {}
 
 
-def parts(of: Kit) -> dict[str, Part]:
+def parts(of: Any, rig: Rig = RIG) -> dict[str, Part]:
     """The parts of a kit, compiled once; what they remember is with their stations."""
     if id(of) not in _READY:  # the kit is kept, so that no other has its identity
-        _READY[id(of)] = of, {name: ready(build(of), of.frames) for name, build in BUILD.items()}
+        made = {name: ready(build(of), of.frames) for name, build in rig.build.items()}
+        _READY[id(of)] = of, made
     return _READY[id(of)][1]
 
 
@@ -61,8 +62,9 @@ class Threads:
 
     stations: ClassVar[Mapping[str, Callable[[Part, Wire], Station]]] = {}  # of parts that are odd
 
-    def __init__(self, rig: Rig, kit: Kit, *_: object):
-        self.parts, self.threads = parts(kit), list[threading.Thread]()
+    def __init__(self, rig: Rig, kit: Any, *_: object):
+        self.parts, self.wire = parts(kit, rig), rig.wire
+        self.threads = list[threading.Thread]()
 
     def __enter__(self) -> "Threads":
         return self
@@ -74,7 +76,7 @@ class Threads:
     def start(self, name: str, port: str, since: int = -1) -> None:
         def be():
             with suppress(OSError), open_port(address(port), timeout_s=None) as line:
-                serve(line, self.stations.get(name, Station)(self.parts[name], WIRE))
+                serve(line, self.stations.get(name, Station)(self.parts[name], self.wire))
 
         self.threads.append(threading.Thread(target=be, daemon=True))
         self.threads[-1].start()

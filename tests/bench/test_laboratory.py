@@ -106,6 +106,10 @@ def test_it_has_all_that_the_satellite_has():
     assert set(RIG.fault.table.kinds) > set(satellite.RIG.fault.table.kinds)
     assert rig_of("laboratory") is RIG
     assert "laboratory/stars" in RIG.flies()
+    offered = [
+        RIG.fault.model_validate({**one["fault"], "begin": 1.0}) for one in RIG.shown.offered
+    ]
+    assert {"dark", "hidden", "stuck"} <= {one.kind for one in offered}
     # the scenarios of the satellite are still flown by its own rig
     assert read("satellite/stars").rig is satellite.RIG
 
