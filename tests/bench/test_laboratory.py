@@ -62,7 +62,7 @@ def fly(parts, order):
 
     def of(steps=STEPS, meddle=lambda name, k, said: said, off=lambda part, k: False):
         states = {name: part.begin() for name, part in parts.items()}
-        said = {name: [None] * steps for sent in SENDS.values() for name in sent}
+        said = {message.name: [None] * steps for message in WIRE.data}
         heard = {name: [None] * steps for name in said}
         for k in range(steps):
             for name in order:
@@ -100,8 +100,8 @@ def error_arcsec(flown):
 
 
 def test_it_has_all_that_the_satellite_has():
-    assert set(messages.MESSAGES) < set(WIRE.messages)
-    assert {m.name for m in WIRE.data} - {m.name for m in messages.MESSAGES} == {"turn", "stars"}
+    assert set(messages.WIRE.messages) < set(WIRE.messages)
+    assert WIRE.numbers.keys() - messages.WIRE.numbers.keys() == {"turn", "stars"}
     assert WIRE.parts[1:4] == ("dynamics", "kinematics", "table")
     assert set(RIG.fault.table.kinds) > set(satellite.RIG.fault.table.kinds)
     assert rig_of("laboratory") is RIG

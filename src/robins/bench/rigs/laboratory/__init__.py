@@ -30,7 +30,7 @@ _SPLIT = {"plant": ("dynamics", "kinematics"), "star": ("sky", "star")}
 WIRE = Wire(
     tuple(part for old in messages.PARTS for part in _SPLIT.get(old, (old,))),
     (
-        *messages.MESSAGES,
+        *messages.WIRE.data,
         message(
             32,
             "turn",

@@ -256,6 +256,6 @@ def _look(given: Given, q_ib: Array, looks_q_ib: Array, before: Array, row: Row)
     return apart(_sensor, given, *apart(_sky, given, q_ib), looks_q_ib, before, row)
 
 
-def inside(kit: Kit) -> Mapping[str, np.ndarray]:
-    """The same run inside one program, of the same parts."""
-    return errors.inside(kit, partial(nodes.react, move=_move, look=_look))
+def inside(kit: Kit, *said: Any) -> Mapping[str, np.ndarray]:
+    """The same run inside one program, of the same parts; ``said`` as the satellite has it."""
+    return errors.inside(kit, *said, react=partial(nodes.react, move=_move, look=_look))
