@@ -6,7 +6,7 @@ machine computes the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -69,8 +69,8 @@ def driven(kit: Kit, node: Callable) -> Callable:
             does.
 
     Returns:
-        ``(step, *args) -> out``; a step beyond the last has the row of the last, so that a part may
-        be asked for more.
+        ``(step, *args, begins=()) -> out``; a step beyond the last has the row of the last, so that
+        a part may be asked for more. ``begins`` takes the place of the first numbers of the row.
     """
     columns, shape = jax.tree_util.tree_flatten(kit.rows)
     steps = len(kit.due)
@@ -83,7 +83,13 @@ def driven(kit: Kit, node: Callable) -> Callable:
         row = shape.unflatten([p.reshape(x.shape[1:]).astype(x.dtype) for p, x in pieces])
         return apart(node, given, *args, row)
 
-    return lambda step, *args: run(kit.given, table[min(step, steps - 1)], *args)
+    def at(step: int, *args: Any, begins: Sequence[float] | np.ndarray = ()):
+        numbers = table[min(step, steps - 1)]
+        if len(begins):
+            numbers = np.concatenate([begins, numbers[len(begins) :]])
+        return run(kit.given, numbers, *args)
+
+    return at
 
 
 def as_numpy(tree: Any) -> Any:
