@@ -30,7 +30,7 @@ from robins.bench.rigs.satellite.messages import (
     STAND_BY,
     USED,
 )
-from robins.bench.rigs.satellite.reference import Plan, Wanted, rehearse, told, wanted
+from robins.bench.rigs.satellite.reference import Plan, rehearse, told, wanted
 from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
@@ -179,11 +179,8 @@ class Steered(NamedTuple):
     stands_by: bool = False
 
 
-def _steers(
-    given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, at: Wanted, row: Row
-) -> Command:
-    course = row.course._replace(ref_q_ib=at.q_ib, ref_omega_b=at.omega_b, ref_alpha_b=at.alpha_b)
-    return nodes.acm(given, q_ib, bias, theta, wheel_h, course)
+def _steers(given: Given, q_ib: Any, bias: Any, theta: Any, wheel_h: Any, row: Row) -> Command:
+    return nodes.acm(given, q_ib, bias, theta, wheel_h, row.course)
 
 
 def acm(kit: Kit) -> Part:
@@ -219,8 +216,9 @@ def acm(kit: Kit) -> Part:
         heard = trusted(state.estimate) and trusted(state.theta)
         if state.stands_by or not (steered and heard):
             return state, [("command", rest())]
-        at = wanted(kit, state.plan, k)
-        command = steers(k, q, bias, state.theta.values, state.wheel_h, at)
+        # A row begins with where the craft is to point.
+        at = () if state.plan is None else np.concatenate(wanted(kit, state.plan, k))
+        command = steers(k, q, bias, state.theta.values, state.wheel_h, begins=at)
         torque = padded(np.asarray(command.wheel_torque))
         return state, [
             ("command", {"wheel_torque": torque, "dipole_b": np.asarray(command.dipole_b)})

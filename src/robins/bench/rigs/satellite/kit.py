@@ -6,7 +6,7 @@ machine computes the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -87,8 +87,8 @@ def driven(kit: Kit, node: Callable) -> Callable:
             does.
 
     Returns:
-        ``(step, *args) -> out``; a step beyond the last has the row of the last, so that a part may
-        be asked for more.
+        ``(step, *args, begins=()) -> out``; a step beyond the last has the row of the last, so that
+        a part may be asked for more. ``begins`` takes the place of the first numbers of the row.
     """
     columns, shape = jax.tree_util.tree_flatten(kit.rows)
     steps = len(kit.due)
@@ -103,4 +103,11 @@ def driven(kit: Kit, node: Callable) -> Callable:
     # JAX is given what stays the same, as `react` is; in a program it is folded.
     by_jax = kit.machine == "jax"
     call = partial(jax.jit(run), kit.given) if by_jax else compiled(kit, partial(run, kit.given))
-    return lambda step, *args: call(table[min(step, steps - 1)], *args)
+
+    def at(step: int, *args: Any, begins: Sequence[float] | np.ndarray = ()):
+        numbers = table[min(step, steps - 1)]
+        if len(begins):
+            numbers = np.concatenate([begins, numbers[len(begins) :]])
+        return call(numbers, *args)
+
+    return at

@@ -27,7 +27,7 @@ Said = tuple[int, np.ndarray, float]  # first step that heard it, q_ib, rate
 
 
 class Wanted(NamedTuple):
-    """Where the craft is to point at an edge of two steps."""
+    """Where the craft is to point at an edge of two steps; in the order of a row of the course."""
 
     q_ib: Any  # (4,)
     omega_b: Any  # (3,) rad/s
