@@ -12,8 +12,9 @@ from robins.bench.rigs.satellite.errors import turn
 from robins.bench.rigs.satellite.messages import FLAGS, WIRE
 from robins.bench.rigs.satellite.preparing import kit_for
 from robins.bench.rigs.satellite.setup import Carrier
-from robins.bench.run.setup import read
+from robins.bench.run.setup import changed, read
 from robins.bench.wire import Header, encode_frame
+from robins.scenario import ScenarioError
 
 ARCSEC = np.pi / 648000.0
 SHORT = "duration=60 s", "counted_from=10 s"
@@ -288,3 +289,9 @@ def test_a_part_of_another_run_hears_nothing(of):
         Header(WIRE.message("tick").number, 4, 1, of.step_ns), WIRE.encode("tick", {"step": 0})
     )
     assert station.feed(tick) == b""
+
+
+def test_a_filter_that_solves_a_problem_at_every_frame_is_no_program_in_c():
+    flight = changed(read("satellite/s1"), {"machine": "c", "filter": "mixed-lmi-step"})
+    with pytest.raises(ScenarioError, match='machine: "c" cannot run mixed-lmi-step, which '):
+        RIG.prepare(flight.setup, flight.given)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from robins.bench.rig import Rig, later, named, packaged
 from robins.bench.rigs import satellite
-from robins.bench.rigs.laboratory.parts import STARS, acm, adm, dynamics, kinematics, sky, star
+from robins.bench.rigs.laboratory.parts import STARS, dynamics, kinematics, sky, star
 from robins.bench.rigs.satellite import messages
 from robins.bench.wire.fields import f64, message
 from robins.bench.wire.schema import Wire
@@ -64,8 +64,6 @@ BUILD = {part: build for part, build in satellite.BUILD.items() if part != "plan
     "kinematics": kinematics,
     "sky": sky,
     "star": star,
-    "adm": adm,
-    "acm": acm,
 }
 """How each part is made of a kit."""
 

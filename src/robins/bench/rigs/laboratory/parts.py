@@ -10,7 +10,7 @@ the camera is shown, which is the same but for rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from robins.bench.rig import Spoken
 from robins.bench.rigs.satellite import computers, errors, preparing
 from robins.bench.rigs.satellite.kit import Kit, driven
 from robins.bench.rigs.satellite.messages import SAFE
-from robins.bench.rigs.satellite.vehicle import HELD, Held, acting, rest
+from robins.bench.rigs.satellite.vehicle import Held, acting, rest
 from robins.rotation import multiply, normalise
 from robins.scenario import ScenarioError
 from robins.sim import spacecraft
@@ -216,32 +216,6 @@ def star(kit: Kit) -> Part:
     shown = {"vectors_s": np.zeros(3 * STARS), "magnitude": np.zeros(STARS)}
     example = {"stars": shown, "gyro": {"theta_b": np.zeros(3)}, "estimate": None}
     return Part("star", {"stars": 0, "gyro": 0, "estimate": 1}, lambda: first, act, example)
-
-
-# ------------------------------------------------------------------------- the computers on board
-
-
-def _late(part: Part, forgets: Callable[[Any], Any]) -> Part:
-    """A part that knows, where its first step is not that of the run, that its state is not so."""
-    first = part.begin()
-
-    def act(state: Any, k: int, inputs: Inputs):
-        return part.act(forgets(first) if state is first and k > 0 else state, k, inputs)
-
-    return part._replace(begin=lambda: first, act=act)
-
-
-def adm(kit: Kit) -> Part:
-    """Attitude determination; one that is switched on late waits for a star frame to begin with."""
-    return _late(computers.adm(kit), lambda state: state._replace(lost=True))
-
-
-def acm(kit: Kit) -> Part:
-    """Attitude control; one that is switched on late rests until it hears an estimate."""
-    return _late(
-        computers.acm(kit),
-        lambda state: state._replace(estimate=state.estimate._replace(age=HELD + 1)),
-    )
 
 
 # -------------------------------------------------------------------------------- one program

@@ -10,6 +10,7 @@ does when the operator resets it, with the bias that it began with.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.bench.parts.station import Inputs, Part
+from robins.bench.rigs.satellite import vehicle as of_vehicle
 from robins.bench.rigs.satellite.kit import Kit, compiled, driven
 from robins.bench.rigs.satellite.messages import (
     AS_IT_IS,
@@ -49,6 +51,20 @@ def sample_of(gyro: Any) -> np.ndarray | None:
     if gyro is None or not np.all(np.isfinite(gyro["theta_b"])):
         return None
     return gyro["theta_b"]
+
+
+def late(part: Part, forgets: Callable[[Any], Any]) -> Part:
+    """A part that knows, where its first step is not that of the run, that its state is not so.
+
+    It has lost its power: determination then waits for a star frame to begin with, and control
+    rests until it hears an estimate.
+    """
+    first = part.begin()
+
+    def act(state: Any, k: int, inputs: Inputs):
+        return part.act(forgets(first) if state is first and k > 0 else state, k, inputs)
+
+    return part._replace(begin=lambda: first, act=act)
 
 
 class Determined(NamedTuple):
@@ -152,7 +168,8 @@ def adm(kit: Kit) -> Part:
         act(anew, 0, {**example, "star": None, "mode": None})
 
     takes = {"gyro": 0, "star": 0, "mode": 1}
-    return Part("adm", takes, lambda: begin, act, {"mode": None, **example}, rare)
+    part = Part("adm", takes, lambda: begin, act, {"mode": None, **example}, rare)
+    return late(part, lambda state: state._replace(lost=True))
 
 
 def _factor(kit: Kit, frame: Any) -> Any:
@@ -225,4 +242,6 @@ def acm(kit: Kit) -> Part:
         ]
 
     takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1, "mode": 1}
-    return Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))
+    part = Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))
+    unheard = begin.estimate._replace(age=of_vehicle.HELD + 1)
+    return late(part, lambda state: state._replace(estimate=unheard))

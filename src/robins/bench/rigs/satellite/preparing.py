@@ -11,6 +11,7 @@ from jax.tree_util import Partial
 
 from robins.bench.rigs.satellite.kit import Kit
 from robins.bench.rigs.satellite.messages import WHEELS
+from robins.scenario import ScenarioError
 from robins.sim.rate_table import RateTable
 from robins.systems.satellite.parameters import AttitudeLoop
 from robins.systems.satellite.study import FILTERS, contender
@@ -18,7 +19,13 @@ from robins.systems.satellite.world import lay_out, simulate
 
 
 def prepare(setup: Any, given: AttitudeLoop) -> Kit:
-    """The kit of a run of the bench."""
+    """The kit of a run of the bench.
+
+    Raises:
+        ScenarioError: the filter has no place in a program of C.
+    """
+    if setup.machine == "c" and (why := FILTERS[setup.filter].on_host):
+        raise ScenarioError([f'machine: "c" cannot run {setup.filter}, which {why}: leave it out'])
     table = None if setup.table is None else setup.table.table()
     return kit_for(given, setup.filter, setup.seed, table=table)._replace(machine=setup.machine)
 
