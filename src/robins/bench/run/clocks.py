@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from robins.bench.broker.link import BenchError
-
-if TYPE_CHECKING:
-    from robins.bench.run.setup import Flight
+from robins.bench.run.setup import Flight
 
 Overrun = Literal["continue", "skip", "abort"]
 _SPIN_NS = 200_000  # before a deadline from which on we do not sleep
