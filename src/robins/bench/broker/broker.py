@@ -233,7 +233,8 @@ class Broker:
             raise SayError(f"message '{message}': {why.text}")
         self._observe(message, self.time_ns, payload)
         for taker in self._takers[message]:
-            self._put(self.links[taker], message, payload, self.time_ns)
+            if taker not in self.off:
+                self._put(self.links[taker], message, payload, self.time_ns)
 
     def revive(self, name: str, patience_s: float, glance: Callable[[], None]) -> None:
         """Bring a part that was started anew to where the old one was; the run waits.

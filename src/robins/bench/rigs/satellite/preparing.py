@@ -25,7 +25,8 @@ def prepare(setup: Any, given: AttitudeLoop) -> Kit:
         ScenarioError: the filter has no place in a program of C.
     """
     if setup.machine == "c" and (why := FILTERS[setup.filter].on_host):
-        raise ScenarioError([f'machine: "c" cannot run {setup.filter}, which {why}: leave it out'])
+        what = f"filter '{setup.filter}' cannot be a program: {why}"
+        raise ScenarioError([f'machine: {what}; leave machine = "c" out, or choose another filter'])
     table = None if setup.table is None else setup.table.table()
     return kit_for(given, setup.filter, setup.seed, table=table)._replace(machine=setup.machine)
 
