@@ -2,10 +2,9 @@
 
 import pytest
 
-from robins.bench.rigs.satellite.messages import FLAGS
+from robins.bench.rigs.satellite.messages import HELD, REFUSED, SAFE, SHORT, SILENT, USED
 from robins.bench.rigs.satellite.view import Alarms
 
-USED, REFUSED, HELD, SAFE, SILENT, SHORT = (1 << k for k in range(len(FLAGS)))
 BETWEEN = [0] * 4  # estimates without a star frame
 
 

@@ -84,7 +84,11 @@ def test_no_wrong_frame_and_no_good_one_lost(kind):
         return
     assert found == expected(pieces)
     gone = 2 * EACH - len(found)
-    assert gone > 0.97 * EACH
+    if kind == "dropped byte":  # one of the two edges, now and then, which a frame can be without
+        edges = sum(2 / len(wire.encode_frame(*frame)) for _, frame, hurt in pieces if hurt)
+        assert abs(EACH - gone - edges) < 5.0 * edges**0.5
+    else:
+        assert gone > 0.97 * EACH
     assert taker.counts.frames == len(found)
     # what was cut off before its first byte leaves nothing to count
     left = sum(bool(data.strip(b"\0")) for data, _, hurt in pieces if hurt)

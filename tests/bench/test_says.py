@@ -128,7 +128,7 @@ def test_fields_are_typed_by_the_wire():
     one = made.model_validate({"at": 1.0, "message": "say", "turn": (0.1, 0.2, 0.3), "way": 2})
     np.testing.assert_array_equal(wire.decode("say", one.payload)["turn"], [0.1, 0.2, 0.3])
     assert wire.decode("say", one.payload)["way"] == 2
-    with pytest.raises(ValueError, match="way is 4, not 0 to 3"):
+    with pytest.raises(ValueError, match="less than or equal to 3"):
         made.model_validate({"at": 1.0, "message": "say", "way": 4})
     with pytest.raises(SayError, match="field 'turn' of the console is there twice"):
         sayings_of(Desk(wire, ("say", "other")))

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import pydantic
 
 from robins import units
-from robins.bench.wire.fields import Field
+from robins.bench.wire.fields import SIZES, Field
 from robins.bench.wire.records import RecordError
 from robins.bench.wire.schema import BARE, Wire
 from robins.errors import RobinsError, hint
@@ -120,6 +120,10 @@ def sayings_of(desk: Desk) -> type[Saying]:
 
 def _type(f: Field) -> Any:
     """As a scenario gives a field: with a unit where the wire's is one of the SI."""
-    one: Any = float if f.kind == "f64" else Annotated[int, pydantic.Field(ge=0)]
-    of = one if f.length == 1 else tuple[(one,) * f.length]
-    return Annotated[of, Quantity(_KINDS[f.unit])] if f.unit in _KINDS and f.unit != "1" else of
+    one: Any = float if f.kind == "f64" else int
+    if f.unit in _KINDS and f.unit != "1":
+        of = one if f.length == 1 else tuple[(one,) * f.length]
+        return Annotated[of, Quantity(_KINDS[f.unit])]
+    least, most = f.limits or ((0, 2 ** (8 * SIZES[f.kind]) - 1) if one is int else (None, None))
+    one = Annotated[one, pydantic.Field(ge=least, le=most)]
+    return one if f.length == 1 else tuple[(one,) * f.length]
