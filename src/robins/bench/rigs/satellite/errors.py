@@ -15,6 +15,7 @@ from robins.bench.rigs.satellite.messages import FLAGS
 from robins.bench.rigs.satellite.reference import Said, followed
 from robins.bench.rigs.satellite.vehicle import padded
 from robins.filters import Loop, run_closed
+from robins.filters.run import Step
 from robins.rotation import conjugate, multiply, to_rotvec
 from robins.systems.satellite.nodes import STAR, Row, StateForm, react
 
@@ -56,6 +57,10 @@ def _reacts(react: Callable, form: StateForm) -> Callable:
     return partial(react, form)
 
 
+def _posterior(step: Step) -> Any:
+    return step.posterior
+
+
 @partial(jax.jit, static_argnames="form")
 def _attitudes(form: StateForm, mean: Any) -> Any:
     return jax.vmap(form.attitude)(mean)
@@ -79,7 +84,7 @@ def inside(
         _rows(kit, [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]),
         {STAR: kit.due},
     )
-    done = run_closed(kit.filter, kit.model, kit.start, loop, keep=lambda step: step.posterior)
+    done = run_closed(kit.filter, kit.model, kit.start, loop, keep=_posterior)
     mean, seen = done.steps.mean, done.readings
     momenta = np.asarray(seen.outputs["wheel_momentum"])
     return {
