@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from robins.bench.parts.station import Inputs, Part
-from robins.bench.rigs.satellite import vehicle as of_vehicle
 from robins.bench.rigs.satellite.kit import Kit, compiled, driven
 from robins.bench.rigs.satellite.messages import (
     AS_IT_IS,
@@ -33,7 +32,7 @@ from robins.bench.rigs.satellite.messages import (
     USED,
 )
 from robins.bench.rigs.satellite.reference import Plan, rehearse, told, wanted
-from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, trusted
+from robins.bench.rigs.satellite.vehicle import Held, padded, renew, rest, stale, trusted
 from robins.filters import Belief, Code, OnlineFilter
 from robins.filters.chi_square import chi_square
 from robins.filters.kalman import FilterState
@@ -243,5 +242,4 @@ def acm(kit: Kit) -> Part:
 
     takes = {"estimate": 1, "gyro": 1, "wheels": 1, "reference": 1, "mode": 1}
     part = Part("acm", takes, lambda: begin, act, dict.fromkeys(takes), lambda: rehearse(kit))
-    unheard = begin.estimate._replace(age=of_vehicle.HELD + 1)
-    return late(part, lambda state: state._replace(estimate=unheard))
+    return late(part, lambda state: state._replace(estimate=stale(state.estimate)))

@@ -38,6 +38,11 @@ def trusted(held: Held) -> bool:
     return held.age <= HELD
 
 
+def stale(held: Held) -> Held:
+    """The same, come so long ago that it no longer stands."""
+    return held._replace(age=HELD + 1)
+
+
 def padded(torque: Any) -> np.ndarray:
     """Numbers of each wheel, as the wire has them."""
     out = np.zeros(WHEELS)
