@@ -34,6 +34,9 @@ def test_it_is_the_run_inside_one_program(run):
     assert flight.timing.steps == len(kit.u.dt) == 60
     of = flown(RIG, kit, 60)[0]
     assert difference(of, RIG.inside(kit)) < 1e-12
+    begins = RIG.inside(kit, 20)
+    assert {len(x) for x in begins.values()} == {20}
+    assert difference(of.until(20), begins) < 1e-12
     said = judged(flight, kit, of)
     error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
     assert 0.1 < np.sqrt(np.mean((error / sigma) ** 2)) < 3.0

@@ -378,7 +378,9 @@ def test_a_part_may_be_a_board_on_a_real_port(threads):
         of = changed(whole, {"ports": {"gyro": ends.bench}})
         ran = Session(of).run()
         assert ran.failure == ""
-        assert difference(ran.flown, inside(ran.kit)) == 0.0
+        alone = inside(ran.kit, ran.steps)
+        assert {len(x) for x in alone.values()} == {50}
+        assert difference(ran.flown, alone) == 0.0
         said, _ = process.communicate(timeout=20.0)
         assert "The bench has said stop." in said
 

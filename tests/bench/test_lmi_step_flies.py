@@ -34,7 +34,7 @@ def test_over_bytes_it_has_the_bits_of_one_program(monkeypatch):
     of = kit(*ONE)
     loop = Loop(of).run(STEPS)
     with pytest.warns(StepWarning, match="did not pass the test"):
-        wanted = inside(of)
+        wanted = inside(of, STEPS)
     same(loop, wanted)
     told = loop.flags() >> KEPT & 1
     assert 0 < np.sum(told) < np.sum(of.due[:STEPS])

@@ -113,7 +113,7 @@ def test_the_craft_comes_to_the_attitude_that_was_asked_and_back_to_its_course(o
 def test_it_has_the_bits_of_one_program_with_the_same_words(of, flown):
     _, ran, _ = flown
     assert [(one.step, one.message) for one in ran.said] == [(50, "reference"), (700, "reference")]
-    assert difference(ran.flown, inside(of, ran.said)) == 0.0
+    assert difference(ran.flown, inside(of, said=ran.said)) == 0.0
     assert difference(ran.flown, inside(of)) > 0.1  # it was another run
 
 
@@ -255,7 +255,7 @@ def test_a_reset_filter_begins_anew_with_the_next_star_frame(of):
     np.testing.assert_array_equal(before, plainly)
     assert np.all(sigma[again, :3] > 1.5 * sigma[100, :3])  # it knows as much as at the start
     np.testing.assert_allclose(sigma[again, 3:], sigma[0, 3:], rtol=0.2)
-    assert inside(of, [Spoken(101, "mode", {"mode": 0, "reset": 1})]) is None
+    assert inside(of, said=[Spoken(101, "mode", {"mode": 0, "reset": 1})]) is None
 
 
 # ----------------------------------------------------------------------------- scripts and pages
@@ -288,9 +288,9 @@ def test_what_is_pressed_and_what_a_script_says(of, asked, monkeypatch):
     by = (rotation(wanted_after(of, ran.flown, 19).q_ib).inv() * rotation(second)).as_rotvec()
     np.testing.assert_allclose(np.degrees(by), [0.0, 10.0, 0.0], atol=0.01)
     # of two in one step the later one stands, in the loop and in what it is judged by
-    assert difference(ran.flown, inside(of, ran.said)) == 0.0
-    assert difference(ran.flown, inside(of, [*ran.said[:2], *ran.said[3:]])) == 0.0
-    assert difference(ran.flown, inside(of, [*ran.said[:3], *ran.said[4:]])) > 0.0
+    assert difference(ran.flown, inside(of, said=ran.said)) == 0.0
+    assert difference(ran.flown, inside(of, said=[*ran.said[:2], *ran.said[3:]])) == 0.0
+    assert difference(ran.flown, inside(of, said=[*ran.said[:3], *ran.said[4:]])) > 0.0
 
 
 def test_all_that_the_page_offers_can_be_said(of):

@@ -175,8 +175,9 @@ class Rig:
         said: faults of its sensors and actuators, by kind, and their parameters.
         view: of the page; left out: all numbers of its messages.
         topics: (kit) -> what viewers and ROS 2 get of its messages, in the record.
-        inside: (kit) -> arrays of the same run inside one program, named as `Flown` names them.
-            With a console: (kit, what was said) -> the same, or None where it cannot be compared.
+        inside: (kit, steps) -> arrays of so many first steps of the same run inside one program,
+            named as `Flown` names them. With a console: (kit, steps, what was said) -> the same, or
+            None where it cannot be compared.
         judge: figures of merit of a run; left out: none, and all numbers in its arrays.
         example: the part with which commands are shown; left out: its last.
         exported: the part that an exported filter can be, by the loop of that name among the files

@@ -82,7 +82,7 @@ def bench_up(
         and all(map(program, flight.setup.ports.values()))
     ):
         progress(0.97, "the same inside one program")
-        inside = rig.inside(ran.kit, *([ran.said] if rig.console else []))
+        inside = rig.inside(ran.kit, ran.steps, *([ran.said] if rig.console else []))
     return outcome(flight, ran, inside, file)
 
 

@@ -167,10 +167,11 @@ def _told(x: np.ndarray) -> dict[str, Any]:
     return {"q_nb": x[..., :4], "v_n": x[..., 4:7], **place, "sigma": x[..., 10:19]}
 
 
-def inside(kit: Kit) -> dict[str, np.ndarray]:
-    """The same flight inside one program."""
+def inside(kit: Kit, steps: int | None = None) -> dict[str, np.ndarray]:
+    """The first epochs of the same flight, or all, inside one program."""
     made = CANDIDATES[kit.filter].make()
-    done = run(made, kit.model, kit.start, kit.y, kit.u, kit.aux, keep=_kept)
+    y, u, aux = jax.tree_util.tree_map(lambda x: x[:steps], (kit.y, kit.u, kit.aux))
+    done = run(made, kit.model, kit.start, y, u, aux, keep=_kept)
     return {f"state.{name}": x for name, x in _told(np.asarray(done.steps)).items()}
 
 

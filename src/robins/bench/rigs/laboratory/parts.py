@@ -234,6 +234,8 @@ def _look(given: Given, q_ib: Array, looks_q_ib: Array, before: Array, row: Row)
 _REACT = partial(nodes.react, move=_move, look=_look)
 
 
-def inside(kit: Kit, said: Sequence[Spoken] = ()) -> Mapping[str, np.ndarray] | None:
+def inside(
+    kit: Kit, steps: int | None = None, said: Sequence[Spoken] = ()
+) -> Mapping[str, np.ndarray] | None:
     """The same run inside one program, of the same parts."""
-    return errors.inside(kit, said, _REACT)
+    return errors.inside(kit, steps, said, _REACT)

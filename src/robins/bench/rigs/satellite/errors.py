@@ -67,22 +67,24 @@ def _attitudes(form: StateForm, mean: Any) -> Any:
 
 
 def inside(
-    kit: Kit, said: Sequence[Spoken] = (), react: Callable = react
+    kit: Kit, steps: int | None = None, said: Sequence[Spoken] = (), react: Callable = react
 ) -> dict[str, np.ndarray] | None:
     """The same run inside one program, by `run_closed`, as `robins run --runs 1` does it.
 
     Args:
         kit: of the run.
+        steps: how many of its first are done; None: all.
         said: by the operator. In one program computers cannot stand by or be reset: None.
         react: the loop one step on, as of `robins.systems.satellite.nodes`.
     """
     if any(one.message != "reference" for one in said):
         return None
+    heard = [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]
     loop = Loop(
         jax.tree_util.Partial(_reacts(react, kit.form), kit.given),
         kit.vehicle,
-        _rows(kit, [(one.step, one.values["q_ib"], one.values["rate"]) for one in said]),
-        {STAR: kit.due},
+        jax.tree_util.tree_map(lambda x: x[:steps], _rows(kit, heard)),
+        {STAR: kit.due[:steps]},
     )
     done = run_closed(kit.filter, kit.model, kit.start, loop, keep=_posterior)
     mean, seen = done.steps.mean, done.readings
