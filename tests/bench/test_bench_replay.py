@@ -12,8 +12,7 @@ from stations import GONE, receive
 
 from robins.bench import wire
 from robins.bench.ports.port import Address, open_port
-from robins.bench.recording import Entry, Event, Record, Recorder, read_record
-from robins.bench.recording.differences import differences
+from robins.bench.recording import Entry, Event, Recorder, open_record
 from robins.bench.recording.replay import ReplayError, recorded, replay
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header, Receiver
@@ -158,9 +157,6 @@ class Story:
         self.total = self.total + self.theta[k]
         self.answer(k)
 
-    def record(self) -> Record:
-        return Record({}, self.entries, [], True, "")
-
 
 def plain_story() -> Story:
     story = Story()
@@ -222,13 +218,19 @@ def test_the_same_part_says_the_same(story, tmp_path):
             parts.append(part)
             yield part
 
-    record = read_record(tmp_path / "run.mcap")
-    found = replay(record, WIRE, "adm", start, 5.0, lambda k, n: told.append((k, n)))
+    record = open_record(tmp_path / "run.mcap")
+    frames: list[wire.Frame] = []
+    found = replay(
+        record.entries, WIRE, "adm", start, 5.0, lambda k, n: told.append((k, n)), frames.append
+    )
     assert found.first_difference is None
     assert found.same
     assert (found.part, found.starts, found.step_ns) == ("adm", 1, STEP_NS)
-    assert found.frames == found.recorded == recorded(record, "adm")
-    assert len(found.frames) == STEPS + (STEPS // 4 if story is noisy_story else 0)
+    assert frames == list(recorded(record.entries, "adm"))
+    many = STEPS + (STEPS // 4 if story is noisy_story else 0)
+    assert found.compared.frames == [many, many]
+    assert len(frames) == many
+    assert found.compared.found() == []
     assert told == [(k + 1, found.steps) for k in range(found.steps)]
     # byte for byte what it heard then, wrong ones included
     sent = b"".join(e.data for e in record.entries if (e.link, e.direction) == ("adm", "to"))
@@ -241,12 +243,13 @@ def test_a_part_that_has_changed_is_found_out():
             said["gyro_bias"][1] = np.nextafter(said["gyro_bias"][1], 9.0)
         return said
 
-    found = replay(plain_story().record(), WIRE, "adm", starting(change=change), 5.0)
+    found = replay(plain_story().entries, WIRE, "adm", starting(change=change), 5.0)
     assert not found.same
-    then = float(WIRE.decode("estimate", found.recorded[23].payload)["gyro_bias"][1])
+    then = list(recorded(plain_story().entries, "adm"))[23]
+    then = float(WIRE.decode("estimate", then.payload)["gyro_bias"][1])
     words = f"was {then!r}, is {float(np.nextafter(then, 9.0))!r}"
     assert found.first_difference == f"step 23 (2.4 s): estimate.gyro_bias[1] {words}"
-    (d,) = differences(WIRE, found.recorded, found.frames, found.step_ns)
+    (d,) = found.compared.found()
     assert (d.field, d.component, d.first_step, d.count) == ("gyro_bias", 1, 23, STEPS - 23)
 
 
@@ -256,7 +259,7 @@ def test_a_nan_of_other_bits_is_not_byte_for_byte():
             said["sigma"] = -np.full(6, np.nan)
         return said
 
-    found = replay(plain_story().record(), WIRE, "adm", starting(change=change), 5.0)
+    found = replay(plain_story().entries, WIRE, "adm", starting(change=change), 5.0)
     assert not found.same
     words = "step 7 (0.8 s): 'estimate' of 0.8 s, number 14, has the same numbers in other bytes"
     assert words in found.first_difference
@@ -265,25 +268,25 @@ def test_a_nan_of_other_bits_is_not_byte_for_byte():
 def test_frames_too_many_and_too_few_are_told():
     story = plain_story()
     lacking = [e for k, e in enumerate(story.entries) if k != 2 + 5 * 8 + 3]
-    found = replay(Record({}, lacking, [], True, ""), WIRE, "adm", starting(), 5.0)
+    found = replay(lacking, WIRE, "adm", starting(), 5.0)
     words = "step 8 (0.9 s): 'estimate' of 0.9 s, number 16, is said now and was not recorded"
     assert found.first_difference == words
     more = {"innovation": [0] * 3, "sigma": [0] * 3, "ratio": 0}
     story.back(encoded("innovation", 2 * STEPS, time_ns(60), **more))
-    found = replay(story.record(), WIRE, "adm", starting(), 5.0)
+    found = replay(story.entries, WIRE, "adm", starting(), 5.0)
     assert "number 120, was recorded and is not said now" in found.first_difference
 
 
 def test_a_frame_that_the_bench_heard_twice_counts_once():
     story = plain_story()
     doubled = [e for e in story.entries for _ in range(1 + (e.direction == "from"))]
-    assert replay(Record({}, doubled, [], True, ""), WIRE, "adm", starting(), 5.0).same
+    assert replay(doubled, WIRE, "adm", starting(), 5.0).same
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3, 4, 5, 6])
 def test_a_record_that_was_cut_is_replayed_so_far(lost):
     """Wherever an answer was cut, what is there is the same."""
-    cut = Record({}, plain_story().entries[:-lost], [], False, "cut")
+    cut = plain_story().entries[:-lost]
     found = replay(cut, WIRE, "adm", starting(), 5.0)
     assert found.same
     assert found.steps == STEPS - (lost >= 4)
@@ -302,7 +305,7 @@ def test_a_part_that_was_started_anew_is_started_anew():
     story.begin()
     for k in range(21, STEPS):
         story.step(k)
-    found = replay(story.record(), WIRE, "adm", starting(), 5.0)
+    found = replay(story.entries, WIRE, "adm", starting(), 5.0)
     assert found.first_difference is None
     assert (found.starts, found.steps) == (2, STEPS)
 
@@ -328,23 +331,23 @@ def test_a_part_that_does_not_go_through_with_it(odd, words):
         yield parts[0]
 
     with pytest.raises(ReplayError, match=words):
-        replay(plain_story().record(), WIRE, "adm", start, 0.5)
+        replay(plain_story().entries, WIRE, "adm", start, 0.5)
     parts[0].join(3.0)  # it ends when its line does
     assert not parts[0].is_alive()
 
 
 def test_a_part_that_says_nothing():
     with pytest.raises(ReplayError, match=r"'adm' did not answer before its hello for 0\.2 s"):
-        replay(plain_story().record(), WIRE, "adm", lambda _: contextlib.nullcontext(), 0.2)
+        replay(plain_story().entries, WIRE, "adm", lambda _: contextlib.nullcontext(), 0.2)
 
 
 def test_a_record_without_the_part_lists_those_it_has():
     with pytest.raises(ReplayError, match="no begin to the part 'star'; links in it: adm, gyro"):
-        replay(plain_story().record(), WIRE, "star", starting())
+        replay(plain_story().entries, WIRE, "star", starting())
     with pytest.raises(ReplayError, match="links in it: adm, gyro"):
-        recorded(plain_story().record(), "star")
+        list(recorded(plain_story().entries, "star"))
     with pytest.raises(ReplayError, match="links in it: none"):
-        replay(Record({}, [], [], True, ""), WIRE, "star", starting())
+        replay([], WIRE, "star", starting())
 
 
 def test_a_process_that_dies_is_told_by_its_code():
@@ -356,7 +359,7 @@ def test_a_process_that_dies_is_told_by_its_code():
         process.wait()
 
     with pytest.raises(ReplayError, match=r"died before its hello \(exit code 3\)"):
-        replay(plain_story().record(), WIRE, "adm", start, 30.0)
+        replay(plain_story().entries, WIRE, "adm", start, 30.0)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler, gcc")
@@ -388,12 +391,10 @@ def test_a_board_in_c_says_the_same_to_a_record(tmp_path):
         turn = [np.nan] * 3 if k == 0 else [0.0, 0.0, (1 if k % 2 else -1) * np.pi / 2]
         entry("from", encoded("gyro", 2 * k, time_ns(k), theta_b=turn))
         entry("from", encoded("done", 2 * k + 1, time_ns(k), step=k, compute=1))
-    found = replay(Record({}, entries, [], True, ""), WIRE, "gyro", start, 5.0)
-    worst = differences(WIRE, found.recorded, found.frames)
-    assert all(d.max_abs < 1e-15 for d in worst)
-    again = replay(
-        Record({}, [*now(entries, found.frames)], [], True, ""), WIRE, "gyro", start, 5.0
-    )
+    frames: list[wire.Frame] = []
+    found = replay(entries, WIRE, "gyro", start, 5.0, says=frames.append)
+    assert all(d.max_abs < 1e-15 for d in found.compared.found())
+    again = replay([*now(entries, frames)], WIRE, "gyro", start, 5.0)
     assert again.same
 
 

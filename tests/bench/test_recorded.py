@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from robins.bench import wire
-from robins.bench.recording import Recorder, read_record
+from robins.bench.recording import Recorder, open_record, read_record
 from robins.bench.recording.replay import recorded
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.cli import main
@@ -30,7 +30,7 @@ def told(capsys, *arguments: str) -> tuple[int, dict]:
 def test_the_record_has_what_it_is_for():
     record = read_record(RECORD)
     assert record.whole
-    said = [(WIRE.message(f.header.type).name, f.payload) for f in recorded(record, "adm")]
+    said = [(WIRE.message(f.header.type).name, f.payload) for f in recorded(record.entries, "adm")]
     flags = [WIRE.decode(name, p)["flags"] for name, p in said if name == "estimate"]
     assert len(flags) == STEPS
     together = 0
@@ -55,13 +55,18 @@ def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
     content = bytearray(damaged.read_bytes())
     content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
-    whole = recorded(record, "adm")
+    whole = list(recorded(record.entries, "adm"))
+    at_once, each = read_record(damaged), open_record(damaged)
+    assert 0 < len(at_once.entries) < len(record.entries)
+    for _ in range(2):  # as often as it is wanted
+        assert list(each.entries) == at_once.entries
+    assert each._replace(entries=at_once.entries) == at_once
     for one, other in ((damaged, damaged), (RECORD, damaged), (damaged, RECORD)):
         command = ["bench", "replay", str(one), "--node", "adm", "--diff", str(other)]
         assert main(command) == 1
         told = capsys.readouterr().out
         assert f"{damaged} is not whole: is damaged" in told
-        left = recorded(read_record(damaged), "adm")
+        left = list(recorded(read_record(damaged).entries, "adm"))
         until_s = left[-1].header.time_ns * 1e-9
         compared = f"{len(left)} frames, up to {until_s:g} s of a run of 8 s"
         assert f"Compared, and no more: {compared}." in told
@@ -69,7 +74,7 @@ def test_a_damaged_record_is_told_with_how_much_was_compared(capsys, tmp_path):
         assert main([*command, "--json"]) == 1
         said = json.loads(capsys.readouterr().out)
         assert (said["whole"], said["planned_s"]) == (False, 8.0)
-    assert 0 < len(recorded(read_record(damaged), "adm")) < len(whole)
+    assert 0 < len(list(recorded(at_once.entries, "adm"))) < len(whole)
     assert main(["bench", "replay", str(RECORD), "--node", "adm", "--diff", str(RECORD)]) == 0
     assert "Same: 'adm' says the same" in capsys.readouterr().out
 

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import address, open_port, program
-from robins.bench.recording import read_record
-from robins.bench.recording.differences import FieldDifference, differences, table
+from robins.bench.recording import open_record
+from robins.bench.recording.differences import Differences, FieldDifference, table
 from robins.bench.recording.replay import Start, recorded, replay
 from robins.bench.run.outcome import outcome
 from robins.bench.run.session import Session
@@ -182,7 +183,7 @@ def bench_replay(
     """
     if filter_ and diff:
         raise InputError("the one runs a filter, the other compares records", "--filter and --diff")
-    first, second = read_record(record), None if diff is None else read_record(diff)
+    first, second = open_record(record), None if diff is None else open_record(diff)
     rig = recorded_rig(first.header)
     if node not in rig.parts:
         raise InputError(f"there is no part '{node}', only {', '.join(rig.parts)}", "--node")
@@ -193,12 +194,19 @@ def bench_replay(
         other = None if filter_ else program(flight.setup.ports.get(node, ""))
         with _starter(flight, node, other) as start:
             heard = replay(
-                first, wire, node, start, progress=lambda k, n: progress(k / max(n, 1), "hearing")
+                first.entries,
+                wire,
+                node,
+                start,
+                progress=lambda k, n: progress(k / max(n, 1), "hearing"),
             )
-        a, b, same, told = heard.recorded, heard.frames, heard.same, heard.first_difference
+        frames, told = heard.compared, heard.first_difference
     else:
-        a, b = recorded(first, node), recorded(second, node)
-        same = not differences(wire, a, b)
+        frames = Differences(wire, step_ns)
+        for pair in zip_longest(recorded(first.entries, node), recorded(second.entries, node)):
+            frames.take_both(*pair)
+    found = frames.found()
+    same = not found if second is not None else told is None
     damages = [
         f"{path} is not whole: {one.why}"
         for path, one in ((record, first), (diff, second))
@@ -206,15 +214,15 @@ def bench_replay(
     ]
     return Compared(
         node=node,
-        frames=len(b),
+        frames=frames.frames[1],
         same=same,
-        differences=differences(wire, a, b, step_ns),
+        differences=found,
         whole=not damages,
         damages=damages,
-        until_s=min(max((f.header.time_ns for f in x), default=0) for x in (a, b)) * 1e-9,
+        until_s=min(frames.until_ns) * 1e-9,
         planned_s=int(first.header["steps"]) * step_ns * 1e-9,
         told=told or "",
-        compared=min(len(a), len(b)),
+        compared=min(frames.frames),
     )
 
 

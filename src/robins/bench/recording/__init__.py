@@ -7,7 +7,7 @@
 
 from robins.bench.recording.differences import FieldDifference
 from robins.bench.recording.layout import Entry, Event, RecordingError
-from robins.bench.recording.reader import Record, read_record
+from robins.bench.recording.reader import Record, open_record, read_record
 from robins.bench.recording.replay import Replayed, ReplayError
 from robins.bench.recording.topics import Topic
 from robins.bench.recording.writer import Recorder
@@ -22,5 +22,6 @@ __all__ = [
     "ReplayError",
     "Replayed",
     "Topic",
+    "open_record",
     "read_record",
 ]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -12,8 +14,8 @@ from robins.bench.wire.fields import Field, Message
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.schema import FIRST_DATA, Wire
 
-Payloads = dict[tuple[int, int, int], bytes]
-"""Payloads by message, time, and which of those with both alike."""
+_Pair = tuple[int, bytes, bytes]  # time [ns], and the payloads of both
+_BATCH = 1024  # pairs that are looked at together, since each call of NumPy costs as much as many
 
 
 @dataclass(frozen=True)
@@ -38,67 +40,120 @@ class FieldDifference:
     count: int  # of frames that differ
 
 
-def differences(
-    wire: Wire, a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0
-) -> list[FieldDifference]:
-    """Where the frames of two runs differ, the earliest difference first; none: an empty list.
+class Differences:
+    """Where the frames of two runs differ, taken as they come.
 
     Frames belong together if message and time are the same; of several such, as of a tick that was
     repeated, the first to the first. Numbers are compared bit by bit, so -0.0 is not 0.0, but NaN
     is NaN, whatever its bits. Run and sequence in the header are not looked at, and messages of the
-    protocol are left out.
+    protocol are left out. Only frames whose partner has not come yet are kept.
 
-    Args:
-        wire: their messages.
-        a: frames of one run.
-        b: frames of the other.
-        step_ns: length of a step, to tell steps; 0: not known.
+    Attributes:
+        frames: with data, of the one and of the other.
+        until_ns: the latest time of each.
     """
-    of_a, of_b = _by_key(a), _by_key(b)
-    found: list[FieldDifference] = []
-    for number in sorted({key[0] for key in (*of_a, *of_b)}):
-        found += _of_message(wire, number, of_a, of_b, step_ns)
-    return sorted(found, key=lambda d: d.first_time_s)
 
+    def __init__(self, wire: Wire, step_ns: int = 0):
+        """Begin.
 
-def _by_key(frames: Iterable[Frame]) -> Payloads:
-    found: Payloads = {}
-    seen: dict[tuple[int, int], int] = {}
-    for frame in frames:
-        number, time_ns = frame.header.type, frame.header.time_ns
+        Args:
+            wire: the messages of both.
+            step_ns: length of a step, to tell steps; 0: not known.
+        """
+        self._wire, self._step_ns = wire, step_ns
+        self.frames, self.until_ns = [0, 0], [0, 0]
+        # of the one whose partner has not come, by message and time
+        self._waiting: dict[tuple[int, int], tuple[int, deque[bytes]]] = {}
+        self._pairs: dict[int, list[_Pair]] = {}  # that differ, by message
+        self._odd: dict[int, list[int]] = {}  # times of pairs that no field tells apart
+        self._found: dict[tuple[str, str, int], FieldDifference] = {}
+
+    def take(self, which: int, frame: Frame) -> None:
+        """A frame of the one (0) or of the other (1)."""
+        key = number, time_ns = frame.header.type, frame.header.time_ns
         if number < FIRST_DATA:
-            continue
-        again = seen.get((number, time_ns), 0)
-        seen[number, time_ns] = again + 1
-        found[number, time_ns, again] = frame.payload
-    return found
+            return
+        self.frames[which] += 1
+        self.until_ns[which] = max(self.until_ns[which], time_ns)
+        whose, waiting = self._waiting.setdefault(key, (which, deque()))
+        if whose == which:
+            return waiting.append(frame.payload)
+        other = waiting.popleft()
+        if not waiting:
+            del self._waiting[key]
+        x, y = (other, frame.payload) if which else (frame.payload, other)
+        if x != y:
+            self._differ(number, time_ns, x, y)
+
+    def take_both(self, a: Frame | None, b: Frame | None) -> None:
+        """A frame of each, which need not belong together; None: it has no more."""
+        for which, frame in enumerate((a, b)):
+            if frame is not None:
+                self.take(which, frame)
+
+    def found(self) -> list[FieldDifference]:
+        """The earliest difference first, of all that came until now; none: an empty list."""
+        for number in self._pairs:
+            self._look(number)
+        only: tuple[dict[int, list[int]], ...] = ({}, {})
+        for (number, time_ns), (which, waiting) in self._waiting.items():
+            only[which].setdefault(number, []).extend([time_ns] * len(waiting))
+        found = list(self._found.values())
+        for of, in_a, in_b in ((only[0], 1.0, 0.0), (only[1], 0.0, 1.0), (self._odd, 1.0, 1.0)):
+            for number, times in of.items():
+                message = self._message(number)
+                name, n = message.name if message else f"message {number}", len(times)
+                when = _when(min(times), self._step_ns)
+                odd = FieldDifference(name, "", -1, "", 0.0, 0.0, *when, in_a * n, in_b * n, n)
+                found.append(odd)
+        return sorted(found, key=lambda d: (d.first_time_s, self._place(d)))
+
+    def _place(self, d: FieldDifference) -> tuple[int, int, int]:
+        """Where a number stands in the table of messages; what is of no field comes last."""
+        of = next((m for m in self._wire.data if m.name == d.message), None)
+        if of is None:
+            return 1 << 16, 0, 0
+        fields = [f.name for f in of.fields]
+        return of.number, fields.index(d.field) if d.field else len(fields), d.component
+
+    def _message(self, number: int) -> Message | None:
+        return self._wire.message(number) if number in self._wire.names else None
+
+    def _differ(self, number: int, time_ns: int, x: bytes, y: bytes) -> None:
+        of = self._message(number)
+        if of is None or not len(x) == len(y) == of.size:
+            self._odd.setdefault(number, []).append(time_ns)
+            return
+        pairs = self._pairs.setdefault(number, [])
+        pairs.append((time_ns, x, y))
+        if len(pairs) == _BATCH:
+            self._look(number)
+
+    def _look(self, number: int) -> None:
+        """Field by field at the pairs that differ."""
+        pairs, of = sorted(self._pairs[number]), self._message(number)
+        self._pairs[number].clear()
+        for new in _of_fields(self._wire, of, pairs, self._step_ns) if of and pairs else ():
+            key = new.message, new.field, new.component
+            old = self._found.get(key, new)
+            if old is not new:
+                new = replace(
+                    min(old, new, key=lambda d: d.first_time_s),
+                    max_abs=max(old.max_abs, new.max_abs),
+                    max_rel=max(old.max_rel, new.max_rel),
+                    count=old.count + new.count,
+                )
+            self._found[key] = new
 
 
-def _of_message(
-    wire: Wire, number: int, a: Payloads, b: Payloads, step_ns: int
+def differences(
+    wire: Wire, a: Iterable[Frame], b: Iterable[Frame], step_ns: int = 0
 ) -> list[FieldDifference]:
-    of = wire.message(number) if number in wire.names else None
-    only_a: list[int] = []  # times [ns] of frames that only one has
-    only_b: list[int] = []
-    as_bytes: list[int] = []  # of frames that both have and no field tells apart
-    by_fields: list[tuple[int, bytes, bytes]] = []
-    for key in sorted(key for key in a.keys() | b.keys() if key[0] == number):
-        x, y, time_ns = a.get(key), b.get(key), key[1]
-        if y is None:
-            only_a.append(time_ns)
-        elif x is None:
-            only_b.append(time_ns)
-        elif x != y and of and len(x) == len(y) == of.size:
-            by_fields.append((time_ns, x, y))
-        elif x != y:
-            as_bytes.append(time_ns)
-    found = _of_fields(wire, of, by_fields, step_ns) if of and by_fields else []
-    name = of.name if of else f"message {number}"
-    for times, in_a, in_b in ((only_a, 1.0, 0.0), (only_b, 0.0, 1.0), (as_bytes, 1.0, 1.0)):
-        if n := len(times):
-            when = _when(times[0], step_ns)
-            found.append(FieldDifference(name, "", -1, "", 0.0, 0.0, *when, in_a * n, in_b * n, n))
-    return found
+    """Where the frames of two runs differ; see `Differences`."""
+    of = Differences(wire, step_ns)
+    for pair in zip_longest(a, b):
+        of.take_both(*pair)
+    return of.found()
 
 
 def _when(time_ns: int, step_ns: int) -> tuple[int, float]:
@@ -107,7 +162,7 @@ def _when(time_ns: int, step_ns: int) -> tuple[int, float]:
 
 
 def _of_fields(
-    wire: Wire, of: Message, frames: Sequence[tuple[int, bytes, bytes]], step_ns: int
+    wire: Wire, of: Message, frames: Sequence[_Pair], step_ns: int
 ) -> list[FieldDifference]:
     a = [wire.decode(of.name, x) for _, x, _ in frames]
     b = [wire.decode(of.name, y) for _, _, y in frames]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import struct
 import zlib
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple
 
@@ -29,10 +31,24 @@ class Record(NamedTuple):
     """What was written down."""
 
     header: dict[str, Any]
-    entries: list[layout.Entry]  # in the order in which they were written
+    entries: Sequence[layout.Entry] | Entries  # in the order in which they were written
     events: list[layout.Event]
     whole: bool  # closed, and every check of the file holds
     why: str  # it is not, or nothing
+
+
+class Entries:
+    """Those of a file up to its first damage, read anew each time that they are gone through."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __iter__(self) -> Iterator[layout.Entry]:
+        with _opened(self._path) as reader:
+            _header(str(self._path), reader)
+            for _ in reader.records():
+                yield from reader.entries
+                reader.entries.clear()
 
 
 class _Damage(Exception):
@@ -52,16 +68,37 @@ def read_record(path: str | Path) -> Record:
         RecordingError: there is no such file, it is no record of the bench, it is of another
             version of the wire, or it ends before the header of the run is whole.
     """
+    return _read(Path(path), lambda reader: reader.entries)
+
+
+def open_record(path: str | Path) -> Record:
+    """Check a record and read all but its entries, which are read when they are gone through.
+
+    Raises:
+        RecordingError: as `read_record`.
+    """
+    return _read(Path(path), lambda reader: Entries(Path(path)))
+
+
+def _read(path: Path, entries: Callable[[_Reader], Sequence[layout.Entry] | Entries]) -> Record:
+    with _opened(path) as reader:
+        header, kept = _header(str(path), reader), entries(reader)
+        for _ in reader.records():
+            if kept is not reader.entries:
+                reader.entries.clear()
+        return Record(header, kept, reader.events, not reader.why, reader.why)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[_Reader]:
+    """What goes through a file.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
     try:
-        with Path(path).open("rb") as file:
-            reader = _Reader(file)
-            header = _header(str(path), reader)
-            try:
-                while reader.step():
-                    pass
-            except _Damage as damage:
-                return Record(header, reader.entries, reader.events, False, str(damage))
-            return Record(header, reader.entries, reader.events, True, "")
+        with path.open("rb") as file:
+            yield _Reader(file)
     except OSError as error:
         raise layout.RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from None
 
@@ -114,6 +151,7 @@ class _Reader:
         self._at = self._check = self._before = 0
         self._topics: dict[int, _Place | None] = {}  # None: of messages for other tools
         self._count = 0  # messages so far, which have numbers
+        self.why = ""  # it did not come to the end
 
     def take(self, size: int) -> bytes:
         """So many bytes, or as many as there are."""
@@ -139,6 +177,15 @@ class _Reader:
                 self._chunk(at, head + body)
             raise _Damage(f"ends at byte {self._at} without having been closed")
         return opcode, body
+
+    def records(self) -> Iterator[None]:
+        """Take all records, one by one, up to the first damage; `why` tells of that."""
+        try:
+            while self.step():
+                yield
+        except _Damage as damage:
+            self.why = str(damage)
+        yield
 
     def step(self) -> bool:
         """Take the next record; whether there is more to come.

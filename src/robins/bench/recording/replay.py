@@ -11,14 +11,14 @@ from __future__ import annotations
 import os
 import select
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
+from itertools import groupby
 from typing import Any, NamedTuple
 
 from robins.bench.ports.port import Pair, open_pair
-from robins.bench.recording.differences import differences, name_of
+from robins.bench.recording.differences import Differences, differences, name_of
 from robins.bench.recording.layout import Entry
-from robins.bench.recording.reader import Record
 from robins.bench.wire.frames import Frame, Header, encode_frame
 from robins.bench.wire.receiver import Receiver
 from robins.bench.wire.records import RecordError
@@ -30,6 +30,7 @@ _LOOK_S = 0.1  # at whether the part still lives
 _HELLO, _TICK, _DONE, _STOP, _BEGIN = (
     NUMBERS[name] for name in ("hello", "tick", "done", "stop", "begin")
 )
+_DONE_SIZE = BARE.size_of("done")
 
 Start = Callable[[str], AbstractContextManager[Any]]
 """From the path of a port to a context within which the part runs there. What the context gives may
@@ -46,71 +47,64 @@ class Replayed(NamedTuple):
     """What a part said when it heard a record again."""
 
     part: str
-    frames: list[Frame]  # with data, as it said them now
-    recorded: list[Frame]  # and then
-    same: bool  # every byte of every frame; but how long computing took
-    first_difference: str | None  # in words
+    compared: Differences  # frames with data, as it said them then and as it says them now
+    first_difference: str | None  # of any byte, but how long computing took; in words
     steps: int  # that were replayed
     step_ns: int
     starts: int  # of the part; more than one where it was started anew in the record
 
-
-class _Life(NamedTuple):
-    """What went to and from a part from one begin to the next."""
-
-    begin: Frame
-    to: list[tuple[bytes, list[Frame]]]  # bytes, with the frames that end in them
-    said: dict[int, Frame]  # with data, by sequence number
-    answered: set[int]  # steps that the part was done with
-
     @property
-    def run(self) -> int:
-        return self.begin.header.run
+    def same(self) -> bool:
+        """Every byte of every frame; but how long computing took."""
+        return self.first_difference is None
 
-    @property
-    def step_ns(self) -> int:
-        return int(BARE.decode("begin", self.begin.payload)["step"])
 
-    @property
-    def ticks(self) -> list[int]:
-        """Steps, in the order of their ticks."""
-        return [
-            int(BARE.decode("tick", f.payload)["step"])
-            for _, found in self.to
-            for f in found
-            if f.header.type == _TICK and f.header.run == self.run
-        ]
+class _Row(NamedTuple):
+    """Something that was on the line of a part."""
+
+    life: int  # which start of the part, from 0
+    begin: Frame  # of it
+    to: bool  # the part, or from it
+    data: bytes
+    found: list[Frame]  # that end in it
+
+    def ticks(self) -> list[Frame]:
+        """Those of this run."""
+        run = self.begin.header.run
+        return [f for f in self.found if f.header.type == _TICK and f.header.run == run]
 
 
 def replay(
-    record: Record,
+    entries: Iterable[Entry],
     wire: Wire,
     part: str,
     start: Start,
     patience_s: float = PATIENCE_S,
     progress: Callable[[int, int], None] | None = None,
+    says: Callable[[Frame], None] = lambda frame: None,
 ) -> Replayed:
     """Let a part hear a record again, and compare what it says.
 
-    Where the part was started anew in the record, it is started anew here.
+    Where the part was started anew in the record, it is started anew here. Of the record and of
+    what the part says, only what cannot be compared yet is kept.
 
     Args:
-        record: of a run; one that was cut is replayed so far.
+        entries: of a run, in the order in which they were written; gone through more than once.
+            Those of a record that was cut are replayed so far.
         wire: its messages.
         part: whose link it is.
         start: runs the part at a port.
         patience_s: for the part's hello, and for each step.
         progress: told the steps done, and all there are.
+        says: told each frame with data that the part says now.
 
     Raises:
         ReplayError: the record has nothing of the part, or the part has another schema, died, did
             not answer in time, or started anew by itself; says in which step.
     """
-    lives = _lives(record.entries, part)
-    total = sum(len(life.ticks) for life in lives)
-    frames: list[Frame] = []
+    total = sum(len(row.ticks()) for row in _rows(entries, part) if row.to)
     first: str | None = None
-    done = 0
+    done, starts, step_ns, compared = 0, 0, 0, None
 
     def count() -> None:
         nonlocal done
@@ -118,41 +112,54 @@ def replay(
         if progress is not None:
             progress(done, total)
 
-    for life in lives:
+    for (_, begin), rows in groupby(_rows(entries, part), _life_of):
+        step_ns = int(BARE.decode("begin", begin.payload)["step"])
+        compared = compared or Differences(wire, step_ns)
+        life = _Life(wire, begin, step_ns, compared, says)
         with open_pair() as pair, start(pair.path) as process:
-            said = _Replay(wire, part, pair, process, patience_s, life).run(count)
-        first = first or _first_difference(wire, life, said)
-        frames += said
-    return Replayed(
-        part, frames, _said(lives), first is None, first, total, lives[0].step_ns, len(lives)
-    )
+            _Replay(wire, part, pair, process, patience_s, life).run(rows, count)
+        first = first or life.first_difference()
+        starts += 1
+    assert compared is not None  # else there was no begin
+    return Replayed(part, compared, first, total, step_ns, starts)
 
 
 # ------------------------------------------------------------------------------------- the record
 
 
-def recorded(record: Record, part: str) -> list[Frame]:
-    """What a part said in a record, data only, each frame once.
+def recorded(entries: Iterable[Entry], part: str) -> Iterator[Frame]:
+    """What a part said in a record, data only, each frame once, in its order.
 
     Raises:
-        ReplayError: the record has nothing of the part.
+        ReplayError: the record has nothing of the part; at its end.
     """
-    return _said(_lives(record.entries, part))
+    for _, rows in groupby(_rows(entries, part), _life_of):
+        newest = -1
+        for row in rows:
+            for frame in () if row.to else row.found:
+                if _is_said(frame, row.begin) and frame.header.sequence > newest:
+                    newest = frame.header.sequence
+                    yield frame
 
 
-def _said(lives: Iterable[_Life]) -> list[Frame]:
-    return [frame for life in lives for _, frame in sorted(life.said.items())]
+def _life_of(row: _Row) -> tuple[int, Frame]:
+    return row.life, row.begin
 
 
-def _lives(entries: Iterable[Entry], part: str) -> list[_Life]:
-    """The record of a part, from begin to begin.
+def _is_said(frame: Frame, begin: Frame) -> bool:
+    return frame.header.type >= FIRST_DATA and frame.header.run == begin.header.run
 
-    A begin that comes before the first tick answers a hello that was repeated.
+
+def _rows(entries: Iterable[Entry], part: str) -> Iterator[_Row]:
+    """The record of a part from its first begin on.
+
+    A begin that comes before the first tick answers a hello that was repeated; a later one begins
+    another life.
 
     Raises:
-        ReplayError: there is none.
+        ReplayError: there is none; at the end.
     """
-    lives: list[_Life] = []
+    begin, life, ticked = None, -1, False
     links: set[str] = set()
     to, back = Receiver(), Receiver()
     for entry in entries:
@@ -161,32 +168,20 @@ def _lives(entries: Iterable[Entry], part: str) -> list[_Life]:
             continue
         if entry.direction == "to":
             found = to.feed(entry.data)
-            begin = next((f for f in found if f.header.type == _BEGIN), None)
-            if begin is not None and not (lives and not lives[-1].ticks):
-                lives.append(_Life(begin, [], {}, set()))
-                back = Receiver()
-            if lives:
-                lives[-1].to.append((entry.data, found))
-        elif lives:
-            for frame in back.feed(entry.data):
-                _hear(lives[-1], frame)
-    if not lives:
+            new = next((f for f in found if f.header.type == _BEGIN), None)
+            if new is not None and (begin is None or ticked):
+                begin, life, ticked, back = new, life + 1, False, Receiver()
+        elif begin is None:
+            continue
+        else:
+            found = back.feed(entry.data)
+        if begin is not None:
+            row = _Row(life, begin, entry.direction == "to", entry.data, found)
+            ticked = ticked or (row.to and bool(row.ticks()))
+            yield row
+    if begin is None:
         there = ", ".join(sorted(links)) or "none"
         raise ReplayError(f"the record has no begin to the part '{part}'; links in it: {there}")
-    return lives
-
-
-def _hear(life: _Life, frame: Frame) -> None:
-    """Note what the part said then."""
-    head = frame.header
-    if head.run != life.run:
-        return
-    if head.type >= FIRST_DATA:
-        # the bench may have heard a frame twice: a fault doubled it, or the part died after it and
-        # the one that took its place said it again
-        life.said.setdefault(head.sequence, frame)
-    elif head.type == _DONE and len(frame.payload) == BARE.size_of("done"):
-        life.answered.add(int(BARE.decode("done", frame.payload)["step"]))
 
 
 # --------------------------------------------------------------------------------------- the part
@@ -204,28 +199,28 @@ class _Replay:
         self._waiting: list[Frame] = []
         self._where = "before its hello"
 
-    def run(self, count: Callable[[], None]) -> list[Frame]:
-        """What the part says, data only."""
+    def run(self, rows: Iterable[_Row], count: Callable[[], None]) -> None:
+        """Say to the part what was said to it; tells the life what it said then and says now."""
         self._greet()
-        run = self._life.run
-        said: list[Frame] = []
         latest, last = -1, self._life.begin.header
-        for data, found in self._life.to:
-            self._write(data)
-            for frame in found:
-                last = frame.header
-                if last.type != _TICK or last.run != run:
-                    continue
-                step = int(BARE.decode("tick", frame.payload)["step"])
+        for row in rows:
+            if not row.to:
+                self._life.said(row)
+                continue
+            self._write(row.data)
+            last = row.found[-1].header if row.found else last
+            for tick in row.ticks():
+                step = int(BARE.decode("tick", tick.payload)["step"])
+                self._life.ticked(step)
                 if step >= latest:  # a part has forgotten what it said to older ones
                     self._where = f"in step {step}"
-                    said += self._until_done(step, latest)
+                    for frame in self._until_done(step, latest):
+                        self._life.says(frame)
                     latest = step
                 count()
         if last.type != _STOP:  # the record ends before the run did
-            head = Header(_STOP, run, (last.sequence + 1) % 2**32, last.time_ns)
+            head = Header(_STOP, self._life.run, (last.sequence + 1) % 2**32, last.time_ns)
             self._write(encode_frame(head, b""))
-        return said
 
     def _greet(self) -> None:
         hello = self._next()
@@ -308,23 +303,81 @@ class _Replay:
 # ---------------------------------------------------------------------------------------- compare
 
 
-def _first_difference(wire: Wire, life: _Life, said: list[Frame]) -> str | None:
-    """The first frame that is not the same, in words."""
-    now = {frame.header.sequence: frame for frame in said}
-    # a record that was cut, or a part that died, ends in the middle of an answer
-    whole = not life.ticks or life.ticks[-1] in life.answered
-    end = max(life.said, default=-1)
-    for number in sorted(life.said.keys() | now.keys()):
-        a, b = life.said.get(number), now.get(number)
-        if a == b:
-            continue
-        if a is not None and b is not None:
-            return _in_words(wire, life, a, b)
-        if a is not None:
-            return f"{_place(life, a)}: {_told(wire, a)} was recorded and is not said now"
-        if b is not None and (whole or number < end):
-            return f"{_place(life, b)}: {_told(wire, b)} is said now and was not recorded"
-    return None
+class _Life:
+    """What a part said then and what it says now, from one begin to the next.
+
+    Attributes:
+        begin: with which it began.
+        step_ns: length of a step.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        begin: Frame,
+        step_ns: int,
+        compared: Differences,
+        says: Callable[[Frame], None],
+    ):
+        self._wire, self.begin, self.step_ns = wire, begin, step_ns
+        self._compared, self._says = compared, says
+        self._then: dict[int, Frame] = {}  # by sequence number, not compared yet
+        self._now: dict[int, Frame] = {}
+        self._newest = self._tick = self._answered = -1  # of the record
+        self._first: tuple[int, str] | None = None
+
+    @property
+    def run(self) -> int:
+        return self.begin.header.run
+
+    def ticked(self, step: int) -> None:
+        """A tick was said to it."""
+        self._tick = step
+
+    def said(self, row: _Row) -> None:
+        """What it said then."""
+        for frame in row.found:
+            head = frame.header
+            # the bench may have heard a frame twice: a fault doubled it, or the part died after it
+            # and the one that took its place said it again
+            if _is_said(frame, self.begin) and head.sequence > self._newest:
+                self._newest = head.sequence
+                self._compared.take(0, frame)
+                self._then[head.sequence] = frame
+                self._compare(head.sequence)
+            elif (head.type, head.run) == (_DONE, self.run) and len(frame.payload) == _DONE_SIZE:
+                step = int(BARE.decode("done", frame.payload)["step"])
+                self._answered = max(self._answered, step)
+
+    def says(self, frame: Frame) -> None:
+        """What it says now."""
+        self._says(frame)
+        self._compared.take(1, frame)
+        self._now[frame.header.sequence] = frame
+        self._compare(frame.header.sequence)
+
+    def _compare(self, number: int) -> None:
+        if number in self._then and number in self._now:
+            then, now = self._then.pop(number), self._now.pop(number)
+            if then != now:
+                self._differs(number, _in_words(self._wire, self, then, now))
+
+    def _differs(self, number: int, words: str) -> None:
+        if self._first is None or number < self._first[0]:
+            self._first = number, words
+
+    def first_difference(self) -> str | None:
+        """The first frame that is not the same, in words, at the end."""
+        for number, frame in self._then.items():
+            told = f"{_place(self, frame)}: {_told(self._wire, frame)}"
+            self._differs(number, f"{told} was recorded and is not said now")
+        # a record that was cut, or a part that died, ends in the middle of an answer
+        whole = self._tick <= self._answered
+        for number, frame in self._now.items():
+            if whole or number < self._newest:
+                told = f"{_place(self, frame)}: {_told(self._wire, frame)}"
+                self._differs(number, f"{told} is said now and was not recorded")
+        return None if self._first is None else self._first[1]
 
 
 def _in_words(wire: Wire, life: _Life, then: Frame, now: Frame) -> str:
