@@ -6,6 +6,7 @@ The camera measures the angle and runs an extended Kalman filter that believes t
 
 from typing import Annotated, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
@@ -64,6 +65,7 @@ def prepare(setup: Any, given: Pendulum) -> Kit:
     return Kit(round(given.step * 1e9), given, given.camera * noise)
 
 
+@jax.jit
 def swing(w2, T, x, u):
     """A step by the midpoint rule; w2 is g/l."""
 

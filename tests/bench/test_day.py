@@ -1,0 +1,117 @@
+"""A simulated day on the bench: recorded, watched, replayed, in memory that does not grow."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from browsing import a_browser, browse
+
+from robins.bench.recording import open_record
+from robins.workbench import bench_replay
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "pendulum.py"
+STEPS = 24 * 3600
+SETTINGS = ("duration=24 h", "step=1 s", "length=1 km")  # a period of 63 s
+MORE_MB = 24  # that a process may take at the end more than after an hour
+
+
+def private_mb(process: Path) -> float:
+    """Memory that is this process's alone."""
+    (line,) = (x for x in (process / "status").read_text().splitlines() if x.startswith("RssAnon"))
+    return int(line.split()[1]) / 1024
+
+
+class Memories(threading.Thread):
+    """Looks at this process or at all of a group, each second."""
+
+    def __init__(self, group: int | None = None):
+        super().__init__(daemon=True)
+        self.group, self.over = group, threading.Event()
+        self.of: dict[str, list[float]] = {}
+
+    def run(self):
+        while not self.over.wait(1.0):
+            for process in Path("/proc").glob("[0-9]*"):
+                try:
+                    group = int((process / "stat").read_text().rsplit(")", 1)[1].split()[2])
+                    mine = process.name == str(os.getpid()) if self.group is None else False
+                    if mine or group == self.group:
+                        words = (process / "cmdline").read_bytes().split(b"\0")
+                        name = b" ".join(words[2:5]).decode() or process.name
+                        self.of.setdefault(name, []).append(private_mb(process))
+                except (OSError, ValueError):  # it has ended
+                    continue
+
+    def growth(self, begin: float) -> dict[str, float]:
+        """From a share of its life on [MB], by process."""
+        self.over.set()
+        self.join()
+        of = {name: x for name, x in self.of.items() if len(x) > 20}
+        return {name: max(x) - x[round(begin * len(x))] for name, x in of.items()}
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory):
+    """A run of a day that has begun."""
+    out = tmp_path_factory.mktemp("day") / "out"
+    robins = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
+    robins += ["bench", "up", f"{EXAMPLE}:rig", "--out", str(out)]
+    settings = [word for one in SETTINGS for word in ("--set", one)]
+    command = [*robins, *settings, "--live", "--port", "0", "--json"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, start_new_session=True, **pipes) as process:
+        memories = Memories(process.pid)
+        memories.start()
+        yield process, memories, out
+        process.kill()
+
+
+def test_the_page_is_there_all_day(day):
+    """Whoever comes in the afternoon sees the morning, and is obeyed."""
+    process, _, _ = day
+    told = ""
+    while not (url := re.search(r"http://127.0.0.1:\d+\S*", told)):
+        assert (line := process.stderr.readline()), told
+        told += line
+    with a_browser() as chromium:
+        with browse(chromium, url.group(), viewport={"width": 1280, "height": 800}) as page:
+            page.wait_for_function("() => bench.time > 40000", timeout=600_000)
+        with browse(chromium, url.group(), viewport={"width": 1280, "height": 800}) as page:
+            page.wait_for_function("() => bench.time > 40000")
+            page.get_by_test_id("span").select_option("whole run")
+            page.wait_for_function("() => bench.plots[0].span[0] === 0")
+            first = page.evaluate("bench.plots[0].chart.data[0][0]")
+            assert 0.0 <= first < 600.0
+            page.get_by_role("button", name="Pause").click()
+            page.wait_for_function("() => bench.state === 'paused'", timeout=10_000)
+            page.get_by_role("button", name="Start").click()
+            page.wait_for_function("() => bench.state === 'live'", timeout=10_000)
+            assert page.evaluate("performance.memory.usedJSHeapSize") < 100e6
+
+
+def test_memory_does_not_grow_and_the_record_is_whole(day):
+    process, memories, out = day
+    said, _ = process.communicate(timeout=1200)
+    assert process.returncode == 0
+    figures = json.loads(said)
+    assert figures["steps"] == STEPS
+    assert figures["counts"]["frames"] == 2 * STEPS
+    assert 0.0 < figures["angle_rms_deg"] < 0.6
+    growth = memories.growth(1.0 / 24.0)
+    assert any("pendulum.py" in name and "camera" in name for name in growth)
+    assert len(growth) >= 3  # the bench and two parts; the page's server has a group of its own
+    assert max(growth.values()) < MORE_MB, growth
+    record = open_record(out / "record.mcap")
+    assert (record.whole, record.why) == (True, "")
+    heard = Memories()
+    heard.start()
+    compared = bench_replay(out / "record.mcap", node="camera")
+    assert compared.same
+    assert compared.frames == STEPS
+    (more,) = heard.growth(0.1).values()
+    assert more < MORE_MB
