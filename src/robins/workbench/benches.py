@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import pickle
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from robins.bench.parts.kits import put
 from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import address, open_port, program
 from robins.bench.recording import open_record
@@ -230,8 +230,8 @@ def bench_replay(
 def _starter(flight: Flight, part: str, other: Path | None) -> Iterator[Start]:
     """What starts a part of a recorded run on a path, or the program that was in its place."""
     with tempfile.TemporaryDirectory(prefix="robins-bench-") as folder:
-        path = Path(folder) / "kit.pickle"
-        path.write_bytes(pickle.dumps(kit_of(flight)))
+        path = Path(folder) / "kit"
+        put(kit_of(flight), path)
 
         @contextlib.contextmanager
         def start(port: str) -> Iterator[subprocess.Popen]:

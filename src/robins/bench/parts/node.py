@@ -1,6 +1,6 @@
 """A part of the vehicle as a process of its own, which knows nothing but its port.
 
-python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 kit.pickle
+python -m robins.bench.parts.node satellite gyro /dev/pts/5,460800 kit
 
 With a folder it puts its memory aside there, and with a step too it goes on from that of the step.
 """
@@ -10,13 +10,13 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import pickle
 import signal
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+from robins.bench.parts.kits import take
 from robins.bench.parts.station import Station, path_of, put_aside, ready, serve
 from robins.bench.ports.port import PortError, address, open_port
 from robins.bench.rigs import rig_of
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
     # An interrupt of the terminal is for the bench, which then tells its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     rig = rig_of(rig_name)
-    kit = pickle.loads(Path(kit_path).read_bytes())
+    kit = take(Path(kit_path))
     part = ready(rig.build[name](kit), kit.frames)
     station = Station(part, rig.wire)
     if more:

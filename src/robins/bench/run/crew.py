@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import pickle
 import re
 import shutil
 import signal
@@ -17,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from robins.bench.parts.kits import put
 from robins.bench.parts.node import REALTIME
 from robins.bench.parts.station import path_of
 from robins.bench.rig import Rig
@@ -67,7 +67,7 @@ class Crew:
 
     def __enter__(self) -> Crew:
         self._folder = Path(tempfile.mkdtemp(prefix="robins-bench-"))  # readable by us alone
-        (self._folder / "kit.pickle").write_bytes(pickle.dumps(self._kit))
+        put(self._kit, self._folder / "kit")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -91,7 +91,7 @@ class Crew:
             environment[REALTIME] = "1"
         command = [sys.executable, "-m", "robins.bench.parts.node"]
         command += [self._rig.address or self._rig.name, part, port]
-        command.append(str(self._folder / "kit.pickle"))
+        command.append(str(self._folder / "kit"))
         if self._restarts:
             command += [str(self._folder), str(since)]
         if part in self._programs:

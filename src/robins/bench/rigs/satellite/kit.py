@@ -7,7 +7,7 @@ machine computes the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +21,8 @@ from robins.filters.kalman import FilterState
 from robins.sim.rate_table import RateTable
 from robins.systems.satellite.model import ADDITIVE, MULTIPLICATIVE, Build, make_filter
 from robins.systems.satellite.nodes import Given, Row, StateForm, Vehicle, apart
+
+_BLOCK = 1024  # rows of a run that a part has as vectors at a time
 
 
 class Kit(NamedTuple):
@@ -92,7 +94,6 @@ def driven(kit: Kit, node: Callable) -> Callable:
     """
     columns, shape = jax.tree_util.tree_flatten(kit.rows)
     steps = len(kit.due)
-    table = np.concatenate([x.reshape(steps, -1).astype(float) for x in columns], axis=1)
     ends = np.cumsum([x[0].size for x in columns])
 
     def run(given: Given, numbers: Array, *args: Any):
@@ -100,12 +101,18 @@ def driven(kit: Kit, node: Callable) -> Callable:
         row = shape.unflatten([p.reshape(x.shape[1:]).astype(x.dtype) for p, x in pieces])
         return apart(node, given, *args, row)
 
+    @lru_cache(maxsize=1)
+    def block(number: int) -> np.ndarray:
+        some = [x[number * _BLOCK : (number + 1) * _BLOCK] for x in columns]
+        return np.concatenate([x.reshape(len(x), -1).astype(float) for x in some], axis=1)
+
     # JAX is given what stays the same, as `react` is; in a program it is folded.
     by_jax = kit.machine == "jax"
     call = partial(jax.jit(run), kit.given) if by_jax else compiled(kit, partial(run, kit.given))
 
     def at(step: int, *args: Any, begins: Sequence[float] | np.ndarray = ()):
-        numbers = table[min(step, steps - 1)]
+        number, row = divmod(min(step, steps - 1), _BLOCK)
+        numbers = block(number)[row]
         if len(begins):
             numbers = np.concatenate([begins, numbers[len(begins) :]])
         return call(numbers, *args)

@@ -1,0 +1,71 @@
+"""A kit goes to processes through a file that they map, to the last bit."""
+
+import subprocess
+import sys
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from stations import Loop, kit, one_program
+
+from robins.bench.parts.kits import put, take
+from robins.bench.rigs.satellite import kit as satellite
+
+SHORT = ("satellite/s1", "mekf", "duration=60 s", "counted_from=10 s")
+
+
+class Of(NamedTuple):
+    words: str
+    rows: Any
+
+
+def test_what_is_taken_is_what_was_put(tmp_path):
+    of = kit(*SHORT)
+    put(of, tmp_path / "kit")
+    back = take(tmp_path / "kit")
+    pairs = [jax.tree_util.tree_flatten(x) for x in (of, back)]
+    assert pairs[0][1] == pairs[1][1]
+    for a, b in zip(pairs[0][0], pairs[1][0], strict=True):
+        if jax.dtypes.issubdtype(getattr(a, "dtype", float), jax.dtypes.prng_key):
+            a, b = jax.random.key_data(a), jax.random.key_data(b)
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+    with pytest.raises(ValueError, match="read-only"):
+        back.rows.gyro_bias[0] = 1.0
+
+
+def test_there_may_be_no_arrays_and_empty_ones(tmp_path):
+    for rows in (None, np.zeros((0, 3)), np.asfortranarray(np.arange(6.0).reshape(2, 3)), 7):
+        put(Of("a", rows), tmp_path / "kit")
+        back = take(tmp_path / "kit")
+        assert back.words == "a"
+        np.testing.assert_array_equal(back.rows, rows)
+
+
+def test_a_process_takes_no_memory_of_its_own_for_it(tmp_path):
+    put({"rows": np.arange(8e6)}, tmp_path / "kit")  # 64 MB
+    script = """if True:
+        import sys
+        from pathlib import Path
+        from robins.bench.parts.kits import take
+        def mb():
+            status = Path("/proc/self/status").read_text().splitlines()
+            return int(next(x for x in status if x.startswith("RssAnon")).split()[1]) / 1024
+        import numpy
+        before = mb()
+        rows = take(Path(sys.argv[1]))["rows"]
+        print(float(rows.sum()), mb() - before)
+    """
+    command = [sys.executable, "-c", script, str(tmp_path / "kit")]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    total, more = map(float, ran.stdout.split())
+    assert total == 8e6 * (8e6 - 1) / 2
+    assert more < 16.0
+
+
+def test_rows_are_those_of_the_run_beyond_a_block(monkeypatch):
+    monkeypatch.setattr(satellite, "_BLOCK", 17)
+    loop = Loop(kit(*SHORT)._replace()).run(60)  # a new one, whose parts are made now
+    for name, wanted in one_program(*SHORT).items():
+        np.testing.assert_array_equal(loop.all(*name.split(".")), wanted[:60])
