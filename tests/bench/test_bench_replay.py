@@ -271,6 +271,9 @@ def test_frames_too_many_and_too_few_are_told():
     found = replay(lacking, WIRE, "adm", starting(), 5.0)
     words = "step 8 (0.9 s): 'estimate' of 0.9 s, number 16, is said now and was not recorded"
     assert found.first_difference == words
+    last = [e for k, e in enumerate(story.entries) if k != 2 + 5 * (STEPS - 1) + 3]
+    found = replay(last, WIRE, "adm", starting(), 5.0)
+    assert f"number {2 * STEPS - 2}, is said now and was not recorded" in found.first_difference
     more = {"innovation": [0] * 3, "sigma": [0] * 3, "ratio": 0}
     story.back(encoded("innovation", 2 * STEPS, time_ns(60), **more))
     found = replay(story.entries, WIRE, "adm", starting(), 5.0)

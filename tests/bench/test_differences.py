@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 
+from robins.bench.recording import differences as module
 from robins.bench.recording.differences import FieldDifference, differences, name_of, table
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header
@@ -91,6 +92,22 @@ def test_numbers_that_differ():
     assert d.max_abs == max(abs(new[k] - old[k]) for k in old)
     assert d.max_rel == max(abs(new[k] - old[k]) / max(abs(new[k]), abs(old[k])) for k in old)
     assert name_of(d) == "estimate.gyro_bias[1]"
+
+
+def test_of_pieces_it_is_what_it_is_of_the_whole(monkeypatch):
+    """The greatest difference comes in any piece, and a piece may have none."""
+    a, rng = frames(), np.random.default_rng(5)
+    b = [
+        frame("estimate", f.header.time_ns // STEP_NS - 1, **estimate(rng))
+        if f.header.type == WIRE.message("estimate").number
+        else f
+        for f in a
+    ]
+    whole = differences(WIRE, a, b, STEP_NS)
+    assert {d.count for d in whole} == {STEPS}
+    monkeypatch.setattr(module, "_BATCH", 4)
+    assert differences(WIRE, a, b, STEP_NS) == whole
+    assert differences(WIRE, a, list(reversed(b)), STEP_NS) == whole
 
 
 def test_whole_numbers_differ_without_going_below_zero():
