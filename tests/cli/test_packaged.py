@@ -308,8 +308,8 @@ STANDS_FOR = {
     "docs/examples/balloon.py:study": "my_system.py:study",
     "docs/examples/pendulum.py:rig": "my_rig.py:rig",
 }
-# A reader's own devices, and pages that stay open until someone closes them.
-NEEDS_MORE = re.compile(r"/dev/|--live|bench node|> ")
+# A reader's own devices and autopilots, and pages that stay open until someone closes them.
+NEEDS_MORE = re.compile(r"/dev/|--live|bench node|> |autopilot=")
 
 
 def helps(command=app):

@@ -179,6 +179,8 @@ class Rig:
             named as `Flown` names them. With a console: (kit, steps, what was said) -> the same, or
             None where it cannot be compared.
         judge: figures of merit of a run; left out: none, and all numbers in its arrays.
+        once: (setup, part) -> why what the part was told cannot be told to it again, from a record
+            or after its death; "": it can.
         example: the part with which commands are shown; left out: its last.
         exported: the part that an exported filter can be, by the loop of that name among the files
             of `robins.bench.wire.c_header.firmware`; "": none.
@@ -206,6 +208,7 @@ class Rig:
     topics: Callable[[Any], Sequence[Topic]] = lambda kit: ()
     inside: Callable[..., Mapping[str, np.ndarray] | None] | None = None
     judge: Callable[[Flight, Ran], Judged] | None = None
+    once: Callable[[Any, str], str] = lambda setup, part: ""
     example: str = ""
     exported: str = ""
     address: str = ""

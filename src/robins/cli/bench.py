@@ -93,7 +93,7 @@ def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> 
     your own is named with its file, my_rig.py:rig.
 
     Scenarios of the bench: dark-sky, false-place, killed-adm, lost-gnss, lost-star, lost-wheel,
-    noisy-line, pointing-command, power-adm, sign-star, stuck-star, wrong-star.
+    noisy-line, pointing-command, power-adm, sign-star, stuck-star, windy-hover, wrong-star.
     """
     out = out or RESULTS / f"bench-{folder_name(scenario)}"
     outcome = carry_out(

@@ -191,6 +191,8 @@ def bench_replay(
     step_ns, told = int(first.header["step_ns"]), None
     if second is None:
         flight = recorded_flight(first.header, filter_)
+        if once := rig.once(flight.setup, node):
+            raise InputError(once, "--node", "compare two records with --diff")
         other = None if filter_ else program(flight.setup.ports.get(node, ""))
         with _starter(flight, node, other) as start:
             heard = replay(

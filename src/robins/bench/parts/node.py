@@ -18,8 +18,9 @@ from pathlib import Path
 
 from robins.bench.parts.kits import take
 from robins.bench.parts.station import Station, path_of, put_aside, ready, serve
-from robins.bench.ports.port import PortError, address, open_port
+from robins.bench.ports.port import address, open_port
 from robins.bench.rigs import rig_of
+from robins.errors import RobinsError
 
 REALTIME = "ROBINS_BENCH_REALTIME"  # set by the bench: ask for SCHED_FIFO
 _PRIORITY = 50
@@ -62,6 +63,14 @@ def few_collections() -> Iterator[None]:
 
 def main(arguments: Sequence[str]) -> int:
     """Be a part until the bench says stop, or is gone."""
+    try:
+        return _be(arguments)
+    except RobinsError as error:  # the bench tells people its last line
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _be(arguments: Sequence[str]) -> int:
     rig_name, name, port, kit_path, *more = arguments
     # An interrupt of the terminal is for the bench, which then tells its parts.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -81,11 +90,10 @@ def main(arguments: Sequence[str]) -> int:
     try:
         with open_port(address(port), timeout_s=None) as line:
             serve(line, station)
+    except RobinsError:  # of which some are OSErrors too
+        raise
     except OSError:  # of which pyserial's are
         return 0  # the bench is gone, and so are we
-    except PortError as error:
-        print(error, file=sys.stderr)
-        return 2
     return 0
 
 

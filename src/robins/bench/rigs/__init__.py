@@ -16,7 +16,7 @@ from robins.systems.catalogue import is_file
 
 __all__ = ["RIGS", "UnknownRig", "rig_of"]
 
-RIGS: tuple[str, ...] = ("satellite", "ins-gnss", "airship", "laboratory")
+RIGS: tuple[str, ...] = ("satellite", "ins-gnss", "airship", "laboratory", "multirotor")
 """Those that come with robins: each a module here, which calls it RIG."""
 
 

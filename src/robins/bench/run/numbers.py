@@ -72,7 +72,7 @@ def arrays_of(rig: Rig, flown: Flown) -> dict[str, Any]:
     """Every number as an array of the solution, with its unit."""
     out: dict[str, Any] = {}
     for m, f in kept_fields(rig):
-        values = flown[f"{m.name}.{f.name}"].reshape(1, len(flown.time_s), -1)
+        values = flown[f"{m.name}.{f.name}"].reshape(1, len(flown.time_s), f.length)
         about = {"unit": f.unit, "long_name": f"{m.name}: {f.name}", "comment": f.text}
         out |= array("value", values, f"{m.name}_{f.name}", axes=axes_of(f), frame=m.name, **about)
     return out

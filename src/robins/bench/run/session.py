@@ -35,6 +35,7 @@ from robins.bench.wire.records import Unsound
 
 HELLO_S = 120.0  # for all to compile and say hello
 REVIVED_S = 60.0
+_ANEW = '; on_death = "restart" would start it anew'
 _TELL_S = 0.2  # between two words on how far it is
 _MOST_DEATHS, _MINUTE_S = 3, 60.0  # of one part, by itself, until the run fails
 _GLANCE_NS = 50_000_000  # how often processes are looked at
@@ -468,7 +469,7 @@ class Session:
                 died, now = self._died.setdefault(part, []), time.monotonic()
                 died[:] = [*(at for at in died if now - at < _MINUTE_S), now]
             if setup.on_death == "fail" or self.broker.time_ns == 0:
-                raise BenchError(f'{fatal}; on_death = "restart" would start it anew')
+                raise BenchError(fatal + ("" if self.rig.once(setup, part) else _ANEW))
             if self.deaths > setup.restarts:
                 raise BenchError(f"{fatal}; that is one more than restarts = {setup.restarts}")
             if len(self._died.get(part, ())) >= _MOST_DEATHS:

@@ -81,6 +81,9 @@ class Setup(Parameters):
             raise ValueError(f"ports: there is no part '{unknown[0]}', only {', '.join(parts)}")
         if self.rate is not None and self.clock == "lockstep":
             raise ValueError('rate: a clock in lock-step has none; choose the clock "realtime"')
+        once = [why for part in parts if (why := self.rig.once(self, part))]
+        if once and self.on_death == "restart":
+            raise ValueError(f"on_death: {once[0]}; leave on_death out")
         if self.filter not in filters:
             if not any(filters):
                 raise ValueError(f"filter: the {self.rig.name} has none to choose: leave it out")

@@ -1,0 +1,146 @@
+"""A multirotor on the bench, flown by PX4 or ArduPilot, each as its makers built it, or by ours.
+
+The craft, its inertial unit with compass and barometer, its receiver and its autopilot, each on its
+own line. The part `autopilot` is ours, or the end of a socket that PX4's or ArduPilot's SITL is at.
+
+- `flight`: what a scenario may say, and what came of a run.
+- `craft`: the physics and the instruments.
+- `autopilots`: who flies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pydantic
+
+from robins.bench.broker.faults import Said
+from robins.bench.rig import Rig, later, named, packaged
+from robins.bench.wire.fields import Field, f64, message
+from robins.bench.wire.schema import Wire
+from robins.scenario import Quantity, default
+
+__all__ = ["MOTORS", "RIG", "WIRE"]
+
+MOTORS = ("front right", "rear left", "front left", "rear right")
+"""As PX4 and ArduPilot number those of a quadrotor in X, from 0 here."""
+_RATE, _FORCE, _SPEED, _FAR = 1e4, 1e4, 1e3, 1e5  # rad/s, m/s^2, m/s, m: far beyond any flight
+
+WIRE = Wire(
+    ("craft", "imu", "gnss", "autopilot"),
+    (
+        message(
+            16,
+            "motion",
+            "The craft as it truly is at the end of the step.",
+            f64("q_nb", 4, "1", "forward-right-down to north-east-down, scalar first", 2.0),
+            f64("omega_b", 3, "rad/s", "turn rate, forward-right-down", _RATE),
+            f64("p_n", 3, "m", "north, east, down of where it started", _FAR),
+            f64("v_n", 3, "m/s", "north, east, down", _SPEED),
+            f64("f_b", 3, "m/s^2", "specific force over the step, forward-right-down", _FORCE),
+        ),
+        message(
+            17,
+            "sample",
+            "A sample of the inertial unit, forward-right-down; NaN: not measured this time.",
+            f64("omega_b", 3, "rad/s", "turn rate", _RATE),
+            f64("f_b", 3, "m/s^2", "specific force", _FORCE),
+            f64("field_b", 3, "T", "magnetic flux density", 1.0, True),
+            f64("pressure", 1, "Pa", "of the air", 2e5, True),
+        ),
+        message(
+            18,
+            "fix",
+            "What the receiver found; NaN: nothing.",
+            f64("lat", 1, "rad", "latitude", 2.0, True),
+            f64("lon", 1, "rad", "longitude", 7.0, True),
+            f64("alt", 1, "m", "height above mean sea level", _FAR, True),
+            f64("v_n", 3, "m/s", "north, east, down", _SPEED, True),
+        ),
+        message(
+            19,
+            "motors",
+            "What the autopilot asks of the motors.",
+            Field("control", "f64", 4, "1", f"share of the most: {', '.join(MOTORS)}", (0.0, 1.0)),
+            Field("answered", "u8", 1, "1", "0: the autopilot has not begun to control", (0, 1)),
+        ),
+    ),
+)
+
+
+def _magnet(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+    """A magnet to the right of the compass."""
+    return {**said, "field_b": said["field_b"] + np.array([0.0, fault.field, 0.0])}
+
+
+def _blind(said: Mapping[str, Any], *_: Any) -> dict[str, Any]:
+    """No satellites."""
+    return {name: np.full(np.shape(x), np.nan) for name, x in said.items()}
+
+
+def _motor(said: Mapping[str, Any], fault: Any, _: int) -> dict[str, Any]:
+    """A motor that gives a share of what is asked, or nothing."""
+    share = np.ones(len(MOTORS))
+    share[fault.motor] = fault.left
+    return {**said, "control": said["control"] * share}
+
+
+_SAID = {
+    "magnet": Said("imu", "sample", "sensed", _magnet, ("field",)),
+    "blind": Said("gnss", "fix", "blind", _blind),
+    "motor": Said("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
+}
+_FAULTS: dict[str, Any] = {
+    "field": (
+        Annotated[float, Quantity("magnetic field", least="-1 mT", most="1 mT")],
+        default("20 uT"),
+    ),
+    "motor": (Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))] | None, None),
+    "left": (Annotated[float, Quantity("ratio", least="0", most="1")], default("0 %")),
+}
+_OPTIONS: dict[str, Any] = {
+    "autopilot": (Literal["own", "px4", "ardupilot"], "own"),
+    "address": (str, "127.0.0.1"),  # of this machine, where the autopilot connects
+    "port": (Annotated[int, pydantic.Field(ge=0, le=65535)], 0),  # 0: that of the autopilot
+}
+
+
+def _once(setup: Any, part: str) -> str:
+    """An autopilot that is a program of its own has a state that no record holds."""
+    if part != "autopilot" or setup.autopilot == "own":
+        return ""
+    return f"'{part}' is {setup.autopilot}, a program whose state no record holds"
+
+
+RIG = Rig(
+    name="multirotor",
+    wire=WIRE,
+    build={
+        "craft": later(f"{__name__}.craft:craft"),
+        "imu": later(f"{__name__}.craft:imu"),
+        "gnss": later(f"{__name__}.craft:gnss"),
+        "autopilot": later(f"{__name__}.autopilots:autopilot"),
+    },
+    sends={
+        "craft": ("motion",),
+        "imu": ("sample",),
+        "gnss": ("fix",),
+        "autopilot": ("motors",),
+    },
+    takes={
+        "craft": ("motors",),
+        "imu": ("motion",),
+        "gnss": ("motion",),
+        "autopilot": ("sample", "fix", "motion"),  # ArduPilot measures the motion by itself
+    },
+    parameters=lambda: named(f"{__name__}.flight:Multirotor"),
+    prepare=later(f"{__name__}.flight:prepare"),
+    truth="motion",
+    scenarios=packaged(__file__),
+    options=lambda: _OPTIONS,
+    said=lambda: (_SAID, _FAULTS),
+    judge=later(f"{__name__}.flight:judge"),
+    once=_once,
+)

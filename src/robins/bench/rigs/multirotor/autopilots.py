@@ -1,0 +1,219 @@
+"""Who flies the multirotor: our autopilot, or PX4's or ArduPilot's SITL at the end of a socket.
+
+Another program is waited for in `Part.rare`: once, in the process of the part, before its hello.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from robins.bench.bridges import ardupilot as of_ardupilot
+from robins.bench.bridges import px4 as of_px4
+from robins.bench.bridges.errors import BridgeClosed, BridgeTimeout
+from robins.bench.bridges.px4_messages import GnssFix, Sensors
+from robins.bench.parts.station import Inputs, Part
+from robins.bench.rigs.multirotor import craft
+from robins.bench.rigs.multirotor.craft import DOWN, G0, INERTIA_KG_M2, MASS_KG
+from robins.bench.rigs.multirotor.flight import Kit
+from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, rotate, to_rotvec
+
+CONNECT_S = 100.0  # that another program may take to start; the bench waits for a part a bit longer
+ANSWER_S = 10.0
+_AGAIN = "begin the run anew, then start the autopilot's SITL again"
+
+
+def autopilot(kit: Kit) -> Part:
+    """The autopilot that was asked for."""
+    return {"own": own, "px4": px4, "ardupilot": ardupilot}[kit.autopilot](kit)
+
+
+def _motors(shares: Any = (0.0,) * 4, answered: bool = True) -> dict[str, Any]:
+    return {"control": np.clip(np.asarray(shares, float), 0.0, 1.0), "answered": int(answered)}
+
+
+# ------------------------------------------------------------------------------------------ ours
+
+READY_S = 1.0  # that the instruments settle before the motors turn
+LEVEL_1_S, COMPASS, PLACE, SPEED = 0.1, 0.02, 0.1, 0.3  # shares of an error taken: by the second,
+# of a sample of the compass, of a fix
+CLIMB_M_S, PUSH_M_S2 = 2.0, 4.0  # limits
+HOLD_1_S, FOLLOW_1_S, LEAN_1_S2 = 1.0, 2.5, 2.0  # of position, of velocity, of what wind leaves
+TURN_1_S, RATE_1_S = 6.0, 20.0  # of attitude, of turn rate
+_UNMIX = np.linalg.inv(np.vstack([np.ones(4), craft.MIXER]))  # thrusts of a force and torques
+
+
+class Mind(NamedTuple):
+    """What ours believes of the craft, and the acceleration with which it leans on the wind."""
+
+    q_nb: Any  # (4,)
+    v_n: Any  # (3,) m/s
+    p_n: Any  # (3,) m, of the start
+    lean_n: Any  # (3,) m/s^2
+
+
+@jax.jit
+def believed(
+    s: Mind, omega_b: Any, f_b: Any, field_b: Any, fix: Any, field_n: Any, dt: Any
+) -> Mind:
+    """A step of strapdown, held to the vertical of a hover, to the compass and to the fixes.
+
+    A complementary filter of constant gains (Mahony, Hamel & Pflimlin, IEEE Trans. Automatic
+    Control 53, 2008). ``fix`` (6,) is position [m] and velocity [m/s], NED; NaN is missing.
+    """
+    q = multiply(s.q_nb, from_rotvec(dt * omega_b))
+    down = jnp.asarray(DOWN)
+    down_b = rotate(conjugate(q), down)
+    level_b = jnp.cross(-f_b / jnp.maximum(jnp.linalg.norm(f_b), 1.0), down_b)
+    seen = rotate(q, field_b)
+    sine = (seen[0] * field_n[1] - seen[1] * field_n[0]) / (
+        jnp.hypot(seen[0], seen[1]) * jnp.hypot(field_n[0], field_n[1])
+    )
+    heading = COMPASS * jnp.where(jnp.isfinite(sine), sine, 0.0)
+    q = multiply(q, from_rotvec(LEVEL_1_S * dt * level_b + heading * down_b))
+    v = s.v_n + dt * (rotate(q, f_b) + G0 * down)
+    p = s.p_n + dt * v
+    off = fix - jnp.concatenate([p, v])
+    off = jnp.where(jnp.isfinite(off), off, 0.0)
+    return Mind(q, v + SPEED * off[3:], p + PLACE * off[:3], s.lean_n)
+
+
+@jax.jit
+def controlled(s: Mind, omega_b: Any, height_m: Any, dt: Any) -> tuple[Mind, Any]:
+    """Position over velocity over attitude over rate; the motors' shares (4,), not yet limited."""
+    down = jnp.asarray(DOWN)
+    off = HOLD_1_S * (-height_m * down - s.p_n)
+    wanted = off * jnp.minimum(1.0, CLIMB_M_S / jnp.maximum(jnp.linalg.norm(off), 1e-9))
+    off = wanted - s.v_n
+    lean = jnp.clip(s.lean_n + dt * LEAN_1_S2 * off, -PUSH_M_S2, PUSH_M_S2)
+    f_n = jnp.clip(FOLLOW_1_S * off + lean, -PUSH_M_S2, PUSH_M_S2) - G0 * down
+    size = jnp.linalg.norm(f_n)
+    z = -f_n / size
+    y = jnp.cross(z, jnp.array([1.0, 0.0, 0.0]))  # the nose to the north
+    y = y / jnp.linalg.norm(y)
+    q_wanted = from_dcm(jnp.stack([jnp.cross(y, z), y, z], axis=1))
+    turn = to_rotvec(multiply(conjugate(s.q_nb), q_wanted))
+    torque = jnp.asarray(INERTIA_KG_M2) * RATE_1_S * (TURN_1_S * turn - omega_b)
+    thrust = jnp.asarray(_UNMIX) @ jnp.concatenate([MASS_KG * size[None], torque])
+    return s._replace(lean_n=lean), thrust / craft.MOST_N
+
+
+def own(kit: Kit) -> Part:
+    """Ours: hovers at the height of the scenario. Its state is its mind and the last sample."""
+    dt, nothing = kit.step_ns * 1e-9, np.full(6, np.nan)
+    none = np.zeros(3)
+    rest = {"omega_b": none, "f_b": -G0 * DOWN, "field_b": nothing[:3], "pressure": np.nan}
+    begin = (Mind(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none), rest)
+
+    def act(state: tuple[Mind, Any], k: int, inputs: Inputs):
+        mind, sample = state[0], inputs["sample"] or state[1]
+        fix = nothing
+        if (found := inputs["fix"]) is not None:
+            place = kit.p_n(np.array([found["lat"], found["lon"], found["alt"]]))
+            fix = np.concatenate([place, found["v_n"]])
+        seen = [sample[name] for name in ("omega_b", "f_b", "field_b")]
+        mind, asked = believed(mind, *seen, fix, kit.field_n_T, dt), _motors(answered=False)
+        if (k + 1) * dt > READY_S:
+            mind, shares = controlled(mind, sample["omega_b"], kit.given.height, dt)
+            asked = _motors(shares)
+        return (Mind(*map(np.asarray, mind)), sample), [("motors", asked)]
+
+    takes = {"sample": 0, "fix": 0}
+
+    def compiled() -> None:
+        act(begin, int(READY_S / dt) + 1, dict.fromkeys(takes))
+
+    return Part("autopilot", takes, lambda: begin, act, rare=compiled)
+
+
+# ---------------------------------------------------------------------------- programs of their own
+
+
+@contextmanager
+def _until_lost(line: of_px4.Px4Simulator | of_ardupilot.ArduPilotPhysics) -> Iterator[None]:
+    """What goes wrong ends the line, and says what to do about it."""
+    try:
+        yield
+    except BridgeClosed as error:
+        line.close()
+        raise BridgeClosed(error.what, error.where, _AGAIN) from None
+    except BridgeTimeout:
+        line.close()
+        raise
+
+
+def px4(kit: Kit) -> Part:
+    """The simulator's end of the line to PX4; while PX4 starts, the motors rest."""
+    lines: list[of_px4.Px4Simulator] = []
+
+    def connect() -> None:
+        lines.append(of_px4.Px4Simulator(kit.address, kit.port or of_px4.PORT))
+        with _until_lost(lines[0]):
+            lines[0].accept(CONNECT_S)
+
+    def act(last: dict[str, Any], k: int, inputs: Inputs):
+        time_us, sample, fix = (k + 1) * kit.step_ns // 1000, inputs["sample"], inputs["fix"]
+        with _until_lost(lines[0]):
+            if fix is not None and np.isfinite([fix["lat"], *fix["v_n"]]).all():
+                place = {"lat_rad": fix["lat"], "lon_rad": fix["lon"], "alt_m": fix["alt"]}
+                lines[0].send(GnssFix(time_us=time_us, **place, v_n_m_s=fix["v_n"]))
+            said = None if sample is None else lines[0].step(_sensors(time_us, sample))
+        if said is not None:
+            last = _motors(said.controls[:4] if said.armed else (0.0,) * 4)
+        return last, [("motors", last)]
+
+    takes = {"sample": 0, "fix": 0}
+    return Part("autopilot", takes, lambda: _motors(answered=False), act, rare=connect)
+
+
+def _sensors(time_us: int, sample: Mapping[str, Any]) -> Sensors:
+    now = np.isfinite([sample["pressure"], *sample["field_b"]]).all()
+    return Sensors(
+        time_us=time_us,
+        f_b_m_s2=sample["f_b"],
+        omega_ib_b_rad_s=sample["omega_b"],
+        field_b_T=sample["field_b"] if now else None,
+        pressure_Pa=sample["pressure"] if now else None,
+    )
+
+
+def ardupilot(kit: Kit) -> Part:
+    """The physics' end of the line to ArduPilot, which makes its own samples of the motion."""
+    lines: list[of_ardupilot.ArduPilotPhysics] = []
+
+    def asked(patience_s: float, fix: str) -> of_ardupilot.Servos:
+        servos, where = lines[0].receive(patience_s), f"ArduPilot at port {lines[0].port}"
+        if servos is None:
+            raise BridgeTimeout(f"nothing came within {patience_s:g} s", where, fix)
+        if servos.restarted:
+            raise BridgeClosed("it was started anew in the middle of the run", where)
+        return servos
+
+    def connect() -> None:
+        lines.append(of_ardupilot.ArduPilotPhysics(kit.address, kit.port or of_ardupilot.PORT))
+        with _until_lost(lines[0]):
+            asked(CONNECT_S, "start ArduPilot's SITL")
+
+    def act(last: dict[str, Any], k: int, inputs: Inputs):
+        if (motion := inputs["motion"]) is not None:
+            state = of_ardupilot.BodyState(
+                time_s=(k + 1) * kit.step_ns * 1e-9,
+                f_b_m_s2=motion["f_b"],
+                omega_ib_b_rad_s=motion["omega_b"],
+                position_n_m=motion["p_n"],
+                v_n_m_s=motion["v_n"],
+                q_nb=motion["q_nb"],
+            )
+            with _until_lost(lines[0]):
+                lines[0].reply(state)
+                pulses_us = asked(ANSWER_S, _AGAIN).pwm_us[:4]
+            # of 1000 to 2000 us; 0: this output does nothing
+            last = _motors([(us - 1000) / 1000 for us in pulses_us])
+        return last, [("motors", last)]
+
+    return Part("autopilot", {"motion": 0}, lambda: _motors(answered=False), act, rare=connect)
