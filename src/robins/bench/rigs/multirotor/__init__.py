@@ -92,12 +92,13 @@ _SAID = {
     "blind": Said("gnss", "fix", "blind", _blind),
     "motor": Said("autopilot", "motors", "said", _motor, ("motor", "left"), needs="motor"),
 }
+_MOTOR: Any = Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))]
 _FAULTS: dict[str, Any] = {
     "field": (
         Annotated[float, Quantity("magnetic field", least="-1 mT", most="1 mT")],
         default("20 uT"),
     ),
-    "motor": (Annotated[int, pydantic.Field(ge=0, lt=len(MOTORS))] | None, None),
+    "motor": (_MOTOR | None, None),
     "left": (Annotated[float, Quantity("ratio", least="0", most="1")], default("0 %")),
 }
 _OPTIONS: dict[str, Any] = {
