@@ -154,9 +154,9 @@ def test_from_a_design_to_a_board_in_three_commands(tmp_path, capsys):
 
 
 def test_what_is_no_part_of_a_rig_is_not_built(tmp_path, capsys):
-    of = ["export", "ins-gnss/drive", "--filter", "ekf", "--to", str(tmp_path / "c"), "--board"]
+    of = ["export", "rocket/a1", "--filter", "ekf", "--to", str(tmp_path / "c"), "--board"]
     assert main(of) == 2
-    assert "no part of the bench is made of a filter of ins-gnss" in capsys.readouterr().err
+    assert "no part of the bench is made of a filter of rocket" in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from robins.bench.run.setup import Flight, Setup
     from robins.bench.run.telemetry import Flown
     from robins.scenario import Parameters
+    from robins.systems.study import Problem
 
 
 class RigError(RobinsError, ValueError):
@@ -141,6 +142,20 @@ class View(NamedTuple):
     )
 
 
+class Aboard(NamedTuple):
+    """What a program is made of that stands for the exported part.
+
+    Attributes:
+        problem: of one contender, whose filter is exported.
+        library: name of the C of the filter, by which its loop calls it.
+        files: of the loop, by name, beside those of the wire.
+    """
+
+    problem: Problem
+    library: str
+    files: Mapping[str, str]
+
+
 class Spoken(NamedTuple):
     """What the operator said through the bench."""
 
@@ -183,7 +198,9 @@ class Rig:
             or after its death; "": it can.
         example: the part with which commands are shown; left out: its last.
         exported: the part that an exported filter can be, by the loop of that name among the files
-            of `robins.bench.wire.c_header.firmware`; "": none.
+            of `robins.bench.wire.c_header.firmware` or of `aboard`; "": none.
+        aboard: (flight) -> its filter and its loop, where these depend on the run; left out: the
+            filter of the scenario.
         address: by which processes find it; left out: its name.
     """
 
@@ -211,6 +228,7 @@ class Rig:
     once: Callable[[Any, str], str] = lambda setup, part: ""
     example: str = ""
     exported: str = ""
+    aboard: Callable[[Flight], Aboard] | None = None
     address: str = ""
 
     def __post_init__(self) -> None:

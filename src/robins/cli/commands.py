@@ -348,7 +348,8 @@ def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) 
     a page that says how to call it, and `make check`: it replays recorded steps and compares each
     state and each code with those of this program. With --float32 it runs the scenario in single
     precision too, and tells what that costs against the simulated truth. With --board it builds a
-    program that stands for the satellite's attitude determination on the bench.
+    program that stands for a part of the bench: the satellite's attitude determination, or the
+    navigation computer of INS/GNSS.
     """
     write(scenario, to, fast=not small, as_json=as_json, **options)
 

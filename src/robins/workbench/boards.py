@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 from robins import __version__, _float64, scenario
 from robins.bench.rig import Rig
 from robins.bench.rigs import RIGS, rig_of
+from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
 from robins.filters import SENTENCES, Code
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
@@ -89,14 +91,21 @@ def export_filter(
     _float64.require()
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise InputError("it is there and not empty", str(to), "name a new folder with --to.")
-    problem, wanted, label = _asked(name, filter_name, seed, settings)
+    rig = _rig_for(name) if board else None
+    if rig is not None and rig.aboard is not None:
+        if float32:
+            what = f"the {rig.name} is not navigated in single precision"
+            raise InputError(what, "--float32", "leave it out with --board")
+        asked = _aboard(rig, name, filter_name, seed, settings)
+    else:
+        asked = _asked(name, filter_name, seed, settings)
+    problem, wanted, label = asked.problem, asked.filter, asked.label
     if why := problem.contenders[wanted].on_host:
         what = f"filter '{wanted}' cannot be exported: {why}, which no program in C does"
         raise InputError(what, label, "choose another by --filter")
-    rig = _rig_for(label) if board else None
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
-    library, record, found = _library(problem, wanted, label, unroll, precision)
+    library, record, found = _library(asked, unroll, precision)
     c = library.source()
     files = {
         f"{library.name}.h": library.header(),
@@ -106,6 +115,7 @@ def export_filter(
         "Makefile": makefile(library),
         "README.md": _readme(library, wanted, label, found),
         **(firmware(rig.wire) if rig else {}),
+        **asked.files,
     }
     _write(to, files)
     made = _built(to, rig.exported) if rig else None
@@ -113,13 +123,13 @@ def export_filter(
     return Exported(to, tuple(files), wanted, scalars, len(c), precision.kind, found, made)
 
 
-def _rig_for(label: str) -> Rig:
-    """The rig of a system, of which a part can be an exported filter.
+def _rig_for(name: str) -> Rig:
+    """The rig of the system of a scenario, of which a part can be an exported filter.
 
     Raises:
         InputError: there is none.
     """
-    system = label.partition("/")[0]
+    system = find_scenario(name, recorded=True)[0].name
     rig = rig_of(system) if system in RIGS else None
     if rig is None or not rig.exported:
         what = f"no part of the bench is made of a filter of {system}"
@@ -146,28 +156,46 @@ def _built(folder: Path, part: str) -> Path:
     return folder / f"{part}_board"
 
 
-def _asked(
-    name: str, filter_name: str, seed: int, settings: Sequence[str]
-) -> tuple[Problem, str, str]:
-    """The problem by which a filter is tried, the filter's name, and how the problem is called."""
+class _Asked(NamedTuple):
+    """What is exported."""
+
+    problem: Problem  # by which the filter is tried
+    filter: str
+    label: str  # of the problem
+    library: str = "robins"
+    files: Mapping[str, str] = MappingProxyType({})  # of a loop around it
+
+
+def _aboard(rig: Rig, name: str, filter_name: str, seed: int, settings: Sequence[str]) -> _Asked:
+    """The filter as a part of a rig has it, in a run of this scenario, and the part's loop."""
+    assert rig.aboard is not None
+    options = {"seed": seed} | ({"filter": filter_name} if filter_name else {})
+    flight = changed(read(name, tuple(settings)), options)
+    made, label = rig.aboard(flight), find_scenario(name, recorded=True)[1]
+    return _Asked(made.problem, flight.setup.filter, label, made.library, made.files)
+
+
+def _asked(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> _Asked:
+    """The problem by which a filter is tried."""
     system, label, text = find_scenario(name, recorded=True)
     if system.aboard is not None and system.replay_parameters is not None:
         given = scenario.parse(system.replay_parameters, text, settings, source=name)
         wanted = filter_name or system.default
         check_filters(label, [system.default], [wanted])
         with refusing(name):
-            return system.aboard(given, seed), wanted, label
+            return _Asked(system.aboard(given, seed), wanted, label)
     one = read_scenario(name, (*settings, "runs=1"))  # which refuses what simulates nothing
     filters = one.study.filters
     wanted = filter_name or (system.default if system.default in filters else one.own[0])
     check_filters(label, filters, [wanted])
-    return one.problem((wanted,), seed), wanted, label
+    return _Asked(one.problem((wanted,), seed), wanted, label)
 
 
 def _library(
-    problem: Problem, name: str, label: str, unroll: int | None, precision: Precision
+    asked: _Asked, unroll: int | None, precision: Precision
 ) -> tuple[Library, Recorded, Cost | None]:
     """The filter as a library, some steps of it by JAX, and what single precision costs."""
+    problem, name, label = asked[:3]
     contender = problem.contenders[name]
     single = precision is SINGLE
     runs = board_runs(problem, name, RUNS if single else 1)
@@ -181,7 +209,7 @@ def _library(
     entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
     axes = tangent_axes(problem, contender.reported, len(belief.factor))
     notes = field_notes(problem, axes, belief.mean, run.given)
-    library = Library("robins", entries, run.start, (), notes, precision)
+    library = Library(asked.library, entries, run.start, (), notes, precision)
     identity = hashlib.sha256((library.header() + library.source()).encode()).hexdigest()
     about = (
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",

@@ -1,7 +1,8 @@
 """INS/GNSS on the bench: inertial unit, receiver, navigation computer, each on its own line.
 
 The plant is a simulated drive or a recorded log, or there is none: boards speak. The computer runs
-`robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`.
+`robins.systems.ins_gnss.LiveInsGnss`, whose epochs are those of `robins replay`. The computer can
+also be a program: `aboard`, and the C beside it.
 """
 
 from __future__ import annotations
@@ -121,4 +122,6 @@ RIG = Rig(
     view=later(f"{_OF}:view"),
     topics=later(f"{_OF}:topics"),
     judge=later(f"{_OF}:judge"),
+    exported="navigation",
+    aboard=later(f"{__name__}.aboard:aboard"),
 )

@@ -1,5 +1,5 @@
-/* What a board has to give the loop in gyro_board.c: its serial line, its clock, its gyros. That in
- * adm_board.c needs the line and the clock. */
+/* What a board has to give the loop in gyro_board.c: its serial line, its clock, its gyros. Loops of
+ * other parts need the line and the clock. */
 #ifndef ROBINS_PLATFORM_H
 #define ROBINS_PLATFORM_H
 
@@ -18,6 +18,7 @@ void write_bytes(const uint8_t *data, size_t size);
 /* A clock that never goes back. */
 uint64_t now_ns(void);
 
+#ifdef ROBINS_MOUNTED /* the wire has a rate table */
 /* A run begins: whatever the gyros have gathered is thrown away. */
 void begin_gyro(void);
 
@@ -27,5 +28,6 @@ void turn_table(uint64_t time_ns, const robins_mounted *mounted);
 
 /* The turn over the step that has ended at `time_ns` [rad], body axes; NaN: no sample of an axis. */
 void read_gyro(uint64_t time_ns, robins_gyro *sample);
+#endif
 
 #endif

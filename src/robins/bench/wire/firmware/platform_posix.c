@@ -81,6 +81,7 @@ uint64_t now_ns(void) {
   return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
 }
 
+#ifdef ROBINS_MOUNTED
 /* Attitudes of the table, body to inertial: of the last sample, and the last that came. */
 static double before[4], after[4];
 static uint64_t after_ns; /* 0: none came */
@@ -116,3 +117,4 @@ void read_gyro(uint64_t time_ns, robins_gyro *sample) {
   before_known |= came;
   memcpy(sample->theta_b, theta_b, sizeof theta_b);
 }
+#endif

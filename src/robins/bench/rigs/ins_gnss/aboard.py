@@ -1,0 +1,164 @@
+"""The navigation computer of INS/GNSS as a program: its filter, and its loop in C.
+
+What `LiveInsGnss` does around the filter is in C beside this file: `navigation_blocks.h` integrates
+samples and cuts them into blocks, `navigation_rest.h` tells when the vehicle rests,
+`navigation_start.h` finds the start, `navigation_board.c` has epochs, late fixes and the wire. By
+the drive or the log of the flight the filter is traced and tried, and the rates of samples and
+fixes are known.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import resources
+from typing import Any
+
+import jax
+import numpy as np
+
+from robins.bench.rig import Aboard, RigError
+from robins.bench.rigs.ins_gnss.navigating import Kit
+from robins.ins.blocks import reach_of_rate, usual_width
+from robins.ins.increments import Increments
+from robins.systems.ins_gnss import model
+from robins.systems.ins_gnss.log import recorded
+from robins.systems.ins_gnss.parameters import Replay
+from robins.systems.ins_gnss.recording import axes_of
+from robins.systems.parts import Block
+from robins.systems.study import Case, Problem
+
+_EPOCHS = 64  # of the drive or log, by which the filter is traced and tried
+_DELAY_S = 1.0  # how late a fix may be, as of `LiveInsGnss`
+_MOST_START_S = 600.0  # in which the start is sought, likewise
+_PATIENCE_S = 0.1  # for which stamps are elsewhere until they are believed, likewise
+_FIELDS = {
+    ("predict_input", "increments_dt"): "s, of each piece of the block; 0 for none",
+    ("predict_input", "increments_theta"): "rad, FRD: turn over it against the stars",
+    ("predict_input", "increments_dv"): "m/s, FRD at its beginning: specific force times time",
+    ("predict_input", "noise_scale"): "of the noise: 1, more where samples are missing",
+    ("update_gnss_position_reading", "lat"): "rad, of the antenna; NaN: no fix",
+    ("update_gnss_position_reading", "lon"): "rad",
+    ("update_gnss_position_reading", "alt"): "m, above the ellipsoid",
+}
+
+
+def aboard(flight: Any) -> Aboard:
+    """What the part `navigation` is made of, for the drive or the log of a flight.
+
+    Raises:
+        RigError: nobody speaks as imu or gnss, the log cannot be navigated, or the part is asked
+            for what the loop does not do.
+        robins.logs.LogError: a file of the log cannot be read.
+    """
+    kit: Kit = flight.rig.prepare(flight.setup, flight.given)
+    given, dataset = kit.given, kit.dataset
+    if dataset is None or dataset.gnss is None:
+        raise RigError("the filter is tried on a drive or a log, and there is none", "--board")
+    if given.start.known_heading is not None:
+        what = "start.known_heading is given, and the loop in C takes the heading from the course"
+        raise RigError(what, "--board", "leave it out")
+    if given.aids.non_holonomic:
+        what = "aids.non_holonomic is set, and the loop in C knows no road"
+        raise RigError(what, "--board", "--set aids.non_holonomic=false, here and on the bench")
+    try:
+        pieces, contender = recorded(dataset, given)
+    except ValueError as error:
+        raise RigError(f"it cannot be navigated: {error}", flight.name) from error
+    piece = pieces[0]
+    usual = usual_width(given.update.longest_block, 1.0 / kit.rates_hz[0]) + 8
+    world = _begun(piece.world, usual)
+    chosen = contender(flight.setup.filter)
+    problem = Problem(
+        epoch_s=piece.epoch_s[:_EPOCHS],
+        blocks=model.state_blocks(given.imu.scale_states),
+        sensors=model.SENSORS,
+        simulate=lambda run: world,
+        contenders={flight.setup.filter: chosen},
+        claims=lambda metrics: [],
+        fields=_FIELDS,
+    )
+    wide = not hasattr(chosen.case(world).start.mean, "q_nb")
+    told = _given_h(given, kit.rates_hz, world, "ins_" if wide else "")
+    here = resources.files("robins.bench.rigs.ins_gnss")
+    files = {name: (here / name).read_text("utf-8") for name in _FILES}
+    return Aboard(problem, "filter", {**files, "navigation_given.h": told})
+
+
+_FILES = tuple(f"navigation_{name}" for name in ("blocks.h", "board.c", "rest.h", "start.h"))
+_SENSORS = (model.POSITION, model.VELOCITY, model.STANDSTILL, model.STILL_RATE)
+
+
+def _begun(world: Case, width: int) -> Case:
+    """The first epochs of a piece, in blocks of so many pieces, with what is on the wire."""
+    heard = {name: world.y[name] for name in _SENSORS if name in world.y}
+    about = {name: world.aux[name] for name in heard if name in world.aux}
+    rows = world._replace(start=(), y=heard, aux=about)
+    first: Case = jax.tree_util.tree_map(lambda a: np.asarray(a)[:_EPOCHS], rows)
+    inc = first.u.increments
+    if np.any(inc.dt[:, width:] > 0.0):
+        what = f"a block of the first {_EPOCHS} holds more than {width} samples: stamps in bursts"
+        raise RigError(what, "--board", "give a log whose samples come evenly at its beginning")
+    more = max(0, width - inc.dt.shape[1])
+    padded = (np.pad(a, [(0, 0), (0, more), (0, 0)][: a.ndim])[:, :width] for a in inc[:3])
+    return first._replace(start=world.start, u=Block(Increments(*padded), first.u.noise_scale))
+
+
+def _given_h(given: Replay, rates_hz: tuple[float, float], world: Case, mean: str) -> str:
+    """`navigation_given.h`: what the part is told, and room for what it keeps."""
+    g, aids, longest_s = given.gnss, given.aids, given.update.longest_block
+    sample_s, fix_s = (1.0 / rate for rate in rates_hz)
+    window_s = fix_s if g.velocity_window is None else g.velocity_window
+    reach_s = reach_of_rate(sample_s)
+    epochs = math.ceil(_DELAY_S / min(longest_s, fix_s))
+    defined = {
+        "SAMPLE_S": sample_s,
+        "REACH_S": reach_s,  # about an epoch, in which rates are looked at
+        "LONGEST_S": longest_s,
+        "LONGEST_GAP_NS": f"{round(1e9 * given.update.longest_gap)}LL",
+        "PATIENCE": max(3, round(_PATIENCE_S * rates_hz[0])),
+        "GAP_NOISE": given.update.gap_noise,
+        "DELAY_S": _DELAY_S,
+        "BACK_S": _DELAY_S + 2.0 * reach_s + max(window_s, 1.5),
+        "WINDOW_S": window_s,
+        "LATENCY_S": g.latency,
+        "LEVER_ARM": ", ".join(map(repr, g.lever_arm)),
+        "LEAST_SIGMA": g.least_sigma,
+        "LEAST_VELOCITY_SIGMA": g.least_velocity_sigma,
+        "TILT": given.start.tilt,
+        "COURSE_SPEED": given.start.course_speed,
+        "MOVING_SPEED": aids.moving_speed,
+        "QUIET_RATE": aids.quiet_rate,
+        "QUIET_ACCEL": aids.quiet_accel,
+        "REST_WIDTH": max(2, round(aids.window / sample_s)),
+        "LEVEL_WIDTH": max(2, round(2.0 * aids.window / sample_s)),
+        "WAIT_S": 1.5 * max(1.0, fix_s),  # for which a fix tells whether the vehicle moves
+        "MOST_START_S": _MOST_START_S,
+        "STEPS": math.ceil(1.1 * _MOST_START_S / sample_s),
+        "FIXES": math.ceil(1.1 * _MOST_START_S / fix_s) + 64,
+        "PAST": 4 * epochs + 16,
+        "PIECES": world.u.increments.dt.shape[1],
+        "VELOCITIES": int(model.VELOCITY in world.y),
+        "REST": int(model.STANDSTILL in world.y),
+        "MEAN(field)": f"mean_{mean}##field",
+    }
+    axes = axes_of(given.imu.orientation).tolist()
+    rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in axes)
+    cases = [f"    case {int(k)}: return {v!r};" for k, v in sorted(g.sigma_factor.items())]
+    lines = [
+        "/* What the part was told when it was exported: s, m, m/s; sizes of what it keeps. */",
+        "#ifndef NAVIGATION_GIVEN_H",
+        "#define NAVIGATION_GIVEN_H",
+        *(f"#define {name} {value}" for name, value in defined.items()),
+        "/* from the axes of the unit to forward-right-down */",
+        f"static const double C_BS[3][3] = {{{rows}}};",
+        "/* by which the sigmas of a fix of this quality are multiplied */",
+        "static inline double factor_of(int quality) {",
+        "  switch (quality) {",
+        *cases,
+        "    default: return 1.0;",
+        "  }",
+        "}",
+        "#endif",
+        "",
+    ]
+    return "\n".join(lines)
