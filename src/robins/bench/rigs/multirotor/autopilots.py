@@ -19,8 +19,9 @@ from robins.bench.bridges.errors import BridgeClosed, BridgeTimeout
 from robins.bench.bridges.px4_messages import GnssFix, Sensors
 from robins.bench.parts.station import Inputs, Part
 from robins.bench.rigs.multirotor import craft
-from robins.bench.rigs.multirotor.craft import DOWN, G0, INERTIA_KG_M2, MASS_KG
+from robins.bench.rigs.multirotor.craft import DOWN, INERTIA_KG_M2, MASS_KG
 from robins.bench.rigs.multirotor.flight import Kit
+from robins.earth.atmosphere import G0
 from robins.rotation import conjugate, from_dcm, from_rotvec, multiply, rotate, to_rotvec
 
 CONNECT_S = 100.0  # that another program may take to start; the bench waits for a part a bit longer
