@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from robins.bench.run.setup import Flight, Setup
     from robins.bench.run.telemetry import Flown
     from robins.scenario import Parameters
-    from robins.systems.study import Problem
 
 
 class RigError(RobinsError, ValueError):
@@ -146,12 +145,12 @@ class Aboard(NamedTuple):
     """What a program is made of that stands for the exported part.
 
     Attributes:
-        problem: of one contender, whose filter is exported.
+        problem: a `robins.systems.study.Problem` of one contender, whose filter is exported.
         library: name of the C of the filter, by which its loop calls it.
         files: of the loop, by name, beside those of the wire.
     """
 
-    problem: Problem
+    problem: Any
     library: str
     files: Mapping[str, str]
 

@@ -36,7 +36,7 @@ DAMPING = 2e-3  # N m s/rad
 FIX_S, SLOW_S = 0.2, 0.02  # between two fixes; between two of compass and barometer
 
 
-class State(NamedTuple):
+class Airframe(NamedTuple):
     """The craft."""
 
     q_nb: Any  # (4,)
@@ -47,14 +47,14 @@ class State(NamedTuple):
     f_b: Any  # (3,) m/s^2, over the last step
 
 
-def at_rest() -> State:
+def at_rest() -> Airframe:
     """Level, its nose to the north, on the ground."""
     none = np.zeros(3)
-    return State(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, np.zeros(4), -G0 * DOWN)
+    return Airframe(np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, np.zeros(4), -G0 * DOWN)
 
 
 @jax.jit
-def moved(s: State, control: Any, wind_n: Any, dt: Any) -> State:
+def moved(s: Airframe, control: Any, wind_n: Any, dt: Any) -> Airframe:
     """A step of dt [s] on, with what is asked of the motors (4,) in [0, 1]; wind (3,) [m/s] NED."""
     down, inertia = jnp.asarray(DOWN), jnp.asarray(INERTIA_KG_M2)
     thrust = s.thrust + (1.0 - jnp.exp(-dt / LAG_S)) * (MOST_N * control - s.thrust)
@@ -65,9 +65,9 @@ def moved(s: State, control: Any, wind_n: Any, dt: Any) -> State:
     drag_b = -DRAG_KG_S * rotate(conjugate(q), s.v_n - wind_n)
     f_b = (drag_b - down * jnp.sum(thrust)) / MASS_KG
     v = s.v_n + dt * (rotate(q, f_b) + G0 * down)
-    flies = State(q, omega, s.p_n + dt * v, v, thrust, f_b)
+    flies = Airframe(q, omega, s.p_n + dt * v, v, thrust, f_b)
     still = jnp.zeros(3)
-    stands = State(s.q_nb, still, s.p_n, still, thrust, -G0 * rotate(conjugate(s.q_nb), down))
+    stands = Airframe(s.q_nb, still, s.p_n, still, thrust, -G0 * rotate(conjugate(s.q_nb), down))
     on_ground = (s.p_n[2] >= 0.0) & (v[2] >= 0.0)
     return jax.tree_util.tree_map(lambda a, b: jnp.where(on_ground, a, b), stands, flies)
 
@@ -77,10 +77,10 @@ def craft(kit: Kit) -> Part:
     wind_n, dt = np.asarray(kit.given.wind), kit.step_ns * 1e-9
     begin = (at_rest(), np.zeros(4))
 
-    def act(state: tuple[State, Any], k: int, inputs: Inputs):
+    def act(state: tuple[Airframe, Any], k: int, inputs: Inputs):
         asked = inputs["motors"]
         control = state[1] if asked is None else asked["control"]
-        after = State(*map(np.asarray, moved(state[0], control, wind_n, dt)))
+        after = Airframe(*map(np.asarray, moved(state[0], control, wind_n, dt)))
         said = {name: getattr(after, name) for name in ("q_nb", "omega_b", "p_n", "v_n", "f_b")}
         return (after, control), [("motion", said)]
 
