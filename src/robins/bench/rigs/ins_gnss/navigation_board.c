@@ -4,7 +4,8 @@
  * It does what the part "navigation" does: samples are integrated, blocks of them end at fixes and
  * where they get too long, and a block is taken once its end lies a little behind the newest sample.
  * A late fix goes back to the epoch before it. What the part was told is in navigation_given.h. */
-#include "platform.h"
+#define PART ROBINS_PART_NAVIGATION
+#include "part_loop.h"
 #include "navigation_start.h"
 
 #define AHEAD_S 10.0 /* of the newest sample, by which a fix may be */
@@ -14,7 +15,6 @@ enum { STARTING = 1, REFUSED = 2 }; /* of the state */
 
 typedef struct { double time_s, wanted_s; int number; filter_state state; } epoch; /* see the part */
 
-static uint32_t run, sequence, next; /* run 0: none; next: the step that has not been done yet */
 static robins_sample sample; /* what came, and the ends of its steps */
 static robins_fix fix;
 static uint64_t sample_ns, fix_ns;
@@ -27,13 +27,7 @@ static int kept, waiting; /* of past (0: not begun), told */
 
 static robins_state state; /* what was answered */
 static robins_epoch passed;
-static robins_done done;
 static int says_state, says_epoch;
-
-static void send(uint8_t type, uint64_t time_ns, const void *payload, size_t size) {
-  static uint8_t out[ROBINS_MOST_FRAME];
-  write_bytes(out, robins_encode(type, run, sequence++, time_ns, payload, size, out));
-}
 
 static void forget_all(void) { samples = count = heard = kept = 0, calmest = INFINITY; }
 
@@ -229,7 +223,7 @@ static int take_fix(void) {
 static int starting(void) { return kept ? 0 : STARTING; }
 
 /* All of a step: what came, then the state at the newest sample, by what it predicts from the epoch. */
-static void navigate(uint64_t time_ns) {
+static void compute(uint64_t time_ns) {
   static filter_state ahead;
   int flags = 0;
   uint64_t stamp = 0;
@@ -257,42 +251,18 @@ static void navigate(uint64_t time_ns) {
   if (says_epoch) passed = told[0], memmove(told, told + 1, sizeof *told * (size_t)--waiting);
 }
 
-static void begin(uint32_t number) {
-  run = number, sequence = next = 0;
+static void begin_anew(void) {
   sample_ns = fix_ns = 0;
   opened = elsewhere = waiting = 0;
   forget_all();
 }
 
-static void take(robins_header head, const uint8_t *payload) {
-  if (head.type == ROBINS_BEGIN && head.run != run) begin(head.run);
-  if (!run || head.run != run) return; /* an earlier run left it in a buffer */
-  if (head.type == ROBINS_STOP) run = sequence = 0;
+static void hear(robins_header head, const uint8_t *payload) {
   if (head.type == ROBINS_SAMPLE) memcpy(&sample, payload, sizeof sample), sample_ns = head.time_ns;
   if (head.type == ROBINS_FIX) memcpy(&fix, payload, sizeof fix), fix_ns = head.time_ns;
-  if (head.type != ROBINS_TICK) return;
-  uint32_t number = ((const robins_tick *)payload)->step;
-  if (number >= next) {
-    uint64_t began_ns = now_ns();
-    navigate(head.time_ns);
-    done.step = number, done.compute = (uint32_t)(now_ns() - began_ns);
-    next = number + 1;
-  }
-  if (number + 1 != next) return; /* its answer is forgotten */
-  if (says_state) send(ROBINS_STATE, head.time_ns, &state, sizeof state);
-  if (says_epoch) send(ROBINS_EPOCH, head.time_ns, &passed, sizeof passed);
-  send(ROBINS_DONE, head.time_ns, &done, sizeof done);
 }
 
-int main(int argc, char **argv) {
-  static const robins_hello hello = {ROBINS_PART_NAVIGATION, ROBINS_SCHEMA};
-  static robins_receiver in;
-  uint8_t byte;
-  open_line(argc > 1 ? argv[1] : "");
-  for (uint64_t hello_ns = 0;;) {
-    if (read_bytes(&byte, 1) && robins_message(&in, byte)) take(robins_head(&in), robins_payload(&in));
-    if (run || now_ns() < hello_ns) continue;
-    send(ROBINS_HELLO, 0, &hello, sizeof hello);
-    hello_ns = now_ns() + 500000000u;
-  }
+static void answer(uint64_t time_ns) {
+  if (says_state) send(ROBINS_STATE, time_ns, &state, sizeof state);
+  if (says_epoch) send(ROBINS_EPOCH, time_ns, &passed, sizeof passed);
 }

@@ -10,7 +10,8 @@
  * star frame after the gyro is back. */
 #include <math.h>
 
-#include "platform.h"
+#define PART ROBINS_PART_ADM
+#include "part_loop.h"
 #include "robins.h"
 
 #ifndef STAR_STEPS
@@ -22,7 +23,6 @@
 
 enum { USED = 1, REFUSED = 2, HELD = 4, SAFE = 8, SILENT = 16, SHORT = 32 }; /* of the estimate */
 
-static uint32_t run, sequence, next; /* run 0: none; next: the step that has not been done yet */
 static robins_state filter;
 static robins_predict_input turn; /* of the last step that the gyro told */
 static uint32_t gyro_age, since_star;
@@ -34,13 +34,7 @@ static uint64_t gyro_ns, star_ns;
 
 static robins_innovation innovation; /* what was answered */
 static robins_estimate estimate;
-static robins_done done;
 static int heard;
-
-static void send(uint8_t type, uint64_t time_ns, const void *payload, size_t size) {
-  static uint8_t out[ROBINS_MOST_FRAME];
-  write_bytes(out, robins_encode(type, run, sequence++, time_ns, payload, size, out));
-}
 
 static int finite(const double *x, int count) {
   for (int k = 0; k < count; k++) {
@@ -49,8 +43,7 @@ static int finite(const double *x, int count) {
   return 1;
 }
 
-static void begin(uint32_t number) {
-  run = number, sequence = next = 0;
+static void begin_anew(void) {
   gyro_ns = star_ns = 0;
   gyro_age = since_star = 0;
   lost = 0;
@@ -105,7 +98,7 @@ static int updates(void) {
   return flags | (code == 0 ? USED : 0) | (code == 3 ? REFUSED : 0);
 }
 
-static void determine(uint64_t time_ns) {
+static void compute(uint64_t time_ns) {
   heard = 0;
   int flags = predicts(time_ns);
   if (star_ns == time_ns) flags |= updates();
@@ -122,35 +115,12 @@ static void determine(uint64_t time_ns) {
   estimate.flags = (uint8_t)flags;
 }
 
-static void take(robins_header head, const uint8_t *payload) {
-  if (head.type == ROBINS_BEGIN && head.run != run) begin(head.run);
-  if (!run || head.run != run) return; /* an earlier run left it in a buffer */
-  if (head.type == ROBINS_STOP) run = sequence = 0;
+static void hear(robins_header head, const uint8_t *payload) {
   if (head.type == ROBINS_GYRO) memcpy(&gyro, payload, sizeof gyro), gyro_ns = head.time_ns;
   if (head.type == ROBINS_STAR) memcpy(&star, payload, sizeof star), star_ns = head.time_ns;
-  if (head.type != ROBINS_TICK) return;
-  uint32_t step = ((const robins_tick *)payload)->step;
-  if (step >= next) {
-    uint64_t began_ns = now_ns();
-    determine(head.time_ns);
-    done.step = step, done.compute = (uint32_t)(now_ns() - began_ns);
-    next = step + 1;
-  }
-  if (step + 1 != next) return; /* its answer is forgotten */
-  if (heard == 1) send(ROBINS_INNOVATION, head.time_ns, &innovation, sizeof innovation);
-  send(ROBINS_ESTIMATE, head.time_ns, &estimate, sizeof estimate);
-  send(ROBINS_DONE, head.time_ns, &done, sizeof done);
 }
 
-int main(int argc, char **argv) {
-  static const robins_hello hello = {ROBINS_PART_ADM, ROBINS_SCHEMA};
-  static robins_receiver in;
-  uint8_t byte;
-  open_line(argc > 1 ? argv[1] : "");
-  for (uint64_t hello_ns = 0;;) {
-    if (read_bytes(&byte, 1) && robins_message(&in, byte)) take(robins_head(&in), robins_payload(&in));
-    if (run || now_ns() < hello_ns) continue;
-    send(ROBINS_HELLO, 0, &hello, sizeof hello);
-    hello_ns = now_ns() + 500000000u;
-  }
+static void answer(uint64_t time_ns) {
+  if (heard == 1) send(ROBINS_INNOVATION, time_ns, &innovation, sizeof innovation);
+  send(ROBINS_ESTIMATE, time_ns, &estimate, sizeof estimate);
 }

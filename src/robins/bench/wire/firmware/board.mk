@@ -3,5 +3,5 @@ CC ?= cc
 CFLAGS ?= -std=c99 -O2 -Wall -Wextra
 
 # the numbers of a filter are those of the host where a product and a sum are rounded apart
-%_board: %_board.c platform_posix.c platform.h robins_wire.h
+%_board: %_board.c platform_posix.c part_loop.h platform.h robins_wire.h
 	$(CC) $(CFLAGS) -ffp-contract=off -o $@ $< $(wildcard robins.c filter.c) platform_posix.c -lm
