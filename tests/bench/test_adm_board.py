@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stations import Loop, kit, on_threads
+from stations import Loop, kit, on_threads, parts
 from test_firmware import SANITISERS, Board, build, sanitised, unpacked
 
 from robins.bench.ports.cable import cable
@@ -28,6 +28,7 @@ STEPS = 170
 # Steps in which something does not reach the filter: one sample of the gyro, two in a row, frames
 # of the star sensor for longer than it may be silent; and a frame of no length.
 NO_GYRO, NO_STAR, NO_LENGTH = (30, 60, 61), range(90, 130), range(48, 53)
+RESET = 147  # by the operator, before this step
 
 
 @pytest.fixture(scope="module")
@@ -60,22 +61,27 @@ def flown(of, meddled):
             reached[step][name] = WIRE.decode(name, payload)
         return [((step + 1) * of.step_ns, payload)]
 
-    return reached, Loop(of, meddle).run(STEPS)
+    loop = Loop(of, meddle).run(RESET)
+    if meddled:
+        reached[RESET]["mode"] = {"mode": 2, "reset": 1}
+        payload = WIRE.encode("mode", reached[RESET]["mode"])
+        loop.to("adm", "mode", payload, RESET * of.step_ns)
+    return reached, loop.run(STEPS - RESET)
 
 
-def answers(program, of, reached):
-    """What the board answers to the same, by message, with the steps of innovations."""
+def answers(program, of, reached, first=0):
+    """What the board answers to the same from a step on, by message."""
     told = {"estimate": [], "innovation": [], "done": []}
     with open_pair() as pair:
         board = Board(program, pair)
         try:
-            board.begin(5)
-            for k, inputs in enumerate(reached):
+            board.begin(5, of.step_ns)
+            for k, inputs in enumerate(reached[first:], first):
                 time_ns = (k + 1) * of.step_ns
                 for name, values in inputs.items():
-                    board.send(name, time_ns, **values)
+                    board.send(name, time_ns - of.step_ns * (name == "mode"), **values)
                 board.send("tick", time_ns, step=k)
-                while len(told["done"]) <= k:
+                while len(told["done"]) <= k - first:
                     frame = board.frame()
                     assert frame is not None, f"no answer in step {k}"
                     name = WIRE.message(frame.header.type).name
@@ -104,6 +110,23 @@ def test_it_says_what_the_part_says_whatever_is_missing(program, of):
     np.testing.assert_array_equal(flags, loop.flags())
     for flag in (HELD, SAFE, SHORT, SILENT, USED):
         assert np.any(flags & flag)
+
+
+def test_one_that_comes_late_waits_for_a_star_frame_as_the_part_does(program, of):
+    """As after a loss of power: its state is not that of the run."""
+    reached, _ = flown(of, meddled=False)
+    told, part = answers(program, of, reached, first=52)["estimate"], parts(of)["adm"]
+    state, wanted = part.begin(), []
+    for k in range(52, STEPS):
+        state, said = part.act(state, k, {name: reached[k].get(name) for name in part.takes})
+        wanted.append(dict(said)["estimate"])
+    flags = all_of(told, "flags")
+    np.testing.assert_array_equal(flags, all_of(wanted, "flags"))
+    assert flags[0] & SAFE
+    assert not flags[-1] & SAFE
+    for field in ("q_ib", "gyro_bias", "sigma"):
+        got, want = all_of(told, field), all_of(wanted, field)
+        np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-15, err_msg=field)
 
 
 def test_it_has_the_bits_of_the_same_filter_in_c_on_the_host(program, of):

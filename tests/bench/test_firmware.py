@@ -103,13 +103,13 @@ class Board:
         assert WIRE.message(one.header.type).name == name
         return one.header, WIRE.decode(name, one.payload)
 
-    def begin(self, run: int) -> None:
+    def begin(self, run: int, step_ns: int = STEP_NS) -> None:
         """Answer a hello."""
         self.run = 0
         self.got("hello")
         self.run, self.sequence = run, 0
         self.waiting.clear()
-        self.send("begin", step=STEP_NS)
+        self.send("begin", step=step_ns)
 
     def step(self, k: int, q_ib=None) -> np.ndarray:
         """Attitude, tick, and what comes of it."""

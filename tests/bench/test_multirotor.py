@@ -204,6 +204,8 @@ def test_it_hovers_in_wind(run):
     assert said.metrics["heading_rms_deg"] < 1.0
     assert said.counts["steps_without_control"] == 250  # the first second
     assert not said.warnings
+    off_n = said.arrays["error_position"].values[0]
+    np.testing.assert_allclose(off_n[-1], of["motion.p_n"][-1] + [0.0, 0.0, 2.0])
     # it leans into the wind as far as drag and weight say, and carries both
     last = slice(-500, None)
     turned = Rotation.from_quat(of["motion.q_nb"][last], scalar_first=True)

@@ -29,6 +29,7 @@ from robins.report import numbers
         ("euler", "Euler angles", ""),
         ("accel_bias_rms_mg", "Accelerometer bias RMS", "mg"),
         ("step_us", "Step", "µs"),
+        ("cycles_per_s", "Cycles", "1/s"),
         ("updates", "Updates", ""),
         ("m", "M", ""),
     ],

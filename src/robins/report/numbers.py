@@ -14,7 +14,7 @@ _PARTS = {
     **{u: u for u in ("deg", "arcmin", "arcsec", "rad", "mrad", "m", "km", "cm", "mm", "s", "ms")},
     **{u: u for u in ("h", "mg")},
     **{"ug": "µg", "ut": "µT", "us": "µs", "s2": "s²", "hz": "Hz", "percent": "%"},
-    **{"mps": "m/s", "m_s": "m/s", "deg_s": "deg/s", "arcsec_s": "arcsec/s"},
+    **{"per_s": "1/s", "mps": "m/s", "m_s": "m/s", "deg_s": "deg/s", "arcsec_s": "arcsec/s"},
     **{"sqrt_h": "√h", "sqrt_s": "√s", "sqrt_hz": "√Hz"},
 }
 _PART = "|".join(sorted(_PARTS, key=len, reverse=True))

@@ -13,7 +13,7 @@ from robins.bench.run.telemetry import Flown
 from robins.bench.wire.fields import Field, Message
 from robins.results import array
 
-_AXES = ("x", "y", "z")
+_AXES, _WXYZ = "xyz", "wxyz"
 
 
 def kept_fields(rig: Rig) -> list[tuple[Message, Field]]:
@@ -24,6 +24,8 @@ def kept_fields(rig: Rig) -> list[tuple[Message, Field]]:
 
 def axes_of(f: Field) -> list[str]:
     """Names of the components of a field."""
+    if f.length == len(_WXYZ) and f.name.startswith("q_"):
+        return list(_WXYZ)
     return list(_AXES) if f.length == len(_AXES) else [str(k) for k in range(f.length)]
 
 

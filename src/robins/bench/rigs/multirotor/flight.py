@@ -12,6 +12,7 @@ from robins.bench.run.numbers import arrays_of, figures_of
 from robins.bench.run.setup import counted_from
 from robins.earth import curvature_radii
 from robins.earth.magnetic import field_n, wmm_for
+from robins.results import array
 from robins.rotation import to_dcm
 from robins.scenario import Parameters, Quantity, default
 
@@ -85,13 +86,13 @@ def prepare(setup: Any, given: Multirotor) -> Kit:
 def judge(flight: Any, ran: Any) -> Judged:
     """How far it was from where it is to hover, how it leaned, and where its nose was."""
     flown, height_m = ran.flown, flight.given.height
-    first = counted_from(flight, ran.steps)
-    p_n, q_nb = (flown[f"motion.{name}"][first:] for name in ("p_n", "q_nb"))
-    known = np.isfinite(p_n).all(axis=1)
+    off_n = flown["motion.p_n"] + np.array([0.0, 0.0, height_m])
+    known = np.isfinite(off_n).all(axis=1)
+    known[: counted_from(flight, ran.steps)] = False
     metrics: dict[str, float | None] = {}
     if known.any():
-        off_m = np.linalg.norm(p_n[known] + np.array([0.0, 0.0, height_m]), axis=1)
-        C_nb = to_dcm(q_nb[known])
+        off_m = np.linalg.norm(off_n[known], axis=1)
+        C_nb = to_dcm(flown["motion.q_nb"][known])
         tilt_rad = np.arccos(np.clip(C_nb[:, 2, 2], -1.0, 1.0))
         heading_rad = np.arctan2(C_nb[:, 1, 0], C_nb[:, 0, 0])
         metrics = {
@@ -102,10 +103,12 @@ def judge(flight: Any, ran: Any) -> Judged:
         }
     silent = int(np.sum(flown["motors.answered"] == 0))
     never = ["the autopilot never controlled the motors"] * (silent == len(flown.time_s))
+    about = {"unit": "m", "comment": "Where the craft is, less where it is to hover."}
+    off = array("error", off_n[None], "position", axes=("north", "east", "down"), **about)
     return Judged(
         metrics,
         {"steps_without_control": silent},
         never,
-        arrays_of(flight.rig, flown),
+        off | arrays_of(flight.rig, flown),
         figures_of(metrics),
     )

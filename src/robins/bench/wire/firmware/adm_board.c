@@ -30,7 +30,7 @@ static int lost; /* waits for a star frame to begin anew */
 
 static robins_gyro gyro; /* what came, and the ends of its steps */
 static robins_star star;
-static uint64_t gyro_ns, star_ns;
+static uint64_t gyro_ns, star_ns, reset_ns, step_ns;
 
 static robins_innovation innovation; /* what was answered */
 static robins_estimate estimate;
@@ -44,7 +44,7 @@ static int finite(const double *x, int count) {
 }
 
 static void begin_anew(void) {
-  gyro_ns = star_ns = 0;
+  gyro_ns = star_ns = 0, reset_ns = UINT64_MAX;
   gyro_age = since_star = 0;
   lost = 0;
   memset(&turn, 0, sizeof turn); /* before the first sample: at rest */
@@ -59,6 +59,8 @@ static int predicts(uint64_t time_ns) {
   if (came) memcpy(turn.value, theta_b, sizeof theta_b);
   gyro_age = came ? 0 : gyro_age + 1;
   lost |= gyro_age > 1;
+  lost |= !next && time_ns > step_ns; /* it was without power until now */
+  if (reset_ns == time_ns - step_ns) robins_init(&filter), lost = 1; /* said after the step before */
   if (!lost) robins_predict(&filter, &turn, &moved);
   return came ? 0 : HELD;
 }
@@ -116,8 +118,10 @@ static void compute(uint64_t time_ns) {
 }
 
 static void hear(robins_header head, const uint8_t *payload) {
+  if (head.type == ROBINS_BEGIN) step_ns = ((const robins_begin *)payload)->step;
   if (head.type == ROBINS_GYRO) memcpy(&gyro, payload, sizeof gyro), gyro_ns = head.time_ns;
   if (head.type == ROBINS_STAR) memcpy(&star, payload, sizeof star), star_ns = head.time_ns;
+  if (head.type == ROBINS_MODE && ((const robins_mode *)payload)->reset) reset_ns = head.time_ns;
 }
 
 static void answer(uint64_t time_ns) {
