@@ -22,6 +22,7 @@ from robins.bench.run.setup import changed, read
 from robins.earth import dcm_en, ecef_from_geodetic
 from robins.earth.atmosphere import pressure_altitude_m
 from robins.earth.magnetic import elements
+from robins.results.solution import check
 from robins.scenario import ScenarioError
 from robins.workbench import InputError, bench_replay, bench_up
 
@@ -266,6 +267,7 @@ def test_it_flies_by_processes_dies_in_between_and_its_record_is_heard_again(tmp
     outcome = bench_up(str(path), record=tmp_path / "record.mcap")
     assert outcome.failure == ""
     assert outcome.metrics["multirotor"]["position_rms_m"] < 0.5
+    check(outcome.solution)  # it can be written
     _, kit = kit_of(*CALM)
     wanted = flown(RIG, kit, 1000)[0]
     p_n = outcome.solution["value_motion_p_n"].values[0]

@@ -103,7 +103,8 @@ def judge(flight: Any, ran: Any) -> Judged:
         }
     silent = int(np.sum(flown["motors.answered"] == 0))
     never = ["the autopilot never controlled the motors"] * (silent == len(flown.time_s))
-    about = {"unit": "m", "comment": "Where the craft is, less where it is to hover."}
+    caption = "Where the craft is, less where it is to hover."
+    about = {"unit": "m", "frame": "NED", "comment": caption}
     off = array("error", off_n[None], "position", axes=("north", "east", "down"), **about)
     return Judged(
         metrics,
