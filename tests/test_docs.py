@@ -1,7 +1,7 @@
 """The documents are true: their examples run, and their docstrings show what was typed.
 
-Each example is compiled, and what it imports and calls is looked up. Of pages of one kind, such as those
-of filters on a few numbers, some are also run; `make certify` runs all.
+Each example is compiled, and what it imports and calls is looked up. Of pages of one kind, such as
+those of filters on a few numbers, some are also run; `make certify` runs all.
 """
 
 import ast
@@ -110,7 +110,7 @@ def looked_up(node: ast.AST, bound: dict[str, object]) -> object:
 
 
 def fits(page: Path) -> int:
-    """Compile the examples of a page; look up their imports and bind the arguments of robins' functions.
+    """Compile the examples of a page, look up their imports and bind arguments of robins' functions.
 
     Returns:
         How many calls of functions of robins it found.
