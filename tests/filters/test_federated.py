@@ -196,7 +196,7 @@ def test_a_silent_filter_hands_its_share_to_the_others(given):
     both, alone = Model(motion, tuple(sensors)), Model(motion, (sensors[0],))
     one = federated([ROBUST, channel("b")], **given, timeout=2)
     got = run(one, both, s.start(), y)
-    start = run(one, both, s.start(), {k: v[:2] for k, v in y.items()}).final.belief
+    start = jax.tree.map(lambda a: a[1], got.steps.posterior)
     held = FLOOR / (1.0 + FLOOR)
     late = given.get("sharing") != "scalar"
     rest = federated([ROBUST], "fusion-reset", "scalar", [1.0 - held], held, after_prediction=late)
@@ -204,9 +204,10 @@ def test_a_silent_filter_hands_its_share_to_the_others(given):
     np.testing.assert_allclose(got.mean[2:], want.mean, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(got.covariance[2:], want.covariance, rtol=1e-10, atol=1e-10)
     assert np.any(np.asarray(want.steps.info["a"].notes["huber.weight"]) < 0.9)
-    never = run(federated([ROBUST, channel("b")], **given), both, s.start(), y)
-    np.testing.assert_array_equal(never.mean[:2], got.mean[:2])
-    assert np.max(np.abs(never.mean - got.mean)) > 1e-3  # Huber judges by another covariance
+    if late and given["shares"] is VECTOR:
+        never = run(federated([ROBUST, channel("b")], **given), both, s.start(), y)
+        np.testing.assert_array_equal(never.mean[:2], got.mean[:2])
+        assert np.max(np.abs(never.mean - got.mean)) > 1e-3  # Huber judges by another covariance
 
 
 def test_a_share_comes_back_with_the_next_measurement_and_stays_where_all_are_silent():
