@@ -86,7 +86,7 @@ def gain(solution, estimate="a-posteriori", count_missing=False):
 @pytest.mark.parametrize("estimate", MEMBERS)
 def test_the_bound_holds_is_reached_and_the_kalman_filter_is_above_it(estimate):
     one = MEMBERS[estimate]
-    least = gamma_min(MODEL, START, Y, L, rtol=1e-8, estimate=estimate)
+    least = least_gamma(SYSTEM, Y, L, estimate)
 
     def of(gamma):
         state = with_gamma(one.init(START, MODEL.dims), gamma)
@@ -123,7 +123,7 @@ def operator(solution, scale=None):
 
 def test_members_whose_bound_changes_keep_it_step_by_step():
     # With L / gamma_k for weights the bound is one.
-    least = gamma_min(MODEL, START, Y, L)
+    least = least_gamma(SYSTEM, Y, L)
     rules = {
         "h_infinity.gamma": h_infinity(0.7 * least, L, policy="raise_gamma"),
         "adaptive_h_infinity.xi": adaptive_h_infinity(L, window=3),
