@@ -197,13 +197,13 @@ def test_slopes_are_right(name):
 def test_what_is_refused_or_missing_teaches_nothing_component_by_component():
     one = kalman(rules=[gate(0.99), *LEARNING])
     update = jax.jit(one.update)
-    state, _ = update(one.init(START, MODEL.dims), MODEL.sensors[0], jnp.array(Y[1]))
-    for y, code in ((jnp.nan, Code.MISSING), (1e4, Code.REFUSED)):
-        after, info = update(state, MODEL.sensors[0], jnp.full(M, y))
+    state, _ = update(OnlineFilter(one, MODEL, START).state, MODEL.sensors[0], Y[1])
+    for y, code in ((np.nan, Code.MISSING), (1e4, Code.REFUSED)):
+        after, info = update(state, MODEL.sensors[0], np.full(M, y))
         assert int(info.code) == code
         equal(after.memory[1:], state.memory[1:])
         equal(after.belief, state.belief)
-    after, info = update(state, MODEL.sensors[0], jnp.array([np.nan, 1.0, np.nan]))
+    after, info = update(state, MODEL.sensors[0], np.array([np.nan, 1.0, np.nan]))
     assert int(info.code) == Code.PARTLY_MISSING
     for rule, new, old in zip(LEARNING, after.memory[1:], state.memory[1:], strict=True):
         moved = [
