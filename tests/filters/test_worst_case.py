@@ -34,7 +34,7 @@ KF = kalman()
 
 
 @cache
-def dense_least(estimate="a-posteriori"):
+def dense_least(estimate):
     """Least gamma of `Y`, from the dense recursion."""
     return least_gamma(SYSTEM, Y, L, estimate)
 
@@ -131,7 +131,7 @@ def operator(solution, scale=None):
 
 def test_members_whose_bound_changes_keep_it_step_by_step():
     # With L / gamma_k for weights the bound is one.
-    least = dense_least()
+    least = dense_least("a-posteriori")
     rules = {
         "h_infinity.gamma": h_infinity(0.7 * least, L, policy="raise_gamma"),
         "adaptive_h_infinity.xi": adaptive_h_infinity(L, window=3),
@@ -147,7 +147,7 @@ def test_members_whose_bound_changes_keep_it_step_by_step():
 def test_the_operator_moves_errors_as_the_filter_does():
     # Run the filter on what disturbances make of the truth: its errors are the operator's.
     one = MEMBERS["a-posteriori"]
-    state = with_gamma(one.init(START, MODEL.dims), 3.0 * dense_least())
+    state = with_gamma(one.init(START, MODEL.dims), 3.0 * dense_least("a-posteriori"))
     rng = np.random.default_rng(1)
     x0, w, v = rng.normal(size=4), rng.normal(size=(T, 4)), rng.normal(size=(T, 3))
     x, y, truth = SYSTEM.m0 + np.linalg.cholesky(SYSTEM.P0) @ x0, np.empty((T, 3)), []
