@@ -243,10 +243,10 @@ def test_memory_is_restored_when_a_step_is_not_taken():
     after, prediction = one.predict(state, broken)
     assert int(prediction.code) == Code.NOT_FINITE
     assert int(after.memory[0][0]) == 0
-    after, info = one.update(state, MODEL.sensors[0], jnp.full(3, 1e308))
+    after, info = one.update(state, MODEL.sensors[0], np.full(3, 1e308))
     assert int(info.code) == Code.NOT_FINITE
     assert not np.any(after.memory[0][1]["y"])
-    after, info = one.update(state, MODEL.sensors[0], jnp.ones(3))
+    after, info = one.update(state, MODEL.sensors[0], np.ones(3))
     np.testing.assert_array_equal(after.memory[0][1]["y"], np.ones((2, 3)))
 
 
