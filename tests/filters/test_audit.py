@@ -77,7 +77,7 @@ FILTERS = {
     "master": (at_master(distributed(LOCALS), "held", asked(2)), [(0, 1), (1, 1), (2, 0)]),
     "delayed": (delayed(asked(0), MODEL, 2), [(0, 1)]),
     "deep": (
-        imm([kalman(), federated([channel("a", imm([asked(0)], [[1.0]])), LOCALS[1]])], EVEN),
+        federated([channel("a", imm([kalman(), asked(0)], EVEN)), LOCALS[1]]),
         [(0, 1), (1, 1)],
     ),
 }
