@@ -281,7 +281,7 @@ def test_a_joined_filter_takes_over_local_by_local():
     base = model(0.05)
     star = Sensor(lambda x, aux: x[:1] + x[2:3], jnp.array([20.0]), 1, "star")
     three = Model(base.motion, (base.sensors[0], star, base.sensors[1]))
-    data = {"sar": SAR[0], "wind": TRUTH[0, :, 2:], "star": TRUTH[0, :, :1] + TRUTH[0, :, 2:3]}
+    data = {"sar": SAR[0], "wind": TRUTH[0, :, 2:]}  # the other local only predicts
     one = guarded(locals_(True), locals_(False), **GUARD, limit=1e3)
     data["wind"] = np.where(np.arange(STEPS)[:, None] == 20, 20.0, 0.0) + data["wind"]
     got = run(one, three, START, {k: v[:21] for k, v in data.items()})
