@@ -2,7 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+# By uv, at the index that pip is set up for; where uv is not to be had or fails, by pip in minutes.
+WHAT = --constraint constraints.txt --editable '.[$(EXTRAS)]'
+INDEX = $(BIN)/python -m pip config list | sed -n "s/.*\.index-url='\(.*\)'/\1/p" | tail -n 1
+UV = UV_DEFAULT_INDEX="$${UV_DEFAULT_INDEX:-$$($(INDEX))}" $(BIN)/python -m uv pip install
+INSTALL = $(UV) --python $(BIN)/python --compile-bytecode $(WHAT) || \
+	{ echo "uv failed; pip takes some minutes."; $(BIN)/python -m pip install $(WHAT); }
 READY := $(VENV)/.ready
 STAMP := $(VENV)/.installed
 
@@ -11,16 +16,21 @@ STAMP := $(VENV)/.installed
 install: $(STAMP)
 
 # A private environment, rebuilt when what it is made from changes: robins with its extras, to use.
+$(READY): EXTRAS = all
 $(READY): pyproject.toml constraints.txt
-	@echo "Installing robins with its extras into $(VENV): 1 GB, some minutes. 'make clean' removes it."
+	@echo "Installing robins with its extras into $(VENV): 1 GB. 'make clean' removes it."
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) '.[all]'
+	-$(BIN)/python -m pip install --quiet uv
+	@$(INSTALL)
+	@# Where writing bytecode is forbidden, every start would read all of robins as text.
+	@$(BIN)/python -m compileall -q src
 	@touch $@
 
 # And what develops and tests it.
+$(STAMP): EXTRAS = all,dev
 $(STAMP): $(READY)
 	@echo "Adding the tools of development and the packages that tests compare with: 1 GB more."
-	$(PIP) '.[all,dev]'
+	@$(INSTALL)
 	@touch $@
 
 demo: $(READY)
