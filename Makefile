@@ -53,8 +53,9 @@ pages: install
 # Without bytecode, which some machines forbid, every process would read all of robins as text.
 PYTEST = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
+# Without checks of annotations, which cost more than these tests.
 fast: install
-	$(PYTEST) -m fast
+	UNCHECKED=1 $(PYTEST) -m fast
 
 check: install
 	$(MAKE) --jobs 2 lint fast
@@ -66,15 +67,12 @@ test: install
 certify: install
 	CERTIFICATE=docs/certified.md $(PYTEST) -m "certify or hypothesis" --hypothesis-profile=thousand
 
-# What each test costs, from an empty cache: 40 minutes. What is cheap only beside the others shows
-# when the fast tests run alone.
-COSTS = .pytest_cache/costs
+# What each file of tests costs, from an empty cache, against the budget of tests/budget.toml.
+# FILES="tests/sim/test_orbit.py ..." measures those files only.
 costs: install
-	rm -rf .pytest_cache/jax $(COSTS) $(COSTS)-fast
-	TEST_COSTS=$(COSTS) $(PYTEST) -m ""
-	$(BIN)/python tests/tiers.py $(COSTS)
-	TEST_COSTS=$(COSTS)-fast $(PYTEST) -m fast
-	$(BIN)/python tests/tiers.py $(COSTS) $(COSTS)-fast
+	rm -rf .pytest_cache/costs
+	COSTS=$(if $(FILES),some,all) JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/costs $(PYTEST) $(FILES)
+	$(BIN)/python tests/budget.py
 
 bench: install
 	$(BIN)/python benchmarks/run.py
@@ -82,7 +80,7 @@ bench: install
 # At every save the fast tests that run what was changed; the first round runs them all.
 watch: install
 	@mkdir -p .pytest_cache
-	TESTMON_DATAFILE=.pytest_cache/testmon $(BIN)/watchfiles --filter python \
+	UNCHECKED=1 TESTMON_DATAFILE=.pytest_cache/testmon $(BIN)/watchfiles --filter python \
 		'$(BIN)/python -m pytest -q -m fast --testmon-forceselect' src tests
 
 # Where a command of robins spends its time: make profile CMD="run satellite/s1 --runs 2"
