@@ -51,10 +51,12 @@ def meant(entry: dict[str, str], node: str) -> bool:
 
 def mark(items: list[pytest.Item]) -> None:
     """Give each test its tier."""
-    costly, moved = costs(), certified()
+    costly, moved = costs(), dict[str, list[dict[str, str]]]()
+    for entry in certified():
+        moved.setdefault(entry["test"], []).append(entry)
     for item in items:
         node = item.nodeid.removeprefix("tests/")
-        if any(meant(entry, node) for entry in moved):
+        if any(meant(entry, node) for entry in moved.get(plain(node), ())):
             item.add_marker(pytest.mark.certify)
         elif plain(node) not in costly:
             item.add_marker(pytest.mark.fast)
