@@ -210,7 +210,8 @@ def rmse(*rules):
     def means(y):
         return run(one, PLANE, STILL, y, keep=lambda step: step.posterior.mean[:2]).steps
 
-    found = np.asarray(jax.jit(jax.vmap(jax.vmap(means)))(jnp.asarray(FAULTY)))
+    every = FAULTY.reshape(-1, LONG, 2)
+    found = np.asarray(jax.jit(jax.vmap(means))(every)).reshape(FAULTY.shape)
     return np.sqrt(np.mean(np.sum((found - TRUTH) ** 2, axis=-1)[:, :, 10:], axis=(1, 2)))
 
 
