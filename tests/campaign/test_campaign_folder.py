@@ -355,6 +355,7 @@ def test_dask_makes_the_same_table(undisturbed, tmp_path):
     distributed = pytest.importorskip("distributed", reason="Dask is an extra")
     begun(tmp_path)
     settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    settings["processes"] = False  # threads are workers too
     with (
         distributed.LocalCluster(**settings) as cluster,
         distributed.Client(cluster) as client,
