@@ -22,6 +22,7 @@ from robins.campaign.plan import needed, write
 from robins.campaign.retention import content_of
 from robins.campaign.store import open_store
 from robins.campaign.work import Missing, Worker, missing
+from robins.cli import main
 from robins.errors import RobinsError
 from robins.program import CPP, LANE_FLAGS
 from robins.workbench import simulated
@@ -81,6 +82,11 @@ def test_any_number_of_workers_make_one_table(undisturbed, tmp_path, workers):
         for one in turns:
             next(one, None)
     assert campaign_status(tmp_path).digest == campaign_status(undisturbed).digest
+
+
+def test_one_more_worker_finds_nothing_to_do(undisturbed, capsys):
+    assert main(["campaign", "work", str(undisturbed), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["done"] == 14
 
 
 def test_a_long_run_by_jax_has_a_process_for_each_core(monkeypatch):
@@ -266,7 +272,7 @@ ROBINS = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(m
 
 
 @pytest.mark.parametrize("kills", [1, 20])
-def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
+def test_killed_at_any_moment_it_goes_on(undisturbed, tmp_path, kills):
     """Workers and the whole are killed; two campaigns are started on one folder at once."""
     settings = [word for one in SHORT for word in ("--set", one)]
     run = [*ROBINS, "run", BALLOON, "--runs", str(RUNS), "--filters", "gated,kf", *settings]
@@ -291,11 +297,7 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, kills):
     told = [one.communicate() for one in both]
     assert {one.returncode for one in both} <= {0, 2}, told  # the report is written by one of them
     assert 0 in {one.returncode for one in both}, told
-    serial = tmp_path / "serial"
-    begun(serial)
-    command = [*ROBINS, "work", str(serial), "--json"]
-    assert json.loads(subprocess.run(command, capture_output=True, check=True).stdout)["done"] == 14
-    assert campaign_status(where).digest == campaign_status(serial).digest
+    assert campaign_status(where).digest == campaign_status(undisturbed).digest
 
 
 UNSHARED = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c")
