@@ -46,7 +46,7 @@ from robins.program import CPP, BuildError, compiler
 from robins.program.stages import Staged
 from robins.systems.study import Problem
 
-MACHINES = ("jax", "c", "cuda")
+MACHINES = ("jax", "c")
 PAYS = 60.0  # seconds of JAX on one core for which it pays to compile lanes
 FEWEST = 100  # runs of which this is asked
 NS = 0.5  # of JAX, for a scalar operation in a scan (measured: 0.4 to 0.8)
@@ -277,10 +277,8 @@ def check_machine(name: str) -> None:
     Raises:
         RobinsError: there is no such machine, or no compiler for it.
     """
-    if name == "cuda":
-        raise RobinsError(
-            "campaigns do not run as a kernel of a GPU yet", "--machine cuda", "say jax or c."
-        )
+    if name and name not in MACHINES:
+        raise RobinsError(f"no machine '{name}'", "--machine", f"say {' or '.join(MACHINES)}")
     if name == "c":
         compiler(CPP)
 

@@ -121,7 +121,7 @@ def demo(runs: int | None, out: Path | None, as_json: bool) -> int:
 @COLUMNS
 @option(
     "--machine",
-    type=click.Choice(["jax", "c", "cuda"]),
+    type=click.Choice(["jax", "c"]),
     callback=lambda _context, _given, name: name or "",
     help="What computes. [default: c where that pays, else jax]",
 )

@@ -37,7 +37,7 @@ def run(
         filters: names; by default those of the scenario, on which its claims are judged, and beside
             them the default of its system.
         settings: "path=value" texts that change the scenario.
-        machine: "jax", "c" or "cuda"; not given, what is faster.
+        machine: "jax" or "c"; not given, what is faster.
         progress: called with the share done and what is being done.
 
     Raises:
