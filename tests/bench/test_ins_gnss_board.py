@@ -1,10 +1,7 @@
 """The filter of INS/GNSS, exported as C with its loop, as the navigation computer of the bench."""
 
-import json
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -55,18 +52,14 @@ def scenario(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def program(scenario, tmp_path_factory):
-    """The part as `robins export --board` builds it; accesses to memory checked where they can.
-
-    By a process of its own, whose calls are not checked one by one: that takes three times as long.
-    """
+    """The part as `robins export --board` builds it; accesses to memory checked where they can."""
     folder = tmp_path_factory.mktemp("navigation")
-    flags = " ".join([STRICT, *(SANITISERS if sanitised(folder) else [])])
-    command = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
-    command += ["export", scenario, "--filter", "ekf", "--to", folder / "c", "--board", "--json"]
-    environment = {**os.environ, "CFLAGS": flags}
-    made = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert made.returncode == 0, made.stderr
-    return json.loads(made.stdout)["program"]
+    extra = SANITISERS if sanitised(folder) else []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CFLAGS", " ".join([STRICT, *extra]))
+        made = export_filter(scenario, folder / "c", filter_name="ekf", board=True)
+    assert made.program is not None
+    return made.program
 
 
 @pytest.fixture(scope="module")
