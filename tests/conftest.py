@@ -10,9 +10,9 @@ import signal
 import sys
 from pathlib import Path
 
+import checking
 import hypothesis
 import jax
-import jaxtyping
 import meter
 import pytest
 import records
@@ -55,7 +55,7 @@ for number, handler in (
 if "robins" in sys.modules:
     raise pytest.UsageError("robins was imported before its annotations could be checked")
 if not os.environ.get("UNCHECKED"):
-    jaxtyping.install_import_hook("robins", "beartype.beartype")
+    checking.install("robins")
 
 # An accidental outer product or a silent change of width is an error here, not a slow surprise.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
