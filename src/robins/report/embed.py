@@ -22,7 +22,6 @@ _FEW = 8  # pictures; more would not all fit into a page in the best form
 # still be read. The last effort gains an eighth of the bytes in six times the time.
 _LADDER = ((1.0, 64, 6), (1.0, 20, 9), (0.75, 20, 9), (0.5625, 20, 9), (0.47, 12, 9))
 _SIMPLE = 1000  # points; a drawing with more is never smaller than its dots
-_RGB = np.array([1 << 16, 1 << 8, 1], np.int32)
 _NUMBER = re.compile(rb"-?\d+\.\d{3,}")
 
 
@@ -85,12 +84,13 @@ def _png(image: Image.Image, dpi: int = DPI, effort: int = 6) -> bytes:
 
 def packed(image: Image.Image, colours: int, effort: int = 9) -> bytes:
     """A PNG with a palette, a third of the size of one in full colour."""
-    table = np.array([(n, *rgb) for n, rgb in image.getcolors(image.width * image.height) or ()])
-    count, rgb = table[:, 0], table[:, 1:]
+    dots = np.asarray(image, np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    found, count = np.unique(dots, return_counts=True)
+    rgb = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1)
     palette, nearest = _palette(rgb, count, colours)
     of_colour = np.zeros(1 << 24, np.uint8)  # of which few pages are touched
-    of_colour[rgb @ _RGB] = nearest
-    indexed = Image.fromarray(of_colour[np.asarray(image, np.int32) @ _RGB])
+    of_colour[found] = nearest
+    indexed = Image.fromarray(of_colour[dots])
     indexed.putpalette(palette.astype(np.uint8).tobytes())
     return _png(indexed, effort=effort)
 

@@ -237,5 +237,6 @@ def start_belief(
     if gyro_bias is not None:
         mean = mean._replace(gyro_bias=jnp.asarray(gyro_bias))
     each = as_array([x for part in sigma for x in part])
-    # most are numbers of a file, of which NumPy has nothing to compile
-    return Belief(mean, (np if isinstance(each, np.ndarray) else jnp).diag(each))
+    # numbers of a file, of which NumPy has nothing to compile, unless they are traced
+    factor: Any = (np if isinstance(each, np.ndarray) else jnp).diag(each)
+    return Belief(mean, factor)
