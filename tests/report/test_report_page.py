@@ -235,12 +235,12 @@ def walk(town):
     return a_drive(1, seconds=40.0)[names]
 
 
-def written(path, walk, progress=None):
+def written(path, walk, progress=None, **more):
     """A result with its report."""
     with results.ResultWriter(path, scenario_text="x = 1", command="robins run x") as writer:
         writer.save_summary(a_summary(1))
         writer.save_solution(walk)
-        report.add(writer, progress)
+        report.add(writer, progress, **more)
     return results.read(path)
 
 
@@ -257,6 +257,11 @@ def test_a_result_gets_its_figures_and_page(tmp_path, walk):
     share = [done / total for done, total, _ in seen]
     assert share == sorted(share)
     assert share[-1] == 1.0
+
+
+def test_only_the_figures_asked_for_are_drawn(tmp_path, walk):
+    assert set(written(tmp_path / "a", walk, only=["error_velocity"]).figures) == {"error_velocity"}
+    assert set(written(tmp_path / "b", walk, only=["lat_rad", "nothing"]).figures) == {"track"}
 
 
 def drawn(path, walk):
