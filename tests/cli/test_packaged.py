@@ -457,7 +457,10 @@ def computes(folder, monkeypatch, capsys):
         if words[0] == "tune" and TOO_SHORT in told.err:
             assert status == Status.BAD_INPUT
             return
-        assert status == Status.DONE, told.out + told.err  # so the demo has passed
+        assert status == Status.DONE, told.out + told.err
+        if words == ("demo",):
+            assert "3 of 3 claims reproduced." in told.out
+            assert len(results.read("results/demo").figures) == 6
         assert "fault of robins" not in told.err
 
     return to_the_end
