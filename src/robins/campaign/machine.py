@@ -8,6 +8,7 @@ they are chosen where JAX would take longer than that.
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -251,6 +252,7 @@ class InLanes:
         return with_stack(computed)
 
     def _worlds(self, begin: int, width: int) -> Any:
+        sys.audit("robins.simulate", width)  # counted by tests
         return self._simulate(jnp.arange(begin, begin + width))
 
     def _of(self, name: str, world: Any, count: int, taken: Taken) -> Any:

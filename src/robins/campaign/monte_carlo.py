@@ -8,6 +8,7 @@ differ in numbers only share what was compiled for them.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -145,6 +146,7 @@ def worlds(
         raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
     width, batch = filled(runs, chunk), batch or batch_of(problem)
     for begin in range(first, first + runs, width):
+        sys.audit("robins.simulate", width)  # counted by tests
         yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
 
 
