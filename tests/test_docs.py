@@ -1,10 +1,17 @@
-"""The documents are true: their examples run, and their docstrings show what was typed."""
+"""The documents are true: their examples run, and their docstrings show what was typed.
 
+Each example is compiled, and what it imports and calls is looked up. Of pages of one kind, such as those
+of filters on a few numbers, some are also run; `make certify` runs all.
+"""
+
+import ast
 import doctest
 import importlib
+import inspect
 import itertools
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import click
@@ -50,22 +57,113 @@ def blocks(text: str) -> list[tuple[int, str, str]]:
     return found
 
 
+def examples(page: Path) -> list[tuple[int, str]]:
+    """Blocks of a page that are Python: first line number, code."""
+    return [
+        (at, code) for at, language, code in blocks(page.read_text("utf-8")) if language == "python"
+    ]
+
+
 def execute(page: Path) -> int:
     """Run a page's ```python blocks in order in one namespace; return how many there are.
 
     A block that is not to be run says so by its language: `text`, `console`.
     """
     namespace = {"__name__": "__main__"}
-    ran = 0
-    for line, language, code in blocks(page.read_text("utf-8")):
-        if language == "python":
-            # Blank lines before it make tracebacks name the line of the page.
-            exec(compile("\n" * (line - 1) + code, page, "exec", dont_inherit=True), namespace)
-            ran += 1
-    return ran
+    found = examples(page)
+    for line, code in found:
+        # Blank lines before it make tracebacks name the line of the page.
+        exec(compile("\n" * (line - 1) + code, page, "exec", dont_inherit=True), namespace)
+    return len(found)
 
 
-@pytest.mark.parametrize("page", pages(), ids=lambda p: str(p.relative_to(ROOT)))
+EACH = pytest.mark.parametrize(
+    "page", [p for p in pages() if examples(p)], ids=lambda p: str(p.relative_to(ROOT))
+)
+
+
+def imported(tree: ast.AST) -> dict[str, object]:
+    """What the imports of a tree bind, by the names that they bind it to."""
+    bound: dict[str, object] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for one in node.names:
+                whole = importlib.import_module(one.name)
+                first = importlib.import_module(one.name.partition(".")[0])
+                bound[one.asname or first.__name__] = whole if one.asname else first
+        elif isinstance(node, ast.ImportFrom):
+            whole = importlib.import_module(node.module)
+            for one in node.names:
+                if not hasattr(whole, one.name):
+                    importlib.import_module(f"{node.module}.{one.name}")
+                bound[one.asname or one.name] = getattr(whole, one.name)
+    return bound
+
+
+def looked_up(node: ast.AST, bound: dict[str, object]) -> object:
+    """The object that a dotted name means; None where it begins with no import."""
+    if isinstance(node, ast.Name):
+        return bound.get(node.id)
+    if isinstance(node, ast.Attribute):
+        owner = looked_up(node.value, bound)
+        return None if owner is None else getattr(owner, node.attr)
+    return None
+
+
+def fits(page: Path) -> int:
+    """Compile the examples of a page; look up their imports and bind the arguments of robins' functions.
+
+    Returns:
+        How many calls of functions of robins it found.
+    """
+    bound: dict[str, object] = {}
+    found = 0
+    for line, code in examples(page):
+        tree = compile("\n" * (line - 1) + code, page, "exec", ast.PyCF_ONLY_AST, dont_inherit=True)
+        bound |= imported(tree)
+        for node in ast.walk(tree):
+            called = (
+                looked_up(node.func, bound)
+                if isinstance(node, ast.Call)
+                else looked_up(node, bound)
+            )
+            ours = getattr(called, "__module__", None) or ""
+            if not isinstance(node, ast.Call) or not ours.startswith("robins."):
+                continue
+            if any(isinstance(a, ast.Starred) for a in node.args) or None in {
+                k.arg for k in node.keywords
+            }:
+                continue
+            named = {one.arg: None for one in node.keywords}
+            inspect.signature(called).bind(*node.args, **named)
+            found += 1
+    return found
+
+
+@EACH
+def test_examples_fit_what_they_import(page):
+    fits(page)
+
+
+def test_an_example_that_does_not_fit_is_found(tmp_path):
+    page = tmp_path / "page.md"
+    head = "# Page\n```python\nfrom robins.filters import kalman\nfrom robins import logs\n"
+    for body, error in (
+        ("kalman(rules=[])", None),
+        ("kalman(rulez=[])", "rulez"),
+        ("kalman(rules=[]", "never closed"),
+        ("logs.examined", "examined"),
+        ("from robins.filters import kalmann", "kalmann"),
+    ):
+        page.write_text(f"{head}{body}\n```\n")
+        if error is None:
+            assert fits(page) == 1
+            continue
+        with pytest.raises((TypeError, SyntaxError, AttributeError, ImportError), match=error):
+            fits(page)
+
+
+@EACH
 def test_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     try:
@@ -194,6 +292,27 @@ def test_links_between_pages_lead_somewhere():
     for page in pages():
         targets = re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
         assert [t for t in targets if not (page.parent / t).exists()] == [], page
+
+
+def files_meant(text: str) -> list[Path]:
+    """Files of this repository behind the absolute addresses of a page, which PyPI needs."""
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["urls"]
+    raw = urls["Source"].replace("https://github.com", "https://raw.githubusercontent.com")
+    pages = re.findall(rf"{re.escape(urls['Documentation'])}/en/latest/([\w/-]+)\.html", text)
+    files = re.findall(
+        rf"(?:{re.escape(urls['Source'])}/blob|{re.escape(raw)})/main/([^)\s]+)", text
+    )
+    return [*(ROOT / "docs" / f"{page}.md" for page in pages), *(ROOT / file for file in files)]
+
+
+def test_the_readme_can_be_read_on_pypi():
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert re.findall(r"\]\((?!https://|#)([^)]+)", text) == []
+    meant = files_meant(text)
+    assert {".png", ".md", ".cff"} <= {path.suffix for path in meant}
+    assert [str(path) for path in meant if not path.is_file()] == []
+    own = [part for part in re.findall(r"https://[^)\s]+", text) if "robins" in part]
+    assert len(own) == len(meant)  # none by another address
 
 
 @pytest.mark.parametrize(

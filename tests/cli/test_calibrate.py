@@ -1,5 +1,7 @@
 """The command `calibrate`: a turned magnetometer, read from a log, with its iron found."""
 
+import contextlib
+import io
 import json
 import tomllib
 
@@ -9,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robins import logs, report, results, scenario
+from robins.cli import main
 from robins.ins.magnetometer_calibration import calibrate
 from robins.sim.magnetometer import observe_field
 from robins.systems import SYSTEMS
@@ -51,15 +54,17 @@ def log(tmp_path_factory):
     return write(tmp_path_factory.mktemp("logs") / "tumbling.npz", tumbling())
 
 
-@pytest.fixture
-def made(robins, log, tmp_path):
-    answer = robins("calibrate", log, "--out", tmp_path / "result")
-    assert answer.status == 0, answer.err
-    return answer, results.read(tmp_path / "result")
+@pytest.fixture(scope="module")
+def made(log):
+    """What the command says, and its result."""
+    said, out = io.StringIO(), log.parent / "result"
+    with contextlib.redirect_stdout(said):
+        assert main(["calibrate", str(log), "--out", str(out)]) == 0
+    return said.getvalue(), results.read(out)
 
 
 def test_offset_and_matrix_come_back(made, log):
-    answer, result = made
+    out, result = made
     columns = result.summary["filters"]
     for k, axis in enumerate("xyz"):
         sigma = columns[axis]["offset_sigma_ut"]
@@ -67,8 +72,8 @@ def test_offset_and_matrix_come_back(made, log):
     matrix = np.array([columns[axis]["matrix_row"] for axis in "xyz"])
     np.testing.assert_allclose(matrix, np.linalg.inv(SOFT), rtol=0.0, atol=5e-3)
     assert columns["field"]["rms_after_ut"] < 0.05 * columns["field"]["rms_before_ut"]
-    assert "Offset [µT]" in answer.out
-    assert f"robins replay {log}" in answer.out
+    assert "Offset [µT]" in out
+    assert f"robins replay {log}" in out
 
 
 def test_the_configuration_is_one_that_a_replay_reads(made):

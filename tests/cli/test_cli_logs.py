@@ -173,9 +173,7 @@ def test_what_a_log_holds_is_shown_before_it_is_judged(robins, still_log, nine_a
 
 
 def test_the_noise_of_an_imu_is_found_beside_its_magnetometer(robins, nine_axis):
-    answer = robins("allan", nine_axis, "--terms", "N", "--json", "--out", "noise")
-    assert answer.status == 0
-    density = json.loads(answer.out)["filters"]["x"]["gyro_angle_random_walk_deg_per_sqrt_h"]
+    density = find_noise(nine_axis, terms="N").metrics["x"]["gyro_angle_random_walk_deg_per_sqrt_h"]
     assert density == pytest.approx(0.3, rel=0.1)
 
 

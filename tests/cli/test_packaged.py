@@ -7,7 +7,6 @@ all. So it is with command lines: each is read up to where its computation begin
 kind is run to its end.
 """
 
-import io
 import re
 import shlex
 import subprocess
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from short_drive import write_pos
 from simulated_pair import pair_dataset
 
 from robins import logs, results, scenario
@@ -192,26 +192,6 @@ def test_a_packaged_scenario_runs(robins, name):
 
 
 # ------------------------------------------------------------------------- command lines shown
-
-GNSS_HEAD = (
-    "%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) "
-    "sdun(m) age(s) ratio vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun\n"
-)
-
-
-def write_pos(path, gnss):
-    """Fixes as RTKLIB writes them."""
-    lines = io.StringIO()
-    lines.write(GNSS_HEAD)
-    for k, stamp in enumerate(gnss.time_ns):
-        week, left = divmod(int(stamp) - 315_964_800_000_000_000, 604_800_000_000_000)
-        n, e, d = gnss.v_n[k]
-        lat, lon = np.rad2deg([gnss.lat_rad[k], gnss.lon_rad[k]])
-        lines.write(
-            f"{week} {left * 1e-9:.3f} {lat:.9f} {lon:.9f} {gnss.alt_m[k]:.4f} 1 12 1 1 2 0 0 0 0 "
-            f"9 {n:.4f} {e:.4f} {-d:.4f} 0.05 0.05 0.1 0 0 0\n"
-        )
-    Path(path).write_text(lines.getvalue())
 
 
 def write_nine_axes(path, seconds=40.0, hz=50.0):
@@ -457,7 +437,10 @@ def computes(folder, monkeypatch, capsys):
         if words[0] == "tune" and TOO_SHORT in told.err:
             assert status == Status.BAD_INPUT
             return
-        assert status == Status.DONE, told.out + told.err  # so the demo has passed
+        assert status == Status.DONE, told.out + told.err
+        if words == ("demo",):
+            assert "3 of 3 claims reproduced." in told.out
+            assert len(results.read("results/demo").figures) == 6
         assert "fault of robins" not in told.err
 
     return to_the_end

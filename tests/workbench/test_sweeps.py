@@ -12,24 +12,31 @@ from robins.campaign.store import open_store
 from robins.errors import RobinsError
 from robins.report import figures
 from robins.results import find, read
-from robins.workbench import publish, sweeps
+from robins.workbench import publish, sweeps, workers
 from robins.workbench.campaigns import campaign_status, campaign_work, needed, problem_of
 from robins.workbench.sweeps import Varied, report, status, sweep, varied
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
 SHORT = ("duration=20 s",)
 SIGMAS = "barometer=1 m,4 m"
+RUNS = 8  # everywhere: one program serves all
+
+
+class Here:
+    """In the place of a worker's process: computes in this one, and has ended."""
+
+    status, said = 0, ""
+
+    def __init__(self, where):
+        list(campaign_work(where))
+
+    def close(self):
+        pass
 
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch):
-    """Points are computed in this process."""
-
-    def fill(where, campaigns, workers, progress):
-        for folder, _ in campaigns:
-            list(campaign_work(folder))
-
-    monkeypatch.setattr(sweeps, "fill", fill)
+    monkeypatch.setattr(workers, "_Process", Here)
 
 
 def test_a_parameter_has_numbers_with_a_unit_or_names():
@@ -61,7 +68,7 @@ def test_what_cannot_be_swept_is_refused(tmp_path, vary, message):
 
 
 def test_each_point_is_the_campaign_of_its_values(tmp_path):
-    found = sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=12, filters=("kf",), settings=SHORT)
+    found = sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=RUNS, filters=("kf",), settings=SHORT)
     rms = find(found.solution, "sweep_rms")["height"]
     low, high = (find(found.solution, f"sweep_{k}")["height"] for k in ("low", "high"))
     assert rms.shape == (1, 2, 1)
@@ -69,7 +76,7 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
     np.testing.assert_array_equal(found.solution["sweep_1"], [1.0, 4.0])
     for k in range(2):
         problem = problem_of(needed(open_store(tmp_path / "points" / str(k))))
-        alone = simulate(problem, 12, machine="jax")
+        alone = simulate(problem, RUNS, machine="jax")
         assert float(rms[0, k, 0]) == pytest.approx(alone.metrics["kf"]["height_rms_m"], rel=1e-12)
         assert low[0, k, 0] < rms[0, k, 0] < high[0, k, 0]
     assert found.metrics["kf"]["height_rms_m"] == [float(x) for x in rms[0, :, 0]]
@@ -79,7 +86,7 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
         ("4 m", "height"),
     ]
     assert float(rows[0]["rms"]) == float(rms[0, 0, 0])
-    assert rows[0]["runs"] == "12"
+    assert rows[0]["runs"] == str(RUNS)
     with pytest.raises(RobinsError, match="holds the 2 campaigns of a sweep"):
         campaign_status(tmp_path)
     assert status(tmp_path)["barometer=4 m"] == campaign_status(tmp_path / "points" / "1")
@@ -94,10 +101,10 @@ def test_each_point_is_the_campaign_of_its_values(tmp_path):
 def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):
     two = [SIGMAS, "outlier_share=0,0.2"]
     asked = {"vary": two, "filters": ("kf",), "settings": SHORT}
-    sweep(BALLOON, tmp_path / "s", runs=8, **asked)
+    sweep(BALLOON, tmp_path / "s", runs=RUNS, **asked)
     before = set((tmp_path / "s").rglob("*.npz"))
     assert len(before) == 4
-    found = sweep(BALLOON, tmp_path / "s", runs=16, **asked)
+    found = sweep(BALLOON, tmp_path / "s", runs=2 * RUNS, **asked)
     assert before < set((tmp_path / "s").rglob("*.npz"))
     assert find(found.solution, "sweep_rms")["height"].shape == (1, 2, 2)
     result = publish(found, tmp_path / "r")
@@ -107,9 +114,8 @@ def test_two_parameters_make_a_map_and_more_runs_go_on(tmp_path):
     assert "height over barometer [m] and outlier_share" in titles
 
 
-def test_damage_at_a_point_is_computed_again(tmp_path, monkeypatch):
-    monkeypatch.undo()  # by processes
-    asked = {"vary": [SIGMAS], "runs": 4, "filters": ("kf",), "settings": SHORT, "workers": 1}
+def test_damage_at_a_point_is_computed_again(tmp_path):
+    asked = {"vary": [SIGMAS], "runs": RUNS, "filters": ("kf",), "settings": SHORT}
     want = sweep(BALLOON, tmp_path, **asked)
     path = next((tmp_path / "points" / "1" / "shards").iterdir())
     path.write_bytes(path.read_bytes()[:-200])
@@ -119,5 +125,5 @@ def test_damage_at_a_point_is_computed_again(tmp_path, monkeypatch):
 def test_a_worker_finds_all_points(tmp_path, monkeypatch):
     monkeypatch.setattr(sweeps, "fill", lambda *_: None)
     with pytest.raises(RobinsError, match="points/0: has no run of 'kf' yet"):
-        sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=4, filters=("kf",), settings=SHORT)
+        sweep(BALLOON, tmp_path, vary=[SIGMAS], runs=RUNS, filters=("kf",), settings=SHORT)
     assert list(campaign_work(tmp_path)) == [(0, 2), (1, 2), (2, 2)]
