@@ -32,7 +32,7 @@ STEPS = 6
 S = SYSTEMS[0]
 MODEL = model_of(*(jnp.array(part) for part in (S.F, S.G, S.H, S.W)))
 HELD = Sensor(Partial(lambda row, x, aux: row @ x, jnp.ones((1, N))), jnp.ones(1), 1, "held")
-WITH_HELD = Model(MODEL.motion, (*MODEL.sensors, HELD))
+WITH_HELD = Model(MODEL.motion, (MODEL.sensors[0], HELD))
 START = Belief(jnp.array(S.m0), linalg.factor(S.P0))
 # One sensor is measured, so that a run compiles one update.
 DATA = {"a": by_sensor(np.nan_to_num(Y[0, :STEPS]))["a"]}
@@ -74,7 +74,7 @@ FILTERS = {
     "two rules": (kalman(rules=[gate(), counting(0), only("a", counting(1))]), [(0, 1), (1, 1)]),
     "family": (imm(Family(asked, jnp.arange(2)), EVEN), [(0, 1), (1, 1)]),
     "guarded": (guarded(asked(0), asked(1), "a", ["b"], [(0, 1)]), [(0, 1), (1, 1)]),
-    "master": (at_master(distributed(LOCALS), "held", asked(2)), [(0, 1), (1, 1), (2, 0)]),
+    "master": (at_master(distributed(LOCALS[:1]), "held", asked(2)), [(0, 1), (2, 0)]),
     "delayed": (delayed(asked(0), MODEL, 2), [(0, 1)]),
     "deep": (
         federated([channel("a", imm([kalman(), asked(0)], EVEN)), LOCALS[1]]),
