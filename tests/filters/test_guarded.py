@@ -81,7 +81,7 @@ START = Belief.of(np.zeros(4), P0)
 
 @jax.jit
 def both(sigma, wind):
-    """Beliefs of the guarded filter and of its parts, and what it said."""
+    """Beliefs of the guarded filter and of its parts, and what it notes of each update."""
 
     def one(y, z):
         def part(z):
@@ -119,7 +119,7 @@ WRONG = {
 
 @pytest.mark.parametrize("case", WRONG)
 def test_what_is_wrong_costs_nothing(case):
-    """Nor is it thought to be less wrong than the reference, which is off by its own offset."""
+    """No more error than the reference, off by its own offset, and none of it left unstated."""
     white, lasting, jump, sigma = WRONG[case]
     got, plain, bold, said = both(sigma, held(TRUTH, white, lasting, jump))
     assert ratio(got) < 2.0 * max(ratio(plain), 1.0) < ratio(bold)

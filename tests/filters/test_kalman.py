@@ -41,7 +41,7 @@ def close(got, want, tolerance):
 
 
 def first_four(one, system, y):
-    """Means, covariances, log-likelihoods and codes, and what the book says, of four steps."""
+    """Means, covariances, log-likelihoods and codes of four steps, and those of the book."""
     solution = run(one, system.model(), system.start(), y)
     info, (*want, _) = solution.steps.info["y"], kalman_filter(system, y[:4])
     got = (solution.mean, solution.covariance, info.log_likelihood, info.code)

@@ -65,7 +65,7 @@ def ran(name):
 
 @cache
 def stepped(name):
-    """One step of such a filter, compiled: a number of it with what it is of, and its slope."""
+    """One compiled step of such a filter: a number, the states and the update it is of, its slope."""
     one = kalman(rules=FILTERS[name])
 
     def step(scale, state, row):
