@@ -65,7 +65,7 @@ def ran(name):
 
 @cache
 def stepped(name):
-    """One compiled step of such a filter: a number, the states and the update it is of, its slope."""
+    """One compiled step of such a filter: a number, what it is of, and its slope in the noise."""
     one = kalman(rules=FILTERS[name])
 
     def step(scale, state, row):
