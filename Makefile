@@ -2,7 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+# By uv, at the index that pip is set up for; where uv is not to be had or fails, by pip in minutes.
+WHAT = --constraint constraints.txt --editable '.[$(EXTRAS)]'
+INDEX = $(BIN)/python -m pip config list | sed -n "s/.*\.index-url='\(.*\)'/\1/p" | tail -n 1
+UV = UV_DEFAULT_INDEX="$${UV_DEFAULT_INDEX:-$$($(INDEX))}" $(BIN)/python -m uv pip install
+INSTALL = $(UV) --python $(BIN)/python --compile-bytecode $(WHAT) || \
+	{ echo "uv failed; pip takes some minutes."; $(BIN)/python -m pip install $(WHAT); }
 READY := $(VENV)/.ready
 STAMP := $(VENV)/.installed
 
@@ -11,16 +16,21 @@ STAMP := $(VENV)/.installed
 install: $(STAMP)
 
 # A private environment, rebuilt when what it is made from changes: robins with its extras, to use.
+$(READY): EXTRAS = all
 $(READY): pyproject.toml constraints.txt
-	@echo "Installing robins with its extras into $(VENV): 1 GB, some minutes. 'make clean' removes it."
+	@echo "Installing robins with its extras into $(VENV): 1 GB. 'make clean' removes it."
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) '.[all]'
+	-$(BIN)/python -m pip install --quiet uv
+	@$(INSTALL)
+	@# Where writing bytecode is forbidden, every start would read all of robins as text.
+	@$(BIN)/python -m compileall -q src
 	@touch $@
 
 # And what develops and tests it.
+$(STAMP): EXTRAS = all,dev
 $(STAMP): $(READY)
 	@echo "Adding the tools of development and the packages that tests compare with: 1 GB more."
-	$(PIP) '.[all,dev]'
+	@$(INSTALL)
 	@touch $@
 
 demo: $(READY)
@@ -43,8 +53,9 @@ pages: install
 # Without bytecode, which some machines forbid, every process would read all of robins as text.
 PYTEST = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
+# Without checks of annotations, which cost more than these tests.
 fast: install
-	$(PYTEST) -m fast
+	UNCHECKED=1 $(PYTEST) -m fast
 
 check: install
 	$(MAKE) --jobs 2 lint fast
@@ -56,15 +67,12 @@ test: install
 certify: install
 	CERTIFICATE=docs/certified.md $(PYTEST) -m "certify or hypothesis" --hypothesis-profile=thousand
 
-# What each test costs, from an empty cache: 40 minutes. What is cheap only beside the others shows
-# when the fast tests run alone.
-COSTS = .pytest_cache/costs
+# What each file of tests costs, from an empty cache, against the budget of tests/budget.toml.
+# FILES="tests/sim/test_orbit.py ..." measures those files only.
 costs: install
-	rm -rf .pytest_cache/jax $(COSTS) $(COSTS)-fast
-	TEST_COSTS=$(COSTS) $(PYTEST) -m ""
-	$(BIN)/python tests/tiers.py $(COSTS)
-	TEST_COSTS=$(COSTS)-fast $(PYTEST) -m fast
-	$(BIN)/python tests/tiers.py $(COSTS) $(COSTS)-fast
+	rm -rf .pytest_cache/costs
+	COSTS=$(if $(FILES),some,all) JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/costs $(PYTEST) $(FILES)
+	$(BIN)/python tests/budget.py
 
 bench: install
 	$(BIN)/python benchmarks/run.py
@@ -72,7 +80,7 @@ bench: install
 # At every save the fast tests that run what was changed; the first round runs them all.
 watch: install
 	@mkdir -p .pytest_cache
-	TESTMON_DATAFILE=.pytest_cache/testmon $(BIN)/watchfiles --filter python \
+	UNCHECKED=1 TESTMON_DATAFILE=.pytest_cache/testmon $(BIN)/watchfiles --filter python \
 		'$(BIN)/python -m pytest -q -m fast --testmon-forceselect' src tests
 
 # Where a command of robins spends its time: make profile CMD="run satellite/s1 --runs 2"

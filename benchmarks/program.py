@@ -9,15 +9,12 @@ machine, in one go, in turn: time of the processor, the best of some rounds.
 
     python benchmarks/program.py [EKF-9] [UKF-9] [H-infinity-9] [INS/GNSS-15] [strapdown]
 
-Where NVRTC is installed (JAX's extra for GPUs brings it), the same program is compiled as a kernel
-for an H100, and its stack and spills shown; where there is a GPU, 131 072 runs are stepped on it.
 Eigen is looked for in /usr/include/eigen3 (Debian: `apt install libeigen3-dev`) and in the folder
 that EIGEN names; where it is not, its column is empty.
 """
 
 import ctypes
 import os
-import re
 import sys
 import tempfile
 import time
@@ -41,19 +38,11 @@ from robins.ins.increments import from_imu
 from robins.ins.mechanise import Nav
 from robins.ins.mechanise import step as mechanise
 from robins.program import CPP, LANE_FLAGS, build, function, header, to_c, trace_step
-from robins.program.cuda import to_cuda
-from robins.program.kernel import Kernel
-from robins.program.nvrtc import compile_cuda, found
 from robins.rotation import Rotation
 from robins.systems.ins_gnss import SYSTEM, Drive
 
 N, M, BATCH, STEPS = 9, 3, 256, 200
 EPOCHS, SAMPLES, RATE = 20, 1000, 100  # of the drive; of strapdown; samples in an epoch
-GPU_RUNS, LARGEST = 131_072, 20_000  # nodes of a program that NVRTC is given
-SPILLS = (
-    r"properties for robins_steps\s+ptxas\s+\.\s+(\d+) bytes stack frame, "
-    r"(\d+) bytes spill stores, (\d+) bytes spill loads"
-)
 EIGEN = Path(os.environ.get("EIGEN", "/usr/include/eigen3"))
 EIGEN_FLAGS = ("-std=gnu++17", "-O3", "-march=native", "-DNDEBUG", f"-isystem{EIGEN}")
 
@@ -281,39 +270,11 @@ def by_filterpy(A, H, y, P0) -> Callable[[], np.ndarray]:
     return go
 
 
-def on_gpu(program, case: Case, machine=None, runs: int = GPU_RUNS) -> Callable[[], Any]:
-    """Many runs in a kernel, on the first GPU; all are given the rows of the first."""
-    kernel = Kernel(program, machine)
-    states = jax.tree.map(lambda x: x[jnp.arange(runs) % BATCH], case.states)
-    rows = jax.tree.map(lambda x: x[:, :1], case.rows)
-    return lambda: kernel(states, rows, every=0)[0]
-
-
-def gpu_columns(program, case: Case, lanes: Callable[[], np.ndarray]) -> list[str]:
-    """Stack of a thread and what a step spills there [bytes]; time of a step, where a GPU is."""
-    if found() is None or len(program.live) > LARGEST:
-        return ["", ""]
-    log = compile_cuda(to_cuda(program), "sm_90").log
-    frame, stored, loaded = map(int, re.search(SPILLS, log).groups())
-    cells = [f"{frame} + {stored + loaded}"]
-    try:
-        jax.devices("cuda")
-    except RuntimeError:
-        return [*cells, ""]
-    go = on_gpu(program, case)
-    first = [np.ravel(x[0]) for x in jax.tree.leaves(go()) if x.dtype == float]
-    assert np.allclose(np.concatenate(first), lanes()[:, 0], rtol=1e-11, atol=1e-11)
-    seconds = best_of({"GPU": go}, 10)["GPU"]
-    return [*cells, f"{seconds / GPU_RUNS / case.steps / case.unit * 1e9:.3f}"]
-
-
 # -------------------------------------------------------------------------------------- the table
 
 HEAD = ("unroll", "nodes", "trace s", "C s", "C++ s", "off JAX", "C ns", "lanes ns", "JAX ns")
 PEERS = (
     "JAX/lanes",
-    "GPU stack + spills B",
-    "GPU ns",
     "Eigen ns",
     "lanes/Eigen",
     "filterpy ns",
@@ -359,7 +320,6 @@ def row(case: Case, unroll: int) -> list[str]:
     made = [str(unroll), str(len(program.live)), *(f"{x:.1f}" for x in (traced, c_s, cpp_s))]
     made += [f"{off:.0e}", *(f"{ns[name]:.0f}" for name in ("C", "lanes", "JAX"))]
     made.append(f"{ns['JAX'] / ns['lanes']:.1f}")
-    made += gpu_columns(program, case, lanes)
     made += (
         [f"{ns['Eigen']:.0f}", f"{ns['lanes'] / ns['Eigen']:.2f}"] if "Eigen" in ns else ["", ""]
     )

@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "room_pages",
+    "budget_table",
     "finding_tables",
     "format_tables",
     "plain_docstrings",

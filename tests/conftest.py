@@ -10,10 +10,12 @@ import signal
 import sys
 from pathlib import Path
 
+import checking
 import hypothesis
 import jax
-import jaxtyping
+import meter
 import pytest
+import records
 import tiers
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,10 +50,12 @@ for number, handler in (
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
 
-# Every annotation in robins is checked at each call: shapes by jaxtyping, types by beartype.
+# Every annotation in robins is checked at each call, shapes by jaxtyping, types by beartype: not in
+# `make check`, where the checks would take longer to make than the tests to run.
 if "robins" in sys.modules:
     raise pytest.UsageError("robins was imported before its annotations could be checked")
-jaxtyping.install_import_hook("robins", "beartype.beartype")
+if not os.environ.get("UNCHECKED"):
+    checking.install("robins")
 
 # An accidental outer product or a silent change of width is an error here, not a slow surprise.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -99,9 +103,11 @@ def pytest_runtest_teardown(item):
 
 
 def pytest_configure(config):
-    if folder := os.environ.get("TEST_COSTS"):
-        config.pluginmanager.register(tiers.Meter(folder))
-    if (page := os.environ.get("CERTIFICATE")) and not hasattr(config, "workerinput"):
+    config.pluginmanager.register(meter.Meter(), "meter")
+    if hasattr(config, "workerinput"):
+        return
+    config.pluginmanager.register(records.Records(config))
+    if page := os.environ.get("CERTIFICATE"):
         config.pluginmanager.register(tiers.Certificate(page))
 
 

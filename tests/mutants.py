@@ -3,9 +3,13 @@
     python tests/mutants.py --commit v0.1.0 --out before.json
     python tests/mutants.py --before before.json --out after.json
     python tests/mutants.py --only gate-patience "wire-*"
+    python tests/mutants.py --random 100 --seed 42 --select fast --out random.json
+    python tests/mutants.py --rows random.json --tests tests/sim/test_orbit.py --resume
 
 They are planted in a copy of the commit, never here. A fault is caught by a test that fails with
-it and passes without it. Exit status 1 if one was not caught.
+it and passes without it. Exit status 1 if one was not caught. `--random` draws faults
+(`mutations.py`) instead of the table; its outcome holds their rows, so `--rows` plants the same
+ones in a later commit.
 """
 
 import argparse
@@ -24,6 +28,8 @@ from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from queue import Queue
+
+import mutations
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = Path(__file__).with_name("mutants.toml")
@@ -64,10 +70,11 @@ def copied(commit: str, folder: Path) -> Path:
     return folder
 
 
-def failing(root: Path, tests: list[str], limit_s: float, most: int) -> list[str]:
+def failing(root: Path, tests: list[str], given: argparse.Namespace, most: int) -> list[str]:
     """The tests that fail, up to so many; raises RuntimeError if pytest does not end well."""
     (root / FAILED).unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", f"--maxfail={most}", *tests]
+    command += ["-m", given.select]
     process = subprocess.Popen(
         command,
         cwd=root,
@@ -76,43 +83,56 @@ def failing(root: Path, tests: list[str], limit_s: float, most: int) -> list[str
         start_new_session=True,
     )
     try:
-        status = process.wait(limit_s)
+        status = process.wait(given.timeout)
     except subprocess.TimeoutExpired:
-        raise RuntimeError(f"the tests did not end within {limit_s:g} s") from None
+        raise RuntimeError(f"the tests did not end within {given.timeout:g} s") from None
     finally:
         with suppress(ProcessLookupError):  # what the tests started ends with them
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-    if status not in (0, 1):
+    if status not in (0, 1, 2, 5):  # 2: a file of tests that cannot be imported; 5: no test
         raise RuntimeError(f"pytest ended with status {status}")
-    return sorted(json.loads((root / FAILED).read_text("utf-8"))) if status else []
+    if status in (0, 5):
+        return []
+    return (
+        sorted(json.loads((root / FAILED).read_text("utf-8"))) if (root / FAILED).exists() else []
+    )
 
 
-def seen_with(mutant: dict, root: Path, stamp: int, limit_s: float, most: int) -> list[str]:
+def seen_with(mutant: dict, root: Path, stamp: int, given: argparse.Namespace) -> list[str]:
     """The tests that fail while a fault is in its file."""
     file, text, tests = planted(mutant, root)
     whole, times = file.read_bytes(), file.stat()
     try:
         file.write_text(text, "utf-8")
         os.utime(file, (stamp, stamp))  # a time of its own, so that no bytecode outlives it
-        return failing(root, tests, limit_s, most)
+        return failing(root, given.tests or tests, given, given.maxfail)
     finally:
         file.write_bytes(whole)
         os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
 
 
-def tried(mutant: dict, root: Path, stamp: int, limit_s: float, most: int) -> dict:
+def tried(mutant: dict, root: Path, stamp: int, given: argparse.Namespace) -> dict:
     """What became of one fault: status, seconds, the tests that caught it, why it was not run."""
     began, caught, why = time.monotonic(), [], ""
     try:
-        seen = seen_with(mutant, root, stamp, limit_s, most)
-        sick = failing(root, seen, limit_s, len(seen)) if seen else []
+        seen = seen_with(mutant, root, stamp, given)
+        sick = failing(root, seen, given, len(seen)) if seen else []
         caught = [test for test in seen if test not in sick]
         status = "caught" if caught else "SURVIVED"
     except (ValueError, RuntimeError) as error:
         status, why = "NOT RUN", str(error)
     seconds = round(time.monotonic() - began)
     return {"status": status, "seconds": seconds, "caught_by": caught, "why": why}
+
+
+def rows(given: argparse.Namespace) -> list[dict]:
+    """Faults to plant: of the table, of an earlier outcome, or drawn."""
+    if given.rows:
+        return list(json.loads(given.rows.read_text("utf-8")).values())
+    if given.random:
+        return mutations.drawn(ROOT / "src" / "robins", TABLE.parent, given.random, given.seed)
+    return table()
 
 
 def listed(due: list[dict], before: dict, done: dict) -> str:
@@ -138,17 +158,22 @@ def main() -> int:
     asked.add_argument("--resume", action="store_true", help="leave out what --out holds already")
     asked.add_argument("--before", type=Path, help="outcome of an earlier commit to compare with")
     asked.add_argument("--page", type=Path, help="where to list the tests that caught each")
+    asked.add_argument("--random", type=int, metavar="N", help="draw so many faults")
+    asked.add_argument("--seed", type=int, default=42, help="of the draw")
+    asked.add_argument("--rows", type=Path, help="an outcome whose faults to plant")
+    asked.add_argument("--select", default="not certify", metavar="MARKS", help="as -m of pytest")
+    asked.add_argument("--tests", nargs="+", help="files of tests; else those of each fault")
     given = asked.parse_args()
     done = json.loads(given.out.read_text("utf-8")) if given.resume and given.out.exists() else {}
     before = json.loads(given.before.read_text("utf-8")) if given.before else {}
-    due = [m for m in table() if any(fnmatch(m["id"], p) for p in given.only)]
+    due = [m for m in rows(given) if any(fnmatch(m["id"], p) for p in given.only)]
     jobs = [(k, m) for k, m in enumerate(due, 1) if m["id"] not in done]
     copies: Queue[Path] = Queue()
 
     def one(job: tuple[int, dict]) -> tuple[dict, dict]:
         root = copies.get()
         try:
-            return job[1], tried(job[1], root, job[0], given.timeout, given.maxfail)
+            return job[1], tried(job[1], root, job[0], given)
         finally:
             copies.put(root)
 
@@ -157,7 +182,7 @@ def main() -> int:
             copies.put(copied(given.commit, Path(scratch) / str(k) / "robins"))
         with ThreadPoolExecutor(given.jobs) as pool:
             for mutant, found in pool.map(one, jobs):
-                done[mutant["id"]] = {"what": mutant["what"], "commit": given.commit} | found
+                done[mutant["id"]] = {"commit": given.commit} | mutant | found
                 given.out.parent.mkdir(parents=True, exist_ok=True)
                 given.out.write_text(json.dumps(done, indent=1) + "\n", "utf-8")
                 told = found["why"] or " ".join(found["caught_by"][:2])

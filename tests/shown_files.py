@@ -1,12 +1,12 @@
 """The files that command lines in the documents name, made small."""
 
-import io
 import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import gnss_logs
 import numpy as np
+from short_drive import write_pos
 from simulated_pair import pair_dataset
 
 from robins import logs, scenario
@@ -21,25 +21,6 @@ from robins.systems.transfer_alignment.product.parameters import Replay
 from robins.workbench import campaign_work, plan_campaign, publish
 
 ROOT = Path(__file__).resolve().parents[1]
-GNSS_HEAD = (
-    "%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) "
-    "sdun(m) age(s) ratio vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun\n"
-)
-
-
-def write_pos(path, gnss):
-    """Fixes as RTKLIB writes them."""
-    lines = io.StringIO()
-    lines.write(GNSS_HEAD)
-    for k, stamp in enumerate(gnss.time_ns):
-        week, left = divmod(int(stamp) - 315_964_800_000_000_000, 604_800_000_000_000)
-        n, e, d = gnss.v_n[k]
-        lat, lon = np.rad2deg([gnss.lat_rad[k], gnss.lon_rad[k]])
-        lines.write(
-            f"{week} {left * 1e-9:.3f} {lat:.9f} {lon:.9f} {gnss.alt_m[k]:.4f} 1 12 1 1 2 0 0 0 0 "
-            f"9 {n:.4f} {e:.4f} {-d:.4f} 0.05 0.05 0.1 0 0 0\n"
-        )
-    Path(path).write_text(lines.getvalue())
 
 
 def write_nine_axes(path, seconds=40.0, hz=50.0):

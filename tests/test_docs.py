@@ -11,6 +11,7 @@ import inspect
 import itertools
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import click
@@ -283,6 +284,27 @@ def test_links_between_pages_lead_somewhere():
     for page in pages():
         targets = re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
         assert [t for t in targets if not (page.parent / t).exists()] == [], page
+
+
+def files_meant(text: str) -> list[Path]:
+    """Files of this repository behind the absolute addresses of a page, which PyPI needs."""
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["urls"]
+    raw = urls["Source"].replace("https://github.com", "https://raw.githubusercontent.com")
+    pages = re.findall(rf"{re.escape(urls['Documentation'])}/en/latest/([\w/-]+)\.html", text)
+    files = re.findall(
+        rf"(?:{re.escape(urls['Source'])}/blob|{re.escape(raw)})/main/([^)\s]+)", text
+    )
+    return [*(ROOT / "docs" / f"{page}.md" for page in pages), *(ROOT / file for file in files)]
+
+
+def test_the_readme_can_be_read_on_pypi():
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert re.findall(r"\]\((?!https://|#)([^)]+)", text) == []
+    meant = files_meant(text)
+    assert {".png", ".md", ".cff"} <= {path.suffix for path in meant}
+    assert [str(path) for path in meant if not path.is_file()] == []
+    own = [part for part in re.findall(r"https://[^)\s]+", text) if "robins" in part]
+    assert len(own) == len(meant)  # none by another address
 
 
 @pytest.mark.parametrize(

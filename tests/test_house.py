@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from ratchets import imported_modules
 
 import robins
 
@@ -36,21 +37,6 @@ class Import(NamedTuple):
 def room_of(module: str) -> str:
     """`robins.filters.rules.gate` -> `filters`; the package itself -> ``."""
     return module.split(".")[1] if "." in module else ""
-
-
-def imported_modules(tree: ast.AST, package: str) -> Iterator[tuple[int, str]]:
-    """Line and full name of everything imported, relative and dynamic imports included."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: 1 - node.level or None] if node.level else []
-            base = ".".join([*above, *([node.module] if node.module else [])])
-            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
-        elif isinstance(node, ast.Call) and "import" in ast.unparse(node.func):
-            yield from (
-                (node.lineno, str(a.value)) for a in node.args[:1] if isinstance(a, ast.Constant)
-            )
 
 
 def imports(source: Path) -> Iterator[Import]:

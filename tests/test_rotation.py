@@ -304,6 +304,7 @@ def test_numpy_is_answered_by_numpy_with_the_same_numbers():
     v = rng.normal(size=(40, 3))
     q = q.at[:3].set(jnp.array([[1.0, 0.0, 0.0, 0.0], [1.0, 1e-9, 0.0, 0.0], [-1.0, 0.0, 0.1, 0]]))
     calls = [(rot.multiply, p, q), (rot.conjugate, q), (rot.to_rotvec, q), (rot.to_dcm, q)]
+    calls += [(rot.rotate, q, jnp.asarray(v))]
     for f, *arguments in [*calls, (rot.skew, jnp.asarray(v))]:
         got = f(*map(np.asarray, arguments))
         assert type(got) is np.ndarray

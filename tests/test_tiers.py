@@ -86,9 +86,3 @@ def test_tiers_are_not_marked_by_hand():
         if path.name != "tiers.py":
             found = re.search(r"mark\.(fast|certify|slow)\b", path.read_text("utf-8"))
             assert not found or path == Path(__file__), path
-
-
-def test_costs_are_those_of_tests_that_are_there():
-    """A name that is gone would hide that its successor was never measured."""
-    for name in tiers.costs():
-        assert defined(name), f"{name} is gone: run `make costs`, or delete its line"

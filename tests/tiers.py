@@ -4,15 +4,13 @@
     make test       all but `certify`
     make certify    those of `certify.toml`, and every property with a thousand examples
 
-`costs.json` holds the seconds of processor of each test that takes 0.2 s or more, with
-what it compiles, from an empty cache; `make costs` writes it. `certify.toml` names what is too long
-to wait for at every push, which promise it guards, and which tests of `make test` stand for it
-meanwhile.
+`costs.json` holds, by file, the seconds of processor of each test that takes 0.2 s or more, from an
+empty cache; `make costs` writes it (`budget.py`). `certify.toml` names what is too long to wait for
+at every push, which promise it guards, and which tests of `make test` stand for it meanwhile.
 
 PART=2/4 runs the second of four parts that cost alike.
 """
 
-import json
 import os
 import re
 import subprocess
@@ -21,11 +19,11 @@ import tomllib
 from datetime import date
 from pathlib import Path
 
+import budget
 import pytest
 
 HERE = Path(__file__).parent
-COSTS, CERTIFY = HERE / "costs.json", HERE / "certify.toml"
-LEAST_S = 0.2  # of a cost worth writing down
+CERTIFY = HERE / "certify.toml"
 
 
 def plain(node: str) -> str:
@@ -40,7 +38,8 @@ def certified() -> list[dict[str, str]]:
 
 def costs() -> dict[str, float]:
     """Seconds of processor of costly tests, without their parameters."""
-    return json.loads(COSTS.read_text("utf-8"))
+    files = budget.costs()["files"]
+    return {f"{f}::{test}": s for f, row in files.items() for test, s in row["tests"].items()}
 
 
 def meant(entry: dict[str, str], node: str) -> bool:
@@ -52,10 +51,12 @@ def meant(entry: dict[str, str], node: str) -> bool:
 
 def mark(items: list[pytest.Item]) -> None:
     """Give each test its tier."""
-    costly, moved = costs(), certified()
+    costly, moved = costs(), dict[str, list[dict[str, str]]]()
+    for entry in certified():
+        moved.setdefault(entry["test"], []).append(entry)
     for item in items:
         node = item.nodeid.removeprefix("tests/")
-        if any(meant(entry, node) for entry in moved):
+        if any(meant(entry, node) for entry in moved.get(plain(node), ())):
             item.add_marker(pytest.mark.certify)
         elif plain(node) not in costly:
             item.add_marker(pytest.mark.fast)
@@ -72,7 +73,7 @@ def arrange(
     costly, spent = costs(), dict[str, float]()
     for node in dict.fromkeys(plain(item.nodeid.removeprefix("tests/")) for item in items):
         file = node.partition("::")[0]
-        spent[file] = spent.get(file, 0.0) + costly.get(node, LEAST_S / 4)
+        spent[file] = spent.get(file, 0.0) + costly.get(node, budget.LEAST_S / 4)
     mine, parts = (int(n) for n in part.split("/"))
     load, place = [0.0] * parts, dict[str, tuple[int, int]]()
     for rank, file in enumerate(sorted(spent, key=lambda f: -spent[f])):
@@ -83,35 +84,6 @@ def arrange(
     ordered = sorted(items, key=lambda item: at[item][1])
     kept = [item for item in ordered if at[item][0] == mine - 1]
     return kept, [item for item in ordered if at[item][0] != mine - 1]
-
-
-class Meter:
-    """Writes what each test cost, a line a test, into a file for each worker."""
-
-    def __init__(self, folder: str):
-        self.file = Path(folder) / f"{os.getpid()}.jsonl"
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-
-    @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_protocol(self, item):
-        """Setup, call and teardown: what the first user of a fixture pays is its cost."""
-        wall, spent = time.monotonic(), _processor()
-        done = yield
-        cost = {"test": item.nodeid.removeprefix("tests/"), "processor_s": _processor() - spent}
-        cost |= {"wall_s": time.monotonic() - wall, "mib": _mib()}
-        with self.file.open("a", encoding="utf-8") as out:
-            print(json.dumps(cost), file=out)
-        return done
-
-
-def _processor() -> float:
-    """Seconds of this process and of those it started and has waited for."""
-    return sum(os.times()[:4])
-
-
-def _mib() -> int:
-    statm = Path("/proc/self/statm")
-    return int(statm.read_text().split()[1]) * 4096 >> 20 if statm.exists() else 0
 
 
 class Certificate:
@@ -132,32 +104,3 @@ class Certificate:
             f"{os.cpu_count()} cores.\n",
             "utf-8",
         )
-
-
-def summed(folder: str) -> dict[str, float]:
-    """What the meters of a run wrote, by test without its parameters."""
-    sums: dict[str, float] = {}
-    for file in Path(folder).glob("*.jsonl"):
-        for line in file.read_text("utf-8").splitlines():
-            row = json.loads(line)
-            name = plain(row["test"])
-            sums[name] = sums.get(name, 0.0) + row["processor_s"]
-    return sums
-
-
-def write_costs(*folders: str) -> None:
-    """The most that each test cost in some run.
-
-    A test may find what another one computed and compiled: the fast ones are measured alone too.
-    """
-    runs = [summed(folder) for folder in folders]
-    most = {test: max(run.get(test, 0.0) for run in runs) for run in runs for test in run}
-    costly = {k: round(v, 1) for k, v in sorted(most.items()) if v >= LEAST_S}
-    COSTS.write_text(json.dumps(costly, indent=0) + "\n", "utf-8")
-    print(f"{COSTS}: {len(costly)} of {len(most)} tests cost {LEAST_S:g} s or more")
-
-
-if __name__ == "__main__":
-    import sys
-
-    write_costs(*sys.argv[1:])

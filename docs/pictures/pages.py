@@ -1,6 +1,6 @@
 """Draw the figures of pages: run each page's examples and save what they call `figure`.
 
-python docs/pictures/pages.py [docs/filters/huber.md ...]; without a page, all of them.
+python docs/pictures/pages.py [docs/filters/huber.md ...]; without a page, README and all filters.
 """
 
 import re
@@ -29,5 +29,6 @@ def draw(page: Path) -> None:
 
 if __name__ == "__main__":
     plt.switch_backend("agg")
-    for page in [Path(p) for p in sys.argv[1:]] or sorted((HERE.parent / "filters").glob("*.md")):
+    pages = [HERE.parents[1] / "README.md", *sorted((HERE.parent / "filters").glob("*.md"))]
+    for page in [Path(p) for p in sys.argv[1:]] or pages:
         draw(page)

@@ -88,12 +88,13 @@ def normalise(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
 
 
-def rotate(q: Float[Array, "*#b 4"], v: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
+def rotate(q: Float[Real, "*#b 4"], v: Float[Real, "*#b 3"]) -> Float[Real, "*b 3"]:
     """Turn vectors; with q_nb, body components become navigation components."""
+    xp = _library(q, v)
     q, v = _same_rank(q, v)
     w, u = q[..., :1], q[..., 1:]
-    t = 2.0 * jnp.cross(u, v)
-    return v + w * t + jnp.cross(u, t)
+    t = 2.0 * xp.cross(u, v)
+    return v + w * t + xp.cross(u, t)
 
 
 def from_rotvec(phi: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:

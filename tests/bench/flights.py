@@ -1,23 +1,37 @@
 """A run of any rig without lines: its parts one after the other, in one process."""
 
+from stations import parts
+
 from robins.bench.run.telemetry import Telemetry
+
+
+def in_order(rig, made):
+    """Parts, each after those whose messages of the same step it takes."""
+    done = {}
+    while len(done) < len(rig.parts):
+        heard = {message for name in done for message in rig.sends[name]} | {*rig.console}
+        for name in rig.parts:
+            now = {message for message, lag in made[name].takes.items() if lag == 0}
+            if name not in done and now <= heard:
+                done[name] = made[name]
+    return list(done.values())
 
 
 def flown(
     rig, kit, steps, lost=lambda name, k: False, begin=0, states=None, wrong=lambda name, k, x: x
 ):
-    """What the parts say, as a bench would note it, and their last states.
+    """What the parts say, as a bench would note it, and their last states with what they heard.
 
     All must be sound. A message for which ``lost(name, step)`` holds reaches nobody, but is noted;
-    what others hear is ``wrong(name, step, values)``. Parts take messages of the same step from
-    those before them in the order of the rig.
+    what others hear is ``wrong(name, step, values)``. From ``begin`` on it continues with the
+    states of an earlier run, and notes nothing of the steps before.
     """
-    parts = [rig.build[name](kit) for name in rig.parts]
-    states = states or {part.name: part.begin() for part in parts}
-    telemetry, heard = Telemetry(rig, steps, kit.step_ns), {}
+    made = in_order(rig, parts(kit, rig))
+    states = dict(states or {part.name: part.begin() for part in made})
+    telemetry, heard = Telemetry(rig, steps, kit.step_ns), states.pop("heard", {})
     for k in range(begin, steps):
         heard, before = {}, heard
-        for part in parts:
+        for part in made:
             inputs = {name: (heard, before)[lag].get(name) for name, lag in part.takes.items()}
             states[part.name], sent = part.act(states[part.name], k, inputs)
             for name, values in sent:
@@ -26,4 +40,4 @@ def flown(
                 if not lost(name, k):
                     heard[name] = wrong(name, k, rig.wire.decode(name, payload))
                 telemetry.observe(name, (k + 1) * kit.step_ns, payload)
-    return telemetry.flown, states
+    return telemetry.flown, {**states, "heard": heard}

@@ -1,24 +1,33 @@
 """The seven parts in one process: joined by bytes, or on threads in the place of processes."""
 
 import os
+import select
+import signal
 import termios
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache, partial
+from hashlib import sha256
+from multiprocessing import Pipe
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 import numpy as np
 
-from robins.bench.parts.station import Part, Station, ready, serve
+from robins.bench.parts.kits import put, take
+from robins.bench.parts.station import HELLO_EACH_S, Part, Station, path_of, put_aside, ready
 from robins.bench.ports.port import address, open_port
+from robins.bench.recording.replay import Start
 from robins.bench.rig import Rig
 from robins.bench.rigs.satellite import BUILD, RIG, Kit
 from robins.bench.rigs.satellite.errors import inside
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.rigs.satellite.preparing import kit_for
-from robins.bench.run.setup import read
-from robins.bench.wire import Frame, Header, Receiver, Wire, encode_frame
+from robins.bench.run.crew import Crew
+from robins.bench.run.setup import Flight, kit_of, read
+from robins.bench.wire import Frame, Header, Receiver, encode_frame
 
 RUN = 7
 ORDER = ("acm", "actuators", "plant", "table", "gyro", "star", "adm")
@@ -46,55 +55,129 @@ def one_program(name: str, filter_: str, *settings: str) -> dict[str, np.ndarray
     return inside(kit(name, filter_, *settings))
 
 
-_READY: dict[int, tuple[Any, dict[str, Part]]] = {}
+_KITS: dict[int, tuple[Any, Any, str]] = {}
+_READY: dict[tuple[str, str], dict[str, Part]] = {}
 
 
-def parts(of: Any, rig: Rig = RIG) -> dict[str, Part]:
-    """The parts of a kit, compiled once; what they remember is with their stations."""
-    if id(of) not in _READY:  # the kit is kept, so that no other has its identity
-        made = {name: ready(build(of), of.frames) for name, build in rig.build.items()}
-        _READY[id(of)] = of, made
-    return _READY[id(of)][1]
+class Parts(dict[str, Part]):
+    """Parts by name, each compiled when it is first needed."""
+
+    def __init__(self, rig: Rig, of: Any):
+        super().__init__()
+        self.rig, self.kit = rig, of
+
+    def __missing__(self, name: str) -> Part:
+        return self.setdefault(name, ready(self.rig.build[name](self.kit), self.kit.frames))
 
 
-class Threads:
-    """In the place of `Crew`: parts on threads, over pseudo-terminals; starts no process."""
+def parts(of: Any, rig: Rig = RIG) -> Mapping[str, Part]:
+    """Parts of a kit as a process would take it; compiled once for all kits with the same bytes.
 
-    stations: ClassVar[Mapping[str, Callable[[Part, Wire], Station]]] = {}  # of parts that are odd
-
-    def __init__(self, rig: Rig, kit: Any, *_: object):
-        self.parts, self.wire = parts(kit, rig), rig.wire
-        self.threads = list[threading.Thread]()
-
-    def __enter__(self) -> "Threads":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for thread in self.threads:
-            thread.join(5.0)
-
-    def start(self, name: str, port: str, since: int = -1) -> None:
-        def be():
-            with suppress(OSError), open_port(address(port), timeout_s=None) as line:
-                serve(line, self.stations.get(name, Station)(self.parts[name], self.wire))
-
-        self.threads.append(threading.Thread(target=be, daemon=True))
-        self.threads[-1].start()
-
-    def process(self, name: str) -> None:
-        return None
-
-    def deaths(self, among: str | None = None) -> list[Any]:
-        return []
-
-    def remembers(self, name: str, step: int) -> bool:
-        return False
+    What they remember is with their stations.
+    """
+    if id(of) not in _KITS:  # the kit is kept, so that no other has its identity
+        with TemporaryDirectory() as folder:
+            put(of, path := Path(folder) / "kit")
+            _KITS[id(of)] = of, take(path), sha256(path.read_bytes()).hexdigest()
+    _, taken, digest = _KITS[id(of)]
+    return _READY.setdefault((rig.name, digest), Parts(rig, taken))
 
 
-def on_threads(monkeypatch: Any, crew: type[Threads] = Threads, **stations: Any) -> None:
-    """Let sessions start threads, some of them with other stations."""
+class Node(threading.Thread):
+    """In the place of the process of a part: a thread at the end of a pseudo-terminal."""
+
+    pid = None
+
+    def __init__(self, station: Station, port: str):
+        super().__init__(daemon=True)
+        self.station, self.port, self.code = station, port, None
+        self.killed, self.killer = Pipe(duplex=False)
+        self.start()
+
+    def run(self) -> None:
+        code = 1
+        try:
+            with suppress(OSError), open_port(address(self.port), timeout_s=None) as line:
+                self.serve(line)
+            code = 0
+        finally:
+            self.code = code if self.code is None else self.code
+
+    def serve(self, line: Any) -> None:
+        """Do as `robins.bench.parts.station.serve` does, until it is killed."""
+        station = self.station
+        while not station.over:
+            if not station.begun:
+                line.write(station.hello())
+            wait_s = None if station.begun else HELLO_EACH_S
+            found = select.select([line, self.killed], [], [], wait_s)[0]
+            if self.killed in found:
+                return
+            if found and (answer := station.feed(os.read(line.fileno(), 65536))):
+                line.write(answer)
+
+    def poll(self) -> int | None:
+        return self.code
+
+    def kill(self) -> None:
+        self.code = -signal.SIGKILL
+        self.killer.send_bytes(b"!")
+        self.wait()
+
+    def wait(self) -> None:
+        self.join(5.0)
+
+
+class Threads(Crew):
+    """In the place of `Crew`: parts of a rig on threads, but for programs and a few.
+
+    Attributes:
+        stations: of parts that are odd.
+        processes: parts that stay processes.
+    """
+
+    stations: ClassVar[Mapping[str, Callable[..., Station]]] = {}
+    processes: ClassVar[Sequence[str]] = ()
+
+    def start(self, part: str, port: str, since: int = -1) -> None:
+        if part in {*self._programs, *self.processes}:
+            return super().start(part, port, since)
+        (self._folder / f"{part}.txt").touch()
+        given = [parts(self._kit, self._rig)[part], self._rig.wire]
+        if self._restarts:
+            memory = None if since < 0 else path_of(self._folder, part, since).read_bytes()
+            given += [memory, partial(put_aside, self._folder, part)]
+        self._running[part] = Node(self.stations.get(part, Station)(*given), port)
+
+
+@contextmanager
+def starting(flight: Flight, part: str, program: Path | None) -> Iterator[Start]:
+    """In the place of what starts a process for a replay."""
+    programs = {} if program is None else {part: program}
+    with Threads(flight.rig, kit_of(flight), programs=programs) as crew:
+
+        @contextmanager
+        def start(port: str) -> Iterator[Any]:
+            crew.start(part, port)
+            running = crew._running[part]
+            yield running
+            running.kill()
+            running.wait()
+
+        yield start
+
+
+def on_threads(
+    monkeypatch: Any,
+    crew: type[Threads] = Threads,
+    processes: Sequence[str] = (),
+    **stations: Any,
+) -> None:
+    """Let sessions and replays start threads, but for some parts; some with other stations."""
     monkeypatch.setattr(crew, "stations", stations)
+    monkeypatch.setattr(crew, "processes", processes)
     monkeypatch.setattr("robins.bench.run.session.Crew", crew)
+    monkeypatch.setattr("robins.workbench.benches._starter", starting)
 
 
 class Loop:
@@ -105,7 +188,7 @@ class Loop:
 
     def __init__(self, of: Kit, meddle: Meddle | None = None):
         self.kit, self.meddle = of, meddle
-        self.stations = {name: Station(part, WIRE) for name, part in parts(of).items()}
+        self.stations = {name: Station(parts(of)[name], WIRE) for name in BUILD}
         self.sent = dict.fromkeys(BUILD, 0)
         self.receivers = {name: Receiver() for name in BUILD}
         self.heard: dict[str, list[dict[str, Any]]] = {}

@@ -44,7 +44,7 @@ def program(tmp_path_factory):
     unpacked(folder / "c")
     extra = SANITISERS if sanitised(folder) else []
     sources = "adm_board.c", "robins.c", "platform_posix.c"
-    return build(folder / "c", *sources, extra=("-ffp-contract=off", *extra))
+    return build(folder / "c", *sources, extra=("-O0", "-ffp-contract=off", *extra))
 
 
 def flown(of, meddled):

@@ -1,4 +1,4 @@
-"""The airship on the bench: its filters over lines are those of the study."""
+"""The airship on the bench: instruments that fail, and what is made of a flight."""
 
 from types import SimpleNamespace
 
@@ -9,9 +9,6 @@ from flights import flown
 from robins.bench.broker.faults import LinkFault
 from robins.bench.rigs import rig_of
 from robins.bench.run.setup import read
-from robins.bench.run.telemetry import difference
-from robins.results import read as read_result
-from robins.workbench import bench_replay, bench_up, publish
 
 RIG = rig_of("airship")
 SPANS = [f"{of}.{edge}" for of in ("counted", "wind.span") for edge in ("begin=20 s", "end=60 s")]
@@ -29,18 +26,13 @@ def judged(flight, kit, of):
     return RIG.judge(flight, SimpleNamespace(flown=of, kit=kit, steps=len(of.time_s)))
 
 
-def test_it_is_the_run_inside_one_program(run):
+def test_it_is_right_about_the_flight(run):
     flight, kit = run
     assert flight.timing.steps == len(kit.u.dt) == 60
-    of = flown(RIG, kit, 60)[0]
-    assert difference(of, RIG.inside(kit)) < 1e-12
-    begins = RIG.inside(kit, 20)
-    assert {len(x) for x in begins.values()} == {20}
-    assert difference(of.until(20), begins) < 1e-12
-    said = judged(flight, kit, of)
+    said = judged(flight, kit, flown(RIG, kit, 60)[0])
     error, sigma = (said.arrays[f"{what}_velocity"].values[0] for what in ("error", "sigma"))
     assert 0.1 < np.sqrt(np.mean((error / sigma) ** 2)) < 3.0
-    assert said.metrics["attitude_rms_arcsec"] < 200.0
+    assert 0.0 < said.metrics["attitude_rms_arcsec"] < 200.0
     assert said.counts["steps_without_increment"] == 0
 
 
@@ -75,14 +67,3 @@ def test_faults_of_its_instruments():
     np.testing.assert_array_equal(off["place"], [51.0, 2.0])
     assert off["heading"] == 0.1
     assert np.isnan(said["blind"].act({"euler": np.zeros(3)}, None, 0)["euler"]).all()
-
-
-def test_it_flies_by_processes_and_its_record_is_heard_again(tmp_path):
-    outcome = bench_up(
-        "airship/s1", settings=SETTINGS, filter="ekf", seconds=20.0, record=tmp_path / "r.mcap"
-    )
-    folder = publish(outcome, tmp_path / "out").path
-    assert outcome.failure == ""
-    assert outcome.metrics["ekf"]["attitude_rms_arcsec"] > 0.0
-    assert {"error_position", "sigma_position"} <= set(read_result(folder).solution)
-    assert bench_replay(folder / "record.mcap", node="navigation").same

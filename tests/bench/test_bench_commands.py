@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+from clockwork import CLOCKWORK
 from stations import alive
 
 from robins.bench.recording import read_record
@@ -22,7 +23,8 @@ def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path, monkeypa
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     out = tmp_path / "out"
-    command = [*ROBINS, "bench", "up", "satellite/s1", "--baud", "9600", "--out", str(out)]
+    command = [*ROBINS, "bench", "up", CLOCKWORK, "--set", "wait=1 s", "--baud", "9600"]
+    command += ["--out", str(out)]
     bench = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until, found = time.monotonic() + 120.0, []
     states = []
@@ -35,11 +37,11 @@ def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path, monkeypa
             assert ": starting, 0.0 s" in status()
     assert states[0] == "starting"
     (one,) = found
-    assert (one["name"], one["filter"], one["state"]) == ("satellite/s1", "mekf", "running")
+    assert (one["name"], one["filter"], one["state"]) == ("clockwork:rig", "exact", "running")
     pids = [part["process"] for part in one["parts"].values()]
-    assert len(pids) == 7
+    assert len(pids) == 2
     assert all(alive(pid) for pid in pids)
-    assert "satellite/s1 (mekf, lockstep), process" in status()
+    assert "clockwork:rig (exact, lockstep), process" in status()
     os.killpg(bench.pid, signal.SIGINT)  # as the terminal does it
     _, said = bench.communicate(timeout=30.0)
     assert bench.returncode == 3, said

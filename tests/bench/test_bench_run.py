@@ -4,6 +4,7 @@ Bits and deaths are those of real processes; where they would make no difference
 threads.
 """
 
+import json
 import os
 import resource
 import signal
@@ -16,17 +17,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from clockwork import CLOCKWORK
 from stations import Station, alive, kit, on_threads, one_program
 
 from robins.bench.broker import BenchError
 from robins.bench.ports.cable import cable
 from robins.bench.recording import read_record
 from robins.bench.rigs.satellite import RIG
-from robins.bench.rigs.satellite.errors import flag, inside
+from robins.bench.rigs.satellite.errors import flag
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.run import Flight
 from robins.bench.run.session import Ran, Session
-from robins.bench.run.setup import built_in, changed, read
+from robins.bench.run.setup import built_in, changed, kit_of, read
 from robins.bench.run.telemetry import difference
 from robins.bench.wire.frames import Frame
 from robins.bench.wire.receiver import Receiver
@@ -50,7 +52,8 @@ class Watch:
         self.events.append((kind, time_s, text))
 
     def step(self, session: Session, step: int) -> None:
-        self.pids |= {p: pid for p in PARTS if (pid := session.crew.process(p)) is not None}
+        pids = {part: session.crew.process(part) for part in session.rig.parts}
+        self.pids |= {part: pid for part, pid in pids.items() if pid is not None}
         if (do := self.at.pop(step, None)) is not None:
             do(session)
 
@@ -69,9 +72,11 @@ class Done(NamedTuple):
 
 def run(of: Flight, at: dict[int, Any] | None = None, record: Any = None) -> Done:
     watch, what = Watch(at), ("satellite/s1", of.setup.filter, *LOOP)
-    ran = Session(of, record, watch, kit=kit(*what)).run()
+    made = kit(*what) if of.rig is RIG else kit_of(of)
+    ran = Session(of, record, watch, kit=made).run()
     assert not any(alive(pid) for pid in watch.pids.values()), "a process was left over"
-    return Done(ran, difference(ran.flown, one_program(*what)), watch)
+    inside = one_program(*what) if of.rig is RIG else of.rig.inside(made, ran.steps)
+    return Done(ran, difference(ran.flown, inside), watch)
 
 
 @pytest.fixture
@@ -185,23 +190,23 @@ def test_each_part_is_killed_in_turn_and_started_anew_to_the_last_bit(tmp_path):
 @pytest.fixture(scope="module")
 def failed(tmp_path_factory):
     """A run in which a part dies, with the best scheduler there is; schedulers by who has them."""
-    schedulers = {}
+    schedulers, of = {}, changed(read(CLOCKWORK), {"fifo": True})
 
     def look(session):
-        numbers = {part: session.crew.process(part) for part in PARTS} | {"bench": 0}
+        numbers = {part: session.crew.process(part) for part in of.rig.parts} | {"bench": 0}
         if hasattr(os, "SCHED_FIFO"):
             schedulers.update({who: os.sched_getscheduler(n) for who, n in numbers.items()})
 
     record = tmp_path_factory.mktemp("bench") / "failed.mcap"
     began = time.monotonic()
-    done = run(flight(fifo=True), {20: look, 30: kill("plant")}, record)
+    done = run(of, {20: look, 30: kill("counter")}, record)
     assert time.monotonic() - began < 60.0
     return done, record, schedulers
 
 
 def test_a_death_fails_the_run_that_says_so_and_leaves_no_process(failed):
     done, path, _ = failed
-    assert "'plant' was killed by SIGKILL, at 3." in done.ran.failure
+    assert "'counter' was killed by SIGKILL, at 3." in done.ran.failure
     assert done.ran.steps == 31
     assert done.off == 0.0  # as far as it went
     assert done.watch.events[-1][0] == "failed"
@@ -227,7 +232,7 @@ def test_parts_end_when_the_bench_is_killed(tmp_path):
         "import sys, pathlib\n"
         "from robins.bench.run.session import Session\n"
         "from robins.bench.run.setup import changed, read\n"
-        f"of = changed(read('satellite/s1', {LOOP!r}), {{'seconds': 60.0, 'baud': 9600}})\n"
+        f"of = changed(read({CLOCKWORK!r}), {{'baud': 57600}})\n"
         "class Watch:\n"
         "    def event(self, *a): pass\n"
         "    def over(self, *a): pass\n"
@@ -239,7 +244,7 @@ def test_parts_end_when_the_bench_is_killed(tmp_path):
     )
     bench = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     pids = [int(word) for word in bench.stdout.readline().split()]
-    assert len(pids) == 7
+    assert len(pids) == 2
     time.sleep(0.6)  # the record is written at least each half second
     bench.kill()
     bench.wait()
@@ -362,9 +367,9 @@ def test_faults_are_the_same_however_fast_it_goes(threads):
 
 
 @contextmanager
-def board(part: str, path: str):
+def board(part: str, path: str, scenario: str):
     robins = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
-    command = [*robins, "bench", "node", part, path, "satellite/s1"]
+    command = [*robins, "bench", "node", part, path, scenario]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield process
@@ -373,16 +378,17 @@ def board(part: str, path: str):
         process.communicate()
 
 
-def test_a_part_may_be_a_board_on_a_real_port(threads):
+def test_a_part_may_be_a_board_on_a_real_port(threads, tmp_path):
     """Here the board is a process started by hand, at the other end of a cable."""
-    whole = changed(read("satellite/s1"), {"seconds": 5.0})
-    with cable() as ends, board("gyro", ends.board) as process:
+    scenario = tmp_path / "short.toml"
+    scenario.write_text(f'bench = "satellite"\nseconds = "5 s"\nset = {json.dumps(LOOP)}\n')
+    whole = read(str(scenario))
+    with cable() as ends, board("gyro", ends.board, str(scenario)) as process:
         of = changed(whole, {"ports": {"gyro": ends.bench}})
         ran = Session(of).run()
         assert ran.failure == ""
-        alone = inside(ran.kit, ran.steps)
-        assert {len(x) for x in alone.values()} == {50}
-        assert difference(ran.flown, alone) == 0.0
+        assert ran.steps == 50
+        assert difference(ran.flown, one_program("satellite/s1", "mekf", *LOOP)) == 0.0
         said, _ = process.communicate(timeout=20.0)
         assert "The bench has said stop." in said
 

@@ -256,9 +256,9 @@ def test_a_path_that_is_no_line(program):
     assert "/nowhere: No such file" in ran.stderr
 
 
-def test_ten_thousand_steps_on_a_noisy_line(board):
+@pytest.mark.parametrize("count", [1_500, 10_000])
+def test_thousands_of_steps_on_a_noisy_line(board, count):
     """Noise, cut frames and wrong bits between good frames cost neither a step nor a bit."""
-    count = 10_000
     q, turns = attitudes(count)
     rng = np.random.default_rng(1)
     order = Sequence()

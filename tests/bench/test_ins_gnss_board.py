@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flights import flown
 from short_drive import DRIVE
+from stations import on_threads, parts
 from test_firmware import SANITISERS, Board, sanitised
 
 from robins.bench.ports.port import open_pair
@@ -14,13 +16,13 @@ from robins.bench.recording import read_record
 from robins.bench.rig import RigError
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.ins_gnss import WIRE
+from robins.bench.rigs.ins_gnss.navigating import epochs_of
 from robins.bench.run.setup import changed, read
 from robins.bench.wire import Receiver
 from robins.cli import main
-from robins.results import read as read_result
 from robins.systems.ins_gnss import SYSTEM
 from robins.systems.streaming import Flag
-from robins.workbench import bench_replay, bench_up, publish
+from robins.workbench import bench_replay, bench_up
 from robins.workbench import replay as replay_log
 from robins.workbench.boards import export_filter
 from robins.workbench.errors import InputError
@@ -80,7 +82,7 @@ def sensed(kit, steps):
 
 def of_the_part(kit, reached):
     """What the part in Python says to that, by step."""
-    part, told = RIG.build["navigation"](kit), []
+    part, told = parts(kit, RIG)["navigation"], []
     state = part.begin()
     for k, inputs in enumerate(reached):
         heard = {
@@ -221,43 +223,42 @@ def test_its_library_agrees_with_jax_and_all_compiles_as_c_plus_plus(program):
     assert built.returncode == 0, built.stderr
 
 
-def test_it_flies_on_the_bench_and_its_record_is_heard_again(scenario, program, kit, tmp_path):
-    """As docs/from-design-to-board.md does it, against a replay of the drive."""
-    bench = tmp_path / "with-board.toml"
+def test_it_flies_on_the_bench_and_its_record_is_heard_again(
+    scenario, program, kit, tmp_path, monkeypatch
+):
+    """As docs/from-design-to-board.md does it, against the part in Python."""
+    on_threads(monkeypatch)  # the other parts
+    bench, record = tmp_path / "with-board.toml", tmp_path / "record.mcap"
     bench.write_text(
         f'bench = "ins-gnss"\nflies = "{scenario}"\nfilter = "ekf"\n'
         f'[ports]\nnavigation = "{program}"\n'
     )
-    outcome = bench_up(str(bench), record=tmp_path / "record.mcap")
+    outcome = bench_up(str(bench), record=record)
     assert outcome.failure == ""
-    folder = publish(outcome, tmp_path / "out").path
-    wanted = SYSTEM.replay(kit.dataset, kit.given, ("ekf",)).solution
-    solution = read_result(folder).solution
-    record = folder / "record.mcap"
+    assert np.isfinite(outcome.solution["lat_rad"].values[0][-1])
     assert bench_replay(record, node="navigation").same
-    told = replayed_epochs(record)
-    at = np.searchsorted(wanted["time"].values, np.array(list(told)) - 1e-6)
-    assert len(at) > 30
-    assert wanted["innovation_zero_velocity"].shape[1] >= 5  # it rests when the fixes are back
-    for field, role in (("q_nb", "q_nb"), ("v_n", "estimate_velocity")):
+    told, of = replayed_epochs(record), flown(RIG, kit, outcome.solution.sizes["time"])[0]
+    rows = epochs_of(of)
+    assert len(rows) > 30
+    assert list(told) == list(of["epoch.time"][rows])
+    rests = of["state.flags"] & Flag.REST > 0
+    assert np.any(rests[50 * 18 :])  # when the fixes are back
+    for field in ("q_nb", "v_n"):
         values = np.array([row[field] for row in told.values()])
-        np.testing.assert_allclose(values, wanted[role].values[0][at], rtol=0.0, atol=1e-9)
-    assert np.isfinite(solution["lat_rad"].values[0][-1])
+        np.testing.assert_allclose(values, of[f"epoch.{field}"][rows], rtol=0.0, atol=1e-9)
 
 
 def replayed_epochs(record):
-    """The last word on each epoch in a record, by time [s] since the first sample."""
-    found, first_ns, receivers = {}, None, {}
+    """The last word on each epoch in a record, by time [ns]."""
+    found, receivers = {}, {}
     for entry in read_record(record).entries:
         if entry.direction != "from":
             continue
         for frame in receivers.setdefault(entry.link, Receiver()).feed(entry.data):
             name = WIRE.names.get(frame.header.type)
-            if name == "sample" and first_ns is None:
-                first_ns = WIRE.decode(name, frame.payload)["time"]
             if name == "epoch":
                 said = WIRE.decode(name, frame.payload)
-                found[(said["time"] - first_ns) * 1e-9] = said
+                found[said["time"]] = said
     return dict(sorted(found.items()))
 
 

@@ -8,18 +8,14 @@ import pytest
 from flights import flown
 from short_drive import DRIVE
 
-from robins.bench.recording import read_record
 from robins.bench.rig import RigError
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.ins_gnss import FLAGS
 from robins.bench.rigs.ins_gnss.navigating import epochs_of
 from robins.bench.run.setup import read
-from robins.logs import load_dataset
-from robins.results import read as read_result
 from robins.scenario import ScenarioError
 from robins.systems.ins_gnss import SYSTEM
 from robins.systems.streaming import Flag
-from robins.workbench import bench_replay, bench_up, publish
 from robins.workbench import replay as replay_log
 
 RIG = rig_of("ins-gnss")
@@ -101,38 +97,6 @@ def test_the_computer_goes_on_from_its_memory_to_the_bit(run):
 
 def test_flags_are_those_of_the_live_object():
     assert [(flag.name or "").lower() for flag in Flag] == list(FLAGS)
-
-
-def test_it_flies_by_processes_and_its_record_is_heard_again(scenario, run, tmp_path):
-    _, _, _, of = run
-    wrong = tmp_path / "wrong.toml"
-    wrong.write_text(
-        f'bench = "ins-gnss"\nflies = "{scenario}"\nfilter = "ekf"\n'
-        '[[faults]]\nkind = "shifted"\nshift = "50 m"\nbegin = "12 s"\nend = "14 s"\n'
-    )
-    outcome = bench_up(str(wrong), record=tmp_path / "record.mcap")
-    folder = publish(outcome, tmp_path / "out").path
-    assert outcome.failure == ""
-    solution = read_result(folder).solution
-    lat = solution["lat_rad"].values[0]
-    before = solution["time"].values < 12.0
-    np.testing.assert_array_equal(lat[before], of["state.lat"][before])
-    assert not np.array_equal(lat[~before], of["state.lat"][~before], equal_nan=True)
-    record = folder / "record.mcap"
-    assert read_record(record).header["rig"] == "ins-gnss"
-    assert bench_replay(record, node="navigation").same
-    # the record is a log, as ROS 2 has them
-    _, kit, steps, _ = run
-    heard = load_dataset([record])
-    np.testing.assert_array_equal(heard.imu.time_ns, kit.dataset.imu.time_ns[:steps])
-    np.testing.assert_allclose(heard.imu.gyro, kit.dataset.imu.gyro[:steps], rtol=1e-15)
-    shown = np.isfinite(heard.gnss.lat_rad)
-    at = np.searchsorted(kit.dataset.gnss.time_ns, heard.gnss.time_ns)
-    at_s = 1e-9 * heard.gnss.time_ns
-    np.testing.assert_array_equal(~shown, (at_s >= 9.5) & (at_s < 12.5))
-    # what was injected came after
-    wanted = kit.dataset.gnss.lat_rad[at]
-    np.testing.assert_allclose(heard.gnss.lat_rad[shown], wanted[shown], rtol=1e-15)
 
 
 def test_without_samples_it_says_what_to_give():

@@ -5,11 +5,12 @@ import subprocess
 
 import numpy as np
 import pytest
+import stations
+from flights import in_order
 from scipy.spatial.transform import Rotation
 
-from robins.bench.parts.station import ready
 from robins.bench.rigs import rig_of, satellite
-from robins.bench.rigs.laboratory import BUILD, RIG, SENDS, TAKES, WIRE
+from robins.bench.rigs.laboratory import RIG, TAKES, WIRE
 from robins.bench.rigs.laboratory.parts import MARGIN_RAD, STARS
 from robins.bench.rigs.satellite import errors, messages
 from robins.bench.run.session import Session
@@ -17,7 +18,7 @@ from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
 from robins.earth.stars import synthetic
 from robins.scenario import ScenarioError
-from robins.workbench import bench_replay, bench_up, publish
+from robins.workbench import bench_replay
 
 ARCSEC = np.pi / 648e3
 STEPS = 300  # 30 s
@@ -41,23 +42,11 @@ def inside(kit):
 
 @pytest.fixture(scope="module")
 def parts(kit):
-    return {name: ready(build(kit), kit.frames) for name, build in BUILD.items()}
+    return {part.name: part for part in in_order(RIG, stations.parts(kit, RIG))}
 
 
 @pytest.fixture(scope="module")
-def order(parts):
-    """Parts, each after those whose messages of the same step it takes."""
-    done: list[str] = []
-    while len(done) < len(parts):
-        for name, part in parts.items():
-            now = {m for m, lag in part.takes.items() if lag == 0}
-            if name not in done and all(p in done for p in SENDS if now & set(SENDS[p])):
-                done.append(name)
-    return done
-
-
-@pytest.fixture(scope="module")
-def fly(parts, order):
+def fly(parts):
     """Parts one after the other; what they say by message, a row a step, None where nothing."""
 
     def of(steps=STEPS, meddle=lambda name, k, said: said, off=lambda part, k: False):
@@ -65,8 +54,7 @@ def fly(parts, order):
         said = {message.name: [None] * steps for message in WIRE.data}
         heard = {name: [None] * steps for name in said}
         for k in range(steps):
-            for name in order:
-                part = parts[name]
+            for name, part in parts.items():
                 if off(name, k):
                     states[name] = part.begin()
                     continue
@@ -260,24 +248,14 @@ def test_a_control_that_lost_its_state_rests_until_it_hears_an_estimate(fly):
     assert np.any(gone["command"][131]["wheel_torque"] != 0.0)
 
 
-# ------------------------------------------------------------------------------ processes
+# ------------------------------------------------------------------------------ power
 
 
-def test_it_flies_by_processes_and_its_record_is_heard_again(tmp_path):
-    record = tmp_path / "r.mcap"
-    outcome = bench_up("laboratory", settings=SETTINGS, seconds=10.0, record=record)
-    folder = publish(outcome, tmp_path / "out").path
-    assert outcome.failure == ""
-    (notes,) = [n for n in outcome.notes if "inside one program" in n]
-    assert notes == "Over the wire the run was bit for bit the same as the run inside one program."
-    for part in ("star", "kinematics"):
-        found = bench_replay(folder / "record.mcap", node=part)
-        assert (found.same, found.whole) == (True, True)
-        assert found.frames >= 20
-
-
-def test_a_part_without_power_has_lost_its_state_and_its_history(flight, fly, tmp_path):
+def test_a_part_without_power_has_lost_its_state_and_its_history(
+    flight, fly, tmp_path, monkeypatch
+):
     """Off for 2 s, killed 2 s later and told all again, which is what came since it was on."""
+    stations.on_threads(monkeypatch)
     faults = (
         RIG.fault(kind="power", link="adm", begin=4.0, end=6.0),
         RIG.fault(kind="killed", link="adm", begin=8.0),

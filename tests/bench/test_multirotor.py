@@ -13,8 +13,11 @@ import pytest
 from flights import flown
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from stations import on_threads
 
 from robins.bench.bridges import BridgeClosed, BridgeTimeout
+from robins.bench.parts import node
+from robins.bench.parts.kits import put
 from robins.bench.rigs import rig_of
 from robins.bench.rigs.multirotor import MOTORS, autopilots
 from robins.bench.rigs.multirotor.craft import at_rest, moved
@@ -22,7 +25,6 @@ from robins.bench.run.setup import changed, read
 from robins.earth import dcm_en, ecef_from_geodetic
 from robins.earth.atmosphere import pressure_altitude_m
 from robins.earth.magnetic import elements
-from robins.results.solution import check
 from robins.scenario import ScenarioError
 from robins.workbench import InputError, bench_replay, bench_up
 
@@ -37,7 +39,7 @@ LAYOUT = {
     "rear right": (-1, 1, "right"),
 }
 WIND = np.array([4.0, -3.0, 0.0])
-STEPS = 2000  # 8 s
+STEPS, HOVERS = 2000, 1250  # 8 s, 5 s
 SHORT = ("duration=8 s", "counted_from=5 s", "height=2 m", 'wind=["4 m/s", "-3 m/s", "0 m/s"]')
 CALM = ("duration=4 s", "counted_from=3 s", "height=1 m", 'wind=["1 m/s", "0 m/s", "0 m/s"]')
 
@@ -56,6 +58,12 @@ def judged(flight, of):
 def run():
     flight, kit = kit_of(*SHORT)
     return flight, kit, flown(RIG, kit, STEPS)[0]
+
+
+@pytest.fixture(scope="module")
+def hovering(run):
+    """States after 5 s, when it counts."""
+    return flown(RIG, run[1], HOVERS)[1]
 
 
 # ------------------------------------------------------------------------------------ physics
@@ -216,34 +224,40 @@ def test_it_hovers_in_wind(run):
     assert of["motors.control"][last].mean() == pytest.approx(carried, rel=0.01)
 
 
-def test_a_sample_that_does_not_come_is_the_one_before(run):
-    flight, kit, _ = run
-    of = flown(RIG, kit, STEPS, lost=lambda name, k: name == "sample" and k % 50 == 7)[0]
+def test_a_sample_that_does_not_come_is_the_one_before(run, hovering):
+    flight, kit, whole = run
+    again = flown(RIG, kit, HOVERS + 60, begin=HOVERS, states=hovering)[0]
+    np.testing.assert_array_equal(again["motion.p_n"][HOVERS:], whole["motion.p_n"][HOVERS:][:60])
+
+    def lost(name, k):
+        return name == "sample" and k % 50 == 7
+
+    of = flown(RIG, kit, STEPS, lost, HOVERS, hovering)[0]
     assert judged(flight, of).metrics["position_rms_m"] < 0.5
 
 
-def disturbed(kit, kind, **more):
+def disturbed(kit, hovering, kind, **more):
     """A flight with a fault of a sensor or a motor from 5 s on."""
     one, of = RIG.fault(kind=kind, begin=0.0, **more), RIG.said()[0][kind]
 
     def wrong(name, k, said):
-        return of.act(said, one, 0) if name == of.message and k >= 1250 else said
+        return of.act(said, one, 0) if name == of.message else said
 
-    return flown(RIG, kit, STEPS, wrong=wrong)[0]
+    return flown(RIG, kit, STEPS, begin=HOVERS, states=hovering, wrong=wrong)[0]
 
 
-def test_faults_of_its_sensors_and_motors(run):
+def test_faults_of_its_sensors_and_motors(run, hovering):
     flight, kit, whole = run
-    weak = judged(flight, disturbed(kit, "motor", motor=0, left=0.8)).metrics
+    weak = judged(flight, disturbed(kit, hovering, "motor", motor=0, left=0.8)).metrics
     assert weak["position_rms_m"] < 0.6
-    dead = disturbed(kit, "motor", motor=2)
+    dead = disturbed(kit, hovering, "motor", motor=2)
     assert judged(flight, dead).metrics["tilt_max_deg"] > 45.0
     assert dead["motion.p_n"][-1, 2] > -0.1  # it has come down
     np.testing.assert_array_equal(dead["motion.v_n"][-1], np.zeros(3))
-    blind = disturbed(kit, "blind")
+    blind = disturbed(kit, hovering, "blind")
     assert judged(flight, blind).metrics["position_max_m"] < 2.0  # its accelerometers carry it on
     assert np.any(blind["motion.p_n"][1300] != whole["motion.p_n"][1300])
-    magnet = judged(flight, disturbed(kit, "magnet", field=20e-6)).metrics
+    magnet = judged(flight, disturbed(kit, hovering, "magnet", field=20e-6)).metrics
     assert magnet["heading_rms_deg"] > 15.0
     assert magnet["position_rms_m"] < 1.0
     with pytest.raises(ValueError, match="needs it"):
@@ -258,22 +272,6 @@ def scenario(tmp_path, settings=CALM, **more):
     path = tmp_path / "flight.toml"
     path.write_text("\n".join(f"{key} = {json.dumps(value)}" for key, value in told.items()))
     return path
-
-
-def test_it_flies_by_processes_dies_in_between_and_its_record_is_heard_again(tmp_path):
-    path = scenario(tmp_path, on_death="restart")
-    killed = '\n[[faults]]\nkind = "killed"\nlink = "autopilot"\nbegin = "1.5 s"\n'
-    path.write_text(path.read_text() + killed)
-    outcome = bench_up(str(path), record=tmp_path / "record.mcap")
-    assert outcome.failure == ""
-    assert outcome.metrics["multirotor"]["position_rms_m"] < 0.5
-    check(outcome.solution)  # it can be written
-    _, kit = kit_of(*CALM)
-    wanted = flown(RIG, kit, 1000)[0]
-    p_n = outcome.solution["value_motion_p_n"].values[0]
-    np.testing.assert_array_equal(p_n, wanted["motion.p_n"])
-    for part in ("imu", "autopilot"):
-        assert bench_replay(tmp_path / "record.mcap", node=part).same
 
 
 def free(kind):
@@ -379,7 +377,8 @@ def ardupilot(port, height, over):
                 pwm = pulses(told, height) if told["timestamp"] > 0.5 else [1000] * 4
 
 
-def test_ardupilot_flies_it_over_udp(tmp_path):
+def test_ardupilot_flies_it_over_udp(tmp_path, monkeypatch):
+    on_threads(monkeypatch, processes=("autopilot",))
     port, over = free(socket.SOCK_DGRAM), threading.Event()
     other = beside(ardupilot, port, 1.0, over)
     path = scenario(tmp_path, autopilot="ardupilot", port=port)
@@ -430,7 +429,8 @@ def test_an_ardupilot_that_is_started_anew_is_told():
     assert part.act(before, 1, {"motion": None}) == (before, [("motors", before)])
 
 
-def test_an_autopilot_that_goes_fails_the_run_and_says_what_to_do(tmp_path):
+def test_an_autopilot_that_goes_fails_the_run_and_says_what_to_do(tmp_path, monkeypatch):
+    on_threads(monkeypatch, processes=("autopilot",))
     pytest.importorskip("pymavlink", reason="needs pymavlink, of the extra 'autopilot'")
     port, (_, kit) = free(socket.SOCK_STREAM), kit_of(*CALM)
     other = beside(px4, port, kit, 100)
@@ -441,12 +441,14 @@ def test_an_autopilot_that_goes_fails_the_run_and_says_what_to_do(tmp_path):
     assert "on_death" not in outcome.failure
 
 
-def test_a_port_that_is_taken_fails_the_run_and_is_named(tmp_path):
+def test_a_port_that_is_taken_ends_the_part_and_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(node.signal, "signal", lambda *_: None)  # of this process
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        outcome = bench_up(str(scenario(tmp_path, autopilot="ardupilot", port=port)))
-    assert f"status 2: 127.0.0.1:{port}: cannot listen: " in outcome.failure
+        put(kit_of(autopilot="ardupilot", port=port)[1], tmp_path / "kit")
+        assert node.main(["multirotor", "autopilot", "none", str(tmp_path / "kit")]) == 2
+    assert capsys.readouterr().err.startswith(f"127.0.0.1:{port}: cannot listen: ")
 
 
 def test_what_cannot_be_is_refused(tmp_path):

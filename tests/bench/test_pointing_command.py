@@ -1,7 +1,5 @@
 """The craft points where the operator says: the way there, the bits, the record, the page."""
 
-import os
-import signal
 from typing import Any
 
 import numpy as np
@@ -82,16 +80,16 @@ class Watch:
 def flown(of, asked, tmp_path_factory):
     """An attitude at 5 s, the course again at 70 s; control is killed on its way to the first."""
 
-    def kill(session):
-        os.kill(session.crew.process("acm"), signal.SIGKILL)
-
     says = (
         {"at": 5.0, "message": "reference", "q_ib": tuple(asked), "rate": 1.0 * DEG},
         {"at": 70.0, "message": "reference", "rate": 2.0 * DEG},  # more than it can
     )
     flight = changed(read("satellite/s1", LOOP), {"says": says, "on_death": "restart"})
     record = tmp_path_factory.mktemp("pointing") / "record.mcap"
-    ran = Session(flight, record, Watch({150: kill}), kit=of).run()
+    watch = Watch({150: lambda session: session.crew.kill("acm")})
+    with pytest.MonkeyPatch.context() as patch:
+        on_threads(patch)
+        ran = Session(flight, record, watch, kit=of).run()
     assert (ran.failure, ran.steps, ran.deaths) == ("", 1300, 1)
     return flight, ran, record
 
@@ -136,8 +134,9 @@ def test_its_pointing_is_judged_by_what_was_asked(of, asked, flown):
         np.testing.assert_allclose(size, away(ran.flown["motion.q_ib"][step], at), atol=1e-6)
 
 
-def test_the_record_has_it_and_control_hears_it_again(flown):
+def test_the_record_has_it_and_control_hears_it_again(flown, monkeypatch):
     _, _, path = flown
+    on_threads(monkeypatch)
     record = read_record(path)
     heard, receiver = [], Receiver()
     for entry in record.entries:

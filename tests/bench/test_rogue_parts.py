@@ -118,7 +118,7 @@ def test_a_part_that_dies_again_and_again_fails_the_run(monkeypatch, restarts, w
             return [Death("adm", -9, "")]
 
         def start(self, name, port, since=-1):
-            if len(self.threads) < len(BUILD):  # nobody comes in the place of the dead
+            if len(self._running) < len(BUILD):  # nobody comes in the place of the dead
                 super().start(name, port, since)
 
     on_threads(monkeypatch, Mortal)

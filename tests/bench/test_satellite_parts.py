@@ -266,7 +266,7 @@ def test_a_gyro_reports_what_it_missed_with_its_next_sample(of):
 def test_a_table_that_lags_is_where_the_craft_was():
     flight = read("satellite/s2", ("duration=200 s", "counted_from=10 s"))
     of = kit_for(flight.given, "mekf", 0, table=Carrier(lag=0.02).table())
-    loop = Loop(of).run(600)
+    loop = Loop(of).run(300)
     behind = turn(loop.all("mounted", "q_ib"), loop.all("motion", "q_ib"))
     change = np.linalg.norm(np.diff(loop.all("motion", "omega_b"), axis=0), axis=1)
     size = np.linalg.norm(behind, axis=1)

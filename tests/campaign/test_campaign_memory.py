@@ -88,12 +88,12 @@ def test_an_example_does_not_hold_its_chunk(problem):
 @needs_compiler
 def test_the_number_of_threads_changes_no_bit(problem, monkeypatch):
     found = []
-    for cores in (1, 2, 5):
+    for cores in (1, 5):
         monkeypatch.setattr(machines, "available_cores", lambda cores=cores: cores)
         found.append(simulate(problem, RUNS, 8, machine="c").solution)
-    for other in found[1:]:
-        for name, variable in found[0].variables.items():
-            np.testing.assert_array_equal(other[name], variable)
+    one, five = found
+    for name, variable in one.variables.items():
+        np.testing.assert_array_equal(five[name], variable)
 
 
 @needs_compiler

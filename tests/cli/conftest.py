@@ -12,7 +12,7 @@ from robins import report, results
 from robins.cli import main
 from robins.systems import Scenario, Study, System, catalogue
 from robins.systems.judgement import Claim
-from robins.workbench import part, publishing
+from robins.workbench import publishing
 
 Answer = namedtuple("Answer", "status out err")
 
@@ -49,7 +49,7 @@ def robins(capsys, monkeypatch, tmp_path, sketched):
 class Workbench:
     """In the place of `robins.workbench`: notes what it is asked, computes nothing or raises."""
 
-    part, publishing = staticmethod(part), staticmethod(publishing)
+    publishing = staticmethod(publishing)
 
     def __init__(self):
         self.asked = {}
@@ -60,6 +60,9 @@ class Workbench:
 
     def run(self, name, **asked):
         return self._work(name, asked)
+
+    def demo(self, **asked):
+        return self._work("car/town", asked)
 
     def replay(self, paths, *, findings, **asked):
         findings(self.findings)

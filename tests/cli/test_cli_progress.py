@@ -37,7 +37,7 @@ def known_terminal(monkeypatch):
 
 def test_a_bar_appears_after_a_while_and_goes_away():
     screen = Screen(terminal=True)
-    with Progress(screen, wait_s=0.05) as progress:
+    with Progress(stream=screen, wait_s=0.05) as progress:
         progress(0.25, "[first] part")
         assert until(lambda: "[first] part" in screen.getvalue())
         assert "25%" in screen.getvalue()
@@ -52,7 +52,7 @@ def test_a_bar_appears_after_a_while_and_goes_away():
 
 def test_it_moves_while_nothing_is_told():
     screen = Screen(terminal=True)
-    with Progress(screen, wait_s=0.0) as progress:
+    with Progress(stream=screen, wait_s=0.0) as progress:
         progress(0.0, "compiling")
 
         def seen():
@@ -61,17 +61,25 @@ def test_it_moves_while_nothing_is_told():
         assert until(lambda: len(seen()) > 2)
 
 
-def test_short_work_shows_nothing():
+def test_short_work_shows_a_line_at_once_and_leaves_nothing():
     screen = Screen(terminal=True)
-    with Progress(screen, wait_s=0.5) as progress:
+    with Progress(stream=screen, wait_s=0.5) as progress:
+        assert screen.getvalue() == "starting ..."
         progress(0.5, "x")
     time.sleep(0.7)
-    assert screen.getvalue() == ""
+    assert screen.getvalue() == "starting ...\r\x1b[2K"
+
+
+def test_a_terminal_that_cannot_erase_gets_no_line(monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    screen = Screen(terminal=True)
+    with Progress(stream=screen, wait_s=10.0):
+        assert screen.getvalue() == ""
 
 
 def test_what_is_not_a_terminal_sees_nothing():
     screen = Screen(terminal=False)
-    with Progress(screen, wait_s=0.0) as progress:
+    with Progress(stream=screen, wait_s=0.0) as progress:
         progress(0.5, "x")
         time.sleep(0.2)
     assert screen.getvalue() == ""
@@ -81,7 +89,7 @@ def test_a_failure_takes_the_bar_away():
     screen = Screen(terminal=True)
 
     def work():
-        with Progress(screen, wait_s=0.01):
+        with Progress(stream=screen, wait_s=0.01):
             assert until(lambda: "starting" in screen.getvalue())  # though nothing is told
             raise RuntimeError
 

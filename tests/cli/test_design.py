@@ -160,7 +160,7 @@ def test_without_the_extra_it_says_what_is_missing(robins, monkeypatch):
     assert answer.status == 0, answer.err
     needing = "lmi-common, lmi-slack, retuned-common, retuned-slack, full-order"
     assert f"Left out: {needing}; they need" in answer.out
-    assert "pip install 'robins[lmi]'" in answer.out
+    assert "pip install 'robins[design]'" in answer.out
     assert "the least Hinf of any gain is 0.5945 (" in answer.out
     assert "gamma 0.7: no method of these reaches it." in answer.out
 

@@ -21,7 +21,7 @@ from robins.filters import (
 )
 from robins.filters.rules import Infeasible, constant_gain, gate, h_infinity, with_gains
 
-DT, STEPS, EVERY = 0.1, 200, 5
+DT, STEPS, EVERY = 0.1, 500, 5
 F = jnp.array([[1.0, DT], [0.0, 1.0]])
 G = jnp.array([0.5 * DT * DT, DT])
 MODEL = Model(
@@ -119,31 +119,37 @@ def test_rules_report_as_in_a_run():
 # ------------------------------------------------------------------------------ a constant gain
 
 GAIN = np.array([[0.2], [0.07]])
+FIXED = kalman(rules=[constant_gain({"seen": GAIN})])
 
 
-def test_a_constant_gain_states_its_own_covariance():
-    y = np.random.default_rng(1).normal(size=(30, 1))
+def fixed(gain, y):
+    """A run of the one filter begun with another gain, which is data."""
+    begun = with_gains(FIXED.init(START, MODEL.dims), {"seen": jnp.asarray(gain)})
+    return run(FIXED, MODEL, begun, y, np.zeros(STEPS))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_constant_gain_states_its_own_covariance(share):
+    y = np.random.default_rng(1).normal(size=(STEPS, 1))
     y[7] = np.nan
-    fixed = kalman(rules=[constant_gain({"seen": GAIN})])
-    found = run(fixed, MODEL, START, y, np.zeros(30))
+    found = run(FIXED, MODEL, START, y, np.zeros(STEPS)) if share == 1.0 else fixed(share * GAIN, y)
     x, P = np.zeros(2), np.diag([1.0, 0.25])
     Q, H, A = np.diag([0.0, 0.02**2]), np.array([[1.0, 0.0]]), np.asarray(F)
-    for k in range(30):
+    for k in range(STEPS):
         x, P = A @ x, A @ P @ A.T + Q
         if np.isfinite(y[k, 0]):
-            x = x + GAIN @ (y[k] - H @ x)
-            I_KH = np.eye(2) - GAIN @ H
-            P = I_KH @ P @ I_KH.T + 0.09 * GAIN @ GAIN.T
+            x = x + share * GAIN @ (y[k] - H @ x)
+            I_KH = np.eye(2) - share * GAIN @ H
+            P = I_KH @ P @ I_KH.T + 0.09 * share**2 * GAIN @ GAIN.T
         np.testing.assert_allclose(found.mean[k], x, atol=1e-13)
         np.testing.assert_allclose(found.covariance[k], P, atol=1e-13)
-    np.testing.assert_allclose(found.steps.info["seen"].gain[8], GAIN)
+    np.testing.assert_allclose(found.steps.info["seen"].gain[8], share * GAIN)
 
 
 def test_a_steady_kalman_gain_is_the_kalman_filter():
-    y, u = np.random.default_rng(2).normal(size=(500, 1)), np.zeros(500)
-    best = run(kalman(), MODEL, START, y, u)
-    steady = np.asarray(best.steps.info["seen"].gain[-1])
-    same = run(kalman(rules=[constant_gain({"seen": steady})]), MODEL, START, y, u)
+    y = np.random.default_rng(2).normal(size=(STEPS, 1))
+    best = run(kalman(), MODEL, START, y, np.zeros(STEPS))
+    same = fixed(best.steps.info["seen"].gain[-1], y)
     np.testing.assert_allclose(same.mean[-1], best.mean[-1], atol=1e-6)
     np.testing.assert_allclose(same.covariance[-1], best.covariance[-1], rtol=1e-6)
 
@@ -158,14 +164,10 @@ def test_a_gate_before_it_refuses():
 
 
 def test_gains_are_data():
-    y, u = np.ones((5, 1)), np.zeros(5)
-    rule = kalman(rules=[constant_gain({"seen": np.zeros((2, 1))})])
-    begun = rule.init(START, MODEL.dims)
-    solve = jax.jit(lambda K: run(rule, MODEL, with_gains(begun, {"seen": K}), y, u).mean[-1])
-    direct = run(kalman(rules=[constant_gain({"seen": GAIN})]), MODEL, START, y, u)
-    np.testing.assert_allclose(solve(jnp.asarray(GAIN)), direct.mean[-1], atol=1e-14)
-    assert np.max(np.abs(solve(jnp.zeros((2, 1))))) == 0.0
+    y = np.ones((STEPS, 1))
+    assert jax.eval_shape(lambda gain: fixed(gain, y).mean, GAIN).shape == (STEPS, 2)
+    assert np.max(np.abs(fixed(np.zeros((2, 1)), y).mean)) == 0.0
     with pytest.raises(ValueError, match="the filter was begun with"):
-        with_gains(begun, {"seen": np.zeros((3, 1))})
+        with_gains(FIXED.init(START, MODEL.dims), {"seen": np.zeros((3, 1))})
     with pytest.raises(ValueError, match="no constant_gain rule"):
         with_gains(kalman().init(START, MODEL.dims), {"seen": GAIN})

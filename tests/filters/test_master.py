@@ -114,7 +114,7 @@ def test_rules_of_the_master_judge_what_was_fused():
 
 def test_a_guard_takes_over_below_the_master():
     one = guarded(at_master(JOINED, "held"), JOINED, "held", ["a", "b"])
-    wrong = DATA | {"held": HELD + 1e3}
+    wrong = {"a": DATA["a"], "held": HELD + 1e3}
     got = run(one, model(1e-3), START, wrong)
     watch = got.final.memory
     assert float(watch.weight) < 0.1

@@ -109,7 +109,7 @@ def test_exact_ones_twice_in_joseph_form_and_in_a_local_filter():
 
     locals_ = distributed([channel("held", one), channel("seen")])
     with pytest.raises(ValueError, match="'held' was singular"):
-        run(locals_, exact, S.start(), {"seen": Y, "held": HELD})
+        run(locals_, exact, S.start(), {"held": HELD})
 
 
 def test_a_projection_that_does_not_fit():
@@ -146,14 +146,14 @@ def test_a_rule_for_one_sensor_leaves_the_others_alone():
 def test_hooks_of_a_step_stay_and_one_rule_serves_several_filters():
     rule = only(["seen", "other"], sage_husa())
     assert rule.name == "sage_husa"
-    data, noise = {"seen": Y, "held": HELD}, jnp.asarray(L)
+    data, noise = {"seen": Y}, jnp.asarray(L)
     joined = distributed([channel("seen", kalman(rules=[rule])), channel("held")])
     alone = distributed([channel("seen", kalman(rules=[sage_husa()])), channel("held")])
     got, want = (run(f, model(noise), S.start(), data).mean for f in (joined, alone))
     np.testing.assert_array_equal(got, want)
     several = kalman(rules=[only("seen", huber()), only("held", igg3())])
     given = model(noise), S.start()
-    both = jax.eval_shape(lambda y: run(several, *given, y), data)
+    both = jax.eval_shape(lambda y: run(several, *given, y), data | {"held": HELD})
     notes = {k: set(v.notes) for k, v in both.steps.info.items()}
     assert all(name.startswith("huber") for name in notes["seen"])
     assert all(name.startswith("igg3") for name in notes["held"])

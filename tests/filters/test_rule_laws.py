@@ -39,11 +39,15 @@ from robins.manifold import Angle
 
 MODEL = line()
 FILTERS = ACTING | HOLDING
+# What acts beside others too needs no programs of its own.
+FILTERS["learning"] = [*FILTERS.pop("discriminating"), *ACTING["learning"]]
 EACH = pytest.mark.parametrize("name", FILTERS)
 WAYS = {"derivatives": taylor(), "sigma points": unscented()}
 # The noise as told, a little less and more of it, and twice of it for other data.
 SMALL = 1e-6
 SCALES = jnp.array([1.0, 1.0 - SMALL, 1.0 + SMALL, 2.0])
+# The gate of "given" is closed in the end; the slope of its whole run is always looked at.
+NO_SLOPE_OF_A_STEP = NO_SLOPE | {"given"}
 DATA = jnp.stack([Y, Y, Y, np.where(np.arange(T)[:, None] == 3, np.nan, Y)])
 
 
@@ -57,6 +61,23 @@ def batch(name):
 def ran(name):
     """The first of them."""
     return jax.tree.map(lambda x: x[0], batch(name))
+
+
+@cache
+def stepped(name):
+    """One compiled step of such a filter: a number, what it is of, and its slope in the noise."""
+    one = kalman(rules=FILTERS[name])
+
+    def step(scale, state, row):
+        model = line(scale)
+        moved, _ = one.predict(state, model.motion, None)
+        after, info = one.update(moved, model.sensors[0], row, None)
+        total = info.log_likelihood + jnp.sum(after.belief.mean**2)
+        return total + jnp.sum(after.belief.factor**2), (moved, after, info)
+
+    if name in NO_SLOPE_OF_A_STEP:
+        return jax.jit(lambda *given: (step(*given), None))
+    return jax.jit(jax.value_and_grad(step, has_aux=True))
 
 
 def equal(a, b, **close):
@@ -108,27 +129,25 @@ def test_rules_whose_limit_is_approached_come_near_the_kalman_filter():
 
 @EACH
 def test_a_stream_is_a_run_of_a_batch_and_what_is_not_measured_moves_nothing(name):
-    whole, one = ran(name), kalman(rules=FILTERS[name])
+    whole, step = ran(name), stepped(name)
     assert np.any(batch(name).mean[3] != whole.mean)
-    live, without = OnlineFilter(one, MODEL, START), OnlineFilter(one, MODEL, START)
+    state = without = OnlineFilter(kalman(rules=FILTERS[name]), MODEL, START).state
     for k, row in enumerate(Y):
-        live.predict()
-        without.predict()
-        before = live.belief
-        info = live.update(row)
-        equal(live.belief.mean, whole.mean[k], rtol=1e-9, atol=1e-11)
+        (_, (moved, state, info)), _ = step(SCALES[0], state, row)
+        (_, (skipped, updated, _)), _ = step(SCALES[0], without, row)
+        without = skipped if k in GONE else updated
+        equal(state.belief.mean, whole.mean[k], rtol=1e-9, atol=1e-11)
         if k not in GONE:
-            without.update(row)
             continue
         assert int(info.code) == Code.MISSING
         assert not np.any(info.gain)
         for note in QUIET.keys() & info.notes.keys():
             assert float(info.notes[note]) == QUIET[note], note
         if name not in HOLDING:
-            equal(live.belief, before)
-    equal(live.state, whole.final, rtol=1e-9, atol=1e-10)
+            equal(state.belief, moved.belief)
+    equal(state, whole.final, rtol=1e-9, atol=1e-10)
     if name not in HOLDING:
-        equal(without.state, live.state)
+        equal(without, state)
 
 
 @EACH
@@ -149,21 +168,13 @@ def test_sigma_points_in_josephs_form_on_a_circle_say_what_derivatives_on_a_line
 SMOOTH = pytest.mark.parametrize("name", [name for name in FILTERS if name not in NO_SLOPE])
 
 
-# The gate of "given" is closed in the end; the slope of its whole run is always looked at.
-@pytest.mark.parametrize("name", [n for n in FILTERS if n not in NO_SLOPE | {"given"}])
+@pytest.mark.parametrize("name", [n for n in FILTERS if n not in NO_SLOPE_OF_A_STEP])
 def test_slopes_of_a_step_are_right(name):
-    one, learnt = kalman(rules=FILTERS[name]), ran(name).final
-    row = jnp.asarray(Y[-1] + np.array([RAD, 1.0, 1.0]))  # too little for a gate to refuse
-
-    @jax.jit
-    @jax.value_and_grad
-    def total(scale):
-        model = line(scale)
-        state, _ = one.predict(learnt, model.motion, None)
-        (x, *_), info = one.update(state, model.sensors[0], row, None)
-        return info.log_likelihood + jnp.sum(x.mean**2) + jnp.sum(x.factor**2)
-
-    (low, _), (_, slope), (high, _) = (total(scale) for scale in SCALES[jnp.array([1, 0, 2])])
+    step, learnt = stepped(name), jax.tree.map(np.asarray, ran(name).final)
+    row = Y[-1] + np.array([RAD, 1.0, 1.0])  # too little for a gate to refuse
+    (low, _), (_, slope), (high, _) = (
+        (total, slope) for (total, _), slope in (step(SCALES[i], learnt, row) for i in (1, 0, 2))
+    )
     assert slope != 0.0
     assert float(slope) == pytest.approx(float(high - low) / (2 * SMALL), rel=1e-5)
 
@@ -186,13 +197,13 @@ def test_slopes_are_right(name):
 def test_what_is_refused_or_missing_teaches_nothing_component_by_component():
     one = kalman(rules=[gate(0.99), *LEARNING])
     update = jax.jit(one.update)
-    state, _ = update(one.init(START, MODEL.dims), MODEL.sensors[0], jnp.array(Y[1]))
-    for y, code in ((jnp.nan, Code.MISSING), (1e4, Code.REFUSED)):
-        after, info = update(state, MODEL.sensors[0], jnp.full(M, y))
+    state, _ = update(OnlineFilter(one, MODEL, START).state, MODEL.sensors[0], Y[1])
+    for y, code in ((np.nan, Code.MISSING), (1e4, Code.REFUSED)):
+        after, info = update(state, MODEL.sensors[0], np.full(M, y))
         assert int(info.code) == code
         equal(after.memory[1:], state.memory[1:])
         equal(after.belief, state.belief)
-    after, info = update(state, MODEL.sensors[0], jnp.array([np.nan, 1.0, np.nan]))
+    after, info = update(state, MODEL.sensors[0], np.array([np.nan, 1.0, np.nan]))
     assert int(info.code) == Code.PARTLY_MISSING
     for rule, new, old in zip(LEARNING, after.memory[1:], state.memory[1:], strict=True):
         moved = [

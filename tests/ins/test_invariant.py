@@ -81,9 +81,13 @@ def test_free_motion_is_that_of_an_integrator():
 @SIDES
 def test_transition_is_the_slope_of_propagate(side):
     x = state(2, side)
-    (new, F, G), plain, (_, again, L) = jax.jit(
-        lambda x, u: (transition(x, u), propagate(x, u), invariant_motion(NOISE).linear(x, u))
-    )(x, INCREMENT)
+    motion = invariant_motion(NOISE)
+
+    @jax.jit
+    def ways(x, u):
+        return transition(x, u), propagate(x, u), motion.linear(x, u), motion.noise_factor(x, u)
+
+    (new, F, G), plain, (_, again, L), alone = ways(x, INCREMENT)
     for a, b in zip(jax.tree.leaves(new), jax.tree.leaves(plain), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -102,7 +106,6 @@ def test_transition_is_the_slope_of_propagate(side):
     Q = 0.2 * (G[:, :3] @ G[:, :3].T * 4e-8 + G[:, 3:] @ G[:, 3:].T * 4e-6)
     Q = Q + 0.2 * np.diag(np.repeat([0.0, 1e-12, 1e-10], [9, 3, 3]))
     np.testing.assert_allclose(L @ L.T, Q, atol=1e-16)
-    alone = jax.jit(invariant_motion(NOISE).noise_factor)(x, INCREMENT)
     np.testing.assert_allclose(alone, L, rtol=1e-15)
 
 

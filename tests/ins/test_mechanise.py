@@ -21,6 +21,7 @@ from robins.ins.mechanise import (
     nav_at,
     refuse_polar,
     step,
+    step_each,
 )
 from robins.rotation import Rotation
 from robins.sim.ideal_imu import true_increments
@@ -281,6 +282,14 @@ def test_streams_pieces_and_batches_give_the_same_numbers(whole):
         np.testing.assert_allclose(piece, want, rtol=1e-14)
         np.testing.assert_allclose(several[2], want, rtol=1e-13)
         assert not np.array_equal(several[1], several[0])
+
+
+def test_numpy_takes_the_step_of_jax(whole):
+    inc, path = whole
+    before = jax.tree.map(lambda a, b: np.asarray([a, *b[:-1]]), nav(), path)
+    for reached, want in zip(*map(jax.tree.leaves, (step_each(before, inc), path)), strict=True):
+        assert type(reached) is np.ndarray
+        np.testing.assert_allclose(reached, want, rtol=1e-14, atol=1e-16)
 
 
 def test_no_increments_make_an_empty_path():

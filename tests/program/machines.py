@@ -1,5 +1,7 @@
 """The same function by JAX and in C, and how far what they give is apart."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +45,7 @@ def same_in_c(function, *args, within=0.0, unroll=None, others=()):
 
 
 NUDGE = 4e-16  # a rounding or two
-NUDGES = 8  # runs with numbers that far off
+NEAR = range(1, 9)  # runs with numbers that far off
 AMPLIFIED = 1e-9  # of its size a number is moved by a million roundings
 
 
@@ -54,8 +56,9 @@ def _sizes(series):
 
 
 def stepping(filter_, model):
-    """A whole step of a filter as one function, and what a log has of it."""
+    """A whole step of a filter as one function, and what a log has of it; traced once for all."""
 
+    @jax.jit
     def step(state, u, y, aux):
         state, done = filter_step(filter_, model, state, u, y, aux)
         return state, (state, done.info, done.prediction.code)
@@ -63,63 +66,74 @@ def stepping(filter_, model):
     return step
 
 
-def _off(numbers, nudge, key):
-    """Each number off by a part of itself, up or down; in a factor of a covariance of its row."""
+def _nudges(numbers, steps, run):
+    """How far each number of each step is off in a run, in parts of itself; in run 0 none is."""
+    rng = np.random.default_rng(run)
+    sizes = [(steps, *np.shape(x)) for x in jax.tree.leaves(numbers)]
+    return [NUDGE * rng.choice((-1.0, 1.0), size) * (run > 0) for size in sizes]
 
-    def off(path, x):
+
+def _off(numbers, nudges):
+    """Numbers off by a part of themselves, those in a covariance's factor by one of their row."""
+    paths, tree = jax.tree_util.tree_flatten_with_path(numbers)
+
+    def off(path, x, nudge):
         if x.dtype != float:
             return x
-        nudges = nudge * jax.random.choice(key, jnp.array([-1.0, 1.0]), x.shape)
         if getattr(path[-1], "name", "") != "factor":
-            return x * (1 + nudges)
+            return x * (1 + nudge)
         row = jnp.max(jnp.abs(x), axis=-1, keepdims=True)
-        return x + nudges * jnp.tril(jnp.ones_like(x)) * row
+        return x + nudge * jnp.tril(jnp.ones_like(x)) * row
 
-    return jax.tree_util.tree_map_with_path(off, numbers)
+    return tree.unflatten([off(*each, nudge) for each, nudge in zip(paths, nudges, strict=True)])
 
 
-def run_in_both(filter_, model, start, y, u=None, aux=None, unroll=None):
-    """Runs by JAX, by JAX with its numbers a rounding off, and in C; series of all that is known.
+class Runs:
+    """Runs of a filter by JAX, by JAX with its numbers a rounding off, and in C.
 
     Off are the state before each step and the log: each number by itself, but in a covariance's
-    factor by a rounding of its row, which is what a factorisation leaves in the row's zeros.
-
-    Returns:
-        What `differs` takes, of the runs and of their steps taken each from the state of JAX; and
-        the program.
+    factor by a rounding of its row, which is what a factorisation leaves in the row's zeros. What a
+    run gives is series of all that is known.
     """
-    step, rows = stepping(filter_, model), (u, y, aux or {})
-    first = start if isinstance(start, FilterState) else filter_.init(start, model.dims)
-    first = jax.tree.map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), first)
-    steps = len(jax.tree.leaves((y, u))[0])
-    keys = jax.random.split(jax.random.key(0), (1 + NUDGES, steps))
-    nudges = np.where(np.arange(1 + NUDGES) > 0, NUDGE, 0.0)
 
-    def nudged(nudge, state, keyed):
-        return step(*_off((state, *keyed[1]), nudge, keyed[0]))
+    def __init__(self, filter_, model, start, y, u, aux, unroll):
+        self.step, self.rows = stepping(filter_, model), (u, y, aux or {})
+        first = start if isinstance(start, FilterState) else filter_.init(start, model.dims)
+        self.first = jax.tree.map(lambda x: jnp.asarray(x, jnp.asarray(x).dtype), first)
+        self.steps = len(jax.tree.leaves((y, u))[0])
+        self.one = (self.first, *_row(self.rows, 0))
+        self.program = in_c(self.step, *self.one, unroll=unroll)
 
-    @jax.jit  # not batched, so that its branches stay branches
-    def one(nudge, keys):
-        return jax.lax.scan(lambda s, row: nudged(nudge, s, row), first, (keys, rows))[1]
+        def one(alone, state, given):
+            before, row, nudges = given
+            state = jax.tree.map(partial(jnp.where, alone), before, state)
+            return self.step(*_off((state, *row), nudges))
 
-    want, *near = (jax.device_get(one(*each)) for each in zip(nudges, keys, strict=True))
-    before = jax.tree.map(lambda x, y: np.concatenate([x[None], y[:-1]]), first, want[0])
-    program = in_c(step, first, *_row(rows, 0), unroll=unroll)
+        # Not batched, so that its branches stay branches.
+        self._scan = jax.jit(lambda a, *given: jax.lax.scan(partial(one, a), self.first, given)[1])
 
-    @jax.jit
-    def alone(nudge, keys):
-        return jax.lax.map(lambda each: nudged(nudge, *each)[1], (before, (keys, rows)))
+    def by_jax(self, run, before=None):
+        """A run from the first state on, or each step from a state; in run 0 no number is off."""
+        there = before is not None
+        if before is None:
+            before = jax.tree.map(lambda x: np.broadcast_to(x, (self.steps, *x.shape)), self.first)
+        given = before, self.rows, _nudges(self.one, self.steps, run)
+        return jax.device_get(self._scan(there, *given))
 
-    def by_steps():
-        near = [jax.device_get(alone(*each)) for each in zip(nudges[1:], keys[1:], strict=True)]
-        made = [program(_row(before, k), *_row(rows, k))[1] for k in range(steps)]
-        return want, _stacked(near), _stacked(made)
+    def in_c(self, before=None):
+        """The run from the first state on, or each step from a state."""
+        state, made = self.first, []
+        for k in range(self.steps):
+            state = state if before is None else _row(before, k)
+            state, kept = self.program(state, *_row(self.rows, k))
+            made.append(kept)
+        return _stacked(made)
 
-    state, made = first, []
-    for k in range(steps):
-        state, kept = program(state, *_row(rows, k))
-        made.append(kept)
-    return (want, _stacked(near), _stacked(made)), by_steps, program
+    def before(self, states):
+        """The states before the steps that these are after."""
+        return jax.tree.map(
+            lambda x, y: np.concatenate([np.asarray(x)[None], y[:-1]]), self.first, states
+        )
 
 
 def _row(rows, k):
@@ -130,25 +144,26 @@ def _stacked(steps):
     return jax.tree.map(lambda *x: np.stack(x), *steps)
 
 
-def differs(want, nudged, got, within):
+def differs(want, near, got, within):
     """Where C differs from JAX by more than roundings do, and whether the run amplifies these.
 
     Codes and counts are to be the same; a flag may be the other way where a rounding turns it.
-    Numbers are to be within a bound, or five times what roundings move.
+    Numbers are to be within a bound, or five times what roundings move in the runs that are near.
     """
     wrong, most = [], 0.0
     told = jax.tree_util.tree_flatten_with_path(want)[0]
-    for (path, a), b, c in zip(told, *map(jax.tree.leaves, (nudged, got)), strict=True):
+    for (path, a), c, *b in zip(told, *map(jax.tree.leaves, (got, *near)), strict=True):
         where = jax.tree_util.keystr(path)
         assert a.dtype == c.dtype, where
         if a.dtype != float:
-            most = max(most, float(np.any(a != b)))
-            turned = np.any(a != b, axis=0) & (a.dtype == bool)
-            if np.any((a != c) & ~turned):
-                wrong.append((where, np.argwhere((a != c) & ~turned)[:5]))
+            changed = np.any([a != one for one in b], axis=0)
+            most = max(most, float(np.any(changed)))
+            differ = (a != c) & ~(changed & (a.dtype == bool))
+            if np.any(differ):
+                wrong.append((where, np.argwhere(differ)[:5]))
             continue
         size = _sizes(a)
-        moved = max(np.nan_to_num(apart(a, one, size), posinf=0.0) for one in b)
+        moved = max((np.nan_to_num(apart(a, one, size), posinf=0.0) for one in b), default=0.0)
         most, off = max(most, moved), apart(a, c, size)
         if not off <= within + 5 * moved:
             wrong.append((where, off, moved))
@@ -156,14 +171,21 @@ def differs(want, nudged, got, within):
 
 
 def runs_the_same(filter_, model, start, y, u=None, aux=None, unroll=None, within=1e-12):
-    """Check that a filter runs in C as by JAX.
+    """Check that a filter runs in C as by JAX; gives what it gave in C, and the program.
 
-    A run that amplifies roundings may end anywhere, by JAX as well: its steps are judged one by
-    one, each from the state that JAX has there.
+    Only what is further apart than the bound is measured by what roundings move. A run that
+    amplifies roundings may end anywhere, by JAX as well: its steps are judged one by one, each from
+    the state that JAX has there.
     """
-    run, by_steps, program = run_in_both(filter_, model, start, y, u, aux, unroll)
-    wrong, amplifies = differs(*run, within)
+    runs = Runs(filter_, model, start, y, u, aux, unroll)
+    want, got = runs.by_jax(0), runs.in_c()
+    wrong, amplifies = differs(want, [], got, within)
+    if wrong:
+        near = [runs.by_jax(run) for run in NEAR]
+        wrong, amplifies = differs(want, near, got, within)
     if wrong and amplifies:
-        wrong, _ = differs(*by_steps(), within)
+        before = runs.before(want[0])
+        near = [runs.by_jax(run, before) for run in NEAR]
+        wrong, _ = differs(want, near, runs.in_c(before), within)
     assert not wrong, wrong
-    return run[-1], program
+    return got, runs.program

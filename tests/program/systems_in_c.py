@@ -4,7 +4,6 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from machines import runs_the_same
 
 from robins.campaign.monte_carlo import contender, solved
@@ -41,13 +40,18 @@ def check(name, filter_):
     """That a filter of a scenario runs in C as by JAX."""
     problem = read_scenario(name, ("runs=1",)).problem((filter_,), 0)
     one = contender(problem, filter_)
-    case = one.case(world_of(name))
-    if case.loop is not None:  # its readings are known when it has run
-        case = solved(one.filter, one.model, case, lambda step: ())[1]
-    u, y, aux = jax.tree.map(
-        lambda x: np.asarray(x)[:EPOCHS], (case.u, dict(case.y), dict(case.aux))
-    )
-    runs_the_same(one.filter, one.model, case.start, y, u, aux, unroll=UNROLL)
+
+    @jax.jit
+    def given(world):
+        case = one.case(world)
+        if case.loop is not None:  # its readings are known when it has run
+            case = solved(one.filter, one.model, case, lambda step: ())[1]
+        rows = case.u, dict(case.y), dict(case.aux)
+        return case.start, jax.tree.map(lambda x: x[:EPOCHS], rows)
+
+    start, rows = given(world_of(name))
+    u, y, aux = jax.device_get(rows)
+    runs_the_same(one.filter, one.model, start, y, u, aux, unroll=UNROLL)
 
 
 def walk(name):

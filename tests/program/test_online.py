@@ -210,8 +210,8 @@ def test_what_has_no_place_in_c_is_named_with_its_line():
 
 
 def test_machines_that_are_not_there(monkeypatch):
-    with pytest.raises(ValueError, match="machine must be 'jax' or 'c', got 'cuda'"):
-        OnlineFilter(EKF, MODEL, START, "cuda")
+    with pytest.raises(ValueError, match="machine must be 'jax' or 'c', got 'fpga'"):
+        OnlineFilter(EKF, MODEL, START, "fpga")
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(BuildError, match="install one"):
         OnlineFilter(EKF, MODEL, START, "c")

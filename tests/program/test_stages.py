@@ -18,12 +18,14 @@ T, N = 240, 11
 NUMBER = jax.ShapeDtypeStruct((), jnp.asarray(0).dtype)
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def quick():
     """Compile without optimisation; the bits are the same."""
     flags = tuple("-O0" if flag == "-O2" else flag for flag in LANE_FLAGS)
-    monkeypatch.setattr("robins.program.lanes.LANE_FLAGS", flags)
-    monkeypatch.setattr("robins.program.stages.WORTH", 0)  # nothing is too little
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("robins.program.lanes.LANE_FLAGS", flags)
+        patch.setattr("robins.program.stages.WORTH", 0)  # nothing is too little
+        yield
 
 
 def world(number):
@@ -66,8 +68,8 @@ def close(want, got, within=1e-13):
         assert apart(a, b) <= (within if a.dtype == float else 0.0), path
 
 
-@pytest.fixture
-def staged():
+@pytest.fixture(scope="module")
+def staged(quick):
     return Staged(world, NUMBER)
 
 
@@ -109,11 +111,10 @@ def test_what_is_wanted_of_one_run_is_kept_of_the_first():
     assert all(x.nbytes <= 8 * 9 * T for x in held)  # "outer" of one run is the largest
 
 
-def test_values_are_dropped_after_their_last_use(monkeypatch):
+def test_values_are_dropped_after_their_last_use(staged, monkeypatch):
     """The bytes of a run are those that are held at the fullest stage, counted there."""
-    staged, runs = Staged(world, NUMBER), jnp.arange(N)
+    runs, held = jnp.arange(N), []
     staged(runs)
-    held = []
 
     def watching(kind):
         call = kind.__call__

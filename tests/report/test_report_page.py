@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from example_results import a_drive, a_summary
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from robins import report, results
@@ -195,12 +196,28 @@ def test_a_palette_keeps_the_colours_that_carry_meaning(shots):
 
 
 def test_fewer_colours_and_dots_are_fewer_bytes(shots):
-    figure = shots[1].picture.figure
-    drawn = [(embed._dots(figure, dpi), colours) for dpi, colours in embed._LADDER]
-    assert drawn[0][0].tobytes() == shots[1].dots.tobytes()  # drawn again it is the same
-    sizes = [len(embed.packed(*one)) for one in drawn]
+    dots = shots[1].dots
+    forms = [(embed.shrunk(dots, share), *kept) for share, *kept in embed._LADDER]
+    assert forms[0][0].tobytes() == dots.tobytes()
+    sizes = [len(embed.packed(*one)) for one in forms]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] < 0.6 * len(shots[1].png())
+
+
+def test_a_picture_is_drawn_once_whatever_its_size_on_the_page(drive, town, monkeypatch):
+    times = []
+    drawing = FigureCanvasAgg.draw
+    monkeypatch.setattr(FigureCanvasAgg, "draw", lambda c: times.append(c) or drawing(c))
+    (picture,) = report.pictures(drive[["lat_rad", "lon_rad", "outage"]], town)[:1]
+    sharp, coarse = (report.draw(picture, embed.dpi_for(count)) for count in (8, 9))
+    assert len(times) == 2
+    assert sharp.dots.width == pytest.approx(coarse.dots.width * 4 / 3, abs=2)
+    assert sharp.pixels == pytest.approx(coarse.pixels, abs=2)
+    (shown,) = embed.embed([sharp], 10**6)
+    (small,) = embed.embed([sharp], len(shown.source) // 2)
+    assert (small.width, small.height) == (shown.width, shown.height) == sharp.pixels
+    assert decoded(small.source).width < decoded(shown.source).width
+    assert len(times) == 2
 
 
 def test_a_picture_of_one_colour_can_be_packed():
@@ -218,12 +235,12 @@ def walk(town):
     return a_drive(1, seconds=40.0)[names]
 
 
-def written(path, walk, progress=None):
+def written(path, walk, progress=None, **more):
     """A result with its report."""
     with results.ResultWriter(path, scenario_text="x = 1", command="robins run x") as writer:
         writer.save_summary(a_summary(1))
         writer.save_solution(walk)
-        report.add(writer, progress)
+        report.add(writer, progress, **more)
     return results.read(path)
 
 
@@ -240,6 +257,11 @@ def test_a_result_gets_its_figures_and_page(tmp_path, walk):
     share = [done / total for done, total, _ in seen]
     assert share == sorted(share)
     assert share[-1] == 1.0
+
+
+def test_only_the_figures_asked_for_are_drawn(tmp_path, walk):
+    assert set(written(tmp_path / "a", walk, only=["error_velocity"]).figures) == {"error_velocity"}
+    assert set(written(tmp_path / "b", walk, only=["lat_rad", "nothing"]).figures) == {"track"}
 
 
 def drawn(path, walk):

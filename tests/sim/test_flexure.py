@@ -10,6 +10,7 @@ from robins.sim.flexure import Flexure, simulate_flexure, transition
 from robins.sim.random import Component, stream
 
 step = jax.jit(transition)
+simulated = jax.jit(simulate_flexure, static_argnames=("dt_s", "count"))
 
 
 def oscillator(tau, zeta):
@@ -71,14 +72,14 @@ def test_simulated_statistics(dof):
 def test_bending_follows_the_load():
     model = Flexure(np.zeros(3), np.ones(3), bending_rad_g=np.array([0.0, 2e-3, 0.0]))
     load = jnp.array([1.0, 2.0, 3.0, 3.0])
-    angle, rate = simulate_flexure(model, jax.random.key(0), 0.5, 3, load)
+    angle, rate = simulated(model, jax.random.key(0), 0.5, 3, load)
     np.testing.assert_allclose(angle[:, 1], [0.0, 2e-3, 4e-3, 4e-3], atol=1e-15)
     np.testing.assert_allclose(rate[1, 1], 4e-3, atol=1e-15)
 
 
 def test_an_angle_is_the_integral_of_its_rate():
     model = Flexure(np.full(3, 5e-3), np.ones(3))
-    angle, rate = simulate_flexure(model, jax.random.key(2), 1e-3, 500)
+    angle, rate = simulated(model, jax.random.key(2), 1e-3, 500)
     integral = np.cumsum(0.5e-3 * (rate[1:] + rate[:-1]), axis=0)
     np.testing.assert_allclose(angle[1:] - angle[:1], integral, atol=5e-3 * np.std(angle))
 

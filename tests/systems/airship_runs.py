@@ -19,12 +19,11 @@ from robins.systems.airship.parameters import Airship
 from robins.systems.airship.world import World
 from robins.systems.study import Problem
 
-RUNS = 20
+RUNS, MANY = 8, 20  # of `make test`, and of the specification, by `make certify`
 STUDY = SYSTEM.studies["navigation"]
-UNWARNED = tuple(name for name in STUDY.filters if name != "distributed-full")
 TO_THE_END = ('imu.rate="10 Hz"', 'duration="800 s"')  # of what counts: 200 to 800 s
 QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, some times as fast to run
-OFTEN = ("ukf", "intersection")  # filters that run so often, or so slowly, that it is worth it
+OFTEN = ("ukf", "intersection")  # filters with so many, or so slow, flights that it is worth it
 
 
 class Found(NamedTuple):
@@ -62,25 +61,23 @@ class Found(NamedTuple):
 class Flights(NamedTuple):
     """Runs of a scenario."""
 
-    problem: Problem
+    name: str
+    settings: tuple[str, ...]
     batch: World  # leading axis: runs
+
+    def problem(self, *filters: str) -> Problem:
+        """The scenario with these filters."""
+        return problem(self.name, self.settings, filters)
 
     def found(self, name: str) -> Found:
         """What a filter makes of them."""
-        program, *given = self._called(name)
-        error, square = program(*given)
-        counted = slice(self.problem.count_from, self.problem.count_to)
+        problem = self.problem(name)
+        c = problem.contenders[name]
+        many = len(self.batch.wind) >= MANY
+        program = _program(c.filter, many and name in OFTEN)
+        error, square = program(c.model, c.case, jnp.asarray(c.reported), self.batch)
+        counted = slice(problem.count_from, problem.count_to)
         return Found(np.asarray(error), np.asarray(square), counted)
-
-    def traced(self, name: str) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
-        """Shapes of the error and of its square, without compiling."""
-        program, *given = self._called(name)
-        return program.eval_shape(*given)
-
-    def _called(self, name: str):
-        c = self.problem.contenders[name]
-        program = _program(c.filter, name in OFTEN)
-        return program, c.model, c.case, jnp.asarray(c.reported), self.batch
 
 
 def parsed(name: str, settings: tuple[str, ...] = TO_THE_END) -> Airship:
@@ -89,11 +86,22 @@ def parsed(name: str, settings: tuple[str, ...] = TO_THE_END) -> Airship:
 
 
 @cache
+def problem(name: str, settings: tuple[str, ...], filters: tuple[str, ...]) -> Problem:
+    """A packaged scenario, changed, with these filters."""
+    return STUDY.problem(parsed(name, settings), filters, seed=0)
+
+
+@cache
 def flights(name: str, settings: tuple[str, ...] = TO_THE_END, runs: int = RUNS) -> Flights:
     """Runs of a packaged scenario."""
-    problem = STUDY.problem(parsed(name, settings), UNWARNED, seed=0)
-    ((batch, _),) = worlds(problem, runs)
-    return Flights(problem, batch)
+    ((batch, _),) = worlds(problem(name, settings, ()), runs)
+    return Flights(name, settings, batch)
+
+
+def beginning(batch: World, epochs: int) -> World:
+    """Of runs the first so many epochs."""
+    count = batch.wind.shape[1]
+    return jax.tree.map(lambda x: x[:, :epochs] if x.shape[1:2] == (count,) else x, batch)
 
 
 def without_radar(batch: World, begin: int, end: int) -> World:
@@ -110,8 +118,15 @@ def told_by_radar(batch: World, changed: Callable[[Any, Any], Any]) -> World:
     return batch._replace(readings=batch.readings | {SAR: after})
 
 
-@cache
-def _program(filter_: Any, quick: bool):
+def traced(problem: Problem, name: str, world: Any) -> tuple[Any, Any]:
+    """Shapes of the error of one run and of its square, without compiling."""
+    c = problem.contenders[name]
+    return jax.eval_shape(_judging(c.filter), c.model, c.case, jnp.asarray(c.reported), world)
+
+
+def _judging(filter_: Any):
+    """Error of a filter in one run, (E, 9), and its square by what it states, (E,)."""
+
     def one(model, case, reported, world):
         it = case(world)
         steps = run(
@@ -127,11 +142,16 @@ def _program(filter_: Any, quick: bool):
         stuck = jnp.cumsum(prediction.code != int(Code.DONE)) > 0
         return jnp.where(stuck[:, None], jnp.nan, error), square
 
-    mapped = jax.vmap(one, in_axes=(None, None, None, 0))
+    return one
+
+
+@cache
+def _program(filter_: Any, quick: bool):
+    mapped = jax.vmap(_judging(filter_), in_axes=(None, None, None, 0))
     return jax.jit(mapped, compiler_options=QUICK if quick else None)
 
 
 @cache
-def found(name: str, filter_: str) -> Found:
+def found(name: str, filter_: str, runs: int = MANY) -> Found:
     """What a filter makes of a packaged scenario."""
-    return flights(name).found(filter_)
+    return flights(name, runs=runs).found(filter_)

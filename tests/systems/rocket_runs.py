@@ -15,18 +15,9 @@ from robins.systems.rocket import SYSTEM
 from robins.systems.rocket.world import PEAK_S, World
 from robins.systems.study import Problem
 
-RUNS = 20
-QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run
+RUNS, MANY = 8, 20  # of `make test`, and of the specification, by `make certify`
+QUICK = {"xla_backend_optimization_level": 1}  # slower to compile, faster to run many
 SHORT = ('duration="150 s"',)  # of the angles; of the field it takes the whole flight
-
-
-class Flights(NamedTuple):
-    """Runs of a scenario."""
-
-    problem: Problem
-    batch: World  # leading axis: runs
-    every_s: float  # of the disturbances, infinite if there are none
-    length_s: float
 
 
 class Found(NamedTuple):
@@ -85,19 +76,21 @@ def parsed(name: str, settings: tuple[str, ...] = ()) -> Any:
 
 
 @cache
-def flights(name: str, settings: tuple[str, ...] = (), runs: int = RUNS) -> Flights:
-    """Runs of a packaged scenario, with every filter of its study."""
+def problem(name: str, settings: tuple[str, ...], filters: tuple[str, ...] = ()) -> Problem:
+    """A packaged scenario, changed, with these filters."""
     given, study = parsed(name, settings)
-    problem = study.problem(given, study.filters, 1)
-    ((batch, _),) = worlds(problem, runs)
-    burst = given.magnetometer.disturbance
-    return Flights(
-        problem, batch, *((np.inf, 0.0) if burst is None else (burst.every, burst.length))
-    )
+    return study.problem(given, filters, 1)
 
 
 @cache
-def _program(filter_: Any):
+def flights(name: str, settings: tuple[str, ...], runs: int) -> World:
+    """Runs of a packaged scenario, changed; leading axis: runs."""
+    ((batch, _),) = worlds(problem(name, settings), runs)
+    return batch
+
+
+@cache
+def _program(filter_: Any, quick: bool):
     def one(model, case, world):
         it = case(world)
         steps = run(filter_, model, it.start, it.y, it.u, it.aux, keep=lambda s: s.posterior).steps
@@ -112,15 +105,16 @@ def _program(filter_: Any):
         return jax.vmap(judged, (0, 0, along))(steps, it.truth, it.rows)
 
     mapped = jax.vmap(one, in_axes=(None, None, 0))
-    return jax.jit(mapped, compiler_options=QUICK)
+    return jax.jit(mapped, compiler_options=QUICK if quick else None)
 
 
 @cache
-def found(name: str, filter_: str) -> Found:
+def found(name: str, filter_: str, runs: int = MANY) -> Found:
     """What a filter makes of flights of a scenario."""
-    flown = flights(name, SHORT if name.startswith("a") else ())
-    p = flown.problem
+    settings = SHORT if name.startswith("a") else ()
+    p, burst = problem(name, settings, (filter_,)), parsed(name)[0].magnetometer.disturbance
     c = p.contenders[filter_]
-    error, square = _program(c.filter)(c.model, c.case, flown.batch)
-    every, length = flown.every_s, flown.length_s
+    program = _program(c.filter, runs >= MANY)
+    error, square = program(c.model, c.case, flights(name, settings, runs))
+    every, length = (np.inf, 0.0) if burst is None else (burst.every, burst.length)
     return Found(np.degrees(np.asarray(error)), np.asarray(square), p.epoch_s, every, length)

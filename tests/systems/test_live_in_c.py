@@ -14,11 +14,19 @@ from test_live_marg import PARAMETERS, RATE_HZ, columns, made_log
 from test_live_marg import played as moved
 
 from robins import scenario
+from robins.program import FLAGS, build
 from robins.systems.ins_gnss import Drive, LiveInsGnss, Replay, drive_dataset
 from robins.systems.marg import LiveMarg
 from robins.systems.streaming import Flag
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Compile without optimisation; the bits are the same."""
+    flags = tuple("-O0" if flag == "-O2" else flag for flag in FLAGS)
+    monkeypatch.setattr("robins.program.memory.build", lambda text, _: build(text, flags))
 
 
 def test_the_orientation_is_that_by_jax():

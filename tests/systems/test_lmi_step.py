@@ -1,6 +1,7 @@
 """The filter that solves its LMI at every star frame: its gains, what it tells, what it cannot."""
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +37,11 @@ SPEC = GainSpec("lmi", 0.5)
 RATES = ([0.0, 0.0, 0.0], [0.01, -0.02, 0.005], [0.4, 0.3, -0.5])
 SOLVER = 2e-6  # what its answer differs by where the last digit of the plant does
 SHORT = ('duration="12 s"', 'counted_from="5 s"')
+SLEWS = (
+    'slew.angle=["40 deg", "30 deg", "20 deg"]',
+    'slew.period=["30 s", "25 s", "20 s"]',
+    'slew.grows="0 s"',
+)
 FRAMES = np.arange(4, 120, 5)
 
 
@@ -133,19 +139,24 @@ class Flown(NamedTuple):
     closed: Any
 
 
-def flown(*settings):
-    """One run: gains and notes of its steps, attitude before and after the update."""
-    p = problem("s2", (NAME,), (*SHORT, *settings))
+@cache
+def prepared():
+    """A problem that slews, its filter, two cases; no cache keeps a program that calls Python."""
+    p = problem("s2", (NAME,), (*SHORT, *SLEWS))
+    ((batch, _),) = worlds(p, 2)
     c = p.contenders[NAME]
-    ((batch, _),) = worlds(p, 1)
-    case = c.case(jax.tree.map(lambda x: x[0], batch))
+    return p, c, [c.case(jax.tree.map(lambda x, i=i: x[i], batch)) for i in range(2)]
+
+
+def flown():
+    """One run: gains and notes of its steps, attitude before and after the update."""
+    _, c, (case, _) = prepared()
     closed = run_closed(c.filter, c.model, case.start, case.loop, kept)
     return Flown(c, case, *map(np.asarray, closed.steps), closed)
 
 
 def test_every_frame_is_used_with_the_gain_of_the_rate_just_measured():
-    slews = 'slew.angle=["40 deg", "30 deg", "20 deg"]', 'slew.period=["30 s", "25 s", "20 s"]'
-    it = flown(*slews, 'slew.grows="0 s"')
+    it = flown()
     assert not np.any(it.failed)
     assert np.all(np.any(it.gains[FRAMES] != 0.0, axis=(1, 2)))
     assert not np.any(np.delete(it.gains, FRAMES, axis=0))
@@ -199,10 +210,7 @@ def test_a_design_that_does_not_pass_leaves_the_last_gain_and_is_told(monkeypatc
 
 
 def test_in_a_batch_each_run_has_its_own_gain():
-    p = problem("s1", (NAME,), SHORT)
-    c = p.contenders[NAME]
-    ((batch, _),) = worlds(p, 2)
-    cases = [c.case(jax.tree.map(lambda x, i=i: x[i], batch)) for i in range(2)]
+    _, c, cases = prepared()
     sensor = c.model.sensor(STAR)
     moved = [
         c.filter.predict(case.start, c.model.motion, DT * jnp.array(rate))[0]
@@ -221,16 +229,13 @@ def test_in_a_batch_each_run_has_its_own_gain():
 
 
 def test_it_is_refused_where_no_python_is(tmp_path):
-    p = problem("s1", (NAME,), SHORT)
+    p, c, (case, _) = prepared()
     assert isinstance(machine_for(p, 1000), ByJax)
     with pytest.raises(RobinsError, match=rf"--machine c: filter '{NAME}' .* an LMI in Python"):
         machine_for(p, 1, "c")
     with pytest.raises(InputError, match=rf"filter '{NAME}' cannot be exported: it solves an LMI"):
         export_filter("satellite/s1", tmp_path / "out", filter_name=NAME, settings=SHORT)
     assert not (tmp_path / "out").exists()
-    ((batch, _),) = worlds(p, 1)
-    c = p.contenders[NAME]
-    case = c.case(jax.tree.map(lambda x: x[0], batch))
     live = OnlineFilter(c.filter, c.model, case.start, "c")
     with pytest.raises(ProgramError, match="'pure_callback' has no place in a program"):
         live.update(case.start.belief.mean.attitude, STAR)

@@ -46,28 +46,29 @@ def parsed(name, *settings):
     return scenario.parse(study.VelocityAttitude, (FOLDER / f"{name}.toml").read_text(), settings)
 
 
+SIZES = {  # what the scenarios below differ in, by table
+    "mounting": ("error",),
+    "disturbance": ("gyro_noise_factor", "drift_step"),
+    "start": ("attitude",),
+    "slave": ("accel_bias", "gyro_slow", "gyro_slow_time"),
+}
+
+
 @cache
 def simulator_of(name):
-    """Simulates scenarios that differ from this one in the sizes below; compiles once for all."""
+    """Simulates scenarios that differ from this one in `SIZES`; compiles once for all."""
     given = parsed(name)
     course = course_of(name)
 
     def simulate(sizes, index):
-        error, factor, step = sizes
-        parts = {
-            "mounting": given.mounting.model_copy(update={"error": error}),
-            "disturbance": given.disturbance.model_copy(
-                update={"gyro_noise_factor": factor, "drift_step": step}
-            ),
-        }
+        parts = {t: getattr(given, t).model_copy(update=size) for t, size in sizes.items()}
         return study.simulate(given.model_copy(update=parts), course, 0, index)
 
     batch = jax.jit(jax.vmap(simulate, (None, 0)), compiler_options=QUICK)
 
     def of(other):
-        d = other.disturbance
-        sizes = (other.mounting.error, d.gyro_noise_factor, d.drift_step)
-        return batch([jnp.asarray(x) for x in sizes], jnp.arange(RUNS))
+        sizes = {t: {k: getattr(getattr(other, t), k) for k in keys} for t, keys in SIZES.items()}
+        return batch(jax.tree.map(jnp.asarray, sizes), jnp.arange(RUNS))
 
     return of
 
@@ -98,9 +99,9 @@ def course_of(name):
 
 
 @cache
-def flights(name):
+def flights(name, *settings):
     """Runs of a scenario, from one program for those of a stiff structure and one for bent ones."""
-    return simulator_of("d" if name in "bd" else "c")(parsed(name))
+    return simulator_of("d" if name in "bd" else "c")(parsed(name, *settings))
 
 
 @cache
@@ -143,16 +144,17 @@ def test_filters_win_and_lose_where_the_reference_does(name, ours, theirs, low, 
     assert low <= reached(name, ours)[0] / reached(name, theirs)[0] <= high
 
 
+SMALL = (  # errors for which the linear model is good
+    'start.attitude=["0.05 deg", "0.05 deg", "0.1 deg"]',
+    'slave.accel_bias=["1 mg", "1 mg", "0 mg"]',
+)
+SLOW = (*SMALL, 'slave.gyro_slow="20 deg/h"', 'slave.gyro_slow_time="40 s"')
+
+
 def test_the_kalman_filter_is_consistent_where_errors_are_small():
-    given = parsed(
-        "a",
-        'start.attitude=["0.05 deg", "0.05 deg", "0.1 deg"]',
-        'slave.accel_bias=["1 mg", "1 mg", "0 mg"]',
-    )
-    problem = STUDY.problem(given, ("kf",), 0)
-    world = jax.jit(jax.vmap(problem.simulate))(jnp.arange(RUNS))
+    problem = STUDY.problem(parsed("a", *SMALL), ("kf",), 0)
     contender = problem.contenders["kf"]
-    error, sigma, code = errors_of(contender, world)
+    error, sigma, code = errors_of(contender, flights("a", *SMALL))
     late = slice(COUNT_FROM, None)
     ratio = np.sqrt(np.mean(error[:, late] ** 2, (0, 1)) / np.mean(sigma[:, late] ** 2, (0, 1)))
     # the attitude; biases are constants of a run, so that a hundred runs say them to 7 % only
@@ -348,19 +350,12 @@ def test_filters_are_told_of_what_compensation_leaves():
 @pytest.mark.parametrize("told", [True, False])
 def test_a_slow_drift_that_is_told_leaves_the_kalman_filter_consistent(told):
     """Its own sigma against 100 runs, where errors are small enough for the linear model."""
-    small = (
-        'start.attitude=["0.05 deg", "0.05 deg", "0.1 deg"]',
-        'slave.accel_bias=["1 mg", "1 mg", "0 mg"]',
-        'slave.gyro_slow="20 deg/h"',
-        'slave.gyro_slow_time="40 s"',
-    )
-    given = parsed("a", *small)
+    given = parsed("a", *SLOW)
     course = lay_out(given)
-    world = jax.jit(jax.vmap(lambda i: study.simulate(given, course, 0, i)))(jnp.arange(RUNS))
     if not told:  # eps' = 0, as the patent's equation stands
         slave = given.slave.model_copy(update={"gyro_slow_time": (1e12,) * 3})
         given = given.model_copy(update={"slave": slave})
-    error, sigma, _ = errors_of(study.contender(given, course, "kf"), world)
+    error, sigma, _ = errors_of(study.contender(given, course, "kf"), flights("a", *SLOW))
     late = slice(COUNT_FROM, None)
     ratio = np.sqrt(np.mean(error[:, late] ** 2, (0, 1)) / np.mean(sigma[:, late] ** 2, (0, 1)))
     if told:

@@ -105,10 +105,13 @@ def block(seed: int) -> Block:
 
 
 def central(g, x):
-    """Jacobian of g between tangent spaces by central differences, in units of `SIZE`."""
-    value, step = g(x), 1e-2 * jnp.diag(jnp.asarray(SIZE))
-    away = jax.vmap(lambda d: local(value, g(retract(x, d))))(jnp.concatenate([step, -step]))
-    return (away[:24] - away[24:]).T / 2e-2
+    """g at x, and its Jacobian between tangent spaces by central differences in units of `SIZE`."""
+    step = 1e-2 * jnp.diag(jnp.asarray(SIZE))
+    ends = jnp.concatenate([jnp.zeros((1, 24)), step, -step])
+    values = jax.vmap(lambda d: g(retract(x, d)))(ends)  # all by one, which is traced once
+    value, others = (jax.tree.map(lambda v, at=at: v[at], values) for at in (0, slice(1, None)))
+    away = jax.vmap(lambda other: local(value, other))(others)
+    return value, (away[:24] - away[24:]).T / 2e-2
 
 
 SIGMAS = {p.ATTITUDE: MINUTE, p.VELOCITY: 0.05, p.POSITION: 5.0}
@@ -131,13 +134,13 @@ def derived():
     def both(x, lag, inc):
         assert motion.linear is not None
         new, Phi, factor = motion.linear(x, inc)
-        moved = motion.step(x, inc)
-        out = {"motion": (Phi, central(lambda s: motion.step(s, inc), x), local(new, moved))}
+        moved, differences = central(lambda s: motion.step(s, inc), x)
+        out = {"motion": (Phi, differences, local(new, moved))}
         for sensor in sensors:
             assert sensor.linear is not None
             z, H = sensor.linear(x, lag)
-            differences = central(lambda s, r=sensor.read: r(s, lag), x)
-            out[sensor.name] = (H, differences, local(z, sensor.read(x, lag)))
+            read, differences = central(lambda s, r=sensor.read: r(s, lag), x)
+            out[sensor.name] = (H, differences, local(z, read))
         return Derived(Phi, factor, out)
 
     return both

@@ -8,23 +8,26 @@ they are chosen where JAX would take longer than that.
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import partial
 from time import monotonic
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from robins.campaign.memory import (
-    CHUNK,
     CHUNK_BYTES,
     LEAST,
     MEMORY,
     at_once,
+    filled,
     give_back,
     said,
     width_of,
@@ -39,6 +42,7 @@ from robins.campaign.monte_carlo import (
     one_record,
     parted,
     record,
+    traced,
     worlds,
 )
 from robins.errors import RobinsError
@@ -46,11 +50,12 @@ from robins.program import CPP, BuildError, compiler
 from robins.program.stages import Staged
 from robins.systems.study import Problem
 
-MACHINES = ("jax", "c", "cuda")
+MACHINES = ("jax", "c")
 PAYS = 60.0  # seconds of JAX on one core for which it pays to compile lanes
 FEWEST = 100  # runs of which this is asked
 NS = 0.5  # of JAX, for a scalar operation in a scan (measured: 0.4 to 0.8)
 BETWEEN_S = 1.0  # between two times that memory is given back
+COMPILERS = 3  # at once, beside that of the worlds: some take a gigabyte
 STACK = 1 << 28  # bytes of a thread's stack, on which lanes hold all that a step computes
 
 Taken = Callable[[str, Any], Any]  # of a filter's name and its record of a chunk: what is kept
@@ -81,10 +86,11 @@ class ByJax:
         self.problem = problem
         self.notes: list[str] = []
         self._batch = batch_of(problem)
+        self._programs: dict[str, Future[Any]] = {}  # being compiled
 
     def width(self, runs: int) -> int:
         """Runs of a chunk in a campaign of so many, by the memory that JAX needs for them."""
-        width = min(runs, CHUNK)
+        width = filled(runs)
         each = -(-bytes_of_batch(self.problem, self._batch, width) // width)
         width = min(width, width_of(each, MEMORY))
         self.notes = said(each, width)
@@ -98,19 +104,37 @@ class ByJax:
             chunk: runs at a time; not given, by the memory that they need.
             taken: what is kept of the record of a filter.
         """
-        first, width = True, chunk or self.width(runs)
-        for batch, count in worlds(self.problem, runs, width, batch=self._batch):
-            held = [batch]
-            del batch
-            yield (
-                first_run(held[0]) if first else None,
-                count,
-                partial(self._of, held, count, taken),
-            )
-            held.clear()  # before the next is simulated
-            first = False
+        first, width = True, filled(runs, chunk or self.width(runs))
+        with self._compiling(width):
+            for batch, count in worlds(self.problem, runs, width, batch=self._batch):
+                held = [batch]
+                del batch
+                yield (
+                    first_run(held[0]) if first else None,
+                    count,
+                    partial(self._of, held, count, taken),
+                )
+                held.clear()  # before the next is simulated
+                first = False
+
+    @contextmanager
+    def _compiling(self, width: int) -> Iterator[None]:
+        """Compile the filters meanwhile, on other cores, in the order in which they will run."""
+        others = available_cores() - 1
+        if not others:
+            yield
+            return
+        programs = traced(self.problem, self._batch, width)
+        with _threads(min(others, COMPILERS)) as pool:
+            self._programs = {
+                name: pool.submit(lambda one=one: one.lower().compile())
+                for name, one in programs.items()
+            }
+            yield
 
     def _of(self, held: list[Any], count: int, taken: Taken, name: str) -> Any:
+        if name in self._programs:
+            self._programs.pop(name).result()  # which serves the call
         return taken(name, record(self.problem, name, held[0], count))
 
     def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
@@ -184,10 +208,8 @@ class InLanes:
         """
         width = chunk or self.width(runs)
         workers = at_once(self.bytes_of_run, width, available_cores())
-        before = threading.stack_size(STACK)
-        pool = ThreadPoolExecutor(workers)
         begins, ahead_by = range(width, runs, width), workers + 1
-        try:
+        with _threads(workers) as pool:
             # The first chunk compiles: each filter on a core of its own.
             world = pool.submit(self._worlds, 0, width).result()
             count = min(width, runs)
@@ -210,9 +232,6 @@ class InLanes:
                     count = min(width, runs - later)
                     ahead.append(pool.submit(self._chunk, later, width, count, taken))
                 yield None, min(width, runs - begin), found.__getitem__
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            threading.stack_size(before)
 
     def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:
         """What is kept of some filters over one chunk, on one core."""
@@ -233,6 +252,7 @@ class InLanes:
         return with_stack(computed)
 
     def _worlds(self, begin: int, width: int) -> Any:
+        sys.audit("robins.simulate", width)  # counted by tests
         return self._simulate(jnp.arange(begin, begin + width))
 
     def _of(self, name: str, world: Any, count: int, taken: Taken) -> Any:
@@ -242,6 +262,18 @@ class InLanes:
     def _chunk(self, begin: int, width: int, count: int, taken: Taken) -> dict[str, Any]:
         world = self._worlds(begin, width)
         return {name: self._of(name, world, count, taken) for name in self._filters}
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads with a stack large enough for lanes and compilers; what waits for one is dropped."""
+    before = threading.stack_size(STACK)
+    pool = ThreadPoolExecutor(count)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        threading.stack_size(before)
 
 
 def with_stack(function: Callable[[], Any]) -> Any:
@@ -256,7 +288,8 @@ def with_stack(function: Callable[[], Any]) -> Any:
 
 def first_run(world: Any) -> Any:
     """Of worlds with a leading axis of runs the first, holding none of the others."""
-    return jax.tree_util.tree_map(lambda x: jnp.array(x[0]), world)
+    # an index of JAX would be a program for each shape
+    return jax.device_put(jax.tree_util.tree_map(lambda x: np.array(np.asarray(x)[0]), world))
 
 
 def one_by_one(function: Callable[..., Any], rows: Any) -> Any:
@@ -277,10 +310,8 @@ def check_machine(name: str) -> None:
     Raises:
         RobinsError: there is no such machine, or no compiler for it.
     """
-    if name == "cuda":
-        raise RobinsError(
-            "campaigns do not run as a kernel of a GPU yet", "--machine cuda", "say jax or c."
-        )
+    if name and name not in MACHINES:
+        raise RobinsError(f"no machine '{name}'", "--machine", f"say {' or '.join(MACHINES)}")
     if name == "c":
         compiler(CPP)
 

@@ -16,6 +16,14 @@ CHUNK_BYTES = 128 << 20  # of a chunk in lanes, of which several are computed at
 MEMORY = 768 << 20  # bytes of all chunks at once
 
 
+def filled(runs: int, most: int = CHUNK) -> int:
+    """Runs of a chunk where memory does not matter: all of a few, `most` of more than half as many.
+
+    The last chunk is filled up, so that 50 and 1000 runs need one program.
+    """
+    return min(most, runs) if runs <= most // 2 else most
+
+
 def width_of(bytes_of_run: int, most: int) -> int:
     """Runs of a chunk that takes so many bytes at most; a multiple of `LEAST`, up to `CHUNK`."""
     fitting = most // max(bytes_of_run, 1) // LEAST * LEAST

@@ -8,6 +8,7 @@ differ in numbers only share what was compiled for them.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array
 
-from robins.campaign.memory import CHUNK
+from robins.campaign.memory import CHUNK, filled
 from robins.filters import Belief, Code, Step, Tally, run, run_closed
 from robins.filters.analysis.consistency import normalised_sq
 from robins.filters.sameness import same, same_model
@@ -135,16 +136,17 @@ def worlds(
     """Simulate runs first .. first + runs - 1, a chunk at a time, by `batch_of` the problem.
 
     Yields:
-        What `Problem.simulate` returns, with a leading axis of ``min(chunk, runs)``, and how many
-        of them count: the last chunk is padded with runs to be thrown away.
+        What `Problem.simulate` returns, with a leading axis of ``filled(runs, chunk)``, and how
+        many of them count: the last chunk is padded with runs to be thrown away.
 
     Raises:
         ValueError: runs or chunk is not positive.
     """
     if runs < 1 or chunk < 1:
         raise ValueError(f"runs and chunk must be at least 1, got {runs} and {chunk}")
-    width, batch = min(chunk, runs), batch or batch_of(problem)
+    width, batch = filled(runs, chunk), batch or batch_of(problem)
     for begin in range(first, first + runs, width):
+        sys.audit("robins.simulate", width)  # counted by tests
         yield batch(jnp.arange(begin, begin + width)), min(width, first + runs - begin)
 
 
@@ -163,14 +165,24 @@ def bytes_of_batch(problem: Problem, batch: Any, width: int) -> int:
         batch: its simulation, as `batch_of` gives it.
         width: runs of the chunk.
     """
-    numbers = jax.ShapeDtypeStruct((width,), jnp.arange(1).dtype)
-    many = jax.eval_shape(batch, numbers)
-    most = bytes_of_jaxpr(batch.trace(numbers).jaxpr.jaxpr)
-    for name in problem.contenders:
-        c, blocks = contender(problem, name), blocks_of(problem)
-        traced = _records.trace(c.filter, blocks, c.model, c.case, c.reported, many)
-        most = max(most, bytes_of_jaxpr(traced.jaxpr.jaxpr))
-    return most
+    every = [batch.trace(_numbers(width)), *traced(problem, batch, width).values()]
+    return max(bytes_of_jaxpr(one.jaxpr.jaxpr) for one in every)
+
+
+def traced(problem: Problem, batch: Any, width: int) -> dict[str, Any]:
+    """The programs of all filters for a chunk of so many runs, by name, not compiled yet."""
+    many = jax.eval_shape(batch, _numbers(width))
+    return {name: _records.trace(*_given(problem, name), many) for name in problem.contenders}
+
+
+def _numbers(width: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((width,), jnp.arange(1).dtype)
+
+
+def _given(problem: Problem, name: str) -> tuple[Any, ...]:
+    """What `_records` is given before the worlds."""
+    c = contender(problem, name)
+    return c.filter, blocks_of(problem), c.model, c.case, c.reported
 
 
 def contender(problem: Problem, name: str) -> Contender:
@@ -201,9 +213,7 @@ def record(problem: Problem, name: str, worlds: Any, count: int) -> dict[str, An
     Raises:
         ValueError: there is no such contender.
     """
-    c = contender(problem, name)
-    found = _records(c.filter, blocks_of(problem), c.model, c.case, c.reported, worlds)
-    return cut(found, count)
+    return cut(_records(*_given(problem, name), worlds), count)
 
 
 def blocks_of(problem: Problem) -> Blocks:

@@ -2,51 +2,105 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import importlib.util
 import os
 import platform
+import subprocess
 import sys
 from pathlib import Path
 
 # These halve the time to compile a campaign and leave the time to run it (`benchmarks/compile.py`).
-# XLA ends a process that gives it an unknown setting: only versions that were tried get them.
+# XLA ends a process that gives it an unknown setting.
 _XLA_FLAGS = (
     "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
     "--xla_backend_optimization_level=1"
 )
-_TRIED = "0.10."
+_KNOWN = ("0.10.",)  # versions of jaxlib that take them; others are tried once
+_TRIAL = """
+try:
+    from jaxlib import xla_client
+    xla_client.CompileOptions()  # reads them, a second before JAX is imported
+except (ImportError, AttributeError):
+    import jax
+    jax.jit(abs)(1.0)
+"""
+_TRIAL_S = 60.0
+_REFUSED = (
+    "robins: note: this jaxlib ({}) does not take the settings that halve the time to compile; "
+    "it will take longer. Nothing else changes."
+)
+_MOST = 1 << 30  # bytes of compiled programs that are kept; those unused for longest go first
 
 
 def enable() -> None:
     """Set up JAX for a command, unless it is imported already; what the user has set stays."""
     if "jax" in sys.modules:
         return
-    if "XLA_FLAGS" not in os.environ and _is_for_them():
-        os.environ["XLA_FLAGS"] = _XLA_FLAGS
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        _keep()
+    # XLA writes to its developers, such as on slow compilations; its errors come as exceptions.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    folder = _folder()
+    if "XLA_FLAGS" not in os.environ and _on_processor():
+        version = importlib.metadata.version("jaxlib")
+        taken = version.startswith(_KNOWN) or _tried(version, folder)
+        os.environ["XLA_FLAGS"] = _XLA_FLAGS if taken else ""
+        if not taken:
+            with contextlib.suppress(OSError):
+                print(_REFUSED.format(version), file=sys.stderr)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and folder is not None:
+        _prune(folder)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
-def _is_for_them() -> bool:
-    """Whether the settings are known to XLA, and it compiles for a processor, not a GPU."""
+def _on_processor() -> bool:
+    """Whether XLA compiles for a processor, not a GPU."""
     accelerated = importlib.util.find_spec("jax_plugins") is not None
-    on_processor = not accelerated or os.environ.get("JAX_PLATFORMS") == "cpu"
-    return on_processor and importlib.metadata.version("jaxlib").startswith(_TRIED)
+    return not accelerated or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 
-def _keep() -> None:
-    """Name a folder of the user's for what is compiled."""
+def _tried(version: str, folder: Path | None) -> bool:
+    """Whether a version takes the settings: tried in a process of its own, and remembered."""
+    digest = hashlib.sha256(f"{version} {_XLA_FLAGS}".encode()).hexdigest()[:12]
+    memory = folder and folder.parent / f"settings-{digest}"
+    with contextlib.suppress(OSError):
+        if memory:
+            return memory.read_text("utf-8") == "taken"
+    try:
+        told = {"XLA_FLAGS": _XLA_FLAGS, "JAX_PLATFORMS": "cpu"}
+        trial = [sys.executable, "-c", _TRIAL]
+        done = subprocess.run(trial, env=os.environ | told, capture_output=True, timeout=_TRIAL_S)
+    except (OSError, subprocess.TimeoutExpired):
+        return False  # tried again next time
+    with contextlib.suppress(OSError):
+        if memory:
+            memory.write_text("refused" if done.returncode else "taken", "utf-8")
+    return done.returncode == 0
+
+
+def _folder() -> Path | None:
+    """The folder of the user's for what is compiled; None where there can be none."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "robins" / f"jax-{_machine()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return  # a home that cannot be written costs time, not the run
-    if os.access(folder, os.W_OK):
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+        return None  # a home that cannot be written costs time, not the run
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def _prune(folder: Path) -> None:
+    """Remove what was not used for longest where a folder holds more than `_MOST`."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        every = [(one.stat(), one.path) for one in entries if one.is_file()]
+        left = sum(stat.st_size for stat, _ in every)
+        for stat, path in sorted(every, key=lambda e: max(e[0].st_atime, e[0].st_mtime)):
+            if left <= _MOST:
+                break
+            os.unlink(path)
+            left -= stat.st_size
 
 
 def _machine() -> str:

@@ -15,9 +15,7 @@ from robins.cli import cache
 from robins.cli.frame import Status, command_line, only_json
 from robins.cli.options import OUT, answers, choices, examples
 from robins.cli.progress import Progress
-from robins.cli.tell import carry_out, say, tell
-
-_COMPUTING = 0.9  # share of the time after which the report is made
+from robins.cli.tell import carry_out, deliver, say
 
 
 @click.group(
@@ -95,15 +93,18 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
         say(found._asdict(), _progress_text(out, found), as_json)
         return
     with only_json(as_json), Progress() as progress:
-        computing = bench.part(progress, 0.0, _COMPUTING)
-        outcome = bench.campaign_run(out, scenario, workers=workers, progress=computing, **options)
-        result = _published(bench, out, outcome, bench.part(progress, _COMPUTING, 1.0))
-    tell(outcome, result, as_json)
+        outcome = bench.campaign_run(out, scenario, workers=workers, progress=progress, **options)
+    _deliver(bench, out, outcome, as_json)
 
 
-def _published(bench: Any, where: str, outcome: Any, progress: Any, to: Path | None = None) -> Any:
+def _deliver(bench: Any, where: str, outcome: Any, as_json: bool, to: Path | None = None) -> None:
     to = to or (_result(where, "report") if "://" in where else Path(where) / "report")
-    return bench.publish(outcome, to, command=command_line(), progress=progress)
+    command, writing = command_line(), Progress("drawing figures")
+
+    def write() -> Any:
+        return bench.publish(outcome, to, command=command, progress=writing)
+
+    deliver(outcome, write, writing, as_json)
 
 
 @campaign.command(
@@ -240,8 +241,7 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
     with only_json(as_json), Progress() as progress:
         progress(0.0, "joining shards")
         outcome = bench.report(where)
-        result = _published(bench, where, outcome, progress, out)
-    tell(outcome, result, as_json)
+    _deliver(bench, where, outcome, as_json, out)
 
 
 @click.command(
@@ -269,7 +269,5 @@ def sweep(scenario: str, out: str, as_json: bool, **options: Any) -> None:
     """
     bench = _workbench()
     with only_json(as_json), Progress() as progress:
-        computing = bench.part(progress, 0.0, _COMPUTING)
-        outcome = bench.sweep(scenario, out, progress=computing, **options)
-        result = _published(bench, out, outcome, bench.part(progress, _COMPUTING, 1.0))
-    tell(outcome, result, as_json)
+        outcome = bench.sweep(scenario, out, progress=progress, **options)
+    _deliver(bench, out, outcome, as_json)

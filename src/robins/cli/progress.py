@@ -1,28 +1,31 @@
-"""A progress bar for people who wait: on a terminal, on standard error, after two seconds."""
+"""Progress for people who wait: on a terminal, on standard error, a line at once, then a bar."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import threading
 from typing import Any
 
 from robins.cli import interrupts
 
-WAIT_S = 2.0
+WAIT_S = 1.0
+_ERASED = "\r\x1b[2K"
 
 
 class Progress:
     """Call it with the share done (0 to 1) and what is being done.
 
-    Used as a context manager, it shows a bar once `WAIT_S` have passed, even if nobody called it
-    yet (a compilation takes its time), and takes the bar away at the end.
+    Used as a context manager, it shows a line at once, before anything heavy is imported, a bar
+    once `WAIT_S` have passed, even if nobody called it yet (a compilation takes its time), and
+    takes both away at the end.
     """
 
-    def __init__(self, stream: Any = None, wait_s: float = WAIT_S):
+    def __init__(self, what: str = "starting", stream: Any = None, wait_s: float = WAIT_S):
         self._stream = sys.stderr if stream is None else stream
         self._lock = threading.Lock()
-        self._share, self._what = 0.0, "starting"
+        self._share, self._what = 0.0, what
         self._bar: Any = None
         self._task: Any = None
         self._timer = threading.Timer(wait_s, self._show)
@@ -61,11 +64,20 @@ class Progress:
         with self._lock:
             if self._timer.finished.is_set():
                 return  # the work ended while the bar was being made
+            self._line(_ERASED)
             self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)
             self._task = self._bar.add_task(self._what, total=1.0, completed=self._share)
             self._bar.start()
 
+    def _line(self, text: str) -> None:
+        """Write to the terminal, if it can erase that; it may have been closed."""
+        if self._stream.isatty() and os.environ.get("TERM") != "dumb":
+            with contextlib.suppress(OSError):
+                self._stream.write(text)
+                self._stream.flush()
+
     def __enter__(self) -> Progress:
+        self._line(f"{self._what} ...")
         if self._stream.isatty():
             self._timer.start()
         return self
@@ -73,7 +85,9 @@ class Progress:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._timer.cancel()
         with self._lock:
-            if self._bar is not None:
-                with contextlib.suppress(OSError):  # the terminal may have been closed
-                    self._bar.stop()
-                self._bar = None
+            if self._bar is None:
+                self._line(_ERASED)
+                return
+            with contextlib.suppress(OSError):  # the terminal may have been closed
+                self._bar.stop()
+            self._bar = None

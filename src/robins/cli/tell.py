@@ -1,9 +1,11 @@
-"""The last lines of every command: the result, where it is, and what to do next."""
+"""What every command prints: the answer, then where its result is and what to do next."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +18,9 @@ from robins.cli.progress import Progress
 if TYPE_CHECKING:
     from robins.results import Outcome, Result
 
-_DRAWING = 0.85  # share of the time after which a result is written
-
 
 def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any) -> Outcome:
-    """Have the workbench compute, write what it found as a result, tell it.
+    """Have the workbench compute, print what it found, write that as a result.
 
     Args:
         name: of the function of `robins.workbench`.
@@ -29,45 +29,67 @@ def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any)
         as_json: print one object for scripts and nothing else to standard output.
         **settings: its keyword arguments.
     """
-    cache.enable()
-    command = command_line()
-    with only_json(as_json), Progress() as progress:
-        workbench = importlib.import_module("robins.workbench")
-        drawing = workbench.part(progress, _DRAWING, 1.0)
-        with workbench.publishing(out, command=command, progress=drawing) as publish:
-            computing = workbench.part(progress, 0.0, _DRAWING)
-            outcome = getattr(workbench, name)(*given, progress=computing, **settings)
-            result = publish(outcome)
-    tell(outcome, result, as_json)
+    command, writing = command_line(), Progress("drawing figures")
+    with contextlib.ExitStack() as held:
+        with only_json(as_json), Progress() as progress:
+            cache.enable()
+            workbench = importlib.import_module("robins.workbench")
+            folder = workbench.publishing(out, command=command, progress=writing)
+            publish = held.enter_context(folder)
+            outcome = getattr(workbench, name)(*given, progress=progress, **settings)
+        deliver(outcome, lambda: publish(outcome), writing, as_json)
     return outcome
 
 
-def tell(outcome: Outcome, result: Result, as_json: bool) -> None:
-    """Print what was found and where it is: one object, or tables and sentences."""
+def deliver(
+    outcome: Outcome, write: Callable[[], Result], writing: Progress, as_json: bool
+) -> None:
+    """Print what was found, have it written, print where it is; or one object for scripts.
 
-    def warn() -> None:
-        for warning in outcome.warnings:
-            click.secho(f"Warning: {warning}", fg="yellow", bold=True, err=as_json)
-
+    Args:
+        outcome: of a command.
+        write: makes the result folder of it.
+        writing: the progress of that.
+        as_json: print one object only, when it is written.
+    """
+    try:
+        if not as_json:
+            _answer(outcome)
+            click.echo("\nWriting the report ...")
+    except OSError:  # nobody reads: what was computed is kept all the same
+        write()
+        raise
+    with only_json(as_json), writing:
+        result = write()
     if as_json:
         click.echo((result.path / outcome.for_scripts).read_text("utf-8"), nl=False)
-        return warn()
+        return _warn(outcome, as_json)
+    click.echo(f"Result: {result.path}")
+    click.echo(f"Report: {result.report}   (open it in a browser)")
+    for line in outcome.last_lines:
+        click.echo(line.replace("{out}", str(result.path)))
+
+
+def _answer(outcome: Outcome) -> None:
+    """Print tables, notes and warnings."""
     from rich.console import Console
 
     from robins.report import table
+    from robins.results import plain
 
     console = Console()
     if outcome.title:
         click.secho(f"{outcome.title}\n", bold=True)
-    for one in outcome.tables or [table(result.summary, console.width)]:
+    for one in outcome.tables or [table(plain(outcome.summary), console.width)]:
         click.echo(one) if isinstance(one, str) else console.print(one)
     for note in outcome.notes:
         click.echo(note)
-    warn()
-    click.echo(f"\nResult: {result.path}")
-    click.echo(f"Report: {result.report}   (open it in a browser)")
-    for line in outcome.last_lines:
-        click.echo(line.replace("{out}", str(result.path)))
+    _warn(outcome, as_json=False)
+
+
+def _warn(outcome: Outcome, as_json: bool) -> None:
+    for warning in outcome.warnings:
+        click.secho(f"Warning: {warning}", fg="yellow", bold=True, err=as_json)
 
 
 def say(data: Any, text: str, as_json: bool) -> None:

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from robins import _float64  # noqa: F401
 from robins.manifold import wrap
+from robins.rotation import Real
 
 A_M = 6378137.0  # semi-major axis
 F = 1.0 / 298.257223563  # flattening
@@ -125,25 +126,28 @@ def dcm_en(lat_rad: ArrayLike, lon_rad: ArrayLike) -> Float[Array, "*b 3 3"]:
     return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
 
 
-def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Array, "*b 3"]:
+def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     """Normal gravity vector [m/s^2] in north, east, down; the centrifugal part is included.
 
     The closed form in ellipsoidal coordinates (Heiskanen & Moritz 1967, section 2-7 and 2-8; NIMA
     TR8350.2, eq. 4-5 to 4-20), exact at every height; on the ellipsoid it is Somigliana's formula.
     Above the ellipsoid the plumb line is curved: the north component is -8.1e-9 sin(2 lat) per
-    metre of height, 8e-5 m/s^2 at 10 km and 45 deg.
+    metre of height, 8e-5 m/s^2 at 10 km and 45 deg. Of arrays of NumPy it is one of NumPy, with
+    nothing to compile.
     """
-    lat, alt = jnp.broadcast_arrays(*_floats(lat_rad, alt_m))
-    sin_lat, cos_lat = jnp.sin(lat), jnp.cos(lat)
-    transverse = A_M / jnp.sqrt(1.0 - E2 * sin_lat**2)
+    given = (lat_rad, alt_m)
+    xp = np if all(isinstance(x, np.ndarray) for x in given) else jnp
+    lat, alt = xp.broadcast_arrays(*(xp.asarray(x, float) for x in given))
+    sin_lat, cos_lat = xp.sin(lat), xp.cos(lat)
+    transverse = A_M / xp.sqrt(1.0 - E2 * sin_lat**2)
     p = (transverse + alt) * cos_lat
     z = ((1.0 - E2) * transverse + alt) * sin_lat
 
     # Semi-minor axis u of the confocal ellipsoid through the point, v its semi-major axis; the
     # reduced latitude on it has the sine z/u and the cosine p/v.
     half = 0.5 * (p * p + z * z - _FOCAL_SQ)
-    u_sq = half + jnp.sqrt(half * half + _FOCAL_SQ * z * z)
-    u = jnp.sqrt(u_sq)
+    u_sq = half + xp.sqrt(half * half + _FOCAL_SQ * z * z)
+    u = xp.sqrt(u_sq)
     per_u = 1.0 / u
     sin_sq = (z * per_u) ** 2
     v_sq = u_sq + _FOCAL_SQ
@@ -165,7 +169,7 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Array, "*b 3"]:
     axial = -z * (inward * v_sq * per_u - poleward * p * p) / spread
     north = axial * cos_lat - across * sin_lat
     down = -axial * sin_lat - across * cos_lat
-    return jnp.stack([north, jnp.zeros_like(north), down], -1)
+    return xp.stack([north, xp.zeros_like(north), down], -1)
 
 
 def gravity(lat_rad: ArrayLike, alt_m: ArrayLike) -> Array:

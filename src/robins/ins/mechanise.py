@@ -12,7 +12,7 @@ convert their tables, see `robins.ins.frames`.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from robins.ins.increments import Increments, displacement
 from robins.ins.kernel import one_kernel, pack
 from robins.ins.zonal_gravity import gravity_nd, horner
 from robins.linalg.scalars import cross, product, rotate
-from robins.rotation import Rotation
+from robins.rotation import Real, Rotation
 
 POLAR_LAT_RAD = math.radians(89.9)
 
@@ -50,6 +50,13 @@ def step(nav: Nav, inc: Increments) -> Nav:
     An increment that is all zero returns `nav` bit for bit, so blocks may be padded with them.
     """
     return unpacked(advance(vector(nav), rows(inc)))
+
+
+def step_each(nav: Nav, inc: Increments) -> Nav:
+    """As `step`, for N states and an increment each, in NumPy: there is nothing to compile."""
+    p = nav.position
+    columns = [*nav.q_nb.wxyz.T, *nav.v_n.T, p.lat, p.lon, p.alt]
+    return unpacked(np.stack(_advanced(columns, rows(inc, np).T, np), -1))
 
 
 def mechanise(nav: Nav, increments: Increments) -> Nav:
@@ -118,11 +125,11 @@ def refuse_polar(lat_rad) -> None:
         )
 
 
-def nav_at(trajectory: Trajectory, index: int | slice | np.ndarray = 0) -> Nav:
-    """One or many states of a trajectory, in NED/FRD whatever its own frames."""
+def nav_at(trajectory: Trajectory, index: int | slice | np.ndarray = 0, library: Any = jnp) -> Nav:
+    """One or many states of a trajectory, in NED/FRD whatever its own frames; of JAX or NumPy."""
     t = to_ned_frd(trajectory)
     leaves = (t.q_nb, t.v_n, t.lat_rad, t.lon_rad, t.alt_m)
-    q, v, lat, lon, alt = (jnp.asarray(np.asarray(a, float)[index]) for a in leaves)
+    q, v, lat, lon, alt = (library.asarray(np.asarray(a, float)[index]) for a in leaves)
     return Nav(Rotation(q), v, Geodetic(lat, lon, alt))
 
 
@@ -144,19 +151,19 @@ def vector(nav: Nav) -> Float[Array, "*b 10"]:
     return jnp.concatenate([jnp.asarray(nav.q_nb.wxyz), jnp.asarray(nav.v_n), lla], -1)
 
 
-def unpacked(x: Float[Array, "*b 10"]) -> Nav:
+def unpacked(x: Float[Real, "*b 10"]) -> Nav:
     """The state in a `vector`."""
     return Nav(Rotation(x[..., :4]), x[..., 4:7], Geodetic(x[..., 7], x[..., 8], x[..., 9]))
 
 
-def rows(inc: Increments) -> Float[Array, "*b 11"]:
+def rows(inc: Increments, library: Any = jnp) -> Float[Real, "*b 11"]:
     """What a step needs of an increment and nothing else depends on: dt, exp(theta/2), dv, dr."""
-    inc = Increments(*(None if a is None else jnp.asarray(a, float) for a in inc))
+    inc = Increments(*(None if a is None else library.asarray(a, float) for a in inc))
     half = 0.5 * inc.theta
-    sq = jnp.sum(half * half, -1, keepdims=True)
+    sq = library.sum(half * half, -1, keepdims=True)
     # As `rotation.from_rotvec`, for turns of at most two pi, by the cheaper series.
     q_bb = [horner(_COS, sq), half * horner(_SIN, sq)]
-    return jnp.concatenate([inc.dt[..., None], *q_bb, inc.dv, displacement(inc)], -1)
+    return library.concatenate([inc.dt[..., None], *q_bb, inc.dv, displacement(inc)], -1)
 
 
 def _sin_cos(x):
@@ -168,15 +175,22 @@ def _sin_cos(x):
     return x * horner(_SIN, sq), horner(_COS, sq)
 
 
-def _wrap(lon):
-    return jnp.where(
-        lon >= jnp.pi, lon - 2.0 * jnp.pi, jnp.where(lon < -jnp.pi, lon + 2.0 * jnp.pi, lon)
-    )
+def _wrap(lon, library):
+    low = library.where(lon < -np.pi, lon + 2.0 * np.pi, lon)
+    return library.where(lon >= np.pi, lon - 2.0 * np.pi, low)
 
 
 @one_kernel
 def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"]:
     """The step, on scalars: see `robins.ins.kernel` for why."""
+    return pack(_advanced(x, row, jnp))
+
+
+def _advanced(x: Any, row: Any, library: Any) -> list[Any]:
+    """The ten components of a state after the step, from those of the state and of its row.
+
+    Each is a scalar of JAX, or a column of NumPy.
+    """
     w, qx, qy, qz, v_north, v_east, v_down, lat, lon, alt = x
     dt, *rest = row
     q, v, q_bb = (w, qx, qy, qz), (v_north, v_east, v_down), tuple(rest[:4])
@@ -188,7 +202,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     # (2e-7 rad at 300 m/s and 100 Hz), so two terms carry sine, cosine and the radii over.
     s, c = _sin_cos(lat)
     per_w_sq = 1.0 / (1.0 - E2 * s * s)
-    transverse = A_M * jnp.sqrt(per_w_sq)
+    transverse = A_M * library.sqrt(per_w_sq)
     meridian = transverse * (1.0 - E2) * per_w_sq
     shift = v_north * half / (meridian + alt)
     s_mid = s + shift * (c - 0.5 * shift * s)
@@ -200,7 +214,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     per_east = 1.0 / (transverse + alt_mid)
     tan_mid = s_mid / c_mid
     earth = (OMEGA_E * c_mid, 0.0, -OMEGA_E * s_mid)  # omega_ie_n
-    g_north, g_down = gravity_nd(s_mid, c_mid, transverse, alt_mid)
+    g_north, g_down = gravity_nd(s_mid, c_mid, transverse, alt_mid, library)
 
     def over_earth(north, east):
         """omega_en_n, or the turn of the frame over a displacement."""
@@ -225,7 +239,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
 
     turn = over_earth(r[0], r[1])
     lat_new = lat - turn[1]
-    lon_new = _wrap(lon + turn[0] / c_mid)
+    lon_new = _wrap(lon + turn[0] / c_mid, library)
 
     # exp(-zeta/2) for the turn zeta of the frame, to its fifth power
     zeta = [-0.5 * (turn[i] + earth[i] * dt) for i in range(3)]
@@ -235,5 +249,5 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     q = product(q_frame, product(q, q_bb))
     # One Newton step to unit length; none for a zero step, which must not touch a bit.
     excess = 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] - 1.0)
-    scale = 1.0 - jnp.where(dt == 0.0, 0.0, excess)
-    return pack([*(scale * component for component in q), *v_new, lat_new, lon_new, alt - r[2]])
+    scale = 1.0 - library.where(dt == 0.0, 0.0, excess)
+    return [*(scale * component for component in q), *v_new, lat_new, lon_new, alt - r[2]]

@@ -8,9 +8,10 @@ the closed form back to rounding.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.polynomial.legendre import leg2poly
 from numpy.polynomial.polynomial import polyder
 
@@ -18,7 +19,7 @@ from robins import _float64  # noqa: F401
 from robins.earth import A_M, E2, GM, OMEGA_E
 from robins.earth.wgs84 import B_M, F
 
-Scalar = Float[Array, ""]
+Scalar = Any  # of JAX, or a column of NumPy
 
 _TERMS = 5  # the first one left out, J12, is 1e-16
 
@@ -65,7 +66,7 @@ def horner(coefficients, x):
 
 
 def gravity_nd(
-    sin_lat: Scalar, cos_lat: Scalar, transverse_m: Scalar, alt_m: Scalar
+    sin_lat: Scalar, cos_lat: Scalar, transverse_m: Scalar, alt_m: Scalar, library: Any = jnp
 ) -> tuple[Scalar, Scalar]:
     """North and down components [m/s^2] of normal gravity; the east one is zero.
 
@@ -74,13 +75,14 @@ def gravity_nd(
         cos_lat: of the same.
         transverse_m: radius of curvature in the prime vertical [m] at that latitude.
         alt_m: height above the ellipsoid [m], above -10 km.
+        library: of the scalars, JAX's or NumPy.
     """
     p = (transverse_m + alt_m) * cos_lat
     z = ((1.0 - E2) * transverse_m + alt_m) * sin_lat
     per_r_sq = 1.0 / (p * p + z * z)
     x = z * z * per_r_sq
     k = A_M**2 * per_r_sq
-    pull = GM * per_r_sq * jnp.sqrt(per_r_sq)
+    pull = GM * per_r_sq * library.sqrt(per_r_sq)
     across = OMEGA_E**2 * p - pull * p * (1.0 + k * horner([horner(c, x) for c in _ACROSS], k))
     along = -pull * z * (1.0 + k * horner([horner(c, x) for c in _ALONG], k))
     return along * cos_lat - across * sin_lat, -along * sin_lat - across * cos_lat

@@ -12,7 +12,7 @@ is left out. What remains is emitted as C99, compiled, and called from Python; o
     Memory       a state that stays in the memory of C, and compiled functions that step it
 
 `stages` makes of a function of one run one of many, its loops in lanes; `library` writes C for a
-board; `cuda` and `kernel` make a kernel of a step.
+board.
 
 This room knows JAX and no filter: no filter, rule or system is written for it.
 """

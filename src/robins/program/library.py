@@ -169,11 +169,14 @@ class Library(NamedTuple):
 
     def source(self) -> str:
         """The file: the scalars, the start, and each entry point around its program."""
-        lines = [*self._head(), f'#include "{self.name}.h"', "", self.programs("static ")]
-        lines += self._init()
+        lines = [f'#include "{self.name}.h"', "", self.programs("static "), *self._init()]
         for entry in self.entries:
             lines += self._entry(entry)
-        return _text(lines) + "\n"
+        return self.headed(_text(lines) + "\n")
+
+    def headed(self, text: str) -> str:
+        """A file below the lines of comment for its head."""
+        return f"{_text(self._head())}\n{text}" if self.about else text
 
     def programs(self, linkage: str = "") -> str:
         """The scalars, and the program of each entry point on bare arrays: a file of C by itself.

@@ -42,7 +42,7 @@ FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", *FASTER)
 # Lanes are as wide as the processor that compiles them.
 LANE_FLAGS = ("-std=gnu++17", "-march=native", "-Wno-psabi", *FLAGS[1:])
 NO_COMPILER = (
-    "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[native]'`), "
+    "install one (Debian: `apt install g++`; anywhere: `pip install 'robins[compiler]'`), "
     "or name it in CC (of C++: CXX)"
 )
 

@@ -14,7 +14,7 @@ import xarray as xr
 
 from robins import results
 from robins.report.document import LIMIT, Origin, page
-from robins.report.embed import Drawn, draw
+from robins.report.embed import Drawn, dpi_for, draw
 from robins.report.figures import FIGURES, drawings
 from robins.report.numbers import verdict
 from robins.report.style import Picture
@@ -43,7 +43,10 @@ def pictures(solution: xr.Dataset | None, summary: Mapping[str, Any]) -> list[Pi
 
 
 def add(
-    writer: results.ResultWriter, progress: Progress | None = None, notes: Sequence[str] = ()
+    writer: results.ResultWriter,
+    progress: Progress | None = None,
+    notes: Sequence[str] = (),
+    only: Sequence[str] = (),
 ) -> None:
     """Draw the figures and the page of a result being written, after its solution and summary.
 
@@ -51,20 +54,21 @@ def add(
         writer: of the result.
         progress: called with done, total and a word on what is done.
         notes: sentences for the reader, printed below the verdict.
+        only: names of arrays, such as "error_position": figures of others are left out.
 
     Raises:
         ResultError: the writer has no summary yet, or the disk refused.
     """
     if writer.summary is None:
         raise results.ResultError(writer.path, "has no summary", "save it before its report")
-    makers = drawings(writer.solution, writer.summary)
-    drawn = []
+    makers = drawings(writer.solution, writer.summary, only)
+    drawn, dpi = [], dpi_for(len(makers))
     for done, make in enumerate(makers):
         if progress is not None:
             progress(done, len(makers), "drawing figures")
         picture = make()
         if picture is not None:
-            drawn.append(draw(picture))
+            drawn.append(draw(picture, dpi))
             writer.save_file(f"figures/{picture.name}.png", drawn[-1].png())
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     versions = results.versions()

@@ -16,10 +16,11 @@ from PIL import Image
 from robins.report.style import Picture, styled
 
 DPI = 160  # 1.3 dots per pixel of the page: sharp on a screen, enough for paper
-# Dots per inch and colours of a PNG, from the best to the least that can still be read; 120 is one
-# dot a pixel of the page.
-_LADDER = ((DPI, 64), (120, 48), (120, 20), (90, 20), (75, 12))
-_FEW = 8  # pictures
+PAGE_DPI = 120  # one dot a pixel of the page
+_FEW = 8  # pictures; more would not all fit into a page in the best form
+# Share of the dots, colours and effort (of zlib) of a PNG, from the best to the least that can
+# still be read. The last effort gains an eighth of the bytes in six times the time.
+_LADDER = ((1.0, 64, 6), (1.0, 20, 9), (0.75, 20, 9), (0.5625, 20, 9), (0.47, 12, 9))
 _SIMPLE = 1000  # points; a drawing with more is never smaller than its dots
 _NUMBER = re.compile(rb"-?\d+\.\d{3,}")
 
@@ -29,10 +30,17 @@ class Drawn(NamedTuple):
 
     picture: Picture
     dots: Image.Image
+    dpi: int = DPI
 
     def png(self) -> bytes:
         """A PNG file in full colour."""
-        return _png(self.dots)
+        return _png(self.dots, self.dpi)
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height on the page."""
+        width, height = (round(side * PAGE_DPI / self.dpi) for side in self.dots.size)
+        return width, height
 
 
 class Embedded(NamedTuple):
@@ -44,42 +52,47 @@ class Embedded(NamedTuple):
     height: int
 
 
+def dpi_for(pictures: int) -> int:
+    """Dots per inch at which each of so many pictures of a page is drawn."""
+    return DPI if pictures <= _FEW else PAGE_DPI
+
+
 @styled
-def draw(picture: Picture) -> Drawn:
+def draw(picture: Picture, dpi: int = DPI) -> Drawn:
     """Draw a picture; its layout stays as it is from here on."""
-    dots = _dots(picture.figure, DPI)
-    # Arranging the axes anew would double the time of every other drawing.
-    picture.figure.set_layout_engine("none")
-    return Drawn(picture, dots)
-
-
-@styled
-def _dots(figure: Figure, dpi: int) -> Image.Image:
-    figure.set_dpi(dpi)
-    canvas: Any = figure.canvas
+    picture.figure.set_dpi(dpi)
+    canvas: Any = picture.figure.canvas
     canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    # Arranging the axes again would double the time of a drawing as lines.
+    picture.figure.set_layout_engine("none")
+    return Drawn(picture, Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"), dpi)
 
 
-def _png(image: Image.Image) -> bytes:
+def shrunk(image: Image.Image, share: float) -> Image.Image:
+    """An image of fewer dots, each the mean of those it stands for."""
+    if share == 1.0:
+        return image
+    size = (round(image.width * share), round(image.height * share))
+    return image.resize(size, Image.Resampling.BOX)
+
+
+def _png(image: Image.Image, dpi: int = DPI, effort: int = 6) -> bytes:
     out = io.BytesIO()
-    image.save(out, format="png", optimize=image.mode == "P", dpi=(DPI, DPI))
+    image.save(out, format="png", compress_level=effort, dpi=(dpi, dpi))
     return out.getvalue()
 
 
-def packed(image: Image.Image, colours: int) -> bytes:
+def packed(image: Image.Image, colours: int, effort: int = 9) -> bytes:
     """A PNG with a palette, a third of the size of one in full colour."""
-    dots = np.asarray(image, np.int32)
-    found, where, count = np.unique(
-        (dots[..., 0] << 16) | (dots[..., 1] << 8) | dots[..., 2],
-        return_inverse=True,
-        return_counts=True,
-    )
+    dots = np.asarray(image, np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    found, count = np.unique(dots, return_counts=True)
     rgb = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1)
     palette, nearest = _palette(rgb, count, colours)
-    indexed = Image.fromarray(nearest[where].reshape(dots.shape[:2]))
+    of_colour = np.zeros(1 << 24, np.uint8)  # of which few pages are touched
+    of_colour[found] = nearest
+    indexed = Image.fromarray(of_colour[dots])
     indexed.putpalette(palette.astype(np.uint8).tobytes())
-    return _png(indexed)
+    return _png(indexed, effort=effort)
 
 
 def _palette(rgb: np.ndarray, count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -137,9 +150,9 @@ def _png_source(content: bytes) -> str:
 class _Choice:
     """The forms of one picture, each made only when it is asked for."""
 
-    def __init__(self, drawn: Drawn, first: int):
+    def __init__(self, drawn: Drawn):
         self.drawn = drawn
-        self.rungs = list(_LADDER[first:])
+        self.rungs = list(_LADDER)
         self.source = self._next()
         if _points(drawn.picture.figure) <= _SIMPLE:
             lines = _svg_source(svg(drawn.picture.figure))
@@ -147,10 +160,8 @@ class _Choice:
                 self.source = lines
 
     def _next(self) -> str:
-        dpi, colours = self.rungs.pop(0)
-        picture, dots = self.drawn
-        # Drawn anew, not shrunk: letters are then fitted to the dots.
-        return _png_source(packed(dots if dpi == DPI else _dots(picture.figure, dpi), colours))
+        share, *kept = self.rungs.pop(0)
+        return _png_source(packed(shrunk(self.drawn.dots, share), *kept))
 
     def shrink(self) -> None:
         self.source = min(self.source, self._next(), key=len)
@@ -161,16 +172,10 @@ def embed(drawn: Sequence[Drawn], limit: int) -> list[Embedded]:
 
     The largest is made coarser until all fit; only what is coarse already is left out.
     """
-    # Many pictures would not fit in the best form anyway; not trying saves half of the time.
-    first = 0 if len(drawn) <= _FEW else 1
-    choices = [_Choice(one, first) for one in drawn]
+    choices = [_Choice(one) for one in drawn]
     while sum(len(c.source) for c in choices) > limit:
         if able := [c for c in choices if c.rungs]:
             max(able, key=lambda c: len(c.source)).shrink()
         else:
             max(choices, key=lambda c: len(c.source)).source = ""
-    return [Embedded(c.drawn.picture, c.source, *_pixels(c.drawn.dots)) for c in choices]
-
-
-def _pixels(image: Image.Image) -> tuple[int, int]:
-    return round(image.width * 120 / DPI), round(image.height * 120 / DPI)
+    return [Embedded(c.drawn.picture, c.source, *c.drawn.pixels) for c in choices]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,9 +33,16 @@ class Figure(NamedTuple):
     each: bool = False
     when: Callable[[xr.Dataset, str], bool] | None = None  # not always, but if this holds
 
-    def of(self, solution: xr.Dataset) -> Iterator[tuple[str, ...]]:
-        """What follows the solution among the arguments of each drawing."""
-        found = find(solution, self.roles.split()[0])
+    def of(self, solution: xr.Dataset, only: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
+        """What follows the solution among the arguments of each drawing.
+
+        With names of arrays in `only`, of the drawings that show one of these first.
+        """
+        found = {
+            of: one
+            for of, one in find(solution, self.roles.split()[0]).items()
+            if not only or one.name in only
+        }
         if self.each:
             yield from ((of,) for of in found if self.when is None or self.when(solution, of))
         elif found:
@@ -84,13 +91,16 @@ FIGURES = (
 
 
 def drawings(
-    solution: xr.Dataset | None, summary: Mapping[str, Any]
+    solution: xr.Dataset | None, summary: Mapping[str, Any], only: Sequence[str] = ()
 ) -> list[Callable[[], Picture | None]]:
-    """What to draw, in the order of the page; the comparison of a summary comes last."""
+    """What to draw, in the order of the page; the comparison of a summary comes last.
+
+    With names of arrays in `only`, just the figures of these.
+    """
     found: list[Callable[[], Picture | None]] = []
     if solution is not None:
-        found += [partial(f.draw, solution, *of) for f in FIGURES for of in f.of(solution)]
+        found += [partial(f.draw, solution, *of) for f in FIGURES for of in f.of(solution, only)]
     # Columns of a summary without filters are something else, such as the axes of a sensor.
-    if solution is None or "filter" in solution.sizes:
+    if not only and (solution is None or "filter" in solution.sizes):
         found.append(partial(comparing.comparison, summary))
     return found

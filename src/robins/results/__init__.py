@@ -51,7 +51,7 @@ from robins.results.reader import Result, read
 from robins.results.rescue import NotWritten, keeping, rescued
 from robins.results.roles import ROLES, find
 from robins.results.solution import array, variable
-from robins.results.summary import VERDICTS
+from robins.results.summary import VERDICTS, plain
 from robins.results.writer import ResultWriter
 
 __all__ = [
@@ -69,6 +69,7 @@ __all__ = [
     "clocks",
     "find",
     "keeping",
+    "plain",
     "read",
     "rescued",
     "silent",

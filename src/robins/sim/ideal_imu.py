@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 from robins.dataset import ImuTable, Trajectory
 from robins.ins.frames import swap
 from robins.ins.increments import Increments, from_imu
-from robins.ins.mechanise import Nav, nav_at, refuse_polar, step
+from robins.ins.mechanise import Nav, nav_at, refuse_polar, step, step_each
+from robins.rotation import Real, conjugate, multiply, rotate, to_rotvec
 from robins.sim.trajectory import Motion
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
@@ -64,15 +65,15 @@ def ideal_increments(
     if len(trajectory) < 2:
         raise ValueError(f"{len(trajectory)} row(s): an increment needs two")
     refuse_polar(trajectory.lat_rad)
-    before, after = (nav_at(trajectory, rows) for rows in (slice(-1), slice(1, None)))
+    before, after = (nav_at(trajectory, rows, np) for rows in (slice(-1), slice(1, None)))
     n = len(trajectory) - 1
     gyro, accel, size = np.zeros((n, 3)), np.zeros((n, 3)), np.inf
     for _ in range(iterations):
         imu = ImuTable(
             trajectory.time_ns, _doubled(gyro), _doubled(accel), "increment", source="trajectory"
         )
-        miss = _miss(before, after, from_imu(imu)[0])
-        turn, push = (np.asarray(a) for a in miss)
+        increments = from_imu(imu)[0]
+        turn, push = _miss(before, after, step_each(before, increments))
         gyro, accel = gyro + turn, accel + push
         size = max(np.abs(turn).max(), np.abs(push).max())
         if size < tolerance:
@@ -103,7 +104,7 @@ def increments_between(before: Nav, after: Nav, dt_s: Float[Array, "n"]) -> Incr
     """
 
     def nearer(_, increments: Increments) -> Increments:
-        turn, push = _miss(before, after, increments)
+        turn, push = _miss(before, after, jax.vmap(step)(before, increments))
         return increments._replace(theta=increments.theta + turn, dv=increments.dv + push)
 
     zero = jnp.zeros((*dt_s.shape, 3))
@@ -114,15 +115,7 @@ def _doubled(a: np.ndarray) -> np.ndarray:
     return np.concatenate([a[:1], a])
 
 
-@jax.jit
-def _miss(
-    before: Nav, after: Nav, increments: Increments
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+def _miss(before: Nav, after: Nav, reached: Nav) -> tuple[Float[Real, "n 3"], Float[Real, "n 3"]]:
     """Rotation [rad] and velocity [m/s], in body axes, that each step still lacks."""
-
-    def one(start: Nav, end: Nav, inc: Increments):
-        reached = step(start, inc)
-        turn = (reached.q_nb.inverse() @ end.q_nb).as_rotvec()
-        return turn, start.q_nb.inverse().apply(end.v_n - reached.v_n)
-
-    return jax.vmap(one)(before, after, increments)
+    turn = to_rotvec(multiply(conjugate(reached.q_nb.wxyz), after.q_nb.wxyz))
+    return turn, rotate(conjugate(before.q_nb.wxyz), after.v_n - reached.v_n)

@@ -61,7 +61,7 @@ class Kinematics(NamedTuple):
         omega_en[:, 1] = -self.v_n[:, 0] / (meridian + self.alt)
         omega_en[:, 2] = -omega_en[:, 0] * np.tan(self.lat)
         f_n = self.a_n + np.cross(2.0 * omega_ie + omega_en, self.v_n)
-        f_n -= _gravity_n(self.lat, self.alt)
+        f_n -= earth.gravity_n(self.lat, self.alt)
         to_body = _Rotation.from_quat(self.q_nb, scalar_first=True).inv()
         return self.omega_nb_b + to_body.apply(omega_ie + omega_en), to_body.apply(f_n)
 
@@ -251,18 +251,6 @@ def _vector_part(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Vector part of ``conjugate(p) q``."""
     a, b = p[:, 1:], q[:, 1:]
     return p[:, :1] * b - q[:, :1] * a - np.cross(a, b)
-
-
-_compiled_gravity_n = jax.jit(earth.gravity_n)
-
-
-def _gravity_n(lat: np.ndarray, alt: np.ndarray, block: int = 4096) -> np.ndarray:
-    """`robins.earth.gravity_n` in blocks of one size, so that it compiles once for all lengths."""
-    out = np.empty((len(lat), 3))
-    for k in range(0, len(lat), block):
-        part = [np.pad(a[k : k + block], (0, max(k + block - len(lat), 0))) for a in (lat, alt)]
-        out[k : k + block] = np.asarray(_compiled_gravity_n(*part))[: len(lat) - k]
-    return out
 
 
 def _radii(lat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

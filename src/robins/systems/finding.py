@@ -11,12 +11,14 @@ import sys
 import traceback
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from robins import systems
+from robins import systems  # whose names are imported when needed: a rig needs no study
 from robins.errors import RobinsError, hint
 from robins.systems.catalogue import is_file
-from robins.systems.study import Study, System
+
+if TYPE_CHECKING:
+    from robins.systems.study import System
 
 
 class UnknownSystem(RobinsError, ValueError):
@@ -43,7 +45,8 @@ def _of_file(name: str, folder: Path) -> System:
     where, _, wanted = name.partition(":")
     path = (folder / where).resolve()
     module = imported(path)
-    offered = [key for key, value in vars(module).items() if isinstance(value, Study | System)]
+    kinds = systems.Study | systems.System
+    offered = [key for key, value in vars(module).items() if isinstance(value, kinds)]
     if not offered:
         raise UnknownSystem(
             "it defines no study", path, "assign a robins.systems.Study to a name at its top level"
@@ -97,10 +100,10 @@ def as_system(name: str, found: Any, where: str) -> System:
     Raises:
         UnknownSystem: it is neither a system nor a study.
     """
-    if isinstance(found, System):
+    if isinstance(found, systems.System):
         return found
-    if isinstance(found, Study):
-        return System(name, {name.rpartition(":")[2]: found})
+    if isinstance(found, systems.Study):
+        return systems.System(name, {name.rpartition(":")[2]: found})
     kind = type(found).__name__
     raise UnknownSystem(
         f"it is of type {kind}", where, "a system is a robins.systems.System or a Study"

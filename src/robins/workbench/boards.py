@@ -105,8 +105,7 @@ def export_filter(
         raise InputError(what, label, "choose another by --filter")
     precision = SINGLE if float32 else DOUBLE
     unroll = None if fast else SMALL
-    library, record, found = _library(asked, unroll, precision)
-    c = library.source()
+    library, c, record, found = _library(asked, unroll, precision)
     files = {
         f"{library.name}.h": library.header(),
         f"{library.name}.c": c,
@@ -193,8 +192,8 @@ def _asked(name: str, filter_name: str, seed: int, settings: Sequence[str]) -> _
 
 def _library(
     asked: _Asked, unroll: int | None, precision: Precision
-) -> tuple[Library, Recorded, Cost | None]:
-    """The filter as a library, some steps of it by JAX, and what single precision costs."""
+) -> tuple[Library, str, Recorded, Cost | None]:
+    """The filter as a library, its C, some steps of it by JAX, and what single precision costs."""
     problem, name, label = asked[:3]
     contender = problem.contenders[name]
     single = precision is SINGLE
@@ -210,7 +209,8 @@ def _library(
     axes = tangent_axes(problem, contender.reported, len(belief.factor))
     notes = field_notes(problem, axes, belief.mean, run.given)
     library = Library(asked.library, entries, run.start, (), notes, precision)
-    identity = hashlib.sha256((library.header() + library.source()).encode()).hexdigest()
+    c = library.source()
+    identity = hashlib.sha256((library.header() + c).encode()).hexdigest()
     about = (
         f"Filter '{name}' of {label}, by robins {__version__}; program {identity[:16]}.",
         "SI units and radians. NaN is missing, for each component of a reading.",
@@ -218,13 +218,14 @@ def _library(
         *components(axes),
     )
     library = library._replace(about=about)
+    c = library.headed(c)
     if not single:
-        return library, _record(run, by_jax(functions, run.cut(STEPS)), anew), None
+        return library, c, _record(run, by_jax(functions, run.cut(STEPS)), anew), None
     doubles = [by_jax(functions, one) for one in runs]
     singles = in_floats(library, runs)
     found = cost(problem, contender, library, runs, doubles, singles)
     record = _compared(library, _record(run, doubles[0], anew), singles[0])
-    return library, record._replace(ruined="" if found.bearable else found.verdict), found
+    return library, c, record._replace(ruined="" if found.bearable else found.verdict), found
 
 
 def _entry(name: str, program: Program) -> Entry:

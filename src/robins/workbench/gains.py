@@ -18,7 +18,7 @@ from robins.workbench.problem import Problem, read_problem
 
 GAINS, TABLE = "gains.json", "trade_off.csv"
 _NUMBERS = ("h2", "hinf", "hinf_sweep", "bound", "radius", "lambda_", "seconds")
-_MISSING = "robins[lmi]"  # in the sentence of a method whose packages are not there
+_MISSING = "robins[design]"  # in the sentence of a method whose packages are not there
 
 
 def as_text(gammas: Sequence[float]) -> list[str]:

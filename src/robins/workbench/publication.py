@@ -72,7 +72,7 @@ def _write(writer: results.ResultWriter, progress: Progress, outcome: Outcome) -
         def drawing(done: int, total: int, what: str) -> None:
             progress(done / max(total, 1), what)
 
-        report.add(writer, drawing, outcome.notes)
+        report.add(writer, drawing, outcome.notes, outcome.figures)
         return results.read(writer.commit())
 
 

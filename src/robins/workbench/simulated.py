@@ -37,7 +37,7 @@ def run(
         filters: names; by default those of the scenario, on which its claims are judged, and beside
             them the default of its system.
         settings: "path=value" texts that change the scenario.
-        machine: "jax", "c" or "cuda"; not given, what is faster.
+        machine: "jax" or "c"; not given, what is faster.
         progress: called with the share done and what is being done.
 
     Raises:
@@ -73,6 +73,33 @@ def run(
         ],
         **asked(one.text, settings),
     )
+
+
+DEMO = "ins-gnss/drive"
+_DEMO_RUNS = 16
+_STORY = (
+    *("lat_rad", "error_position", "error_attitude", "rms_position"),
+    *("anees", "innovation_gnss_position"),
+)
+
+
+def demo(
+    *, runs: int | None = None, filters: Sequence[str] = (), progress: Progress = silent
+) -> Outcome:
+    """Simulate a drive with a GNSS outage: few runs of one filter, six figures.
+
+    Args:
+        runs: how many.
+        filters: names; by default those on which the claims of the scenario are judged.
+        progress: called with the share done and what is being done.
+
+    Raises:
+        InputError: there is no such filter.
+    """
+    chosen = filters or read_scenario(DEMO, ()).own
+    found = run(DEMO, runs=runs or _DEMO_RUNS, filters=chosen, progress=progress)
+    whole = f"Next:   robins run {DEMO}   all its runs and figures, with the default filter"
+    return replace(found, figures=_STORY, last_lines=[whole])
 
 
 def _not_kept(one: Simulated) -> list[str]:

@@ -113,7 +113,7 @@ def test_without_the_packages_of_the_lmi_the_others_are_made(monkeypatch):
     found = trade_off(two_states(), [1.0, 0.7])
     assert [(o.method, o.gamma) for o in found.attempts] == [("riccati", 1.0), ("riccati", 0.7)]
     assert found.least.proved == pytest.approx(0.594542, abs=1e-6)  # which asks for no solver
-    left_out = {name for name, why in found.left_out.items() if "robins[lmi]" in why}
+    left_out = {name for name, why in found.left_out.items() if "robins[design]" in why}
     assert left_out == {name for name in METHODS if "lmi" in name or "retuned" in name} | {
         "full-order"
     }

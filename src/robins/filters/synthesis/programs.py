@@ -107,7 +107,7 @@ def packages() -> ModuleType:
         import cvxpy
     except ImportError as error:
         raise MissingExtra(
-            f"designs by LMI need cvxpy and Clarabel ({error}): pip install 'robins[lmi]'. The "
+            f"designs by LMI need cvxpy and Clarabel ({error}): pip install 'robins[design]'. The "
             "Riccati designs (robins.filters.synthesis.riccati) do without"
         ) from error
     return cvxpy

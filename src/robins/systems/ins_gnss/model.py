@@ -25,6 +25,7 @@ import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike
 
@@ -235,4 +236,7 @@ def start_belief(
     mean = InsState.start(nav, imu.scale_states)
     if gyro_bias is not None:
         mean = mean._replace(gyro_bias=jnp.asarray(gyro_bias))
-    return Belief(mean, jnp.diag(jnp.asarray(as_array([x for part in sigma for x in part]))))
+    each = as_array([x for part in sigma for x in part])
+    # numbers of a file, of which NumPy has nothing to compile, unless they are traced
+    factor: Any = (np if isinstance(each, np.ndarray) else jnp).diag(each)
+    return Belief(mean, factor)

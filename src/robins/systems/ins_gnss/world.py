@@ -21,7 +21,7 @@ from robins.earth import Geodetic
 from robins.ins.blocks import Blocks, cut, epochs_between
 from robins.ins.imu_errors import ImuErrorModel, TriadErrors
 from robins.ins.increments import Increments, from_imu
-from robins.ins.mechanise import Nav, mechanise, nav_at
+from robins.ins.mechanise import Nav, mechanise_chunked, nav_at
 from robins.ins.state import InsState
 from robins.manifold import retract
 from robins.sim.commands import from_commands
@@ -116,8 +116,8 @@ def lay_out(drive: Drive) -> Course:
     # what comes after the last fix would end on no sample, so the run ends with the fix
     epochs = epochs_between(0.0, float(stamps[-1]), stamps, drive.update.longest_block)
     blocks = cut(compensated, time_s, 0.0, epochs)
-    start = nav_at(trajectory, 0)
-    path = mechanise(start, jax.tree_util.tree_map(jnp.asarray, compensated))
+    start = nav_at(trajectory, 0, np)
+    path = mechanise_chunked(start, compensated)
     index = np.searchsorted(time_s, epochs - 1e-9)
     if np.max(np.abs(time_s[index] - epochs)) > 1e-6:
         raise ValueError(
@@ -221,7 +221,7 @@ def belief_of(drive: Drive, course: Course) -> DriveBelief:
     known = start_belief(course.start, drive.imu, begin, begin.tilt, begin.heading)
     r, g = np.sqrt(drive.believed.r_factor), drive.gnss
     sigma = {POSITION: g.sigma} | ({VELOCITY: g.velocity_sigma} if g.use_velocity else {})
-    return DriveBelief(jnp.asarray(known.factor), {k: r * jnp.asarray(v) for k, v in sigma.items()})
+    return DriveBelief(known.factor, {name: r * as_array(each) for name, each in sigma.items()})
 
 
 def as_believed(told: DriveBelief, world: Case) -> Case:

@@ -59,7 +59,7 @@ def axis_design(b: SensorNoise, star_rad: float, spec: GainSpec) -> Design:
     """Gain and certified norms of one axis.
 
     Raises:
-        robins.filters.synthesis.programs.MissingExtra: a design by LMI without the extra "lmi".
+        robins.filters.synthesis.programs.MissingExtra: a design by LMI without the extra "design".
         robins.filters.synthesis.Unreachable: no gain of this way has such a worst case.
     """
     plant = axis_plant(b, star_rad, spec.enters)

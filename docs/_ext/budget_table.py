@@ -1,0 +1,11 @@
+"""What the tests and the promised commands cost, and their ceilings, as tables for people."""
+
+import sys
+from pathlib import Path
+
+from generated import setup_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+import budget
+
+setup = setup_of(rooms=budget.table, commands=budget.commands)

@@ -1,0 +1,176 @@
+"""Meter of a test run: processor seconds, and counts that are the same on every machine.
+
+Counted are the programs that JAX is asked to compile, whether or not its cache has them; processes
+started; calls of a C compiler; and runs that campaigns simulate.
+
+    python tests/meter.py COUNTS.json demo --runs 2
+
+runs a command of robins in this process and writes its counts, and the modules it imported.
+"""
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+KINDS = ("programs", "processes", "compilers", "runs")
+COMPILERS = {"cc", "c++", "gcc", "g++", "clang", "clang++", "zig"}
+# Processor seconds of `reference` on the machine on which the ceilings were set.
+REFERENCE_S = 0.5
+
+
+def reference() -> float:
+    """Processor seconds of a fixed loop of Python and NumPy, by which machines are compared."""
+    import numpy as np
+
+    begin = time.process_time()
+    total, matrix = 0.0, np.linspace(0.0, 1.0, 2500).reshape(50, 50)
+    for k in range(500_000):
+        total += len(str(k)) * hash((k, "x")) % 7
+    for _ in range(50_000):
+        total += float((matrix @ matrix)[0, 0])
+    assert total > 0.0
+    return time.process_time() - begin
+
+
+class Counts(Counter[str]):
+    """Events of this process since `begin`.
+
+    Args:
+        every: count programs of one operation of JAX too. Which test of a worker is the first to
+            need such an operation depends on the order, so the counts of tests leave them out.
+    """
+
+    def __init__(self, every: bool) -> None:
+        super().__init__()
+        self.every, self.joined = every, False
+
+    def begin(self) -> None:
+        """Begin to count, programs as soon as JAX is imported."""
+        sys.addaudithook(self._audit)
+        self._join()
+
+    def _join(self) -> None:
+        register = "register_event_duration_secs_listener"
+        monitoring = sys.modules.get("jax.monitoring")
+        if not self.joined and hasattr(monitoring, register):
+            self.joined = True
+            getattr(monitoring, register)(self._compiled)
+
+    def _compiled(self, event: str, duration: float, **about: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            name = str(about.get("fun_name")).removeprefix("jit(").rstrip(")").strip("_")
+            self["programs"] += self.every or name not in operations()
+
+    def _audit(self, event: str, given: tuple) -> None:
+        if event == "import":
+            self._join()
+        elif event == "subprocess.Popen":
+            name = Path(os.fsdecode(given[0] or "")).name
+            self["compilers" if name in COMPILERS else "processes"] += 1
+        elif event == "robins.simulate":
+            self["runs"] += given[0]
+
+
+@cache
+def operations() -> set[str]:
+    """Names of what JAX compiles when it is called outside compiled code."""
+    import jax.lax
+    import jax.numpy
+
+    return {*dir(jax.lax), *dir(jax.numpy)}
+
+
+def digest(file: str) -> str:
+    """Digest of the text of a file of tests."""
+    return hashlib.sha256((HERE / file).read_bytes()).hexdigest()[:12]
+
+
+def sealed(row: dict) -> dict:
+    """A row of `costs.json` with a checksum of its numbers, by which a typed one is found."""
+    bare = {k: v for k, v in row.items() if k != "seal"}
+    text = json.dumps(bare, sort_keys=True)
+    return bare | {"seal": hashlib.sha256(text.encode()).hexdigest()[:12]}
+
+
+class Meter:
+    """Plugin that measures each test, and gathers the workers' rows in the controller.
+
+    Attributes:
+        rows: by file of tests and name of a test, its counts, with "seconds" of processor as on
+            the machine of the ceilings.
+        modules: imported when all tests are collected.
+        spent_s: processor seconds of all workers, with what they did between tests.
+    """
+
+    def __init__(self) -> None:
+        self.rows: dict[str, dict[str, Counter]] = {}
+        self.modules, self.spent_s, self.peak_mib = 0, 0.0, 0
+        self.counts, self.loop_s = Counts(every=False), reference()
+
+    def pytest_collection_finish(self) -> None:
+        """Count modules; what is imported while tests run depends on their order."""
+        self.counts.begin()
+        self.modules = len(sys.modules)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item):
+        """Setup, call and teardown: the first user of a fixture pays for it."""
+        before, spent = Counter(self.counts), processor_s()
+        done = yield
+        file, _, name = item.nodeid.removeprefix("tests/").partition("::")
+        row = self.rows.setdefault(file, {}).setdefault(name.partition("[")[0], Counter())
+        row.update({k: self.counts[k] - before[k] for k in KINDS})
+        row["seconds"] += (processor_s() - spent) * REFERENCE_S / self.loop_s
+        return done
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session):
+        """Hand the rows of a worker to the controller."""
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+        if self.rows:
+            self.spent_s, self.peak_mib = processor_s(), peak
+        if hasattr(session.config, "workeroutput"):
+            rows = {f: {t: dict(c) for t, c in tests.items()} for f, tests in self.rows.items()}
+            session.config.workeroutput["meter"] = rows
+            session.config.workeroutput["totals"] = self.modules, self.spent_s, self.peak_mib
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node, error):
+        """Add the rows of a worker."""
+        for file, tests in getattr(node, "workeroutput", {}).get("meter", {}).items():
+            for name, counts in tests.items():
+                self.rows.setdefault(file, {}).setdefault(name, Counter()).update(counts)
+        modules, spent, peak = getattr(node, "workeroutput", {}).get("totals", (0, 0.0, 0))
+        self.modules = max(self.modules, modules)
+        self.spent_s, self.peak_mib = self.spent_s + spent, max(self.peak_mib, peak)
+
+
+def processor_s() -> float:
+    """Processor seconds of this process and of those it started and has waited for."""
+    return sum(os.times()[:4])
+
+
+def command(page: str, *words: str) -> int:
+    """Run a command of robins and write its counts, programs of one operation included."""
+    from robins.cli import main
+
+    counts = Counts(every=True)
+    counts.begin()
+    status = main(list(words))
+    counts["modules"] = len(sys.modules)
+    Path(page).write_text(json.dumps(counts), "utf-8")
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(command(*sys.argv[1:]))

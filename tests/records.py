@@ -1,0 +1,96 @@
+"""Record of a test run: what it cost, compared with the budget, written where `make costs` asks."""
+
+import json
+import os
+import re
+from collections import Counter
+from pathlib import Path
+
+import budget
+import meter
+import pytest
+import tiers
+
+
+class Records:
+    """Plugin of the controller: the sums of all workers at the end of a run."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.tests = config.option.markexpr in ("fast", "not certify")
+        self.meter: meter.Meter = config.pluginmanager.get_plugin("meter")
+        self.write = os.environ.get("COSTS")
+
+    def passed(self) -> list[str]:
+        """Ceilings that the run passed; seconds are compared where they are recorded."""
+        files = {file: tests.values() for file, tests in self.meter.rows.items()}
+        most = budget.ceilings()["rooms"]
+        return budget.passed(budget.by_room(files), most, budget.COUNTS) if self.tests else []
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session, exitstatus):
+        """Fail a run that passed a ceiling; write the record of one that passed its tests."""
+        if self.write:
+            written = record(self.meter, whole=self.write == "all")
+            budget.COSTS.write_text(json.dumps(written, indent=0) + "\n", "utf-8")
+        elif self.passed() and exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter):
+        """Print what the run cost, and the ceilings that it passed."""
+        sums = sum((Counter(c) for t in self.meter.rows.values() for c in t.values()), Counter())
+        counts = ", ".join(f"{sums[kind]} {kind}" for kind in budget.COUNTS)
+        terminalreporter.write_line(
+            f"{self.meter.spent_s:.0f} s of processor, {counts}; {self.meter.modules} modules at "
+            f"collection; a worker takes {self.meter.peak_mib} MiB at most."
+        )
+        for line in self.passed():
+            terminalreporter.write_line(f"Budget (tests/budget.py): {line}", red=True)
+
+
+def record(measured: meter.Meter, whole: bool) -> dict:
+    """`costs.json`: rows of the files measured, and with ``whole`` the figures of the run.
+
+    Files that are gone, and in a whole run those that were not run, lose their rows.
+    """
+    before = budget.costs() if budget.COSTS.exists() else {"files": {}}
+    kept = {} if whole else {f: r for f, r in before["files"].items() if (meter.HERE / f).exists()}
+    for file, tests in measured.rows.items():
+        sums = sum(tests.values(), Counter())
+        row = {"digest": meter.digest(file), **{kind: sums[kind] for kind in meter.KINDS}}
+        row["seconds"] = round(sums["seconds"], 1)
+        dear = {t: round(c["seconds"], 1) for t, c in sorted(tests.items())}
+        row["tests"] = {t: s for t, s in dear.items() if s >= budget.LEAST_S}
+        kept[file] = meter.sealed(row)
+    if whole:
+        scale = meter.REFERENCE_S / measured.loop_s
+        before = {
+            "modules": measured.modules,
+            "seconds": round(measured.spent_s * scale),
+            "peak_mib": measured.peak_mib,
+        }
+    return before | {"files": dict(sorted(kept.items()))}
+
+
+def named(file: Path) -> set[str]:
+    """Names of the tests of a file."""
+    return set(re.findall(r"^ *def (test_\w+)", file.read_text("utf-8"), re.MULTILINE))
+
+
+def unsound(files: dict[str, dict]) -> list[str]:
+    """A sentence for each row of `costs.json` that is missing, stale or typed in.
+
+    A file whose tests all belong to `make certify` needs no row.
+    """
+    moved = {entry["test"] for entry in tiers.certified() if "only" not in entry}
+    found = []
+    for path in sorted(meter.HERE.rglob("test_*.py")):
+        file = str(path.relative_to(meter.HERE))
+        row = files.get(file)
+        if row is None:
+            if not {f"{file}::{name}" for name in named(path)} <= moved:
+                found.append(f"{file} was never measured")
+        elif row["digest"] != meter.digest(file):
+            found.append(f"{file} has changed since it was measured")
+        elif meter.sealed(row) != row:
+            found.append(f"{file}: its figures are not those that were measured")
+    return found + [f"{file} is gone" for file in files if not (meter.HERE / file).exists()]

@@ -1,0 +1,112 @@
+"""Nothing costs more than its budget: tests by room, promised commands, counts of the source."""
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import budget
+import meter
+import pytest
+import ratchets
+import records
+from short_drive import DRIVE, write_pos
+
+from robins import logs, scenario
+from robins.systems.ins_gnss import Drive, drive_dataset
+
+HERE = Path(__file__).parent
+ADVICE = "measure these files again: make costs FILES='{}'"
+
+# ------------------------------------------------------------------------------------ the records
+
+
+def test_no_ceiling_is_passed():
+    assert budget.verdict() == []
+
+
+def test_every_file_of_tests_was_measured_as_it_is():
+    found = records.unsound(budget.costs()["files"])
+    files = " ".join(f"tests/{line.split()[0].rstrip(':')}" for line in found)
+    assert found == [], ADVICE.format(files)
+
+
+def test_a_row_that_is_stale_missing_or_typed_in_is_found():
+    files = budget.costs()["files"]
+    name = "test_budget.py"
+    row = meter.sealed(files["test_units.py"] | {"digest": meter.digest(name)})
+    assert not any(name in line for line in records.unsound(files | {name: row}))
+    for planted in ({**row, "digest": "0" * 12}, {**row, "seconds": 1.0}, {**row, "programs": 7}):
+        assert [x for x in records.unsound(files | {name: planted}) if name in x]
+    gone = {file: row for file, row in files.items() if file != "test_units.py"}
+    assert "test_units.py was never measured" in records.unsound(gone)
+    assert "test_x.py is gone" in records.unsound(files | {"test_x.py": row})
+
+
+def test_ceilings_never_rise():
+    now = budget.ceilings()
+    for before in budget.earlier():
+        assert budget.raised(now, before) == []
+    less = now | {"whole": {kind: limit - 1 for kind, limit in now["whole"].items()}}
+    assert len(budget.raised(now, less)) == len(now["whole"])
+
+
+def test_a_passed_ceiling_is_named():
+    found = {"filters": Counter(programs=3, runs=1)}
+    most = {"filters": {"programs": 2, "runs": 1}}
+    assert budget.passed(found, most, ("programs", "runs")) == [
+        "filters: 3 programs, the ceiling is 2"
+    ]
+    assert budget.passed({"new": Counter(runs=1)}, most, budget.COUNTS) == [
+        "new: 1 runs, the ceiling is 0"
+    ]
+
+
+# -------------------------------------------------------------------------- the promised commands
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A short log of a drive."""
+    here = tmp_path_factory.mktemp("promised")
+    drive = drive_dataset(scenario.parse(Drive, DRIVE), seed=1)
+    since_ns = 1_700_000_000 * 10**9
+    imu, gnss = (replace(t, time_ns=t.time_ns + since_ns) for t in (drive.imu, drive.gnss))
+    logs.write_log(here / "imu.csv", imu)
+    write_pos(here / "gnss.pos", gnss)
+    return here
+
+
+@pytest.mark.parametrize("line", budget.ceilings()["commands"])
+def test_a_promised_command_stays_within_its_counts(line, folder):
+    run = [sys.executable, HERE / "meter.py", folder / "counts.json", *line.split()]
+    done = subprocess.run(run, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    counts = Counter(json.loads((folder / "counts.json").read_text()))
+    most = budget.ceilings()["commands"]
+    assert budget.passed({line: counts}, most, most[line]) == []
+
+
+# ------------------------------------------------------------------------------------- the source
+
+
+def test_counts_of_the_source_do_not_rise():
+    assert ratchets.risen(ratchets.measured(), ratchets.most()) == []
+
+
+def test_what_ratchets_count_is_found(tmp_path):
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "a.py").write_text(
+        '"""What it is."""\nfrom typing import Any\nfrom robins.room import b\n'
+        'class A:\n    """A class."""\n    def f(self, x: Any, *y: list[object]) -> Any:\n'
+        '        """Whether it is."""\n' + "        x += 1\n" * 60
+    )
+    back = "def g():\n    from robins.room.a import A\n    return A\n"
+    (tmp_path / "room" / "b.py").write_text(back)
+    found = ratchets.measured(tmp_path)
+    assert found == {"room": {"clauses": 2, "classes": 1, "circular": 2, "long": 1, "loose": 3}}
+    assert ratchets.risen(found, found) == []
+    less = {"room": {**found["room"], "classes": 0}}
+    assert ratchets.risen(found, less) == ["room: 1 classes, 0 allowed"]
