@@ -1,7 +1,7 @@
 """The documents are true: their examples run, and their docstrings show what was typed.
 
-Each example is compiled, and what it imports and calls is looked up. Of pages of one kind, such as those
-of filters on a few numbers, some are also run; `make certify` runs all.
+Each example is compiled, and what it imports and calls is looked up. Of pages of one kind, such as
+those of filters on a few numbers, some are also run; `make certify` runs all.
 """
 
 import ast
@@ -83,7 +83,7 @@ EACH = pytest.mark.parametrize(
 
 
 def imported(tree: ast.AST) -> dict[str, object]:
-    """What the imports of a tree bind, by the names that they bind it to."""
+    """Objects that the imports of a tree bind, by their names there."""
     bound: dict[str, object] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -111,10 +111,10 @@ def looked_up(node: ast.AST, bound: dict[str, object]) -> object:
 
 
 def fits(page: Path) -> int:
-    """Compile the examples of a page; look up their imports and bind the arguments of robins' functions.
+    """Compile the examples of a page and look up all that they take from modules.
 
     Returns:
-        How many calls of functions of robins it found.
+        How many calls of functions of robins there are, whose arguments fit.
     """
     bound: dict[str, object] = {}
     found = 0
@@ -122,21 +122,13 @@ def fits(page: Path) -> int:
         tree = compile("\n" * (line - 1) + code, page, "exec", ast.PyCF_ONLY_AST, dont_inherit=True)
         bound |= imported(tree)
         for node in ast.walk(tree):
-            called = (
-                looked_up(node.func, bound)
-                if isinstance(node, ast.Call)
-                else looked_up(node, bound)
-            )
-            ours = getattr(called, "__module__", None) or ""
-            if not isinstance(node, ast.Call) or not ours.startswith("robins."):
-                continue
-            if any(isinstance(a, ast.Starred) for a in node.args) or None in {
-                k.arg for k in node.keywords
-            }:
-                continue
-            named = {one.arg: None for one in node.keywords}
-            inspect.signature(called).bind(*node.args, **named)
-            found += 1
+            looked_up(node, bound)
+            called = looked_up(node.func, bound) if isinstance(node, ast.Call) else None
+            if (getattr(called, "__module__", None) or "").startswith("robins."):
+                named = {keyword.arg: None for keyword in node.keywords}
+                if None not in named and not any(isinstance(a, ast.Starred) for a in node.args):
+                    inspect.signature(called).bind(*node.args, **named)
+                    found += 1
     return found
 
 

@@ -4,7 +4,9 @@ import sys
 from collections import namedtuple
 from pathlib import Path
 
+import jaxtyping
 import pytest
+from matplotlib.figure import Figure
 
 from robins import report, results
 from robins.cli import main
@@ -16,7 +18,23 @@ Answer = namedtuple("Answer", "status out err")
 
 
 @pytest.fixture
-def robins(capsys, monkeypatch, tmp_path):
+def unchecked(monkeypatch):
+    """As users run it: arguments are compared with annotations in the tests of each function.
+
+    A traced program calls some of them a million times.
+    """
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture
+def sketched(monkeypatch):
+    """Pictures of few dots: that they are drawn counts here, not how they look."""
+    finer = Figure.set_dpi
+    monkeypatch.setattr(Figure, "set_dpi", lambda figure, dpi: finer(figure, min(dpi, 25)))
+
+
+@pytest.fixture
+def robins(capsys, monkeypatch, tmp_path, sketched):
     """Run a command line in an empty folder: status, standard output, standard error."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")

@@ -10,6 +10,8 @@ from robins import results
 from robins.cli import Status
 from robins.systems import SYSTEMS
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 
 @pytest.fixture(scope="module")
 def car(tmp_path_factory):

@@ -5,6 +5,8 @@ import subprocess
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 SCENARIO = "transfer-alignment/s0", "--filter", "kf"
 
 
