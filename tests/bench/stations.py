@@ -57,6 +57,7 @@ def one_program(name: str, filter_: str, *settings: str) -> dict[str, np.ndarray
 
 _KITS: dict[int, tuple[Any, Any, str]] = {}
 _READY: dict[tuple[str, str], dict[str, Part]] = {}
+MOST_KITS = 4  # whose parts are kept: each has some hundred MB of programs
 
 
 class Parts(dict[str, Part]):
@@ -80,7 +81,11 @@ def parts(of: Any, rig: Rig = RIG) -> Mapping[str, Part]:
             put(of, path := Path(folder) / "kit")
             _KITS[id(of)] = of, take(path), sha256(path.read_bytes()).hexdigest()
     _, taken, digest = _KITS[id(of)]
-    return _READY.setdefault((rig.name, digest), Parts(rig, taken))
+    key = rig.name, digest
+    _READY[key] = _READY.pop(key, None) or Parts(rig, taken)  # the latest is the last
+    while len(_READY) > MOST_KITS:
+        del _READY[next(iter(_READY))]
+    return _READY[key]
 
 
 class Node(threading.Thread):

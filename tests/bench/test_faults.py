@@ -1,5 +1,6 @@
 """Faults on purpose: what a scenario may say, and what becomes of frames."""
 
+import os
 from collections import Counter
 from functools import partial
 
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 from robins.bench import wire
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.injector import Injector, Piece
+from robins.bench.broker.link import Link
+from robins.bench.ports.port import open_pair
 from robins.bench.rigs.satellite import RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Frame, Header, Receiver
@@ -410,6 +413,17 @@ def test_damaged_and_strange_payloads_pass_as_they_are():
     injector = injecting(faults('kind = "turned"; begin = "0 s"'))
     short = Frame(Header(WIRE.message("star").number, 7, 0, 0), b"abc")
     assert put(injector, "star", "from", short, 0) == [Piece(None, short)]
+
+
+def test_a_frame_of_an_earlier_run_goes_no_further():
+    with open_pair() as pair:
+        link = Link("gyro", pair.master, WIRE, injecting((), 0), lambda *_: None)
+        link.restart(7)
+        old = gyro(1)._replace(header=gyro(1).header._replace(run=6))
+        os.write(pair.slave, wire.encode_frame(*old) + wire.encode_frame(*gyro(2)))
+        found = link.read(0, S)
+    assert found == [("gyro", gyro(2))]
+    assert (link.health.frames, link.health.strange) == (1, 1)
 
 
 def test_a_lie_on_a_noisy_line():

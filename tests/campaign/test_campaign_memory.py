@@ -149,6 +149,31 @@ def test_the_width_depends_on_the_problem_alone(problem, machine, monkeypatch):
     assert by.width(1000) in (8, 16, 24)
 
 
+def test_one_width_serves_any_number_of_runs_and_a_few_pay_for_no_more(problem):
+    assert [memory.filled(n) for n in (1, 2, 16, 32, 33, 50, 1000)] == [1, 2, 16, 32, 64, 64, 64]
+    by = ByJax(problem)
+    (fifty,) = (of("right") for _, n, of in by.chunks(50) if n == 50)
+    for begin, first in (("", 0), ("later", 1)):
+        (many,) = (of("right") for k, (_, _, of) in enumerate(by.chunks(90)) if k == first)
+        assert len(many["error"]) == (26 if begin else 64)
+        if not begin:
+            np.testing.assert_array_equal(many["error"][:50], fifty["error"])
+
+
+def test_filters_of_one_structure_are_compiled_once_and_meanwhile(three, monkeypatch, caplog):  # noqa: F811
+    monkeypatch.setattr(machines, "available_cores", lambda: 4)
+    numbers = ("right", "wrong R")
+    one = replace(three, contenders={name: three.contenders[name] for name in numbers})
+    jax.config.update("jax_log_compiles", True)
+    try:
+        simulate(one, 11)  # as no other test
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    what = "Finished XLA compilation of jit(_records)"
+    (done,) = (record for record in caplog.records if record.getMessage().startswith(what))
+    assert done.threadName != threading.current_thread().name
+
+
 @pytest.mark.parametrize("machine", ["jax", pytest.param("c", marks=needs_compiler)])
 def test_more_than_the_bound_is_said(problem, machine, monkeypatch):
     monkeypatch.setattr(memory, "MEMORY", 1000)

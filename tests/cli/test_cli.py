@@ -396,10 +396,20 @@ def test_the_compiler_knows_its_settings():
         patched.setattr(cache, "_XLA_FLAGS", "--xla_no_such_setting=1")
         assert not cache._tried("of this test", None)
     code = "from robins.cli import cache; cache.enable(); import os, jax.numpy as n; n.ones(1) + 1"
-    bare = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    ours = ("XLA_FLAGS", "TF_CPP_MIN_LOG_LEVEL")
+    bare = {k: v for k, v in os.environ.items() if k not in ours}
     told = [sys.executable, "-c", f"{code}; print(os.environ['XLA_FLAGS'])"]
     done = subprocess.run(told, env=bare, capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout == f"{cache._XLA_FLAGS}\n"
+    # of which XLA complains in its log, if it compiles
+    failing = bare | {
+        "XLA_FLAGS": "--xla_dump_to=/proc/nowhere",
+        "JAX_ENABLE_COMPILATION_CACHE": "false",
+    }
+    done = subprocess.run(
+        told, env=failing, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stderr == ""
 
 
 @pytest.mark.parametrize("why", ["told by the user", "jax is there", "no home"])

@@ -261,7 +261,7 @@ def test_a_result_gets_its_figures_and_page(tmp_path, walk):
 
 def test_only_the_figures_asked_for_are_drawn(tmp_path, walk):
     assert set(written(tmp_path / "a", walk, only=["error_velocity"]).figures) == {"error_velocity"}
-    assert set(written(tmp_path / "b", walk, only=["lat_rad", "nothing"]).figures) == {"track"}
+    assert set(written(tmp_path / "b", walk, only=["track", "nothing"]).figures) == {"track"}
 
 
 def drawn(path, walk):

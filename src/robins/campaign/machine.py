@@ -126,15 +126,19 @@ class ByJax:
             return
         programs = traced(self.problem, self._batch, width)
         with _threads(min(others, COMPILERS)) as pool:
-            self._programs = {
-                name: pool.submit(lambda one=one: one.lower().compile())
-                for name, one in programs.items()
+            # contenders that differ in numbers are the same program
+            distinct = {id(one.jaxpr): one for one in programs.values()}
+            begun = {
+                key: pool.submit(lambda one=one: one.lower().compile())
+                for key, one in distinct.items()
             }
+            self._programs = {name: begun[id(one.jaxpr)] for name, one in programs.items()}
             yield
+            self._programs = {}
 
     def _of(self, held: list[Any], count: int, taken: Taken, name: str) -> Any:
         if name in self._programs:
-            self._programs.pop(name).result()  # which serves the call
+            self._programs[name].result()  # which serves the call
         return taken(name, record(self.problem, name, held[0], count))
 
     def compute(self, part: Part, names: Sequence[str], taken: Taken = whole) -> dict[str, Any]:

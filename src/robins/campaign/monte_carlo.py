@@ -176,7 +176,7 @@ def traced(problem: Problem, batch: Any, width: int) -> dict[str, Any]:
 
 
 def _numbers(width: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct((width,), jnp.arange(1).dtype)
+    return jax.ShapeDtypeStruct((width,), jax.dtypes.canonicalize_dtype(int))
 
 
 def _given(problem: Problem, name: str) -> tuple[Any, ...]:

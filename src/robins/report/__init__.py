@@ -54,7 +54,7 @@ def add(
         writer: of the result.
         progress: called with done, total and a word on what is done.
         notes: sentences for the reader, printed below the verdict.
-        only: names of arrays, such as "error_position": figures of others are left out.
+        only: names of figures, such as "track" or "error_position"; else all.
 
     Raises:
         ResultError: the writer has no summary yet, or the disk refused.

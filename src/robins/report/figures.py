@@ -34,19 +34,16 @@ class Figure(NamedTuple):
     when: Callable[[xr.Dataset, str], bool] | None = None  # not always, but if this holds
 
     def of(self, solution: xr.Dataset, only: Sequence[str] = ()) -> Iterator[tuple[str, ...]]:
-        """What follows the solution among the arguments of each drawing.
-
-        With names of arrays in `only`, of the drawings that show one of these first.
-        """
-        found = {
-            of: one
-            for of, one in find(solution, self.roles.split()[0]).items()
-            if not only or one.name in only
-        }
-        if self.each:
-            yield from ((of,) for of in found if self.when is None or self.when(solution, of))
-        elif found:
-            yield ()
+        """What follows the solution among the arguments of each drawing, or of those in `only`."""
+        found = find(solution, self.roles.split()[0])
+        if not self.each:
+            named = not only or getattr(self.draw, "__name__", "") in only
+            yield from [()] if found and named else []
+            return
+        for of, one in found.items():
+            named = not only or one.name in only
+            if named and (self.when is None or self.when(solution, of)):
+                yield (of,)
 
 
 def _scatters(solution: xr.Dataset, block: str) -> bool:
@@ -95,7 +92,7 @@ def drawings(
 ) -> list[Callable[[], Picture | None]]:
     """What to draw, in the order of the page; the comparison of a summary comes last.
 
-    With names of arrays in `only`, just the figures of these.
+    In `only` are the names of some, which are those of their arrays, or else of their functions.
     """
     found: list[Callable[[], Picture | None]] = []
     if solution is not None:

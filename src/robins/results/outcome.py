@@ -42,7 +42,7 @@ class Outcome:
 
     # how it is told
     title: str = ""
-    figures: tuple[str, ...] = ()  # names of the arrays that are drawn; else all
+    figures: tuple[str, ...] = ()  # names of those that are drawn; else all
     tables: list[Any] = field(default_factory=list)  # else that of the metrics; texts, or for rich
     last_lines: list[str] = field(default_factory=list)  # where else to look, what to do next
     for_scripts: str = "summary.json"  # the file that --json prints

@@ -78,7 +78,7 @@ def run(
 DEMO = "ins-gnss/drive"
 _DEMO_RUNS = 16
 _STORY = (
-    *("lat_rad", "error_position", "error_attitude", "rms_position"),
+    *("track", "error_position", "error_attitude", "rms_position"),
     *("anees", "innovation_gnss_position"),
 )
 
