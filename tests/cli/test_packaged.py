@@ -263,8 +263,7 @@ def as_short_as_can_be(words):
         case ["run", "my.toml", *_]:
             return [*words, "--runs", "1", "--filters", "ekf"]
         case ["run", name, *more] if name in PACKAGED:
-            short = settings_of(study_of(name)[2])
-            return ["run", "--filters", cheapest(name), *short, name, *more, "--runs", "1"]
+            return ["run", "--filters", cheapest(name), name, *more, "--runs", "1"]
         case ["run", *_]:
             return [*words, "--runs", "1"]
         case ["campaign", "show", *_]:
