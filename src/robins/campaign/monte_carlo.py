@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.stages import Traced
 from jax.tree_util import Partial
 from jaxtyping import Array
 
@@ -169,7 +170,7 @@ def bytes_of_batch(problem: Problem, batch: Any, width: int) -> int:
     return max(bytes_of_jaxpr(one.jaxpr.jaxpr) for one in every)
 
 
-def traced(problem: Problem, batch: Any, width: int) -> dict[str, Any]:
+def traced(problem: Problem, batch: Callable, width: int) -> dict[str, Traced]:
     """The programs of all filters for a chunk of so many runs, by name, not compiled yet."""
     many = jax.eval_shape(batch, _numbers(width))
     return {name: _records.trace(*_given(problem, name), many) for name in problem.contenders}
@@ -179,8 +180,8 @@ def _numbers(width: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((width,), jax.dtypes.canonicalize_dtype(int))
 
 
-def _given(problem: Problem, name: str) -> tuple[Any, ...]:
-    """What `_records` is given before the worlds."""
+def _given(problem: Problem, name: str) -> tuple:
+    """Arguments of `_records` before the worlds."""
     c = contender(problem, name)
     return c.filter, blocks_of(problem), c.model, c.case, c.reported
 

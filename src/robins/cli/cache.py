@@ -56,13 +56,13 @@ def enable() -> None:
 
 
 def _on_processor() -> bool:
-    """Whether XLA compiles for a processor, not a GPU."""
+    """True if XLA compiles for a processor, not a GPU."""
     accelerated = importlib.util.find_spec("jax_plugins") is not None
     return not accelerated or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 
 def _tried(version: str, folder: Path | None) -> bool:
-    """Whether a version takes the settings: tried in a process of its own, and remembered."""
+    """True if a version takes the settings; tried in a process of its own, and remembered."""
     digest = hashlib.sha256(f"{version} {_XLA_FLAGS}".encode()).hexdigest()[:12]
     memory = folder and folder.parent / f"settings-{digest}"
     with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What every command prints: the answer, then where its result is and what to do next."""
+"""Last lines of every command: the answer, the place of its result, the next step."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ convert their tables, see `robins.ins.frames`.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -125,7 +126,9 @@ def refuse_polar(lat_rad) -> None:
         )
 
 
-def nav_at(trajectory: Trajectory, index: int | slice | np.ndarray = 0, library: Any = jnp) -> Nav:
+def nav_at(
+    trajectory: Trajectory, index: int | slice | np.ndarray = 0, library: ModuleType = jnp
+) -> Nav:
     """One or many states of a trajectory, in NED/FRD whatever its own frames; of JAX or NumPy."""
     t = to_ned_frd(trajectory)
     leaves = (t.q_nb, t.v_n, t.lat_rad, t.lon_rad, t.alt_m)
@@ -156,7 +159,7 @@ def unpacked(x: Float[Real, "*b 10"]) -> Nav:
     return Nav(Rotation(x[..., :4]), x[..., 4:7], Geodetic(x[..., 7], x[..., 8], x[..., 9]))
 
 
-def rows(inc: Increments, library: Any = jnp) -> Float[Real, "*b 11"]:
+def rows(inc: Increments, library: ModuleType = jnp) -> Float[Real, "*b 11"]:
     """What a step needs of an increment and nothing else depends on: dt, exp(theta/2), dv, dr."""
     inc = Increments(*(None if a is None else library.asarray(a, float) for a in inc))
     half = 0.5 * inc.theta
@@ -186,7 +189,7 @@ def advance(x: Float[Array, "10"], row: Float[Array, "11"]) -> Float[Array, "10"
     return pack(_advanced(x, row, jnp))
 
 
-def _advanced(x: Any, row: Any, library: Any) -> list[Any]:
+def _advanced(x, row, library) -> list:
     """The ten components of a state after the step, from those of the state and of its row.
 
     Each is a scalar of JAX, or a column of NumPy.

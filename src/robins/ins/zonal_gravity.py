@@ -8,6 +8,7 @@ the closed form back to rounding.
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
@@ -66,7 +67,7 @@ def horner(coefficients, x):
 
 
 def gravity_nd(
-    sin_lat: Scalar, cos_lat: Scalar, transverse_m: Scalar, alt_m: Scalar, library: Any = jnp
+    sin_lat: Scalar, cos_lat: Scalar, transverse_m: Scalar, alt_m: Scalar, library: ModuleType = jnp
 ) -> tuple[Scalar, Scalar]:
     """North and down components [m/s^2] of normal gravity; the east one is zero.
 
