@@ -113,6 +113,7 @@ class Meter:
     def __init__(self) -> None:
         self.rows: dict[str, dict[str, Counter]] = {}
         self.modules, self.spent_s, self.peak_mib = 0, 0.0, 0
+        self.gathered = False  # from workers
         self.counts, self.loop_s = Counts(every=False), reference()
 
     def pytest_collection_finish(self) -> None:
@@ -137,7 +138,7 @@ class Meter:
         import resource
 
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-        if self.rows:
+        if not self.gathered:
             self.spent_s, self.peak_mib = processor_s(), peak
         if hasattr(session.config, "workeroutput"):
             rows = {f: {t: dict(c) for t, c in tests.items()} for f, tests in self.rows.items()}
@@ -151,7 +152,7 @@ class Meter:
             for name, counts in tests.items():
                 self.rows.setdefault(file, {}).setdefault(name, Counter()).update(counts)
         modules, spent, peak = getattr(node, "workeroutput", {}).get("totals", (0, 0.0, 0))
-        self.modules = max(self.modules, modules)
+        self.gathered, self.modules = True, max(self.modules, modules)
         self.spent_s, self.peak_mib = self.spent_s + spent, max(self.peak_mib, peak)
 
 

@@ -151,7 +151,9 @@ def test_unknown_filter():
 def test_a_design_without_its_solver(monkeypatch):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     axis_design.cache_clear()
-    with pytest.raises(ValueError, match=r"'mixed-lmi': .* pip install 'robins\[lmi\]'.*--filters"):
+    with pytest.raises(
+        ValueError, match=r"'mixed-lmi': .* pip install 'robins\[design\]'.*--filters"
+    ):
         problem("s1", ("mixed-lmi",), SHORT)
 
 

@@ -371,7 +371,7 @@ def test_without_the_solvers_a_design_says_what_to_install(monkeypatch):
     for name in ("cvxpy", "clarabel"):
         with monkeypatch.context() as without:
             without.setitem(sys.modules, name, None)
-            with pytest.raises(programs.MissingExtra, match=r"pip install 'robins\[lmi\]'"):
+            with pytest.raises(programs.MissingExtra, match=r"pip install 'robins\[design\]'"):
                 observer(two_states(), 1.0)
 
 
