@@ -291,9 +291,14 @@ def with_stack(function: Callable[[], Any]) -> Any:
 
 
 def first_run(world: Any) -> Any:
-    """Of worlds with a leading axis of runs the first, holding none of the others."""
-    # an index of JAX would be a program for each shape
-    return jax.device_put(jax.tree_util.tree_map(lambda x: np.array(np.asarray(x)[0]), world))
+    """First of the worlds with a leading axis of runs, holding none of the others."""
+
+    def first(x: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return x[0]
+        return np.array(np.asarray(x)[0])  # an index of JAX would be a program for each shape
+
+    return jax.device_put(jax.tree_util.tree_map(first, world))
 
 
 def one_by_one(function: Callable[..., Any], rows: Any) -> Any:
