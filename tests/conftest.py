@@ -86,16 +86,19 @@ hypothesis.settings.load_profile("repeatable")
 MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
 MANY_BYTES = 2 * 2**30
+MANY_BYTES_OF_A_FILE = 2**30  # more than this is not carried into the next file of tests
 LOOK_EVERY = 10  # tests, at the maps: to write them out takes the system milliseconds
 FINISHED = pytest.StashKey[int]()
 
 
-def pytest_runtest_teardown(item):
+def pytest_runtest_teardown(item, nextitem):
     """Forget compiled programs when there are many; the cache gives back those needed again."""
     if not MAPS.exists():
         return
     count = item.config.stash[FINISHED] = item.config.stash.get(FINISHED, 0) + 1
-    large = int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MANY_BYTES
+    same_file = nextitem is not None and nextitem.path == item.path
+    most = MANY_BYTES if same_file else MANY_BYTES_OF_A_FILE
+    large = int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > most
     if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
         jax.clear_caches()
         gc.collect()
