@@ -31,7 +31,7 @@ class Records:
         """Fail a run that passed a ceiling; write the record of one that passed its tests."""
         if self.write:
             written = record(self.meter, whole=self.write == "all")
-            budget.COSTS.write_text(json.dumps(written, indent=0) + "\n", "utf-8")
+            budget.COSTS.write_text(lines(written), "utf-8")
         elif self.passed() and exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -69,6 +69,13 @@ def record(measured: meter.Meter, whole: bool) -> dict:
             "peak_mib": measured.peak_mib,
         }
     return before | {"files": dict(sorted(kept.items()))}
+
+
+def lines(written: dict) -> str:
+    """`costs.json` as text, a line for each file, so that a diff shows whose cost changed."""
+    rows = (f"{json.dumps(file)}: {json.dumps(row)}" for file, row in written["files"].items())
+    head = json.dumps({k: v for k, v in written.items() if k != "files"})
+    return head[:-1] + ', "files": {\n' + ",\n".join(rows) + "\n}}\n"
 
 
 def named(file: Path) -> set[str]:
