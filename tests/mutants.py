@@ -126,12 +126,12 @@ def tried(mutant: dict, root: Path, stamp: int, given: argparse.Namespace) -> di
     return {"status": status, "seconds": seconds, "caught_by": caught, "why": why}
 
 
-def rows(given: argparse.Namespace) -> list[dict]:
-    """Faults to plant: of the table, of an earlier outcome, or drawn."""
+def rows(given: argparse.Namespace, root: Path) -> list[dict]:
+    """Faults to plant: of the table, of an earlier outcome, or drawn from a commit in a folder."""
     if given.rows:
         return list(json.loads(given.rows.read_text("utf-8")).values())
     if given.random:
-        return mutations.drawn(ROOT / "src" / "robins", TABLE.parent, given.random, given.seed)
+        return mutations.drawn(root / "src" / "robins", root / "tests", given.random, given.seed)
     return table()
 
 
@@ -166,8 +166,6 @@ def main() -> int:
     given = asked.parse_args()
     done = json.loads(given.out.read_text("utf-8")) if given.resume and given.out.exists() else {}
     before = json.loads(given.before.read_text("utf-8")) if given.before else {}
-    due = [m for m in rows(given) if any(fnmatch(m["id"], p) for p in given.only)]
-    jobs = [(k, m) for k, m in enumerate(due, 1) if m["id"] not in done]
     copies: Queue[Path] = Queue()
 
     def one(job: tuple[int, dict]) -> tuple[dict, dict]:
@@ -180,6 +178,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
         for k in range(given.jobs):
             copies.put(copied(given.commit, Path(scratch) / str(k) / "robins"))
+        drawn = rows(given, Path(scratch) / "0" / "robins")
+        due = [m for m in drawn if any(fnmatch(m["id"], p) for p in given.only)]
+        jobs = [(k, m) for k, m in enumerate(due, 1) if m["id"] not in done]
         with ThreadPoolExecutor(given.jobs) as pool:
             for mutant, found in pool.map(one, jobs):
                 done[mutant["id"]] = {"commit": given.commit} | mutant | found
