@@ -5,7 +5,7 @@ import datetime
 import numpy as np
 import pytest
 
-from robins.gps_time import GPS_EPOCH_S, dated, leap_seconds, utc_of
+from robins.gps_time import GPS_EPOCH_S, dated, gps_of, leap_seconds, utc_of
 from robins.logs.timebase import calendar_to_ns
 
 NS = 1_000_000_000
@@ -31,6 +31,9 @@ def test_utc_of_a_stamp_is_the_clock_it_was_read_from(date, clock, behind):
     (found,) = utc_of(np.array([stamp]))
     assert found == np.datetime64(f"{year}-{month:02d}-{day:02d}T{clock}")
     assert dated(stamp)
+    one = utc_of(np.asarray(stamp))
+    assert isinstance(one, np.ndarray) and one == found
+    assert gps_of(one.astype(np.int64)) == stamp
 
 
 def test_a_leap_second_is_shown_as_the_second_after_it():

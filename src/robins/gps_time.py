@@ -49,11 +49,12 @@ def utc_of(time_ns: np.ndarray) -> np.ndarray:
     """
     time_ns = np.asarray(time_ns, dtype=np.int64)
     behind = np.searchsorted(_LEAPS_NS, time_ns, side="right")
-    return (time_ns - behind * _NS).astype("datetime64[ns]")
+    # Of one stamp NumPy makes a scalar, which is no array.
+    return np.asarray(time_ns - behind * _NS).astype("datetime64[ns]")
 
 
 def gps_of(utc_ns: np.ndarray) -> np.ndarray:
     """GPS time since 1970 of UTC since 1970, both int64 ns; `utc_of` backwards."""
     utc_ns = np.asarray(utc_ns, dtype=np.int64)
     leaps_utc_ns = _LEAPS_NS - np.arange(1, len(_LEAPS_NS) + 1) * _NS
-    return utc_ns + np.searchsorted(leaps_utc_ns, utc_ns, side="right") * _NS
+    return np.asarray(utc_ns + np.searchsorted(leaps_utc_ns, utc_ns, side="right") * _NS)
