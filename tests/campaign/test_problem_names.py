@@ -80,6 +80,15 @@ def test_a_disk_that_takes_nothing_is_told_as_it_is(tmp_path, monkeypatch):
         raise KeyError("first")
 
 
+def test_an_interrupt_takes_along_what_was_computed(tmp_path):
+    kept = {"a": np.ones(2)}
+    with pytest.raises(KeyboardInterrupt) as stop:  # noqa: SIM117
+        with results.rescued(tmp_path / "out"), results.keeping(kept):
+            raise KeyboardInterrupt
+    (found,) = tmp_path.rglob("arrays.npz")
+    assert str(found) in "".join(stop.value.__notes__)
+
+
 def test_what_fails_before_anything_is_computed_fails_as_it_is(tmp_path):
     with pytest.raises(KeyError), results.rescued(tmp_path / "out"):
         raise KeyError("early")

@@ -368,7 +368,7 @@ def test_the_compiler_is_set_up_where_it_takes_the_settings(
 
     def trial(*_, env, **__):
         tried.append(env["XLA_FLAGS"])
-        return subprocess.CompletedProcess((), 1 if jaxlib == "0.12.0" else 0)
+        return subprocess.CompletedProcess((), jaxlib == "0.12.0", stderr=cache._UNKNOWN)
 
     monkeypatch.setattr(subprocess, "run", trial)
     for name, value in (("XLA_FLAGS", user), ("JAX_PLATFORMS", platform)):
@@ -394,7 +394,9 @@ def test_the_compiler_knows_its_settings():
     assert cache._tried("of this test", None)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(cache, "_XLA_FLAGS", "--xla_no_such_setting=1")
-        assert not cache._tried("of this test", None)
+        assert cache._tried("of this test", None) is False
+        patched.setattr(cache, "_TRIAL", "raise SystemExit(3)")  # which tells nothing of XLA
+        assert cache._tried("of this test", None) is None
     code = "from robins.cli import cache; cache.enable(); import os, jax.numpy as n; n.ones(1) + 1"
     ours = ("XLA_FLAGS", "TF_CPP_MIN_LOG_LEVEL")
     bare = {k: v for k, v in os.environ.items() if k not in ours}
@@ -406,10 +408,11 @@ def test_the_compiler_knows_its_settings():
         "XLA_FLAGS": "--xla_dump_to=/proc/nowhere",
         "JAX_ENABLE_COMPILATION_CACHE": "false",
     }
-    done = subprocess.run(
-        told, env=failing, capture_output=True, text=True, check=True, timeout=120
-    )
-    assert done.stderr == ""
+    for level, silent in ({}, True), ({"TF_CPP_MIN_LOG_LEVEL": "0"}, False):
+        done = subprocess.run(
+            told, env=failing | level, capture_output=True, text=True, check=True, timeout=120
+        )
+        assert (done.stderr == "") == silent
 
 
 @pytest.mark.parametrize("why", ["told by the user", "jax is there", "no home"])

@@ -21,7 +21,7 @@ def filled(runs: int, most: int = CHUNK) -> int:
 
     The last chunk is filled up, so that 50 and 1000 runs need one program.
     """
-    return min(most, runs) if runs <= most // 2 else most
+    return runs if runs <= most // 2 else most
 
 
 def width_of(bytes_of_run: int, most: int) -> int:

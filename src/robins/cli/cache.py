@@ -28,6 +28,7 @@ except (ImportError, AttributeError):
     jax.jit(abs)(1.0)
 """
 _TRIAL_S = 60.0
+_UNKNOWN = b"Unknown flag"  # what XLA says before it ends the process
 _REFUSED = (
     "robins: note: this jaxlib ({}) does not take the settings that halve the time to compile; "
     "it will take longer. Nothing else changes."
@@ -46,7 +47,7 @@ def enable() -> None:
         version = importlib.metadata.version("jaxlib")
         taken = version.startswith(_KNOWN) or _tried(version, folder)
         os.environ["XLA_FLAGS"] = _XLA_FLAGS if taken else ""
-        if not taken:
+        if taken is False:
             with contextlib.suppress(OSError):
                 print(_REFUSED.format(version), file=sys.stderr)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and folder is not None:
@@ -61,22 +62,29 @@ def _on_processor() -> bool:
     return not accelerated or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 
-def _tried(version: str, folder: Path | None) -> bool:
-    """True if a version takes the settings; tried in a process of its own, and remembered."""
+def _tried(version: str, folder: Path | None) -> bool | None:
+    """True if a version takes the settings; tried in a process of its own, and remembered.
+
+    None where the trial itself failed, which is made again next time.
+    """
     digest = hashlib.sha256(f"{version} {_XLA_FLAGS}".encode()).hexdigest()[:12]
     memory = folder and folder.parent / f"settings-{digest}"
     with contextlib.suppress(OSError):
-        if memory:
-            return memory.read_text("utf-8") == "taken"
+        if memory and (known := memory.read_text("utf-8")) in ("taken", "refused"):
+            return known == "taken"
     try:
         told = {"XLA_FLAGS": _XLA_FLAGS, "JAX_PLATFORMS": "cpu"}
         trial = [sys.executable, "-c", _TRIAL]
         done = subprocess.run(trial, env=os.environ | told, capture_output=True, timeout=_TRIAL_S)
     except (OSError, subprocess.TimeoutExpired):
-        return False  # tried again next time
+        return None
+    if done.returncode and _UNKNOWN not in done.stderr:
+        return None
     with contextlib.suppress(OSError):
         if memory:
-            memory.write_text("refused" if done.returncode else "taken", "utf-8")
+            new = memory.with_suffix(f".{os.getpid()}")
+            new.write_text("refused" if done.returncode else "taken", "utf-8")
+            new.replace(memory)
     return done.returncode == 0
 
 

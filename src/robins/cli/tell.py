@@ -31,8 +31,8 @@ def carry_out(name: str, *given: Any, out: Path, as_json: bool, **settings: Any)
     """
     command, writing = command_line(), Progress("drawing figures")
     with contextlib.ExitStack() as held:
+        cache.enable()  # may write a note, on a line of its own
         with only_json(as_json), Progress() as progress:
-            cache.enable()
             workbench = importlib.import_module("robins.workbench")
             folder = workbench.publishing(out, command=command, progress=writing)
             publish = held.enter_context(folder)

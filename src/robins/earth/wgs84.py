@@ -132,8 +132,8 @@ def gravity_n(lat_rad: ArrayLike, alt_m: ArrayLike) -> Float[Real, "*b 3"]:
     The closed form in ellipsoidal coordinates (Heiskanen & Moritz 1967, section 2-7 and 2-8; NIMA
     TR8350.2, eq. 4-5 to 4-20), exact at every height; on the ellipsoid it is Somigliana's formula.
     Above the ellipsoid the plumb line is curved: the north component is -8.1e-9 sin(2 lat) per
-    metre of height, 8e-5 m/s^2 at 10 km and 45 deg. Of arrays of NumPy it is one of NumPy, with
-    nothing to compile.
+    metre of height, 8e-5 m/s^2 at 10 km and 45 deg. Given NumPy arrays it returns one, and
+    nothing is compiled.
     """
     given = (lat_rad, alt_m)
     xp = np if all(isinstance(x, np.ndarray) for x in given) else jnp

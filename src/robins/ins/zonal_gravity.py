@@ -9,18 +9,19 @@ the closed form back to rounding.
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from numpy.polynomial.legendre import leg2poly
 from numpy.polynomial.polynomial import polyder
 
 from robins import _float64  # noqa: F401
 from robins.earth import A_M, E2, GM, OMEGA_E
 from robins.earth.wgs84 import B_M, F
+from robins.rotation import Real
 
-Scalar = Any  # of JAX, or a column of NumPy
+Scalar = Float[Real, "..."]
 
 _TERMS = 5  # the first one left out, J12, is 1e-16
 

@@ -15,6 +15,7 @@ from robins.errors import RobinsError
 from robins.results import folder
 
 ARRAYS = "arrays.npz"
+_WHERE = "Its numbers are kept in {}; numpy.load reads them."
 _KEPT = "computed"  # the attribute of an error that takes numbers along
 
 
@@ -33,7 +34,7 @@ def keeping(tree: Any) -> Iterator[None]:
     """
     try:
         yield
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
         vars(error).setdefault(_KEPT, tree)
         raise
 
@@ -45,18 +46,25 @@ def rescued(path: str | os.PathLike[str]) -> Iterator[None]:
     The arrays go into a new folder beside the result, or among the temporary files where nothing
     can be written there.
 
+    An interrupt stays one, with a note that names the folder.
+
     Raises:
         NotWritten: in place of the error, where something was kept.
     """
     try:
         yield
+    except KeyboardInterrupt as stop:
+        kept = _saved(Path(path), vars(stop)[_KEPT]) if _KEPT in vars(stop) else None
+        if kept is not None:
+            stop.add_note(_WHERE.format(kept / ARRAYS))
+        raise
     except Exception as error:
         kept = _saved(Path(path), vars(error)[_KEPT]) if _KEPT in vars(error) else None
         if kept is None:
             raise
         raise NotWritten(
             f"the result was computed and could not be written: {error}\n"
-            f"Its numbers are kept in {kept / ARRAYS}; numpy.load reads them."
+            + _WHERE.format(kept / ARRAYS)
         ) from error
 
 
