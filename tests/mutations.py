@@ -7,6 +7,7 @@ text of its statement, so that it can be planted in a later commit where the sta
 """
 
 import ast
+import contextlib
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -149,7 +150,15 @@ def drawn(source: Path, tests: Path, number: int, seed: int) -> list[dict]:
         mutant | {"tests": tests_of(room, tests)}
         for room, found in sorted(rooms.items())
         for mutant in chance.sample(found, max(1, round(number * len(found) / total)))
+        if is_python((source / mutant["file"]).read_text("utf-8"), mutant)
     ]
+
+
+def is_python(text: str, mutant: dict) -> bool:
+    """Whether a file with a mutant can be read; any test would catch one that cannot."""
+    with contextlib.suppress(SyntaxError):
+        return bool(ast.parse(text.replace(mutant["old"], mutant["new"])))
+    return False
 
 
 def tests_of(room: str, tests: Path) -> list[str]:

@@ -32,7 +32,8 @@ def test_utc_of_a_stamp_is_the_clock_it_was_read_from(date, clock, behind):
     assert found == np.datetime64(f"{year}-{month:02d}-{day:02d}T{clock}")
     assert dated(stamp)
     one = utc_of(np.asarray(stamp))
-    assert isinstance(one, np.ndarray) and one == found
+    assert isinstance(one, np.ndarray)
+    assert one == found
     assert gps_of(one.astype(np.int64)) == stamp
 
 

@@ -5,6 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 import mutants
+import mutations
 import pytest
 
 # Planted faults of each room in the commit 6c2b523; a room may have more.
@@ -53,3 +54,9 @@ def test_a_place_that_is_gone_is_told():
     gone = {**mutants.table()[0], "old": "no such text", "new": ""}
     with pytest.raises(ValueError, match="units-root-hour: not just one `old` in units"):
         mutants.planted(gone, mutants.ROOT)
+
+
+def test_a_change_that_is_no_python_is_not_planted():
+    text = "def f(x=1):\n    return -x\n"
+    assert mutations.is_python(text, {"old": "return -x", "new": "return  x"})
+    assert not mutations.is_python(text, {"old": "return -x", "new": "return -x)"})
