@@ -29,7 +29,7 @@ $(READY): pyproject.toml constraints.txt
 # And what develops and tests it.
 $(STAMP): EXTRAS = all,dev
 $(STAMP): $(READY)
-	@echo "Adding the tools of development and the packages that tests compare with: 1 GB more."
+	@echo "Installing the development tools and the packages that tests compare with: 1 GB more."
 	@$(INSTALL)
 	@touch $@
 

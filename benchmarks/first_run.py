@@ -52,7 +52,7 @@ def spent(arguments: list[str], folder: Path) -> Spent:
 
 def main() -> None:
     arguments = sys.argv[1:] or ["demo"]
-    print(f"robins {' '.join(arguments)}, {len(os.sched_getaffinity(0))} cores", flush=True)
+    print(f"robins {' '.join(arguments)}, {os.cpu_count()} cores", flush=True)
     with tempfile.TemporaryDirectory(prefix="robins-first-") as name:
         for what in ("empty cache", "again"):
             s = spent(arguments, Path(name))
