@@ -11,6 +11,7 @@ as much there or moves it to `make certify`.
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -62,7 +63,7 @@ def recorded() -> Found:
 def passed(found: Found, most: Ceilings, kinds: Iterable[str]) -> list[str]:
     """A sentence for each ceiling that is passed."""
     return [
-        f"{name}: {counts[kind]:.0f} {kind}, the ceiling is {most.get(name, {}).get(kind, 0)}"
+        f"{name}: {counts[kind]:.0f} {kind}, over the ceiling of {most.get(name, {}).get(kind, 0)}"
         for name, counts in sorted(found.items())
         for kind in kinds
         if counts[kind] > most.get(name, {}).get(kind, 0)
@@ -72,7 +73,7 @@ def passed(found: Found, most: Ceilings, kinds: Iterable[str]) -> list[str]:
 def of_the_whole(measured: dict, most: dict[str, int]) -> list[str]:
     """A sentence for each ceiling of the whole run that is passed."""
     return [
-        f"whole run: {measured[kind]:.0f} {kind}, the ceiling is {limit}"
+        f"whole run: {measured[kind]:.0f} {kind}, over the ceiling of {limit}"
         for kind, limit in most.items()
         if measured[kind] > limit
     ]
@@ -140,22 +141,24 @@ def lowered(most: dict) -> dict:
     return most | {"rooms": rooms}
 
 
-def earlier() -> list[dict]:
-    """Ceilings of earlier commits, as far as git knows them; none where there is no git."""
-    ask = ["git", "log", "--format=%H", "--", "tests/budget.toml"]
-    done = subprocess.run(ask, cwd=HERE.parent, capture_output=True, text=True, check=False)
-    found = []
-    for commit in done.stdout.split()[:20]:
-        show = ["git", "show", f"{commit}:tests/budget.toml"]
-        text = subprocess.run(show, cwd=HERE.parent, capture_output=True, text=True, check=False)
-        if text.returncode == 0:
-            found.append(tomllib.loads(text.stdout))
-    return found
+def earlier(name: str) -> list[dict]:
+    """A table of this folder in earlier commits; none where git or its history is missing."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=HERE, capture_output=True, text=True)
+        return "" if done.returncode else done.stdout
+
+    if shutil.which("git") is None:
+        return []
+    commits = git("log", "--format=%H", "-20", "--", name).split()
+    return [tomllib.loads(text) for c in commits if (text := git("show", f"{c}:./{name}"))]
 
 
-def flat(most: dict) -> dict[str, int]:
-    """Ceilings by part, name and kind, in one table."""
-    found = {f"whole {kind}": limit for kind, limit in most["whole"].items()}
+def flat(most: dict) -> Counter[str]:
+    """Ceilings by part, name and kind, and of each kind the sum of all rooms, in one table."""
+    found = Counter({f"whole {kind}": limit for kind, limit in most["whole"].items()})
+    for row in most["rooms"].values():
+        found.update({f"all rooms {kind}": limit for kind, limit in row.items()})
     for part in ("rooms", "commands"):
         for name, row in most[part].items():
             found |= {f"{part} {name} {kind}": limit for kind, limit in row.items()}
@@ -168,7 +171,7 @@ def raised(now: dict, before: dict) -> list[str]:
     return [
         f"{name}: {here[name]} now, {limit} before"
         for name, limit in flat(before).items()
-        if here.get(name, 0) > limit
+        if here[name] > limit > 0
     ]
 
 

@@ -85,7 +85,7 @@ hypothesis.settings.load_profile("repeatable")
 # their programs leave no room for the processes of the bench.
 MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
-MANY_BYTES = 2 * 2**30
+MANY_BYTES = 3 * 2**29
 MANY_BYTES_OF_A_FILE = 2**30  # more than this is not carried into the next file of tests
 LOOK_EVERY = 10  # tests, at the maps: to write them out takes the system milliseconds
 FINISHED = pytest.StashKey[int]()

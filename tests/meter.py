@@ -1,11 +1,7 @@
-"""Meter of a test run: processor seconds, and counts that are the same on every machine.
+"""Meter of a test run: processor seconds of each test, and its counts.
 
 Counted are the programs that JAX is asked to compile, whether or not its cache has them; processes
-started; calls of a C compiler; and runs that campaigns simulate.
-
-    python tests/meter.py COUNTS.json demo --runs 2
-
-runs a command of robins in this process and writes its counts, and the modules it imported.
+started; calls of a C compiler; and runs that campaigns simulate (`counting.py`).
 """
 
 import hashlib
@@ -14,14 +10,12 @@ import os
 import sys
 import time
 from collections import Counter
-from functools import cache
 from pathlib import Path
 
 import pytest
+from counting import KINDS, Counts
 
 HERE = Path(__file__).parent
-KINDS = ("programs", "processes", "compilers", "runs")
-COMPILERS = {"cc", "c++", "gcc", "g++", "clang", "clang++", "zig"}
 # Processor seconds of `reference` on the machine on which the ceilings were set.
 REFERENCE_S = 0.37
 
@@ -38,54 +32,6 @@ def reference() -> float:
         total += float((matrix @ matrix)[0, 0])
     assert total > 0.0
     return time.process_time() - begin
-
-
-class Counts(Counter[str]):
-    """Events of this process since `begin`.
-
-    Args:
-        every: count programs of one operation of JAX too. Which test of a worker is the first to
-            need such an operation depends on the order, so the counts of tests leave them out.
-    """
-
-    def __init__(self, every: bool) -> None:
-        super().__init__()
-        self.every, self.joined = every, False
-
-    def begin(self) -> None:
-        """Begin to count, programs as soon as JAX is imported."""
-        sys.addaudithook(self._audit)
-        self._join()
-
-    def _join(self) -> None:
-        register = "register_event_duration_secs_listener"
-        monitoring = sys.modules.get("jax.monitoring")
-        if not self.joined and hasattr(monitoring, register):
-            self.joined = True
-            getattr(monitoring, register)(self._compiled)
-
-    def _compiled(self, event: str, duration: float, **about: object) -> None:
-        if event.endswith("backend_compile_duration"):
-            name = str(about.get("fun_name")).removeprefix("jit(").rstrip(")").strip("_")
-            self["programs"] += self.every or name not in operations()
-
-    def _audit(self, event: str, given: tuple) -> None:
-        if event == "import":
-            self._join()
-        elif event == "subprocess.Popen":
-            name = Path(os.fsdecode(given[0] or "")).name
-            self["compilers" if name in COMPILERS else "processes"] += 1
-        elif event == "robins.simulate":
-            self["runs"] += given[0]
-
-
-@cache
-def operations() -> set[str]:
-    """Names of what JAX compiles when it is called outside compiled code."""
-    import jax.lax
-    import jax.numpy
-
-    return {*dir(jax.lax), *dir(jax.numpy)}
 
 
 def digest(file: str) -> str:
@@ -159,19 +105,3 @@ class Meter:
 def processor_s() -> float:
     """Processor seconds of this process and of those it started and has waited for."""
     return sum(os.times()[:4])
-
-
-def command(page: str, *words: str) -> int:
-    """Run a command of robins and write its counts, programs of one operation included."""
-    from robins.cli import main
-
-    counts = Counts(every=True)
-    counts.begin()
-    status = main(list(words))
-    counts["modules"] = len(sys.modules)
-    Path(page).write_text(json.dumps(counts), "utf-8")
-    return status
-
-
-if __name__ == "__main__":
-    sys.exit(command(*sys.argv[1:]))

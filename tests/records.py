@@ -17,9 +17,13 @@ class Records:
 
     def __init__(self, config: pytest.Config) -> None:
         # A part of the tests compiles and starts for itself what others do for it in the whole.
-        given = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
+        option = config.option
         self.whole = (
-            config.option.markexpr == "not certify" and not given and "PART" not in os.environ
+            config.args_source is pytest.Config.ArgsSource.TESTPATHS
+            and option.markexpr == "not certify"
+            and not (option.keyword or option.deselect or option.ignore or option.lf)
+            and (option.numprocesses or 1) <= 2  # each worker compiles what tests share
+            and "PART" not in os.environ
         )
         self.meter: meter.Meter = config.pluginmanager.get_plugin("meter")
         self.write = os.environ.get("COSTS")
@@ -33,10 +37,14 @@ class Records:
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session, exitstatus):
         """Fail a run that passed a ceiling; write the record of one that passed its tests."""
+        if exitstatus != pytest.ExitCode.OK:
+            return
         if self.write:
-            written = record(self.meter, whole=self.write == "all")
-            budget.COSTS.write_text(lines(written), "utf-8")
-        elif self.passed() and exitstatus == pytest.ExitCode.OK:
+            written = lines(record(self.meter, whole=self.write == "all"))
+            new = budget.COSTS.with_suffix(".new")
+            new.write_text(written, "utf-8")
+            new.replace(budget.COSTS)
+        elif self.passed():
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter):
@@ -67,11 +75,13 @@ def record(measured: meter.Meter, whole: bool) -> dict:
         kept[file] = meter.sealed(row)
     if whole:
         scale = meter.REFERENCE_S / measured.loop_s
-        before = {
-            "modules": measured.modules,
-            "seconds": round(measured.spent_s * scale),
-            "peak_mib": measured.peak_mib,
-        }
+        before = meter.sealed(
+            {
+                "modules": measured.modules,
+                "seconds": round(measured.spent_s * scale),
+                "peak_mib": measured.peak_mib,
+            }
+        )
     return before | {"files": dict(sorted(kept.items()))}
 
 
@@ -88,7 +98,7 @@ def named(file: Path) -> set[str]:
 
 
 def unsound(files: dict[str, dict]) -> list[str]:
-    """A sentence for each row of `costs.json` that is missing, stale or typed in.
+    """A sentence for each row of `costs.json` that is missing, stale or edited by hand.
 
     A file whose tests all belong to `make certify` needs no row.
     """

@@ -11,6 +11,7 @@ at every push, which promise it guards, and which tests of `make test` stand for
 PART=2/4 runs the second of four parts that cost alike.
 """
 
+import contextlib
 import os
 import re
 import subprocess
@@ -95,12 +96,15 @@ class Certificate:
     def pytest_terminal_summary(self, terminalreporter):
         """The commit, how many tests passed and failed, and how long they took."""
         ask = ["git", "describe", "--always", "--dirty", "--abbrev=7"]
-        commit = subprocess.run(ask, capture_output=True, text=True, cwd=HERE, check=True).stdout
+        commit = "unknown"
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            done = subprocess.run(ask, capture_output=True, text=True, cwd=HERE, check=True)
+            commit = done.stdout.strip()
         counts = {k: len(terminalreporter.stats.get(k, ())) for k in ("passed", "failed", "error")}
         told = ", ".join(f"{n} {k}" for k, n in counts.items())
         minutes = (time.monotonic() - self.begun) / 60.0
         self.page.write_text(
-            f"Commit `{commit.strip()}`, {date.today()}: {told}, in {minutes:.0f} minutes on "
+            f"Commit `{commit}`, {date.today()}: {told}, in {minutes:.0f} minutes on "
             f"{os.cpu_count()} cores.\n",
             "utf-8",
         )

@@ -86,9 +86,7 @@ def fly(tmp_path_factory):
     @cache
     def now(name: str) -> Done:
         folder, seen = tmp_path_factory.mktemp(name), list[tuple[Flight, Ran, Any]]()
-        drive = DRIVE.replace(
-            'velocity_sigma = "0.05 m/s"\n', f'velocity_sigma = "0.05 m/s"\n{ARM}'
-        )
+        drive = DRIVE.replace(PLACE, PLACE + ARM)
         (folder / "drive.toml").write_text(f'system = "ins-gnss"\n{drive}{OUTAGE}')
         scenario = folder / "bench.toml"
         scenario.write_text(TABLE[name].scenario.replace("{folder}", str(folder)))
