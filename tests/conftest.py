@@ -85,24 +85,30 @@ hypothesis.settings.load_profile("repeatable")
 # their programs leave no room for the processes of the bench.
 MAPS, SIZE = Path("/proc/self/maps"), Path("/proc/self/statm")
 MANY_MAPS = 25_000
-MANY_BYTES = 3 * 2**29
-MANY_BYTES_OF_A_FILE = 2**30  # more than this is not carried into the next file of tests
+# Since programs were last forgotten: what stays then is not freed by forgetting again, and a worker
+# that does so at every test compiles everything anew.
+MANY_BYTES = 2**30
 LOOK_EVERY = 10  # tests, at the maps: to write them out takes the system milliseconds
 FINISHED = pytest.StashKey[int]()
+LEFT = pytest.StashKey[int]()
 
 
-def pytest_runtest_teardown(item, nextitem):
+def resident() -> int:
+    """Bytes of memory of this process."""
+    return int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def pytest_runtest_teardown(item):
     """Forget compiled programs when there are many; the cache gives back those needed again."""
     if not MAPS.exists():
         return
     count = item.config.stash[FINISHED] = item.config.stash.get(FINISHED, 0) + 1
-    same_file = nextitem is not None and nextitem.path == item.path
-    most = MANY_BYTES if same_file else MANY_BYTES_OF_A_FILE
-    large = int(SIZE.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > most
+    large = resident() > item.config.stash.setdefault(LEFT, resident()) + MANY_BYTES
     if large or (count % LOOK_EVERY == 0 and MAPS.read_bytes().count(b"\n") > MANY_MAPS):
         jax.clear_caches()
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)  # else what was freed stays with the process
+        item.config.stash[LEFT] = resident()
 
 
 def pytest_configure(config):

