@@ -145,17 +145,20 @@ def lowered(most: dict) -> dict:
     return most | {"rooms": rooms}
 
 
-def earlier(name: str) -> list[dict]:
-    """A table of this folder in earlier commits; none where git or its history is missing."""
+def earlier(*names: str) -> list[list[dict]]:
+    """Tables of this folder in earlier commits; none where git or its history is missing."""
 
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", *words], cwd=HERE, capture_output=True, text=True)
+    def git(*words: str, told: str = "") -> str:
+        done = subprocess.run(["git", *words], cwd=HERE, input=told, capture_output=True, text=True)
         return "" if done.returncode else done.stdout
 
     if shutil.which("git") is None:
-        return []
-    commits = git("log", "--format=%H", "-20", "--", name).split()
-    return [tomllib.loads(text) for c in commits if (text := git("show", f"{c}:./{name}"))]
+        return [[] for _ in names]
+    commits = git("log", "--format=%H", "-20", "--", *names).split()
+    asked = "".join(f"{commit}:tests/{name}\n" for name in names for commit in commits)
+    told = git("cat-file", "--batch", told=asked)
+    tables = [tomllib.loads(t) for t in re.split(r"(?m)^.*(?: blob \d+| missing)\n", told)[1:]]
+    return [tables[k * len(commits) : (k + 1) * len(commits)] for k in range(len(names))]
 
 
 def flat(most: dict) -> Counter[str]:
