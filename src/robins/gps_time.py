@@ -38,7 +38,7 @@ def leap_seconds(utc: datetime.date) -> int:
 
 
 def dated(stamp_ns: int) -> bool:
-    """Whether a stamp is GPS time since 1970, not since power-up or the beginning of a week."""
+    """True if a stamp is GPS time since 1970, not since power-up or the beginning of a week."""
     return stamp_ns >= GPS_EPOCH_S * _NS
 
 
