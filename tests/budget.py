@@ -168,7 +168,7 @@ def flat(most: dict) -> Counter[str]:
         found.update({f"all rooms {kind}": limit for kind, limit in row.items()})
     for part in ("rooms", "commands"):
         for name, row in most[part].items():
-            found |= {f"{part} {name} {kind}": limit for kind, limit in row.items()}
+            found.update({f"{part} {name} {kind}": limit for kind, limit in row.items()})
     return found
 
 
@@ -178,7 +178,7 @@ def raised(now: dict, before: dict) -> list[str]:
     return [
         f"{name}: {here[name]} now, {limit} before"
         for name, limit in flat(before).items()
-        if here[name] > limit > 0
+        if here[name] > limit
     ]
 
 
