@@ -146,6 +146,12 @@ def outside(variable: str, folder: str) -> Path:
     return path
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_configuration(tmp_path_factory):
+    """Confirmations of user code are those of the tests, here and in processes that they start."""
+    os.environ["XDG_CONFIG_HOME"] = str(tmp_path_factory.mktemp("config"))
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Real logs: ROBINS_DATA, else ../shared/data beside the repository."""

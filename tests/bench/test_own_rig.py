@@ -19,6 +19,7 @@ from robins.bench.run.telemetry import Telemetry
 from robins.report import figures
 from robins.results import read as read_result
 from robins.scenario import ScenarioError
+from robins.systems import trust
 from robins.workbench import bench_replay, bench_up, publish
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "pendulum.py"
@@ -83,6 +84,7 @@ def test_faults_of_the_line_and_settings_are_of_any_rig(tmp_path):
         f'bench = "{RIG}"\nseconds = "2 s"\nset = ["length=2 m"]\n'
         '[[faults]]\nkind = "loss"\nlink = "pendulum"\nbegin = "1 s"\n'
     )
+    trust.confirm(EXAMPLE)
     flight = read(str(scenario))
     assert flight.given.length == 2.0
     assert flight.setup.faults[0].link == "pendulum"

@@ -10,7 +10,7 @@ import pytest
 
 from robins import results
 from robins.cli import main
-from robins.systems import SYSTEMS, catalogue
+from robins.systems import SYSTEMS, catalogue, trust
 from robins.systems.finding import UnknownSystem, find_system
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "balloon.py"
@@ -20,6 +20,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "balloon.p
 def modules_as_before(monkeypatch):
     """What a test imports is forgotten after it."""
     monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(trust, "_local", {})
     before = set(sys.modules)
     yield
     for name in set(sys.modules) - before:
@@ -67,7 +68,10 @@ def test_a_scenario_file_names_the_file_beside_it(tmp_path, capsys):
     )
     (tmp_path / "windy.toml").write_text(text)
     out = tmp_path / "out"
-    assert main(["run", str(tmp_path / "windy.toml"), "--json", "--out", str(out)]) == 0
+    words = ["run", str(tmp_path / "windy.toml"), "--json", "--out", str(out)]
+    assert main(words) == 2  # a file that a file names is confirmed once
+    assert f"--trust {tmp_path / 'weather.py'}" in capsys.readouterr().err
+    assert main([*words, "--trust", str(tmp_path / "weather.py")]) == 0
     told = json.loads(capsys.readouterr().out)
     assert list(told["filters"]) == ["kf"]
     assert told["claims"] == []
@@ -85,6 +89,8 @@ def test_a_default_runs_beside_the_filters_of_a_scenario_and_is_not_judged(tmp_p
     )
     text = 'system = "much.py:much"\nruns = 2\nfilters = ["kf"]\nduration = "20 s"\n'
     (tmp_path / "much.toml").write_text(text)
+
+    trust.confirm(tmp_path / "much.py")
 
     def told(*more):
         words = ["run", str(tmp_path / "much.toml"), *more, "--json", "--out", str(tmp_path / "o")]

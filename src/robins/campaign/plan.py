@@ -16,6 +16,8 @@ import robins
 from robins import scenario
 from robins.campaign.store import Store
 from robins.errors import RobinsError
+from robins.systems import trust
+from robins.systems.catalogue import is_file
 
 NAME = "campaign.json"
 SCHEMA = 1
@@ -179,16 +181,17 @@ def code_of(asked: str, text: str) -> str:
     """Hash of all code that a shard depends on.
 
     Args:
-        asked: how the system is found; a file of a user's own counts with its content.
+        asked: how the system is found; a file of a user's own counts with the local modules that
+            it imports.
         text: of the scenario, which may name such a file.
     """
     sha = hashlib.sha256(_of_package().encode())
     sha.update(os.environ.get("XLA_FLAGS", "").encode())  # by which JAX rounds
     named: Mapping[str, Any] = scenario.mapping_of(text)
-    for one in dict.fromkeys((asked, str(named.get("system", "")))):
-        path = Path(one.rpartition(":")[0])
-        if ".py:" in one and path.is_file():
-            sha.update(path.read_bytes())
+    folder = Path(asked).parent if asked.endswith(".toml") else Path()
+    for path in dict.fromkeys((Path(asked), folder / str(named.get("system", "")))):
+        if is_file(path.name):
+            sha.update(trust.digest(path.with_name(path.name.partition(":")[0])).encode())
     return sha.hexdigest()[:16]
 
 

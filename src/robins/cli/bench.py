@@ -15,6 +15,7 @@ from robins.cli.options import (
     LOGS,
     RESULTS,
     SETTINGS,
+    TRUST,
     answers,
     examples,
     folder_name,
@@ -82,6 +83,7 @@ _FILTER = option("--filter", "filter_", metavar="NAME", help="Filter to fly with
 @option("--port", type=click.IntRange(0, 65535), default=8321, show_default=True, help="Page port.")
 @SETTINGS
 @_SEED
+@TRUST
 @publishes
 def up(scenario: str, out: Path | None, filter_: str | None, **options: Any) -> int:
     """Run SCENARIO on the bench: one of a vehicle, one of the bench, or a file of either.
@@ -130,6 +132,7 @@ def status(as_json: bool) -> None:
 @option("--node", required=True, metavar="PART", help="Which part.")
 @_FILTER
 @option("--diff", type=LOGS, metavar="RECORD", help="Compare with another record.")
+@TRUST
 @answers
 def replay(record: Path, as_json: bool, **options: Any) -> int:
     """Start a part alone and send it RECORD, the record.mcap of a run, again.
@@ -169,6 +172,7 @@ def ports(as_json: bool) -> None:
 @click.argument("scenario")
 @_FILTER
 @_SEED
+@TRUST
 @DEBUG
 def node(part: str, port: str, scenario: str, **options: Any) -> None:
     """Run PART of SCENARIO at PORT until the bench says stop, as its process would.

@@ -74,7 +74,7 @@ def _tried(version: str, folder: Path | None) -> bool | None:
             return known == "taken"
     try:
         told = {"XLA_FLAGS": _XLA_FLAGS, "JAX_PLATFORMS": "cpu"}
-        trial = [sys.executable, "-c", _TRIAL]
+        trial = [sys.executable, "-P", "-c", _TRIAL]
         done = subprocess.run(trial, env=os.environ | told, capture_output=True, timeout=_TRIAL_S)
     except (OSError, subprocess.TimeoutExpired):
         return None

@@ -13,7 +13,7 @@ from click import option
 
 from robins.cli import cache
 from robins.cli.frame import Status, command_line, only_json
-from robins.cli.options import OUT, answers, choices, examples
+from robins.cli.options import OUT, TRUST, answers, choices, examples
 from robins.cli.progress import Progress
 from robins.cli.tell import carry_out, deliver, say
 
@@ -76,6 +76,7 @@ def _held(_context: click.Context, _given: click.Parameter, held: bool) -> None:
     help="What computes. [default: c where that pays, else jax]",
 )
 @choices
+@TRUST
 @answers
 def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: Any) -> None:
     """Run SCENARIO many times, with as many processes as there are cores.
@@ -113,6 +114,7 @@ def _deliver(bench: Any, where: str, outcome: Any, as_json: bool, to: Path | Non
 )
 @_WHERE
 @option("--held", is_flag=True, hidden=True, expose_value=False, callback=_held)
+@TRUST
 @answers
 def work(where: str, as_json: bool) -> None:
     """Take the next missing chunk of the campaign in DIR, compute it, put it; until all are there.
@@ -188,6 +190,7 @@ def _progress_text(where: str, found: Any) -> str:
 )
 @_WHERE
 @option("--share", type=click.FloatRange(0.0, 1.0, min_open=True), default=0.01, show_default=True)
+@TRUST
 @answers
 def verify(where: str, share: float, as_json: bool) -> int:
     """Check all shards of DIR, compute some again, drawn by chance, and compare them bit by bit.
@@ -213,6 +216,7 @@ def verify(where: str, share: float, as_json: bool) -> int:
 @_WHERE
 @option("--run", "number", type=click.IntRange(min=0), required=True, help="Its number.")
 @OUT
+@TRUST
 @answers
 def show(where: str, number: int, out: Path | None, as_json: bool) -> None:
     """Compute one run of DIR again and write its histories and figures; it has the same bits."""
@@ -231,6 +235,7 @@ def _result(where: str, what: str) -> Path:
 )
 @_WHERE
 @OUT
+@TRUST
 @answers
 def report(where: str, out: Path | None, as_json: bool) -> None:
     """Join the shards of DIR and write a result with figures and a page; by default DIR/report.
@@ -259,6 +264,7 @@ def report(where: str, out: Path | None, as_json: bool) -> None:
 @option("--workers", type=click.IntRange(min=1), help="Processes. [default: one a core]")
 @option("--machine", type=click.Choice(["jax", "c"]), default="jax", show_default=True)
 @choices
+@TRUST
 @answers
 def sweep(scenario: str, out: str, as_json: bool, **options: Any) -> None:
     """Run SCENARIO for each value of one parameter or of two, with the same random numbers.

@@ -20,6 +20,7 @@ from robins.cli.options import (
     LOGS,
     RESULTS,
     SETTINGS,
+    TRUST,
     answers,
     as_names,
     choices,
@@ -114,6 +115,7 @@ def demo(out: Path | None, **options: Any) -> None:
     help="What computes. [default: c where that pays, else jax]",
 )
 @choices
+@TRUST
 @publishes
 def run(
     scenario: str,
@@ -160,6 +162,7 @@ def run(
 @option("--without", multiple=True, metavar="SENSOR", help="Leave it out; may be repeated.")
 @option("--at", multiple=True, metavar="TIME", help='Print that time, "200 s"; may be repeated.')
 @choices
+@TRUST
 @publishes
 def bound(scenario: str, filters: tuple[str, ...], out: Path | None, **options: Any) -> None:
     """Compute the covariance bound and observability of SCENARIO; no filter can do better.
@@ -328,6 +331,7 @@ app.add_command(sensitivity)
 @option("--board", is_flag=True, help="Build it as a part of the bench too.")
 @option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of the recorded run.")
 @SETTINGS
+@TRUST
 @answers
 def export(scenario: str, to: Path, small: bool, as_json: bool, **options: Any) -> None:
     """Write a filter of SCENARIO as C99, with a test of it for your own compiler.

@@ -31,6 +31,30 @@ COLUMNS = option(
 )
 
 
+def _confirm(
+    _context: click.Context, _given: click.Parameter, files: tuple[Path, ...]
+) -> tuple[Path, ...]:
+    """Confirm files of user code before the command reads what names them."""
+    if files:
+        from robins.systems import trust
+
+        for file in files:
+            trust.confirm(file)
+    return files
+
+
+TRUST = option(
+    "--trust",
+    type=LOGS,
+    multiple=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_confirm,
+    metavar="FILE",
+    help="Let this code run, which a file names; remembered until it changes. May be repeated.",
+)
+
+
 def answers(command: Callable) -> Callable:
     """Options of every command that tells something."""
     return JSON(DEBUG(command))

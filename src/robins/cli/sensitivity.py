@@ -8,7 +8,7 @@ from typing import Any
 import click
 from click import option
 
-from robins.cli.options import RESULTS, SETTINGS, examples, folder_name, publishes
+from robins.cli.options import RESULTS, SETTINGS, TRUST, examples, folder_name, publishes
 from robins.cli.tell import carry_out
 
 
@@ -34,6 +34,7 @@ from robins.cli.tell import carry_out
 )
 @SETTINGS
 @option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Of all noise and points.")
+@TRUST
 @publishes
 def sensitivity(scenario: str, out: Path | None, **options: Any) -> None:
     """Say which share of the variance of a filter's error comes from which parameter of SCENARIO.

@@ -13,6 +13,7 @@ from robins.cli.options import (
     COLUMNS,
     RESULTS,
     SETTINGS,
+    TRUST,
     examples,
     folder_name,
     log_name,
@@ -46,6 +47,7 @@ from robins.cli.tell import carry_out
 @COLUMNS
 @SETTINGS
 @option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, help="Seed of all noise.")
+@TRUST
 @publishes
 def tune(what: tuple[str, ...], out: Path | None, **options: Any) -> None:
     """Find factors on parameters of a filter with which it is best.

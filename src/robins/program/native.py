@@ -74,7 +74,7 @@ def compiler(language: Language = C) -> tuple[str, ...]:
         if (found := shutil.which(name)) is not None:
             return (found,)
     if importlib.util.find_spec("ziglang") is not None:
-        return (sys.executable, "-m", "ziglang", language.zig)
+        return (sys.executable, "-P", "-m", "ziglang", language.zig)
     raise BuildError("there is no C compiler on this machine", "", NO_COMPILER)
 
 

@@ -1,13 +1,13 @@
 """Systems by name: of robins, of an installed package, or in a file of the user's.
 
 A file is named with what it defines, "my_system.py:study": a `System`, or a `Study`, which is taken
-for a system that has no other. The file is imported, so it runs; it can import what lies beside it.
+for a system that has no other. The file is imported, so it runs, and it can import the modules of
+its folder; `robins.systems.trust` says which files may.
 """
 
 from __future__ import annotations
 
-import importlib
-import sys
+import os
 import traceback
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from robins import systems  # whose names are imported when needed: a rig needs no study
 from robins.errors import RobinsError, hint
+from robins.systems import trust
 from robins.systems.catalogue import is_file
 
 if TYPE_CHECKING:
@@ -25,14 +26,20 @@ class UnknownSystem(RobinsError, ValueError):
     """There is no such system, or what is said to be one is none."""
 
 
-def find_system(name: str, folder: Path = Path()) -> System:
-    """The system of a name as `robins list` tells it, or of "file.py:name", relative to a folder.
+def find_system(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> System:
+    """The system of a name in `robins list`, or of "file.py:name", relative to a folder.
+
+    Args:
+        name: of the system.
+        folder: to which a file is relative.
+        named_in: file that names it; empty where the user does.
 
     Raises:
         UnknownSystem: there is none; the message says what there is.
+        RobinsError: it is a file named in another file, and the user has not confirmed it.
     """
     if is_file(name):
-        return _of_file(name, folder)
+        return _of_file(name, folder, named_in)
     if name in (known := systems.SYSTEMS):
         return known[name]
     raise UnknownSystem(
@@ -41,9 +48,11 @@ def find_system(name: str, folder: Path = Path()) -> System:
     )
 
 
-def _of_file(name: str, folder: Path) -> System:
+def _of_file(name: str, folder: Path, named_in: str | os.PathLike[str]) -> System:
     where, _, wanted = name.partition(":")
     path = (folder / where).resolve()
+    if named_in:
+        trust.require(path, named_in)
     module = imported(path)
     kinds = systems.Study | systems.System
     offered = [key for key, value in vars(module).items() if isinstance(value, kinds)]
@@ -61,28 +70,20 @@ def _of_file(name: str, folder: Path) -> System:
 
 
 def imported(path: Path) -> ModuleType:
-    """A file as a module, importable by its name as if Python had been started beside it.
+    """A file that the user names, or has confirmed, as a module.
 
     Raises:
         UnknownSystem: there is no such file, or it cannot be imported.
     """
-    if not path.is_file():
-        raise UnknownSystem("there is no such file", path)
-    if str(path.parent) not in sys.path:
-        sys.path.insert(0, str(path.parent))
     try:
-        module = importlib.import_module(path.stem)
+        trust.confirm(path)
+        return trust.load(path)
+    except RobinsError as error:
+        raise UnknownSystem(error.what, error.where, error.fix) from None
     except Exception as error:
         raise UnknownSystem(
             f"importing it failed: {type(error).__name__}: {error}", _place(path, error)
         ) from error
-    if Path(str(module.__file__)).resolve() != path:
-        raise UnknownSystem(
-            f"the name {path.stem} is that of another module, {module.__file__}",
-            path,
-            "give the file another name",
-        )
-    return module
 
 
 def _place(path: Path, error: Exception) -> str:

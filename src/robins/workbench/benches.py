@@ -184,13 +184,13 @@ def bench_replay(
     if filter_ and diff:
         raise InputError("the one runs a filter, the other compares records", "--filter and --diff")
     first, second = open_record(record), None if diff is None else open_record(diff)
-    rig = recorded_rig(first.header)
+    rig = recorded_rig(first.header, record)
     if node not in rig.parts:
         raise InputError(f"there is no part '{node}', only {', '.join(rig.parts)}", "--node")
     wire = rig.wire
     step_ns, told = int(first.header["step_ns"]), None
     if second is None:
-        flight = recorded_flight(first.header, filter_)
+        flight = recorded_flight(first.header, record, filter_)
         if once := rig.once(flight.setup, node):
             raise InputError(once, "--node", "compare two records with --diff")
         other = None if filter_ else program(flight.setup.ports.get(node, ""))
@@ -237,7 +237,7 @@ def _starter(flight: Flight, part: str, other: Path | None) -> Iterator[Start]:
 
         @contextlib.contextmanager
         def start(port: str) -> Iterator[subprocess.Popen]:
-            command = [sys.executable, "-m", "robins.bench.parts.node"]
+            command = [sys.executable, "-P", "-m", "robins.bench.parts.node"]
             command += [flight.rig.address or flight.rig.name, part, port, str(path)]
             command = command if other is None else [str(other), port]
             process = subprocess.Popen(command, start_new_session=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,12 +20,24 @@ from robins.campaign.bound import bound_sigma
 from robins.campaign.gather import State, blank, example_of, gather
 from robins.campaign.machine import machine_for
 from robins.campaign.outcome import outcome_of
-from robins.campaign.plan import KEPT, Chunk, Plan, Shard, check_code, code_of, needed, read, write
+from robins.campaign.plan import (
+    KEPT,
+    NAME,
+    Chunk,
+    Plan,
+    Shard,
+    check_code,
+    code_of,
+    needed,
+    read,
+    write,
+)
 from robins.campaign.retention import by_stem, content_of, kept
 from robins.campaign.shards import Damaged, unpack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store, open_store
 from robins.campaign.work import Worker, missing
+from robins.errors import RobinsError
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.systems.study import Problem
@@ -33,6 +46,7 @@ from robins.workbench.scenarios import beside, check_filters, read_scenario
 
 Where = str | os.PathLike[str]
 SWEEP = "sweep.json"  # in the folder of several campaigns
+_POINT = re.compile(r"points/\d+(-\d+)?")
 
 
 def plan_campaign(
@@ -114,8 +128,12 @@ def _of_runs(text: str) -> str:
 
 
 def problem_of(plan: Plan, filters: Sequence[str] = ()) -> Problem:
-    """The problem of a campaign, with its filters or some of them."""
-    one = read_scenario(plan.asked, (), plan.text)
+    """The problem of a campaign, with its filters or some of them.
+
+    Raises:
+        robins.errors.RobinsError: it names code that the user has not confirmed.
+    """
+    one = read_scenario(plan.asked, (), plan.text, named_in=NAME)
     problem = one.problem(filters or plan.filters, plan.seed)
     return replace(problem, claims=about(one.own, problem.claims))
 
@@ -138,14 +156,13 @@ def opened(where: Where) -> tuple[Store, Plan]:
     Raises:
         robins.errors.RobinsError: there is none, or there are several.
     """
-    store = open_store(where)
-    if store.get(SWEEP) is not None:
-        points = campaigns_of(where)
+    if sweep := sweep_of(where):
         raise InputError(
-            f"holds the {len(points)} campaigns of a sweep",
+            f"holds the {len(sweep[1])} campaigns of a sweep",
             where,
-            f"name one, such as {points[0]}.",
+            f"name one, such as {where}/{sweep[1][0]}.",
         )
+    store = open_store(where)
     return store, needed(store)
 
 
@@ -164,10 +181,31 @@ def campaign_work(where: Where) -> Iterator[tuple[int, int]]:
 
 def campaigns_of(where: Where) -> list[str]:
     """The campaigns of a sweep, or the one that is there."""
+    sweep = sweep_of(where)
+    return [str(where)] if sweep is None else [f"{where}/{point}" for point in sweep[1]]
+
+
+def sweep_of(where: Where) -> tuple[list[str], list[str]] | None:
+    """Texts ``key=a,b,c`` and folders of the points of a sweep; None where there is none.
+
+    Raises:
+        robins.errors.RobinsError: its file is damaged.
+    """
     content = open_store(where).get(SWEEP)
     if content is None:
-        return [str(where)]
-    return [f"{where}/{point}" for point in json.loads(content)["points"]]
+        return None
+    try:
+        data = json.loads(content)
+        vary, points = list(map(str, data["vary"])), list(map(str, data["points"]))
+        if not points or not all(map(_POINT.fullmatch, points)):
+            raise ValueError("its points are not folders of its own")
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise RobinsError(
+            f"{SWEEP} is damaged ({error!r})",
+            where,
+            "run the same `robins sweep` again: what is there is not computed again.",
+        ) from None
+    return vary, points
 
 
 class Status(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +17,12 @@ from robins.systems.finding import find_system
 from robins.systems.study import Problem
 from robins.workbench.errors import InputError, refusing
 
+Where = str | os.PathLike[str]
 
-def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
+
+def find_scenario(
+    name: str, recorded: bool = False, named_in: Where = ""
+) -> tuple[System, str, str]:
     """System, name and text of a scenario.
 
     Args:
@@ -25,13 +30,19 @@ def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
             the key ``system``; or a system of the user's own, "file.py:study" or the name of an
             installed one, whose parameters then have their defaults.
         recorded: a recorded pair takes the place of the simulation.
+        named_in: file or folder that names it; empty where the user does.
 
     Raises:
         InputError: there is no such scenario or file, the file names no system, or only a
             recorded pair fits it.
+        robins.errors.RobinsError: it names code that the user has not confirmed.
     """
     if is_file(name) or name in installed():
-        return find_system(name), Path(name).name.replace(".py:", ":"), f'system = "{name}"\n'
+        return (
+            find_system(name, named_in=named_in),
+            Path(name).name.replace(".py:", ":"),
+            f'system = "{name}"\n',
+        )
     known = systems.SYSTEMS
     packaged = {f"{s}/{k}": (s, one.path) for s in known for k, one in listed(s).items()}
     others = {f"{s}/{k}": (s, path) for s in known for k, path in configurations(s).items()}
@@ -60,7 +71,7 @@ def find_scenario(name: str, recorded: bool = False) -> tuple[System, str, str]:
             f"file.py:study for one of your own; it says {chosen!r}",
             name,
         )
-    return find_system(chosen, Path(name).parent), Path(name).stem, text
+    return find_system(chosen, Path(name).parent, name), Path(name).stem, text
 
 
 def study_of(system: System, text: str, source: str) -> Study:
@@ -113,13 +124,15 @@ class Simulated(NamedTuple):
         return scenario.parse(self.study.parameters, self.text, settings, source=self.source)
 
 
-def read_scenario(name: str, settings: Sequence[str], text: str = "") -> Simulated:
+def read_scenario(
+    name: str, settings: Sequence[str], text: str = "", named_in: Where = ""
+) -> Simulated:
     """A scenario by name, as `find_scenario`, or of another text.
 
     Raises:
         InputError, robins.scenario.ScenarioError: there is none, or it cannot be run.
     """
-    system, label, found = find_scenario(name)
+    system, label, found = find_scenario(name, named_in=named_in)
     text = text or found
     study = study_of(system, text, name)
     parameters = scenario.parse(study.parameters, text, settings, source=name)

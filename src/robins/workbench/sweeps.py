@@ -29,6 +29,7 @@ from robins.workbench.campaigns import (
     plan_campaign,
     problem_of,
     ready,
+    sweep_of,
 )
 from robins.workbench.errors import InputError
 from robins.workbench.publication import csv_of
@@ -170,10 +171,10 @@ def report(where: Where) -> Outcome:
 
 def _asked(where: Where) -> tuple[list[Varied], list[Point]] | None:
     """What the sweep of a folder varies, and its points; None where there is one campaign."""
-    content = open_store(where).get(SWEEP)
-    if content is None:
+    sweep = sweep_of(where)
+    if sweep is None:
         return None
-    chosen = [varied(text) for text in json.loads(content)["vary"]]
+    chosen = [varied(text) for text in sweep[0][:2]]
     return chosen, list(points(where, chosen))
 
 

@@ -18,6 +18,7 @@ from robins.campaign.store import open_store
 from robins.campaign.work import missing
 from robins.errors import RobinsError
 from robins.results import Outcome, Progress, silent
+from robins.systems import trust
 from robins.workbench.campaigns import campaign_report, mend, plan_campaign
 
 POLL_S = 0.2
@@ -25,13 +26,23 @@ DEATHS = 3  # of workers, without a shard between them, after which a campaign f
 _ROBINS = "from robins.cli import main; raise SystemExit(main())"
 
 
-def command(where: str | os.PathLike[str]) -> list[str]:
-    """The command line of a worker of a campaign, with this Python."""
-    return [sys.executable, "-c", _ROBINS, "campaign", "work", str(where), "--json"]
+def command(
+    where: str | os.PathLike[str], trusted: Sequence[str | os.PathLike[str]] = ()
+) -> list[str]:
+    """The command line of a worker of a campaign, with this Python and files of user code."""
+    options = [word for file in trusted for word in ("--trust", os.fspath(file))]
+    return [
+        *(sys.executable, "-P", "-c", _ROBINS),
+        *("campaign", "work", os.fspath(where), *options, "--json"),
+    ]
 
 
-def work_here(where: str | os.PathLike[str]) -> int:
+def work_here(where: str | os.PathLike[str], trusted: Sequence[str | os.PathLike[str]] = ()) -> int:
     """Run a worker as a process of its own until nothing is missing; for engines that call Python.
+
+    Args:
+        where: folder or address of the campaign.
+        trusted: files of user code that the campaign names and that may run here.
 
     Returns:
         How many shards are there then.
@@ -39,7 +50,7 @@ def work_here(where: str | os.PathLike[str]) -> int:
     Raises:
         RobinsError: the worker failed.
     """
-    done = subprocess.run(command(where), capture_output=True, text=True)
+    done = subprocess.run(command(where, trusted), capture_output=True, text=True)
     if done.returncode:
         raise _failed(done.stderr.removeprefix("robins: ").strip(), str(where))
     return json.loads(done.stdout)["done"]
@@ -51,7 +62,7 @@ class _Process:
     def __init__(self, where: str):
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed by `close`)
         self._process = subprocess.Popen(
-            [*command(where), "--held"],
+            [*command(where, trust.confirmed()), "--held"],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,

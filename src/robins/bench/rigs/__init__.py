@@ -6,12 +6,14 @@ A user's own rig is in a file, "pendulum.py:rig".
 from __future__ import annotations
 
 import importlib
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from robins.bench.rig import Rig
 from robins.errors import RobinsError, hint
+from robins.systems import trust
 from robins.systems.catalogue import is_file
 
 __all__ = ["RIGS", "UnknownRig", "rig_of"]
@@ -24,17 +26,26 @@ class UnknownRig(RobinsError, ValueError):
     """There is no such rig, or what is said to be one is none."""
 
 
-def rig_of(name: str, folder: Path = Path()) -> Rig:
+def rig_of(name: str, folder: Path = Path(), named_in: str | os.PathLike[str] = "") -> Rig:
     """A rig by its name, or "file.py:name", relative to a folder.
+
+    Args:
+        name: of the rig.
+        folder: to which a file is relative.
+        named_in: file that names it; empty where the user does.
 
     Raises:
         UnknownRig: there is none; the message says what there is.
+        RobinsError: it is a file named in another file, and the user has not confirmed it.
     """
     if name in RIGS:
         return importlib.import_module(f"{__name__}.{name.replace('-', '_')}").RIG
     if is_file(name):
         where, _, wanted = name.partition(":")
-        return _of_file((folder / where).resolve(), wanted)
+        path = (folder / where).resolve()
+        if named_in:
+            trust.require(path, named_in)
+        return _of_file(path, wanted)
     raise UnknownRig(
         f"no rig '{name}'{hint(name, RIGS)} There are {', '.join(RIGS)}",
         fix="for one of your own write file.py:name",

@@ -89,7 +89,7 @@ class Crew:
         environment = {**os.environ, "JAX_CPU_ENABLE_ASYNC_DISPATCH": "false"}
         if self._realtime:
             environment[REALTIME] = "1"
-        command = [sys.executable, "-m", "robins.bench.parts.node"]
+        command = [sys.executable, "-P", "-m", "robins.bench.parts.node"]
         command += [self._rig.address or self._rig.name, part, port]
         command.append(str(self._folder / "kit"))
         if self._restarts:

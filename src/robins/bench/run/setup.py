@@ -13,6 +13,7 @@ end = "601 s"
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -22,10 +23,12 @@ import pydantic
 from robins import scenario
 from robins.bench.broker.faults import LinkFault
 from robins.bench.broker.says import Saying
+from robins.bench.ports.port import program
 from robins.bench.rig import Kit, Rig, Timing
 from robins.bench.rigs import RIGS, rig_of
 from robins.errors import hint
 from robins.scenario import Parameters, Quantity, ScenarioError
+from robins.systems import trust
 from robins.systems.catalogue import is_file
 
 Clock = Literal["lockstep", "realtime"]
@@ -150,9 +153,22 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
         setup = rig.setup.model_validate({"set": settings} | ({"flies": flies} if flies else {}))
         title = Path(name).name.replace(".py:", ":") if is_file(name) else name
         return Flight(title, rig, setup, _flies(rig, setup), "")
+    if name not in built_in():
+        _require_programs(scenario.mapping_of(text).get("ports"), name)
     setup = scenario.parse(rig.setup, text, settings, source=name)
     title = name if name in built_in() else Path(name).stem
     return Flight(title, rig, setup, _flies(rig, setup), text)
+
+
+def _require_programs(ports: Any, named_in: str | os.PathLike[str]) -> None:
+    """Refuse programs in the place of parts that a file names and the user has not confirmed.
+
+    Raises:
+        RobinsError: one is not confirmed.
+    """
+    for port in ports.values() if isinstance(ports, Mapping) else ():
+        if isinstance(port, str) and (path := program(port)) is not None:
+            trust.require(path, named_in)
 
 
 def _text(name: str) -> tuple[str, Rig]:
@@ -170,8 +186,8 @@ def _text(name: str) -> tuple[str, Rig]:
     text = ours[name].read_text("utf-8") if name in ours else scenario.read_text(name)
     said = scenario.mapping_of(text, source=name)
     if "bench" in said:
-        return text, rig_of(str(said["bench"]), Path(name).parent)
-    return "", rig_of(str(said.get("system", RIGS[0])))
+        return text, rig_of(str(said["bench"]), Path(name).parent, name)
+    return "", rig_of(str(said.get("system", RIGS[0])), Path(name).parent, name)
 
 
 def _flies(rig: Rig, setup: Setup) -> Parameters:
@@ -241,13 +257,16 @@ def steps_of(flight: Flight) -> int:
     return steps
 
 
-def recorded_flight(header: Mapping[str, Any], filter_: str | None = None) -> Flight:
+def recorded_flight(
+    header: Mapping[str, Any], record: str | os.PathLike[str], filter_: str | None = None
+) -> Flight:
     """The run of a record, from its header; or the same with another filter.
 
     Raises:
         ScenarioError: the header is of another version of robins.
+        RobinsError: it names code that the user has not confirmed.
     """
-    rig = recorded_rig(header)
+    rig = recorded_rig(header, record)
     try:
         # JSON has lists where parameters have tuples.
         setup = rig.setup.model_validate(header["setup"], strict=False)
@@ -256,10 +275,15 @@ def recorded_flight(header: Mapping[str, Any], filter_: str | None = None) -> Fl
         raise ScenarioError(
             [f"the record was made by another version of robins ({header.get('robins')}): {error}"]
         ) from None
+    _require_programs(setup.ports, record)
     flight = Flight(str(header["name"]), rig, setup, given, "")
     return flight if filter_ is None else changed(flight, {"filter": filter_})
 
 
-def recorded_rig(header: Mapping[str, Any]) -> Rig:
-    """The rig of a record; older ones do not say it."""
-    return rig_of(str(header.get("rig", RIGS[0])))
+def recorded_rig(header: Mapping[str, Any], record: str | os.PathLike[str]) -> Rig:
+    """The rig that the header of a record names; headers of old records name none.
+
+    Raises:
+        RobinsError: it is in a file that the user has not confirmed.
+    """
+    return rig_of(str(header.get("rig", RIGS[0])), named_in=record)
