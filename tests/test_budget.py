@@ -62,6 +62,8 @@ def test_ceilings_never_rise():
         assert ratchets.risen(then, allowed) == []
     less = now | {"whole": {kind: limit - 1 for kind, limit in now["whole"].items()}}
     assert len(budget.raised(now, less)) == len(now["whole"])
+    none = {"rooms": {name: row | {"runs": 0} for name, row in now["rooms"].items()}}
+    assert budget.raised(now, now | none)  # one of nought is a ceiling too
     room = {"new": dict.fromkeys((*budget.COUNTS, "seconds"), 1)}
     assert len(budget.raised(now | {"rooms": now["rooms"] | room}, now)) == len(room["new"])
 

@@ -34,7 +34,7 @@ def mark_bounds(axes: Axes, places: np.ndarray, sigmas: np.ndarray) -> None:
 
 @style.styled
 def draw(solution: xr.Dataset) -> None:
-    """Draw the true way, the estimate and its bound around the outage."""
+    """Draw the true path, the estimate and its bound around the outage."""
     hidden = np.asarray(solution["outage"].values) != 0
     first, last = np.flatnonzero(hidden)[[0, -1]]
     part = slice(first - AROUND, last + AROUND)
@@ -61,7 +61,7 @@ def draw(solution: xr.Dataset) -> None:
     axes.update_datalim([*(truth - sigma), *(truth + sigma)])
     axes.autoscale_view()
     keys = [
-        style.key("true way", color=style.TRUTH, linewidth=0.9),
+        style.key("true path", color=style.TRUTH, linewidth=0.9),
         style.key("no GNSS, 30 s", color="#F2CF63", linewidth=5.0),
         style.key("estimate, error x 20", color=style.colour(0), linewidth=1.6),
         Patch(color=BOUND, label="its bound of 3 sigma x 20"),

@@ -153,21 +153,20 @@ def read(name: str, settings: tuple[str, ...] = ()) -> Flight:
         setup = rig.setup.model_validate({"set": settings} | ({"flies": flies} if flies else {}))
         title = Path(name).name.replace(".py:", ":") if is_file(name) else name
         return Flight(title, rig, setup, _flies(rig, setup), "")
-    if name not in built_in():
-        _require_programs(scenario.mapping_of(text).get("ports"), name)
     setup = scenario.parse(rig.setup, text, settings, source=name)
+    _require_programs(setup.ports, name)
     title = name if name in built_in() else Path(name).stem
     return Flight(title, rig, setup, _flies(rig, setup), text)
 
 
-def _require_programs(ports: Any, named_in: str | os.PathLike[str]) -> None:
+def _require_programs(ports: Mapping[str, str], named_in: str | os.PathLike[str]) -> None:
     """Refuse programs in the place of parts that a file names and the user has not confirmed.
 
     Raises:
         RobinsError: one is not confirmed.
     """
-    for port in ports.values() if isinstance(ports, Mapping) else ():
-        if isinstance(port, str) and (path := program(port)) is not None:
+    for port in ports.values():
+        if (path := program(port)) is not None:
             trust.require(path, named_in)
 
 
