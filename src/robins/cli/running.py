@@ -18,6 +18,10 @@ from robins.cli.commands import app
 from robins.cli.frame import Status
 from robins.errors import RobinsError
 
+_OF_A_PATH = {  # what is wrong with a path that was given, not with the disk
+    *(errno.ENAMETOOLONG, errno.EEXIST, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
+    *(errno.EACCES, errno.EPERM),
+}
 _OF_THE_BENCH = ("serial", "cobs", "fastcrc", "mcap")  # packages of an extra
 
 
@@ -151,6 +155,9 @@ def _told(error: Exception) -> Status:
     if isinstance(error, MemoryError):
         _tell("out of memory; ask for fewer runs or filters at a time.")
         return Status.FAILED
+    if isinstance(error, OSError) and error.filename is not None:
+        _tell(f"{os.fsdecode(error.filename)}: {error.strerror}; choose another path.")
+        return Status.BAD_INPUT if error.errno in _OF_A_PATH else Status.FAILED
     first = (str(error).strip().splitlines() or [""])[0]
     _tell(f"failed: {type(error).__name__}: {first}")
     _tell("this may be a fault of robins; run it again with --debug to see where.")
