@@ -25,6 +25,15 @@ def test_a_line_drawn_by_chance_is_answered(monkeypatch, tmp_path):
     assert all(one.said.startswith("robins: ") for one in refused)
 
 
+@pytest.mark.parametrize("words", [["verify", "x" * 300], ["bench", "header", "--to", "text.py"]])
+def test_a_path_that_the_system_refuses_is_named(monkeypatch, tmp_path, words):
+    hostile.furnish(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (one,) = check([words])
+    assert one.status == 2
+    assert words[-1] in one.said
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_a_setting_that_looks_right_is_taken_or_refused(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
