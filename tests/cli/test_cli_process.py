@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import select
 import shlex
 import signal
 import subprocess
@@ -74,6 +75,9 @@ def test_a_terminal_that_is_closed_is_an_interrupt(tmp_path):
     screen, keyboard = os.openpty()
     process = start(SLOW, *RUN, cwd=tmp_path, stderr=keyboard)
     os.close(keyboard)
+    # A screen that nobody reads is full after some refreshes, and who writes to it waits.
+    while process.stdout not in select.select([process.stdout, screen], [], [], 60)[0]:
+        os.read(screen, 4096)
     assert process.stdout.readline() == "computing\n"
     # To close it may wait for who writes to it: some kernels then wait for ever.
     closing = threading.Thread(target=os.close, args=(screen,), daemon=True)
