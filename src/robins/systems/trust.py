@@ -18,7 +18,7 @@ import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, SourceFileLoader
 from importlib.util import spec_from_file_location
 from pathlib import Path
@@ -204,7 +204,7 @@ def load(path: Path) -> ModuleType:
 
 
 def _spec(
-    name: str, _path: Sequence[str] | None = None, _target: ModuleType | None = None
+    name: str, _path: Iterable[str] | None = None, _target: ModuleType | None = None
 ) -> ModuleSpec | None:
     """Specification of a local module, from the text that was hashed."""
     if name not in _local:
