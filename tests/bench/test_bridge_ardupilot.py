@@ -4,6 +4,7 @@ import json
 import math
 import re
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from ardupilot_peer import Peer, packet
 from rotorcraft import STEP_US, Craft, Pilot, angle_deg, fly
 
 from robins.bench.bridges import BridgeClosed, BridgeError
+from robins.bench.bridges import ardupilot as bridge
 from robins.bench.bridges.ardupilot import ArduPilotPhysics, BodyState, Servos, decode, encode
 
 
@@ -172,7 +174,8 @@ def test_the_loop_over_the_line_is_that_inside_one_program(physics):
     assert (physics.counts.lost, physics.counts.repeated, physics.counts.restarts) == (0, 0, 0)
 
 
-def test_ardupilot_goes_and_comes_back_and_the_physics_begin_anew(physics):
+def test_ardupilot_goes_and_comes_back_and_the_physics_begin_anew(physics, monkeypatch):
+    monkeypatch.setattr(bridge, "SILENT_S", 0.0)
     for flight in range(2):
         one = threading.Thread(target=fly_by_wire, args=(physics.port, 20), daemon=True)
         one.start()
@@ -224,7 +227,8 @@ def test_a_packet_that_was_not_answered_is_handed_out_again(physics, peer):
 
 
 @pytest.mark.parametrize(("before", "after"), [(1000, 0), (7, 7), (7, 9)])
-def test_another_ardupilot_is_a_restart_whatever_it_counts(physics, before, after):
+def test_another_ardupilot_is_a_restart_whatever_it_counts(physics, before, after, monkeypatch):
+    monkeypatch.setattr(bridge, "SILENT_S", 0.0)
     for count, restarted in ((before, False), (after, True)):
         with Peer(physics.port) as peer:
             peer.put(packet(count))
@@ -244,6 +248,48 @@ def test_other_datagrams_are_counted_and_nobody_is_answered(physics, peer):
         assert stranger.line(timeout=0.05) is None
     assert peer.line() is not None
     assert (physics.counts.wrong, physics.counts.packets) == (3, 1)
+
+
+def test_a_stranger_does_not_take_the_place_of_an_autopilot_that_flies(physics, peer):
+    peer.put(packet(0))
+    assert physics.receive(5.0).frame == 0
+    with Peer(physics.port) as stranger:
+        stranger.put(packet(0, [1900]), packet(7, [1900]))
+        physics.reply(state(time_s=1.0))  # what came while the answer was computed
+        stranger.put(packet(8, [1900]))
+        assert physics.receive(0.05) is None
+        peer.put(packet(1))
+        servos = physics.receive(5.0)
+        assert (servos.frame, servos.restarted) == (1, False)
+        physics.reply(state(time_s=2.0))
+        assert stranger.line(timeout=0.05) is None
+    assert [json.loads(peer.line())["timestamp"] for _ in range(2)] == [1.0, 2.0]
+    assert (physics.counts.strangers, physics.counts.restarts, physics.counts.packets) == (3, 0, 2)
+
+
+HERE, THERE, ELSEWHERE = "127.0.0.1", "192.0.2.7", "192.0.2.8"
+
+
+@pytest.mark.parametrize(
+    ("declared", "bound", "sender", "silent_s", "admitted"),
+    [
+        ("", None, ELSEWHERE, 0.0, True),  # nobody is bound yet
+        ("", HERE, HERE, 0.9, False),
+        ("", HERE, HERE, 1.1, True),
+        ("", HERE, THERE, 9e9, False),
+        ("", THERE, THERE, 9e9, False),  # of another machine, which nobody declared
+        (THERE, THERE, THERE, 0.9, False),
+        (THERE, THERE, THERE, 1.1, True),
+        (THERE, None, ELSEWHERE, 9e9, False),
+        (THERE, None, THERE, 0.0, True),
+    ],
+)
+def test_who_may_take_the_place_of_an_autopilot(declared, bound, sender, silent_s, admitted):
+    with ArduPilotPhysics(port=0, peer=declared) as physics:
+        physics._peer = None if bound is None else (bound, 1000)
+        physics._active = time.monotonic() - silent_s
+        assert physics.admits((sender, 2000)) == admitted
+        assert bound is None or physics.admits((bound, 1000))
 
 
 def test_errors_say_what_to_do(physics):

@@ -262,6 +262,19 @@ def test_a_line_that_ends_is_told(connected):
         assert simulator.actuators(5.0).time_us == 5
 
 
+def test_a_connection_of_another_machine_is_closed_and_counted():
+    with Px4Simulator(port=0, peer="192.0.2.7") as simulator:
+        with Peer(simulator.port) as stranger:
+            with pytest.raises(BridgeTimeout, match="PX4 did not connect"):
+                simulator.accept(0.2)
+            assert stranger.socket.recv(1) == b""
+        assert (simulator.counts.strangers, simulator.connected) == (1, False)
+        simulator._peer = "127.0.0.1"
+        with Peer(simulator.port):
+            simulator.accept(5.0)
+        assert simulator.connected
+
+
 def test_a_port_that_is_taken_is_told(simulator):
     with pytest.raises(BridgeClosed, match=f"127.0.0.1:{simulator.port}: cannot listen"):
         Px4Simulator(port=simulator.port)

@@ -8,7 +8,11 @@ endian, of 16 channels or, with its parameter SERVO_32_ENABLE, of 32:
 ArduPilot waits for an answer to each packet, so the two are in lock-step. If none comes for some
 seconds it sends the packet again with the same count, and we answer the same again: nothing is
 computed twice. A count that jumps tells of packets that were lost. A smaller count, or another
-sender, tells of an ArduPilot that was started anew: the physics then has to begin anew too.
+port, tells of an ArduPilot that was restarted: the physics then has to restart too.
+
+UDP has no connection, so whoever reaches the port can send. The first sender of a packet is the
+ArduPilot; `admits` is the rule by which another address takes its place. Datagrams of all others
+are counted as `strangers`, and nobody answers them.
 
 (ArduPilot, libraries/SITL/examples/JSON/readme.md.) ArduPilot looks for the names of fields as
 text: no blank may follow a colon, "velocity" has to come before "velocity_wind", and each answer
@@ -24,6 +28,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from ipaddress import ip_address
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +38,8 @@ from robins.bench.bridges.errors import BridgeClosed, BridgeError, finite, vecto
 PORT = 9002
 MAGIC = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
 RANGEFINDERS = 6  # that ArduPilot has fields for
+_WAITING = 64  # datagrams that are kept while an answer is computed
+SILENT_S = 1.0  # without a packet of the old address, before another may take its place
 Vector = Sequence[float] | np.ndarray
 Address = tuple[str, int]
 
@@ -43,7 +50,7 @@ class Servos(NamedTuple):
     frame: int  # number of the packet since ArduPilot started
     rate_hz: int  # steps a second that ArduPilot would like; the physics may take others
     pwm_us: tuple[int, ...]  # 16 or 32 pulses, 1000 to 2000; 0: this output does nothing
-    restarted: bool = False  # ArduPilot was started anew: begin at time zero
+    restarted: bool = False  # ArduPilot was restarted: begin at time zero
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +144,7 @@ class ArduPilotCounts:
     repeated: int = 0  # that ArduPilot sent again, for want of an answer
     restarts: int = 0
     wrong: int = 0  # datagrams that are no servo outputs
+    strangers: int = 0  # datagrams of an address that is not that of the autopilot
 
 
 class ArduPilotPhysics:
@@ -147,12 +155,15 @@ class ArduPilotPhysics:
         counts: of what came.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = PORT):
+    def __init__(self, host: str = "127.0.0.1", port: int = PORT, peer: str = ""):
         """Listen.
 
         Args:
             host: address of this machine to listen at.
             port: 9002, and 10 more for each further instance of ArduPilot; 0: any that is free.
+            peer: numeric address of the machine of ArduPilot; packets of others are not taken.
+                Without it the first sender is bound, and one of another machine stays bound to its
+                port until this end is closed.
 
         Raises:
             BridgeClosed: the port cannot be had.
@@ -171,6 +182,7 @@ class ArduPilotPhysics:
         self.counts = ArduPilotCounts()
         self._last: int | None = None  # number of the packet that was handed out last
         self._peer: Address | None = None  # who sent it
+        self._declared, self._active = peer, 0.0  # time of the last packet or answer
         self._answer = b""  # to it; empty: none yet
         self._waiting: deque[tuple[bytes, Address]] = deque()
 
@@ -183,6 +195,24 @@ class ArduPilotPhysics:
     def close(self) -> None:
         """Stop listening. May be repeated."""
         self._socket.close()
+
+    def admits(self, sender: Address) -> bool:
+        """Whether datagrams of this address are looked at.
+
+        The bound address always is. Another is if no address is bound yet, or if it is of the same
+        machine, that machine is this one (loopback) or the declared peer, and the bound address has
+        been silent for `SILENT_S` since its last packet and our last answer: a restarted ArduPilot
+        sends from another port, and repeats its packet until it is answered.
+        """
+        if sender == self._peer:
+            return True
+        if self._declared and sender[0] != self._declared:
+            return False
+        if self._peer is None:
+            return True
+        known = bool(self._declared) or ip_address(sender[0]).is_loopback
+        silent = time.monotonic() - self._active >= SILENT_S
+        return sender[0] == self._peer[0] and known and silent
 
     def receive(self, timeout_s: float) -> Servos | None:
         """The next packet that asks for a step; None: none came in that time.
@@ -215,7 +245,7 @@ class ArduPilotPhysics:
         answer = encode(state)
         # If we were slow, ArduPilot asked again meanwhile. It takes the answers one for one, so
         # each beyond the first would leave it a step behind.
-        while (arrived := self._take(0.0)) is not None:
+        while len(self._waiting) < _WAITING and (arrived := self._take(0.0)) is not None:
             self._waiting.append(arrived)
         asked = self._waiting
         self._waiting = deque(one for one in asked if not self._repeats(*one))
@@ -237,7 +267,11 @@ class ArduPilotPhysics:
         except BridgeError:
             self.counts.wrong += 1
             return None
+        if not self.admits(sender):  # the bound address was active after this was received
+            self.counts.strangers += 1
+            return None
         self.counts.packets += 1
+        self._active = time.monotonic()
         last, peer = self._last, self._peer
         if (servos.frame, sender) == (last, peer):
             self.counts.repeated += 1
@@ -255,15 +289,22 @@ class ArduPilotPhysics:
         return servos
 
     def _send(self, peer: Address) -> None:
+        self._active = time.monotonic()
         try:
             self._socket.sendto(self._answer, peer)
         except OSError as error:
             raise BridgeClosed(f"cannot answer: {error}", f"port {self.port}") from None
 
     def _take(self, timeout_s: float) -> tuple[bytes, Address] | None:
+        """The next datagram of an address that is admitted; None: none came in that time."""
+        deadline = time.monotonic() + timeout_s
         try:
-            self._socket.settimeout(timeout_s)
-            return self._socket.recvfrom(65536)
+            while True:
+                self._socket.settimeout(max(deadline - time.monotonic(), 0.0))
+                datagram, sender = self._socket.recvfrom(65536)
+                if self.admits(sender):
+                    return datagram, sender
+                self.counts.strangers += 1
         except (TimeoutError, BlockingIOError):
             return None
         except OSError as error:

@@ -9,6 +9,9 @@ of our samples, so that neither side can run ahead:
 
 While PX4 starts it takes samples and does not answer; the simulation runs on without it
 ("freewheeling") until its first answer (PX4 guide, "Lockstep Simulation").
+
+The machine that connects first is bound, unless one is declared: connections of others are closed
+and counted. Only one connection is served at a time.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ class Px4Counts:
     late: int = 0  # answers to an earlier sample than the one that a step waited for
     others: int = 0  # messages that we do not use
     bad: int = 0  # pieces of bytes that are no message, of a wrong check for example
+    strangers: int = 0  # connections of another machine, closed at once
 
 
 class Px4Simulator:
@@ -47,12 +51,13 @@ class Px4Simulator:
         counts: of what came.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = PORT):
+    def __init__(self, host: str = "127.0.0.1", port: int = PORT, peer: str = ""):
         """Listen.
 
         Args:
             host: address of this machine to listen at.
             port: 4560 and the number of PX4's instance; 0: any that is free.
+            peer: numeric address of the machine of PX4; without it that of the first connection.
 
         Raises:
             MissingPackage: pymavlink is not installed.
@@ -70,6 +75,7 @@ class Px4Simulator:
         self.port: int = self._server.getsockname()[1]
         self.counts = Px4Counts()
         self._where = f"PX4 at port {self.port}"
+        self._peer = peer
         self._line: socket.socket | None = None
         self._mav: Any = None
         self._waiting: deque[Actuators] = deque()
@@ -110,9 +116,16 @@ class Px4Simulator:
             BridgeClosed: this end was closed, or PX4 went at once.
         """
         self.hang_up()
+        deadline = time.monotonic() + timeout_s
         try:
-            self._server.settimeout(timeout_s)
-            self._line, _ = self._server.accept()
+            while self._line is None:
+                self._server.settimeout(max(deadline - time.monotonic(), 0.0))
+                line, (address, *_) = self._server.accept()
+                if address == (self._peer or address):
+                    self._line, self._peer = line, address
+                else:
+                    self.counts.strangers += 1
+                    line.close()
         except (TimeoutError, BlockingIOError):
             raise BridgeTimeout(
                 f"PX4 did not connect within {timeout_s:g} s", self._where, "start PX4's SITL"
