@@ -1,11 +1,17 @@
 """Who looks on sees what matters, however much else happens."""
 
+import os
+import re
+
+import pytest
+
 from robins.bench.live.feed import check, latest
 from robins.bench.rigs.satellite.view import signals
 from robins.bench.run import watching
 from robins.bench.run.spans import FaultSpans
 from robins.bench.run.watching import Looking
-from robins.bench.status import Status
+from robins.bench.status import Status, running
+from robins.errors import RobinsError
 from robins.systems.satellite.parameters import AttitudeLoop
 
 
@@ -91,3 +97,77 @@ def test_true_and_estimated_attitude_are_signals_of_the_page():
     attitudes = [s for s in found if s.role == "attitude"]
     assert [s.of for s in attitudes] == ["true"] * 4 + ["estimated"] * 4
     assert found[:8] == attitudes  # as `sample` has them first
+
+
+# --------------------------------------------------------------------------------- the status file
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The folder of the status files, which is not there yet."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / f"robins-bench-{os.getuid()}"
+
+
+def test_a_report_is_a_file_of_its_own_that_nobody_else_reads(place):
+    with Status() as status:
+        status.tell({"state": "running"})
+        (path,) = place.iterdir()
+        assert (place.stat().st_mode & 0o777, path.stat().st_mode & 0o777) == (0o700, 0o600)
+        (place / "2147483647.json").write_text("{}")  # of a bench that was killed
+        (place / f"{os.getpid()}.01234567.new").write_text("half")  # is being written
+        (place / "notes.txt").write_text("not ours")
+        (one,) = running()
+        assert (one["state"], one["pid"], status.refused) == ("running", os.getpid(), "")
+        left = {f"{os.getpid()}.json", f"{os.getpid()}.01234567.new", "notes.txt"}
+        assert {path.name for path in place.iterdir()} == left
+    assert running() == []
+
+
+def _linked(place, goal):
+    goal.mkdir(mode=0o700)
+    place.symlink_to(goal)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (_linked, "is a link, which is not followed"),
+        (lambda place, goal: place.mkdir(mode=0o755), r"is open to others \(mode 755\); chmod 700"),
+        (lambda place, goal: place.write_text(""), "cannot be used: "),
+    ],
+)
+def test_a_folder_of_others_is_refused_and_the_run_goes_on_without(place, tmp_path, spoil, why):
+    goal = tmp_path / "goal"
+    spoil(place, goal)
+    with Status() as status:
+        status.tell({"state": "running"})
+        assert re.search(f"does not show this run: {place}: .* {why}", status.refused)
+    with pytest.raises(RobinsError, match=why) as caught:
+        running()
+    assert not caught.value.bad_input
+    assert not goal.exists() or list(goal.iterdir()) == []
+    assert place.is_file() or list(place.iterdir()) == []
+
+
+def test_a_folder_of_another_user_is_refused(place, monkeypatch):
+    mine = os.getuid()
+    place.with_name(f"robins-bench-{mine + 1}").mkdir(mode=0o700)
+    monkeypatch.setattr(os, "getuid", lambda: mine + 1)
+    with pytest.raises(RobinsError, match=f"belongs to the user with number {mine}"):
+        running()
+
+
+def test_links_among_the_reports_lead_nowhere(place, tmp_path):
+    target = tmp_path / "precious"
+    target.write_text("kept")
+    place.mkdir(mode=0o700)
+    (place / f"{os.getpid()}.json").symlink_to(target)
+    (place / f"{os.getpid()}.new").symlink_to(target)
+    with Status() as status:
+        assert running() == []
+        (place / f"{os.getpid()}.json").symlink_to(target)
+        status.tell({"state": "running"})
+        assert target.read_text() == "kept"
+        assert running()[0]["state"] == "running"
+    assert target.read_text() == "kept"

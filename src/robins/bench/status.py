@@ -5,36 +5,88 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
+import secrets
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from robins.errors import RobinsError
+
 EACH_S = 1.0
 _OLD_S = 10.0  # after which a bench that says nothing hangs
+_LARGEST = 1 << 20  # characters of a report
+_REPORT = re.compile(r"[1-9][0-9]{0,9}\.(json|[0-9a-f]{8}\.new)")
 STARTING = "starting"  # its state until the first step: it may compile for long, and says nothing
 
 
-def _folder() -> Path:
-    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
-    return Path(base) / f"robins-bench-{os.getuid()}"
+def _refused(what: str, path: Path, fix: str) -> RobinsError:
+    error = RobinsError(f"reports of benches are kept here, and it {what}", path, fix)
+    error.bad_input = False
+    return error
+
+
+@contextlib.contextmanager
+def _folder() -> Iterator[int]:
+    """Open the folder of this user's status files, made if need be.
+
+    Its path can be predicted, so somebody else may have made it, with links in it. It is opened
+    without following a link and checked by its descriptor; files are named relative to that.
+
+    Yields:
+        The descriptor.
+
+    Raises:
+        RobinsError: it belongs to somebody else, others may use it, or it is a link or no folder.
+    """
+    base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
+    base = base if base.is_dir() else Path(tempfile.gettempdir())
+    path = base / f"robins-bench-{os.getuid()}"
+    fix = "remove it, or set XDG_RUNTIME_DIR to a folder of your own"
+    try:
+        with contextlib.suppress(OSError):
+            path.mkdir(mode=0o700)
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError as error:
+        linked = "is a link, which is not followed" if path.is_symlink() else ""
+        raise _refused(linked or f"cannot be used: {error.strerror or error}", path, fix) from None
+    try:
+        about = os.fstat(folder)
+        if about.st_uid != os.getuid():
+            raise _refused(f"belongs to the user with number {about.st_uid}", path, fix)
+        if about.st_mode & 0o077:
+            mode = f"is open to others (mode {about.st_mode & 0o777:o})"
+            raise _refused(mode, path, f"chmod 700 {path}")
+        yield folder
+    finally:
+        os.close(folder)
 
 
 class Status:
-    """What this bench tells; a context that takes it away at the end."""
+    """Report of this bench to `robins bench status`; a context that removes it at the end.
+
+    Attributes:
+        refused: why there is no report; empty where there is one.
+    """
 
     def __init__(self) -> None:
-        self._path = _folder() / f"{os.getpid()}.json"
+        self.refused = ""
+        self._name = f"{os.getpid()}.json"
         self._told = 0.0
 
     def __enter__(self) -> Status:
-        self._path.parent.mkdir(mode=0o700, exist_ok=True)
+        try:
+            with _folder():
+                pass
+        except RobinsError as error:
+            self.refused = f"`robins bench status` does not show this run: {error}"
         return self
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):
-            self._path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError, RobinsError), _folder() as folder:
+            os.unlink(self._name, dir_fd=folder)
 
     @property
     def due(self) -> bool:
@@ -42,28 +94,53 @@ class Status:
         return time.monotonic() - self._told >= EACH_S
 
     def tell(self, said: Mapping[str, Any]) -> None:
-        """Say how it is; a full disk is no reason to stop a run."""
+        """Report the state; neither a full disk nor a folder of somebody else stops a run."""
         self._told = time.monotonic()
-        new = self._path.with_suffix(".new")
-        with contextlib.suppress(OSError):
-            new.write_text(json.dumps({**said, "pid": os.getpid(), "at": time.time()}), "utf-8")
-            new.replace(self._path)
+        content = json.dumps({**said, "pid": os.getpid(), "at": time.time()})
+        new = f"{self._name}.{secrets.token_hex(4)}.new"
+        with contextlib.suppress(OSError, RobinsError), _folder() as folder:
+            way = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+            try:
+                with open(os.open(new, way, 0o600, dir_fd=folder), "w", encoding="utf-8") as file:
+                    file.write(content)
+                os.rename(new, self._name, src_dir_fd=folder, dst_dir_fd=folder)
+            except OSError:
+                os.unlink(new, dir_fd=folder)
+                raise
 
 
 def running() -> list[dict[str, Any]]:
-    """What the benches of this user say, the oldest first; of those that are gone, nothing."""
+    """Reports of the benches of this user, the oldest first; those of dead ones are removed.
+
+    Raises:
+        RobinsError: the folder of the reports belongs to somebody else.
+    """
     found = []
-    for path in sorted(_folder().glob("*.json")):
-        try:
-            said = json.loads(path.read_text("utf-8"))
-            os.kill(said["pid"], 0)
-        except (ValueError, KeyError, OSError):  # gone, or was killed before it could tidy up
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
-            continue
-        said["silent_s"] = round(max(time.time() - said["at"], 0.0), 1)
-        found.append(said)
+    with _folder() as folder:
+        for name in filter(_REPORT.fullmatch, os.listdir(folder)):
+            pid, _, kind = name.partition(".")
+            try:
+                os.kill(int(pid), 0)
+                if kind == "json":
+                    found.append(_read(folder, name))
+            except (ValueError, KeyError, TypeError, OverflowError, RecursionError, OSError):
+                with contextlib.suppress(OSError):  # gone, or was killed before it could tidy up
+                    os.unlink(name, dir_fd=folder)
     return sorted(found, key=lambda said: said["pid"])
+
+
+def _read(folder: int, name: str) -> dict[str, Any]:
+    """Report of a bench.
+
+    Raises:
+        OSError, ValueError, KeyError, TypeError, RecursionError: it is none.
+    """
+    way = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with open(os.open(name, way, dir_fd=folder), encoding="utf-8") as file:
+        said = json.loads(file.read(_LARGEST))
+    said["pid"] = int(name.partition(".")[0])
+    said["silent_s"] = round(max(time.time() - said["at"], 0.0), 1)
+    return said
 
 
 def table(benches: list[dict[str, Any]]) -> str:

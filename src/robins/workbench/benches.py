@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,7 +68,8 @@ def bench_up(
         raise InputError("--paused waits for the page's Start", fix="give --live too.")
     flight = flight_of(scenario, settings, options)
     file = None if record is None else Path(record)
-    with _onlooker(flight, live, host, port, opened) as watch:
+    status = Status()
+    with _onlooker(flight, status, live, host, port, opened) as watch:
         session = Session(flight, file, watch, part(progress, 0.0, 0.95), paused)
         try:
             ran = session.run()
@@ -84,7 +86,8 @@ def bench_up(
     ):
         progress(0.97, "the same inside one program")
         inside = rig.inside(ran.kit, ran.steps, *([ran.said] if rig.console else []))
-    return outcome(flight, ran, inside, file)
+    found = outcome(flight, ran, inside, file)
+    return replace(found, warnings=[*found.warnings, *filter(None, [status.refused])])
 
 
 def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]) -> Flight:
@@ -100,11 +103,16 @@ def flight_of(scenario: str, settings: Sequence[str], options: Mapping[str, Any]
 
 @contextlib.contextmanager
 def _onlooker(
-    flight: Flight, live: bool, host: str, port: int, opened: Callable[[str], None]
+    flight: Flight,
+    status: Status,
+    live: bool,
+    host: str,
+    port: int,
+    opened: Callable[[str], None],
 ) -> Iterator[Looking]:
     """The status file, and the page if it is wanted."""
     with contextlib.ExitStack() as stack:
-        status = stack.enter_context(Status())
+        stack.enter_context(status)
         status.tell(starting(flight))
         page = None
         if live:
