@@ -1,9 +1,11 @@
 """Parts that say what they must not, among honest ones: all on threads, over pseudo-terminals."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
+from clockwork import CLOCKWORK, adder, inside
 from stations import Threads, kit, on_threads
 
 from robins.bench.parts.station import Part, Station
@@ -107,6 +109,93 @@ def test_a_part_that_counts_anew_is_heard(fly):
     once = Event(0, "died", "'adm' was killed", {"time_s": 0.0})
     told = figures(honest._replace(events=[once, *often]))["events"]
     assert (len(told), told[0]["kind"]) == (200, "died")
+
+
+CLOCK = changed(read(CLOCKWORK), {"seconds": 0.9})
+STEP_NS, STEPS, ODD = 100_000_000, 9, 5
+
+
+class Untimely(Station):
+    """Says a number more in a step, after one of its messages: as sound, as new, of another time.
+
+    In the step before it leaves its own out, if it is to.
+    """
+
+    def __init__(self, of: Part, wire: Wire, after: str, later_ns: int, leaves_out: bool = False):
+        super().__init__(of, wire)
+        self._after, self._later_ns, self._leaves_out = after, later_ns, leaves_out
+
+    def _frame(self, name: str, payload: bytes, time_ns: int) -> bytes:
+        step = self._done[0]
+        if name == "count" and self._leaves_out and step == ODD - 1:
+            return b""
+        frame = super()._frame(name, payload, time_ns)
+        if step == ODD and name == self._after:
+            lie = self._wire.encode("count", {"n": 777.0})
+            frame += super()._frame("count", lie, time_ns + self._later_ns)
+        return frame
+
+
+def clockwork(monkeypatch, lag: int = 0, counter=Station, **more):
+    """A run of the clockwork whose counter is odd, its health, and what is counted in its lines."""
+    build = {**CLOCK.rig.build, "adder": lambda of: adder(of)._replace(takes={"count": lag})}
+    of = CLOCK._replace(rig=replace(CLOCK.rig, name=f"clockwork {lag}", build=build))
+    on_threads(monkeypatch, counter=partial(counter, **more) if more else counter)
+    ran = Session(of).run()
+    assert (ran.failure, ran.steps) == ("", STEPS)
+    told = outcome.figures(of, ran, outcome.judged(of, ran), None)["counts"]
+    told = {name.removesuffix("_frames"): n for name, n in told.items() if n and name != "frames"}
+    return ran, told
+
+
+@pytest.mark.parametrize(
+    ("lag", "after", "steps", "counted"),
+    [
+        (0, "count", 0, "repeated"),
+        (1, "done", 0, "repeated"),
+        (0, "count", -1, "repeated"),
+        (1, "count", -1, "repeated"),
+        (0, "count", -ODD, "repeated"),
+        (1, "count", -ODD - 1, "late"),  # before the first step
+        (1, "count", -0.5, "late"),  # between two
+        (1, "count", 1, "early"),
+        (0, "count", 1e10, "early"),
+    ],
+)
+def test_neither_past_nor_future_can_be_written(monkeypatch, lag, after, steps, counted):
+    later_ns = round(steps * STEP_NS)
+    ran, told = clockwork(monkeypatch, lag, Untimely, after=after, later_ns=later_ns)
+    assert told == {counted: 1}
+    wanted = inside(None, STEPS)
+    np.testing.assert_array_equal(ran.flown["count.n"], wanted["count.n"])
+    wanted = np.r_[np.zeros(lag), wanted["sum.total"][: STEPS - lag]]
+    np.testing.assert_array_equal(ran.flown["sum.total"], wanted)
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_a_step_is_filled_in_later_only_where_a_part_takes_its_message_so(monkeypatch, lag):
+    late = {"after": "count", "later_ns": -STEP_NS, "leaves_out": True}
+    ran, told = clockwork(monkeypatch, lag, Untimely, **late)
+    assert told == {"late": 1}
+    n = np.arange(float(STEPS))
+    n[ODD - 1] = 777.0 if lag else np.nan
+    np.testing.assert_array_equal(ran.flown["count.n"], n)
+    n[ODD - 1] = 0.0  # the adder was ticked before it came
+    sums = np.cumsum(n)[: STEPS - lag]
+    np.testing.assert_array_equal(ran.flown["sum.total"], np.r_[np.zeros(lag), sums])
+
+
+@pytest.mark.parametrize(("ahead", "lost", "jumps"), [(7, 7, 0), (10**9, 0, 1), (2**31 + 5, 0, 1)])
+def test_a_jump_of_a_number_is_no_loss_of_frames(monkeypatch, ahead, lost, jumps):
+    class Jumps(Station):
+        def _frame(self, name, payload, time_ns):
+            if name == "count" and self._done[0] == ODD:
+                self._sent += ahead
+            return super()._frame(name, payload, time_ns)
+
+    ran, told = clockwork(monkeypatch, 0, Jumps)
+    assert (told.pop("lost", 0), told.pop("sequence_jumps", 0), told) == (lost, jumps, {})
+    np.testing.assert_array_equal(ran.flown["count.n"], np.arange(float(STEPS)))
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from robins.bench.wire.schema import BARE, Wire
 
 Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
+_REMEMBERED = 64  # steps, whose messages are known if they come again
 _GLANCE_S = 0.05  # how often the world beside the wire is looked at while nothing comes
 _CLOCK_NS = time.monotonic_ns
 
@@ -42,6 +43,10 @@ class Wiring(NamedTuple):
     def takers(self, message: str) -> tuple[str, ...]:
         """Parts that take a message."""
         return tuple(p for p, taken in self.takes.items() if message in taken)
+
+    def lag(self, message: str) -> int:
+        """Steps for which a part may wait for a message."""
+        return max((taken.get(message, 0) for taken in self.takes.values()), default=0)
 
 
 class Ticked(NamedTuple):
@@ -101,9 +106,10 @@ class Broker:
             for sent in (*wiring.sends.values(), wiring.console)
             for name in sent
         }
+        self._lags = {name: wiring.lag(name) for p in links for name in wiring.sends[p]}
         self._sends = {p: frozenset(wiring.sends[p]) for p in links}
         self._kept = dict(keep or {})
-        self._routed: set[tuple[str, int]] = set()
+        self._routed: dict[int, set[str]] = {}  # messages by their time, of the last steps
         self._ticked: dict[str, Ticked] = {}
         self._done: set[str] = set()
         self._by_fd = {link.fd: link for link in links.values()}
@@ -172,7 +178,10 @@ class Broker:
             LinkLost: the far end of a port is gone.
         """
         self._step, self.time_ns = number, (number + 1) * self.step_ns
-        self._done, self._ticked, self._routed = set(self.off), {}, set()
+        self._done, self._ticked = set(self.off), {}
+        self._routed[self.time_ns] = set()
+        if len(self._routed) > _REMEMBERED:
+            del self._routed[next(iter(self._routed))]
         self._glance()
         for name, link in self.links.items():
             if name in self.off:
@@ -320,14 +329,27 @@ class Broker:
             elif message == "done":
                 self._finished(name, frame)
             elif message not in self._sends[name]:
-                self.links[name].health.strange += 1
-            elif frame.header.time_ns == self.time_ns and name in self._done:
-                self.links[name].health.late += 1  # those who need it have computed without it
-                self._route(message, frame)
-            elif (message, frame.header.time_ns) in self._routed:
-                self.links[name].health.repeated += 1
-            else:
-                self._route(message, frame)
+                self.links[name].count("strange")
+            elif (age := self._age(name, message, frame.header.time_ns)) is not None:
+                self._route(message, frame, age)
+
+    def _age(self, name: str, message: str, at_ns: int) -> int | None:
+        """Steps since that of a frame, counted if it is not in its time; None: of no use.
+
+        The past stays as it was: a frame of a step that is over goes on only where a part takes its
+        message with such a lag, and only the first one of its message for a step does.
+        """
+        link, (age, beside) = self.links[name], divmod(self.time_ns - at_ns, self.step_ns)
+        if age < 0:
+            link.count("early")
+            return None
+        if message in self._routed.get(at_ns, ()):
+            link.count("repeated")
+            return None
+        if age or beside or name in self._done or self._step < 0:
+            link.count("late")  # whoever takes it without a lag has computed without it
+        usable = not beside and age <= min(self._lags[message], self._step)
+        return age if usable else None
 
     def _finished(self, name: str, frame: Frame) -> None:
         said = BARE.decode("done", frame.payload)
@@ -339,12 +361,12 @@ class Broker:
         self._tell(name, self._step, at, _CLOCK_NS(), said["compute"])
         self._end(name)
 
-    def _route(self, message: str, frame: Frame) -> None:
+    def _route(self, message: str, frame: Frame, age: int) -> None:
         at, payload = frame.header.time_ns, frame.payload
-        self._routed.add((message, at))
+        self._routed.setdefault(at, set()).add(message)
         self._observe(message, at, payload)
         for taker in self._takers[message]:
-            if taker in self.off:
+            if taker in self.off or age > self.wiring.takes[taker][message]:
                 continue
             link = self.links[taker]
             self._put(link, message, payload, at)

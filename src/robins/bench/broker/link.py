@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from robins.bench.broker.injector import Injector, Piece
@@ -48,13 +48,15 @@ Refuser = Callable[[str, str, Unsound], None]
 
 @dataclass
 class Health:
-    """What a link has carried so far, towards the bench."""
+    """What a link has carried so far, towards the bench; `Link.count` alone writes it."""
 
     frames: int = 0  # data frames, sound and new
     wrong: int = 0  # runs of bytes that are no frame
     lost: int = 0  # sequence numbers that never came
-    repeated: int = 0
+    jumps: int = 0  # of sequence numbers, further than frames can have been lost
+    repeated: int = 0  # by its number, or a second one of its message for a step
     late: int = 0  # out of order, or of a step that was over
+    early: int = 0  # of a step that has not begun
     strange: int = 0  # of another run, or a message that this part has not to send
     refused: int = 0  # sound frames of a length or with numbers that their message cannot have
     bytes_in: int = 0
@@ -108,7 +110,8 @@ class Link:
         self._run, self._sent = run, 0
         self._sequence = Sequence()
         self._receiver, self._spoilt = Receiver(), Receiver()
-        self._before = replace(self.health)
+        self._counted: dict[str, int] = {}  # by those three, and in the health
+        self._most_lost = 0  # frames that the part can have sent since the last one that came
 
     # ------------------------------------------------------------------------------------- to
 
@@ -128,6 +131,8 @@ class Link:
             number, self._sent = 0, max(self._sent, 1)
         else:
             number, self._sent = self._sent, (self._sent + 1) % 2**32
+        if name == "tick":
+            self._most_lost += len(self._wire.data) + 1
         header = Header(self._wire.numbers[name], self._run, number, time_ns)
         frame = Frame(header, payload)
         raw = encode_frame(header, payload)
@@ -168,7 +173,7 @@ class Link:
                 written = os.write(self.fd, self._ready)
             except BlockingIOError:
                 return  # the port is full; what is left goes first next time
-            self.health.bytes_out += written
+            self.count("bytes_out", written)
             del self._ready[:written]
 
     @property
@@ -205,14 +210,14 @@ class Link:
         if self._lines is not None:
             self._lines[1].send(data, wall_ns)
             data = self._lines[1].take(wall_ns)
-        self.health.bytes_in += len(data)
+        self.count("bytes_in", len(data))
         found: list[tuple[str, Frame]] = []
         for frame in self._receiver.feed(data):
             name = self._wire.names.get(frame.header.type)
             if frame.header.type < FIRST_DATA:
                 self._control(name, frame, found, now_ns)
             elif frame.header.run != self._run:
-                self.health.strange += 1
+                self.count("strange")
             else:
                 raw = encode_frame(*frame)
                 self._watch(self.name, "from", raw, frame.header.time_ns)
@@ -227,13 +232,18 @@ class Link:
         """Frames from the part that a fault held back until now."""
         found: list[tuple[str, Frame]] = []
         self._arrive(self._injector.release(self.name, "from", now_ns), found, now_ns)
+        self._count()
         return found
+
+    def count(self, what: str, more: int = 1) -> None:
+        """Add to a count of the health."""
+        setattr(self.health, what, getattr(self.health, what) + more)
 
     def _control(
         self, name: str | None, frame: Frame, found: list[tuple[str, Frame]], now_ns: int
     ) -> None:
         if name != "hello" and (name != "done" or frame.header.run != self._run):
-            self.health.strange += 1
+            self.count("strange")
         elif not self._bars(name, frame, now_ns):
             self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
             if name == "done":
@@ -246,14 +256,16 @@ class Link:
             return False
         if name != "hello":  # whose number is not of this run
             self._counts(frame, now_ns)
-        self.health.refused += 1
+        self.count("refused")
         self._refuse(self.name, name, why)
         return True
 
     def _counts(self, frame: Frame, now_ns: int) -> bool:
         """Count the number of a frame; whether it is new and in its order."""
-        here = frame.header.time_ns == now_ns
-        return self._sequence.take(frame.header.sequence, now_ns if here else None)
+        here = now_ns if frame.header.time_ns == now_ns else None
+        most = self._sequence.REMEMBERED + self._most_lost
+        self._most_lost = 0
+        return self._sequence.take(frame.header.sequence, here, most)
 
     def _arrive(self, pieces: list[Piece], found: list[tuple[str, Frame]], now_ns: int) -> None:
         for piece in pieces:
@@ -264,16 +276,16 @@ class Link:
     def _use(self, frame: Frame, found: list[tuple[str, Frame]], now_ns: int) -> None:
         name = self._wire.names.get(frame.header.type)
         if name is None:
-            self.health.strange += 1
+            self.count("strange")
         elif self._counts(frame, now_ns):
-            self.health.frames += 1
+            self.count("frames")
             self.health.heard_ns = now_ns
             found.append((name, frame))
 
     def _count(self) -> None:
-        health, before, sequence = self.health, self._before, self._sequence
-        wrong = self._receiver.counts.wrong + self._spoilt.counts.wrong
-        health.wrong = before.wrong + wrong
-        health.lost = before.lost + sequence.lost
-        health.repeated = before.repeated + sequence.repeated
-        health.late = before.late + sequence.late
+        sequence = self._sequence
+        counted = {name: getattr(sequence, name) for name in ("lost", "jumps", "repeated", "late")}
+        counted["wrong"] = self._receiver.counts.wrong + self._spoilt.counts.wrong
+        for what, so_far in counted.items():
+            self.count(what, so_far - self._counted.get(what, 0))
+        self._counted = counted

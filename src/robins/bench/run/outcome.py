@@ -64,6 +64,8 @@ def figures(
             "lost_frames": sum(h.lost for h in health),
             "repeated_frames": sum(h.repeated for h in health),
             "late_frames": sum(h.late for h in health),
+            "early_frames": sum(h.early for h in health),
+            "sequence_jumps": sum(h.jumps for h in health),
             "refused_frames": sum(h.refused for h in health),
             **said.counts,
             "silent_parts": sum(ran.silent.values()),

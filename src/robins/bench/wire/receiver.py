@@ -87,7 +87,8 @@ class Sequence:
         lost: numbers that have not come and are not expected any more.
         repeated: frames whose number had come before.
         late: frames that came after one of a higher number; they are not lost any more.
-        jumps: times that the sender began to count anew.
+        jumps: times that the sender began to count anew, or went on further than frames can have
+            been lost.
     """
 
     REMEMBERED = 1024
@@ -99,7 +100,7 @@ class Sequence:
         self._now_ns: int | None = None
         self._of_now: set[int] = set()
 
-    def take(self, number: int, now_ns: int | None = None) -> bool:
+    def take(self, number: int, now_ns: int | None = None, most: int = 2**31) -> bool:
         """Count a frame; whether it is new and in its order, and so may be used.
 
         Args:
@@ -107,12 +108,13 @@ class Sequence:
             now_ns: the time of the run, of a frame that is of this time. None: it may be an old
                 one. A frame of now whose number is old, but did not come now, is no repeated one:
                 its sender counts anew.
+            most: frames that can have been lost before it; a number further ahead is a jump.
         """
         if self._next is None:
             self._next = number
         again = now_ns is None or self._came(number, now_ns)
         ahead = (number - self._next) % 2**32
-        if ahead < 2**31:
+        if ahead <= min(most, 2**31 - 1):
             for k in range(min(ahead, self.REMEMBERED)):
                 self._missing[(number - 1 - k) % 2**32] = None
             while len(self._missing) > self.REMEMBERED:
@@ -124,7 +126,7 @@ class Sequence:
             del self._missing[number]
             self.lost -= 1
             self.late += 1
-        elif again:
+        elif again and ahead >= 2**31:
             self.repeated += 1
         else:
             self.jumps += 1
