@@ -5,11 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
+from jax.extend.core import primitives as published
 from jax.extend.random import threefry_2x32
 from machines import in_c, same_in_c
 
 import robins.program.primitives  # noqa: F401
 from robins.program import ProgramError, trace
+from robins.program.refused import REFUSED
 from robins.program.trace import RULES
 
 RNG = np.random.default_rng(0)
@@ -147,6 +150,7 @@ EXACT = {
             jnp.concatenate([a, a + 1], axis=1),
             jnp.stack([a, -a], axis=1),
             jnp.split(w, 7, axis=1),
+            jnp.unstack(w, axis=1),
             jnp.broadcast_to(a, (2, 3, 4)),
             jnp.moveaxis(w, 0, 2),
             jnp.arange(5),
@@ -165,6 +169,7 @@ EXACT = {
             a[i, 1:],
             a.at[i].set(0.0),
             a.at[i, 1].add(1.0),
+            a.at[i, 2].subtract(1.0),
             lax.dynamic_slice(a, (i, i), (2, 2)),
         ),
         A,
@@ -250,6 +255,7 @@ EXACT = {
             jax.checkpoint(lambda x: x * 2.0)(a),
             jax.nn.relu(a),
             lax.stop_gradient(a),
+            checkpoint_name(a, "a"),
             lax.optimization_barrier(a),
             lax.reduce_precision(a, 11, 52),
             lax.platform_dependent(a, cpu=lambda x: x + 5.0, default=lambda x: x),
@@ -403,6 +409,13 @@ def test_every_rule_has_a_case():
     assert set(RULES) - seen - ELSEWHERE == set()
 
 
+def test_every_primitive_of_jax_has_a_rule_or_a_reason():
+    modules = published, lax, lax.linalg
+    names = {getattr(m, key).name for m in modules for key in dir(m) if key.endswith("_p")}
+    assert names - set(RULES) - set(REFUSED) == set()
+    assert set(REFUSED) & set(RULES) == set()
+
+
 def test_vectors_of_a_symmetric_matrix_are_its_vectors():
     # Their signs are free, so what they promise is checked: A v = w v, v'v = 1, in order.
     for unroll in (None, 0):
@@ -423,7 +436,7 @@ def test_a_primitive_without_a_rule_is_named_with_its_line():
     def asks(x):
         return jnp.linalg.svd(x[None])[1]  # this line
 
-    with pytest.raises(ProgramError, match=r"test_primitives.py:\d+: .*'svd'") as caught:
+    with pytest.raises(ProgramError, match=r"test_primitives.py:\d+: .*'svd'.*: there is no ") as caught:
         trace(asks, V)
     line = int(caught.value.where.rpartition(":")[2])
     with open(__file__) as text:

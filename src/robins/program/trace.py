@@ -18,11 +18,14 @@ from robins import _float64  # noqa: F401
 from robins.program.kinds import kind_of, numbers_of
 from robins.program.nodes import Graph, Node
 from robins.program.refusal import ProgramError
+from robins.program.refused import REFUSED
 from robins.program.roll import FEWEST
 
 # Scalar operations up to which a loop or a factorisation is written out: all of a filter of nine
 # states, not the thirty samples of an IMU between two fixes.
 UNROLL = 10_000
+
+UNKNOWN = "this version of robins does not know it"
 
 # What may leave the range of its type, with whole numbers of fewer than 64 bits.
 OVERFLOWING = {
@@ -170,7 +173,7 @@ class Walk:
         name = equation.primitive.name
         if name not in RULES:
             raise ProgramError(
-                f"'{name}' has no place in a program of scalars",
+                f"'{name}' has no place in a program of scalars: {REFUSED.get(name, UNKNOWN)}",
                 line_of(equation),
                 "write it with other operations, or run this filter by JAX",
             )

@@ -140,6 +140,7 @@ def _bits(walk: Walk, equation: Any, a: Nodes) -> Nodes:
 
 
 @rule("stop_gradient", "copy", "copy_p", "reduce_precision", "device_put", "optimization_barrier")
+@rule("name")
 def _as_it_is(walk: Walk, equation: Any, *arrays: Nodes) -> list[Nodes]:
     if equation.primitive.name == "reduce_precision" and equation.params["mantissa_bits"] < 52:
         raise ProgramError("numbers are rounded to fewer bits", "", "leave them in float64")

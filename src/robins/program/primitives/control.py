@@ -185,6 +185,7 @@ def _while(walk: Walk, equation: Any, *args: Nodes) -> list[Nodes]:
 FREE = {
     *("broadcast_in_dim", "reshape", "transpose", "squeeze", "slice", "concatenate", "stack"),
     *("split", "rev", "iota", "pad", "tile", "stop_gradient", "expand_dims", "gather", "copy"),
+    *("unstack", "name"),
 }
 
 

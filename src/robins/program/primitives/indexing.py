@@ -146,6 +146,7 @@ def _filling(walk: Walk, p: Any, dtype: Any) -> Node:
 JOINED = {
     "scatter": None,
     "scatter-add": "add",
+    "scatter-sub": "sub",
     "scatter-mul": "mul",
     "scatter-min": "min",
     "scatter-max": "max",

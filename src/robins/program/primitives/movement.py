@@ -56,6 +56,11 @@ def _stack(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
     return np.stack(arrays, axis=equation.params["axis"])
 
 
+@rule("unstack")
+def _unstack(walk: Walk, equation: Any, a: Nodes) -> list[Nodes]:
+    return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
+
+
 @rule("tile")
 def _tile(walk: Walk, equation: Any, a: Nodes) -> Nodes:
     return np.tile(a, equation.params["reps"])
