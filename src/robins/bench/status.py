@@ -22,6 +22,9 @@ _REPORT = re.compile(r"[1-9][0-9]{0,9}\.(json|[0-9a-f]{8}\.new)")
 STARTING = "starting"  # its state until the first step: it may compile for long, and says nothing
 
 
+Report = dict[str, Any]  # what a bench says of itself, by name
+
+
 def _refused(what: str, path: Path, fix: str) -> RobinsError:
     error = RobinsError(f"reports of benches are kept here, and it {what}", path, fix)
     error.bad_input = False
@@ -109,7 +112,7 @@ class Status:
                 raise
 
 
-def running() -> list[dict[str, Any]]:
+def running() -> list[Report]:
     """Reports of the benches of this user, the oldest first; those of dead ones are removed.
 
     Raises:
@@ -129,7 +132,7 @@ def running() -> list[dict[str, Any]]:
     return sorted(found, key=lambda said: said["pid"])
 
 
-def _read(folder: int, name: str) -> dict[str, Any]:
+def _read(folder: int, name: str) -> Report:
     """Report of a bench.
 
     Raises:
@@ -143,7 +146,7 @@ def _read(folder: int, name: str) -> dict[str, Any]:
     return said
 
 
-def table(benches: list[dict[str, Any]]) -> str:
+def table(benches: list[Report]) -> str:
     """The same for people."""
     if not benches:
         return "No bench runs.\n  robins bench up satellite/s1   starts one"

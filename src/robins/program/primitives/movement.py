@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from robins.program.trace import Nodes, Walk, rule
 
@@ -57,7 +58,7 @@ def _stack(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
 
 
 @rule("unstack")
-def _unstack(walk: Walk, equation: Any, a: Nodes) -> list[Nodes]:
+def _unstack(walk: Walk, equation: JaxprEqn, a: Nodes) -> list[Nodes]:
     return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
 
 
