@@ -18,9 +18,10 @@ from mcap.writer import Writer
 
 from robins.bench import wire
 from robins.bench.recording import Entry, Event, Recorder, RecordingError, read_record
-from robins.bench.recording.layout import CHUNK
+from robins.bench.recording.layout import CHUNK, check_of
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header
+from robins.bench.wire.frames import VERSION
 
 HEADER = {"scenario": "title = 'é'\n", "seeds": [1, 2], "versions": {"robins": "0.1"}}
 MS = 10**6
@@ -434,6 +435,18 @@ def test_files_that_are_no_records(tmp_path, content, words):
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=rf"a\.mcap'.*{words}"):
+        read_record(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [("[" * 5000, "is damaged: RecursionError"), ("[1]", "the header of the run is no table")],
+)
+def test_a_header_of_others_whose_check_fits(tmp_path, header, words):
+    path, number = tmp_path / "a.mcap", str(VERSION)
+    about = {"wire": number, "header": header, "check": check_of(number + header)}
+    foreign(path, "robins-bench", about)
+    with pytest.raises(RecordingError, match=words):
         read_record(path)
 
 

@@ -1,16 +1,22 @@
 """Objects that are put once: whole or not at all, by several writers, on a full disk, damaged."""
 
 import errno
+import importlib.util
+import json
 import os
 import subprocess
 import sys
 import urllib.request
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from robins import foreign
+from robins.campaign import shards
 from robins.campaign import store as stores
 from robins.campaign.shards import Damaged, digest, pack, tables, unpack
 from robins.campaign.statistics import Statistics
@@ -150,6 +156,69 @@ def test_a_flipped_bit_or_a_cut_is_seen(part):
         return
     # A bit of the archive that says nothing of the numbers, such as a date, may be flipped unseen.
     assert digest({"kf": read}) == digest({"kf": statistics(0)})
+
+
+def test_a_bit_of_the_flags_of_an_archive_is_damage():
+    """The bit "encrypted" made `zipfile` raise a RuntimeError."""
+    content = pack({"filter": "kf"}, statistics(0))
+    for magic, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8), (b"PK\x01\x02", 10)):
+        for bit in range(8):
+            spoilt = bytearray(content)
+            spoilt[content.index(magic) + at] ^= 1 << bit
+            try:
+                unpack(bytes(spoilt), Statistics(()))
+            except Damaged:
+                continue
+            assert (magic, bit) != (b"PK\x01\x02", 0)
+
+
+def test_sizes_that_an_archive_declares_are_not_believed(monkeypatch):
+    file = BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        np.save(packed := BytesIO(), np.zeros(3 << 17))
+        archive.writestr("sum x.npy", packed.getvalue())
+    monkeypatch.setattr(foreign, "FREE", 1 << 20)
+    with pytest.raises(Damaged, match="'sum x' it would take 3145856 bytes"):
+        unpack(file.getvalue(), Statistics(()))
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**15, 3)}
+    for name, fill in (("sum x.npy", bytes(64)), ("sum x.npy", b"")):
+        np.lib.format.write_array_header_1_0(lie := BytesIO(), header)
+        with zipfile.ZipFile(file := BytesIO(), "w") as archive:
+            archive.writestr(name, lie.getvalue() + fill)
+        with pytest.raises(Damaged, match="where its header declares 24000000000000000"):
+            unpack(file.getvalue(), Statistics(()))
+
+
+def test_shards_of_others_with_a_checksum_that_fits():
+    """Whoever can write a file can write its checksum: its parts are looked at all the same."""
+    about = {"filter": "kf"}
+    told = statistics(0)
+    told.example = {"error": np.zeros(3)}
+    content = pack(about, told)
+    with pytest.raises(Damaged, match="its record has 1 arrays, not 2"):
+        unpack(content, Statistics(()), {"error": 0, "mean": 0})
+    arrays = {"about": np.array(json.dumps({"sha256": shards._seal({}, {})}))}
+    np.savez(file := BytesIO(), **arrays)
+    with pytest.raises(Damaged, match="does not state 'runs'"):
+        unpack(file.getvalue(), Statistics(()))
+
+
+SPEC = importlib.util.spec_from_file_location(
+    "mutated_files", Path(__file__).parents[2] / "benchmarks" / "mutated_files.py"
+)
+assert SPEC is not None
+assert SPEC.loader is not None
+mutated_files = importlib.util.module_from_spec(SPEC)
+sys.modules["mutated_files"] = mutated_files
+SPEC.loader.exec_module(mutated_files)
+
+
+def test_damaged_files_of_every_kind_are_read_or_refused(tmp_path):
+    kinds = [kind for kind in mutated_files.kinds() if not kind.compiles]
+    found = mutated_files.try_all(200, 43, kinds, tmp_path)
+    assert mutated_files.wrong(found) == []
+    assert sum(of["read"] for of in found.values()) > 20
+    assert sum(of["refused"] for of in found.values()) > 100
 
 
 def test_paths_are_told(tmp_path):

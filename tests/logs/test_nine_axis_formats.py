@@ -116,7 +116,7 @@ def test_quaternions_that_are_none(tmp_path):
         ({"imu_gyr": ARRAYS["imu_gyr"][:-1]}, r"imu_acc: is float64 of shape .* as imu_gyr has"),
         ({"imu_mag": ARRAYS["imu_mag"] * 1j}, "imu_mag: is complex128 of shape"),
         ({"imu_mag": ARRAYS["imu_mag"].astype(str)}, "imu_mag: is <U.* of real numbers is needed"),
-        ({"imu_mag": ARRAYS["imu_mag"].astype(object)}, "imu_mag: is no plain array .*pickle"),
+        ({"imu_mag": ARRAYS["imu_mag"].astype(object)}, "'imu_mag' is no plain array .*pickle"),
         ({"opt_quat": ARRAYS["opt_quat"][:, :3]}, r"opt_quat: is float64 of shape \(200, 3\)"),
         ({"movement": ARRAYS["movement"] * 1.0}, "movement: is float64 of .* of bool is needed"),
         ({"movement": np.array(True)}, r"movement: is bool of shape \(\)"),
@@ -190,7 +190,9 @@ def test_more_numbers_than_the_header_says_are_refused(tmp_path):
         for name in old.namelist():
             more = b"\0" * 24 if name == "imu_mag.npy" else b""
             new.writestr(name, old.read(name) + more)
-    assert "imu_mag: holds more than its header says" in refusal(tmp_path, file.getvalue())
+    assert "'imu_mag' holds 4824 bytes where its header declares 4800" in refusal(
+        tmp_path, file.getvalue()
+    )
 
 
 def test_another_archive_is_told_from_a_trial(tmp_path):
@@ -198,6 +200,12 @@ def test_another_archive_is_told_from_a_trial(tmp_path):
     with zipfile.ZipFile(file, "w") as other:
         other.writestr("readme.txt", "hello")
     assert "is a zip archive, not a text log; unpack it first" in refusal(tmp_path, file.getvalue())
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**15, 3)}
+    np.lib.format.write_array_header_1_0(lie := io.BytesIO(), header)
+    with zipfile.ZipFile(file := io.BytesIO(), "w") as new:
+        new.writestr("imu_gyr.npy", lie.getvalue() + bytes(64))
+    told = refusal(tmp_path, file.getvalue())
+    assert "'imu_gyr' holds 64 bytes where its header declares 24000000000000000" in told
     assert "has no array imu_gyr, " in refusal(tmp_path, archive({"x": np.zeros(3)}))
 
 

@@ -3,15 +3,19 @@
 import dataclasses
 import math
 import stat
+import struct
 import warnings
 from io import BytesIO
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from made_rosbag import FIX, IMU, MAG, NS, drive, fix, header, imu, rosbag
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
+from robins import foreign
 from robins.dataset import AttitudeTable, Dataset, GnssTable, ImuTable, MagTable, Trajectory
 from robins.gps_time import gps_of, utc_of
 from robins.ins.frames import to_enu_rfu
@@ -137,6 +141,35 @@ def test_damage_is_refused(path):
         read(path, bytes(content))
     with pytest.raises(LogError, match=r"is damaged .RosError: sensor_msgs/msg/Imu of 20 bytes"):
         read(path, rosbag([("/imu", IMU, header(5))]))
+
+    for compression in (CompressionType.ZSTD, CompressionType.LZ4):
+        content = bytearray(rosbag(drive(), compression))
+        content[len(content) // 8] ^= 1
+        with pytest.raises(LogError, match=r"is damaged .*fetch it again"):
+            read(path, bytes(content))
+
+
+@pytest.mark.parametrize(
+    ("packed", "declared", "why"),
+    [
+        (zstandard.compress(bytes(30 << 20)), 30 << 20, "its chunks would take 31457280 bytes"),
+        (zstandard.compress(bytes(3 << 20)), 100, "unpacks to 101 bytes or more, declared are 100"),
+        (zstandard.compress(bytes(100)), 1 << 60, "its chunks would take 115[0-9]{16} bytes"),
+        (lz4.frame.compress(bytes(3 << 20)), 100, "unpacks to 101 bytes or more, declared are 100"),
+        (zstandard.compress(bytes(100)), 101, "unpacks to 100 bytes or more, declared are 101"),
+        (bytes(100), 1 << 19, "unpacks to 100 bytes"),
+    ],
+)
+def test_sizes_that_chunks_declare_are_not_believed(path, monkeypatch, packed, declared, why):
+    monkeypatch.setattr(foreign, "FREE", 1 << 20)
+    kind = "zstd" if packed[:1] == b"\x28" else "lz4" if packed[:1] == b"\x04" else ""
+    content = rosbag(drive(), CompressionType.NONE)
+    body = struct.pack("<QQQI", 0, 1, declared, 0)
+    body += struct.pack("<I", len(kind)) + kind.encode() + struct.pack("<Q", len(packed)) + packed
+    chunk = struct.pack("<BQ", 6, len(body)) + body
+    at = 17 + struct.unpack_from("<Q", content, 9)[0]  # behind the record of the header
+    with pytest.raises(LogError, match=rf"drive.mcap: is damaged .*{why}"):
+        read(path, content[:at] + chunk + content[at:])
 
 
 # ------------------------------------------------------------------------------------------ writing

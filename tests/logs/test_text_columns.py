@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robins import foreign
+from robins.logs import open_log
 from robins.logs.findings import LogError, LogWarning
 from robins.logs.text import Layout, peek, read_columns
 
@@ -227,6 +229,25 @@ def test_output_that_waits_in_the_decompressor_is_fetched(tmp_path, monkeypatch,
         findings = []
         assert len(read_columns(path, LAYOUT, findings).rows) == n
         assert findings == []
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, lzma.compress])
+def test_a_stream_that_unpacks_to_more_than_any_log_is_refused(tmp_path, monkeypatch, compress):
+    path = tmp_path / "log.csv"
+    path.write_bytes(compress(b"1,2,3\n" * 600_000))
+    assert len(read_columns(path, LAYOUT).rows) == 600_000
+    monkeypatch.setattr(foreign, "FREE", 1 << 20)
+    with pytest.raises(LogError, match=r"log.csv: is damaged: .*it would take \d+ bytes, and"):
+        read_columns(path, LAYOUT)
+
+
+def test_a_row_of_commas_is_named(tmp_path):
+    """As the only row no stamp has a digit."""
+    path = tmp_path / "truth.csv"
+    names = "time_ms,lat_deg,lon_deg,height_m,v_north_m_s,v_east_m_s,v_down_m_s,q_w,q_x,q_y,q_z"
+    path.write_text(f"{names}\n{10 * ','}\n")
+    with pytest.raises(LogError, match=r"truth.csv line 2: time_ms: is not a time stamp"):
+        open_log(path)
 
 
 def test_garbage_behind_a_compressed_stream_is_refused(tmp_path):

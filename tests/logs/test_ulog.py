@@ -1,10 +1,11 @@
 """PX4 logs: what is read of them, and what a cut or damaged one gives (F29)."""
 
+import re
 import sys
 
 import numpy as np
 import pytest
-from made_ulog import GPS, IMU, NEW_GPS, RAW_MAG, flight, ulog
+from made_ulog import GPS, IMU, NEW_GPS, RAW_MAG, flight, message, ulog
 
 from robins.logs import LogError, load_dataset, open_log
 
@@ -143,6 +144,11 @@ def test_damaged_definitions_are_refused(tmp_path):
         (b"uint64_t timestamp", b"uint64_t timestamq"),
     ):
         assert len(refusal(tmp_path, LOG.replace(old, new))) > 60
+    for fields in ("a[60000] x;", "a[300] x;", "root x;"):  # by itself, in each other, in itself
+        nested = message("F", f"root:{fields}".encode())
+        nested += message("F", b"a:b[400] y;") + message("F", b"b:float[9] z;")
+        told = refusal(tmp_path, LOG[:16] + nested + LOG[16:])
+        assert re.search(r"the definition of root (has \d+ numbers|contains itself)", told)
     no_magic = b"ULof" + LOG[4:]
     assert "holds NUL bytes: a binary file" in refusal(tmp_path, no_magic)
     assert "Header too short" in refusal(tmp_path, LOG[:8])

@@ -5,6 +5,7 @@ import math
 import re
 import subprocess
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -12,7 +13,7 @@ from example_folder import a_solution, a_summary, names, write
 
 import robins
 from robins import results
-from robins.results import ResultError, ResultWriter, array, read, variable
+from robins.results import ResultError, ResultWriter, array, read, solution, variable
 
 # ------------------------------------------------------------------------------- there and back
 
@@ -140,6 +141,19 @@ def without(attr):
     solution = a_solution()
     del solution["error_attitude"].attrs[attr]
     return solution
+
+
+@pytest.mark.parametrize(("rows", "chunk"), [(10**12, 1000), (10, 1 << 27)])
+def test_sizes_that_a_solution_declares_are_not_believed(tmp_path, rows, chunk):
+    path = tmp_path / "solution.nc"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", (rows,), "<f8", chunks=(chunk,), maxshape=(None,))
+    assert path.stat().st_size < 20_000
+    with pytest.raises(ResultError, match=r"is damaged: it would take [0-9]{10,} bytes"):
+        solution.read(path)
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(ResultError, match=r"solution.nc: is damaged: "):
+        solution.read(path)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ EACH_S = 1.0
 _OLD_S = 10.0  # after which a bench that says nothing hangs
 _LARGEST = 1 << 20  # characters of a report
 _REPORT = re.compile(r"[1-9][0-9]{0,9}\.(json|[0-9a-f]{8}\.new)")
+Report = dict[str, Any]
 STARTING = "starting"  # its state until the first step: it may compile for long, and says nothing
 
 

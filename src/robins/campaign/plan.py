@@ -135,7 +135,7 @@ def read(store: Store) -> Plan | None:
         data = json.loads(content)
         schema = data.pop("schema")
         plan = Plan(**data | {"filters": tuple(data["filters"])})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise RobinsError(
             f"{NAME} is damaged ({error})",
             store.where,

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from robins.campaign.statistics import Statistics
 from robins.errors import RobinsError
+from robins.foreign import arrays_of, decoding
 
 _ABOUT = "about"
 _COUNTS = ("runs", "diverged", "n")
@@ -69,16 +69,14 @@ def unpack(content: bytes, into: Statistics, example: Any = None) -> dict[str, A
     Raises:
         Damaged: the content is cut or changed.
     """
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        told = json.loads(str(arrays.pop(_ABOUT)))
-        sealed = told.pop("sha256")
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise Damaged(str(error)) from error
-    if sealed != _seal(told, arrays):
+    arrays = arrays_of(content, Damaged)
+    with decoding(Damaged):
+        told = json.loads(str(arrays.pop(_ABOUT, "{}")))
+    if not isinstance(told, dict) or told.pop("sha256", None) != _seal(told, arrays):
         raise Damaged("its checksum does not fit")
     for name in _COUNTS:
+        if not isinstance(told.get(name), int):
+            raise Damaged(f"it does not state {name!r}")
         setattr(into, name, told[name])
     leaves = []
     for name in sorted(arrays):
@@ -92,7 +90,10 @@ def unpack(content: bytes, into: Statistics, example: Any = None) -> dict[str, A
         else:
             leaves.append(arrays[name])
     if leaves and example is not None:
-        into.example = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(example), leaves)
+        tree = jax.tree_util.tree_structure(example)
+        if tree.num_leaves != len(leaves):
+            raise Damaged(f"its record has {len(leaves)} arrays, not {tree.num_leaves}")
+        into.example = jax.tree_util.tree_unflatten(tree, leaves)
     return told
 
 

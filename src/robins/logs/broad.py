@@ -13,19 +13,13 @@ stands for the sensor's own axes, of samples and of the attitude alike, so nothi
 
 from __future__ import annotations
 
-import io
-import lzma
 import os
-import struct
-import warnings
-import zipfile
-import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from robins.dataset import AttitudeTable, Dataset, ImuTable, MagTable
+from robins.foreign import archive_of, arrays_of
 from robins.logs.findings import Finding, LogError, refused
 from robins.logs.opening import whole
 from robins.logs.tables import unit_quaternions
@@ -34,7 +28,7 @@ from robins.units import to_si
 
 _COLUMNS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4}
 _NAMES = (*_COLUMNS, "movement", "sampling_rate")
-_LARGEST = 1 << 30  # bytes of one array, 18 hours at 500 Hz
+_LARGEST = 1 << 30  # bytes of a file, 18 hours at 500 Hz
 _RATES_HZ = (0.1, 1e5)
 _HEADER = 30  # bytes before the name of an archive's first member
 
@@ -86,51 +80,20 @@ def read_broad(path: str | os.PathLike[str], findings: list[Finding] | None = No
 def _members(file: str) -> dict[str, np.ndarray]:
     """The arrays by name, each checked against its checksum before it is looked at."""
     data, _ = whole(file, _LARGEST)
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            held = {name.removesuffix(".npy") for name in archive.namelist()}
-            if lacking := [name for name in _NAMES if name not in held]:
-                raise LogError(
-                    file,
-                    f"has no array {', '.join(lacking)}; it has {', '.join(sorted(held))}",
-                    "name the arrays as BROAD does",
-                )
-            return {name: _array(file, archive, name) for name in _NAMES}
-    except LogError:
-        raise
-    # What zipfile and zlib raise on damage depends on where the damage is.
-    except (
-        *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError),
-        *(NotImplementedError, RuntimeError, ValueError, OverflowError, IndexError),
-    ) as error:
-        raise LogError(
-            file,
-            f"is cut short or damaged after {len(data)} bytes: {error or type(error).__name__}",
-            "fetch it again; nothing of it was used, for no number in it can be trusted",
-        ) from error
 
+    def damaged(why: str) -> LogError:
+        mend = (
+            "fetch it again, or save it as plain numbers; nothing of it was used, for no number in "
+            "it can be trusted"
+        )
+        return LogError(file, f"is cut short or damaged after {len(data)} bytes: {why}", mend)
 
-def _array(file: str, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    member = archive.getinfo(f"{name}.npy")
-    if member.file_size > _LARGEST:
-        raise refused(file, field=name)(
-            f"would take {member.file_size >> 20} MiB, more than {_LARGEST >> 20} MiB",
-            "cut the recording into parts",
-        )
-    data = io.BytesIO(archive.read(member))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # NumPy warns of arrays that Python 2 wrote
-            array: Any = np.lib.format.read_array(data, allow_pickle=False)
-    except (ValueError, UserWarning) as error:
-        raise refused(file, field=name)(
-            f"is no plain array ({error})", "save it as numbers, without pickle"
-        ) from error
-    if data.read(1):
-        raise refused(file, field=name)(
-            "holds more than its header says", "save it again with numpy.savez"
-        )
-    return array
+    arrays = arrays_of(data, damaged, _NAMES)
+    if lacking := [name for name in _NAMES if name not in arrays]:
+        held = sorted(name.removesuffix(".npy") for name in archive_of(data, damaged).namelist())
+        what = f"has no array {', '.join(lacking)}; it has {', '.join(held)}"
+        raise LogError(file, what, "name the arrays as BROAD does")
+    return arrays
 
 
 def _rate(file: str, value: np.ndarray) -> float:

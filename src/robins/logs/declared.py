@@ -22,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from robins.foreign import decoding
 from robins.logs.findings import LogError, refused
 from robins.logs.quantities import QUANTITIES
 from robins.logs.text import Head, peek
@@ -46,12 +47,13 @@ def columns_from(path: str | os.PathLike[str]) -> TextFormat:
     file = os.fspath(path)
     try:
         text = Path(path).read_text("utf-8")
-        content = tomllib.loads(text)
     except OSError as error:
         why = error.strerror or str(error)
         raise LogError(file, f"cannot be read: {why}", "check path and permissions") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise LogError(file, f"is no TOML: {error}", "repair it") from error
+    with decoding(lambda why: LogError(file, f"is no TOML: {why}", "repair it")):
+        content = tomllib.loads(text)
     _checked(file, "", content, _KEYS)
     if not content.get("columns"):
         mend = 'state them, such as time = { name = "t", unit = "ms" }'

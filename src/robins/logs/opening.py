@@ -14,9 +14,11 @@ import os
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from robins.foreign import FREE, decoding, within
 from robins.logs.findings import LogError
 
 _BLOCK = 1 << 20
@@ -92,31 +94,43 @@ class Source:
             raise LogError(
                 str(self.path), f"cannot be read: {why}", "check path and permissions"
             ) from error
-        except (lzma.LZMAError, zlib.error) as error:
-            raise LogError(
-                str(self.path),
-                f"is damaged: the compressed stream does not decode ({error})",
-                "fetch it again; nothing of it was used, for no number in it can be trusted",
-            ) from error
 
     def _expand(self, file, xz: bool) -> Iterator[bytes]:
-        new = lzma.LZMADecompressor if xz else _Gunzip
+        new = partial(lzma.LZMADecompressor, memlimit=2 * FREE) if xz else _Gunzip
         decoder = new()
         between = False  # after one stream's end mark, before another stream
+        packed = plain = 0
+
+        def decompress(data: bytes) -> bytes:
+            nonlocal plain
+            with decoding(self._damaged):
+                out = decoder.decompress(data, _BLOCK)
+            plain += len(out)
+            within(plain, packed, "it", self._damaged)
+            return out
+
         while raw := file.read(_BLOCK):
+            packed += len(raw)
             while raw:
                 if between and not (raw := raw.lstrip(b"\0")):  # padding
                     break
                 between = False
-                out = decoder.decompress(raw, _BLOCK)
+                out = decompress(raw)
                 if out:
                     yield out
                 while not (decoder.eof or decoder.needs_input):
-                    yield decoder.decompress(b"", _BLOCK)
+                    yield decompress(b"")
                 raw = decoder.unused_data if decoder.eof else b""
                 if decoder.eof:
                     decoder, between = new(), True
         self.cut = not between
+
+    def _damaged(self, why: str) -> LogError:
+        return LogError(
+            str(self.path),
+            f"is damaged: the compressed stream does not decode ({why})",
+            "fetch it again; nothing of it was used, for no number in it can be trusted",
+        )
 
 
 def beginning(path: str | os.PathLike[str], size: int = 256) -> bytes:

@@ -17,21 +17,28 @@ from __future__ import annotations
 import io
 import os
 import struct
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from robins import ros
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.foreign import decoding, unpacked, within
 from robins.gps_time import GPS_EPOCH_S, gps_of
 from robins.logs.findings import Finding, LogError, report, telling
 from robins.logs.opening import whole
 from robins.logs.tables import Table
 from robins.logs.text import Head
 
+if TYPE_CHECKING:
+    from mcap.records import McapRecord
+
 MAGIC = b"\x89MCAP0\r\n"
 _LARGEST = 1 << 30  # bytes of a file
+_RECORD, _FOOTER = struct.Struct("<BQ"), 2  # opcode and length of a record; the last one's opcode
 _FLU = np.array([1.0, -1.0, -1.0])  # forward-left-up <-> forward-right-down
 _NED = [1, 0, 2]  # of east, north, up: variances have no sign
 _QUALITY = {0: 5, 1: 3, 2: 4}  # status of a NavSatFix -> RTKLIB's Q
@@ -110,32 +117,94 @@ def _messages(
     Raises:
         LogError: as `read_rosbag`.
     """
-    try:
-        from mcap.exceptions import EndOfFile, McapError
-        from mcap.reader import NonSeekingReader
-    except ImportError as error:
-        raise LogError(file, NO_PACKAGE, INSTALL) from error
     data, cut = whole(path, _LARGEST)
+    sound, closed = _sound(data)
+
+    def damaged(why: str) -> LogError:
+        mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
+        return LogError(file, f"is damaged ({why})", mend)
+
     found: dict[tuple[str, str], list[ros.Stamped]] = {}
     names = {ros.name_of(kind): kind for kind in _KINDS}
-    reader = NonSeekingReader(io.BytesIO(data), validate_crcs=True)
-    why = "its compressed stream has no end" if cut else ""
-    try:
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if schema is None or schema.name not in names or channel.message_encoding != "cdr":
-                continue
-            one = ros.decode(names[schema.name], message.data)
-            found.setdefault((schema.name, channel.topic), []).append(one)
-    except EndOfFile:
-        why = f"after {len(data)} bytes"
-    except (McapError, ros.RosError, struct.error, ValueError, KeyError) as error:
-        mend = "fetch it again; nothing of it was used, for no number in it can be trusted"
-        raise LogError(file, f"is damaged ({type(error).__name__}: {error})", mend) from error
-    if why:
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}  # schema and topic of those whose messages are read
+    one: Any
+    for one in _records(file, data[:sound], damaged):
+        kind = type(one).__name__  # the package is not imported here
+        if kind == "Schema":
+            schemas[one.id] = one.name
+        elif kind == "Channel":
+            name = schemas.get(one.schema_id, "")
+            if one.schema_id and not name:
+                raise damaged(f"topic {one.topic} has schema {one.schema_id}, which is not there")
+            if name in names and one.message_encoding == "cdr":
+                channels[one.id] = (name, one.topic)
+            else:
+                channels[one.id] = ("", one.topic)
+        elif kind == "Message":
+            if one.channel_id not in channels:
+                raise damaged(f"a message of channel {one.channel_id}, which is not there")
+            name, topic = channels[one.channel_id]
+            if name:
+                try:
+                    stamped = ros.decode(names[name], one.data)
+                except ros.RosError as error:
+                    raise damaged(f"RosError: {error}") from error
+                found.setdefault((name, topic), []).append(stamped)
+    if cut or not closed:
+        why = "its compressed stream has no end" if cut else f"after {len(data)} bytes"
         sentence = _EARLY.format(name=Path(file).name, why=why)
         place = f"byte {len(data)}"
         report(findings, Finding("warning", "ends_early", file, place, len(data), sentence))
     return found
+
+
+def _sound(data: bytes) -> tuple[int, bool]:
+    """Up to which byte records follow each other without a break, and whether the last closes."""
+    at = len(MAGIC)
+    while at + _RECORD.size <= len(data):
+        opcode, size = _RECORD.unpack_from(data, at)
+        if opcode == 0 or at + _RECORD.size + size > len(data):
+            break
+        at += _RECORD.size + size
+        if opcode == _FOOTER:
+            return at + len(MAGIC), data[at : at + len(MAGIC)] == MAGIC
+    return min(at, len(data)), False
+
+
+def _records(file: str, data: bytes, damaged: Callable[[str], LogError]) -> Iterator[McapRecord]:
+    """All records of a file, those of its chunks among them; the package decodes each.
+
+    Raises:
+        LogError: the package is not installed, or a record is damaged.
+    """
+    try:
+        from mcap.exceptions import EndOfFile
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader, breakup_chunk
+    except ImportError as error:
+        raise LogError(file, NO_PACKAGE, INSTALL) from error
+    plain, stream = 0, io.BytesIO(data)
+    records = StreamReader(stream, emit_chunks=True, validate_crcs=True).records
+    while True:
+        try:
+            with decoding(damaged):
+                one = next(records, None)
+        except LogError as error:
+            if isinstance(error.__cause__, EndOfFile) and stream.tell() == len(data):
+                return  # behind the last whole record: the file is not closed
+            raise
+        if one is None:
+            return
+        if not isinstance(one, Chunk):
+            yield one
+            continue
+        plain += one.uncompressed_size
+        within(plain, len(data), "its chunks", damaged)
+        content = unpacked(one.data, one.compression, one.uncompressed_size, damaged)
+        with decoding(damaged):
+            inner = breakup_chunk(replace(one, data=content, compression=""), validate_crc=True)
+        yield from inner
 
 
 def _first(

@@ -55,7 +55,7 @@ def read_rtklib(path: str | os.PathLike[str], findings: list[Finding] | None = N
     if not data:
         raise LogError(file, "holds no solution: header only", "was any epoch solved?")
     comma = "," in data[0][1]
-    calendar = "/" in data[0][1].replace(",", " ").split()[0]
+    calendar = "/" in (data[0][1].replace(",", " ").split() or [""])[0]
     names, utc = _header(head)
     # With commas, date and clock share a field; week and time of week never do.
     texts = 1 if comma and calendar else 2

@@ -235,7 +235,7 @@ class _Reader:
                 ndmin=1,
                 encoding="latin1",
             ) if block.strip() else np.zeros(0, self.dtype)  # fmt: skip
-        except ValueError:
+        except Exception:  # of the decoder of NumPy: the lines say where
             table = None
         if table is None or len(table) != block.count(_LF):
             return self._line_by_line(block, line, cut_first)

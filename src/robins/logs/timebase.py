@@ -40,7 +40,7 @@ def decimals_to_ns(text: np.ndarray, exponent: int = 9) -> tuple[np.ndarray, np.
     """
     n, width = len(text), text.dtype.itemsize
     value, plain = np.zeros(n, np.int64), np.zeros(n, bool)
-    if n:
+    if n and np.char.str_len(text).any():
         columns = np.ascontiguousarray(text).view(np.uint8).reshape(n, width)
         columns = np.ascontiguousarray(columns[:, columns.any(axis=0)].T)  # (characters, n)
         length = np.count_nonzero(columns, axis=0)

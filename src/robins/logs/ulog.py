@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robins.dataset import Dataset, GnssTable, ImuTable, MagTable
+from robins.foreign import decoding
 from robins.logs.findings import Finding, LogError, refused, report, telling
 from robins.logs.opening import whole
 from robins.logs.text import Head
@@ -33,6 +34,7 @@ from robins.units import to_si
 MAGIC = b"ULog\x01\x12\x35"
 _START = 16  # bytes before the first message
 _HEADER = struct.Struct("<HB")  # size of what follows, type
+_MOST, _DEEPEST = 1 << 16, 20  # numbers in a message, definitions in each other
 _TYPES = frozenset(b"BFIMPQARDLCSO")
 _LARGEST = 1 << 30  # bytes of a file
 _IMU, _MAG = ("sensor_combined",), ("vehicle_magnetometer", "sensor_mag")
@@ -77,6 +79,7 @@ def read_ulog(path: str | os.PathLike[str], findings: list[Finding] | None = Non
     if sound < len(data) or cut:
         sentence = _EARLY.format(name=Path(file).name, sound=sound, size=len(data))
         report(findings, Finding("warning", "ends_early", file, f"byte {sound}", sound, sentence))
+    _check_formats(file, data[:sound])
     log = _decode(file, data[:sound])
     imu = _first(file, log, _IMU, findings)
     if imu is None:
@@ -111,6 +114,45 @@ def _sound(data: bytes) -> int:
     return min(at, len(data))
 
 
+def _check_formats(file: str, data: bytes) -> None:
+    """Refuse a definition that declares more numbers than a message has bytes: 64 KiB.
+
+    The package makes a name for each number of each definition, nested ones multiplied, before it
+    looks at a message.
+
+    Raises:
+        LogError: there is one, or it contains itself.
+    """
+    formats: dict[str, list[tuple[str, int]]] = {}
+    at = _START
+    while at + _HEADER.size <= len(data):
+        size, kind = _HEADER.unpack_from(data, at)
+        at += _HEADER.size + size
+        if kind == ord("F"):
+            name, _, fields = data[at - size : at].decode("utf-8", "replace").partition(":")
+            formats[name] = []
+            for field in fields.split(";"):
+                of, _, length = field.partition(" ")[0].partition("[")
+                with contextlib.suppress(ValueError):  # no number, which the package refuses
+                    formats[name].append((of, int(length.partition("]")[0] or 1)))
+    sizes: dict[str, int] = {}
+
+    def size_of(name: str, above: tuple[str, ...]) -> int:
+        if name not in formats:
+            return 1
+        if name in above or len(above) > _DEEPEST:
+            raise _damaged(file, f"the definition of {name} contains itself")
+        if name not in sizes:
+            parts = (count * size_of(of, (*above, name)) for of, count in formats[name])
+            sizes[name] = sum(parts)
+            if sizes[name] > _MOST:
+                raise _damaged(file, f"the definition of {name} has {sizes[name]} numbers")
+        return sizes[name]
+
+    for name in formats:
+        size_of(name, ())
+
+
 def _decode(file: str, data: bytes) -> Any:
     try:
         from pyulog import ULog
@@ -121,11 +163,9 @@ def _decode(file: str, data: bytes) -> Any:
             "install it with: pip install 'robins[logs]'",
         ) from error
     told = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(told):  # it prints what it doubts
-            log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
-    except Exception as error:  # what it raises on damage depends on where the damage is
-        raise _damaged(file, f"{type(error).__name__}: {error}") from error
+    # it prints what it doubts
+    with decoding(lambda why: _damaged(file, why)), contextlib.redirect_stdout(told):
+        log = ULog(io.BytesIO(data), [*_IMU, *_MAG, *_GNSS], disable_str_exceptions=False)
     if log.file_corruption:
         raise _damaged(file, " ".join(told.getvalue().split()) or "messages contradict each other")
     return log

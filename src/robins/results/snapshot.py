@@ -12,25 +12,18 @@ import io
 import json
 import os
 import secrets
-import struct
-import zipfile
-import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from robins.foreign import arrays_of, decoding
 from robins.results.errors import ResultError, cannot
 from robins.results.folder import sync
 
-# what NumPy and zipfile raise of a file that is none of theirs, or has a wrong bit
-_DAMAGE = (
-    ValueError, KeyError, TypeError, AttributeError, EOFError, NotImplementedError, RecursionError,
-    zipfile.BadZipFile, zlib.error, struct.error,
-)  # fmt: skip
 FORMAT, VERSION = "robins-live", 1
-_LARGEST = 1 << 30  # bytes of one array; keeps a damaged header from filling the memory
+_LARGEST = 1 << 30  # bytes of a file
 
 
 class Snapshot(NamedTuple):
@@ -83,13 +76,11 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
         ResultError: the file cannot be read, is none, is damaged, or of another version or class.
     """
     try:
-        with open(path, "rb") as file, np.load(_read(file), allow_pickle=False) as packed:
-            told, arrays = _unpacked(packed)
+        with open(path, "rb") as file:
+            content = file.read(_LARGEST + 1)
     except OSError as error:
         raise cannot(path, "read the state", error) from error
-    except _DAMAGE as error:
-        why = "it is damaged or no file of a live state"
-        raise ResultError(path, why, "begin anew, or restore an older one") from error
+    told, arrays = _unpacked(content, path)
     if told.get("version") != VERSION:
         what = f"it is of version {told.get('version')} of the format, this robins reads {VERSION}"
         raise ResultError(path, what, "use the robins that wrote it, or begin anew")
@@ -102,21 +93,22 @@ def read(path: str | os.PathLike[str], kind: str) -> Snapshot:
     return Snapshot(told["parameters"], _thawed(told["state"], arrays))
 
 
-def _read(file: Any) -> io.BytesIO:
-    """All of a file that is not too large; NumPy does not close one that is damaged."""
-    content = file.read(_LARGEST + 1)
+def _unpacked(
+    content: bytes, path: str | os.PathLike[str]
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    def refuse(why: str) -> ResultError:
+        what = f"it is damaged or no file of a live state ({why})"
+        return ResultError(path, what, "start again, or restore an older one")
+
     if len(content) > _LARGEST:
-        raise ValueError("larger than a state")
-    return io.BytesIO(content)
-
-
-def _unpacked(packed: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-    if any(info.file_size > _LARGEST for info in packed.zip.infolist()):
-        raise ValueError("larger than a state")
-    told = json.loads(packed["told"].tobytes().decode())
+        raise refuse(f"more than {_LARGEST >> 20} MiB")
+    packed = arrays_of(content, refuse)
+    with decoding(refuse):
+        told = json.loads(packed.pop("told").tobytes())
     if not isinstance(told, dict) or told.get("format") != FORMAT:
-        raise ValueError("another format")
-    return told, [packed[f"a{k}"] for k in range(len(packed.files) - 1)]
+        raise refuse("it is of another format")
+    with decoding(refuse):
+        return told, [packed[f"a{k}"] for k in range(len(packed))]
 
 
 def _digest(body: Any, arrays: list[np.ndarray]) -> str:

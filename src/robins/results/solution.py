@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +11,9 @@ import numpy as np
 import xarray as xr
 
 from robins import units
+from robins.foreign import decoding, within
 from robins.results import roles
+from robins.results.errors import ResultError
 
 
 def variable(
@@ -122,5 +125,23 @@ def pack(solution: xr.Dataset) -> bytes:
 
 def read(path: str | os.PathLike[str]) -> xr.Dataset:
     """Load everything into memory; the file is closed again. Every array has its role."""
-    with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as solution:
-        return roles.recognised(solution.load())
+
+    def refuse(why: str) -> ResultError:
+        return ResultError(path, f"is damaged: {why}", "make the result again")
+
+    with decoding(refuse):
+        import h5py
+
+        sizes: list[int] = []
+
+        def add(_name: str, one: h5py.HLObject) -> None:
+            if isinstance(one, h5py.Dataset):
+                numbers = max(one.size or 0, math.prod(one.chunks or ()))
+                sizes.append(numbers * one.dtype.itemsize)
+
+        with h5py.File(path) as file:
+            file.visititems(add)
+    within(sum(sizes), os.path.getsize(path), "it", refuse)
+    with decoding(refuse), xr.open_dataset(path, engine="h5netcdf", decode_times=False) as solution:
+        loaded = solution.load()
+    return roles.recognised(loaded)

@@ -37,7 +37,7 @@ from robins.campaign.shards import Damaged, unpack
 from robins.campaign.statistics import Statistics
 from robins.campaign.store import Store, open_store
 from robins.campaign.work import Worker, missing
-from robins.errors import RobinsError
+from robins.foreign import decoding
 from robins.results import Outcome, Progress, silent
 from robins.systems.judgement import about
 from robins.systems.study import Problem
@@ -194,17 +194,16 @@ def sweep_of(where: Where) -> tuple[list[str], list[str]] | None:
     content = open_store(where).get(SWEEP)
     if content is None:
         return None
-    try:
+
+    def refuse(why: str) -> InputError:
+        fix = "run the same `robins sweep` again: what is there is not computed again."
+        return InputError(f"{SWEEP} is damaged ({why})", where, fix)
+
+    with decoding(refuse):
         data = json.loads(content)
         vary, points = list(map(str, data["vary"])), list(map(str, data["points"]))
-        if not points or not all(map(_POINT.fullmatch, points)):
-            raise ValueError("its points are not folders of its own")
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise RobinsError(
-            f"{SWEEP} is damaged ({error!r})",
-            where,
-            "run the same `robins sweep` again: what is there is not computed again.",
-        ) from None
+    if not points or not all(map(_POINT.fullmatch, points)):
+        raise refuse("its points are not folders of its own")
     return vary, points
 
 

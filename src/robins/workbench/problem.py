@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from robins.filters.synthesis import Plant, current_form, plant
+from robins.foreign import decoding
 from robins.workbench.contents import designs
 from robins.workbench.errors import InputError
 
@@ -61,10 +62,8 @@ def read_problem(given: str) -> Problem:
             ) from error
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"cannot be read: {error}.", given) from error
-    try:
+    with decoding(lambda why: InputError(f"is not TOML: {why}.", given)):
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML: {error}.", given) from error
     try:
         return _problem(path.name.removesuffix(".toml"), table, text)
     except (ValueError, TypeError) as error:

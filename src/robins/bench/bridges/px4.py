@@ -22,8 +22,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from robins.bench.bridges.errors import BridgeClosed, BridgeTimeout
+from robins.bench.bridges.errors import BridgeClosed, BridgeError, BridgeTimeout
 from robins.bench.bridges.px4_messages import Actuators, Px4Sample, Sensors, dialect, message
+from robins.foreign import decoding
 
 PORT = 4560
 SYSTEM, COMPONENT = 1, 200  # ours; PX4 does not look at them
@@ -222,7 +223,13 @@ class Px4Simulator:
             raise self._gone(error) from None
         if not data:
             raise self._gone("the connection ended")
-        for one in self._mav.parse_buffer(data) or ():
+        found = []
+        try:
+            with decoding(lambda why: BridgeError(f"bytes of PX4 cannot be parsed: {why}")):
+                found = self._mav.parse_buffer(data) or []
+        except BridgeError:
+            self.counts.bad += 1
+        for one in found:
             self._sort(one)
 
     def _sort(self, one: Any) -> None:

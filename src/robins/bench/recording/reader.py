@@ -13,12 +13,13 @@ from typing import Any, BinaryIO, Literal, NamedTuple
 
 from mcap import records as mcap
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.well_known import MessageEncoding
 
 from robins.bench.recording import layout
 from robins.bench.wire.frames import VERSION
+from robins.errors import RobinsError
+from robins.foreign import decoding
 
 LONGEST = 1 << 24  # bytes of a record; a length beyond it is damage, and no memory is asked for it
 _ABOUT = {"wire", "header", "check"}
@@ -51,12 +52,8 @@ class Entries:
                 reader.entries.clear()
 
 
-class _Damage(Exception):
+class _Damage(RobinsError):
     """Why the reading of a record ends before its end."""
-
-
-# what damaged bytes make of those who read them
-_UNREADABLE = (_Damage, EndOfFile, struct.error, ValueError, KeyError)
 
 
 def read_record(path: str | Path) -> Record:
@@ -115,8 +112,9 @@ def _header(path: str, reader: _Reader) -> dict[str, Any]:
         raise layout.RecordingError(f"'{path}' is no MCAP file: give a record that the bench wrote")
     try:
         opcode, body = reader.record()
-        profile = mcap.Header.read(_stream(body)).profile if opcode == Opcode.HEADER else ""
-    except _UNREADABLE as error:
+        with decoding(_Damage):
+            profile = mcap.Header.read(_stream(body)).profile if opcode == Opcode.HEADER else ""
+    except _Damage as error:
         raise layout.RecordingError(f"'{path}' {error}, before the header of the run") from None
     if profile != layout.PROFILE:
         raise layout.RecordingError(
@@ -125,8 +123,9 @@ def _header(path: str, reader: _Reader) -> dict[str, Any]:
         )
     try:
         opcode, body = reader.record()
-        about = mcap.Metadata.read(_stream(body)) if opcode == Opcode.METADATA else None
-    except _UNREADABLE as error:
+        with decoding(_Damage):
+            about = mcap.Metadata.read(_stream(body)) if opcode == Opcode.METADATA else None
+    except _Damage as error:
         raise layout.RecordingError(f"'{path}' {error}, within the header of the run") from None
     if about is None or about.name != layout.METADATA or set(about.metadata) != _ABOUT:
         raise layout.RecordingError(f"'{path}' is damaged: no header of the run where it should be")
@@ -138,7 +137,11 @@ def _header(path: str, reader: _Reader) -> dict[str, Any]:
             f"'{path}' has version {wire} of the wire, this is version {VERSION}: read it with the "
             "robins that wrote it"
         )
-    return json.loads(text)
+    with decoding(lambda why: layout.RecordingError(f"'{path}' is damaged: {why}")):
+        header = json.loads(text)
+    if not isinstance(header, dict):
+        raise layout.RecordingError(f"'{path}' is damaged: the header of the run is no table")
+    return header
 
 
 class _Reader:
@@ -228,12 +231,11 @@ class _Reader:
             end = place + layout.RECORD.size + length
             if end > len(body):
                 break
+            where = f"is damaged at byte {at + layout.CHUNK.size + place}"
             try:
                 self._inner(opcode, body[place:end])
-            except _UNREADABLE as error:
-                raise _Damage(
-                    f"is damaged at byte {at + layout.CHUNK.size + place}: {error}"
-                ) from None
+            except _Damage as error:
+                raise _Damage(f"{where}: {error}") from None
             place = end
 
     def _inner(self, opcode: int, data: bytes) -> None:
@@ -241,18 +243,25 @@ class _Reader:
         if opcode == Opcode.SCHEMA:
             return
         if opcode == Opcode.CHANNEL:
-            channel = mcap.Channel.read(_stream(data[layout.RECORD.size :]))
+            with decoding(_Damage):
+                channel = mcap.Channel.read(_stream(data[layout.RECORD.size :]))
             self._topics[channel.id] = _place(channel)
             return
         if opcode != Opcode.MESSAGE:
             raise _Damage(f"a record of kind {opcode}")
+        if len(data) < layout.MESSAGE.size:
+            raise _Damage(f"a message of {len(data)} bytes")
         _, _, channel, number, log_ns, _ = layout.MESSAGE.unpack_from(data)
         if number != self._count & 0xFFFFFFFF:
             raise _Damage(f"message {number} where number {self._count} should be")
+        if channel not in self._topics:
+            raise _Damage(f"a message of channel {channel}, which is not there")
         place, content = self._topics[channel], data[layout.MESSAGE.size :]
         if place == _EVENTS:
-            told = json.loads(content)
-            self.events.append(layout.Event(log_ns, told["kind"], told["text"], told["fields"]))
+            with decoding(_Damage):
+                told = json.loads(content)
+                event = layout.Event(log_ns, told["kind"], told["text"], told["fields"])
+            self.events.append(event)
         elif place is not None:
             self.entries.append(layout.Entry(log_ns, *place, content))
         self._count += 1
@@ -283,7 +292,12 @@ def _place(channel: mcap.Channel) -> _Place | None:
         return _EVENTS
     if channel.message_encoding in (MessageEncoding.CDR, MessageEncoding.JSON):
         return None
-    empty, link, direction = channel.topic.split("/")
-    if empty or channel.message_encoding != f"{layout.ENCODING}{VERSION}":
+    empty, _, rest = channel.topic.partition("/")
+    link, _, direction = rest.partition("/")
+    if (
+        empty
+        or direction not in _DIRECTIONS
+        or channel.message_encoding != f"{layout.ENCODING}{VERSION}"
+    ):
         raise _Damage(f"topic '{channel.topic}' of messages '{channel.message_encoding}'")
     return link, _DIRECTIONS[direction]
