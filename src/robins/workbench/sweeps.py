@@ -26,7 +26,6 @@ from robins.workbench.campaigns import (
     Where,
     campaign_report,
     campaign_status,
-    of_sweep,
     plan_campaign,
     problem_of,
     ready,
