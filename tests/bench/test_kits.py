@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from stations import kit
 
-from robins.bench.parts.kits import put, take
+from robins.bench.parts import kits
+from robins.bench.parts.kits import held_folder, put, take
 from robins.bench.rigs.satellite import kit as satellite
 
 SHORT = ("satellite/s1", "mekf", "duration=60 s", "counted_from=10 s")
@@ -41,6 +42,26 @@ def test_there_may_be_no_arrays_and_empty_ones(tmp_path):
         back = take(tmp_path / "kit")
         assert back.words == "a"
         np.testing.assert_array_equal(back.rows, rows)
+
+
+def test_what_a_killed_bench_has_left_is_removed_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr(kits.tempfile, "tempdir", str(tmp_path))
+    with held_folder() as mine, held_folder() as other:
+        assert mine != other
+        assert mine.stat().st_mode & 0o077 == 0
+        dead, making, precious = (tmp_path / f"robins-parts-{k}" for k in "abc")
+        for path in (dead, making, tmp_path / "goal"):
+            path.mkdir()
+            (path / "kit").write_bytes(bytes(100))
+        (dead / "locked").touch()
+        (tmp_path / "goal" / "locked").touch()
+        precious.symlink_to(tmp_path / "goal")
+        with held_folder():
+            there = {path.name for path in tmp_path.iterdir()}
+            assert {mine.name, other.name, making.name, "goal"} < there
+            assert dead.name not in there
+        assert (tmp_path / "goal" / "kit").exists()
+    assert not mine.exists()
 
 
 def test_a_process_takes_no_memory_of_its_own_for_it(tmp_path):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -20,11 +21,13 @@ from robins.campaign.gather import gather
 from robins.campaign.machine import Part
 from robins.campaign.plan import needed, write
 from robins.campaign.retention import content_of
-from robins.campaign.store import open_store
+from robins.campaign.store import GOES_ON, open_store
 from robins.campaign.work import Missing, Worker, missing
+from robins.cli import campaign as coordinating
 from robins.cli import main
 from robins.errors import RobinsError
 from robins.program import CPP, LANE_FLAGS
+from robins.results import Outcome
 from robins.workbench import simulated
 from robins.workbench import workers as work
 from robins.workbench.campaigns import (
@@ -37,6 +40,7 @@ from robins.workbench.campaigns import (
     plan_campaign,
     problem_of,
 )
+from robins.workbench.errors import InputError
 from robins.workbench.workers import work_here
 
 BALLOON = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'balloon.py'}:study"
@@ -266,6 +270,52 @@ def test_what_is_no_campaign_is_told(tmp_path):
     (tmp_path / "campaign.json").write_text("{")
     with pytest.raises(RobinsError, match="is damaged"):
         campaign_status(tmp_path)
+    for content in ("{", "[" * 5000, "[]", '{"points": [1]}'):
+        (tmp_path / "sweep.json").write_text(content)
+        with pytest.raises(InputError, match=r"sweep.json is damaged .*repeat the same"):
+            campaign_status(tmp_path)
+
+
+@pytest.mark.parametrize("command", ["work", "status", "verify", "report", "show --run 0"])
+def test_a_file_in_place_of_a_campaign_is_bad_input(tmp_path, capsys, command):
+    path = tmp_path / "file"
+    path.write_text("")
+    word, *options = command.split()
+    assert main(["campaign", word, str(path), *options]) == 2
+    told = capsys.readouterr().err
+    assert "Not a directory; name the folder of a campaign" in told
+    assert told.count(str(path)) == 1
+
+
+def test_a_worker_that_finds_the_disk_full_is_told_once(monkeypatch):
+    error = RobinsError("cannot write shards/a: No space left", "out", f"make room; {GOES_ON}")
+    monkeypatch.setattr(work._Process, "status", 1)
+    monkeypatch.setattr(work._Process, "said", f"robins: a warning\nrobins: {error}")
+    ended = object.__new__(work._Process)
+    with pytest.raises(RobinsError) as caught:
+        work._judged(ended, "out")
+    assert str(caught.value) == (
+        "out: a worker failed: cannot write shards/a: No space left; make room; the same command "
+        "goes on."
+    )
+    monkeypatch.setattr(work._Process, "said", "")
+    with pytest.raises(RobinsError, match="ended with 1; the same command goes on"):
+        work._judged(ended, "out")
+
+
+def test_a_second_coordinator_waits_for_the_report_of_the_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(coordinating, "command_line", str)
+    (tmp_path / "summary.json").write_text("{}")
+    asked = []
+
+    def publish(outcome, to, **options):
+        asked.append((to, options["patience_s"]))
+        return SimpleNamespace(path=tmp_path, report="")
+
+    bench, outcome = SimpleNamespace(publish=publish), Outcome()
+    coordinating._deliver(bench, "out", outcome, True)
+    coordinating._deliver(bench, "out", outcome, True, tmp_path / "elsewhere")
+    assert asked == [(Path("out/report"), 600.0), (tmp_path / "elsewhere", 0.0)]
 
 
 ROBINS = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())", "campaign"]

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 
 import pytest
@@ -332,6 +333,20 @@ def test_the_second_writer_of_a_folder_is_refused_at_once(earlier):
     write(earlier, a_summary(seed=3))
     assert read(earlier).summary["seed"] == 3
     assert names(earlier.parent) == ["latest", "other", "out"]
+
+
+def test_a_writer_with_patience_waits_for_the_other(earlier):
+    first = ResultWriter(earlier)
+    first.save_summary(a_summary(seed=2))
+    with pytest.raises(ResultError, match="is being written by process"):
+        ResultWriter(earlier, patience_s=0.3)
+    other = threading.Timer(0.5, first.commit)
+    other.start()
+    with ResultWriter(earlier, patience_s=60.0) as second:
+        assert read(earlier).summary["seed"] == 2
+        second.save_summary(a_summary(seed=3))
+    other.join()
+    assert read(earlier).summary["seed"] == 3
 
 
 def test_another_process_holds_a_folder_until_it_is_killed(earlier):

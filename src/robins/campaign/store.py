@@ -17,8 +17,11 @@ from time import time
 from typing import Any, Protocol, runtime_checkable
 
 from robins.errors import RobinsError
+from robins.foreign import decoding
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
+_NO_FOLDER = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP}  # of the name given
+GOES_ON = "the same command goes on."
 _PARTIAL = ".partial"  # what is being written
 _OLD_S = 3600.0  # what is older was left by a writer that died
 
@@ -123,12 +126,14 @@ class Folder:
             return RobinsError("is no folder", self.where, "name the folder of a campaign.")
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         fix = "make room" if full else "make the folder readable and writable"
+        fix = f"{fix}; what is there is whole, and {GOES_ON}"
+        given = error.errno in _NO_FOLDER
         failure = RobinsError(
             f"cannot {what}: {error.strerror or error}",
             self.where,
-            f"{fix}; what is there is whole, and the same command goes on.",
+            "name the folder of a campaign, or a new one." if given else fix,
         )
-        failure.bad_input = False
+        failure.bad_input = given
         return failure
 
 
@@ -169,7 +174,9 @@ class Objects:
                 "object storage needs the extra 'objects'", url, "pip install 'robins[objects]'."
             ) from None
         self.where, self._obstore = url, obstore
-        self._store = self._tried("open it", lambda: obstore.store.from_url(url))
+        fix = "check address and rights."
+        with decoding(lambda why: RobinsError(f"cannot be opened: {why}", url, fix)):
+            self._store = obstore.store.from_url(url)
 
     def put(self, name: str, content: bytes, *, anew: bool = False) -> bool:
         """Put an object; see `Store`."""

@@ -42,6 +42,7 @@ def _workbench() -> Any:
     return importlib.import_module("robins.workbench")
 
 
+_PATIENCE_S = 600.0  # for a report that another coordinator writes
 _WHERE = click.argument("where", metavar="DIR")
 
 
@@ -99,11 +100,13 @@ def run(scenario: str, out: str, workers: int | None, as_json: bool, **options: 
 
 
 def _deliver(bench: Any, where: str, outcome: Any, as_json: bool, to: Path | None = None) -> None:
+    # several coordinators of a campaign end together, and each has all runs to report
+    patience_s = 0.0 if to else _PATIENCE_S
     to = to or (_result(where, "report") if "://" in where else Path(where) / "report")
     command, writing = command_line(), Progress("drawing figures")
 
     def write() -> Any:
-        return bench.publish(outcome, to, command=command, progress=writing)
+        return bench.publish(outcome, to, command=command, progress=writing, patience_s=patience_s)
 
     deliver(outcome, write, writing, as_json)
 

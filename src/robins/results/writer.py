@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 import xarray as xr
@@ -15,6 +15,7 @@ from robins.results import folder, manifest, solution, summary
 from robins.results.errors import ResultError, cannot
 
 SOLUTION, SUMMARY, REPORT, FIGURES = "solution.nc", "summary.json", "report.html", "figures"
+_POLL_S = 0.2
 _OF_THE_DESKTOP = {".DS_Store", "Thumbs.db", "desktop.ini"}  # not put there by a person
 
 
@@ -34,6 +35,7 @@ class ResultWriter:
         scenario_text: the scenario as it was read, with what the command line changed.
         device: what computed it, e.g. "cpu" or the name of an accelerator.
         command: the command line or call that makes the result again.
+        patience_s: how long to wait for another writer of the folder before it is refused.
 
     Raises:
         ResultError: the path cannot or must not be written to; also from every method.
@@ -46,6 +48,7 @@ class ResultWriter:
         scenario_text: str = "",
         device: str = "cpu",
         command: str = "",
+        patience_s: float = 0.0,
     ):
         self.path = Path(path)
         self.scenario_text, self.device, self.command = scenario_text, device, command
@@ -53,17 +56,9 @@ class ResultWriter:
         self.solution: xr.Dataset | None = None
         self._began = monotonic()
         self._moved: list[Path] = []
-        _check_replaceable(self.path)
-        try:
-            self._stage = folder.stage(self.path)
-        except folder.Busy as busy:
-            raise ResultError(
-                self.path,
-                f"is being written by {busy.strerror}",
-                "wait for it to end, or choose another folder (--out)",
-            ) from None
-        except OSError as error:
-            raise cannot(self.path, "make the result folder", error) from error
+        if not patience_s:  # else another writer may be exchanging it; `commit` looks
+            _check_replaceable(self.path)
+        self._stage = _staged(self.path, patience_s)
 
     def save_solution(self, dataset: xr.Dataset) -> None:
         """Store the time series as `solution.nc`; `robins.results` lists what it holds.
@@ -174,6 +169,28 @@ class ResultWriter:
                 self.commit()
         finally:
             self.discard()  # nothing is left to do after a commit
+
+
+def _staged(path: Path, patience_s: float) -> folder.Stage:
+    """Stage of a result, when no other writer has its folder.
+
+    Raises:
+        ResultError: another one still has it after that time, or it cannot be made.
+    """
+    until = monotonic() + patience_s
+    while True:
+        try:
+            return folder.stage(path)
+        except folder.Busy as busy:
+            if monotonic() >= until:
+                raise ResultError(
+                    path,
+                    f"is being written by {busy.strerror}",
+                    "wait for it to end, or choose another folder (--out)",
+                ) from None
+            sleep(_POLL_S)
+        except OSError as error:
+            raise cannot(path, "make the result folder", error) from error
 
 
 def _check_replaceable(path: Path) -> None:

@@ -6,14 +6,13 @@ import contextlib
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from robins.bench.parts.kits import put
+from robins.bench.parts.kits import held_folder, put
 from robins.bench.parts.station import Station, ready, serve
 from robins.bench.ports.port import address, open_port, program
 from robins.bench.recording import open_record
@@ -239,8 +238,8 @@ def bench_replay(
 @contextlib.contextmanager
 def _starter(flight: Flight, part: str, other: Path | None) -> Iterator[Start]:
     """What starts a part of a recorded run on a path, or the program that was in its place."""
-    with tempfile.TemporaryDirectory(prefix="robins-bench-") as folder:
-        path = Path(folder) / "kit"
+    with held_folder() as folder:
+        path = folder / "kit"
         put(kit_of(flight), path)
 
         @contextlib.contextmanager

@@ -16,7 +16,11 @@ from robins.results import Outcome, Progress, Result, silent
 
 @contextmanager
 def publishing(
-    out: str | os.PathLike[str], *, command: str = "", progress: Progress = silent
+    out: str | os.PathLike[str],
+    *,
+    command: str = "",
+    progress: Progress = silent,
+    patience_s: float = 0.0,
 ) -> Iterator[Callable[[Outcome], Result]]:
     """Hold a result folder while something is computed for it.
 
@@ -30,6 +34,7 @@ def publishing(
         out: the folder.
         command: how to make the result again, for its report.
         progress: called with the share done and what is being done while it is written.
+        patience_s: how long to wait for another writer of the folder.
 
     Yields:
         A function that writes an outcome into the folder and returns the result read back.
@@ -39,7 +44,7 @@ def publishing(
         robins.results.NotWritten: neither could what was computed, which is kept elsewhere.
     """
     with results.rescued(out):
-        writer = results.ResultWriter(out, command=command)
+        writer = results.ResultWriter(out, command=command, patience_s=patience_s)
         try:
             yield partial(_write, writer, progress)
         finally:
@@ -47,14 +52,19 @@ def publishing(
 
 
 def publish(
-    outcome: Outcome, out: str | os.PathLike[str], *, command: str = "", progress: Progress = silent
+    outcome: Outcome,
+    out: str | os.PathLike[str],
+    *,
+    command: str = "",
+    progress: Progress = silent,
+    patience_s: float = 0.0,
 ) -> Result:
     """Write an outcome as a result folder with figures and a page; see `publishing`.
 
     Raises:
         robins.results.ResultError, robins.results.NotWritten: as for `publishing`.
     """
-    with publishing(out, command=command, progress=progress) as write:
+    with publishing(out, command=command, progress=progress, patience_s=patience_s) as write:
         return write(outcome)
 
 

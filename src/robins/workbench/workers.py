@@ -14,7 +14,7 @@ from typing import IO, Any
 
 from robins.campaign.machine import available_cores
 from robins.campaign.plan import Plan
-from robins.campaign.store import open_store
+from robins.campaign.store import GOES_ON, open_store
 from robins.campaign.work import missing
 from robins.errors import RobinsError
 from robins.results import Outcome, Progress, silent
@@ -164,12 +164,15 @@ def _judged(process: _Process, where: str) -> int:
     """
     status = process.status or 0
     if status > 0:
-        said: Sequence[str] = process.said.removeprefix("robins: ").splitlines()
-        raise _failed(said[-1] if said else f"it ended with {status}", where)
+        said: Sequence[str] = process.said.splitlines()
+        why = said[-1].removeprefix("robins: ") if said else f"it ended with {status}"
+        raise _failed(why, where)
     return int(status < 0)
 
 
 def _failed(why: str, where: str) -> RobinsError:
-    error = RobinsError(f"a worker failed: {why}", where, "the same command goes on.")
+    """Error of a worker; what its own sentence has already, folder and advice, is not repeated."""
+    why = why.removeprefix(f"{where}: ")
+    error = RobinsError(f"a worker failed: {why}", where, "" if why.endswith(GOES_ON) else GOES_ON)
     error.bad_input = False
     return error

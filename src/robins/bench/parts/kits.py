@@ -2,18 +2,66 @@
 
 So what a long run is driven by is in memory once, however many parts look at it, and only as far
 as they have come. Anything that pickles can be sent (PEP 574: arrays travel beside the pickle).
+
+The file lies in a folder for temporary files that its bench holds a lock on. The kernel drops the
+lock with the process, however that ends, and the next bench removes what dead ones have left.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import mmap
+import os
 import pickle
+import shutil
 import struct
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 _END = struct.Struct("<Q")  # where the pickle begins, behind the arrays
 _ALIGNED = 64  # bytes
+_PREFIX, _LOCKED = "robins-parts-", "locked"
+
+
+@contextlib.contextmanager
+def held_folder() -> Iterator[Path]:
+    """Make a folder that only this user can open, for as long as the context lasts."""
+    _sweep()
+    with contextlib.ExitStack() as stack:
+        path = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        stack.callback(shutil.rmtree, path, ignore_errors=True)
+        with contextlib.suppress(OSError):  # a file system without locks: it is never swept
+            stack.enter_context(_locked(path))
+            (path / _LOCKED).touch()
+        yield path
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Lock a folder.
+
+    Raises:
+        OSError: another process has it, it is gone, or it cannot be locked.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _sweep() -> None:
+    """Remove the folders of this user's benches that were killed."""
+    for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            # a folder without the mark is between its making and its locking
+            if path.lstat().st_uid == os.getuid() and (path / _LOCKED).exists():
+                with _locked(path):
+                    shutil.rmtree(path, ignore_errors=True)
 
 
 def put(kit: Any, path: Path) -> None:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from robins.bench.parts.kits import put
+from robins.bench.parts.kits import held_folder, put
 from robins.bench.parts.node import REALTIME
 from robins.bench.parts.station import path_of
 from robins.bench.rig import Rig
@@ -63,17 +61,19 @@ class Crew:
         self._rig, self._kit, self._programs = rig, kit, programs
         self._realtime, self._restarts = realtime, restarts
         self._folder: Path | None = None
+        self._held = contextlib.ExitStack()
         self._running: dict[str, subprocess.Popen] = {}
 
     def __enter__(self) -> Crew:
-        self._folder = Path(tempfile.mkdtemp(prefix="robins-bench-"))  # readable by us alone
-        put(self._kit, self._folder / "kit")
+        with contextlib.ExitStack() as stack:
+            self._folder = stack.enter_context(held_folder())
+            put(self._kit, self._folder / "kit")
+            self._held = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.end()
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        self._held.close()
 
     def start(self, part: str, port: str, since: int = -1) -> None:
         """Start a part on its port; it says hello when it is ready.
