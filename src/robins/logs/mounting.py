@@ -75,14 +75,18 @@ def to_local(trajectory: Trajectory, origin: Origin) -> LocalPath:
 def from_local(path: LocalPath, origin: Origin, source: str = "") -> Trajectory:
     """The trajectory, along east, north, up of each place on the way; body axes stay."""
     C_el, r0_e = origin._axes()
-    lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r0_e + path.r_l @ C_el.T))
+    with np.errstate(invalid="ignore"):  # what is infinite has no place: NaN, for `clean` to count
+        r_e = r0_e + path.r_l @ C_el.T
+    lat, lon, alt = (np.asarray(a) for a in geodetic_from_ecef(r_e))
     C_nl = np.swapaxes(_axes_at(lat, lon, "ENU"), -1, -2) @ C_el
+    with np.errstate(invalid="ignore"):
+        v_n = np.einsum("nij,nj->ni", C_nl, path.v_l)
     return Trajectory(
         time_ns=path.time_ns,
         lat_rad=lat,
         lon_rad=lon,
         alt_m=alt,
-        v_n=np.einsum("nij,nj->ni", C_nl, path.v_l),
+        v_n=v_n,
         q_nb=_compose(C_nl, path.q_lb),
         nav="ENU",
         source=source,

@@ -71,7 +71,7 @@ def _kfgins_nav(rows: Rows) -> bool:
     """A week, its second, a latitude."""
     return (
         len(rows[0]) == 11
-        and all(row[0] == int(row[0]) and 0 <= row[0] < 5000 for row in rows)
+        and all(0 <= row[0] < 5000 and row[0] == int(row[0]) for row in rows)
         and all(0 <= row[1] < 700_000 and abs(row[2]) <= 90 for row in rows)
     )
 
