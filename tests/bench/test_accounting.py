@@ -1,13 +1,31 @@
-"""Accounts of times: quantiles against NumPy's, bounded memory, what counts and what does not."""
+"""Accounts of times: quantiles against NumPy's, bounded memory, what counts and what does not.
+
+And of whole runs: reasons, warnings.
+"""
 
 import json
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from clockwork import CLOCKWORK
 
+from robins.bench.recording import Event
+from robins.bench.rigs import RIGS
 from robins.bench.run.accounting import EDGES_US, RECENT, Histogram, Latencies
+from robins.bench.run.outcome import outcome
+from robins.bench.run.session import Ran
+from robins.bench.run.setup import Flight, built_in, changed, read, steps_of
+from robins.bench.run.telemetry import Telemetry
+from robins.bench.run.untested import doubts
 
 US, MS = 1000, 10**6
+PENDULUM = f"{Path(__file__).parents[2] / 'docs' / 'examples' / 'pendulum.py'}:rig"
 
 
 def drawn(kind: str) -> np.ndarray:
@@ -152,3 +170,75 @@ def test_the_table_has_the_numbers_of_the_summary():
     assert {len(line) for line in lines[1:-1]} == {98}
     assert "-" in run(5, np.zeros(5), deadlines=False).table().splitlines()[2].split()
     assert Latencies().table().splitlines()[-1] == "0 cycles, 0 missed"
+
+
+# ------------------------------------------------------------------------------ what came of a run
+
+
+def ran_of(of: Flight, steps: int, **more: Any) -> Ran:
+    """A run of so many steps in which nothing was heard."""
+    step_ns = round(1e9 * of.timing.step_s)
+    flown, kit = Telemetry(of.rig, 1 + steps, step_ns).flown, SimpleNamespace(step_ns=step_ns)
+    ran = Ran(flown.until(steps), kit, steps, 0.0, Latencies(), {}, {}, {}, [], 0, "", False)
+    return ran._replace(**more)
+
+
+@pytest.mark.parametrize("name", [*RIGS, CLOCKWORK, PENDULUM])
+def test_a_run_without_a_step_has_its_reason_and_no_figures(name, tmp_path):
+    of, record = read(name), tmp_path / "record.mcap"
+    for failure, reason in (("'adm' died", "'adm' died"), ("", "it was stopped before its first")):
+        found = outcome(of, ran_of(of, 0, failure=failure), None, record)
+        told = json.loads(found.files["bench.json"])
+        assert found.failure == told["failure"]
+        assert found.failure.startswith(reason)
+        assert (found.solution, found.warnings, told["steps"]) == (None, [], 0)
+        assert found.notes[0] == f"The run failed: {found.failure}."
+
+
+def test_what_a_judge_cannot_judge_is_a_result_all_the_same():
+    of = read(CLOCKWORK)
+    of = of._replace(rig=replace(of.rig, judge=lambda flight, ran: [][ran.steps]))
+    for failure in ("", "'adder' died"):
+        found = outcome(of, ran_of(of, 3, failure=failure), None, None)
+        reason = (
+            r"test_accounting.py, line \d+: the judge of the rig 'clockwork' fails \(IndexError: "
+        )
+        assert re.match((failure and f"{failure}; {reason}") or reason, found.failure)
+        assert found.solution is not None
+        assert "value_count_n" in found.solution
+
+
+def test_what_a_run_does_not_test_is_said():
+    of = read(CLOCKWORK)
+    make = partial(of.rig.fault, begin=0.5)
+    faults = (
+        make(kind="loss", begin=600.0),
+        make(kind="silent", link="adder"),
+        make(kind="delay", delay=1.0),
+    )
+    short = changed(of, {"faults": faults})
+    ran = ran_of(of, 20, injected={("delay", "counter"): 3})
+    nothing = "the run tests nothing of it"
+    after = f"after the end of the run at 2 s: {nothing}"
+    assert doubts(short, ran) == [
+        f"The fault 'loss' at all links begins at 600 s, {after}",
+        f"The fault 'silent' at adder, from 0.5 s on, met nothing: {nothing}",
+    ]
+    late = [Event(k, "behind", f"the run is {k}.0 s behind", {"time_s": 4.0}) for k in (33, 66)]
+    behind = ["At 4 s the run is 66.0 s behind"]
+    assert doubts(of, ran._replace(events=late)) == behind
+    assert doubts(short, ran._replace(events=late, failure="'adm' died")) == behind
+    inner = read("satellite/star-stuck")
+    (found,) = doubts(inner, ran_of(inner, 20))
+    assert found == f"'star.faults' of what flies begins at 600 s, {after}"
+    commanded = read("pointing-command")
+    found = doubts(commanded, ran_of(commanded, 20))
+    assert found[0].startswith("'reference' was to be said at ")
+    assert len(found) == len(commanded.setup.says)
+
+
+@pytest.mark.parametrize("name", built_in())
+def test_a_scenario_as_it_is_comes_to_its_faults(name):
+    of = read(name)
+    hit = {(one.kind, part): 1 for one in of.setup.faults for part in of.rig.parts}
+    assert doubts(of, ran_of(of, 1)._replace(steps=steps_of(of), injected=hit)) == []

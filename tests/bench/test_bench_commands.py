@@ -8,12 +8,28 @@ import sys
 import time
 
 from clockwork import CLOCKWORK
-from stations import alive
+from stations import Station, alive, on_threads
 
 from robins.bench.recording import read_record
 from robins.cli import main
 
 ROBINS = [sys.executable, "-c", "from robins.cli import main; raise SystemExit(main())"]
+
+
+def test_a_run_that_fails_before_its_first_step_is_a_result(tmp_path, monkeypatch, capsys):
+    class Mute(Station):
+        def hello(self):
+            return b""
+
+    on_threads(monkeypatch, counter=Mute)
+    monkeypatch.setattr("robins.bench.run.session.HELLO_S", 0.2)
+    out = tmp_path / "out"
+    assert main(["bench", "up", CLOCKWORK, "--out", str(out), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["failure"].startswith("no hello from counter in 0.2 s: is it connected, ")
+    assert (told["steps"], told) == (0, json.loads((out / "bench.json").read_text()))
+    record = read_record(out / "record.mcap")
+    assert (record.whole, record.events[-1].text) == (True, told["failure"])
 
 
 def test_a_run_is_in_the_status_and_ctrl_c_ends_every_process(tmp_path, monkeypatch, capsys):

@@ -75,6 +75,35 @@ def test_abort_says_how_late_it_was(wall):
         clock.over(0)
 
 
+@pytest.mark.parametrize("policy", ["continue", "skip"])
+def test_a_run_that_falls_behind_says_so_again_when_that_has_doubled(wall, policy):
+    clock, told, period_ns = RealTime(100.0, policy), [], 10_000_000
+    first = clock.wait(0, wall.serve)
+    for k in range(90):  # each step takes eight periods, then none
+        wall.ns += 8 * period_ns if k < 60 else 0
+        clock.over(k)
+        told += [(k, words)] if (words := clock.behind(k)) else []
+    late_s = [0.07 * (k + 1) for k, _ in told]
+    assert late_s[0] == pytest.approx(1.0, abs=0.08)  # within a step
+    assert late_s[1] == pytest.approx(2.0 * late_s[0], abs=0.08)
+    assert [words for _, words in told] == [
+        f"the run is {late:.1f} s behind its clock: 100 Hz is too fast" for late in late_s
+    ]
+    wall.ns = first + 2 * 10**9  # it has caught up, and falls behind again
+    assert clock.behind(199) == ""
+    wall.ns += 11 * 10**8
+    assert clock.behind(199).startswith("the run is 1.1 s behind")
+    assert LockStep().behind(3) == ""
+
+
+def test_a_slow_clock_is_behind_by_periods(wall):
+    clock = RealTime(0.5)
+    wall.ns = clock.wait(0, wall.serve) + 21 * 10**9
+    assert clock.behind(0) == ""
+    wall.ns += 2 * 10**9
+    assert clock.behind(0).startswith("the run is 21.0 s behind")
+
+
 def test_a_pause_moves_all_deadlines(wall):
     clock = RealTime(100.0)
     first = clock.wait(0, wall.serve)

@@ -1,11 +1,22 @@
 """A part that was started in the place of another goes on from what that one remembered."""
 
+import math
+import os
+import socket
+import threading
+import time
+from functools import partial
+
+import pytest
 from stations import RUN, Loop, kit
 
-from robins.bench.broker.revive import History, beginning
+from robins.bench.broker import BenchError, Injector, Link
+from robins.bench.broker.revive import History, beginning, catch_up
+from robins.bench.broker.revive import Told as Told_
 from robins.bench.parts import station as memory
+from robins.bench.parts.idle import idleness
 from robins.bench.parts.station import Station
-from robins.bench.rigs.satellite import BUILD
+from robins.bench.rigs.satellite import BUILD, RIG
 from robins.bench.rigs.satellite.messages import WIRE
 from robins.bench.wire import Header, Receiver, encode_frame
 
@@ -54,6 +65,42 @@ def test_every_part_goes_on_from_its_memory_to_the_last_bit(monkeypatch, tmp_pat
         payloads = [[f.payload for f in x if f.header.type != done] for x in (again, said)]
         assert payloads[0] == payloads[1]
         assert len(payloads[0]) >= 30 // 5
+
+
+@pytest.mark.parametrize("idle_s", [0.0, math.inf])
+def test_a_part_that_computes_is_waited_for(idle_s):
+    """Its hello, and each answer, may take as long as it computes."""
+    ours, theirs = socket.socketpair()
+    link = Link("adm", ours.fileno(), WIRE, Injector(RIG.table), lambda *_: None)
+    hello = Header(WIRE.numbers["hello"], 0, 0, 0), WIRE.encode("hello", {"part": 5, "schema": 0})
+    done = Header(WIRE.numbers["done"], RUN, 0, 0), WIRE.encode("done", {"step": 3, "compute": 0})
+    with ours, theirs:
+        late = [
+            threading.Timer(0.3 * (k + 1), theirs.send, (encode_frame(*frame),))
+            for k, frame in enumerate((hello, done))
+        ]
+        for timer in late:
+            timer.start()
+        wait = partial(catch_up, link, [Told_(3, b"tick")], b"", 3, 0.1, lambda: None)
+        if idle_s:
+            with pytest.raises(BenchError, match=r"there is no hello from it in 0.1 s"):
+                wait(lambda: idle_s)
+        else:
+            wait(lambda: idle_s)
+        for timer in late:
+            timer.join()
+
+
+def test_a_process_that_computes_is_known_from_one_that_waits():
+    idle_s, pid = idleness(), os.getpid()
+    assert idle_s(pid) == 0.0
+    time.sleep(0.2)
+    assert idle_s(pid) >= 0.2
+    until = time.process_time() + 0.6
+    while time.process_time() < until:
+        pass
+    assert idle_s(pid) == 0.0
+    assert idle_s(None) == idle_s(2**22 + 1) == math.inf
 
 
 def test_what_is_kept_for_a_part_is_bounded():

@@ -1,5 +1,6 @@
 """The craft points where the operator says: the way there, the bits, the record, the page."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,28 @@ def test_it_has_the_bits_of_one_program_with_the_same_words(of, flown):
     assert [(one.step, one.message) for one in ran.said] == [(50, "reference"), (700, "reference")]
     assert difference(ran.flown, inside(of, said=ran.said)) == 0.0
     assert difference(ran.flown, inside(of)) > 0.1  # it was another run
+
+
+def test_an_estimate_that_is_not_to_be_steered_by_is_not_in_the_figures(flown):
+    flight, ran, _ = flown
+    plain, unfit = judge(flight, ran), np.arange(1300) % 100 >= 60
+    counts = np.arange(1300) >= 100
+    arrays = {name: x.copy() for name, x in ran.flown.items()}
+    arrays["estimate.flags"][unfit] |= SAFE
+    arrays["estimate.q_ib"][unfit] = [0.5, 0.5, 0.5, 0.5]  # far from any
+    marked = judge(flight, ran._replace(flown=replace(ran.flown, arrays=arrays)))
+    error_arcsec = away(ran.flown["estimate.q_ib"], ran.flown["motion.q_ib"]) * 3600.0
+    of = error_arcsec[counts & ~unfit]
+    found = marked.metrics
+    np.testing.assert_allclose(found["attitude_peak_arcsec"], np.max(of), rtol=1e-6)
+    np.testing.assert_allclose(found["attitude_rms_arcsec"], np.sqrt(np.mean(of**2)), rtol=1e-6)
+    assert np.isnan(found["attitude_end_arcsec"])  # it ends with one
+    assert found["pointing_rms_arcsec"] == plain.metrics["pointing_rms_arcsec"]  # it is true
+    assert (plain.warnings, marked.counts["steps_in_safe_mode"]) == ([], 520)
+    assert marked.warnings == [
+        "The estimate was marked as not to be steered by in 480 of the 1200 steps that count, and "
+        "the figures are those of the others"
+    ]
 
 
 def test_its_pointing_is_judged_by_what_was_asked(of, asked, flown):

@@ -1,5 +1,7 @@
 """Parts that say what they must not, among honest ones: all on threads, over pseudo-terminals."""
 
+import math
+import time
 from dataclasses import replace
 from functools import partial
 
@@ -8,6 +10,7 @@ import pytest
 from clockwork import CLOCKWORK, adder, inside
 from stations import Threads, kit, on_threads
 
+from robins.bench.broker import Broker
 from robins.bench.parts.station import Part, Station
 from robins.bench.recording import Event
 from robins.bench.rigs.satellite import BUILD
@@ -196,6 +199,39 @@ def test_a_jump_of_a_number_is_no_loss_of_frames(monkeypatch, ahead, lost, jumps
     ran, told = clockwork(monkeypatch, 0, Jumps)
     assert (told.pop("lost", 0), told.pop("sequence_jumps", 0), told) == (lost, jumps, {})
     np.testing.assert_array_equal(ran.flown["count.n"], np.arange(float(STEPS)))
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_a_part_that_computes_is_waited_for_and_named(monkeypatch, works):
+    """Before the first step, and in one; a part that does nothing is not."""
+
+    class Slow(Station):
+        def hello(self):
+            time.sleep(0.5)
+            return super().hello()
+
+        def _compute(self, step, time_ns):
+            time.sleep(0.5 * (step == ODD))
+            super()._compute(step, time_ns)
+
+    told, step = [], Broker.step
+    short = {"again_ns": 50_000_000, "most_ns": 200_000_000}
+    monkeypatch.setattr(Broker, "step", lambda *args: step(*args, **short))
+    monkeypatch.setattr(Threads, "idle_s", lambda crew, part: 0.0 if works else math.inf)
+    for name in ("session.HELLO_S", "session._LONG_S"):
+        monkeypatch.setattr(f"robins.bench.run.{name}", 0.2 if works else 1.0)
+    monkeypatch.setattr("robins.bench.broker.broker._TOLD_S", 0.1)
+    on_threads(monkeypatch, counter=Slow)
+    ran = Session(CLOCK, progress=lambda share, what: told.append(what)).run()
+    assert "counter: starting, compiling" in told
+    said = [event.text for event in ran.events if event.kind == "waiting"]
+    assert bool(said) == works
+    if works:
+        assert (ran.failure, ran.steps) == ("", STEPS)
+        assert all(": counter: starting, compiling" in text for text in said)
+    else:
+        words = f"'counter' does not answer the tick of step {ODD} (for 0.2 s)"
+        assert (ran.failure, ran.steps) == (words, ODD)
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,25 @@ def part(**more) -> Part:
     return Part("gyro", {"mounted": 0}, lambda: (0.0, 0), act, **more)
 
 
+def test_a_part_without_an_example_is_made_ready_if_it_can_do_without_its_inputs():
+    seen = []
+
+    def act(state, step, inputs):
+        seen.append(inputs["mounted"])
+        return state, [("gyro", {"theta_b": inputs["mounted"]["q_ib"][:3]})]
+
+    shown = {"q_ib": np.ones(4)}
+    plain = Part("gyro", {"mounted": 0}, lambda: None, act)
+    ready(plain, (0, 1))  # it cannot, and is compiled by its first step
+    ready(plain._replace(example={"mounted": shown}), (0,))
+    assert seen == [None, shown]
+    with pytest.raises(KeyError, match="q_ib"):  # what is wrong is not hidden
+        ready(plain._replace(example={"mounted": {}}), (0,))
+    source = Part("gyro", {}, lambda: None, lambda state, step, inputs: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        ready(source, (0,))
+
+
 class Bench:
     """The far end, by hand."""
 

@@ -55,6 +55,14 @@ def test_a_flood_of_commands_hides_nothing_else(monkeypatch):
     assert texts[12:] == ["the run failed", "stop"]
 
 
+def test_a_run_that_falls_behind_its_clock_is_an_alarm():
+    page = Page()
+    looking = Looking(page, Status())
+    for kind in ("behind", "waiting", "restarted"):
+        looking.event(kind, 1.0, kind)
+    assert page.shown == [("alarm", "behind"), ("warning", "waiting"), ("info", "restarted")]
+
+
 def test_a_frequent_kind_does_not_push_out_a_rare_one():
     events = ["a", *"w" * 500, "a", *"i" * 30, *"w" * 500]
     found = latest(events, str, 200)

@@ -8,9 +8,11 @@ clock, which only says when a step begins and how long a part is waited for.
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from robins.bench.broker.injector import Injector
@@ -23,6 +25,7 @@ from robins.bench.wire.schema import BARE, Wire
 Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
 _REMEMBERED = 64  # steps, whose messages are known if they come again
+_TOLD_S = 10.0  # between two words on who is waited for
 _GLANCE_S = 0.05  # how often the world beside the wire is looked at while nothing comes
 _CLOCK_NS = time.monotonic_ns
 
@@ -77,6 +80,8 @@ class Broker:
         done: Callable[[str, int, int, int, int], None],
         meanwhile: Callable[[], None] = lambda: None,
         keep: Mapping[str, History] | None = None,
+        idle_s: Callable[[str], float] = lambda part: math.inf,
+        waiting: Callable[[Sequence[str], float], None] = lambda parts, since_s: None,
     ):
         """Take the links of a run.
 
@@ -92,6 +97,10 @@ class Broker:
             meanwhile: called when there is nothing to do but to wait for a part: what need not be
                 done before the part computes is done while it does.
             keep: the histories of the parts that can be started anew.
+            idle_s: for how long the process of a part has done nothing [s]; one that computes is
+                waited for however long it takes. Infinite: it has none.
+            waiting: given the parts whose hello is waited for, and for how long they have been [s];
+                when they are others, and now and then.
         """
         self.links, self.wiring, self.step_ns = dict(links), wiring, step_ns
         self.time_ns = 0
@@ -100,6 +109,7 @@ class Broker:
         self._run = 0
         self._injector, self._observe = injector, observe
         self._glance, self._tell, self._meanwhile = glance, done, meanwhile
+        self._idle_s, self._waiting = idle_s, waiting
         self._sources = {p: wiring.sources(p) & set(links) for p in links}
         self._takers = {
             name: tuple(p for p in wiring.takers(name) if p in links)
@@ -123,6 +133,10 @@ class Broker:
     def gather(self, run: int, patience_s: float) -> None:
         """Wait until every part has said hello, and let the run begin.
 
+        Args:
+            run: its number.
+            patience_s: for a part without a process, or whose process does nothing.
+
         Raises:
             BenchError: a part says nothing, or speaks another version of the wire.
         """
@@ -130,11 +144,19 @@ class Broker:
         for link in self.links.values():
             link.restart(run)
             link.greeted = False
-        until = time.monotonic() + patience_s
-        while waited := [n for n, link in self.links.items() if not link.greeted]:
-            if time.monotonic() > until:
+        self._await(self.links, patience_s)
+
+    def _await(self, parts: Iterable[str], patience_s: float) -> None:
+        began, told, told_s = time.monotonic(), list[str](), 0.0
+        while waited := [name for name in parts if not self.links[name].greeted]:
+            since_s = time.monotonic() - began
+            if waited != told or since_s - told_s > _TOLD_S:
+                told, told_s = waited, since_s
+                self._waiting(waited, since_s)
+            idle = [name for name in waited if self._idle_s(name) > patience_s]
+            if since_s > patience_s and idle:
                 raise BenchError(
-                    f"no hello from {', '.join(waited)} in {patience_s:g} s: is it connected, "
+                    f"no hello from {', '.join(idle)} in {patience_s:g} s: is it connected, "
                     "at this speed, and does it run? (`robins bench ports` lists the ports)"
                 )
             self.poll(_GLANCE_S)
@@ -171,7 +193,8 @@ class Broker:
             patience_ns: how long a part is waited for before the step goes on without it; None: as
                 long as it takes, up to ``most_ns``.
             again_ns: a tick that is not answered is sent again after this.
-            most_ns: after which a part that is there but does not answer fails the run.
+            most_ns: after which a part that does not answer fails the run, unless its process
+                computes.
 
         Raises:
             BenchError: a part does not answer.
@@ -199,10 +222,11 @@ class Broker:
         for name, ticked in list(self._ticked.items()):
             if name in self._done:
                 continue
-            if patience_ns is not None and now - ticked.at_ns > patience_ns:
+            waited = now - ticked.at_ns
+            if patience_ns is not None and waited > patience_ns:
                 self.silent[name] += 1
                 self._end(name)
-            elif now - ticked.at_ns > most_ns:
+            elif waited > again_ns and min(waited, 1e9 * self._idle_s(name)) > most_ns:
                 raise BenchError(
                     f"'{name}' does not answer the tick of step {self._step} "
                     f"(for {most_ns * 1e-9:g} s)"
@@ -257,11 +281,11 @@ class Broker:
             BenchError: it does not answer.
             LinkLost: the far end of its port is gone.
         """
-        link = self.links[name]
         answered = self._step if name in self._done else self._step - 1
-        begin = beginning(self._run, self.step_ns)
+        begin, idle_s = beginning(self._run, self.step_ns), partial(self._idle_s, name)
+        told = self._kept[name].told
         try:
-            catch_up(link, self._kept[name].told, begin, answered, patience_s, glance)
+            catch_up(self.links[name], told, begin, answered, patience_s, glance, idle_s)
         except OSError as error:
             raise LinkLost(name, error) from None
 
@@ -283,11 +307,7 @@ class Broker:
             BenchError: it says none.
             LinkLost: the far end of a port is gone.
         """
-        until = time.monotonic() + patience_s
-        while not self.links[name].greeted:
-            if time.monotonic() > until:
-                raise BenchError(f"'{name}' was switched on: no hello from it in {patience_s:g} s")
-            self.poll(_GLANCE_S)
+        self._await([name], patience_s)
         self.off.remove(name)
 
     # ----------------------------------------------------------------------------------- the wire

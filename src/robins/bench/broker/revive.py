@@ -6,6 +6,7 @@ nothing had happened. It costs the time to start, and to compute some hundred st
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import time
@@ -68,6 +69,7 @@ def catch_up(
     answered: int,
     patience_s: float,
     glance: Callable[[], None],
+    idle_s: Callable[[], float] = lambda: math.inf,
 ) -> None:
     """Wait for the hello of a part that was started anew, and bring it to where the old one was.
 
@@ -79,12 +81,13 @@ def catch_up(
             answers are left to the broker. -1: none.
         patience_s: for its hello, and for each answer.
         glance: called now and then.
+        idle_s: for how long its process has done nothing [s]; one that computes is waited for.
 
     Raises:
         BenchError: it does not answer.
         OSError: the far end is gone.
     """
-    talk = _Talk(link, patience_s, glance)
+    talk = _Talk(link, patience_s, glance, idle_s)
     talk.until("hello", None)
     talk.say(begin)
     for one in told:
@@ -101,8 +104,15 @@ def beginning(run: int, step_ns: int) -> bytes:
 
 
 class _Talk:
-    def __init__(self, link: Link, patience_s: float, glance: Callable[[], None]):
-        self._link, self._patience_s, self._glance = link, patience_s, glance
+    def __init__(
+        self,
+        link: Link,
+        patience_s: float,
+        glance: Callable[[], None],
+        idle_s: Callable[[], float],
+    ):
+        self._link, self._patience_s = link, patience_s
+        self._glance, self._idle_s = glance, idle_s
         self._receiver = Receiver()
         self._come: list[tuple[int, bytes]] = []
 
@@ -115,7 +125,7 @@ class _Talk:
 
     def until(self, name: str, step: int | None) -> None:
         """Read until a message has come, of a step if that is given."""
-        end = time.monotonic() + self._patience_s
+        began = time.monotonic()
         while True:
             while self._come:
                 number, payload = self._come.pop(0)
@@ -123,7 +133,7 @@ class _Talk:
                     step is None or BARE.decode(name, payload)["step"] == step
                 ):
                     return
-            if time.monotonic() > end:
+            if min(time.monotonic() - began, self._idle_s()) > self._patience_s:
                 what = name if step is None else f"answer to the tick of step {step}"
                 raise BenchError(
                     f"'{self._link.name}' was started anew, but there is no {what} from it in "

@@ -69,7 +69,8 @@ class Part(NamedTuple):
         takes: messages it takes, with how many steps they are older than the tick: 0 or 1.
         begin: () -> state before the first step.
         act: (state, step, inputs) -> (state, sent), at a tick.
-        example: inputs as they will be, so that all can be compiled before the first tick.
+        example: inputs as they will be, so that all can be compiled before the first tick; one
+            that is left out is None, as if it had not come.
         rare: computes what no example does, to compile that too.
     """
 
@@ -222,9 +223,16 @@ def ready(part: Part, steps: Iterable[int]) -> Part:
     Args:
         part: any.
         steps: one of each kind that it computes otherwise.
+
+    Raises:
+        Exception: whatever the part raises, if it has an example of each message that it takes. One
+            that lacks some, and cannot do without, is compiled by its first steps.
     """
-    for step in steps:
-        part.act(part.begin(), step, part.example)
+    given = {name: part.example.get(name) for name in part.takes}
+    whole = contextlib.nullcontext() if given.keys() <= part.example.keys() else None
+    with whole or contextlib.suppress(Exception):
+        for step in steps:
+            part.act(part.begin(), step, given)
     part.rare()
     return part
 

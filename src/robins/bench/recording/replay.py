@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager
 from itertools import groupby
 from typing import Any, NamedTuple
 
+from robins.bench.parts.idle import idleness
 from robins.bench.ports.port import Pair, open_pair
 from robins.bench.recording.differences import Differences, differences, name_of
 from robins.bench.recording.layout import Entry
@@ -25,7 +26,7 @@ from robins.bench.wire.records import RecordError
 from robins.bench.wire.schema import BARE, FIRST_DATA, NUMBERS, Wire
 from robins.errors import RobinsError
 
-PATIENCE_S = 60.0  # a part may compile its filter before it answers
+PATIENCE_S = 60.0  # with a part that neither answers nor computes
 _LOOK_S = 0.1  # at whether the part still lives
 _HELLO, _TICK, _DONE, _STOP, _BEGIN = (
     NUMBERS[name] for name in ("hello", "tick", "done", "stop", "begin")
@@ -195,6 +196,7 @@ class _Replay:
     ):
         self._wire, self._part, self._pair, self._process = wire, part, pair, process
         self._patience_s, self._life = patience_s, life
+        self._idle_s = idleness()
         self._receiver = Receiver()
         self._waiting: list[Frame] = []
         self._where = "before its hello"
@@ -260,15 +262,15 @@ class _Replay:
 
     def _next(self) -> Frame:
         """The next frame that the part sends."""
-        end = time.monotonic() + self._patience_s
+        began = time.monotonic()
         while not self._waiting:
             if not self._read(_LOOK_S):
-                self._check(end)
+                self._check(began)
         return self._waiting.pop(0)
 
     def _write(self, data: bytes) -> None:
         """Put bytes on the line; reads, too, so that neither end waits for the other."""
-        end = time.monotonic() + self._patience_s
+        began = time.monotonic()
         master = self._pair.master
         while data:
             readable, writable, _ = select.select([master], [master], [], _LOOK_S)
@@ -280,7 +282,7 @@ class _Replay:
                 except BlockingIOError:
                     continue
             else:
-                self._check(end)
+                self._check(began)
 
     def _read(self, wait_s: float) -> bool:
         master = self._pair.master
@@ -289,12 +291,13 @@ class _Replay:
         self._waiting += self._receiver.feed(os.read(master, 65536))
         return True
 
-    def _check(self, end: float) -> None:
-        """That the part lives and there is time left."""
+    def _check(self, began: float) -> None:
+        """Require that the part lives, and that there is time left or it computes."""
         poll = getattr(self._process, "poll", None)
         if poll is not None and (code := poll()) is not None and not self._read(0.0):
             raise ReplayError(f"part '{self._part}' died {self._where} (exit code {code})")
-        if time.monotonic() > end:
+        idle_s = self._idle_s(getattr(self._process, "pid", None))
+        if min(time.monotonic() - began, idle_s) > self._patience_s:
             raise ReplayError(
                 f"part '{self._part}' did not answer {self._where} for {self._patience_s:g} s"
             )

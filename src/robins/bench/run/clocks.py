@@ -14,6 +14,7 @@ from robins.bench.broker.link import BenchError
 from robins.bench.run.setup import Flight
 
 Overrun = Literal["continue", "skip", "abort"]
+_BEHIND_S, _BEHIND_PERIODS = 1.0, 10.0  # the longer: from so much on a run is behind its clock
 _SPIN_NS = 200_000  # before a deadline from which on we do not sleep
 
 
@@ -29,6 +30,10 @@ class LockStep:
     def over(self, step: int) -> bool:
         """Whether the step has missed its deadline: there is none."""
         return False
+
+    def behind(self, step: int) -> str:
+        """Say that the run is behind its clock; in lock-step it has none to be behind."""
+        return ""
 
     def rested(self, ns: int) -> None:
         """The run was paused so long; nothing comes of it."""
@@ -53,6 +58,7 @@ class RealTime:
         self._rate_hz, self._overrun = rate_hz, overrun
         self.patience_ns: int | None = round(patience * 1e9 / rate_hz)
         self.skipped = 0
+        self._alarm_s = self._least_s = max(_BEHIND_S, _BEHIND_PERIODS / rate_hz)
         self._began_ns: int | None = None
 
     def deadline_ns(self, step: int) -> int:
@@ -82,6 +88,19 @@ class RealTime:
         """The run was paused so long; all deadlines move."""
         if self._began_ns is not None:
             self._began_ns += ns
+
+    def behind(self, step: int) -> str:
+        """A sentence when the run, after a step, is far behind its clock: once, and again whenever
+        that has doubled. Deadlines that were let go by count too.
+        """
+        assert self._began_ns is not None
+        due_ns = self._began_ns + round((step + 1) * 1e9 / self._rate_hz)
+        late_s = (time.monotonic_ns() - due_ns) * 1e-9
+        if late_s < self._alarm_s:
+            self._alarm_s = self._alarm_s if late_s > 0.5 * self._least_s else self._least_s
+            return ""
+        self._alarm_s = 2.0 * late_s
+        return f"the run is {late_s:.1f} s behind its clock: {self._rate_hz:g} Hz is too fast"
 
     def over(self, step: int) -> bool:
         """Whether the step that is just done has missed the deadline of the next one.

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from robins.bench.parts.idle import idleness
 from robins.bench.parts.kits import held_folder, put
 from robins.bench.parts.node import REALTIME
 from robins.bench.parts.station import path_of
@@ -63,6 +64,7 @@ class Crew:
         self._folder: Path | None = None
         self._held = contextlib.ExitStack()
         self._running: dict[str, subprocess.Popen] = {}
+        self._idle_s = idleness()
 
     def __enter__(self) -> Crew:
         with contextlib.ExitStack() as stack:
@@ -110,6 +112,10 @@ class Crew:
         """The process number of a part; None where a board takes its place."""
         running = self._running.get(part)
         return None if running is None else running.pid
+
+    def idle_s(self, part: str) -> float:
+        """Time in which the process of a part has done next to nothing [s]; see `idleness`."""
+        return self._idle_s(self.process(part))
 
     def remembers(self, part: str, step: int) -> bool:
         """Whether a part has put its memory aside after a step."""

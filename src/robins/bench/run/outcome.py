@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from robins.bench.broker.link import BenchError
 from robins.bench.live.feed import latest
 from robins.bench.rig import Judged
 from robins.bench.run.numbers import arrays_of
 from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight
 from robins.bench.run.telemetry import Flown, difference
+from robins.bench.run.untested import doubts
 from robins.results import Outcome, array, variable
 from robins.results.summary import dumps, plain
 
@@ -24,10 +27,25 @@ _EVENTS = 200  # told; all are in the record
 
 
 def judged(flight: Flight, ran: Ran) -> Judged:
-    """What the rig says of the run."""
-    if flight.rig.judge is not None:
+    """Figures of the rig for the run; none of a run without a step, of which no rig need know.
+
+    Raises:
+        BenchError: the rig cannot judge it; says where it failed.
+    """
+    if not ran.steps:
+        return Judged()
+    if flight.rig.judge is None:
+        return Judged(arrays=arrays_of(flight.rig, ran.flown))
+    try:
         return flight.rig.judge(flight, ran)
-    return Judged(arrays=arrays_of(flight.rig, ran.flown))
+    except Exception as error:  # of the user's code, and of what was flown there is more to show
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(at.filename).name}, line {at.lineno}"
+        raise BenchError(
+            f"the judge of the rig '{flight.rig.name}' fails ({type(error).__name__}: {error})",
+            where,
+            "correct it, or leave it out: then all numbers are drawn",
+        ) from error
 
 
 def figures(
@@ -74,7 +92,7 @@ def figures(
         **said.metrics,
         "injected": {f"{kind} at {link}": n for (kind, link), n in ran.injected.items()},
         "failure": ran.failure,
-        "warnings": [*refusals(ran), *said.warnings],
+        "warnings": [*refusals(ran), *doubts(flight, ran), *said.warnings],
         "latencies": summary,
         "links": {name: dict(vars(h)) for name, h in ran.health.items()},
         "events": [
@@ -95,16 +113,21 @@ def outcome(
         inside: the same run inside one program; None where there is none to compare with.
         record: what went over the lines, to be moved into the folder.
     """
-    said = judged(flight, ran)
+    if not (ran.steps or ran.failure):
+        ran = ran._replace(failure="it was stopped before its first step")
+    try:
+        said = judged(flight, ran)
+    except BenchError as error:
+        said = Judged(arrays=arrays_of(flight.rig, ran.flown))
+        ran = ran._replace(failure="; ".join(filter(None, (ran.failure, str(error)))))
     told = figures(flight, ran, said, inside)
     files: dict[str, bytes | Path] = {ACCOUNT: dumps(plain(told)).encode()}
     last_lines = []
     if record is not None:
         files[RECORD] = record
-        last_lines = [
-            f"Record: {{out}}/{RECORD}   (opens in MCAP viewers too)",
-            f"Next:   robins bench replay {{out}}/{RECORD} --node {flight.rig.example}",
-        ]
+        again = f"Next:   robins bench replay {{out}}/{RECORD} --node {flight.rig.example}"
+        last_lines = [f"Record: {{out}}/{RECORD}   (opens in MCAP viewers too)"]
+        last_lines += [again] * bool(ran.steps)
     rig = flight.rig.address or flight.rig.name
     flies = f'flies = "{flight.setup.flies}"\n' if flight.setup.flies else ""
     name = flight.setup.filter or flight.rig.name

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from robins.bench.broker.link import BenchError
 from robins.bench.rig import Rig
 from robins.bench.run.room import Room
 
@@ -88,6 +89,21 @@ class Telemetry:
         self._heard += 1
         if self._heard % _OFTEN == 0:
             self._room.forget()
+
+
+def know_truth(rig: Rig, flown: Flown, counted: slice, time_s: float) -> None:
+    """Require that something was heard to judge the estimates by.
+
+    Raises:
+        BenchError: the truth is not known in any step that counts.
+    """
+    if not (truth := rig.truth):
+        return
+    first = next(x for name, x in flown.items() if name.startswith(f"{truth}."))
+    known = first[counted]
+    if len(known) and not np.any(np.all(np.isfinite(known.reshape(len(known), -1)), axis=-1)):
+        speaker = next(part for part, sent in rig.sends.items() if truth in sent)
+        raise BenchError(f"no true {truth} was heard from '{speaker}' up to {time_s:.1f} s")
 
 
 def difference(flown: Flown, inside: Mapping[str, np.ndarray]) -> float:

@@ -22,8 +22,8 @@ _PREPARING = {
     "state": "preparing",
     "doing": "The filter is compiled, then each part starts as a process and says hello.",
 }
-ALARMS = ("died", "failed", "killed")
-WARNINGS = ("missed", "refused", "command", "power")
+ALARMS = ("died", "failed", "killed", "behind")
+WARNINGS = ("missed", "refused", "command", "power", "waiting")
 
 
 @runtime_checkable

@@ -20,21 +20,26 @@ from robins.bench.run.session import Ran
 from robins.bench.run.setup import Flight, counted_from
 from robins.results import array, variable
 
+UNFIT = "safe: do not steer by this"
 _AXES = ("x", "y", "z (boresight)")
 
 
 def judge(flight: Flight, ran: Ran) -> Judged:
-    """Errors of attitude determination and of pointing, over the steps that count."""
+    """Errors of attitude determination and of pointing, over the steps that count.
+
+    Those of the determination are of the estimates that it does not itself call unfit for use.
+    """
     flown, counted = ran.flown, slice(counted_from(flight, ran.steps), None)
-    attitude = attitude_error(flown)
+    attitude, unfit = attitude_error(flown), flag(flown, UNFIT)
+    stated = np.where(unfit[:, None], np.nan, attitude)
     wanted = reference_q_ib(ran.kit, flown, len(flown.time_s))
     pointing = turn(wanted, flown["motion.q_ib"])
     metrics = {
-        "attitude_rms_arcsec": rms_arcsec(attitude, counted),
-        "attitude_peak_arcsec": peak_arcsec(attitude, counted),
+        "attitude_rms_arcsec": rms_arcsec(stated, counted),
+        "attitude_peak_arcsec": peak_arcsec(stated, counted),
         "pointing_rms_arcsec": rms_arcsec(pointing, counted),
         "pointing_peak_arcsec": peak_arcsec(pointing, counted),
-        "attitude_end_arcsec": float(np.linalg.norm(attitude[-1])) / ARCSEC if ran.steps else None,
+        "attitude_end_arcsec": float(np.linalg.norm(stated[-1])) / ARCSEC,
     }
     return Judged(
         metrics,
@@ -45,9 +50,9 @@ def judge(flight: Flight, ran: Ran) -> Judged:
             ),
             "designs_not_passed": int(np.sum(flag(flown, "last gain kept: no new one passed"))),
             "steps_without_gyro": int(np.sum(flag(flown, "gyro held"))),
-            "steps_in_safe_mode": int(np.sum(flag(flown, "safe: do not steer by this"))),
+            "steps_in_safe_mode": int(np.sum(unfit)),
         },
-        warnings(attitude[counted]),
+        warnings(attitude[counted], unfit[counted]),
         arrays(ran, attitude, pointing),
         [
             f"{name.removesuffix('_arcsec').replace('_', ' '):<16}{value:10.2f} arcsec"
@@ -56,19 +61,20 @@ def judge(flight: Flight, ran: Ran) -> Judged:
     )
 
 
-def warnings(error: np.ndarray) -> list[str]:
+def warnings(error: np.ndarray, unfit: np.ndarray) -> list[str]:
     """Why a reader should doubt the figures.
 
     Args:
         error: (E, 3) of the attitude, over the counted steps; NaN where it is not known.
+        unfit: (E,) whether the estimate was marked as not to be steered by.
     """
-    unknown = int(np.sum(~np.all(np.isfinite(error), axis=-1)))
-    if not unknown:
-        return []
-    return [
-        f"The error of the attitude is not known in {unknown} of the {len(error)} steps that "
-        "count, and the figures are those of the others"
-    ]
+    known = np.all(np.isfinite(error), axis=-1)
+    told = (
+        ("The error of the attitude is not known", np.sum(~known)),
+        ("The estimate was marked as not to be steered by", np.sum(known & unfit)),
+    )
+    rest = f"of the {len(error)} steps that count, and the figures are those of the others"
+    return [f"{what} in {steps} {rest}" for what, steps in told if steps]
 
 
 def arrays(ran: Ran, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, Any]:
