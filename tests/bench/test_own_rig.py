@@ -2,16 +2,19 @@
 
 import ast
 import dataclasses
+import json
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from robins import bench
 from robins.bench.recording import read_record
 from robins.bench.rig import RigError
-from robins.bench.rigs import UnknownRig, rig_of
+from robins.bench.rigs import RIGS, UnknownRig, rig_of
 from robins.bench.run.numbers import arrays_of, view_of
 from robins.bench.run.session import Session
 from robins.bench.run.setup import read
@@ -69,6 +72,37 @@ def test_a_swing_by_hand():
         a, b = 0.5 * (a + b), np.sqrt(a * b)
     period = 2.0 * np.pi * np.sqrt(1.0 / 9.81) / a
     np.testing.assert_allclose(np.mean(np.diff(through)) * 2e-3, period, rtol=1e-5)
+
+
+def test_viewers_decode_every_message_of_its_record(flown):
+    _, folder = flown
+    with (folder / "record.mcap").open("rb") as file:
+        found = [
+            (channel.topic, json.loads(one.data))
+            for schema, channel, one in make_reader(file).iter_messages()
+            if schema.encoding == "jsonschema" and channel.topic != "/events"
+        ]
+    assert Counter(topic for topic, _ in found) == {
+        "/pendulum/swing": 300, "/camera/estimate": 300
+    }  # fmt: skip
+    angles = [said["angle"] for topic, said in found if topic == "/camera/estimate"]
+    estimate = read_result(folder).solution["error_angle"].values[0, :, 0]
+    true = [said["angle"] for topic, said in found if topic == "/pendulum/swing"]
+    np.testing.assert_allclose(np.degrees(np.subtract(true, angles)), estimate, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [*RIGS, RIG])
+def test_the_page_of_any_rig_offers_faults_that_it_has(name):
+    """Of an own rig those of every line; each can be injected as it stands."""
+    rig = rig_of(name)
+    made = [rig.fault.model_validate({**one["fault"], "begin": 1.0}) for one in rig.shown.offered]
+    labels = [one["label"] for one in rig.shown.offered]
+    assert len(set(labels)) == len(labels) > 0
+    if name in ("airship", "multirotor", RIG):  # they offer none themselves
+        lines = {(one.kind, one.link) for one in made}
+        assert lines >= {(k, p) for k in ("silent", "loss", "bit errors") for p in rig.parts}
+        needless = {kind for kind, one in rig.table.said.items() if not one.needs}
+        assert needless == {one.kind for one in made} - {"silent", "loss", "bit errors"}
 
 
 def test_its_record_is_heard_again(flown):

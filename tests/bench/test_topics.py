@@ -19,14 +19,17 @@ from robins.bench import wire
 from robins.bench.recording import Entry, Event, Recorder, RecordingError, Topic, read_record
 from robins.bench.recording.topics import (
     JSON,
+    Topics,
     as_json,
+    completed,
     imu,
     magnetic_field,
     nav_sat_fix,
     odometry,
 )
-from robins.bench.rigs.satellite.messages import WIRE
-from robins.bench.wire import Header
+from robins.bench.rigs.satellite.messages import SENDS, WIRE
+from robins.bench.wire import Header, Wire
+from robins.bench.wire.fields import f64, message
 from robins.cli import main
 
 IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
@@ -338,6 +341,21 @@ def test_a_record_with_topics_is_heard_again(tmp_path, capsys):
     assert main([*command, "--diff", str(old)]) == 0
     assert "Same: 'adm' says the same" in capsys.readouterr().out
     assert read_record(path).entries == then.entries  # so a part hears the same
+
+
+def test_each_message_without_a_row_has_one_of_json():
+    rows = completed(ROWS[:2], WIRE, SENDS)
+    assert rows[:2] == list(ROWS[:2])
+    sent = [(part, name) for part, some in SENDS.items() for name in some]
+    named = {row.message for row in ROWS[:2]}
+    rest = [f"/{part}/{name}" for part, name in sent if name not in named]
+    assert [row.topic for row in rows[2:]] == rest
+    assert {row.type for row in rows[2:]} == {JSON}
+    Topics(WIRE, rows)  # each fits
+    odd = Wire(("2nd part", "b"), (message(16, "from", ".", f64("x", 1, "1", "x", 1.0)),))
+    (one,) = completed((), odd, {"2nd part": ("from",), "b": ()})
+    assert one.topic == "/_2nd_part/from_"
+    Topics(odd, [one])
 
 
 # --------------------------------------------------------------------------------------- refusals

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from robins import cli, report, results
+from robins.bench.rigs import RIGS
 from robins.cli import Status, cache, running
 from robins.logs import Finding, LogError
 from robins.results.errors import cannot
@@ -284,10 +285,15 @@ def test_the_list_names_everything(robins, systems):
         "systems": [car, kite],
         "filters": filters,
         "claims": [claim | {"system": "car"}],
+        "rigs": sorted(RIGS),
         "bench": sorted(p.stem for p in PACKAGE.glob("bench/rigs/*/scenarios/*.toml")),
         "designs": sorted(p.stem for p in PACKAGE.glob("workbench/problems/*.toml")),
     }
     assert json.loads(robins("list", "car", "--json").out) == car
+    for name in ("bench", "laboratory"):
+        bench = json.loads(robins("list", name, "--json").out)
+        assert sorted(bench["rigs"]) == sorted(RIGS)
+        assert bench["scenarios"]["noisy-line"] == "Noisy lines"
 
 
 def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, systems):
@@ -298,7 +304,8 @@ def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, system
         "  car/road                     A car on the road",
         "",
     ]
-    for name, title in (("noisy-line", "Noisy lines"), ("two-states", "Two coupled states")):
+    shown = ("noisy-line", "Noisy lines"), ("two-states", "Two coupled states")
+    for name, title in (*shown, ("multirotor", "A multirotor on the bench, flown by PX4 or")):
         assert any(line.startswith(f"  {name} ") and title in line for line in lines)
     assert "robins run car/town" in lines[-1]
     assert "C1" not in "\n".join(lines)
@@ -313,6 +320,7 @@ def test_people_get_a_line_a_scenario_and_the_details_of_a_system(robins, system
     ):
         assert expected in car
     assert "robins replay LOG --system kite" in robins("list", "kite").out
+    assert "Next:   robins bench up laboratory" in robins("list", "laboratory").out
     refused = robins("list", "boat")
     assert refused.status == Status.BAD_INPUT
     assert refused.err.startswith("robins: no system 'boat'. There are car, kite; for one of your ")

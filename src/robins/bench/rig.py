@@ -118,6 +118,10 @@ class Alarms(Protocol):
         ...
 
 
+Offer = dict[str, Any]
+"""A fault on the page: its ``label``, and the ``fault`` as a scenario gives it, without a time."""
+
+
 class View(NamedTuple):
     """What the page of a rig shows.
 
@@ -126,7 +130,8 @@ class View(NamedTuple):
         sample: (arrays, kit, first step since the last sample, step) -> their values.
         alarms: a listener for a run.
         counts: (arrays, steps done) -> what was counted, by name.
-        offered: faults that can be injected, each with its label.
+        offered: faults that can be injected, each with its label; left out: those of every line,
+            and those of sensors and actuators that need no parameter.
         says: what the operator can say, by label: (arrays, kit, last step that was done) -> the
             message and its values.
     """
@@ -135,7 +140,7 @@ class View(NamedTuple):
     sample: Callable[[Flown, Any, int, int], Sequence[float]]
     alarms: Callable[[], Alarms | None] = lambda: None
     counts: Callable[[Flown, int], dict[str, int]] = lambda flown, done: {}
-    offered: tuple[dict[str, Any], ...] = ()
+    offered: tuple[Offer, ...] = ()
     says: Mapping[str, Callable[[Flown, Any, int], tuple[str, Mapping[str, Any]]]] = (
         MappingProxyType({})
     )
@@ -188,7 +193,8 @@ class Rig:
         options: parameters of a run besides those of all rigs, each with type and default.
         said: faults of its sensors and actuators, by kind, and their parameters.
         view: of the page; left out: all numbers of its messages.
-        topics: (kit) -> what viewers and ROS 2 get of its messages, in the record.
+        topics: (kit) -> what viewers and ROS 2 get of its messages, in the record; JSON of those
+            that it leaves out.
         inside: (kit, steps) -> arrays of so many first steps of the same run inside one program,
             named as `Flown` names them. With a console: (kit, steps, what was said) -> the same, or
             None where it cannot be compared.
@@ -298,6 +304,7 @@ class Rig:
     @cached_property
     def shown(self) -> View:
         """What its page shows."""
-        from robins.bench.run.numbers import view_of
+        from robins.bench.run.numbers import faults_of, view_of
 
-        return self.view() if self.view is not None else view_of(self)
+        view = self.view() if self.view is not None else view_of(self)
+        return view if view.offered else view._replace(offered=faults_of(self))

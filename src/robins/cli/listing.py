@@ -26,8 +26,14 @@ def listing(name: str | None, as_json: bool) -> None:
     cache.enable()
     with only_json(as_json):
         told = workbench.inventory(name)
-    section = sections.get(name or "", (told["summary"], {}) if name else ("", {}))
-    say(told, "" if name is None else _details(told, *section), as_json)
+    if name is None:
+        return say(told, "", as_json)
+    if "rigs" in told:
+        rig = name if name in told["rigs"] else next(iter(told["rigs"]))
+        words = f"{_section('bench', *sections['bench'])}\n\nNext:   robins bench up {rig}"
+        return say(told, words, as_json)
+    section = sections.get(name, (told["summary"], {}))
+    return say(told, _details(told, *section), as_json)
 
 
 def _section(name: str, summary: str, titles: Mapping[str, str]) -> str:

@@ -10,25 +10,29 @@ from typing import Any
 from robins.systems import catalogue
 
 _ROBINS = files("robins")
+_RIGS = _ROBINS.joinpath("bench", "rigs")
+BENCH, _BENCH = "bench", "vehicles part by part over serial lines, `robins bench up`"
 
 
 def overview() -> dict[str, tuple[str, dict[str, str]]]:
     """A sentence on every system, on the bench and on design, and titles of what each can run."""
     told = {name: (text, titles(name)) for name, text in catalogue.summaries().items()}
-    bench = "vehicles part by part over serial lines, `robins bench up`"
     design = "gains between H2 and H-infinity, `robins design`"
-    return told | {"bench": (bench, _benches()), "design": (design, designs())}
+    return told | {"bench": (_BENCH, rigs() | _benches()), "design": (design, designs())}
 
 
 def inventory(system: str | None = None) -> dict[str, Any]:
     """What there is, or what a system has: scenarios, filters, claims, whether it replays logs.
 
     Args:
-        system: its name, or "file.py:study"; all where not given.
+        system: its name, or "file.py:study"; "bench", or a rig that is no system: the bench; all
+            where not given.
 
     Raises:
         robins.systems.finding.UnknownSystem: there is no such system.
     """
+    if system == BENCH or (system in rigs() and system not in catalogue.summaries()):
+        return {"name": BENCH, "summary": _BENCH, "rigs": rigs(), "scenarios": _benches()}
     if system is not None:
         return _told(system)
     told = [_told(name) for name in catalogue.summaries()]
@@ -37,6 +41,7 @@ def inventory(system: str | None = None) -> dict[str, Any]:
         "systems": told,
         "filters": list(dict.fromkeys(name for one in told for name in one["filters"])),
         "claims": [claim | {"system": one["name"]} for one in told for claim in one["claims"]],
+        "rigs": list(rigs()),
         "bench": list(_benches()),
         "designs": list(designs()),
     }
@@ -62,9 +67,19 @@ def titles(system: str) -> dict[str, str]:
     return {f"{system}/{k}": one.title for k, one in catalogue.listed(system).items()}
 
 
+def rigs() -> dict[str, str]:
+    """Sentences on the rigs of the bench, by the names that `bench up` takes.
+
+    Read from the first lines of their modules, without the bench: its packages are an extra.
+    """
+    files = {one.name: one.joinpath("__init__.py") for one in _RIGS.iterdir() if one.is_dir()}
+    found = {name: file.read_text("utf-8") for name, file in files.items() if file.is_file()}
+    first = {name: text.removeprefix('"""').partition("\n")[0] for name, text in found.items()}
+    return {name.replace("_", "-"): line.rstrip('."') for name, line in sorted(first.items())}
+
+
 def _benches() -> dict[str, str]:
-    """Looked up without the bench: its packages are an extra."""
-    every = (rig.joinpath("scenarios") for rig in _ROBINS.joinpath("bench", "rigs").iterdir())
+    every = (rig.joinpath("scenarios") for rig in _RIGS.iterdir())
     found = [_titled(folder) for folder in every if folder.is_dir()]
     return dict(sorted((name, title) for one in found for name, title in one.items()))
 

@@ -74,6 +74,29 @@ def as_json(values: Values) -> dict[str, Any]:
     return {name: plain(np.asarray(value).tolist()) for name, value in values.items()}
 
 
+def completed(rows: Iterable[Topic], wire: Wire, sends: Mapping[str, Iterable[str]]) -> list[Topic]:
+    """Rows, and one of JSON for each message of a part that none of them names.
+
+    Its topic is ``/part/message``, with underscores for what no topic may have.
+
+    Args:
+        rows: of the table.
+        wire: the messages.
+        sends: messages by part.
+    """
+    made = list(rows)
+    named, taken = {row.message for row in made}, {row.topic for row in made}
+    for part, sent in sends.items():
+        for name in (one for one in sent if one not in named):
+            topic = "".join(f"/{re.sub(r'[^a-zA-Z0-9_]', '_', word)}" for word in (part, name))
+            topic = re.sub("/(?=[0-9])", "/_", topic)
+            while topic in taken or topic.endswith(("/to", "/from")):
+                topic += "_"
+            taken.add(topic)
+            made.append(Topic(wire.message(name).name, topic, JSON, as_json))
+    return made
+
+
 class Topics:
     """Rows, ready to be applied to what parts send.
 

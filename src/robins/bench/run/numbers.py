@@ -1,4 +1,4 @@
-"""What page and report show of a rig that says nothing of it: all numbers of its messages."""
+"""What page and report show of a rig that says nothing of it: its numbers, faults of its lines."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 
 from robins.bench.live.feed import Signal
-from robins.bench.rig import Rig, View
+from robins.bench.rig import Offer, Rig, View
 from robins.bench.run.telemetry import Flown
 from robins.bench.wire.fields import Field, Message
 from robins.results import array
 
+_LINE_FAULTS: tuple[tuple[str, str, dict[str, float]], ...] = (
+    ("silent", "link silent", {}),
+    ("loss", "2 % of frames lost", {"share": 0.02}),
+    ("bit errors", "2 % of frames damaged", {"share": 0.02}),
+)
 _AXES, _WXYZ = "xyz", "wxyz"
 
 
@@ -47,6 +52,22 @@ def view_of(rig: Rig) -> View:
         return np.concatenate(every).tolist()
 
     return View(signals, sample)
+
+
+def faults_of(rig: Rig) -> tuple[Offer, ...]:
+    """Faults for the page of a rig that offers none: of its lines, then of what it can itself."""
+    line = [
+        {"label": f"{part}: {words}", "fault": {"kind": kind, "link": part, **how} | at}
+        for part in rig.parts
+        for at in [{} if rig.sends[part] else {"direction": "to"}]
+        for kind, words, how in _LINE_FAULTS
+    ]
+    own = [
+        {"label": f"{one.link}: {kind}", "fault": {"kind": kind}}
+        for kind, one in rig.table.said.items()
+        if not one.needs
+    ]
+    return (*line, *own)
 
 
 def latest(values: np.ndarray, since: int, step: int) -> np.ndarray:

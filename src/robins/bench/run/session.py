@@ -20,6 +20,7 @@ from robins.bench.broker.revive import History
 from robins.bench.parts.node import few_collections, realtime
 from robins.bench.ports.port import BAUD, Pair, open_pair, open_port, parted
 from robins.bench.recording import Entry, Event, Recorder
+from robins.bench.recording.topics import completed
 from robins.bench.rig import Kit, Rig, Spoken
 from robins.bench.run.accounting import Latencies
 from robins.bench.run.clocks import clock_of
@@ -314,7 +315,8 @@ class Session:
             "step_ns": self.kit.step_ns,
             "steps": self.steps,
         }
-        rows, wire = self.rig.topics(self.kit), self.rig.wire
+        wire = self.rig.wire
+        rows = completed(self.rig.topics(self.kit), wire, self.rig.sends)
         recorder = Recorder(self._record_path, wire, header, topics=rows, overwrite=True)
         return stack.enter_context(recorder)
 
