@@ -224,6 +224,7 @@ def test_what_a_run_does_not_test_is_said():
         f"The fault 'loss' at all links begins at 600 s, {after}",
         f"The fault 'silent' at adder, from 0.5 s on, met nothing: {nothing}",
     ]
+    assert outcome(short, ran, None, None).warnings == doubts(short, ran)
     late = [Event(k, "behind", f"the run is {k}.0 s behind", {"time_s": 4.0}) for k in (33, 66)]
     behind = ["At 4 s the run is 66.0 s behind"]
     assert doubts(of, ran._replace(events=late)) == behind

@@ -201,6 +201,20 @@ def test_a_jump_of_a_number_is_no_loss_of_frames(monkeypatch, ahead, lost, jumps
     np.testing.assert_array_equal(ran.flown["count.n"], np.arange(float(STEPS)))
 
 
+def test_a_frame_that_no_part_may_send_is_strange_and_not_lost(monkeypatch):
+    class Strange(Station):
+        def _frame(self, name, payload, time_ns):
+            frame = super()._frame(name, payload, time_ns)
+            if name == "count" and self._done[0] == ODD:
+                tick = self._wire.encode("tick", {"step": ODD})
+                frame += super()._frame("sum", payload, time_ns)
+                frame += super()._frame("tick", tick, time_ns)
+            return frame
+
+    ran, told = clockwork(monkeypatch, 0, Strange)
+    assert (ran.health["counter"].strange, told) == (2, {})
+
+
 @pytest.mark.parametrize("works", [True, False])
 def test_a_part_that_computes_is_waited_for_and_named(monkeypatch, works):
     """Before the first step, and in one; a part that does nothing is not."""
@@ -220,7 +234,7 @@ def test_a_part_that_computes_is_waited_for_and_named(monkeypatch, works):
     monkeypatch.setattr(Threads, "idle_s", lambda crew, part: 0.0 if works else math.inf)
     for name in ("session.HELLO_S", "session._LONG_S"):
         monkeypatch.setattr(f"robins.bench.run.{name}", 0.2 if works else 1.0)
-    monkeypatch.setattr("robins.bench.broker.broker._TOLD_S", 0.1)
+    monkeypatch.setattr("robins.bench.broker.broker._REPORT_S", 0.1)
     on_threads(monkeypatch, counter=Slow)
     ran = Session(CLOCK, progress=lambda share, what: told.append(what)).run()
     assert "counter: starting, compiling" in told

@@ -25,7 +25,7 @@ from robins.bench.wire.schema import BARE, Wire
 Sends = Mapping[str, tuple[str, ...]]  # messages that a part sends
 Takes = Mapping[str, Mapping[str, int]]  # messages that it takes, and how many steps older
 _REMEMBERED = 64  # steps, whose messages are known if they come again
-_TOLD_S = 10.0  # between two words on who is waited for
+_REPORT_S = 10.0  # between two reports of the parts that are waited for
 _GLANCE_S = 0.05  # how often the world beside the wire is looked at while nothing comes
 _CLOCK_NS = time.monotonic_ns
 
@@ -147,11 +147,11 @@ class Broker:
         self._await(self.links, patience_s)
 
     def _await(self, parts: Iterable[str], patience_s: float) -> None:
-        began, told, told_s = time.monotonic(), list[str](), 0.0
+        began, shown, shown_s = time.monotonic(), list[str](), 0.0
         while waited := [name for name in parts if not self.links[name].greeted]:
             since_s = time.monotonic() - began
-            if waited != told or since_s - told_s > _TOLD_S:
-                told, told_s = waited, since_s
+            if waited != shown or since_s - shown_s > _REPORT_S:
+                shown, shown_s = waited, since_s
                 self._waiting(waited, since_s)
             idle = [name for name in waited if self._idle_s(name) > patience_s]
             if since_s > patience_s and idle:
@@ -367,7 +367,7 @@ class Broker:
             link.count("repeated")
             return None
         if age or beside or name in self._done or self._step < 0:
-            link.count("late")  # whoever takes it without a lag has computed without it
+            link.count("late")  # parts that take it without a lag have computed without it
         usable = not beside and age <= min(self._lags[message], self._step)
         return age if usable else None
 

@@ -56,7 +56,7 @@ class Health:
     jumps: int = 0  # of sequence numbers, further than frames can have been lost
     repeated: int = 0  # by its number, or a second one of its message for a step
     late: int = 0  # out of order, or of a step that was over
-    early: int = 0  # of a step that has not begun
+    early: int = 0  # of a step to come
     strange: int = 0  # of another run, or a message that this part has not to send
     refused: int = 0  # sound frames of a length or with numbers that their message cannot have
     bytes_in: int = 0
@@ -244,6 +244,8 @@ class Link:
     ) -> None:
         if name != "hello" and (name != "done" or frame.header.run != self._run):
             self.count("strange")
+            if frame.header.run == self._run:
+                self._counts(frame, now_ns)  # it has come, and is not lost
         elif not self._bars(name, frame, now_ns):
             self._watch(self.name, "from", encode_frame(*frame), frame.header.time_ns)
             if name == "done":
@@ -275,9 +277,10 @@ class Link:
 
     def _use(self, frame: Frame, found: list[tuple[str, Frame]], now_ns: int) -> None:
         name = self._wire.names.get(frame.header.type)
+        new = self._counts(frame, now_ns)
         if name is None:
             self.count("strange")
-        elif self._counts(frame, now_ns):
+        elif new:
             self.count("frames")
             self.health.heard_ns = now_ns
             found.append((name, frame))

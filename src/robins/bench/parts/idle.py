@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_WORK_S = 0.5  # of processor time; who only says hello and looks at a port uses less in two minutes
+_WORK_S = 0.5  # of processor time; a process that waits at a port uses less in two minutes
 
 
 def idleness() -> Callable[[int | None], float]:
     """Make a function that gives, by its number, for how long a process has done next to nothing.
 
     That time [s] begins when the function is first asked of the process. It is infinite where there
-    is no process, or where the system does not tell its processor time in ``/proc``.
+    is no process, or where the system does not show its processor time in ``/proc``.
     """
     worked: dict[int, tuple[float, float]] = {}  # processor time, and when so much was used
 
@@ -26,10 +26,10 @@ def idleness() -> Callable[[int | None], float]:
         if pid is None:
             return math.inf
         try:
-            told = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         except OSError:
             return math.inf
-        used_s, now = sum(map(int, told[11:15])) / os.sysconf("SC_CLK_TCK"), time.monotonic()
+        used_s, now = sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK"), time.monotonic()
         if pid not in worked or used_s - worked[pid][0] > _WORK_S:
             worked[pid] = used_s, now
         return now - worked[pid][1]

@@ -32,7 +32,7 @@ class LockStep:
         return False
 
     def behind(self, step: int) -> str:
-        """Say that the run is behind its clock; in lock-step it has none to be behind."""
+        """Return no sentence: in lock-step there is no clock to be behind."""
         return ""
 
     def rested(self, ns: int) -> None:

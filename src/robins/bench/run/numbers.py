@@ -1,4 +1,4 @@
-"""What page and report show of a rig that says nothing of it: its numbers, faults of its lines."""
+"""Defaults of page and report for any rig: all numbers of its messages, faults of its lines."""
 
 from __future__ import annotations
 

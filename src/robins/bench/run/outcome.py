@@ -30,7 +30,7 @@ def judged(flight: Flight, ran: Ran) -> Judged:
     """Figures of the rig for the run; none of a run without a step, of which no rig need know.
 
     Raises:
-        BenchError: the rig cannot judge it; says where it failed.
+        BenchError: the rig cannot judge it; names the line that failed.
     """
     if not ran.steps:
         return Judged()

@@ -32,7 +32,7 @@ from robins.bench.run.telemetry import Flown, Telemetry, know_truth
 from robins.bench.wire.frames import VERSION
 from robins.bench.wire.records import Unsound
 
-HELLO_S = 120.0  # for a hello from whoever does not compile
+HELLO_S = 120.0  # for the hello of a part that does not compute
 REVIVED_S = 60.0
 _ANEW = '; on_death = "restart" would start it anew'
 _LONG_S = 9.0  # of waiting for a hello, before it is an event
@@ -225,8 +225,8 @@ class Session:
                 self.latencies.cycle(k, deadline, began, ended, missed)
                 self.done, self.step_ms = k + 1, (ended - began) * 1e-6
                 if missed:
-                    missed_ = f"step {k} was not over at the deadline of the next"
-                    self.event("missed", missed_, False)
+                    text = f"step {k} was not over at the deadline of the next"
+                    self.event("missed", text, False)
                 if behind := self.clock.behind(k):
                     self.event("behind", behind)
                 if self._watch is not None:
@@ -350,7 +350,7 @@ class Session:
         )
 
     def _waiting(self, parts: Sequence[str], since_s: float) -> None:
-        """Show which parts have not said hello yet."""
+        """Show the parts whose hello is waited for."""
         processes = [part for part in parts if part not in self.ports]
         silent = [part for part in parts if part in self.ports]
         words = [f"{', '.join(processes)}: starting, compiling"] * bool(processes)

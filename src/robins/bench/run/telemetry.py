@@ -92,7 +92,7 @@ class Telemetry:
 
 
 def know_truth(rig: Rig, flown: Flown, counted: slice, time_s: float) -> None:
-    """Require that something was heard to judge the estimates by.
+    """Require that the truth is known in some step that counts.
 
     Raises:
         BenchError: the truth is not known in any step that counts.

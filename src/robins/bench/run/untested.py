@@ -12,7 +12,7 @@ from robins.scenario import Parameters, Span
 def doubts(flight: Flight, ran: Ran) -> list[str]:
     """Sentences on what was planned and did not happen, and on a clock that was not kept.
 
-    A run that failed says why it ended, and no more.
+    Of a run that failed the reason is known, so only the latter.
     """
     behind = [event for event in ran.events if event.kind == "behind"]
     late = [f"At {one.fields['time_s']:g} s {one.text}" for one in behind[-1:]]

@@ -87,7 +87,7 @@ class Sequence:
         lost: numbers that have not come and are not expected any more.
         repeated: frames whose number had come before.
         late: frames that came after one of a higher number; they are not lost any more.
-        jumps: times that the sender began to count anew, or went on further than frames can have
+        jumps: times that the sender restarted its count, or went on further than frames can have
             been lost.
     """
 

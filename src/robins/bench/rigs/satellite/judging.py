@@ -69,12 +69,12 @@ def warnings(error: np.ndarray, unfit: np.ndarray) -> list[str]:
         unfit: (E,) whether the estimate was marked as not to be steered by.
     """
     known = np.all(np.isfinite(error), axis=-1)
-    told = (
+    unusable = (
         ("The error of the attitude is not known", np.sum(~known)),
         ("The estimate was marked as not to be steered by", np.sum(known & unfit)),
     )
     rest = f"of the {len(error)} steps that count, and the figures are those of the others"
-    return [f"{what} in {steps} {rest}" for what, steps in told if steps]
+    return [f"{what} in {steps} {rest}" for what, steps in unusable if steps]
 
 
 def arrays(ran: Ran, attitude: np.ndarray, pointing: np.ndarray) -> dict[str, Any]:
