@@ -37,6 +37,9 @@ CASES = (
 )
 
 
+_WORD = re.compile(r"([0-9a-f]{8}|[0-9a-f]{16}) ([0-9.e+-]+)")
+
+
 class Board(NamedTuple):
     """A processor, and a machine of QEMU that has it."""
 
@@ -59,8 +62,9 @@ class Ran(NamedTuple):
     """What a test of a library printed."""
 
     said: str  # its line on codes and numbers
-    bits: str  # checksum of the bits of all states
-    reals: np.ndarray  # all states, one after the other
+    bits: str  # checksum of the bits of all reals
+    reals: np.ndarray  # of all outputs, in the order of the calls
+    sizes: np.ndarray  # the largest number in the field of each
 
 
 class Built(NamedTuple):
@@ -106,30 +110,22 @@ def on_host(folder: Path, compiler: str = "cc") -> Ran:
 def _ran(command: list[str]) -> Ran:
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     lines = done.stdout.split("\n")
-    words = [line for line in lines if len(line) in (8, 16) and " " not in line]
+    words = [found.groups() for line in lines if (found := _WORD.fullmatch(line))]
     said = [line for line in lines if " steps: " in line]
     bits = [line.rpartition(" ")[2] for line in lines if line.startswith("bits of all")]
     if not said or not bits:
         raise RuntimeError(f"{command[0]} ended with {done.returncode}: {done.stdout[-300:]}")
-    kinds = (np.uint32, np.float32) if len(words[0]) == 8 else (np.uint64, np.float64)
-    reals = np.array([int(word, 16) for word in words], kinds[0]).view(kinds[1])
-    return Ran(said[0], bits[0], reals)
+    kinds = (np.uint32, np.float32) if len(words[0][0]) == 8 else (np.uint64, np.float64)
+    reals = np.array([int(word, 16) for word, _ in words], kinds[0]).view(kinds[1])
+    return Ran(said[0], bits[0], reals, np.array([float(size) or 1.0 for _, size in words]))
 
 
-def sizes(folder: Path) -> np.ndarray:
-    """The largest number in its field, of each number of a state."""
-    fields = re.findall(r"state_(\w+)\[t\], (\d+), size_", (folder / "test.c").read_text())
-    told = re.findall(r"double size_(\w+) = (\S+);", (folder / "recorded.h").read_text())
-    known = {name: float(size) for name, size in told}
-    return np.concatenate([np.full(int(count), known[name] or 1.0) for name, count in fields])
-
-
-def apart(one: Ran, other: Ran, size: np.ndarray) -> str:
-    """How far the states of two runs are apart, in parts of a field."""
+def apart(one: Ran, other: Ran) -> str:
+    """How far the numbers of two runs are apart, in parts of a field."""
     if one.bits == other.bits:
         return "to the bit"
-    a, b = (ran.reals.reshape(-1, len(size)) for ran in (one, other))
-    off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b)) / size
+    a, b = one.reals, other.reals
+    off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b)) / one.sizes
     return f"within {np.max(off):.1e} of a field"
 
 
@@ -159,7 +155,7 @@ def row(folder: Path, case: str, real: str, board: Board, host: Ran) -> str:
     codes = there.said.partition(" steps: ")[2].partition(",")[0]
     return (
         f"| {case} | {board.name} | {real} | {size.flash / 1000:.1f} | {size.stack / 1000:.1f} "
-        f"| {codes} | {apart(host, there, sizes(folder))} |"
+        f"| {codes} | {apart(host, there)} |"
     )
 
 
@@ -169,7 +165,7 @@ def compared(folder: Path, label: str, real: str, zig: str) -> None:
     for board in (M4F, M7):
         print(row(folder, label, real, board, host), flush=True)
     if zig:
-        bits = apart(host, on_host(folder, zig), sizes(folder))
+        bits = apart(host, on_host(folder, zig))
         print(f"| {label} | this machine, clang | {real} | | | | {bits} |", flush=True)
 
 

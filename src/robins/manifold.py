@@ -3,8 +3,9 @@
 A state is any pytree. Its leaves are arrays, which add, and *elements*: objects with ``dim``,
 ``retract(delta)`` and ``local(other)``, such as `robins.rotation.Rotation` or `Angle`. The tangent
 vector of a state stacks those of its leaves in pytree order. An element in a state is one, not
-many; many states are one state under `vmap`. With no elements this room costs
-nothing: `retract` is addition and `local` subtraction.
+many; many states are one state under `vmap`. An element whose arrays are not in the units of its
+tangent vector has ``units``, by array: texts for a reader of exported code. With no elements this
+room costs nothing: `retract` is addition and `local` subtraction.
 
     retract(x, local(x, y)) == y        local(x, retract(x, d)) == d
 """

@@ -14,7 +14,7 @@ are `left_jacobian(phi)` and, on the right, `left_jacobian(-phi)`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -245,6 +245,9 @@ class Rotation:
     wxyz: Any  # (..., 4) array; unannotated, for JAX rebuilds the class with stand-ins
 
     dim = 3
+    units: ClassVar[dict[str, str]] = {
+        "wxyz": "unit quaternion, scalar first; error: that of the rotation"
+    }
 
     @classmethod
     def identity(cls) -> Rotation:

@@ -332,6 +332,11 @@ def test_the_example_compiles_as_c_plus_plus_too(tmp_path):
     command = ["g++", *flags, *sources]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
+    # A compiler that takes NaN for impossible would pass or refuse any number that is missing.
+    command.insert(1, "-ffast-math")
+    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert refused.returncode != 0
+    assert "NaN means missing here: compile without -ffast-math" in refused.stderr
 
 
 def test_a_frame_without_payload_is_the_least():

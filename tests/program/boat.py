@@ -13,6 +13,7 @@ from robins.manifold import Angle
 from robins.program import DOUBLE, trace_steps
 from robins.program.harness import Recorded, check_c, makefile, recorded_h
 from robins.program.library import Entry, Library
+from robins.workbench.board_runs import BoardRun, by_jax, entry_functions, reset_function
 
 STEPS = 12
 
@@ -22,57 +23,51 @@ class State(NamedTuple):
     rate: Any
 
 
-class Told(NamedTuple):
-    code: Any
-    used: Any
+class Drive(NamedTuple):
+    """Names that a header of C cannot use as they are: a macro of complex.h, and a word of C++."""
+
+    I: Any  # noqa: E741 s
+    new: Any  # rad/s
 
 
 def drift(x, u):
     """The heading turns, a little faster where it is south."""
-    return x._replace(heading=x.heading.retract(u * (x.rate + 0.01 * jnp.sin(x.heading.rad))))
+    rate = x.rate + 0.01 * jnp.sin(x.heading.rad) + u.new
+    return x._replace(heading=x.heading.retract(u.I * rate))
 
 
 MODEL = Model(
     Motion(drift, np.array([0.01, 0.02])),
-    (Sensor(lambda x, aux: x.heading, np.array([0.1]), 1, "compass"),),
+    (Sensor(lambda x, aux: x.heading, np.array([0.1]), 1, "steering compass"),),
 )
 FILTER = kalman(rules=[huber(0.95), sage_husa(0.98)])
-
-
-def predict(state, u):
-    state, prediction = FILTER.predict(state, MODEL.motion, u)
-    return state, Told(prediction.code, jnp.ones(0, dtype=bool))
-
-
-def update(state, y, aux):
-    state, info = FILTER.update(state, MODEL.sensors[0], y, aux)
-    return state, Told(info.code, info.used)
+UPDATE = "update_steering compass"
 
 
 @cache
 def made():
-    """The entry points, the start, and steps by JAX: inputs, states, codes."""
-    start = Belief.of(State(Angle(jnp.array(3.1)), jnp.array([0.4])), np.diag([0.1, 0.2]))
-    begin = state = FILTER.init(start, MODEL.dims)
-    u = np.full((STEPS, 1), 0.1)
+    """The entry points, the start, and steps by JAX: inputs and outputs."""
+    belief = Belief.of(State(Angle(jnp.array(3.1)), jnp.array([0.4])), np.diag([0.1, 0.2]))
+    start = jax.tree.map(jnp.asarray, FILTER.init(belief, MODEL.dims))
+    u = Drive(np.full(STEPS, 0.1), np.zeros(STEPS))
     y = Angle(3.1 + 0.05 * np.arange(STEPS) + np.where(np.arange(STEPS) == 5, np.nan, 0.0))
-    steps = [(predict, (u[0],)), (update, (Angle(y.rad[0]), None))]
+    run = BoardRun(None, start, {"predict": (u,), UPDATE: (y, None)})
+    functions = entry_functions(FILTER, MODEL, run.given)
+    anew = reset_function(FILTER, start)
+    steps = [(function, run.row(0)[name]) for name, function in functions.items()]
+    programs = trace_steps([*steps, (anew, (belief,))], start)
     told = [
         ("predict", ("input",), "Moves on by one step."),
-        ("update_compass", ("reading", "about"), "Uses a reading."),
+        (UPDATE, ("reading", "about"), "Uses a reading."),
+        ("reset", ("belief",), "Begins again."),
     ]
-    programs = trace_steps(steps, state)
     entries = [Entry(n, p, takes, text) for (n, takes, text), p in zip(told, programs, strict=True)]
-    go, use = jax.jit(predict), jax.jit(update)
-    states, codes = [], []
-    for k in range(STEPS):
-        state, moved = go(state, u[k])
-        state, seen = use(state, Angle(jnp.asarray(y.rad[k])), None)
-        states.append(state)
-        codes.append([int(moved.code), int(seen.code)])
-    stacked = jax.tree_util.tree_map(lambda *a: np.stack([np.asarray(x) for x in a]), *states)
-    given = {"predict": (u,), "update_compass": (y, None)}
-    return entries, begin, Recorded(given, stacked, np.array(codes))
+    calls = by_jax(functions, run, dict)
+    last = jax.tree.map(lambda a: a[-1], calls[UPDATE][0])
+    calls["reset"] = jax.tree.map(lambda a: np.asarray(a)[None], jax.jit(anew)(last, belief))
+    result = f"{entries[1].symbol}_result"
+    sizes = {(result, "nis"): 1.0, (result, "innovation"): 0.3}
+    return entries, start, Recorded(run.given, calls, sizes=sizes, ends={"reset": (belief,)})
 
 
 def write_boat(folder, precision=DOUBLE, name="boat"):
@@ -81,7 +76,10 @@ def write_boat(folder, precision=DOUBLE, name="boat"):
     notes = {("state", "mean_rate"): "rad/s"}
     library = Library(name, entries, start, ("A boat.",), notes, precision)
     if precision is not DOUBLE:  # twelve steps of some ten roundings each
-        record = record._replace(tolerances={f.name: 120 * 6e-8 for f in library.state})
+        keys = [("state", f.name) for f in library.state]
+        for entry in entries:
+            keys += [(f"{entry.symbol}_result", f.name) for f in library.result(entry)]
+        record = record._replace(tolerances=dict.fromkeys(keys, 120 * 6e-8))
     for file, text in {
         f"{name}.h": library.header(),
         f"{name}.c": library.source(),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exported import primitives
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import primitives as published
@@ -383,16 +384,6 @@ def test_it_gives_what_jax_gives(name, unroll):
     same_in_c(function, *args, within=within, unroll=unroll)
 
 
-def primitives(jaxpr):
-    """Names of all primitives of a jaxpr, inner ones included."""
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for value in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns")):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                yield from primitives(inner)
-
-
 # Names of older versions of JAX, and what JAX itself writes only in some transformations.
 ELSEWHERE = {
     *("pjit", "closed_call", "core_call", "remat", "remat2", "custom_vjp_call_jaxpr", "custom_lin"),
@@ -436,7 +427,9 @@ def test_a_primitive_without_a_rule_is_named_with_its_line():
     def asks(x):
         return jnp.linalg.svd(x[None])[1]  # this line
 
-    with pytest.raises(ProgramError, match=r"test_primitives.py:\d+: .*'svd'.*: there is no ") as caught:
+    with pytest.raises(
+        ProgramError, match=r"test_primitives.py:\d+: .*'svd'.*: there is no "
+    ) as caught:
         trace(asks, V)
     line = int(caught.value.where.rpartition(":")[2])
     with open(__file__) as text:

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from robins.earth import Geodetic
+from robins.ins.extended_pose import ExtendedPose
 from robins.manifold import Angle
 from robins.rotation import Rotation
 from robins.systems.study import Problem, SensorAxes, StateBlock
@@ -41,7 +43,7 @@ REPORTED[6, 6] = -1.0
 
 def test_the_mean_has_units_and_axes_in_its_own_order():
     axes = tangent_axes(PROBLEM, REPORTED, 8)
-    notes = field_notes(PROBLEM, axes, MEAN, {"predict": (), "update_fix": ()})
+    notes = field_notes(PROBLEM, axes, MEAN, {"predict": (), "update_fix": (np.zeros(3), None)})
     assert notes["state", "mean_attitude_wxyz"] == (
         "unit quaternion, scalar first; error: turn [rad], NED: north, east, down"
     )
@@ -54,6 +56,24 @@ def test_the_mean_has_units_and_axes_in_its_own_order():
         "  4 to 6: position [m], ENU: north, east, minus up",
         "  the others: what the model adds to them",
     ]
+
+
+def test_what_an_element_holds_is_in_its_own_units():
+    class Track(NamedTuple):
+        pose: ExtendedPose
+        place: Geodetic
+
+    mean = Track(ExtendedPose.identity(), Geodetic(0.5, 0.5, 0.5))
+    axes = tangent_axes(PROBLEM, np.eye(7, 12), 12)
+    notes = field_notes(PROBLEM, axes, mean, {"update_fix": (Geodetic(0.5, 0.5, 0.5), None)})
+    for struct, name in (("state", "mean_place"), ("update_fix_reading", "value")):
+        where = {field: text for (one, field), text in notes.items() if one == struct}
+        root = name.removesuffix("value") + ("_" if name != "value" else "")
+        assert where[f"{root}lat"] == "rad, geodetic latitude, positive north"
+        assert where[f"{root}lon"] == "rad, longitude, positive east"
+        assert where[f"{root}alt"] == "m, height above the ellipsoid, positive up"
+    assert notes["state", "mean_pose_velocity"] == "m/s"
+    assert notes["state", "mean_pose_rotation_wxyz"] == "unit quaternion, scalar first"
 
 
 def test_what_is_reported_as_a_mixture_is_not_told():

@@ -10,7 +10,7 @@ from robins.filters.rules import gate
 from robins.program import SINGLE, trace_steps
 from robins.program.library import Entry, Library
 from robins.systems.study import Case, Contender, Problem, SensorAxes, StateBlock
-from robins.workbench.board_runs import board_runs, by_jax, entry_functions
+from robins.workbench.board_runs import board_runs, by_jax, ends, entry_functions
 from robins.workbench.single_precision import BlockCost, Cost, cost, differences, in_floats
 
 STEPS, NOISE = 200, 0.1
@@ -62,8 +62,8 @@ def judged(problem, count=2):
         )
     ]
     library = Library("robins", entries, runs[0].start, precision=SINGLE)
-    doubles = [by_jax(functions, run) for run in runs]
-    singles = in_floats(library, runs)
+    doubles = [by_jax(functions, run, ends) for run in runs]
+    singles = in_floats(library, runs, ends)
     found = cost(problem, contender, library, runs, doubles, singles)
     return found, library, doubles, singles, runs
 
@@ -129,5 +129,5 @@ def test_what_is_not_a_number_in_one_precision_only_is_infinitely_far(near):
     mean = states.belief.mean.copy()
     mean[3] = np.nan
     lost = states._replace(belief=states.belief._replace(mean=mean))
-    assert differences(library, states, lost)["mean"] == np.inf
-    assert differences(library, lost, lost)["mean"] == 0.0
+    assert differences(library.state, states, lost)["mean"] == np.inf
+    assert differences(library.state, lost, lost)["mean"] == 0.0

@@ -13,7 +13,7 @@ to full precision.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -215,6 +215,11 @@ class Geodetic:
     alt: Any  # (...) array, m
 
     dim = 3
+    units: ClassVar[dict[str, str]] = {
+        "lat": "rad, geodetic latitude, positive north",
+        "lon": "rad, longitude, positive east",
+        "alt": "m, height above the ellipsoid, positive up",
+    }
 
     @classmethod
     def from_degrees(cls, lat_deg, lon_deg, alt_m) -> Geodetic:

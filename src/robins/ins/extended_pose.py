@@ -16,7 +16,7 @@ moves by a linear law that does not depend on the path, however large the error 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +52,7 @@ class ExtendedPose:
     error: Side = field(default="right", metadata={"static": True})
 
     dim = 9
+    units: ClassVar[dict[str, str]] = {"velocity": "m/s", "position": "m"}
 
     @classmethod
     def identity(cls, error: Side = "right") -> ExtendedPose:

@@ -1,21 +1,25 @@
 """A test of an exported library with the user's own compiler: recorded steps, replayed.
 
-`make check` in the folder compiles library and test, replays the recorded inputs, and compares the
-state after each step and every code with those of JAX. Entry points that are no part of a step are
-called once, after the last one. It also prints a checksum of the bits of all states, by which two
-compilers or two machines are compared.
+`make check` in the folder compiles library and test, replays the recorded inputs, and compares
+every output of every call with that of JAX: all fields of the state, the initial one included, and
+all fields of the result. Entry points that are no part of a step are called once, after the last
+one. It also prints a checksum of the bits of all reals, by which two compilers or two machines are
+compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
-from robins.program.library import C_TYPES, Entry, Field, Library, fields_of, number
+from robins.program.library import C_TYPES, CODE, Entry, Field, Library, fields_of, number
 from robins.program.precision import DOUBLE, SINGLE, Precision
+from robins.program.wrap import wrapped
 
 TOLERANCE = 1e-9  # of the size of a field; of a library of doubles
 
@@ -47,14 +51,14 @@ BITS = {
     DOUBLE: {
         "word": "uint64_t",
         "nan": "0x7ff8000000000000u",
-        "printed": '"%08lx%08lx\\n", (unsigned long)(word >> 32),\n'
+        "printed": '"%08lx%08lx %.17g\\n", (unsigned long)(word >> 32),\n'
         + " " * 15
-        + "(unsigned long)(word & 0xffffffffu)",
+        + "(unsigned long)(word & 0xffffffffu), size",
     },
     SINGLE: {
         "word": "uint32_t",
         "nan": "0x7fc00000u",
-        "printed": '"%08lx\\n", (unsigned long)word',
+        "printed": '"%08lx %.17g\\n", (unsigned long)word, size',
     },
 }
 
@@ -66,17 +70,19 @@ BEGIN = """\
 #include "recorded.h"
 
 static double worst = 0.0; /* difference, in parts of a field */
-static int beyond = 0;     /* numbers that differ by more than they may */
+static int wrong = 0;      /* calls of which a code, a count or a flag differs */
+static int beyond = 0;     /* reals that differ by more than they may */
+static const char *where = ""; /* the first of these */
 static uint64_t bits = 14695981039346656037u;
 
-static void compare(const {name}_real *found, const double *expected, int n, double size,
-                    double tolerance)
+static void compare(const char *field, const {name}_real *found, const double *expected, int n,
+                    double size, double tolerance)
 {{
     for (int i = 0; i < n; ++i) {{
         const double here = (double)found[i];
         const double off = fabs(here - expected[i]);
         const double part = size > 0.0 ? off / size : off;
-        const int same = isnan(here) && isnan(expected[i]);
+        const int same = here == expected[i] || (isnan(here) && isnan(expected[i]));
         {word} word = {nan};
         if (!isnan(here)) {{ memcpy(&word, &found[i], sizeof word); }}
         bits = (bits ^ word) * 1099511628211u;
@@ -84,23 +90,28 @@ static void compare(const {name}_real *found, const double *expected, int n, dou
         printf({printed});
 #endif
         if (!same && !(part <= worst)) {{ worst = isnan(part) ? (double)INFINITY : part; }}
-        if (!same && !(part <= tolerance)) {{ ++beyond; }}
+        if (!same && !(part <= tolerance) && !isinf(tolerance)) {{
+            ++beyond;
+            where = *where ? where : field;
+        }}
     }}
 }}
 
-int main(void)
+static int differ(const char *field, int yes)
 {{
-    static {name}_state state;
-    int wrong = 0;
-    {name}_init(&state);
-    for (int t = 0; t < STEPS + ENDS; ++t) {{"""
+    if (yes && CODES_OFF == 0 && !*where) {{ where = field; }}
+    return yes != 0;
+}}
+"""
 
 END = """\
-    }
     const int good = wrong <= CODES_OFF && beyond == 0;
     printf("%d steps: %d codes differ, numbers differ by %.1e of a field at most: %s\\n",
            STEPS, wrong, worst, good ? "passed" : "FAILED");
-    printf("bits of all states: %08lx%08lx\\n", (unsigned long)(bits >> 32),
+    if (!good) {
+        printf("first in %s\\n", where);
+    }
+    printf("bits of all numbers: %08lx%08lx\\n", (unsigned long)(bits >> 32),
            (unsigned long)(bits & 0xffffffffu));
     if (sizeof RUINED > 1) {
         printf("FAILED: %s\\n", RUINED);
@@ -109,6 +120,10 @@ END = """\
 }
 """
 
+COUNTED = ("    wrong += off;", "}", "")
+
+Key = tuple[str, str]  # struct ("state", "predict_result") and field, as in the notes of a library
+
 
 class Recorded(NamedTuple):
     """Steps of a filter.
@@ -116,25 +131,24 @@ class Recorded(NamedTuple):
     Attributes:
         given: of each entry point, in the order in which a step calls them, its arguments after the
             state, with a leading axis of steps.
-        states: after each step, and after each call of `ends`.
-        codes: (steps, entry points).
-        tolerances: of fields of the state, in parts of its size, the largest number that it has;
-            `TOLERANCE` of the others.
-        codes_off: how many codes may differ.
-        sizes: of fields of the state, the least size by which a difference is judged, where the
-            numbers of the field may be nothing but rounding.
+        made: of each entry point what its calls returned, the state and the result, with a leading
+            axis of calls.
+        tolerances: of fields, in parts of their size, the largest number that each has; `TOLERANCE`
+            of the others.
+        codes_off: how many calls may return another code, count or flag.
+        sizes: of fields, the least size by which a difference is judged, where the numbers of the
+            field may be nothing but rounding.
         ends: of each entry point that is called once after the last step, its arguments after the
-            state; its code is 0.
+            state.
         ruined: why the library is not to be used, however well it was compiled; its test says so
             and fails.
     """
 
     given: Mapping[str, Sequence[Any]]
-    states: Any
-    codes: np.ndarray
-    tolerances: Mapping[str, float] = {}
+    made: Mapping[str, tuple[Any, Any]]
+    tolerances: Mapping[Key, float] = {}
     codes_off: int = 0
-    sizes: Mapping[str, float] = {}
+    sizes: Mapping[Key, float] = {}
     ends: Mapping[str, Sequence[Any]] = {}
     ruined: str = ""
 
@@ -146,43 +160,58 @@ def makefile(library: Library) -> str:
 
 def recorded_h(library: Library, record: Recorded) -> str:
     """The record as C."""
-    steps = len(record.codes)
+    steps = len(jax.tree_util.tree_leaves(record.given)[0])
     lines = [
         f"#define STEPS {steps}",
-        f"#define ENDS {len(record.ends)} /* calls after the last step */",
-        f"#define CODES_OFF {record.codes_off} /* that may differ */",
-        f'#define RUINED "{record.ruined}" /* why the library is not to be used */',
+        f"#define CODES_OFF {record.codes_off} /* calls that may differ in a code or a count */",
+        f"#define RUINED {json.dumps(record.ruined)} /* why the library is not to be used */",
         "",
     ]
-    for entry, name, fields, leaves in _tables(library, record):
-        for f, leaf in zip(fields, leaves, strict=True):
-            lines += _table(f"{entry.name}_{name}_{f.name}", f, leaf, library.precision)
-    kept = [f for f in library.state if f.is_real]
-    states = [np.asarray(x) for x in jax.tree_util.tree_leaves(record.states)]
-    reals = [x for x in states if x.dtype == np.float64 and x[0].size]
-    for f, leaf in zip(kept, reals, strict=True):
-        lines += _table(f"state_{f.name}", f, leaf, DOUBLE)
-        least = record.sizes.get(f.name, 0.0)
-        size = np.max(np.abs(leaf), initial=least, where=np.isfinite(leaf))
-        lines.append(f"static const double size_{f.name} = {float(size)!r};")
-        allowed = record.tolerances.get(f.name, TOLERANCE)
-        lines.append(f"static const double tolerance_{f.name} = {float(allowed)!r};")
-    rows = ", ".join("{" + ", ".join(map(str, map(int, row))) + "}" for row in record.codes)
-    lines.append(f"static const int codes[STEPS][{record.codes.shape[1]}] = {{{rows}}};")
+    for table, f, leaf in _given(library, record):
+        lines += _table(table, f, leaf, library.precision)
+    sizes: dict[Key, float] = {}
+    for table, key, f, leaf in _made(library, record):
+        lines += _table(table, f, leaf, DOUBLE)
+        if f.is_real:
+            least = sizes.get(key, record.sizes.get(key, 0.0))
+            sizes[key] = np.max(np.abs(leaf), initial=least, where=np.isfinite(leaf))
+    for key, size in sizes.items():
+        allowed, name = record.tolerances.get(key, TOLERANCE), "_".join(key)
+        lines.append(f"static const double size_{name} = {float(size)!r};")
+        lines.append(f"static const double tolerance_{name} = {number(allowed, True)};")
     return "\n".join([*lines, ""])
 
 
-def _tables(library: Library, record: Recorded):
-    """Entry, argument, fields and arrays of all that is given; leading axis of calls."""
+def _given(library: Library, record: Recorded) -> Iterator[tuple[str, Field, np.ndarray]]:
+    """Table, field and numbers of all arguments; leading axis of calls."""
     once = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], dict(record.ends))
-    all_given = {**record.given, **once}
+    given = {**record.given, **once}
     for entry in library.entries:
-        for j, (name, given) in enumerate(
-            zip(entry.takes, all_given[entry.name], strict=True), start=1
-        ):
-            leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(given)]
-            some = [x for x in leaves if x[0].size]
-            yield entry, name, fields_of(entry.program.inputs, j), some
+        pairs = zip(entry.takes, given[entry.name], strict=True)
+        for j, (argument, tree) in enumerate(pairs, start=1):
+            struct = library.argument(entry, argument)
+            for f, leaf in _filled(fields_of(entry.program.inputs, j), tree):
+                yield f"{struct}_{f.name}", f, leaf
+
+
+def _made(library: Library, record: Recorded) -> Iterator[tuple[str, Key, Field, np.ndarray]]:
+    """Table, key, field and numbers of all outputs; leading axis of calls."""
+    start = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], library.start)
+    for f, leaf in _filled(library.state, start):
+        yield f"init_state_{f.name}", ("state", f.name), f, leaf
+    for entry in library.entries:
+        state, result = record.made[entry.name]
+        for f, leaf in _filled(library.state, state):
+            yield f"{entry.symbol}_state_{f.name}", ("state", f.name), f, leaf
+        struct = f"{entry.symbol}_result"
+        for f, leaf in _filled(library.result(entry), result):
+            yield f"{struct}_{f.name}", (struct, f.name), f, leaf
+
+
+def _filled(fields: Sequence[Field], tree: PyTree) -> Iterator[tuple[Field, np.ndarray]]:
+    """Fields and their numbers; empty arrays have no field."""
+    leaves = [np.asarray(x) for x in jax.tree_util.tree_leaves(tree)]
+    return zip(fields, [x for x in leaves if x[0].size], strict=True)
 
 
 def _table(name: str, f: Field, leaf: np.ndarray, precision: Precision) -> list[str]:
@@ -198,33 +227,51 @@ def _table(name: str, f: Field, leaf: np.ndarray, precision: Precision) -> list[
 def check_c(library: Library, record: Recorded) -> str:
     """The test."""
     name = library.name
-    lines = [BEGIN.format(name=name, **BITS[library.precision])]
-    steps = [entry for entry in library.entries if entry.name in record.given]
-    ends = [entry for entry in library.entries if entry.name in record.ends]
-    for k, entry in enumerate(steps):
-        lines += _called(library, entry, "t < STEPS", "t", f"codes[t][{k}]")
-    for k, entry in enumerate(ends):
-        lines += _called(library, entry, f"t == STEPS + {k}", "0", "0")
-    for f in library.state:
-        if f.is_real:
-            first = f.first("(&state)").replace("(&state)->", "state.")
-            told = f"{first}, state_{f.name}[t], {f.size}, size_{f.name}, tolerance_{f.name}"
-            lines.append(f"        compare({told});")
-    return "\n".join([*lines, END])
+    lines = BEGIN.format(name=name, **BITS[library.precision]).split("\n")
+    lines += [f"static void call_init({name}_state *state, int t)", "{", "    int off = 0;"]
+    lines += [f"    {name}_init(state);", *_compared("init", library.state, "state"), *COUNTED]
+    for entry in library.entries:
+        lines += _called(library, entry)
+    lines += ["int main(void)", "{", f"    static {name}_state state;", "    call_init(&state, 0);"]
+    lines += ["    for (int t = 0; t < STEPS; ++t) {"]
+    calls = {entry.name: f"call_{entry.symbol}(&state," for entry in library.entries}
+    lines += [f"        {call} t);" for entry, call in calls.items() if entry not in record.ends]
+    lines += ["    }", *(f"    {calls[entry]} 0);" for entry in record.ends)]
+    return "\n".join([*(part for line in lines for part in wrapped(line)), END])
 
 
-def _called(library: Library, entry: Entry, when: str, row: str, code: str) -> list[str]:
-    """One call of an entry point on a row of what is given, and the code that it should give."""
-    name, lines, given = library.name, [f"        if ({when}) {{"], []
+def _called(library: Library, entry: Entry) -> list[str]:
+    """A function that calls an entry point on a row of what is given, and compares all it makes."""
+    name, e, given = library.name, entry.symbol, []
+    lines = [f"static void call_{e}({name}_state *state, int t)", "{"]
     for j, argument in enumerate(entry.takes, start=1):
         if fields := fields_of(entry.program.inputs, j):
             given.append(argument)
-            lines.append(f"            {name}_{library.argument(entry, argument)} {argument};")
+            struct = library.argument(entry, argument)
+            lines.append(f"    {name}_{struct} {argument};")
             for f in fields:
-                first = f.first("it").replace("it->", f"{argument}.")
-                table = f"{entry.name}_{argument}_{f.name}[{row}]"
-                lines.append(f"            memcpy({first}, {table}, sizeof {table});")
-    lines.append(f"            {name}_{entry.name}_result result;")
-    told = ", ".join(["&state", *(f"&{a}" for a in given), "&result"])
-    lines.append(f"            wrong += {name}_{entry.name}({told}) != {code};")
-    return [*lines, "        }"]
+                table = f"{struct}_{f.name}[t]"
+                lines.append(f"    memcpy(&{argument}.{f.name}, {table}, sizeof {table});")
+    lines += [f"    {name}_{e}_result result;", "    memset(&result, 0x5a, sizeof result);"]
+    told = ", ".join(["state", *(f"&{a}" for a in given), "&result"])
+    lines.append(f"    const int code = {name}_{e}({told});")
+    lines.append(f'    int off = differ("{e}/code", code != {e}_result_{CODE}[t][0]);')
+    lines += _compared(e, library.result(entry), "result")
+    lines += _compared(e, library.state, "state")
+    return [*lines, *COUNTED]
+
+
+def _compared(entry: str, fields: Sequence[Field], struct: str) -> list[str]:
+    """The fields of a struct against a row of the record."""
+    lines = []
+    for f in fields:
+        table = f"{entry}_{struct}_{f.name}[t]"
+        text = f'"{entry}/{struct}.{f.name}"'
+        found = f.first(struct) if struct == "state" else f.first(struct).replace("->", ".")
+        key = f"state_{f.name}" if struct == "state" else f"{entry}_{struct}_{f.name}"
+        if f.is_real:
+            scale = f"{f.size}, size_{key}, tolerance_{key}"
+            lines.append(f"    compare({text}, {found}, {table}, {scale});")
+        else:
+            lines.append(f"    off |= differ({text}, memcmp({found}, {table}, sizeof {table}));")
+    return lines

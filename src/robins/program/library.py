@@ -19,6 +19,27 @@ from robins.program.precision import DOUBLE, Precision
 from robins.program.trace import Leaf, Program
 from robins.program.wrap import COLUMNS, wrapped
 
+# NaN means missing, so a compiler may not assume that there is none.
+FINITE_ONLY = """\
+#if defined(__FAST_MATH__) || defined(_M_FP_FAST) || \\
+    (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "NaN means missing here: compile without -ffast-math and -ffinite-math-only"
+#endif"""
+EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
+
+# Words that name no field: those of C and C++, and what compilers and widespread headers define.
+_WORDS = """
+auto break case char const continue default do double else enum extern float for goto if inline int
+long register restrict return short signed sizeof static struct switch typedef union unsigned void
+volatile while asm typeof alignas alignof and and_eq bitand bitor bool catch class compl concept
+const_cast constexpr decltype delete dynamic_cast explicit export false friend mutable namespace new
+noexcept not not_eq nullptr operator or or_eq private protected public reinterpret_cast requires
+static_assert static_cast template this thread_local throw true try typeid typename using virtual
+wchar_t xor xor_eq complex errno far i386 imaginary interface linux near small stderr stdin stdout
+unix
+"""
+RESERVED = frozenset(_WORDS.split())
+
 C_TYPES = {"flag": "int", "whole": "int64_t", "word": "uint32_t", "word64": "uint64_t"}
 CODE = "code"  # of a result: what the entry point returns
 
@@ -37,6 +58,11 @@ class Entry(NamedTuple):
     program: Program
     takes: tuple[str, ...]
     about: str
+
+    @property
+    def symbol(self) -> str:
+        """Its name as a part of names in C."""
+        return symbol(self.name)
 
 
 class Field(NamedTuple):
@@ -79,12 +105,22 @@ def fields_of(leaves: Sequence[Leaf], which: int) -> list[Field]:
     return found
 
 
+def symbol(name: str) -> str:
+    """Any name as a part of names in C."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)
+
+
 def identifier(path: str) -> str:
-    """A path in a pytree as a name in C: attributes and indices, the belief's own left out."""
-    words = re.findall(r"[A-Za-z_]\w*|\d+", path)
+    """A path in a pytree as a name in C: attributes and indices, the belief's own left out.
+
+    A name that is reserved, or has capitals only as macros have (`I` of complex.h), ends with an
+    underscore.
+    """
+    words = re.findall(r"[A-Za-z_]\w*|\d+", path, re.ASCII)
     words = words[1:] if words[:1] == ["belief"] else words
     name = "_".join(words) or "value"
-    return f"at_{name}" if name[0].isdigit() else name
+    name = f"at_{name}" if name[0].isdigit() else name
+    return f"{name}_" if name in RESERVED or name.isupper() else name
 
 
 class Library(NamedTuple):
@@ -118,11 +154,11 @@ class Library(NamedTuple):
             for k, name in enumerate(entry.takes):
                 if fields := fields_of(entry.program.inputs, k + 1):
                     yield self.argument(entry, name), fields, f"What {entry.name} takes."
-            yield f"{entry.name}_result", self.result(entry), f"What {entry.name} tells."
+            yield f"{entry.symbol}_result", self.result(entry), f"What {entry.name} tells."
 
     def argument(self, entry: Entry, name: str) -> str:
         """The name of the struct of an argument."""
-        return f"{entry.name}_{name}"
+        return f"{entry.symbol}_{name}"
 
     def result(self, entry: Entry) -> list[Field]:
         """Fields of what an entry point tells."""
@@ -137,14 +173,15 @@ class Library(NamedTuple):
             for k, name in enumerate(entry.takes)
             if fields_of(entry.program.inputs, k + 1)
         ]
-        all_ = [f"{self.name}_state *state", *given, f"{self.name}_{entry.name}_result *result"]
-        return f"int {self.name}_{entry.name}({', '.join(all_)})"
+        all_ = [f"{self.name}_state *state", *given, f"{self.name}_{entry.symbol}_result *result"]
+        return f"int {self.name}_{entry.symbol}({', '.join(all_)})"
 
     def header(self) -> str:
         """The header: types, structs, entry points."""
         guard = f"{self.name.upper()}_H"
         lines = [*self._head(), f"#ifndef {guard}", f"#define {guard}", "", "#include <stdint.h>"]
-        lines += ["", f"typedef {self.precision.kind} {self.name}_real;", ""]
+        lines += ["", FINITE_ONLY, "", EXTERN_C[0], ""]
+        lines += [f"typedef {self.precision.kind} {self.name}_real;", ""]
         for name, fields, about in self.structs():
             lines += [f"/* {about} */", "typedef struct {"]
             for f in fields:
@@ -160,10 +197,11 @@ class Library(NamedTuple):
         ]
         for entry in self.entries:
             lines += ["", f"/* {entry.about} Returns its code. */", f"{self.signature(entry)};"]
-        return _text([*lines, "", "#endif", ""])
+        return _text([*lines, "", EXTERN_C[1], "", "#endif", ""])
 
     def _head(self) -> list[str]:
-        return ["/*", *(f" * {line}".rstrip() for line in self.about), " */"] if self.about else []
+        about = (f" * {_within(line)}".rstrip() for line in self.about)
+        return ["/*", *about, " */"] if self.about else []
 
     # -------------------------------------------------------------------------------- the file
 
@@ -185,7 +223,7 @@ class Library(NamedTuple):
         """
         texts = [header(precision=self.precision)]
         for entry in self.entries:
-            texts.append(function(entry.program, f"of_{entry.name}", linkage, self.precision))
+            texts.append(function(entry.program, f"of_{entry.symbol}", linkage, self.precision))
         return "\n".join(texts)
 
     def _init(self) -> list[str]:
@@ -198,8 +236,9 @@ class Library(NamedTuple):
             entries = ", ".join(
                 number(x, f.is_real, self.precision) for x in value.ravel().tolist()
             )
-            lines.append(f"    static const {kind} {f.name}[{f.size}] = {{{entries}}};")
-            copies.append(f"    memcpy({f.first('state')}, {f.name}, sizeof {f.name});")
+            at = f"at_{f.name}"
+            lines.append(f"    static const {kind} {at}[{f.size}] = {{{entries}}};")
+            copies.append(f"    memcpy({f.first('state')}, {at}, sizeof {at});")
         return [*lines, *copies, "}", ""]
 
     def _entry(self, entry: Entry) -> list[str]:
@@ -211,7 +250,7 @@ class Library(NamedTuple):
         lines += _copied(self.state, "state", "x", "k", inwards=True)
         for j, name in enumerate(entry.takes):
             lines += _copied(fields_of(program.inputs, j + 1), name, "x", "k", inwards=True)
-        lines.append(f"    of_{entry.name}(x, k, x, k);")
+        lines.append(f"    of_{entry.symbol}(x, k, x, k);")
         lines += _copied(fields_of(program.results, 0), "state", "x", "k", inwards=False)
         result = self.result(entry)
         lines += _copied(result, "result", "x", "k", inwards=False)
@@ -223,8 +262,14 @@ def _declared(text: str, note: str) -> list[str]:
     """A field and its note: behind it where there is room, else before it."""
     if not note:
         return [text]
-    both = f"{text} /* {note} */"
-    return [both] if len(both) <= COLUMNS else [f"    /* {note} */", text]
+    comment = f"/* {_within(note)} */"
+    both = f"{text} {comment}"
+    return [both] if len(both) <= COLUMNS else [f"    {comment}", text]
+
+
+def _within(comment: str) -> str:
+    """A text that neither ends the comment it stands in nor begins another."""
+    return comment.replace("*/", "* /").replace("/*", "/ *")
 
 
 def counts(leaves: Sequence[Leaf]) -> tuple[int, int]:

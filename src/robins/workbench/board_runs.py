@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array
 from robins.campaign.monte_carlo import solved, worlds
 from robins.filters import Belief, Code, Filter, Model, StepInfo
 from robins.filters.trees import select
+from robins.manifold import State
 from robins.systems.study import Case, Problem
 
 
@@ -128,17 +129,23 @@ def reset_function(filter_: Filter, start: Any) -> Any:
     return begin_anew
 
 
-def by_jax(functions: Mapping[str, Any], run: BoardRun) -> tuple[Any, np.ndarray]:
-    """States after each step, and codes (steps, entry points)."""
+Calls = dict[str, tuple[State, State]]  # of each entry point what it returns, state and result
+Kept = TypeVar("Kept")
 
-    def step(state: Any, row: Any):
-        codes = []
+
+def ends(calls: Calls) -> tuple[State, Array]:
+    """The state after a step, and the codes (entry points,)."""
+    return list(calls.values())[-1][0], jnp.stack([told.code for _, told in calls.values()], -1)
+
+
+def by_jax(functions: Mapping[str, Any], run: BoardRun, kept: Callable[[Calls], Kept]) -> Kept:
+    """What is kept of the calls of each step, with a leading axis of steps; NumPy."""
+
+    def step(state: State, row: State):
+        calls: Calls = {}
         for name, function in functions.items():
-            state, told = function(state, *row[name])
-            codes.append(told.code)
-        return state, (state, jnp.stack(codes))
+            calls[name] = state, _ = function(state, *row[name])
+        return state, kept(calls)
 
-    states, codes = jax.jit(lambda state, rows: jax.lax.scan(step, state, rows)[1])(
-        run.start, run.given
-    )
-    return jax.tree_util.tree_map(np.asarray, states), np.asarray(codes)
+    made = jax.jit(lambda state, rows: jax.lax.scan(step, state, rows)[1])(run.start, run.given)
+    return jax.tree_util.tree_map(np.asarray, made)

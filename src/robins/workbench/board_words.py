@@ -8,10 +8,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.tree_util import KeyPath
 
 from robins import manifold
-from robins.program.library import identifier
-from robins.systems.study import Problem
+from robins.manifold import State
+from robins.program.library import identifier, symbol
+from robins.systems.study import Problem, SensorAxes
 
 Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
@@ -54,37 +56,82 @@ def components(axes: list[Axis | None]) -> list[str]:
 
 
 def field_notes(
-    problem: Problem, axes: list[Axis | None], mean: Any, given: Mapping[str, Any]
+    problem: Problem, axes: list[Axis | None], mean: State, given: Mapping[str, Any]
 ) -> dict[tuple[str, str], str]:
     """Units and axes of the mean, of readings and of innovations, by struct and field."""
     notes = {
         ("state", "current"): "the last prediction was taken",
         ("reset_belief", "factor"): "above the diagonal not looked at",
     }
-    for name, first, last in mean_fields(mean):
-        whole = "unit quaternion, scalar first; error: " if name.endswith("wxyz") else ""
-        if told := _told(axes[first:last], first):
-            notes["state", name] = notes["reset_belief", name] = whole + told
-    for entry in given:
+    for name, first, last, own in mean_fields(mean):
+        if text := _said(own, _told(axes[first:last], first)):
+            notes["state", name] = notes["reset_belief", name] = text
+    for entry, arguments in given.items():
         sensor = problem.sensors.get(entry.removeprefix("update_"))
         if sensor is not None:
-            told = f"{sensor.units}, {sensor.frame}: {', '.join(sensor.axes)}"
-            notes[f"{entry}_reading", "value"] = told
-            notes[f"{entry}_result", "innovation"] = told
+            name = symbol(entry)
+            for field, first, last, own in tangent_fields(arguments[0], ""):
+                notes[f"{name}_reading", field] = _said(own, _read(sensor, first, last))
+            notes[f"{name}_result", "innovation"] = _read(sensor, 0, len(sensor.axes))
             deviation = f"{sensor.units}: its standard deviation; NaN where not used"
-            notes[f"{entry}_result", "sigma"] = deviation
+            notes[f"{name}_result", "sigma"] = deviation
     return {**notes, **problem.fields}
 
 
-def mean_fields(mean: Any) -> Iterator[tuple[str, int, int]]:
-    """Fields of a mean, and the first and the end of their components of the error."""
+def _read(sensor: SensorAxes, first: int, last: int) -> str:
+    """Some components of a reading; an axis in brackets has a unit of its own."""
+    axes = sensor.axes[first:last]
+    units = dict.fromkeys(axis.partition("[")[2].rstrip("]") or sensor.units for axis in axes)
+    return f"{', '.join(units)}, {sensor.frame}: {', '.join(axes)}"
+
+
+def _said(own: str | None, told: str) -> str:
+    """The note of a field: in its own words, or those of its error."""
+    if own is None:
+        return told
+    text, _, error = own.partition("; error: ")
+    return f"{text}; error: {told}" if error and told else text
+
+
+Place = tuple[str, int, int, str | None]
+
+
+def mean_fields(mean: State) -> Iterator[Place]:
+    """`tangent_fields` of a mean in a belief."""
+    return tangent_fields(mean, ".belief.mean")
+
+
+def tangent_fields(tree: State, root: str) -> Iterator[Place]:
+    """Fields of a point, the first and the end of their components of the error, and their units.
+
+    The units are None where they are those of the error: of arrays, and of an element that has no
+    others, as `Angle`.
+    """
     at = 0
-    flat = jax.tree_util.tree_flatten_with_path(mean, is_leaf=manifold.is_element)[0]
+    flat = jax.tree_util.tree_flatten_with_path(tree, is_leaf=manifold.is_element)[0]
     for path, leaf in flat:
         end = at + manifold.dim(leaf)
-        for inner, _ in jax.tree_util.tree_flatten_with_path(leaf)[0]:
-            yield identifier(f".belief.mean{jax.tree_util.keystr((*path, *inner))}"), at, end
+        for inner, own in _inner(leaf):
+            yield identifier(f"{root}{jax.tree_util.keystr((*path, *inner))}"), at, end, own
         at = end
+
+
+def _inner(leaf: State) -> Iterator[tuple[KeyPath, str | None]]:
+    """Paths of the arrays in a leaf, and what units these have by themselves."""
+    if not manifold.is_element(leaf):
+        yield (), None
+        return
+    own = getattr(leaf, "units", {})
+    parts = jax.tree_util.tree_flatten_with_path(
+        leaf, is_leaf=lambda part: part is not leaf and manifold.is_element(part)
+    )[0]
+    additive = not own and len(parts) == 1 and np.size(parts[0][1]) == leaf.dim
+    for path, part in parts:
+        if manifold.is_element(part):
+            for inner, text in _inner(part):
+                yield (*path, *inner), "" if text is None else text.partition("; error: ")[0]
+        else:
+            yield path, None if additive else own.get(getattr(path[-1], "name", ""), "")
 
 
 def _told(axes: list[Axis | None], at: int) -> str:

@@ -21,20 +21,22 @@ from robins.bench.run.setup import changed, read
 from robins.bench.wire.c_header import firmware
 from robins.filters import SENTENCES, Code
 from robins.program import DOUBLE, SINGLE, Precision, Program, trace_steps
-from robins.program.harness import Recorded, check_c, makefile, recorded_h
-from robins.program.library import Entry, Library
+from robins.program.harness import Key, Recorded, check_c, makefile, recorded_h
+from robins.program.library import Entry, Library, symbol
 from robins.systems.study import Problem
 from robins.workbench.board_runs import (
     BoardRun,
+    Calls,
     board_runs,
     by_jax,
+    ends,
     entry_functions,
     reset_function,
 )
 from robins.workbench.board_words import components, field_notes, mean_fields, tangent_axes
 from robins.workbench.errors import InputError, refusing
 from robins.workbench.scenarios import check_filters, find_scenario, read_scenario
-from robins.workbench.single_precision import Cost, Made, cost, differences, in_floats
+from robins.workbench.single_precision import Cost, cost, differences, in_floats
 
 STEPS = 60  # of a run, recorded for the test
 RUNS = 3  # by which the cost of single precision is told
@@ -207,7 +209,7 @@ def _library(
     programs = trace_steps([*steps, (anew, (belief,))], _any_start(runs), unroll=unroll)
     entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
     axes = tangent_axes(problem, contender.reported, len(belief.factor))
-    notes = field_notes(problem, axes, belief.mean, run.given)
+    notes = field_notes(problem, axes, belief.mean, first)
     library = Library(asked.library, entries, run.start, (), notes, precision)
     c = library.source()
     identity = hashlib.sha256((library.header() + c).encode()).hexdigest()
@@ -219,12 +221,13 @@ def _library(
     )
     library = library._replace(about=about)
     c = library.headed(c)
+    record = _record(run.cut(STEPS), functions, anew)
     if not single:
-        return library, c, _record(run, by_jax(functions, run.cut(STEPS)), anew), None
-    doubles = [by_jax(functions, one) for one in runs]
-    singles = in_floats(library, runs)
+        return library, c, record, None
+    doubles = [by_jax(functions, one, ends) for one in runs]
+    singles = in_floats(library, runs, ends)
     found = cost(problem, contender, library, runs, doubles, singles)
-    record = _compared(library, _record(run, doubles[0], anew), singles[0])
+    record = _compared(library, record, in_floats(library, [run.cut(STEPS)], dict)[0])
     return library, c, record._replace(ruined="" if found.bearable else found.verdict), found
 
 
@@ -248,36 +251,62 @@ def _any_start(runs: Sequence[BoardRun]) -> Any:
     return jax.tree_util.tree_map(either, *(run.start for run in runs))
 
 
-def _record(run: BoardRun, made: Made, anew: Any) -> Recorded:
-    """The first steps by JAX, and then a new start from what was believed after the first."""
-    states, codes = jax.tree_util.tree_map(lambda a: a[:STEPS], made)
+def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> Recorded:
+    """The steps by JAX, and then a new start from what was believed after the first."""
+    made = by_jax(functions, run, dict)
+    states = list(made.values())[-1][0]
     first, last = (jax.tree_util.tree_map(lambda a, k=k: a[k], states) for k in (0, -1))
-    state, _ = jax.jit(anew)(last, first.belief)
-    states = jax.tree_util.tree_map(lambda a, b: np.append(a, b[None], axis=0), states, state)
-    given, ends = run.cut(STEPS).given, {RESET: (first.belief,)}
-    return Recorded(given, states, codes, sizes=_sigmas(states), ends=ends)
+    once = jax.jit(anew)(last, first.belief)
+    made[RESET] = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], once)
+    return Recorded(run.given, made, sizes=_sizes(made), ends={RESET: (first.belief,)})
 
 
-def _sigmas(states: Any) -> dict[str, float]:
-    """Of each field of the mean the largest sigma: less than a billionth of it is no difference."""
-    belief = states.belief
-    sigma = np.sqrt(np.sum(np.square(belief.factor), axis=-1))
-    mean = jax.tree_util.tree_map(lambda a: a[0], belief.mean)
-    return {
-        name: float(
-            np.max(sigma[:, first:end], initial=0.0, where=np.isfinite(sigma[:, first:end]))
-        )
-        for name, first, end in mean_fields(mean)
-    }
+def _sizes(made: Calls) -> dict[Key, float]:
+    """Numbers beside which a billionth is no difference, by struct and field.
+
+    They are the largest sigma of what is in the units of a sigma, and the degrees of freedom of a
+    NIS.
+    """
+    sizes: dict[Key, float] = {}
+    for entry, (state, told) in made.items():
+        factor, mean = state.belief.factor, state.belief.mean
+        sigma = np.sqrt(np.sum(np.square(factor), axis=-1))
+        for name, first, end, own in mean_fields(jax.tree_util.tree_map(lambda a: a[0], mean)):
+            if not own:
+                key = "state", name
+                sizes[key] = max(sizes.get(key, 0.0), _largest(sigma[:, first:end]))
+        if hasattr(told, "innovation"):
+            struct = f"{symbol(entry)}_result"
+            sizes[struct, "innovation"] = _largest(told.sigma)
+            sizes[struct, "nis"] = _largest(told.dof)
+    return sizes
 
 
-def _compared(library: Library, record: Recorded, singles: Made) -> Recorded:
+def _largest(numbers: np.ndarray) -> float:
+    return float(np.max(numbers, initial=0.0, where=np.isfinite(numbers)))
+
+
+def _compared(library: Library, record: Recorded, singles: Calls) -> Recorded:
     """With how far off floats may be: a margin beside what they are."""
-    narrow, others = jax.tree_util.tree_map(lambda a: a[: len(record.codes)], singles)
-    wide = jax.tree_util.tree_map(lambda a: a[: len(record.codes)], record.states)
-    parts = differences(library, wide, narrow, record.sizes)
-    tolerances = {f: max(MARGIN * part, LEAST) for f, part in parts.items() if np.isfinite(part)}
-    return record._replace(tolerances=tolerances, codes_off=int(np.sum(record.codes != others)))
+    parts: dict[Key, float] = {}
+    off = 0
+    for entry in library.entries:
+        if entry.name not in singles:
+            continue
+        result = f"{entry.symbol}_result"
+        fields = ("state", library.state), (result, library.result(entry))
+        pairs = zip(record.made[entry.name], singles[entry.name], strict=True)
+        changed = np.zeros(len(singles[entry.name][1].code), bool)
+        for (struct, own), (wide, narrow) in zip(fields, pairs, strict=True):
+            least = {f: size for (one, f), size in record.sizes.items() if one == struct}
+            for name, part in differences(own, wide, narrow, least).items():
+                parts[struct, name] = max(part, parts.get((struct, name), 0.0))
+            for a, b in zip(*map(jax.tree_util.tree_leaves, (wide, narrow)), strict=True):
+                if a.dtype != np.float64:
+                    changed |= np.any((a != b).reshape(len(a), -1), axis=1)
+        off += int(np.sum(changed))
+    tolerances = {key: max(MARGIN * part, LEAST) for key, part in parts.items()}
+    return record._replace(tolerances=tolerances, codes_off=off)
 
 
 def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:

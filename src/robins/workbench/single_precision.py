@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from robins import units
 from robins.campaign.monte_carlo import reported_rows
 from robins.filters.analysis.consistency import normalised_sq
 from robins.manifold import local
-from robins.program import FLAGS, build
-from robins.program.library import Library, counts
+from robins.program import FLAGS, Program, build
+from robins.program.library import Field, Library, counts
 from robins.systems.study import Contender, Problem
-from robins.workbench.board_runs import BoardRun
+from robins.workbench.board_runs import BoardRun, Calls, Kept
 
 NONE: Mapping[str, float] = {}
 LITTLE, MUCH = 1.01, 1.1  # growth of an error: below the one it does not show, above the other ...
@@ -139,52 +140,46 @@ class Cost(NamedTuple):
         return "\n".join(rows)
 
 
-def in_floats(library: Library, runs: Sequence[BoardRun]) -> list[tuple[Any, np.ndarray]]:
-    """States after each step, and codes (steps, entry points), by the library compiled here.
+def in_floats(
+    library: Library, runs: Sequence[BoardRun], kept: Callable[[Calls], Kept]
+) -> list[Kept]:
+    """What is kept of all calls of the library, compiled here; leading axis of steps, doubles.
 
     Raises:
         BuildError: there is no compiler.
     """
     loaded = ctypes.CDLL(str(build(library.programs(), QUICK)))
-    return [_one(loaded, library, run) for run in runs]
+    made = (kept(_one(loaded, library, run)) for run in runs)
+    return [jax.tree_util.tree_map(np.asarray, one) for one in made]
 
 
-def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> tuple[Any, np.ndarray]:
+def _one(loaded: ctypes.CDLL, library: Library, run: BoardRun) -> Calls:
     dtype, calls = library.precision.dtype, []
-    leaves, tree = jax.tree_util.tree_flatten(run.start)
-    begin = [rows[0] for rows in _flat([np.asarray(x)[None] for x in leaves], dtype, 1)]
-    own = [a.size for a in begin]
+    start = [np.asarray(x)[None] for x in jax.tree_util.tree_leaves(run.start)]
+    state = [rows[0] for rows in _flat(start, dtype, 1)]
+    own = [a.size for a in state]
     for entry in library.entries:
         if entry.name not in run.given:
             continue  # it is no part of a step
-        x, k = (
-            np.zeros(max(sizes), kind)
-            for sizes, kind in zip(
-                zip(counts(entry.program.inputs), counts(entry.program.results), strict=True),
-                (dtype, np.int64),
-                strict=True,
-            )
-        )
-        function = getattr(loaded, f"of_{entry.name}")
+        made = counts(entry.program.results)
+        sizes = zip(counts(entry.program.inputs), made, strict=True)
+        x, k = (np.zeros(max(n), kind) for n, kind in zip(sizes, (dtype, np.int64), strict=True))
+        function = getattr(loaded, f"of_{entry.symbol}")
         function.restype = None
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in (x, k, x, k)]
         rows = _flat(jax.tree_util.tree_leaves(run.given[entry.name]), dtype, run.steps)
-        code = next(f.at for f in library.result(entry) if f.name == "code")
-        calls.append((function, pointers, (x, k), rows, code))
-    kept = [np.zeros((run.steps, size), a.dtype) for size, a in zip(own, begin, strict=True)]
-    codes = np.zeros((run.steps, len(calls)), np.int64)
-    state = begin
+        kept = [np.zeros((run.steps, n), a.dtype) for n, a in zip(made, (x, k), strict=True)]
+        calls.append((entry, function, pointers, (x, k), rows, kept))
     for t in range(run.steps):
-        for j, (function, pointers, memory, rows, code) in enumerate(calls):
+        for _, function, pointers, memory, rows, kept in calls:
             for space, carried, row, size in zip(memory, state, rows, own, strict=True):
                 space[:size] = carried
                 space[size : size + row.shape[1]] = row[t]
             function(*pointers)
             state = [space[:size].copy() for space, size in zip(memory, own, strict=True)]
-            codes[t, j] = memory[1][code]
-        for whole, carried in zip(kept, state, strict=True):
-            whole[t] = carried
-    return _as_tree(kept, leaves, tree), codes
+            for whole, space in zip(kept, memory, strict=True):
+                whole[t] = space[: whole.shape[1]]
+    return {entry.name: _as_tree(kept, entry.program) for entry, *_, kept in calls}
 
 
 def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
@@ -199,31 +194,31 @@ def _flat(leaves: Sequence[Any], dtype: Any, steps: int) -> list[np.ndarray]:
     return parts
 
 
-def _as_tree(kept: Sequence[np.ndarray], leaves: Sequence[Any], tree: Any) -> Any:
-    """States of a run as the filter has them, in doubles."""
+def _as_tree(kept: Sequence[np.ndarray], program: Program) -> Any:
+    """Results of all calls of a program as it gives them, in doubles."""
     at, found = [0, 0], []
-    for leaf in map(np.asarray, leaves):
-        pool = int(leaf.dtype != np.float64)
-        part = kept[pool][:, at[pool] : at[pool] + leaf.size]
-        at[pool] += leaf.size
+    for leaf in program.results:
+        pool, size = int(leaf.kind != "real"), math.prod(leaf.shape)
+        part = kept[pool][:, at[pool] : at[pool] + size]
+        at[pool] += size
         found.append(part.reshape(len(part), *leaf.shape).astype(leaf.dtype))
-    return jax.tree_util.tree_unflatten(tree, found)
+    return jax.tree_util.tree_unflatten(program.structure[1], found)
 
 
-Made = tuple[Any, np.ndarray]  # states and codes of a run
+Made = tuple[Any, np.ndarray | Array]  # states and codes of a run
 
 
 def differences(
-    library: Library, doubles: Any, singles: Any, least: Mapping[str, float] = NONE
+    fields: Sequence[Field], doubles: Any, singles: Any, least: Mapping[str, float] = NONE
 ) -> dict[str, float]:
-    """Of each field of reals in the states of a run, the largest difference over its size.
+    """Largest difference over its size, of each field of reals in the states or results of a run.
 
     Its size is its largest number, or what is the ``least``.
     """
     pairs = zip(*map(jax.tree_util.tree_leaves, (doubles, singles)), strict=True)
     some = [(a, b) for a, b in pairs if a[0].size]
     found = {}
-    for f, (a, b) in zip(library.state, some, strict=True):
+    for f, (a, b) in zip(fields, some, strict=True):
         if f.is_real:
             size = np.max(np.abs(a), initial=least.get(f.name, 0.0), where=np.isfinite(a))
             with np.errstate(invalid="ignore"):
@@ -244,7 +239,7 @@ def cost(
     """What single precision costs in some runs."""
     fields: dict[str, float] = {}
     for (wide, _), (narrow, _) in zip(doubles, singles, strict=True):
-        for name, part in differences(library, wide, narrow).items():
+        for name, part in differences(library.state, wide, narrow).items():
             fields[name] = max(part, fields.get(name, 0.0))
     errors = [
         [

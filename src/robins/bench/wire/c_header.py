@@ -26,6 +26,9 @@ _TOP = """\
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "the structs of this header are those of the wire on little-endian machines only"
 #endif
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "NaN means missing here: compile without -ffast-math and -ffinite-math-only"
+#endif
 
 #define ROBINS_VERSION {version}
 #define ROBINS_SCHEMA 0x{schema:08x}u

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jax.extend.core import JaxprEqn
 
 from robins.program.trace import Nodes, Walk, rule
 
@@ -57,18 +56,15 @@ def _stack(walk: Walk, equation: Any, *arrays: Nodes) -> Nodes:
     return np.stack(arrays, axis=equation.params["axis"])
 
 
-@rule("unstack")
-def _unstack(walk: Walk, equation: JaxprEqn, a: Nodes) -> list[Nodes]:
-    return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
-
-
 @rule("tile")
 def _tile(walk: Walk, equation: Any, a: Nodes) -> Nodes:
     return np.tile(a, equation.params["reps"])
 
 
-@rule("split")
+@rule("split", "unstack")
 def _split(walk: Walk, equation: Any, a: Nodes) -> list[Nodes]:
+    if equation.primitive.name == "unstack":
+        return [np.asarray(row) for row in np.moveaxis(a, equation.params["axis"], 0)]
     ends = np.cumsum(equation.params["sizes"])[:-1]
     return np.split(a, ends, axis=equation.params["axis"])
 

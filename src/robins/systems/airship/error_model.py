@@ -26,7 +26,7 @@ written differently, so it serves as its check; the paper's local filters are no
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -213,6 +213,10 @@ class Fed:
     x: Any  # (9,)
 
     dim = 9
+    units: ClassVar[dict[str, str]] = {
+        "v_n": "m/s, NED: of the SINS",
+        "x": "errors of the SINS, ENU: rad; m/s; longitude, latitude rad; height m",
+    }
 
     def retract(self, delta: Array) -> Fed:
         """Add to the errors."""

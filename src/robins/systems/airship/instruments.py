@@ -91,7 +91,7 @@ def _believed_sar(given: Airship, course: Course) -> Sensor:
 
 RADAR = Instrument(
     SAR,
-    SensorAxes("m or rad", "NED", ("north", "east", "heading", "up")),
+    SensorAxes("m, rad", "NED", ("north [m]", "east [m]", "heading [rad]", "up [m]")),
     _measure_sar,
     _believed_sar,
 )

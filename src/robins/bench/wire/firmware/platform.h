@@ -5,6 +5,10 @@
 
 #include "robins_wire.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* Opens the line: raw, 8 data bits, no parity, one stop bit, no flow control. `path` is for
  * platforms that have several lines. */
 void open_line(const char *path);
@@ -28,6 +32,10 @@ void turn_table(uint64_t time_ns, const robins_mounted *mounted);
 
 /* The turn over the step that has ended at `time_ns` [rad], body axes; NaN: no sample of an axis. */
 void read_gyro(uint64_t time_ns, robins_gyro *sample);
+#endif
+
+#ifdef __cplusplus
+}
 #endif
 
 #endif
