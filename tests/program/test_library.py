@@ -10,7 +10,7 @@ import pytest
 from boat import STEPS, made, write_boat
 from exported import found, spoil
 
-from robins.program import DOUBLE, SINGLE, trace
+from robins.program import DOUBLE, SINGLE, to_c, trace
 from robins.program.library import Library, fields_of, identifier, number, symbol
 
 PRECISIONS = {"double": DOUBLE, "float": SINGLE}
@@ -95,9 +95,13 @@ def test_a_program_of_c_and_cplusplus_may_include_its_header(folder, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("flag", ["-ffast-math", "-ffinite-math-only"])
-def test_a_compiler_that_takes_nan_for_impossible_is_refused(folder, flag):
-    line = ["cc", flag, "-fsyntax-only", "boat.c"]
+@pytest.mark.parametrize(
+    ("flag", "name"),
+    [("-ffast-math", "boat.c"), ("-ffinite-math-only", "boat.h"), ("-ffast-math", "alone.c")],
+)
+def test_a_compiler_that_takes_nan_for_impossible_is_refused(folder, flag, name):
+    (folder / "alone.c").write_text(to_c(made()[0][0].program))
+    line = ["cc", flag, "-fsyntax-only", name]
     done = subprocess.run(line, cwd=folder, capture_output=True, text=True)
     assert done.returncode != 0
     assert "NaN means missing here: compile without -ffast-math" in done.stderr

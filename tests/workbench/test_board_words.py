@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from robins.earth import Geodetic
+from robins.filters import Belief, FilterState
 from robins.ins.extended_pose import ExtendedPose
 from robins.manifold import Angle
 from robins.rotation import Rotation
@@ -41,9 +42,16 @@ REPORTED[4, 5] = REPORTED[5, 4] = 1.0
 REPORTED[6, 6] = -1.0
 
 
+def state_of(mean):
+    belief = Belief(mean, np.zeros((0, 0)))
+    return FilterState(belief, (FilterState(belief, ()),))
+
+
 def test_the_mean_has_units_and_axes_in_its_own_order():
     axes = tangent_axes(PROBLEM, REPORTED, 8)
-    notes = field_notes(PROBLEM, axes, MEAN, {"predict": (), "update_fix": (np.zeros(3), None)})
+    notes = field_notes(
+        PROBLEM, axes, state_of(MEAN), {"predict": (), "update_fix": (np.zeros(3), None)}
+    )
     assert notes["state", "mean_attitude_wxyz"] == (
         "unit quaternion, scalar first; error: turn [rad], NED: north, east, down"
     )
@@ -65,7 +73,9 @@ def test_what_an_element_holds_is_in_its_own_units():
 
     mean = Track(ExtendedPose.identity(), Geodetic(0.5, 0.5, 0.5))
     axes = tangent_axes(PROBLEM, np.eye(7, 12), 12)
-    notes = field_notes(PROBLEM, axes, mean, {"update_fix": (Geodetic(0.5, 0.5, 0.5), None)})
+    notes = field_notes(
+        PROBLEM, axes, state_of(mean), {"update_fix": (Geodetic(0.5, 0.5, 0.5), None)}
+    )
     for struct, name in (("state", "mean_place"), ("update_fix_reading", "value")):
         where = {field: text for (one, field), text in notes.items() if one == struct}
         root = name.removesuffix("value") + ("_" if name != "value" else "")
@@ -73,6 +83,7 @@ def test_what_an_element_holds_is_in_its_own_units():
         assert where[f"{root}lon"] == "rad, longitude, positive east"
         assert where[f"{root}alt"] == "m, height above the ellipsoid, positive up"
     assert notes["state", "mean_pose_velocity"] == "m/s"
+    assert notes["state", "memory_0_belief_mean_place_lat"] == notes["state", "mean_place_lat"]
     assert notes["state", "mean_pose_rotation_wxyz"] == "unit quaternion, scalar first"
 
 
@@ -81,7 +92,7 @@ def test_what_is_reported_as_a_mixture_is_not_told():
     mixed[4:7, 4:7] = np.full((3, 3), 0.5)
     axes = tangent_axes(PROBLEM, mixed, 8)
     assert axes[4:] == [None] * 4
-    assert ("state", "mean_place") not in field_notes(PROBLEM, axes, MEAN, {})
+    assert ("state", "mean_place") not in field_notes(PROBLEM, axes, state_of(MEAN), {})
     none = tangent_axes(PROBLEM, 0.5 * REPORTED, 8)
     assert components(none) == [
         "factor is lower triangular, covariance P = factor factor' of the error"

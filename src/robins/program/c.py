@@ -24,9 +24,13 @@ WIDEST = 60  # characters of a scalar that is written where it is used
 
 def header(name: str = "scalars.h", precision: Precision = DOUBLE) -> str:
     """The text that a program stands on, for one number at a time or, in doubles, for lanes."""
-    folder = files("robins.program")
-    parts = name, precision.sine, "routines.h"
-    return precision.text("\n".join((folder / part).read_text("utf-8") for part in parts))
+    parts = "finite.h", name, precision.sine, "routines.h"
+    return precision.text("\n".join(map(part, parts)))
+
+
+def part(name: str) -> str:
+    """A file of C of this room; `finite.h` refuses a compiler that assumes there is no NaN."""
+    return (files("robins.program") / name).read_text("utf-8")
 
 
 def function(

@@ -14,17 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from robins.program.c import function, header
+from robins.program.c import function, header, part
 from robins.program.precision import DOUBLE, Precision
 from robins.program.trace import Leaf, Program
 from robins.program.wrap import COLUMNS, wrapped
 
-# NaN means missing, so a compiler may not assume that there is none.
-FINITE_ONLY = """\
-#if defined(__FAST_MATH__) || defined(_M_FP_FAST) || \\
-    (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
-#error "NaN means missing here: compile without -ffast-math and -ffinite-math-only"
-#endif"""
 EXTERN_C = '#ifdef __cplusplus\nextern "C" {\n#endif', "#ifdef __cplusplus\n}\n#endif"
 
 # Words that name no field: those of C and C++, and what compilers and widespread headers define.
@@ -180,7 +174,7 @@ class Library(NamedTuple):
         """The header: types, structs, entry points."""
         guard = f"{self.name.upper()}_H"
         lines = [*self._head(), f"#ifndef {guard}", f"#define {guard}", "", "#include <stdint.h>"]
-        lines += ["", FINITE_ONLY, "", EXTERN_C[0], ""]
+        lines += ["", part("finite.h"), EXTERN_C[0], ""]
         lines += [f"typedef {self.precision.kind} {self.name}_real;", ""]
         for name, fields, about in self.structs():
             lines += [f"/* {about} */", "typedef struct {"]

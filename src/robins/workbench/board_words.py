@@ -11,10 +11,12 @@ import numpy as np
 from jax.tree_util import KeyPath
 
 from robins import manifold
+from robins.filters import Belief
 from robins.manifold import State
 from robins.program.library import identifier, symbol
 from robins.systems.study import Problem, SensorAxes
 
+MEAN = ".belief.mean"  # of a state
 Axis = tuple[str, str, str]  # block, "[unit], frame", axis
 
 
@@ -56,16 +58,24 @@ def components(axes: list[Axis | None]) -> list[str]:
 
 
 def field_notes(
-    problem: Problem, axes: list[Axis | None], mean: State, given: Mapping[str, Any]
+    problem: Problem, axes: list[Axis | None], state: State, given: Mapping[str, Any]
 ) -> dict[tuple[str, str], str]:
-    """Units and axes of the mean, of readings and of innovations, by struct and field."""
+    """Units and axes by struct and field: of the means in a state, of readings and innovations.
+
+    A belief inside the state, such as a member's, is of the same components if its mean has the
+    same structure.
+    """
     notes = {
         ("state", "current"): "the last prediction was taken",
         ("reset_belief", "factor"): "above the diagonal not looked at",
     }
-    for name, first, last, own in mean_fields(mean):
-        if text := _said(own, _told(axes[first:last], first)):
-            notes["state", name] = notes["reset_belief", name] = text
+    mean = state.belief.mean
+    for root in _roots(state):
+        for name, first, last, own in tangent_fields(mean, root):
+            if text := _said(own, _told(axes[first:last], first)):
+                notes["state", name] = text
+                if root == MEAN:
+                    notes["reset_belief", name] = text
     for entry, arguments in given.items():
         sensor = problem.sensors.get(entry.removeprefix("update_"))
         if sensor is not None:
@@ -76,6 +86,15 @@ def field_notes(
             deviation = f"{sensor.units}: its standard deviation; NaN where not used"
             notes[f"{name}_result", "sigma"] = deviation
     return {**notes, **problem.fields}
+
+
+def _roots(state: State) -> Iterator[str]:
+    """Paths of the means in a state that have the structure of its own."""
+    parts = jax.tree_util.tree_flatten_with_path(state, is_leaf=lambda x: isinstance(x, Belief))[0]
+    own = jax.tree_util.tree_structure(state.belief.mean)
+    for path, part in parts:
+        if isinstance(part, Belief) and jax.tree_util.tree_structure(part.mean) == own:
+            yield f"{jax.tree_util.keystr(path)}.mean"
 
 
 def _read(sensor: SensorAxes, first: int, last: int) -> str:
@@ -98,7 +117,7 @@ Place = tuple[str, int, int, str | None]
 
 def mean_fields(mean: State) -> Iterator[Place]:
     """`tangent_fields` of a mean in a belief."""
-    return tangent_fields(mean, ".belief.mean")
+    return tangent_fields(mean, MEAN)
 
 
 def tangent_fields(tree: State, root: str) -> Iterator[Place]:

@@ -40,6 +40,7 @@ from robins.workbench.single_precision import Cost, cost, differences, in_floats
 
 STEPS = 60  # of a run, recorded for the test
 RUNS = 3  # by which the cost of single precision is told
+NIS = 1e-7  # tolerance: it squares what is left of readings far larger than their sigma
 MARGIN, LEAST = 4.0, 1e-6  # of its differences in the test: other compilers round otherwise
 RESET = "reset"  # the entry point that begins anew
 SMALL = 200  # scalar operations up to which a loop is written out where the code is to be small
@@ -209,7 +210,7 @@ def _library(
     programs = trace_steps([*steps, (anew, (belief,))], _any_start(runs), unroll=unroll)
     entries = [_entry(n, p) for n, p in zip([*functions, RESET], programs, strict=True)]
     axes = tangent_axes(problem, contender.reported, len(belief.factor))
-    notes = field_notes(problem, axes, belief.mean, first)
+    notes = field_notes(problem, axes, run.start, first)
     library = Library(asked.library, entries, run.start, (), notes, precision)
     c = library.source()
     identity = hashlib.sha256((library.header() + c).encode()).hexdigest()
@@ -258,7 +259,9 @@ def _record(run: BoardRun, functions: Mapping[str, Any], anew: Any) -> Recorded:
     first, last = (jax.tree_util.tree_map(lambda a, k=k: a[k], states) for k in (0, -1))
     once = jax.jit(anew)(last, first.belief)
     made[RESET] = jax.tree_util.tree_map(lambda x: np.asarray(x)[None], once)
-    return Recorded(run.given, made, sizes=_sizes(made), ends={RESET: (first.belief,)})
+    sizes = _sizes(made)
+    tolerances = {key: NIS for key in sizes if key[1] == "nis"}
+    return Recorded(run.given, made, tolerances, 0, sizes, {RESET: (first.belief,)})
 
 
 def _sizes(made: Calls) -> dict[Key, float]:
@@ -318,7 +321,7 @@ def _readme(library: Library, name: str, label: str, found: Cost | None) -> str:
 By robins {__version__}. C99, no allocation, no global state, no recursion, no library but `math.h`;
 one thread may use one state, several threads several states.
 
-    make check     compiles the library and a test, and replays recorded steps
+    make check     compiles the library and a test, replays recorded steps, compares all outputs
     make stack     says how much stack each function uses
 
 `{n}.h` names all fields; `{n}.c` needs nothing else. What the model was told (noise, axes,
@@ -328,7 +331,7 @@ constants) is in the code: export again to change it.
 {calls}
 
 Each step calls `{n}_predict`, then the update of each sensor that has a reading. A component that
-is missing is NaN. Each call returns a code:
+is missing is NaN, so the header refuses `-ffast-math`. Each call returns a code:
 
 | code | meaning |
 |---|---|
