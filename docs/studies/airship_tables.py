@@ -43,7 +43,7 @@ def main() -> None:
         for filter_, m in outcome.metrics.items():
             nees = " ".join(
                 f"{m[key]:8.3g}"
-                for key in ("nees_per_dim", *(f"nees_per_dim_{b.name}" for b in problem.blocks))
+                for key in ("nees_all_states", *(f"nees_{b.name}" for b in problem.blocks))
             )
             print(
                 f"{filter_:22s} {m['horizontal_mean_m']:8.2f} / {m['horizontal_std_m']:6.2f}"

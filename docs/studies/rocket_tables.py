@@ -17,7 +17,7 @@ from robins import scenario
 from robins.campaign import simulate
 from robins.systems.rocket import SYSTEM
 
-ANGLES = ("attitude_rms_deg", "quiet_rms_deg", "burst_peak_deg", "nees_per_dim", "settled_s")
+ANGLES = ("attitude_rms_deg", "quiet_rms_deg", "burst_peak_deg", "nees_attitude", "settled_s")
 FIELD = ("total_rms_deg", "about_field_rms_deg", "across_field_rms_deg", "about_field_end_deg")
 BY_AXIS = ("roll_rms_deg", "pitch_rms_deg", "yaw_rms_deg")
 
@@ -50,7 +50,7 @@ def table(name: str, filters: tuple[str, ...], runs: int) -> None:
     begun = time.perf_counter()
     given, outcome = campaign(name, filters, runs, seed=0)
     angles = given.study == "magnetic-attitude"
-    keys = (*ANGLES, *BY_AXIS) if angles else (*FIELD, "attitude_rms_deg", "nees_per_dim")
+    keys = (*ANGLES, *BY_AXIS) if angles else (*FIELD, "attitude_rms_deg", "nees_attitude")
     print(f"\n{name}: {given.title}, {runs} runs")
     print("| filter | " + " | ".join(key.removesuffix("_deg") for key in keys) + " |")
     print("|---" * (len(keys) + 1) + "|")

@@ -18,7 +18,7 @@ from robins.systems.satellite import SYSTEM
 KEYS = (
     *("attitude_rms_arcsec", "attitude_rms_spread_arcsec", "pointing_rms_arcsec"),
     *("x_rms_arcsec", "y_rms_arcsec", "z_rms_arcsec", "attitude_peak_arcsec"),
-    *("pointing_peak_arcsec", "nees_per_dim", "predicted_rms_arcsec", "worst_case_share"),
+    *("pointing_peak_arcsec", "nees_attitude", "predicted_rms_arcsec", "worst_case_share"),
 )
 
 

@@ -14,6 +14,7 @@ from robins.filters import Belief, Model, Motion, Sensor, kalman, run, taylor
 from robins.filters.rules import h_infinity
 from robins.results import Probability
 from robins.sim.random import Component, stream
+from robins.systems.judgement import Claim, judging, ratio
 from robins.systems.study import Case, Contender, Limit, Problem, SensorAxes, StateBlock
 
 STEPS = 60
@@ -118,6 +119,43 @@ def test_statistics_are_those_of_a_plain_loop(problem):
     assert s.runs == 10
     assert s.run_rms.shape == (10, 2)
     assert s.sensors == ["y"]
+
+
+def test_runs_drawn_again_are_those_runs(problem):
+    """Against statistics of records whose runs are repeated."""
+    (one,) = chunks(problem, "right", 10, chunk=10)
+    draws = np.vstack([np.arange(10), np.random.default_rng(0).integers(0, 10, (2, 10))])
+    for at, again in zip(draws, collect([one], problem.blocks).resampled(draws), strict=True):
+        want = collect([jax.tree_util.tree_map(lambda x, at=at: x[at], one)], problem.blocks)
+        for figure in ("pooled_rms", "pooled_sigma", "run_rms", "lost", "runs", "diverged", "n"):
+            np.testing.assert_array_equal(getattr(again, figure), getattr(want, figure))
+        np.testing.assert_allclose(again.overall_ratio(), want.overall_ratio(), rtol=1e-14)
+        np.testing.assert_allclose(again.ratio_bounds(), want.ratio_bounds(), rtol=1e-14)
+        assert again.mean_nees() == want.mean_nees()
+        assert again.nis("y") == want.nis("y")
+        assert np.isnan(again.rms).all()
+        assert np.isnan(again.anees_share_inside())
+
+
+def test_pooled_figures_are_those_of_all_epochs(problem, right):
+    np.testing.assert_allclose(right.pooled_rms, np.sqrt(np.mean(right.rms**2, axis=0)))
+    np.testing.assert_allclose(right.pooled_sigma, np.sqrt(np.mean(right.sigma**2, axis=0)))
+    assert right.mean_nees() == pytest.approx(
+        {"nees_all_states": np.mean(right.anees()), "nees_line": np.mean(right.anees())}
+    )
+
+
+def test_a_claim_of_few_runs_is_undecided_and_one_of_many_is_not(problem):
+    """Filters of one noise and another: their true ratio of RMS errors is some 0.9."""
+    claim = Claim("x", ("right", "sure"), ratio("right", "sure", "rms_m"), (0.0, 0.97))
+    judged = replace(
+        problem,
+        metrics=lambda s: {"rms_m": float(s.pooled_rms[0])},
+        claims=judging({"better": claim}),
+    )
+    few, many = simulate(judged, 3), simulate(judged, 100)
+    assert (few.claims[0]["verdict"], many.claims[0]["verdict"]) == ("undecided", "reproduced")
+    assert "The claim better is undecided" in few.notes[-1]
 
 
 def test_a_matched_filter_is_consistent_and_wrong_ones_are_caught(problem, right):

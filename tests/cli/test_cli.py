@@ -170,7 +170,7 @@ FULL_DISK = cannot("out", "write", OSError(28, "No space left on device"))
         (REFUSED, 2, ["out: is a file, not a folder; choose a new folder"]),
         (FULL_DISK, 1, ["out: cannot write: No space left on device; free some space"]),
         (MemoryError(), 1, ["out of memory; ask for fewer runs or filters at a time."]),
-        (OSError(13, "Permission denied", "x"), 1, ["failed: PermissionError: [Errno 13] "]),
+        (OSError(13, "Permission denied", "x"), 2, ["x: Permission denied; choose another path."]),
         (ValueError("shapes\nand more"), 1, ["failed: ValueError: shapes", "this may be a fault"]),
         (RuntimeError(""), 1, ["failed: RuntimeError: ", "this may be a fault of robins"]),
     ],

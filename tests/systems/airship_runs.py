@@ -49,7 +49,7 @@ class Found(NamedTuple):
         return self.mean(3)
 
     @property
-    def nees_per_dim(self) -> float:
+    def nees_all_states(self) -> float:
         """One for a filter that knows how wrong it is."""
         return float(np.mean(self.nees[:, self.counted]))
 

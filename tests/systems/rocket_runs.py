@@ -64,7 +64,7 @@ class Found(NamedTuple):
         return float(np.sqrt(2.0) * self.rms(self.counted, slice(4, 6)))
 
     @property
-    def nees_per_dim(self) -> float:
+    def nees_attitude(self) -> float:
         return float(np.mean(self.nees[:, self.counted]))
 
 

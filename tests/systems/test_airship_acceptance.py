@@ -83,7 +83,7 @@ def test_errors_are_those_of_the_reference(runs, name, filter_, position_m, velo
     ],
 )
 def test_what_is_stated_is_as_true_as_in_the_reference(runs, name, filter_, low, high):
-    assert low < found(name, filter_, runs).nees_per_dim < high
+    assert low < found(name, filter_, runs).nees_all_states < high
 
 
 def test_the_robust_filter_bears_outliers():
@@ -165,7 +165,7 @@ def test_information_shared_out_is_not_counted_twice():
 def test_the_covariance_fed_back_is_counted_again_and_again():
     of = flights("matched", runs=MANY)
     with pytest.warns(UserWarning, match="counted again at the next fusion"):
-        assert of.found("distributed-full").nees_per_dim > 100.0
+        assert of.found("distributed-full").nees_all_states > 100.0
 
 
 # ----------------------------------------------------- error states fed back are the total state

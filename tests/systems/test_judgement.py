@@ -2,10 +2,20 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from robins import scenario
 from robins.systems import SYSTEMS
-from robins.systems.judgement import Claim, consistency_claims, judging
+from robins.systems.judgement import (
+    RUNS,
+    Claim,
+    consistency_claims,
+    interval_of,
+    judging,
+    nees_claim,
+    ratio,
+    ratio_claims,
+)
 
 STATED = [
     (system, study)
@@ -81,3 +91,109 @@ def test_of_several_filters_the_worst_is_judged(worse, held):
     metrics = {"right": figures(0.0, 0.99, 1.0), "worse": worse, "again": figures(0.0, 0.99, 1.0)}
     found = judging(claims)(metrics)
     assert {c["id"] for c in found if c["verdict"] == "reproduced"} == held
+
+
+# -------------------------------------------------------------------------------------- intervals
+
+
+def drawn(squares, draws=200, seed=0):
+    """Metrics of all runs and of draws of them, the same for both filters, of (runs, 2) squares."""
+    count = len(squares)
+    random = np.random.default_rng(seed).integers(0, count, (draws, count))
+    every = [
+        {n: {"rms": float(np.sqrt(m)), RUNS: count} for n, m in zip("ab", mean, strict=True)}
+        for mean in (np.mean(squares[at], axis=0) for at in [np.arange(count), *random])
+    ]
+    return every[0], every
+
+
+def test_the_interval_of_a_mean_is_that_of_the_normal_law():
+    """The closed form of a mean: its Student-t interval."""
+    numbers = np.random.default_rng(1).normal(5.0, 1.0, 40)
+    mean = np.mean(numbers)
+    low, high = stats.t.interval(0.95, 39, mean, stats.sem(numbers))
+    metrics, every = drawn(np.stack([numbers, numbers], axis=1), draws=4000)
+    found = interval_of(lambda m: m["a"]["rms"] ** 2, metrics["a"]["rms"] ** 2, every)
+    np.testing.assert_allclose(found, (low, high), atol=0.05 * (high - low))
+
+
+@pytest.mark.parametrize("count", [8, 40])
+def test_intervals_cover_the_true_ratio_as_often_as_they_say(count):
+    """Errors of two filters share what is common to them; the true ratio of their RMS is 1 / 2."""
+    random, hits = np.random.default_rng(2), 0
+    for _ in range(300):
+        common, own = random.chisquare(4, (count, 1)), random.chisquare(4, (count, 2))
+        metrics, every = drawn((common + own) * (1.0, 4.0))
+        of = ratio("a", "b", "rms")
+        low, high = interval_of(of, of(metrics), every)
+        hits += low <= 0.5 <= high
+    assert stats.binom.cdf(hits, 300, 0.93) > 1e-3
+    assert hits < 300
+
+
+def test_draws_are_paired():
+    squares = np.random.default_rng(3).chisquare(1, (20, 1)) * (1.0, 4.0)
+    metrics, every = drawn(squares)
+    of = ratio("a", "b", "rms")
+    found = interval_of(of, of(metrics), every)
+    assert found is None or np.ptp(found) < 1e-12  # the ratio is 1 / 2 in every run
+
+
+def test_a_value_that_does_not_follow_from_the_runs_has_no_interval():
+    metrics, every = drawn(np.ones((4, 2)) * (1.0, 2.0))
+    assert (
+        interval_of(lambda m: 1.0 if m is metrics else 2.0, 1.0, [dict(m) for m in every]) is None
+    )
+    assert interval_of(lambda m: np.nan, 1.0, every) is None
+    assert interval_of(lambda m: np.inf, np.inf, every) is None
+    assert interval_of(lambda m: 1.0, 1.0, ()) is None
+
+
+@pytest.mark.parametrize(
+    ("band", "partly", "verdict", "more"),
+    [
+        ((0.0, 0.9), None, "reproduced", False),
+        ((0.0, 0.1), (0.0, 0.9), "partly", False),
+        ((0.0, 0.1), (0.0, 0.2), "not", False),
+        ((0.0, 0.52), None, "undecided", True),
+        ((0.0, 0.1), (0.0, 0.52), "undecided", True),
+        ((0.48, None), (0.0, None), "undecided", True),
+    ],
+)
+def test_a_verdict_holds_for_all_of_the_interval(band, partly, verdict, more):
+    squares = np.random.default_rng(4).chisquare(2, (50, 2)) * (1.0, 4.0)
+    metrics, every = drawn(squares)
+    of = ratio("a", "b", "rms")
+    judge = judging({"c": Claim("x", ("a", "b"), of, band, partly)})
+    (point,), (found,) = judge(metrics), judge(metrics, every)
+    assert point["interval"] is None
+    assert (found["verdict"], found["more_runs"] is not None) == (verdict, more)
+    assert found["interval"][0] < found["value"] < found["interval"][1]
+    if more:
+        edge = next(e for e in (*(partly or ()), *band) if e and 0.3 < e < 0.7)
+        end = found["interval"][int(edge > found["value"])]
+        share = np.sqrt(50 / (50 + found["more_runs"]))
+        assert abs(end - found["value"]) * share <= abs(edge - found["value"]) * (1.0 + 1e-9)
+
+
+def test_a_verdict_of_its_own_is_decided_by_most_draws():
+    squares = np.random.default_rng(5).chisquare(2, (50, 2)) * (1.0, 4.0)
+    metrics, every = drawn(squares)
+    of = ratio("a", "b", "rms")
+
+    def judged(limit):
+        own = Claim(
+            "x", ("a", "b"), of, None, verdict=lambda m: "not" if of(m) > limit else "partly"
+        )
+        return judging({"c": own})(metrics, every)[0]["verdict"]
+
+    assert [judged(limit) for limit in (0.1, of(metrics), 2.0)] == ["not", "undecided", "partly"]
+
+
+def test_a_claim_names_what_its_nees_is_of():
+    nees_claim("NEES of the position stays below 1.3", "a", "position", (0.0, 1.3))
+    with pytest.raises(ValueError, match="decided by nees_all_states; say in its words"):
+        nees_claim("NEES of the position stays below 1.3", "a", "all_states", (0.0, 1.3))
+    row = {"c": ("a", ("b",), ("nees_velocity",), (0.0, 1.0), (0.0, 1.0))}
+    with pytest.raises(ValueError, match="nees_velocity"):
+        ratio_claims(row, {"c": "NEES of the attitude, one over the other"})

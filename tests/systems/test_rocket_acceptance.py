@@ -19,7 +19,7 @@ STRONG = "federated-vector-stukf"
 OF_THE_PAPER = [
     ("a1", "ukf", "attitude", 0.40, 0.50),
     ("a1", "ukf", "peak", 1.3, 1.8),
-    ("a1", "ukf", "nees_per_dim", 3.0, np.inf),
+    ("a1", "ukf", "nees_attitude", 3.0, np.inf),
     ("a1", STRONG, "attitude", 0.95, 1.10),
     ("a1", STRONG, "peak", 5.4, 6.2),  # it follows the disturbance
     ("a1", "discriminator", "peak", 0.0, 0.7),
@@ -28,12 +28,12 @@ OF_THE_PAPER = [
 ]
 OTHERS = [
     ("a1", "huber", "attitude", 0.20, 0.25),
-    ("a1", "gate", "nees_per_dim", 0.8, 1.2),
+    ("a1", "gate", "nees_attitude", 0.8, 1.2),
     ("a2", "ukf", "attitude", 0.85, 0.97),
     ("a2", STRONG, "quiet", 0.47, 0.57),
     ("a2", "discriminator", "attitude", 0.54, 0.66),
-    ("b1n", "usque", "nees_per_dim", 0.8, 1.3),
-    ("b1", "gate", "nees_per_dim", 0.8, 1.7),
+    ("b1n", "usque", "nees_attitude", 0.8, 1.3),
+    ("b1", "gate", "nees_attitude", 0.8, 1.7),
 ]
 
 
@@ -54,7 +54,7 @@ def test_figures_are_those_of_the_reference(runs, name, filter_, figure, low, hi
         (MANY, "a1", "attitude", ("gate", "huber", "ukf")),
         (MANY, "a2", "attitude", ("discriminator", "ukf")),
         (MANY, "a2", "attitude", ("discriminator", STRONG)),
-        (MANY, "b1", "nees_per_dim", ("gate", "usque")),
+        (MANY, "b1", "nees_attitude", ("gate", "usque")),
         (MANY, "b2", "across", ("gate", "usque")),
     ],
     ids=lambda x: "<".join(x) if isinstance(x, tuple) else str(x),

@@ -15,6 +15,7 @@ from robins.campaign.machine import ByJax, InLanes, machine_for
 from robins.campaign.statistics import PERCENTS, Statistics, thinned
 from robins.filters import Code, doubts
 from robins.results import Outcome, Probability, Progress, array, keeping, silent, variable
+from robins.systems.judgement import RUNS
 from robins.systems.study import Problem, StateBlock
 from robins.systems.tables import block_array, innovation_tables
 
@@ -83,23 +84,55 @@ def simulate(
 
 def outcome_of(problem: Problem, found: dict[str, Statistics], bound: np.ndarray | None) -> Outcome:
     """What the statistics of all filters say; bound: (E, r) covariance bound, if there is one."""
-    facts = {name: dict(c.facts) for name, c in problem.contenders.items()}
-    metrics = {name: problem.metrics(s) | facts[name] | _chances(s) for name, s in found.items()}
-    if bound is not None:
-        for name, s in found.items():
-            metrics[name] |= _over_bound(problem, s, bound)
+    metrics = {name: _metrics(problem, name, s, bound) for name, s in found.items()}
+    claims = _claims(problem, found, bound, metrics)
     return Outcome(
         solution=campaign_solution(problem, found, bound),
         metrics=metrics,
-        claims=problem.claims(metrics),
+        claims=claims,
         counts=_counts(found),
-        notes=list(problem.notes),
+        notes=[*problem.notes, *(_undecided(c) for c in claims if c["verdict"] == "undecided")],
         warnings=[
             f"{name}: {sentence}"
             for name, s in found.items()
             for sentence in doubts(s.tally, problem.contenders[name].bounds)
         ],
     )
+
+
+DRAWS, SEED = 200, 1993  # of the bootstrap
+
+
+def _metrics(
+    problem: Problem, name: str, s: Statistics, bound: np.ndarray | None
+) -> dict[str, Any]:
+    out = problem.metrics(s) | dict(problem.contenders[name].facts) | _chances(s)
+    return out if bound is None else out | _over_bound(problem, s, bound)
+
+
+def _claims(
+    problem: Problem,
+    found: dict[str, Statistics],
+    bound: np.ndarray | None,
+    metrics: dict[str, dict[str, Any]],
+) -> list[dict[str, Any]]:
+    """Verdicts, with intervals by draws of the runs, the same runs for all filters."""
+    claims, runs = problem.claims(metrics), {s.runs for s in found.values()}
+    if not claims or len(runs) > 1 or (count := runs.pop()) < 2:
+        return claims
+    random = np.random.default_rng(SEED).integers(0, count, (DRAWS, count))
+    draws = np.vstack([np.arange(count), random])
+    drawn: list[dict[str, Any]] = [{} for _ in draws]
+    for name, s in found.items():
+        for one, again in zip(drawn, s.resampled(draws), strict=True):
+            one[name] = _metrics(problem, name, again, bound) | {RUNS: count}
+    return problem.claims(metrics, drawn)
+
+
+def _undecided(claim: dict[str, Any]) -> str:
+    more = claim["more_runs"]
+    how = f"about {more} more runs decide it" if more else "more runs will hardly decide it"
+    return f"The claim {claim['id']} is undecided: its interval reaches an edge of its band; {how}."
 
 
 def _chances(s: Statistics) -> dict[str, Probability]:
@@ -109,11 +142,9 @@ def _chances(s: Statistics) -> dict[str, Probability]:
 
 def _over_bound(problem: Problem, s: Statistics, bound: np.ndarray) -> dict[str, float]:
     """RMS error of each block over the covariance bound, pooled over the epochs that count."""
-    rms, least = s.rms[s.counted], bound[s.counted]
+    rms, least = s.pooled_rms, np.sqrt(np.mean(bound[s.counted] ** 2, axis=0))
     return {
-        f"{b.name}_over_bound": float(
-            np.sqrt(np.sum(rms[:, b.where] ** 2) / np.sum(least[:, b.where] ** 2))
-        )
+        f"{b.name}_over_bound": float(np.linalg.norm(rms[b.where]) / np.linalg.norm(least[b.where]))
         for b in problem.blocks
     }
 

@@ -7,7 +7,7 @@ are plain arrays by name.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,18 +65,23 @@ class Statistics:
         self._sum("error", error)
         self._sum("square", error**2)
         self._sum("variance", sigma**2)
-        self._sum("nees", _infinite(record["nees"], bad))
-        for name, value in record["block_nees"].items():
-            self._sum(f"nees of {name}", _infinite(value, bad))
+        nees = {"nees": record["nees"]}
+        nees |= {f"nees of {name}": value for name, value in record["block_nees"].items()}
+        for name, value in nees.items():
+            value = _infinite(value, bad)
+            self._sum(name, value)
+            self._each(name, np.mean(value[:, self.counted], axis=1))
         for name, update in record["updates"].items():
-            self._sum(f"nis of {name}", update.nis)
-            self._sum(f"dof of {name}", update.dof)
+            for what, value in (("nis", update.nis), ("dof", update.dof)):
+                self._sum(f"{what} of {name}", value)
+                self._each(f"{what} of {name}", np.sum(value, axis=1))
         self._outputs(record.get("outputs", {}), bad)
         self._scatter(error)
         self._lengths(error)
         self._within(error)
         self._each("lost", bad)
         self._each("rms", np.sqrt(np.mean(error[:, self.counted] ** 2, axis=1)))
+        self._each("variance", np.mean(sigma[:, self.counted] ** 2, axis=1))
         if self.windows:
             worst = [np.max(np.abs(error[:, span]), axis=1) for span in self.windows]
             self._each("peaks", np.stack(worst, axis=1))
@@ -106,6 +111,24 @@ class Statistics:
         return Statistics(
             self.blocks, self.count_from, self.limits, self.count_to, self.norms, self.windows
         )
+
+    def resampled(self, draws: np.ndarray) -> Iterator[Statistics]:
+        """The statistics of other choices of the runs, for a bootstrap.
+
+        Sums over the runs at each epoch cannot be made anew, and are NaN there: figures pooled over
+        the epochs are those of the runs drawn.
+
+        Args:
+            draws: (B, runs) numbers of runs.
+        """
+        each = {name: self._all(name) for name in self.each}
+        sums = {name: np.full(np.shape(x), np.nan) for name, x in self.sums.items()}
+        for at in draws:
+            one = self.blank()
+            one.runs, one.n, one.example = len(at), self.n, self.example
+            one.sums, one.each = sums, {name: [x[at]] for name, x in each.items()}
+            one.diverged = int(np.sum(one.lost))
+            yield one
 
     def _sum(self, name: str, values: np.ndarray) -> None:
         total = np.sum(values, axis=0)
@@ -251,6 +274,26 @@ class Statistics:
         """(runs, r)."""
         return self._all("rms")
 
+    @property
+    def pooled_rms(self) -> np.ndarray:
+        """(r,) root mean square error over the runs and the epochs counted."""
+        return np.sqrt(np.mean(self.run_rms**2, axis=0))
+
+    @property
+    def pooled_sigma(self) -> np.ndarray:
+        """(r,) root of the mean variance stated over the runs and the epochs counted."""
+        return np.sqrt(np.mean(self._all("variance"), axis=0))
+
+    def mean_nees(self) -> dict[str, float]:
+        """Mean NEES over runs and epochs counted, over its degrees of freedom: ``nees_all_states``
+        of the whole state, which may have more than is reported, ``nees_attitude`` and the like.
+        """
+        of = {"all_states": float(np.mean(self._all("nees"))) / self.n}
+        for block in self.blocks:
+            if (name := f"nees of {block.name}") in self.each:
+                of[block.name] = float(np.mean(self._all(name))) / len(block.axes)
+        return {f"nees_{name}": value for name, value in of.items()}
+
     def share_within(self, limit: str) -> np.ndarray:
         """(E,) share of the runs whose largest error in the block is within a limit."""
         return self.sums[f"within {limit}"] / self.runs
@@ -273,8 +316,7 @@ class Statistics:
 
     def overall_ratio(self) -> np.ndarray:
         """(r,) RMS error over stated sigma, both pooled over the epochs counted; one is right."""
-        at = self.counted
-        return np.sqrt(np.sum(self.sums["square"][at], 0) / np.sum(self.sums["variance"][at], 0))
+        return self.pooled_rms / self.pooled_sigma
 
     def ratio_bounds(self, level: float = 0.99) -> np.ndarray:
         """(r, 2) bounds of `overall_ratio` that hold for all states at once at this level.
@@ -282,10 +324,9 @@ class Statistics:
         Runs are independent, the epochs of one are not, so the spread between runs is what counts;
         the level is shared out over the states (Bonferroni).
         """
-        variance = np.mean(self.sums["variance"][self.counted] / self.runs, axis=0)
-        squares = self.run_rms**2 / variance
+        squares = (self.run_rms / self.pooled_sigma) ** 2
         each = 1.0 - (1.0 - level) / squares.shape[1]
-        return np.array([rms_with_bounds(column, each)[1:] for column in squares.T])
+        return np.transpose(rms_with_bounds(squares, each)[1:])
 
     def anees(self) -> np.ndarray:
         """(E,) average NEES over n."""
@@ -304,20 +345,19 @@ class Statistics:
         """Share of the epochs counted whose ANEES is inside its band."""
         low, high = self.anees_band(level)
         value = self.anees()[self.counted]
+        if np.any(np.isnan(value)):
+            return float("nan")
         return float(np.mean((value >= low) & (value <= high)))
 
     def nis(self, sensor: str, level: float = 0.95) -> Verdict:
         """Grand mean NIS of a sensor per degree of freedom, all runs and epochs, and its band."""
-        return grand_mean_nis(self.sums[f"nis of {sensor}"], self.sums[f"dof of {sensor}"], level)
+        return grand_mean_nis(self._all(f"nis of {sensor}"), self._all(f"dof of {sensor}"), level)
 
     @property
     def sensors(self) -> list[str]:
         """Sensors that were used at all."""
-        return [
-            k[len("dof of ") :]
-            for k, v in self.sums.items()
-            if k.startswith("dof of ") and np.sum(v) > 0
-        ]
+        names = [name for name in self.each if name.startswith("dof of ")]
+        return [name.removeprefix("dof of ") for name in names if np.sum(self._all(name)) > 0]
 
 
 TALLY = " counted of "
@@ -344,21 +384,21 @@ def _infinite(values: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), np.inf, values)
 
 
-def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[float, float, float]:
-    """Mean of independent numbers with its Student-t confidence bounds."""
+def mean_with_bounds(values: np.ndarray, level: float = 0.95) -> tuple[Any, Any, Any]:
+    """Mean of independent numbers, or of each column, with its Student-t confidence bounds."""
     values = np.asarray(values, dtype=float)
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, float("nan"), float("nan")
-    half = stats.t.ppf(0.5 + level / 2.0, len(values) - 1) * np.std(values, ddof=1)
-    half = float(half / np.sqrt(len(values)))
+    mean, count = np.mean(values, axis=0), len(values)
+    if count < 2:
+        return mean, mean * np.nan, mean * np.nan
+    quantile = stats.t.ppf(0.5 + level / 2.0, count - 1)
+    half = quantile * np.std(values, axis=0, ddof=1) / np.sqrt(count)
     return mean, mean - half, mean + half
 
 
-def rms_with_bounds(square_means: np.ndarray, level: float = 0.95) -> tuple[float, float, float]:
+def rms_with_bounds(square_means: np.ndarray, level: float = 0.95) -> tuple[Any, Any, Any]:
     """Root of the mean of per-run mean squares, with bounds from the spread between runs.
 
     Epochs of one run are correlated, runs are not, so the spread between runs is what counts.
     """
     mean, low, high = mean_with_bounds(square_means, level)
-    return float(np.sqrt(mean)), float(np.sqrt(max(low, 0.0))), float(np.sqrt(high))
+    return np.sqrt(mean), np.sqrt(np.maximum(low, 0.0)), np.sqrt(high)

@@ -13,7 +13,7 @@ from robins.report.style import Picture
 
 LIMIT = 500_000  # bytes of the whole page
 
-_SIGNS = {"reproduced": "✓", "partly": "≈", "not": "✗"}
+_SIGNS = {"reproduced": "✓", "partly": "≈", "not": "✗", "undecided": "?"}
 _LOCKED = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _LONGEST_SCENARIO = 40_000  # characters shown; the manifest has all of it
 
@@ -81,7 +81,7 @@ def _page(summary: Mapping[str, Any], figures: str, origin: Origin) -> str:
 
 def _verdict(claims: Sequence[Mapping[str, Any]]) -> str:
     verdicts = {claim["verdict"] for claim in claims}
-    worst = next((v for v in ("not", "partly", "reproduced") if v in verdicts), "")
+    worst = next((v for v in ("not", "undecided", "partly", "reproduced") if v in verdicts), "")
     sign = f"{_SIGNS[worst]} " if worst else ""
     return f'<p class="verdict {worst}">{sign}{escape(numbers.verdict(claims))}</p>'
 
@@ -129,7 +129,7 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
         [
             _td(f"{_SIGNS[c['verdict']]} {c['verdict']}", f"tag {c['verdict']}"),
             f"<td>{escape(c['text'])} <span class='meta'>({escape(c['id'])})</span></td>",
-            _td(numbers.show(c["value"]), "number"),
+            _td(numbers.found(c), "number"),
             _td(numbers.band(c["band"]), "number"),
         ]
         for c in claims

@@ -117,13 +117,18 @@ def band(value: Any) -> str:
     return show(value)
 
 
+def found(claim: Mapping[str, Any]) -> str:
+    """The value of a claim, with its 95 % interval where there is one."""
+    interval = claim.get("interval")
+    return show(claim["value"]) + (f" ({band(interval)})" if interval else "")
+
+
 def verdict(claims: Sequence[Mapping[str, Any]]) -> str:
     """One sentence on the claims."""
     if not claims:
         return "No claims are attached to this scenario."
-    found = [claim["verdict"] for claim in claims]
-    held, partly, failed = (found.count(v) for v in ("reproduced", "partly", "not"))
-    rest = [f"{partly} partly"] if partly else []
-    rest += [f"{failed} not"] if failed else []
+    told = [claim["verdict"] for claim in claims]
+    held = told.count("reproduced")
+    rest = [f"{n} {v}" for v in ("partly", "not", "undecided") if (n := told.count(v))]
     noun = "claim" if len(claims) == 1 else "claims"
     return f"{held} of {len(claims)} {noun} reproduced" + "".join(f", {r}" for r in rest) + "."

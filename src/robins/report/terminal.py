@@ -12,7 +12,7 @@ from rich.text import Text
 from robins.report import numbers
 
 _GAP = 2  # columns between columns
-_COLOURS = {"reproduced": "green", "partly": "yellow", "not": "red"}
+_COLOURS = {"reproduced": "green", "partly": "yellow", "not": "red", "undecided": "cyan"}
 
 
 def table(summary: Mapping[str, Any], width: int = 100) -> Group:
@@ -42,7 +42,7 @@ def table(summary: Mapping[str, Any], width: int = 100) -> Group:
             claims.add_row(
                 Text(verdict, style=_COLOURS[verdict]),
                 Text(claim["text"]),
-                numbers.show(claim["value"]),
+                numbers.found(claim),
                 numbers.band(claim["band"]),
             )
         parts += [Text(), claims, Text(numbers.verdict(summary["claims"]))]

@@ -13,7 +13,7 @@ import numpy as np
 
 from robins.results.probability import Probability
 
-VERDICTS = ("reproduced", "partly", "not")
+VERDICTS = ("reproduced", "partly", "not", "undecided")
 
 _GIVEN = {
     "scenario": str,
@@ -25,6 +25,7 @@ _GIVEN = {
     "seconds": numbers.Real,
 }
 _CLAIM = ("id", "text", "verdict", "value", "band")
+_MORE = ("interval", "more_runs")  # of a claim, where runs were simulated
 _ORDER = (
     *("scenario", "seed", "runs", "machine", "filters", "claims", "counts", "warnings", "files"),
     "seconds",
@@ -82,7 +83,7 @@ def checked(summary: Mapping[str, Any]) -> dict[str, Any]:
         if not isinstance(metrics, Mapping):
             raise TypeError(f"summary.filters.{name}: {metrics!r} does not map metrics to values")
     for i, claim in enumerate(summary["claims"]):
-        if not isinstance(claim, Mapping) or set(claim) != set(_CLAIM):
+        if not isinstance(claim, Mapping) or set(claim) - set(_MORE) != set(_CLAIM):
             raise ValueError(f"summary.claims[{i}]: needs exactly the keys {', '.join(_CLAIM)}")
         if claim["verdict"] not in VERDICTS:
             raise ValueError(

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from robins import units
-from robins.errors import require_known
+from robins.errors import require, require_known
 
 Metrics = Mapping[str, Mapping[str, Any]]  # by filter
 Band = Sequence[float | int | None]  # from, to
+Judge = Callable[..., list[dict[str, Any]]]  # (metrics, metrics of draws of the runs) -> verdicts
+MOST_MORE = 1e4  # times as many runs, beyond which nobody waits for a verdict
+RUNS = "runs"  # in the metrics of draws: of how many runs they are
 
 
 class Claim(NamedTuple):
@@ -47,6 +53,9 @@ def ratio_claims(
             that counts, and the bands in which the claim is reproduced and partly so.
         texts: of the claims.
     """
+    for key, (_, _, keys, *_) in rows.items():
+        for metric in keys:
+            check_words(texts[key], metric)
 
     def largest(ours: str, theirs: Sequence[str], keys: Sequence[str]) -> Callable[..., float]:
         return lambda metrics: max(
@@ -59,12 +68,35 @@ def ratio_claims(
     }
 
 
-def judging(
-    claims: Mapping[str, Claim], stated: Sequence[str] | None = None
-) -> Callable[[Metrics], list[dict[str, Any]]]:
-    """What gives the verdicts of the claims stated, by id, where their filters were run.
+def check_words(text: str, metric: str) -> None:
+    """Refuse a claim on a NEES whose words do not name what the NEES is of.
 
-    All claims are judged where none are stated.
+    Raises:
+        ValueError: they do not.
+    """
+    of = metric.removeprefix("nees_").replace("_", " ")
+    require(
+        not metric.startswith("nees_") or of in text,
+        f"the claim {text!r} is decided by {metric}; say in its words that it is of: {of}",
+    )
+
+
+def nees_claim(text: str, filter_: str, of: str, band: Band) -> Claim:
+    """Claim on the mean NEES per degree of freedom of a block, or of "all_states".
+
+    Raises:
+        ValueError: the words do not name the block.
+    """
+    check_words(text, metric := f"nees_{of}")
+    return Claim(text, (filter_,), lambda metrics: metrics[filter_][metric], band)
+
+
+def judging(claims: Mapping[str, Claim], stated: Sequence[str] | None = None) -> Judge:
+    """The judge of the claims stated, by id, where their filters were run.
+
+    All claims are judged where none are stated. A second argument are metrics of runs that were
+    drawn from those of the first, see `interval_of`; with it a verdict is "undecided" where the
+    interval of the value reaches beyond the edge of a band.
 
     Raises:
         ValueError: the study has no claim of this id.
@@ -75,36 +107,117 @@ def judging(
     return partial(_verdicts, {key: claims[key] for key in chosen})
 
 
-def about(
-    filters: Sequence[str], claims: Callable[[Metrics], list[dict[str, Any]]]
-) -> Callable[[Metrics], list[dict[str, Any]]]:
+def about(filters: Sequence[str], judge: Judge) -> Judge:
     """Verdicts on these filters alone, whatever else was run beside them."""
-    return lambda metrics: claims({k: m for k, m in metrics.items() if k in filters})
+
+    def judged(metrics: Metrics, drawn: Sequence[Metrics] = ()) -> list[dict[str, Any]]:
+        chosen = [{k: m for k, m in one.items() if k in filters} for one in (metrics, *drawn)]
+        return judge(chosen[0], chosen[1:])
+
+    return judged
 
 
-def _verdicts(claims: Mapping[str, Claim], metrics: Metrics) -> list[dict[str, Any]]:
+def _verdicts(
+    claims: Mapping[str, Claim], metrics: Metrics, drawn: Sequence[Metrics] = ()
+) -> list[dict[str, Any]]:
     out = []
     for key, claim in claims.items():
         exists = (n in metrics and metrics[n].get("feasible", True) for n in claim.needs)
         value = claim.value(metrics) if all(exists) else None
         if value is None:
             continue
-        verdict = graded(_inside(value, claim.band), _inside(value, claim.partly))
+        interval = interval_of(claim.value, value, drawn)
+        verdict = _verdict(claim, metrics, value, interval, drawn)
         out.append(
             {
                 "id": key,
                 "text": claim.text,
-                "verdict": verdict if claim.verdict is None else claim.verdict(metrics),
+                "verdict": verdict,
                 "value": value,
                 "band": None if claim.band is None else list(claim.band),
+                "interval": interval,
+                "more_runs": _more_runs(claim, value, interval, drawn)
+                if verdict == "undecided"
+                else None,
             }
         )
     return out
 
 
+def interval_of(
+    value_of: Callable[[Metrics], Any], value: Any, drawn: Sequence[Metrics]
+) -> list[float] | None:
+    """95 % interval of a value by a paired bootstrap over the runs (Efron & Tibshirani 1993, 13).
+
+    The percentiles of the draws, moved away from the value by the factor sqrt(n / (n - 1)) t / z by
+    which a normal mean of n runs scatters more than draws from them.
+
+    Args:
+        value_of: the value of metrics.
+        value: that of all runs.
+        drawn: metrics of draws of the runs, the same runs for all filters; the first are of all
+            runs, each once. Each filter says in `RUNS` how many.
+
+    Returns:
+        From, to; None: there are no draws, or the value does not follow from figures of each run.
+    """
+    if not drawn or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    again = np.array([value_of(metrics) for metrics in drawn], dtype=float)
+    if not math.isclose(again[0], value, rel_tol=1e-9, abs_tol=1e-12):
+        return None
+    runs = _runs_of(drawn)
+    wider = math.sqrt(runs / (runs - 1)) * stats.t.ppf(0.975, runs - 1) / stats.norm.ppf(0.975)
+    low, high = np.percentile(again[1:], [2.5, 97.5], method="inverted_cdf") - value
+    if not np.isfinite(low + high) or low == high == 0.0:
+        return None
+    return [float(value + wider * min(low, 0.0)), float(value + wider * max(high, 0.0))]
+
+
+def _verdict(
+    claim: Claim,
+    metrics: Metrics,
+    value: Any,
+    interval: Sequence[float] | None,
+    drawn: Sequence[Metrics],
+) -> str:
+    if claim.verdict is not None:
+        verdict = claim.verdict(metrics)
+        others = [] if interval is None else [claim.verdict(one) for one in drawn[1:]]
+        decided = sum(one != verdict for one in others) <= 0.05 * len(others)
+    else:
+        ends = {_graded(claim, one) for one in (value, *(interval or ()))}
+        verdict, decided = _graded(claim, value), len(ends) == 1
+    return verdict if decided else "undecided"
+
+
+def _graded(claim: Claim, value: Any) -> str:
+    return graded(_inside(value, claim.band), _inside(value, claim.partly))
+
+
+def _more_runs(
+    claim: Claim, value: float, interval: Sequence[float] | None, drawn: Sequence[Metrics]
+) -> int | None:
+    """Further runs after which the interval will not reach an edge of the claim's bands.
+
+    It shrinks with the root of the runs. None where the value is as good as at the edge.
+    """
+    needed = 0.0
+    edges = [e for band in (claim.band, claim.partly) for e in band or () if e is not None]
+    for edge, end in itertools.product(edges, interval or ()):
+        if min(value, end) <= edge <= max(value, end):
+            needed = max(needed, ((end - value) / (edge - value)) ** 2 if edge != value else np.inf)
+    runs = _runs_of(drawn)
+    return math.ceil(runs * (needed - 1.0)) if 1.0 <= needed < MOST_MORE else None
+
+
+def _runs_of(drawn: Sequence[Metrics]) -> int:
+    return next(iter(drawn[0].values()))[RUNS]
+
+
 def rms_by_component(statistics: Any) -> np.ndarray:
     """(r,) RMS error of each component that is reported [SI], over runs and epochs that count."""
-    return np.sqrt(np.mean(statistics.rms[statistics.counted] ** 2, axis=0))
+    return statistics.pooled_rms
 
 
 def rms_by_axis(statistics: Any, all_axes: Sequence[str] = ()) -> dict[str, Any]:
@@ -133,13 +246,17 @@ def standard_metrics(statistics: Any) -> dict[str, Any]:
 
 
 def consistency(statistics: Any) -> dict[str, Any]:
-    """Metrics, of campaign statistics, on whether a filter errs as much as it says."""
+    """Metrics, of campaign statistics, on whether a filter errs as much as it says.
+
+    A NEES is the mean over runs and epochs, over its degrees of freedom, and named by what it is
+    of: ``nees_all_states`` or that of a block. The ANEES, whose share inside the 95 % band is
+    told, is the mean over the runs at each epoch, of all states.
+    """
     out: dict[str, Any] = {
         "error_over_sigma": statistics.overall_ratio().tolist(),
         "error_over_sigma_bounds": statistics.ratio_bounds().tolist(),
         "anees_share_inside": statistics.anees_share_inside(),
-        "anees_mean": float(np.mean(statistics.anees()[statistics.count_from :])),
-    }
+    } | statistics.mean_nees()
     for sensor in statistics.sensors:
         verdict = statistics.nis(sensor, 0.999)
         out[f"nis_{sensor}"] = verdict.value

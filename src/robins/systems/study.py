@@ -24,7 +24,7 @@ from robins.manifold import State
 from robins.results import Outcome
 from robins.scenario import Parameters
 from robins.systems.catalogue import listed
-from robins.systems.judgement import Claim, Metrics, judging, standard_metrics
+from robins.systems.judgement import Claim, judging, standard_metrics
 from robins.systems.parts import HowMany, Names, RunNumber, Runs
 
 
@@ -176,7 +176,7 @@ class Problem(View):
 
     simulate: Callable[[Array], Any]  # run number (traced) -> world; pure, so it batches
     contenders: Mapping[str, Contender]
-    claims: Callable[[Metrics], list[dict[str, Any]]]
+    claims: Judge
     # what inputs are in an exported library, by struct and field, where no axes are declared
     fields: Mapping[tuple[str, str], str] = field(default_factory=dict)
 

@@ -57,8 +57,8 @@ def run(
     if pays_processes(problem, by, total):
         with TemporaryDirectory(prefix="robins-run-") as folder:
             asked_for = {"runs": total, "seed": seed, "filters": chosen, "settings": settings}
-            found = campaign_run(folder, name, machine=by.name, progress=progress, **asked_for)
-        found = replace(found, claims=problem.claims(found.metrics))
+            asked_for |= {"machine": by.name, "judge": problem.claims}
+            found = campaign_run(folder, name, progress=progress, **asked_for)
     else:
         found = simulate(problem, total, progress=progress, machine=by)
     return replace(

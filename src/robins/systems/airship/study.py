@@ -221,14 +221,11 @@ def airship_metrics(epoch_s: np.ndarray, at_s: Sequence[float], statistics: Any)
     """Metrics of one filter from its campaign statistics, over the epochs that count.
 
     Means and standard deviations over time are of the length of the horizontal error, averaged over
-    the runs; `nees_per_dim` is one for a filter that knows how wrong it is.
+    the runs; a NEES is one for a filter that knows how wrong it is.
     """
     position, velocity = (np.mean(statistics.norm(n), axis=0) for n in ("horizontal", "velocity"))
-    at = statistics.counted
     out: dict[str, Any] = dict(zip(METRICS, map(float, [*position, *velocity]), strict=True))
-    out["nees_per_dim"] = float(np.mean(statistics.anees()[at]))
-    for block, values in statistics.block_anees().items():
-        out[f"nees_per_dim_{block}"] = float(np.mean(values[at]))
+    out |= statistics.mean_nees()
     out["anees_share_inside"] = statistics.anees_share_inside()
     horizontal = np.sqrt(np.sum(statistics.rms[:, 6:8] ** 2, axis=1))
     for time in at_s:

@@ -40,7 +40,7 @@ CLAIMS = consistency_claims(
     {
         "sigma": "On no state the RMS error is proven, at 99 % confidence, to differ from the "
         "filter's sigma by more than 5 %; value: the largest difference proven",
-        "anees": "ANEES is inside its 95 % band at 90 % of the epochs or more",
+        "anees": "ANEES of all states is inside its 95 % band at 90 % of the epochs or more",
         "nis": "The grand mean NIS of every sensor is inside its 99.9 % band",
     }
 )

@@ -27,12 +27,12 @@ def _common_metrics(course: Course, statistics: Any) -> dict[str, Any]:
     """
     counted = statistics.counted
     attitude, quiet = statistics.rms[counted, :3], course.quiet[counted]
-    out: dict[str, Any] = {RMS: _pooled_deg(attitude)}
+    out: dict[str, Any] = {RMS: _pooled_deg(statistics.pooled_rms[:3])}
     if np.any(quiet):
         out[QUIET] = _pooled_deg(attitude[quiet])
     if course.bursts:
         out[PEAK] = float(np.degrees(np.mean(statistics.peaks[:, :, :3])))
-    out["nees_per_dim"] = float(np.mean(statistics.block_anees()["attitude"][counted]))
+    out["nees_attitude"] = statistics.mean_nees()["nees_attitude"]
     out["anees_share_inside"] = statistics.anees_share_inside()
     out["diverged_runs"] = statistics.diverged
     return out
@@ -84,7 +84,7 @@ _RATIOS = {
     "converges-faster": (PAPER, (UKF,), ("settled_s",), (0.0, 0.8), (0.0, 0.95)),
     "vector-shares-improve": ("federated-vector-ukf", (SCALAR,), (RMS,), *_BETTER),
     "discriminator-best": ("discriminator", (UKF, PAPER), (RMS,), *_BETTER),
-    "gate-consistent": ("gate", ("usque",), ("nees_per_dim",), (0.0, 0.5), (0.0, 0.9)),
+    "gate-consistent": ("gate", ("usque",), ("nees_attitude",), (0.0, 0.5), (0.0, 0.9)),
     "fading-loses-attitude": ("strong-tracking", ("gyro",), (ABOUT,), (2.0, None), (1.0, None)),
     "scale-factor-state": ("gate-scale-factor", ("gate",), (TOTAL,), (0.0, 0.5), (0.0, 0.9)),
 }

@@ -188,8 +188,7 @@ def attitude_metrics(statistics: Any) -> dict[str, Any]:
         "bias_rms_arcsec_s": float(np.linalg.norm(np.sqrt(np.mean(s.run_rms[:, 3:6] ** 2, axis=0))))
         / ARCSEC,
     }
-    blocks = s.block_anees()
-    out["nees_per_dim"] = float(np.mean(blocks["attitude"][s.counted]))
+    out["nees_attitude"] = s.mean_nees()["nees_attitude"]
     out["anees_share_inside"] = s.anees_share_inside()
     out["diverged_runs"] = s.diverged
     return out

@@ -191,8 +191,8 @@ CLAIMS = consistency_claims(
     {
         "sigma": "On no state the RMS error of the filter 'product' is proven, at 99 % confidence, "
         "to differ from its sigma by more than 5 %; value: the largest difference proven",
-        "anees": "ANEES of the filter 'product' is inside its 95 % band at 90 % of the epochs or "
-        "more; value: the share",
+        "anees": "ANEES of all states of the filter 'product' is inside its 95 % band at 90 % of "
+        "the epochs or more; value: the share",
         "nis": "The grand mean NIS of every sensor is inside its 99.9 % band for the filter "
         "'product'; value: the one farthest from 1",
     },
@@ -221,9 +221,9 @@ def product_metrics(statistics: Any) -> dict[str, Any]:
         last = units.convert(statistics.sigma[-1][block.where], block.units, block.display_unit)
         out[f"{name}_last_sigma_arcmin"] = last.tolist()
         if name == "attitude":
-            sigma = np.sqrt(np.mean(statistics.sigma[statistics.counted, block.where] ** 2, axis=0))
-            rms = rms_by_component(statistics)[block.where]
-            out["attitude_over_sigma"] = float(np.sqrt(np.sum(rms**2) / np.sum(sigma**2)))
+            rms, sigma = rms_by_component(statistics), statistics.pooled_sigma
+            sizes = (np.linalg.norm(x[block.where]) for x in (rms, sigma))
+            out["attitude_over_sigma"] = float(np.divide(*sizes))
             for key in ("attitude_rms_arcmin", "attitude_last_sigma_arcmin"):
                 north, east, down = out[key]
                 out[key] = [east, north, down]  # sizes, which have no sign
