@@ -148,7 +148,7 @@ def tally(nis=100.0, dof=100, **codes) -> Tally:
         (tally(nis=120, dof=20, DONE=20), ""),  # two that count: chi-square may reach 6.9 of each
         (tally(nis=160, dof=20, DONE=20), "mean NIS per degree of freedom 8"),
         (tally(DONE=99, NOT_FINITE=1), "1 of 100 updates with 'gnss' are NOT_FINITE"),
-        (tally(nis=np.inf, DONE=99, CONTRADICTED=1), "without noise contradicts"),
+        (tally(nis=np.inf, DONE=99, CONTRADICTED=1), "contradict what is known exactly"),
     ],
 )
 def test_doubts(given, said):

@@ -70,6 +70,21 @@ class Code(IntEnum):
     CONTRADICTED = 9
 
 
+# A prediction or an update was not taken, or a rule could not do what it is for.
+FAILURES = (
+    Code.INDEFINITE,
+    Code.NOT_FINITE,
+    Code.INFEASIBLE,
+    Code.NOT_PREDICTED,
+    Code.CONTRADICTED,
+)
+
+
+def is_failure(code: Array) -> Array:
+    """() bool: a code is one of `FAILURES`."""
+    return jnp.any(code == jnp.array([int(one) for one in FAILURES]))
+
+
 SENTENCES: dict[Code, str] = {
     Code.DONE: "the measurement was used",
     Code.MISSING: "no component of the measurement was there, so the belief stands",
@@ -95,8 +110,9 @@ SENTENCES: dict[Code, str] = {
         "measurement, and stands"
     ),
     Code.CONTRADICTED: (
-        "a component without noise contradicts what is known exactly and was left out: give the "
-        "sensor, the constraint or the initial state the noise that it has"
+        "a component without noise, a constraint or bounds contradict what is known exactly, or "
+        "each other, and were left out: give the sensor, the constraint or the initial state the "
+        "noise that it has, or look at the bounds"
     ),
 }
 
@@ -123,6 +139,18 @@ class StepInfo(NamedTuple):
     def noted(self, rule: str, **notes: Any) -> StepInfo:
         """With notes of a rule (`with_notes`)."""
         return self._replace(notes=with_notes(self.notes, rule, notes))
+
+    def contradicted_where(self, wrong: Array) -> StepInfo:
+        """The information of an update after which a rule could not do what it is for.
+
+        Its code is `Code.CONTRADICTED` there, which the tally of a run counts, and the likelihood
+        zero. A rule whose notes report a failure passes it through this method.
+        """
+        return self._replace(
+            nis=jnp.where(wrong, jnp.inf, self.nis),
+            log_likelihood=jnp.where(wrong, -jnp.inf, self.log_likelihood),
+            code=jnp.where(wrong, int(Code.CONTRADICTED), self.code),
+        )
 
     @property
     def sigma(self) -> Array:

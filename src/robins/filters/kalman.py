@@ -120,11 +120,10 @@ def predicted_factor(t: Transition, form: Form) -> Array:
     return linalg.cholesky(P)
 
 
-def _outcome(o: Observation, wrong: Array) -> Array:
+def _outcome(o: Observation) -> Array:
     some = jnp.where(jnp.any(o.accepted), int(Code.PARTLY_MISSING), int(Code.REFUSED))
     some = jnp.where(jnp.any(o.present), some, int(Code.MISSING))
-    some = jnp.where(jnp.all(o.accepted), int(Code.DONE), some)
-    return jnp.where(wrong, int(Code.CONTRADICTED), some)
+    return jnp.where(jnp.all(o.accepted), int(Code.DONE), some)
 
 
 def _aside(sound: Array, S_y: Array) -> Array:
@@ -181,13 +180,13 @@ def updated(prior: Belief, o: Observation, form: Form) -> tuple[Belief, StepInfo
         factor=S_y,
         gain=jnp.where(used[None, :], gain, 0.0),
         used=used,
-        nis=jnp.where(wrong, jnp.inf, seen.nis),
+        nis=seen.nis,
         dof=seen.dof,
-        log_likelihood=jnp.where(wrong, -jnp.inf, likely - linalg.log_diagonal(S_y, used)),
-        code=_outcome(o, wrong),
+        log_likelihood=likely - linalg.log_diagonal(S_y, used),
+        code=_outcome(o),
         notes=dict(o.notes),
     )
-    return posterior, info
+    return posterior, info.contradicted_where(wrong)
 
 
 def _failure(inputs: Any, factor: Array) -> Array:

@@ -15,7 +15,7 @@ from robins.filters.belief import Belief, with_notes
 
 # A quantity known exactly carries the rounding of many steps. This share of what it was summed from
 # is far above that rounding, and far below the noise of any sensor.
-_CONTRADICTS = 1e-9
+CONTRADICTS = 1e-9
 
 
 class Observation(NamedTuple):
@@ -157,7 +157,7 @@ def contradicted(o: Observation, seen: Normalised) -> Array:
             among = used @ wide.T - jnp.outer(jnp.where(seen.used, o.deficit, 0.0), o.deficit)
             share = linalg.solve_lower(seen.factor, among).T
         off = jnp.abs(o.residual - share @ seen.white)
-        return idle & (off > _CONTRADICTS * (o.size + jnp.abs(share) @ jnp.abs(seen.white)))
+        return idle & (off > CONTRADICTS * (o.size + jnp.abs(share) @ jnp.abs(seen.white)))
 
     return jax.lax.cond(jnp.any(idle), compare, lambda: jnp.zeros_like(idle))
 

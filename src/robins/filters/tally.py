@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from robins.filters.belief import SENTENCES, Code, StepInfo
+from robins.filters.belief import FAILURES, SENTENCES, Code, StepInfo
 from robins.filters.chi_square import chi2_band
 
 # A gate against outliers refuses a few measurements in a hundred. One that refuses more than this
@@ -23,8 +23,6 @@ FEWEST = 20  # measurements, or degrees of freedom, below which no share and no 
 NIS_HIGH, NIS_LOW = 4.0, 1.0 / 16.0
 CORRELATED = 10  # innovations of a wrong model are alike for a while: so many count as one
 LEVEL = 0.999
-
-_LOST = (Code.INDEFINITE, Code.NOT_FINITE, Code.INFEASIBLE, Code.NOT_PREDICTED, Code.CONTRADICTED)
 
 
 class StepWarning(UserWarning):
@@ -93,7 +91,7 @@ def not_taken(tally: Tally) -> list[str]:
         said += [
             f"{number} of {total} updates with '{sensor}' are {code.name}: {SENTENCES[code]}"
             for code, number in counts.items()
-            if code in _LOST
+            if code in FAILURES
         ]
     return said
 

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from robins.errors import require
 from robins.filters.audit import Again, audit
-from robins.filters.belief import Belief, Code, StepInfo
+from robins.filters.belief import Belief, Code, StepInfo, is_failure
 from robins.filters.kalman import Filter, FilterState, compiled
 from robins.filters.model import Model, Motion, Sensor
 from robins.filters.trees import select
@@ -85,7 +85,8 @@ def delayed(
     the belief stands, as if it were missing.
 
     The `StepInfo` of a late measurement is that of its own step, with its innovation there; only
-    ``log_likelihood`` is what it adds to that of all measurements so far.
+    ``log_likelihood`` is what it adds to that of all measurements so far, and ``code`` the first
+    update that fails now that it is repeated, where there is one.
 
     A prediction holds no transition, for what follows may revise it: such a run is not smoothed.
     Forward derivatives work (`jax.jvp`, `jax.jacfwd`), backward ones do not: how many steps are
@@ -202,7 +203,7 @@ def delayed(
         )
 
         def repeat(i: Array, carry: tuple) -> tuple:
-            inner, before, gained, own, taken = carry
+            inner, before, gained, own, taken, failed = carry
             j = (at + i) % size
             row = jax.tree_util.tree_map(lambda a: a[j], past)
             before = jax.tree_util.tree_map(lambda a, x: a.at[j].set(x), before, inner)
@@ -213,17 +214,21 @@ def delayed(
                 after, seen = filter_.update(inner, each, row.y[each.name], row.aux[each.name])
                 inner = select(row.asked[k], after, inner)
                 gained = gained.at[j, k].set(jnp.where(row.asked[k], seen.log_likelihood, 0.0))
+                told = jnp.isneginf(row.log_likelihood[k])  # when it was first asked
+                failed = _first_failure(failed, row.asked[k] & ~told, seen.code)
                 if k == which:
                     own = select(i == 0, seen, own)
-            return inner, before, gained, own, taken
+            return inner, before, gained, own, taken, failed
 
         start = jax.tree_util.tree_map(lambda a: a[at], past.before)
         inner = select(again, start, inner)
-        carry = (inner, past.before, past.log_likelihood, info, jnp.ones((), bool))
-        inner, before, gained, own, taken = jax.lax.fori_loop(
+        fine = (jnp.ones((), bool), jnp.asarray(int(Code.DONE)))
+        carry = (inner, past.before, past.log_likelihood, info, *fine)
+        inner, before, gained, own, taken, failed = jax.lax.fori_loop(
             0, jnp.where(again, steps + 1, 0), repeat, carry
         )
         added = _change(jnp.sum(past.log_likelihood), jnp.sum(gained), own, taken)
+        own = own._replace(code=_first_failure(own.code, again, failed))
         past = past._replace(before=before, log_likelihood=gained)
         code = jnp.where(too_old, int(Code.TOO_OLD), jnp.where(used, own.code, int(Code.REFUSED)))
         own = own._replace(
@@ -265,6 +270,11 @@ def _unread(sensor: Sensor, state: FilterState, aux: Any) -> Any:
     """A measurement of a sensor that tells nothing."""
     like = jax.eval_shape(sensor.read, state.belief.mean, aux)
     return jax.tree_util.tree_map(lambda leaf: jnp.full(leaf.shape, jnp.nan), like)
+
+
+def _first_failure(code: Array, asked: Array, found: Array) -> Array:
+    """The code, or the first failure that is found in what was asked of the filter."""
+    return jnp.where(asked & ~is_failure(code) & is_failure(found), found, code)
 
 
 def _change(earlier: Array, later: Array, own: StepInfo, taken: Array) -> Array:

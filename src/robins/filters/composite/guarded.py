@@ -42,7 +42,7 @@ from jaxtyping import Array
 
 from robins import linalg, manifold
 from robins.errors import require
-from robins.filters.belief import Belief, Code, Number, StepInfo
+from robins.filters.belief import Belief, Code, Number, StepInfo, is_failure
 from robins.filters.checks import sensor_names
 from robins.filters.kalman import Filter, FilterState, Prediction, in_step
 from robins.filters.model import Motion, Sensor
@@ -219,7 +219,7 @@ def guarded(
         mine, info = filter.update(watch.filter, sensor, y, aux)
         notes = dict(info.notes)
         if sensor.name in assumed:
-            new = judged(watch._replace(filter=mine), _failure(info), 0.0)
+            new = judged(watch._replace(filter=mine), is_failure(info.code), 0.0)
             said = select(watch.weight >= 0.5, info._replace(notes={}), _not_believed(info))
         else:
             other, plain = reference.update(watch.reference, sensor, y, aux)
@@ -229,7 +229,7 @@ def guarded(
                 share = jnp.clip(1.0 - _quotient(after**2, before**2), 0.0, 1.0)
                 renewed = jnp.where((plain.dof > 0) & (before > 0.0), share, 0.0)
             both = watch._replace(filter=mine, reference=other)
-            new = judged(both, _failure(info) & ~_failure(plain), renewed)
+            new = judged(both, is_failure(info.code) & ~is_failure(plain.code), renewed)
             notes |= {f"reference.{name}": value for name, value in plain.notes.items()}
             said = select(watch.weight >= 0.5, info._replace(notes={}), plain._replace(notes={}))
         notes["guarded.weight"] = new.weight
@@ -282,12 +282,6 @@ def _members(groups: Groups | None, n: int) -> np.ndarray:
             raise ValueError(f"guarded: group {list(members)} is not of a state of {n} components")
         row[list(members)] = 1.0
     return M
-
-
-def _failure(info: StepInfo) -> Array:
-    """Whether a step was not taken."""
-    lost = (Code.INDEFINITE, Code.NOT_FINITE, Code.INFEASIBLE, Code.CONTRADICTED)
-    return jnp.any(info.code == jnp.array([int(code) for code in lost]))
 
 
 def _not_believed(info: StepInfo) -> StepInfo:

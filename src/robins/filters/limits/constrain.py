@@ -98,7 +98,7 @@ def constrain(
     else:
         exact = Sensor(sensor.read, jnp.zeros((sensor.dim, 0)), sensor.dim, "", sensor.linear)
         seen = way.observation(metric, exact, target, None)
-        mean, G, used = nearest(metric, seen)
+        mean, G, used, _ = nearest(metric, seen)
         S = belief.factor
         rest = S - G @ (seen.spread if root is None else seen.spread @ (root.T @ S))
         if noise is None:
@@ -111,13 +111,18 @@ def constrain(
     return Constrained(posterior, before.residual, used, nis, judged.dof)
 
 
-def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array]:
-    """The state nearest to the mean that meets an exact observation, its gain, what was used."""
+def nearest(metric: Belief, o: Observation) -> tuple[State, Array, Array, Array]:
+    """The state nearest to the mean that meets an exact observation, and how it is found.
+
+    Returns:
+        The state, its gain, the components used, and those that contradict what is known exactly.
+    """
     seen = normalised(o)
     spread = jnp.where(seen.used[:, None], o.spread, 0.0)
     cross = metric.factor @ linalg.solve_lower(seen.factor, spread).T
     gain = linalg.solve_lower_transposed(seen.factor, cross.T).T
-    return manifold.retract(metric.mean, cross @ seen.white), gain, seen.used
+    mean = manifold.retract(metric.mean, cross @ seen.white)
+    return mean, gain, seen.used, contradicted(o, seen)
 
 
 def as_sensor(mean: State, g: Function, d: Any, noise: Numbers | None) -> tuple[Sensor, Any]:

@@ -13,7 +13,8 @@ from robins import linalg, manifold
 from robins.filters.belief import Belief
 from robins.filters.limits.constrain import Function, Numbers, Weight, as_sensor, metric_of, nearest
 from robins.filters.linearise import taylor
-from robins.filters.observation import Observation
+from robins.filters.observation import CONTRADICTS, Observation
+from robins.filters.trees import select
 
 # Gauss-Legendre nodes and how many e-folds of a density they span: moments to 1e-15.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
@@ -25,7 +26,9 @@ class Bounded(NamedTuple):
 
     belief: Belief
     outside: Array  # (c,) bool: the mean was out of these bounds
-    infeasible: Array  # () bool: no state fulfils all bounds; the belief is as it was
+    # () bool: no state fulfils all bounds, and the belief is as it was; or a reading that is known
+    # exactly violates its own, and stays
+    infeasible: Array
 
 
 def _seen(belief: Belief, g: Function) -> Observation:
@@ -58,24 +61,29 @@ def clip(
     o = _seen(metric, g)
     value = -o.residual
     low, high = jnp.asarray(lower, float), jnp.asarray(upper, float)
-    at_low, at_high, infeasible = _active(o.spread, o.size, low - value, high - value)
+    at_low, at_high, infeasible, denied = _active(o, low - value, high - value)
     # Which rows are active does not change with small changes, so gradients pass them by.
     shift = jnp.where(at_low, low - value, jnp.where(at_high, high - value, 0.0))
     moved = nearest(metric, o._replace(residual=shift, accepted=at_low | at_high))[0]
     mean = jax.tree_util.tree_map(
         lambda new, old: jnp.where(infeasible, old, new), moved, belief.mean
     )
-    return Bounded(belief._replace(mean=mean), (value < low) | (value > high), infeasible)
+    outside = (value < low) | (value > high)
+    return Bounded(belief._replace(mean=mean), outside, infeasible | denied)
 
 
-def _active(spread: Array, size: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Which lower and upper bounds are active at the nearest state, and whether there is none.
+def _active(o: Observation, low: Array, high: Array) -> tuple[Array, Array, Array, Array]:
+    """Lower and upper bounds that are active at the nearest state, and whether there is one.
+
+    Returns:
+        (c,) and (c,) bool; () whether no state fulfils the bounds of what may move; () whether a
+        reading that is known exactly violates its own.
 
     In units of the belief the state nearest to 0 is sought with N t >= b, rows of N of unit length.
     A violated row is met by a step in the space of the active ones; where a multiplier would turn
     negative on the way, its row is let go first.
     """
-    spread, size, low, high = jax.lax.stop_gradient((spread, size, low, high))
+    spread, size, low, high = jax.lax.stop_gradient((o.spread, o.size, low, high))
     c = len(low)
     free = ~jnp.all(linalg.lost_in_rounding(spread, size), axis=1)  # others cannot be moved
     length = jnp.where(free, jnp.sqrt(jnp.sum(spread**2, axis=1)), 1.0)
@@ -120,7 +128,8 @@ def _active(spread: Array, size: Array, low: Array, high: Array) -> tuple[Array,
     none = jnp.zeros(2 * c, bool)
     start = jnp.zeros(N.shape[1]), none, jnp.zeros(2 * c), no_row, jnp.zeros((), bool), 0
     end = jax.lax.while_loop(go_on, step, start)
-    return end[1][:c], end[1][c:], end[4] | go_on((*end[:5], 0))
+    beyond = jnp.maximum(low, -high) > CONTRADICTS * size
+    return end[1][:c], end[1][c:], end[4] | go_on((*end[:5], 0)), jnp.any(~free & beyond)
 
 
 def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bounded:
@@ -132,7 +141,8 @@ def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bou
         x := x + P D_i' alpha / s,   S := S (I - (1 - v^1/2) a a'),   a = S' D_i' / s
 
     whose square is P - (1 - v) P D_i' D_i P / s^2: no variance grows. Exact for one row, and for
-    rows whose readings are not correlated; for others it depends on their order.
+    rows whose readings are not correlated; for others it depends on their order. Where no state is
+    inside all bounds the belief stays.
 
     Args:
         belief: what to cut.
@@ -167,7 +177,9 @@ def truncate(belief: Belief, g: Function, lower: Numbers, upper: Numbers) -> Bou
     (t, M), _ = jax.lax.scan(cut, start, (o.spread, o.size, low, high))
     S = belief.factor
     cut_belief = Belief(manifold.retract(belief.mean, S @ t), linalg.tria(S @ M))
-    return Bounded(cut_belief, (low > 0.0) | (high < 0.0), jnp.zeros((), bool))
+    *_, infeasible, denied = _active(o, low, high)
+    kept = select(infeasible, belief, cut_belief)
+    return Bounded(kept, (low > 0.0) | (high < 0.0), infeasible | denied)
 
 
 def _scaled(bound: Array, mean: Array, s: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from robins.errors import require
 from robins.filters import trees
-from robins.filters.belief import Belief, Number, StepInfo
+from robins.filters.belief import Belief, Code, Number, StepInfo
 from robins.filters.checks import finite_numbers
 from robins.filters.chi_square import quantiles
 from robins.filters.limits.constrain import (
@@ -51,7 +51,9 @@ def equality(
     that is read) is a sensor, not a rule.
 
     Notes: ``equality.residual``, the greatest entry of d - g(x) before; ``equality.nis``, all of
-    them squared by D P D' + R_d; ``equality.refused``. Infinite noise is the Kalman filter.
+    them squared by D P D' + R_d; ``equality.refused``. A constraint that contradicts what is known
+    exactly makes the update `Code.CONTRADICTED`, one that the gate refuses ``PARTLY_MISSING``.
+    Infinite noise is the Kalman filter.
 
     Args:
         g: (c, n) matrix D or a function of the state, as in `constrain`.
@@ -98,7 +100,10 @@ def equality(
         belief = trees.select(skip, posterior, held.belief)
         worst = jnp.max(jnp.abs(held.residual))
         info = info.noted("equality", residual=worst, nis=held.nis, refused=refused)
-        return used | once, belief, info
+        info = info.contradicted_where(~skip & jnp.isinf(held.nis))
+        partly = refused & (info.code == int(Code.DONE))
+        code = jnp.where(partly, int(Code.PARTLY_MISSING), info.code)
+        return used | once, belief, info._replace(code=code)
 
     return Rule(init=init, process=process, after=after, name="equality")
 

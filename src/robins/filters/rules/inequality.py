@@ -38,8 +38,9 @@ def inequality(
 
     Truncation acts when something was measured, and at the first sensor of each step; clipping
     always. Notes: ``inequality.outside``, the number of bounds that the mean violated;
-    ``inequality.infeasible``, whether no state fulfils them all (the belief then stays). Bounds at
-    infinity are the Kalman filter.
+    ``inequality.infeasible``, whether no state fulfils them all (the belief then stays) or one that
+    is known exactly does not: the update is then `Code.CONTRADICTED`. Bounds at infinity are the
+    Kalman filter.
 
     Args:
         g: (c, n) matrix D, or a function of the state with values in an array, linearised about
@@ -76,7 +77,7 @@ def inequality(
             belief = trees.select(skip, posterior, kept.belief)
             cut = jnp.ones((), bool)
         notes = {"outside": jnp.sum(kept.outside), "infeasible": kept.infeasible}
-        return cut, belief, info.noted("inequality", **notes)
+        return cut, belief, info.contradicted_where(kept.infeasible).noted("inequality", **notes)
 
     return Rule(init=init, process=process, after=after, name="inequality")
 

@@ -38,6 +38,8 @@ def projection(
 
     It goes before rules that look at the posterior: what rules before it did to that is lost.
 
+    A constraint that contradicts what is known exactly cannot be met: `Code.CONTRADICTED`.
+
     Notes: ``projection.residual``, the greatest component of d - D x.
 
     Args:
@@ -65,8 +67,9 @@ def projection(
     def after(memory, posterior: Belief, info: StepInfo, o: Observation):
         if o.sensor not in names:
             return memory, posterior, info
-        belief, gain, used = projected(o, weight, project_covariance)
+        belief, gain, used, wrong = projected(o, weight, project_covariance)
         info = info._replace(gain=jnp.where(used[None, :], gain, 0.0))
+        info = info.contradicted_where(jnp.any(wrong))
         return memory, belief, info.noted("projection", residual=jnp.max(jnp.abs(o.residual)))
 
     return Rule(init=init, after=after, name="projection")
@@ -74,14 +77,14 @@ def projection(
 
 def projected(
     o: Observation, weight: Weight, project_covariance: bool = True
-) -> tuple[Belief, Array, Array]:
-    """The belief on the constraint that an observation is, the gain, and what was used."""
+) -> tuple[Belief, Array, Array, Array]:
+    """The belief on the constraint that an observation is, and the rest of `nearest`."""
     prior, S = o.prior, o.prior.factor
     metric, root = metric_of(prior, weight)
     spread = o.spread if root is None else _slope(o) @ metric.factor
     nothing = jnp.zeros((len(o.residual), 0))
     exact = o._replace(spread=spread, excess=nothing, noise=nothing, deficit=None)
-    mean, G, used = nearest(metric, exact)
+    mean, G, used, wrong = nearest(metric, exact)
     factor = S
     if project_covariance:
         error = jnp.concatenate([o.excess, o.noise], axis=1)
@@ -91,7 +94,7 @@ def projected(
         lost = linalg.lost_in_rounding(factor, prior.sigma)
         factor = jnp.where(clean & lost, 0.0, factor)
     some = jnp.any(used)
-    return Belief(mean, jnp.where(some, factor, S)), G, used
+    return Belief(mean, jnp.where(some, factor, S)), G, used, wrong
 
 
 def _slope(o: Observation) -> Array:
