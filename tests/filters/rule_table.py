@@ -12,7 +12,7 @@ import numpy as np
 from dense_kalman import System, simulate
 from jax.tree_util import Partial
 
-from robins.filters import Belief, Model, Motion, Observation, Sensor
+from robins.filters import Belief, Code, Model, Motion, Observation, Sensor, adaptive, kalman
 from robins.filters.rules import (
     adaptive_h_infinity,
     channel_inflation,
@@ -235,6 +235,63 @@ NO_SLOPE = {"adaptive_h_infinity"}
 # What a sensor teaches these is known by component.
 LEARNING = [sage_husa(adapt="R"), variational_bayes(), innovation_fading()]
 
+# --------------------------------------------------------------------------- failing, and returning
+
+ABSURD = 1e30
+TWO = [[1.0, 0.0], [1.0, 0.0]]
+FIRST = TWO[:1]
+# A rule, standard deviations of a state (0, 0), a reading of its second component, and the code.
+FAILING = {
+    "equality": (equality(FIRST, [5.0]), (0, 1), 0.5, Code.CONTRADICTED),
+    "equality of a function": (
+        equality(lambda x: x[:1], jnp.array([5.0])),
+        (0, 1),
+        math.nan,
+        Code.CONTRADICTED,
+    ),
+    "equality by a metric": (
+        equality(FIRST, [5.0], np.eye(2)),
+        (0, 1),
+        0.5,
+        Code.CONTRADICTED,
+    ),
+    "equality refused": (equality(FIRST, [99.0], gate=0.99), (1, 1), 0.5, Code.PARTLY_MISSING),
+    "inequality": (inequality(TWO, [2, -math.inf], [math.inf, 1]), (1, 1), 0.5, Code.CONTRADICTED),
+    "truncation": (
+        inequality(TWO, [2, -math.inf], [math.inf, 1], "truncation"),
+        (1, 1),
+        0.5,
+        Code.CONTRADICTED,
+    ),
+    "inequality of the known": (inequality(FIRST, [2.0]), (0, 1), 0.5, Code.CONTRADICTED),
+    "truncation of the known": (
+        inequality(FIRST, [2.0], None, "truncation"),
+        (0, 1),
+        0.5,
+        Code.CONTRADICTED,
+    ),
+    "projection": (projection("y"), (1, 0), 5.0, Code.CONTRADICTED),
+    "gate": (gate(), (1, 1), ABSURD, Code.REFUSED),
+    "huber": (huber(), (1, 1), ABSURD, Code.REFUSED),
+    "student_t": (student_t(), (1, 1), ABSURD, Code.REFUSED),
+    "student_t of both": (student_t(whose="both"), (1, 1), ABSURD, Code.REFUSED),
+    "correntropy": (correntropy(), (1, 1), ABSURD, Code.REFUSED),
+    "igg3": (igg3(), (1, 1), ABSURD, Code.REFUSED),
+    "discriminator": (discriminator(), (1, 1), ABSURD, Code.REFUSED),
+}
+# Filters that must come back from a jump of the state, and how many refusals in a row they keep.
+RETURNING = {
+    "gate": (kalman(rules=[gate()]), 10),
+    "gate by component": (kalman(rules=[gate(scope="component")]), 10),
+    "igg3": (kalman(rules=[igg3()]), 10),
+    "huber": (kalman(rules=[huber()]), 30),
+    "student_t": (kalman(rules=[student_t()]), 30),
+    "correntropy": (kalman(rules=[correntropy()]), 30),
+    "discriminator": (kalman(rules=[discriminator()]), 29),
+    "discriminator that refuses": (kalman(rules=[discriminator(robust="gate")]), 29),
+    "adaptive": (adaptive(), 30),
+}
+
 # ------------------------------------------------------------------------------------------ misused
 
 NAN, INF = math.nan, math.inf
@@ -250,7 +307,7 @@ MISUSED = [
     (gate, {"probability": 0.0}, "gate probability must lie between 0 and 1, got 0.0"),
     (gate, {"probability": 1.0}, "gate probability must"),
     (gate, {"probability": NAN}, "gate probability must"),
-    (gate, {"patience": -1}, "gate patience must be at least 0 to accept, got -1"),
+    (gate, {"patience": -1}, "gate patience must be at least 0 to inflate, got -1"),
     (gate, {"patience": 0, "recovery": "reinitialise"}, "gate patience must be at least 1"),
     (gate, {"recovery": "hope"}, "gate recovery must be .*'inflate' or .*, got 'hope'"),
     (gate, {"scope": "half"}, "gate scope must be 'joint' or 'component', got 'half'"),
@@ -258,6 +315,9 @@ MISUSED = [
     (huber, {"probability": 1.1}, "huber probability"),
     (huber, {"probability": NAN}, "huber probability"),
     (huber, {"threshold": 0.0}, "huber threshold must be positive, got 0.0"),
+    (huber, {"patience": -1}, "huber patience must not be negative, got -1"),
+    (student_t, {"patience": -1}, "student_t patience must not be negative, got -1"),
+    (correntropy, {"patience": -1}, "correntropy patience must not be negative, got -1"),
     (igg3, {"k0": 4.0}, "igg3 needs 0 < k0 < k1 < inf, got k0 = 4.0, k1 = 4.0"),
     (igg3, {"k0": 0.0}, "igg3 needs"),
     (igg3, {"k1": INF}, "igg3 needs"),

@@ -33,9 +33,11 @@ def troubled(seed: int) -> np.ndarray:
 Y = troubled(0)
 
 
-def open_prior(P, H, D):
+def open_prior(P, H, D, r):
     G = P @ H.T @ np.linalg.inv(H @ P @ H.T)
-    return P + G @ D @ G.T
+    told = np.diag(G @ H @ P) / np.diag(P)
+    k = np.max(r**2 / np.diag(H @ P @ H.T))
+    return P + G @ D @ G.T + k * np.sqrt(np.outer(told, told)) * (P - G @ H @ P)
 
 
 def gated(s, y, recovery, scope):
@@ -83,7 +85,7 @@ def gated(s, y, recovery, scope):
         if recovery == "reinitialise":
             D += 100.0 * s.R
         if np.any(doubted) and recovery != "accept":
-            P = open_prior(P, s.H[doubted], D[np.ix_(doubted, doubted)])
+            P = open_prior(P, s.H[doubted], D[np.ix_(doubted, doubted)], r[doubted])
         if np.any(accepted):
             H, R = s.H[accepted], s.R[np.ix_(accepted, accepted)]
             K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)

@@ -77,13 +77,15 @@ def book_igg3(m, P, H, R, z, memory, floor=0.01, patience=4):
         elif one < k1:
             w.append(max(k0 / one * ((k1 - one) / (k1 - k0)) ** 2, floor))
         else:
-            w.append(floor)
+            w.append(0.0 if floor * one > k0 else floor)
     w = np.array(w)
     recovered = np.all(w <= floor) and memory >= patience
     if recovered:
         G = P @ H.T @ np.linalg.inv(H @ P @ H.T)
         a = 1 / k0**2 - 1 / np.max(t) ** 2
-        P, w = P + a * np.outer(G @ r, G @ r), np.ones(len(z))
+        told = np.diag(G @ H @ P) / np.diag(P)
+        more = np.max(r**2 / np.diag(H @ P @ H.T)) * np.sqrt(np.outer(told, told)) * (P - G @ H @ P)
+        P, w = P + a * np.outer(G @ r, G @ r) + more, np.ones(len(z))
         assert np.max(np.abs(r) / np.sqrt(np.diag(H @ P @ H.T + R))) < k0 * (1 + 1e-9)
         memory = 0
     else:

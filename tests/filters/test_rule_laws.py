@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rule_table import (
+    ABSURD,
     ACTING,
     AROUND,
     BASE,
     CIRCLE,
     FACING,
+    FAILING,
     GONE,
     HOLDING,
     LEARNING,
@@ -24,6 +26,7 @@ from rule_table import (
     QUIET,
     QUIET_WHEN_OFF,
     RAD,
+    RETURNING,
     RULES,
     SEAM,
     START,
@@ -33,7 +36,18 @@ from rule_table import (
     line,
 )
 
-from robins.filters import Code, OnlineFilter, kalman, run, taylor, unscented
+from robins.filters import (
+    Belief,
+    Code,
+    Model,
+    Motion,
+    OnlineFilter,
+    Sensor,
+    kalman,
+    run,
+    taylor,
+    unscented,
+)
 from robins.filters.rules import gate
 from robins.manifold import Angle
 
@@ -212,6 +226,78 @@ def test_what_is_refused_or_missing_teaches_nothing_component_by_component():
             if jnp.shape(a)[:1] == (M,)
         ]
         assert np.any(moved, axis=0).tolist() == [False, True, False], rule.name
+
+
+# --------------------------------------------------------------------- failures, and the way back
+
+
+def test_what_a_rule_cannot_do_and_what_has_no_weight_reach_the_tally():
+    told = {"refused", "infeasible", "weight"}
+    notes = {note for name in FILTERS for note in ran(name).steps.info["y"].notes}
+    there = {rule.name for rule, *_ in FAILING.values()}
+    assert there >= {note.split(".")[0] for note in notes if note.split(".")[-1] in told}
+    model = Model(
+        Motion(lambda x, u: x, jnp.zeros(2)), (Sensor(lambda x, aux: x[1:], jnp.ones(1), 1, "y"),)
+    )
+
+    @jax.jit
+    def found():
+        def one(rule, sigma, y, _):
+            start = Belief(jnp.zeros(2), jnp.diag(jnp.asarray(sigma, float)))
+            return run(kalman(rules=[rule]), model, start, jnp.full((1, 1), y))
+
+        return {name: one(*row) for name, row in FAILING.items()}
+
+    for name, got in found().items():
+        *_, y, code = FAILING[name]
+        assert got.tally.counts("y") == {code: 1}, name
+        lost = code == Code.CONTRADICTED
+        assert bool(np.isinf(got.tally.nis["y"])) == bool(np.isinf(got.log_likelihood)) == lost
+        if y == ABSURD:  # as if it had not been
+            np.testing.assert_array_equal(got.mean[0], np.zeros(2), err_msg=name)
+            np.testing.assert_array_equal(got.covariance[0], np.eye(2), err_msg=name)
+
+
+AT, BACK, LONG = 40, 60, 130  # the step of a jump, steps until all must be back, and all
+
+
+def test_a_jump_of_the_state_is_followed_and_a_burst_is_not():
+    """A jump of 1e3 and of 1e6 sigma; and readings off by 1e6 for as long as a rule is patient."""
+    F, G = np.array([[1.0, 1.0], [0.0, 1.0]]), 0.03 * np.array([0.5, 1.0])
+    rng, x, truth = np.random.default_rng(0), np.zeros(2), []
+    for _ in range(LONG):
+        x = F @ x + G * rng.normal()
+        truth.append(x[0])
+    truth, step = np.array(truth), np.arange(LONG)
+    y = truth + rng.normal(size=LONG)
+    jumped = np.array([1e3, 1e6])[:, None] * (step >= AT)
+    model = Model(
+        Motion(lambda x, u: jnp.asarray(F) @ x, jnp.asarray(G)[:, None]),
+        (Sensor(lambda x, aux: x[:1], jnp.ones(1), 1, "y"),),
+    )
+    start = Belief.of(np.zeros(2), np.eye(2))
+
+    @jax.jit
+    def found():
+        def one(filter_, patience):
+            burst = 1e6 * ((step >= AT) & (step < AT + patience))
+            data = jnp.asarray(y + np.vstack([jumped, burst]))[..., None]
+
+            def keep(step):
+                return step.posterior.mean[0], step.posterior.sigma[0]
+
+            return jax.vmap(lambda one: run(filter_, model, start, one, keep=keep).steps)(data)
+
+        return {name: one(*row) for name, row in RETURNING.items()}
+
+    for name, (mean, sigma) in found().items():
+        error = np.abs(np.asarray(mean) - truth - np.vstack([jumped, 0.0 * step]))
+        off = error > 5.0 * np.asarray(sigma)
+        assert not np.any(off[:, :AT]), name
+        assert np.all(off[:2, AT]), f"{name} follows the first reading of a jump"
+        assert not np.any(off[:2, AT + BACK :]), f"{name} is not back"
+        assert np.max(error[:2, AT + BACK :]) < 5.0, f"{name} is not back"
+        assert not np.any(off[2]), f"{name} is led away by a burst"
 
 
 REFUSED = [(*row, ValueError) for row in MISUSED] + [(*row, TypeError) for row in MISTYPED]

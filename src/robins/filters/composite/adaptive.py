@@ -9,7 +9,8 @@ scale of the process noise,
     Q_s = s^2 Q,     s of the scales
 
 so a motion that is wrong for long makes a mode of more noise likely, and a bad record, which is
-gone at the next step, does not. There is no gate: nothing is refused, so nothing is locked out.
+gone at the next step, does not. There is no gate, and where no mode has given weight to a sensor
+for long, its next record is believed by all.
 
 States that the model holds for constant (biases, misalignments) stay constant in every mode: a
 bias that may wander explains what was something else, and what the quiet mode has learnt of it is
@@ -47,6 +48,7 @@ from robins.filters.kalman import Filter, Form, kalman
 from robins.filters.linearise import Linearisation, Transition, taylor
 from robins.filters.rule import Rule
 from robins.filters.rules import huber
+from robins.filters.rules._robust import PATIENCE
 
 SCALES = (1.0, 8.0, 64.0)
 UP, BACK = 1e-5, 1e-2
@@ -115,6 +117,7 @@ def adaptive(
     linearise: Linearisation | None = None,
     form: Form = "sqrt",
     off: Sequence[str] = (),
+    patience: int | None = PATIENCE,
 ) -> Filter:
     """A bank of Kalman filters over the scale of the process noise, with Huber's rule in each.
 
@@ -131,6 +134,8 @@ def adaptive(
         form: of the update, "sqrt" or "joseph".
         off: names of sensors whose records may be off for some time, one at a time. It costs a
             state for each of their components, and two modes for each of them.
+        patience: records of a sensor in a row with hardly any weight before one is believed
+            (`huber`); None never does.
 
     Raises:
         ValueError: scales that do not rise from above zero; probabilities that are none. When a run
@@ -144,16 +149,16 @@ def adaptive(
     own = np.repeat(np.eye(len(parts)), len(s) - 1, axis=0)
     gains = s[0] * np.ones((1 + len(more), len(parts)))
     gains[1:] = np.where(own > 0.0, more[:, None], gains[1:])
-    by = taylor() if linearise is None else linearise
+    by, weight = taylor() if linearise is None else linearise, huber(robust, patience=patience)
     change = changes([s[0], *more], up, back)
     if not off:
 
         def one(gain: Any) -> Filter:
-            return kalman(by, (excited(parts, gain), huber(robust)), form)
+            return kalman(by, (excited(parts, gain), weight), form)
 
         return imm(Family(one, gains), change, lasting(change))
 
-    weighed, plain = kalman(by, (huber(robust),), form), len(gains)
+    weighed, plain = kalman(by, (weight,), form), len(gains)
 
     def supposes(row: tuple[Any, Supposed]) -> Filter:
         gain, of = row

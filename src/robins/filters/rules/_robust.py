@@ -1,7 +1,8 @@
-"""What robust rules share: parts of an innovation's covariance, heavier noise, wider priors."""
+"""Shared by robust rules: parts of an innovation, weights, refusals, and the way out of a lock."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -9,8 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from robins import linalg
+from robins.errors import require
 from robins.filters.belief import Belief
 from robins.filters.observation import Normalised, Observation, left_out, normalised, whiten
+from robins.filters.rule import Memory, Rule
+from robins.filters.rules._variances import ratio, variance
+from robins.filters.trees import select
 
 
 class Shares(NamedTuple):
@@ -46,6 +51,8 @@ def shares(o: Observation) -> Shares:
 
 
 MOST = 1e12  # noise raised this far is noise of infinity, and still leaves digits to compare with
+PATIENCE = 30  # measurements in a row with hardly any weight before one is believed
+_HARDLY = 1e-2  # weight of a measurement; less is that of an innovation beyond some 30 deviations
 _STEPS = 40  # some four are needed; forty is a bound, not a plan
 _CLOSE = 1e-13
 
@@ -68,14 +75,15 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
         seen: `normalised` of the observation, where it is known already.
 
     Returns:
-        () the factor of the covariance R, at most 1e12: an innovation without noise of its own
+        () the factor of the covariance R, at most `MOST`: an innovation without noise of its own
         cannot be made likely. Its derivative is that of the root.
     """
     seen = normalised(o) if seen is None else seen
     noise = jnp.where(seen.used[:, None], o.noise, 0.0)
     W = linalg.solve_lower(seen.factor, noise)
     B = W @ W.T
-    above = seen.nis > limit
+    beyond = seen.nis >= MOST * limit  # g(s) >= NIS / s, so that s is `MOST` at least
+    above = (seen.nis > limit) & ~beyond
     nis = jnp.where(above, seen.nis, 1.0)
     ratio = jnp.where(above, nis / limit, 1.0)
     unit = jnp.where(above, seen.white, 0.0) / jnp.sqrt(nis)
@@ -104,17 +112,98 @@ def scale_to_quantile(o: Observation, limit: ArrayLike, seen: Normalised | None 
     again = 2.0 * (v @ unit) - v @ v - (s - 1.0) * (v @ (B @ v))
     free = above & (s < MOST) & (slope > 0.0)
     turn = jnp.where(free, g / jnp.where(free, slope, 1.0), 0.0)
-    return jnp.where(above, s + turn * (again * ratio - 1.0), 1.0)
+    return jnp.where(above, s + turn * (again * ratio - 1.0), jnp.where(beyond, MOST, 1.0))
+
+
+def weighed(o: Observation, scale: Array) -> tuple[Observation, Array]:
+    """A measurement with noise R_ij sqrt(s_i s_j), and its weights 1 / s.
+
+    A weight cannot fall below 1 / `MOST`, so that beyond it the pull of a reading would grow again:
+    one of 1e30 would move the state by 1e18. There a component is refused, and its weight is 0. One
+    without noise of its own keeps its place.
+
+    Args:
+        o: the measurement.
+        scale: () of the whole, or (m,) of its components.
+    """
+    lost = scale >= (1.0 - 1e-9) * MOST
+    refused = lost & jnp.any(o.noise != 0.0, axis=1)
+    root = jnp.sqrt(jnp.where(lost, 1.0, scale))
+    noise = jnp.broadcast_to(root, refused.shape)[:, None] * o.noise
+    o = o._replace(noise=noise, accepted=o.accepted & ~refused)
+    return o, jnp.where(lost, 0.0, 1.0 / scale)
+
+
+def opening(rule: Rule, patience: int | None) -> Rule:
+    r"""A robust rule that does not refuse for ever.
+
+    A filter that has gone wrong would give weight to no measurement any more. So when ``patience``
+    measurements of a sensor in a row were refused or had a weight below 1e-2, its next one that is
+    like that is used with full weight, and the prior is first widened along the innovation r until
+    the NIS is that of m right components (`widened` by a r r', a = 1 / m - 1 / NIS).
+
+    Notes: ``recovered``, under the name of the rule.
+
+    Args:
+        rule: with no other hook than `before`.
+        patience: measurements in a row; None leaves the rule as it is.
+    """
+    if patience is None:
+        return rule
+    require(patience >= 0, f"{rule.name} patience must not be negative", patience)
+
+    def init(belief: Belief, dims: Mapping[str, int]):
+        return rule.init(belief, dims), {name: jnp.zeros((), int) for name in dims}
+
+    def before(memory: Memory, prior: Belief, o: Observation):
+        inner, counts = memory
+        inner, faded, given = rule.before(inner, prior, o)
+        R, raised = variance(o.noise), variance(given.noise)
+        counting = o.accepted & o.present & (R > 0.0)
+        weight = ratio(R, raised)
+        hopeless = jnp.any(counting)
+        hopeless &= jnp.all(~counting | ~given.accepted | (weight < _HARDLY))
+        due = hopeless & (counts[o.sensor] >= patience)
+        wide = widened_to_dof(due, prior, o, normalised(o))
+        count = jnp.where(hopeless & ~due, counts[o.sensor] + 1, 0)
+        count = jnp.where(jnp.any(counting), count, counts[o.sensor])
+        given = given._replace(
+            noise=jnp.where(due, o.noise, given.noise),
+            accepted=jnp.where(due, o.accepted, given.accepted),
+        )
+        given = given.noted(rule.name, recovered=due)
+        memory = inner, {**counts, o.sensor: count}
+        return memory, select(due, wide, Belief(*faded)), given
+
+    return rule._replace(init=init, before=before)
+
+
+def is_hopeless(seen: Normalised, limit: ArrayLike) -> Array:
+    """Whether a weight by that limit of the NIS would be hardly any."""
+    return seen.nis * _HARDLY > limit
+
+
+def widened_to_dof(due: Array, prior: Belief, o: Observation, seen: Normalised) -> Belief:
+    """The prior, `widened` along the innovation until the NIS is at most its degrees of freedom."""
+    a = ratio(jnp.ones(()), seen.dof.astype(float)) - ratio(jnp.ones(()), seen.nis)
+    due = due & (a > 0.0)
+    return widened(due, prior, o, seen.used, jnp.sqrt(jnp.where(due, a, 1.0)) * o.residual[:, None])
 
 
 def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Array) -> Belief:
     r"""The prior with a covariance D added to what some components see, where that is due.
 
-        P' = P + G D G',   G = P H' (H P H')^-1,   so that H G = I and H P' H' = H P H' + D,
+        P' = P + G D G' + E,   G = P H' (H P H')^-1,   H G = I,   so that H P' H' >= H P H' + D,
 
-    H being the rows of those components. The state's other directions follow as far as they are
-    correlated with those seen; otherwise their variance stays. A component that is known exactly
-    stays so: its column of G is 0.
+    H being the rows of those components. What the state's other directions are correlated with
+    these moves them too, and by as much as the error that is now believed: a velocity would be
+    known as well as ever, about a mean that the jump of a position has thrown far off. So what the
+    components do not tell of a state, P_c = P - G H P, grows by the share that they do tell,
+
+        E = k V P_c V,   V_ii^2 = (G H P)_ii / P_ii,   k = max_i r_i^2 / (H P H')_ii
+
+    r being the innovation, and a state that is not correlated with them stays as it was. So does a
+    component that is known exactly: its column of G is 0.
 
     Args:
         due: () bool; without it the prior stands.
@@ -125,9 +214,16 @@ def widened(due: Array, prior: Belief, o: Observation, chosen: Array, root: Arra
     """
 
     def wider() -> Belief:
-        spread = jnp.where(chosen[:, None], o.spread, 0.0)
-        solid, _ = linalg.guard(spread, o.size)
-        G_root = prior.factor @ (spread.T @ linalg.solve_spd(solid, root))
-        return prior._replace(factor=linalg.tria(prior.factor, G_root))
+        S, spread = prior.factor, jnp.where(chosen[:, None], o.spread, 0.0)
+        solid, independent = linalg.guard(spread, o.size)
+        G_root = S @ (spread.T @ linalg.solve_spd(solid, root))
+        T = jnp.where(independent[:, None], linalg.solve_lower(solid, spread), 0.0)
+        told = S @ T.T
+        growth = jnp.where(chosen & independent, ratio(o.residual**2, variance(spread)), 0.0)
+        share = jnp.max(growth) * ratio(variance(told), variance(S))
+        some = share > 0.0  # twice: the slope of a root at 0 is infinite
+        share = jnp.where(some, jnp.sqrt(jnp.where(some, share, 1.0)), 0.0)
+        untold = share[:, None] * (S - told @ T)
+        return prior._replace(factor=linalg.tria(S, G_root, untold))
 
     return jax.lax.cond(due, wider, lambda: Belief(*prior))

@@ -11,15 +11,15 @@ from robins.errors import require
 from robins.filters.belief import Belief, Number
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._robust import shares
+from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
 
 
 def _least(e: Array) -> Array:
     """A weight as good as none that leaves digits: 1e-8, less if that pulled by a milli-sigma."""
-    return 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e9)
+    return 1e-3 / jnp.minimum(1e5 + jnp.abs(e), 1e-3 * MOST)
 
 
-def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
+def correntropy(kernel: Number = 3.0, iterations: int = 3, patience: int | None = PATIENCE) -> Rule:
     r"""Maximum correntropy Kalman filter (Chen, Liu, Zhao & Principe 2017), in the measurement.
 
     The state that maximises -(x - m)' P^-1 (x - m) / 2 + sigma^2 sum G(e_i), the Gaussian kernel
@@ -34,16 +34,21 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
     result depends on the order of the states in the factor of P, and a state far off is
     locked out. Here the prior stays quadratic.
 
-    Notes: ``correntropy.weight``, the least of the measurement. Components without noise of their
-    own keep their weight. The Kalman filter is ``kernel=inf``.
+    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
+    the next one is believed (`robins.filters.rules._robust.opening`).
+
+    Notes: ``correntropy.weight``, the least of the measurement, 0 if refused, and
+    ``correntropy.recovered``. Components without noise of their own keep their weight. The Kalman
+    filter is ``kernel=inf``.
 
     Args:
         kernel: width sigma of the kernel, in standard deviations of the noise. It is a hidden
             tuning: below 2 good measurements are lost, above 6 outliers of 10 sigma still count.
         iterations: of the weights, at least 1.
+        patience: measurements in a row with a weight below 1e-2; None never recovers.
 
     Raises:
-        ValueError: the kernel is not positive, or there is no iteration.
+        ValueError: the kernel is not positive, there is no iteration, or patience is negative.
     """
     require(kernel > 0.0, "correntropy kernel must be positive", kernel)
     require(iterations >= 1, "correntropy iterations must be at least 1", iterations)
@@ -68,8 +73,7 @@ def correntropy(kernel: Number = 3.0, iterations: int = 3) -> Rule:
         return jax.lax.fori_loop(0, iterations, better, jnp.ones(len(own)))
 
     def before(memory, prior: Belief, o: Observation):
-        w = weights(o)
-        o = o._replace(noise=o.noise / jnp.sqrt(w)[:, None])
+        o, w = weighed(o, 1.0 / weights(o))
         return memory, prior, o.noted("correntropy", weight=jnp.min(w))
 
-    return Rule(before=before, name="correntropy")
+    return opening(Rule(before=before, name="correntropy"), patience)

@@ -16,7 +16,12 @@ from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
 from robins.filters.rules import _fading
-from robins.filters.rules._robust import scale_to_quantile
+from robins.filters.rules._robust import (
+    is_hopeless,
+    scale_to_quantile,
+    weighed,
+    widened_to_dof,
+)
 
 Fade = Literal["projected", "multiple"]
 Robust = Literal["huber", "gate"]
@@ -58,6 +63,8 @@ def discriminator(
 
         0 < c < patience   outlier: R becomes s R with r' (H P H' + s R)^-1 r = k2
                            ("huber"), or the measurement is refused ("gate"); V stands
+        c = patience       where g > 100 k2 too, the prior is widened until g = m, once (`widened`
+                           in `robins.filters.rules._robust`), and V stands
         otherwise          V = rho V + (1 - rho) r r', from V = R; where V is significantly above
                            H P H' + R the model is wrong, and the prior is faded by
                            lambda = (tr V - m) / tr H P H'
@@ -133,20 +140,21 @@ def discriminator(
         longer = jnp.where(seen.nis > quantile, count + 1, 0)
         count = jnp.where(seen.dof == 0, count, longer)
         outlier = (seen.dof > 0) & (count > 0) & (count < patience)
+        opens = (seen.dof > 0) & (count == patience) & is_hopeless(seen, quantile)
 
-        white = _fading.whitened(o)
-        power = jnp.where(outlier, power, _fading.averaged(power, white, rho))
+        white, stands = _fading.whitened(o), outlier | opens
+        power = jnp.where(stands, power, _fading.averaged(power, white, rho))
         total = _fading.total(power, white)
-        N = jnp.where(~outlier & significant(total, white), total - white.dof, 0.0)
+        N = jnp.where(~stands & significant(total, white), total - white.dof, 0.0)
         S, factor = _fading.faded(prior.factor, white, N, fade, a, limit)
+        S = widened_to_dof(opens, Belief(prior.mean, S), o, seen).factor
 
         if robust == "gate":
             weight = jnp.where(outlier, 0.0, 1.0)
             o = o._replace(accepted=o.accepted & ~outlier)
         else:
             s = jnp.where(outlier, scale_to_quantile(o, quantile, seen), 1.0)
-            weight = 1.0 / s
-            o = o._replace(noise=jnp.sqrt(s) * o.noise)
+            o, weight = weighed(o, s)
         wrong = (factor > 1.0) | ((seen.dof > 0) & (count >= patience))
         state = jnp.where(outlier, int(Verdict.OUTLIER), jnp.where(wrong, int(Verdict.MODEL), 0))
         memory = _Memory(

@@ -37,7 +37,7 @@ class _Channel(NamedTuple):
 def gate(
     probability: float = 0.9999,
     patience: int = 10,
-    recovery: Recovery = "accept",
+    recovery: Recovery = "inflate",
     scope: Scope = "joint",
 ) -> Rule:
     r"""Chi-square gate on the innovation of a sensor (Bar-Shalom et al. 2001, sec. 2.3.2).
@@ -47,10 +47,11 @@ def gate(
     wrong would refuse for ever, so after ``patience`` refusals of a sensor in a row the next
     measurement that is too large recovers it:
 
-    - ``accept`` uses it with the gain there is;
-    - ``inflate`` first widens the prior covariance along the innovation until the NIS is q,
-      P' = P + a G r r' G', G = P H' (H P H')^-1, a = 1 / q - 1 / NIS; by component D = diag(a_i
-      r_i^2) stands in for a r r', with a_i = 1 / q - S_ii / r_i^2;
+    - ``accept`` uses it with the gain there is, which follows a jump of many deviations only in
+      hundreds of measurements;
+    - ``inflate`` first widens the prior covariance along the innovation until the NIS is q or
+      less, by D = a r r', a = 1 / q - 1 / NIS; by component by D = diag(a_i r_i^2), with a_i =
+      1 / q - S_ii / r_i^2 (`robins.filters.rules._robust.widened`);
     - ``reinitialise`` uses it only if it and the refused ones before it *agree*: their scatter
       about their mean, sum (r_k - mean)' R^-1 (r_k - mean), is within the chi-square quantile of
       patience times m degrees of freedom. It then widens what is seen by D = r r' + 100 R, and

@@ -9,10 +9,14 @@ from robins.filters.belief import Belief, Number
 from robins.filters.chi_square import quantiles
 from robins.filters.observation import Observation, normalised
 from robins.filters.rule import Rule
-from robins.filters.rules._robust import scale_to_quantile
+from robins.filters.rules._robust import PATIENCE, opening, scale_to_quantile, weighed
 
 
-def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
+def huber(
+    probability: Number = 0.999,
+    threshold: Number | None = None,
+    patience: int | None = PATIENCE,
+) -> Rule:
     r"""Huber weight on the joint Mahalanobis distance of a measurement (Chang 2014, sec. 3).
 
     Where the NIS exceeds k^2, the measurement covariance R becomes s R with
@@ -23,16 +27,22 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
     measurement: correlated noise stays what it is, and no unit enters. The state is pulled by about
     k^2 / |r| at the most: the further off a measurement is, the less it moves the state.
 
-    Notes: ``huber.weight``, 1 / s. Components without noise of their own cannot be weighed down.
-    The Kalman filter is ``probability=1`` or ``threshold=inf``.
+    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
+    the next one is believed (`robins.filters.rules._robust.opening`).
+
+    Notes: ``huber.weight``, 1 / s, 0 if refused, and ``huber.recovered``. Components without noise
+    of their own cannot be weighed down. The Kalman filter is ``probability=1`` or
+    ``threshold=inf``.
 
     Args:
         probability: share of right measurements that keep their weight, in (0, 1].
         threshold: k, in standard deviations, whatever the number of components; None takes it from
             the probability.
+        patience: measurements in a row with a weight below 1e-2; None never recovers.
 
     Raises:
-        ValueError: the probability is not in (0, 1], or the threshold not positive.
+        ValueError: the probability is not in (0, 1], the threshold not positive, or patience is
+            negative.
     """
     require(0.0 < probability <= 1.0, "huber probability must lie in (0, 1]", probability)
     require(threshold is None or threshold > 0.0, "huber threshold must be positive", threshold)
@@ -44,7 +54,7 @@ def huber(probability: Number = 0.999, threshold: Number | None = None) -> Rule:
         else:
             limit = float(threshold) ** 2
         s = scale_to_quantile(o, limit, seen)
-        o = o._replace(noise=jnp.sqrt(s) * o.noise)
-        return memory, prior, o.noted("huber", weight=1.0 / s)
+        o, weight = weighed(o, s)
+        return memory, prior, o.noted("huber", weight=weight)
 
-    return Rule(before=before, name="huber")
+    return opening(Rule(before=before, name="huber"), patience)

@@ -24,14 +24,15 @@ def igg3(
               floor                                  beyond k1
         R_ij becomes R_ij / sqrt(w_i w_j)
 
-    With the floor at zero a component beyond k1 is refused.
+    With the floor at zero a component beyond k1 is refused; else one beyond k0 / floor, which even
+    by the floor would pull more than one of full weight can.
 
     A filter that has gone wrong would give weight to no measurement any more. So when no component
     of a sensor has had more weight than the floor ``patience`` times in a row, its next such
     measurement is used with full weight, and the prior covariance is first widened along the
-    innovation until no t_i exceeds k0:
+    innovation until no t_i exceeds k0, by `robins.filters.rules._robust.widened` with
 
-        P' = P + a G r r' G',   G = P H' (H P H')^-1,   a = max_i (1 / k0^2 - 1 / t_i^2)
+        D = a r r',   a = max_i (1 / k0^2 - 1 / t_i^2)
 
     Notes: ``igg3.weight``, the least of the measurement, and ``igg3.recovered``. The Kalman filter
     is the limit of k0 above every t_i.
@@ -60,6 +61,7 @@ def igg3(
         beyond = jnp.where(far, t, k1)
         share = jnp.maximum(k1 - beyond, 0.0) / (k1 - k0)
         weight = jnp.where(far, jnp.maximum(k0 / beyond * share**2, floor), 1.0)
+        weight = jnp.where((t >= k1) & (floor * t > k0), 0.0, weight)
 
         measured = jnp.any(seen.used)
         hopeless = measured & jnp.all(~seen.used | (weight <= floor))

@@ -14,12 +14,17 @@ from robins.filters.belief import Belief, Number
 from robins.filters.checks import one_of
 from robins.filters.observation import Observation
 from robins.filters.rule import Rule
-from robins.filters.rules._robust import MOST, shares
+from robins.filters.rules._robust import MOST, PATIENCE, opening, shares, weighed
 
 Whose = Literal["R", "both"]
 
 
-def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rule:
+def student_t(
+    dof: Number = 5.0,
+    iterations: int = 3,
+    whose: Whose = "R",
+    patience: int | None = PATIENCE,
+) -> Rule:
     r"""Student's t filter by variational Bayes (Huang, Zhang, Li, Wu & Chambers 2017, sec. III).
 
     Noise of v ~ t(0, R, nu) is Gaussian of covariance R / u with u ~ Gamma(nu/2, nu/2) (Roth,
@@ -35,16 +40,22 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
     given, so that on Gaussian data the filter is a little wasteful; weights below one are common
     and mean nothing by themselves.
 
-    Notes: ``student_t.weight``, 1 / c, and ``student_t.prior``, 1 / b. Components without noise of
-    their own do not count. The Kalman filter is ``dof=inf``.
+    A weight of 1e-12 or less is a refusal. After ``patience`` measurements with hardly any weight
+    the next one is believed (`robins.filters.rules._robust.opening`).
+
+    Notes: ``student_t.weight``, 1 / c, 0 if refused; ``student_t.prior``, 1 / b; and
+    ``student_t.recovered``. Components without noise of their own do not count. The Kalman filter
+    is ``dof=inf``.
 
     Args:
         dof: nu, degrees of freedom of the tails: 3 to 10; 1 are those of Cauchy.
         iterations: of c, at least 1.
         whose: tails of the measurement noise "R" only, or of "both" it and the prior.
+        patience: measurements in a row with a weight below 1e-2; None never recovers.
 
     Raises:
-        ValueError: dof is not positive, there is no iteration, or whose is neither.
+        ValueError: dof is not positive, there is no iteration, whose is neither, or patience is
+            negative.
     """
     require(dof > 0.0, "student_t dof must be positive", dof)
     require(iterations >= 1, "student_t iterations must be at least 1", iterations)
@@ -77,9 +88,10 @@ def student_t(dof: Number = 5.0, iterations: int = 3, whose: Whose = "R") -> Rul
 
     def before(memory, prior: Belief, o: Observation):
         b, c = scales(o, prior.factor.shape[0])
+        o, weight = weighed(o, c)
+        b = jnp.where(weight > 0.0, b, 1.0)
         if whose == "both":
             prior = prior._replace(factor=jnp.sqrt(b) * prior.factor)
-        o = o._replace(noise=jnp.sqrt(c) * o.noise)
-        return memory, prior, o.noted("student_t", weight=1.0 / c, prior=1.0 / b)
+        return memory, prior, o.noted("student_t", weight=weight, prior=1.0 / b)
 
-    return Rule(before=before, name="student_t")
+    return opening(Rule(before=before, name="student_t"), patience)

@@ -258,7 +258,7 @@ def tails() -> Rule:
     A position far away is a matter of the hypotheses. A mode that explains it by a weight, again at
     every step, would stay likelier than what has to be believed once, and swallow it in the mixing.
     """
-    t = student_t(_TAILS)
+    t = student_t(_TAILS, patience=None)  # the hypotheses are the way out
 
     def before(memory: Any, prior: Belief, o: Observation):
         memory, prior, seen = t.before(memory, prior, o)

@@ -93,8 +93,10 @@ def marg_filter(
         field_t: T, spread of strength and vertical component of a new field.
     """
     chain = [
-        rules.only(model.TRAVEL, rules.huber(weight)),
-        rules.only(model.REST_RATE, rules.gate(0.9999, 100)),
+        rules.only(
+            model.TRAVEL, rules.huber(weight, patience=None)
+        ),  # an assumption may stay wrong
+        rules.only(model.REST_RATE, rules.gate(0.9999, 100, "accept")),
     ]
     if gate is not None:
         chain.append(undisturbed(gate, patience, field_t))
